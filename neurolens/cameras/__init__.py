@@ -1,0 +1,1 @@
+"""Cameras: pinhole, thin lens, exact lens and exported model behind one contract."""

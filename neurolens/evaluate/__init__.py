@@ -1,0 +1,1 @@
+"""Error and speed: rays, vignetting, images, time, and the report that shows the trade."""

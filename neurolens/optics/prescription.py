@@ -1,0 +1,194 @@
+"""A lens prescription as frozen data: surfaces from the scene to the film, and what a photographer changes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from dataclasses import dataclass, replace
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+from neurolens.errors import InputError
+
+
+@dataclass(frozen=True)
+class Surface:
+    """One surface. Lengths in mm, lens frame.
+
+    Attributes:
+        radius_mm: positive when the centre of curvature lies towards the film; `inf` for a plane.
+        thickness_mm: axial distance to the next surface (for the last one: to the film as tabled).
+        diameter_mm: full clear diameter of the rim; of the opening, for the stop.
+        n_d: refractive index at 587.56 nm of the medium after the surface.
+        V_d: Abbe number of that medium; None where unknown (constant index) or air.
+        material: name of the glass in the source, for people only.
+        stop: whether this row is the aperture stop.
+
+    `radius_mm`, `thickness_mm` and `n_d` may be 0-d tensors where gradients with respect to the prescription are wanted.
+    """
+
+    radius_mm: Any
+    thickness_mm: Any
+    diameter_mm: float
+    n_d: Any = 1.0
+    V_d: float | None = None
+    material: str | None = None
+    stop: bool = False
+
+    @property
+    def curvature(self) -> Any:
+        """1 / radius in 1/mm, 0 for a plane."""
+        return 1.0 / self.radius_mm
+
+    @property
+    def semi_diameter_mm(self) -> float:
+        return self.diameter_mm / 2
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """A zoom or focus state of the source: thicknesses that replace those of the table, by surface index."""
+
+    name: str
+    efl_mm: float
+    thickness_mm: tuple[tuple[int, float], ...]
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A prescription with the film's place. Nothing mutates it: `at` gives a new lens.
+
+    Attributes:
+        name, designer, source, notes: as cited in the lens file.
+        f_number: nominal, of the source; the stop's own diameter rules the trace.
+        image_radius_mm: radius of the image circle, None where only the field is known.
+        half_field_deg: half field of view, None where unknown.
+        film_z_mm: film plane in the lens frame; None until `at` has focused the lens (then the table's thickness rules).
+        configurations: zoom states of the source.
+        path: the file it was read from, for error messages.
+    """
+
+    name: str
+    source: str
+    surfaces: tuple[Surface, ...]
+    f_number: float
+    image_radius_mm: float | None = None
+    half_field_deg: float | None = None
+    designer: str = ""
+    notes: str = ""
+    film_z_mm: float | None = None
+    configurations: tuple[Configuration, ...] = ()
+    path: str = "lens"
+
+    @property
+    def vertices_mm(self) -> list[Any]:
+        """z of every surface's vertex, and last the film plane as tabled."""
+        return list(accumulate((s.thickness_mm for s in self.surfaces), initial=0.0))
+
+    @property
+    def stop_index(self) -> int:
+        return next(k for k, s in enumerate(self.surfaces) if s.stop)
+
+    @property
+    def stop_radius_mm(self) -> float:
+        return self.surfaces[self.stop_index].semi_diameter_mm
+
+    @property
+    def semi_diameters_mm(self) -> list[float]:
+        return [s.semi_diameter_mm for s in self.surfaces]
+
+    @property
+    def dispersive(self) -> bool:
+        """Whether the index of any glass is known to change with wavelength."""
+        return any(s.V_d is not None for s in self.surfaces)
+
+    @property
+    def lens_id(self) -> str:
+        """Stem of the lens file: the name that models carry."""
+        return Path(self.path).stem
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the figures that decide where rays go (glass only: neither film nor stop opening nor texts)."""
+        rows = [
+            [float(s.radius_mm), float(s.thickness_mm), None if s.stop else s.diameter_mm, float(s.n_d), s.V_d, s.stop]
+            for s in self.surfaces[:-1]
+        ]
+        last = self.surfaces[-1]
+        rows.append([float(last.radius_mm), None, None if last.stop else last.diameter_mm, float(last.n_d), last.V_d, last.stop])
+        return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
+
+    def at(
+        self,
+        *,
+        configuration: str | None = None,
+        efl_mm: float | None = None,
+        f_number: float | None = None,
+        focus_m: float | None = None,
+    ) -> Lens:
+        """The same lens in another state.
+
+        Args:
+            configuration: name of a zoom state of the file.
+            efl_mm: rescale the whole lens so that its focal length at infinity focus is this.
+            f_number: EFL / paraxial entrance-pupil diameter at infinity focus; None keeps the tabled stop.
+            focus_m: distance from object to film in metres, `inf` allowed; None focuses at infinity.
+
+        Raises:
+            InputError: an unknown configuration, a value that is not positive, or focus nearer than four focal lengths.
+        """
+        from neurolens.optics import paraxial  # paraxial needs this module's types
+
+        lens = self if configuration is None else self._configured(configuration)
+        for field, value in (("efl_mm", efl_mm), ("f_number", f_number), ("focus_m", focus_m)):
+            if value is not None and not value > 0:
+                raise InputError(self.path, field, value, "a positive number")
+        if efl_mm is not None:
+            lens = lens.scaled(efl_mm / paraxial.first_order(lens).efl_mm)
+        if f_number is not None:
+            lens = lens.with_stop_radius(paraxial.stop_radius_mm(lens, f_number))
+        return replace(lens, film_z_mm=paraxial.film_z_mm(lens, math.inf if focus_m is None else focus_m))
+
+    def scaled(self, factor: float) -> Lens:
+        """All lengths times `factor`; angles, indices and f-number stay."""
+
+        def scale(value: Any) -> Any:
+            return None if value is None else value * factor
+
+        surfaces = tuple(
+            replace(
+                s,
+                radius_mm=scale(s.radius_mm),
+                thickness_mm=scale(s.thickness_mm),
+                diameter_mm=s.diameter_mm * factor,
+            )
+            for s in self.surfaces
+        )
+        configurations = tuple(
+            Configuration(c.name, c.efl_mm * factor, tuple((k, t * factor) for k, t in c.thickness_mm))
+            for c in self.configurations
+        )
+        return replace(
+            self,
+            surfaces=surfaces,
+            configurations=configurations,
+            image_radius_mm=scale(self.image_radius_mm),
+            film_z_mm=scale(self.film_z_mm),
+        )
+
+    def with_stop_radius(self, radius_mm: float) -> Lens:
+        """The same lens with another opening of the stop."""
+        k = self.stop_index
+        stop = replace(self.surfaces[k], diameter_mm=2 * radius_mm)
+        return replace(self, surfaces=(*self.surfaces[:k], stop, *self.surfaces[k + 1 :]))
+
+    def _configured(self, name: str) -> Lens:
+        for c in self.configurations:
+            if c.name == name:
+                thickness = dict(c.thickness_mm)
+                rows = (replace(s, thickness_mm=thickness.get(k, s.thickness_mm)) for k, s in enumerate(self.surfaces))
+                return replace(self, surfaces=tuple(rows))
+        known = ", ".join(c.name for c in self.configurations) or "none in this file"
+        raise InputError(self.path, "configuration", name, f"one of: {known}")

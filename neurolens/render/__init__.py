@@ -1,0 +1,1 @@
+"""A compact Monte Carlo renderer: vectorised numpy wavefronts, spectral, OpenEXR out."""

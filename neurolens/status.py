@@ -1,0 +1,42 @@
+"""The status that every ray carries: passed, or what ended it and where.
+
+One integer a ray, the same code for the exact tracer and for exported models:
+
+    0                 passed
+    1                 outside the domain of a model (exact tracing never returns it)
+    4 (k + 1) + r     ended at surface k (0-based, counted from the scene), for reason r:
+                      1 missed the surface, 2 blocked by its rim (or by the stop), 3 total reflection
+
+At each surface the reasons are tested in that order; the first failure along the travel wins.
+"""
+
+from __future__ import annotations
+
+PASSED = 0
+OUTSIDE_DOMAIN = 1
+MISSED, RIM, TOTAL_REFLECTION = 1, 2, 3
+_REASONS = {MISSED: "missed surface", RIM: "blocked by the rim of surface", TOTAL_REFLECTION: "total reflection at surface"}
+
+
+def blocked(surface: int, reason: int) -> int:
+    """Status of a ray that ends at `surface` (0-based, from the scene) for `reason` (MISSED, RIM or TOTAL_REFLECTION)."""
+    return 4 * (surface + 1) + reason
+
+
+def surface_of(status: int) -> int | None:
+    """Surface that ended a ray of this status, or None when no surface did."""
+    return status // 4 - 1 if status >= 4 else None
+
+
+def reason_of(status: int) -> int | None:
+    """MISSED, RIM or TOTAL_REFLECTION, or None when no surface ended the ray."""
+    return status % 4 if status >= 4 else None
+
+
+def describe(status: int) -> str:
+    """A status in words, for messages and tables."""
+    if status == PASSED:
+        return "passed"
+    if status == OUTSIDE_DOMAIN:
+        return "outside the model's domain"
+    return f"{_REASONS[status % 4]} {status // 4 - 1}"

@@ -1,0 +1,1 @@
+"""Surrogates: ray domain and pairs, bases, fits, networks, cards and ONNX graphs."""
