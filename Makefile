@@ -1,0 +1,68 @@
+# On a fresh machine with Python 3.11 or newer and make, each target does its own set-up in .venv; a second run starts at once.
+#
+#   make demo     train, evaluate and render the quickstart (minutes), then print where to look
+#   make test     tests, then lint, format and types
+#   make bench    speed against accuracy; fails when a promised ratio is lost
+#   make models   fit again every model of models/
+#   make lint     lint, format and types only
+#   make format   rewrite the code in the project's format
+#   make clean    remove .venv and caches
+#
+# PYTHON=/path/to/python3 chooses the interpreter. PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu takes the small torch.
+
+SHELL := /bin/sh
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+# Versions come from constraints.txt alone; a slow mirror should not fail the build.
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export PIP_DEFAULT_TIMEOUT ?= 120
+# Small batches lose speed to threads beyond the free cores.
+export OMP_NUM_THREADS ?= 2
+export MPLBACKEND ?= Agg
+
+.PHONY: demo test bench models lint format clean
+.DELETE_ON_ERROR:
+
+demo: $(INSTALLED)
+	$(BIN)/neurolens train experiments/quickstart.toml
+
+test: $(INSTALLED)
+	$(BIN)/python -m pytest -q --durations=10
+	$(MAKE) --no-print-directory lint
+
+bench: $(INSTALLED)
+	$(BIN)/python -m neurolens.evaluate.bench
+
+models: $(INSTALLED)
+	$(BIN)/python -m neurolens.evaluate.make_models
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(INSTALLED)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache build *.egg-info
+
+# torch goes first, by itself: it brings setuptools, which then builds the project without fetching anything unpinned.
+$(INSTALLED): pyproject.toml constraints.txt
+	@set -e; found=; \
+	for candidate in "$(PYTHON)" python3 python3.14 python3.13 python3.12 python3.11; do \
+	    if "$$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then found=$$candidate; break; fi; \
+	done; \
+	if [ -z "$$found" ]; then \
+	    echo "neurolens needs Python 3.11 or newer: '$(PYTHON)' is `$(PYTHON) --version 2>&1 || true`. Try make PYTHON=/path/to/python3.11" >&2; \
+	    exit 1; \
+	fi; \
+	echo "Setting up $(VENV) with $$found (once; torch is large)"; \
+	"$$found" -m venv $(VENV) || { echo "'$$found -m venv' failed: is the venv module installed (Debian: python3-venv)?" >&2; exit 1; }
+	$(BIN)/python -m pip install --quiet -c constraints.txt torch==2.13.0
+	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[train,dev]'
+	@touch $@
