@@ -1,0 +1,220 @@
+"""Image error: relative MSE on linear radiance, FLIP as seen on a display, and the noise floor both are judged by.
+
+A render through a surrogate is never equal to the exact render, because Monte Carlo noise differs with the seed. What
+counts is whether it differs by more than exact renders of different seeds differ from each other: `compare`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from neurolens.errors import InputError, NeurolensError
+
+Image = NDArray[np.float64]
+
+MIN_PAIRS = 4  # fewer pairs leave the noise floor itself too noisy to divide by
+
+
+@dataclass(frozen=True)
+class ImageSettings:
+    """How two linear pictures are compared; stated beside every figure.
+
+    Attributes:
+        exposure: factor on linear RGB before the sRGB curve and the clip to [0, 1], for FLIP only.
+        pixels_per_degree: of visual angle, for FLIP; 67 is its authors' default (0.7 m from a 0.7 m wide 4K display).
+        eps: in the denominator of the relative MSE, in squared radiance, so that dark pixels do not rule the mean.
+        trim: share of pixels dropped from the relative MSE, those of largest error (fireflies); 0 keeps all.
+    """
+
+    exposure: float = 1.0
+    pixels_per_degree: float = 67.0
+    eps: float = 1e-2
+    trim: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("exposure", "pixels_per_degree", "eps"):
+            value = getattr(self, name)
+            if not (0 < value < float("inf")):
+                raise InputError("image settings", name, value, "a positive number")
+        if not (0 <= self.trim < 1):
+            raise InputError("image settings", "trim", self.trim, "a share in [0, 1)")
+
+
+def checked_image(image: ArrayLike, name: str) -> Image:
+    """`image` as float64 [H, W, 3].
+
+    Raises:
+        InputError: another shape, an empty picture, or values that are not finite; `name` says which picture.
+    """
+    array = np.asarray(image)
+    if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
+        raise InputError("image", f"{name}, shape", f"({array.shape})", "[height, width, 3] linear RGB")
+    if not np.issubdtype(array.dtype, np.floating):
+        raise InputError("image", f"{name}, type", str(array.dtype), "floating-point linear radiance, not 8-bit values")
+    array = array.astype(np.float64)
+    bad = int(np.count_nonzero(~np.isfinite(array)))
+    if bad:
+        raise InputError("image", f"{name}, values", f"({bad} values not finite)", "finite linear RGB")
+    return array
+
+
+def _checked_pair(test: ArrayLike, reference: ArrayLike) -> tuple[Image, Image]:
+    a, b = checked_image(test, "test"), checked_image(reference, "reference")
+    if a.shape != b.shape:
+        raise InputError("image", "test, shape", f"({a.shape})", f"the shape of the reference, {b.shape}")
+    return a, b
+
+
+def to_srgb(linear: ArrayLike, exposure: float = 1.0) -> Image:
+    """Linear RGB times `exposure`, clipped to [0, 1], through the sRGB curve (IEC 61966-2-1). Any shape."""
+    c = np.clip(np.asarray(linear, dtype=np.float64) * exposure, 0.0, 1.0)
+    return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
+
+
+def rel_squared_error_map(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = ImageSettings()) -> Image:
+    """(a - b)^2 / (b^2 + eps) for each pixel, mean over the channels, [H, W]; a the test, b the reference picture."""
+    a, b = _checked_pair(test, reference)
+    ratio: Image = ((a - b) ** 2 / (b**2 + settings.eps)).mean(axis=2)
+    return ratio
+
+
+def rel_mse(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = ImageSettings()) -> float:
+    """Relative mean squared error on linear radiance: mean over pixels and channels of (a - b)^2 / (b^2 + eps).
+
+    Rousselle, Knaus, Zwicker 2011, "Adaptive sampling and reconstruction using greedy error minimization", with their
+    eps = 0.01. `settings.trim` drops that share of the worst pixels first, as they do against fireflies.
+
+    Args:
+        test, reference: [H, W, 3] linear RGB.
+    Raises:
+        InputError: shapes that differ or are not [H, W, 3]; values that are not finite.
+    """
+    errors = np.sort(rel_squared_error_map(test, reference, settings), axis=None)
+    kept = max(1, errors.size - int(settings.trim * errors.size))
+    return float(errors[:kept].mean())
+
+
+def flip_map(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = ImageSettings()) -> Image:
+    """LDR-FLIP for each pixel, [H, W] in [0, 1]: what an observer sees when flipping between the two pictures.
+
+    Andersson et al. 2020, "FLIP: a difference evaluator for alternating images", through their `flip-evaluator`.
+    Linear RGB goes through `to_srgb` with the stated exposure; the viewing distance is `pixels_per_degree`.
+
+    Raises:
+        InputError: as `rel_mse`.
+        NeurolensError: flip-evaluator is not installed.
+    """
+    a, b = _checked_pair(test, reference)
+    try:
+        import flip_evaluator
+    except ImportError as error:
+        raise NeurolensError('FLIP needs flip-evaluator: pip install "neurolens[train]"') from error
+    shown_a, shown_b = (np.ascontiguousarray(to_srgb(x, settings.exposure), dtype=np.float32) for x in (a, b))
+    errors, _, _ = flip_evaluator.evaluate(
+        shown_b, shown_a, "LDR", applyMagma=False, computeMeanError=False, parameters={"ppd": settings.pixels_per_degree}
+    )
+    return np.asarray(errors, dtype=np.float64).reshape(a.shape[:2])
+
+
+def flip(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = ImageSettings()) -> float:
+    """Mean of `flip_map`: 0 for equal pictures, 1 at most."""
+    return float(flip_map(test, reference, settings).mean())
+
+
+def seed_pairs(count: int) -> list[tuple[int, int]]:
+    """(i, j) with j the next render in a ring: every render is once the test and once the reference, never with itself.
+
+    Raises:
+        InputError: fewer than MIN_PAIRS renders.
+    """
+    if count < MIN_PAIRS:
+        raise InputError("image", "renders of different seeds", count, f"at least {MIN_PAIRS}, for {MIN_PAIRS} pairs")
+    return [(i, (i + 1) % count) for i in range(count)]
+
+
+def noise_floor(exact_renders: Sequence[ArrayLike], settings: ImageSettings = ImageSettings()) -> dict[str, Any]:
+    """How much exact renders of different seeds differ from each other, mean over the pairs of `seed_pairs`.
+
+    Args:
+        exact_renders: at least four [H, W, 3] linear renders, equal but for their seeds.
+    Returns:
+        noise_floor_flip, noise_floor_rel_mse, pairs.
+    Raises:
+        InputError: too few renders, or pictures that do not fit each other.
+    """
+    pairs = seed_pairs(len(exact_renders))
+    flips, errors = _over_pairs(exact_renders, exact_renders, pairs, settings)
+    return {"noise_floor_flip": _mean(flips), "noise_floor_rel_mse": _mean(errors), "pairs": len(pairs)}
+
+
+def compare(
+    renders: Sequence[ArrayLike], exact_renders: Sequence[ArrayLike], settings: ImageSettings = ImageSettings()
+) -> dict[str, Any]:
+    """Error of a surrogate's renders against exact ones, beside the noise floor.
+
+    Render i of the surrogate is compared with exact render j != i of `seed_pairs`, never with its own seed: noise
+    that both share would cancel and flatter the surrogate. The floor of the pair is exact i against the same exact j,
+    so a surrogate without error has a ratio of exactly 1 where it draws the same random numbers, and of 1 but for
+    noise where it does not.
+
+    Args:
+        renders: one or more [H, W, 3] linear renders; number i has the seed of exact render i.
+        exact_renders: at least four, and at least as many as `renders`.
+    Returns:
+        flip, rel_mse: mean over the pairs; noise_floor_flip, noise_floor_rel_mse: mean over all exact pairs;
+        flip_ratio, rel_mse_ratio: over the floor of the same pairs, None where that floor is 0;
+        flip_same_seed: mean FLIP of render i against exact render i, where shared noise cancels (what the lens
+        alone changes, if both cameras use the random numbers alike); pairs; settings.
+    Raises:
+        InputError: too few renders, or pictures that do not fit each other.
+    """
+    ring = seed_pairs(len(exact_renders))
+    if not (1 <= len(renders) <= len(ring)):
+        raise InputError("image", "surrogate renders", len(renders), f"1 to {len(ring)}, one for each exact render")
+    pairs = ring[: len(renders)]
+    flips, errors = _over_pairs(renders, exact_renders, pairs, settings)
+    floor_flips, floor_errors = _over_pairs(exact_renders, exact_renders, ring, settings)
+    used = len(pairs)
+    return {
+        "flip": _mean(flips),
+        "rel_mse": _mean(errors),
+        "noise_floor_flip": _mean(floor_flips),
+        "noise_floor_rel_mse": _mean(floor_errors),
+        "flip_ratio": _ratio(_mean(flips), _mean(floor_flips[:used])),
+        "rel_mse_ratio": _ratio(_mean(errors), _mean(floor_errors[:used])),
+        "flip_same_seed": _mean(flip(a, b, settings) for a, b in zip(renders, exact_renders, strict=False)),
+        "pairs": used,
+        "exposure": settings.exposure,
+        "pixels_per_degree": settings.pixels_per_degree,
+        "eps": settings.eps,
+        "trim": settings.trim,
+    }
+
+
+def error_maps(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = ImageSettings()) -> dict[str, Image]:
+    """Both errors for each pixel, [H, W]: `flip` in [0, 1], `rel_squared_error` without unit."""
+    return {
+        "flip": flip_map(test, reference, settings),
+        "rel_squared_error": rel_squared_error_map(test, reference, settings),
+    }
+
+
+def _over_pairs(
+    tests: Sequence[ArrayLike], references: Sequence[ArrayLike], pairs: Iterable[tuple[int, int]], settings: ImageSettings
+) -> tuple[list[float], list[float]]:
+    """FLIP and relative MSE of each pair (i, j): test i against reference j."""
+    both = [(flip(tests[i], references[j], settings), rel_mse(tests[i], references[j], settings)) for i, j in pairs]
+    return [pair[0] for pair in both], [pair[1] for pair in both]
+
+
+def _mean(values: Iterable[float]) -> float:
+    return float(np.mean(list(values)))
+
+
+def _ratio(value: float, floor: float) -> float | None:
+    return value / floor if floor > 0 else None
