@@ -27,3 +27,7 @@ class InputError(NeurolensError, ValueError):
 
 class ModelError(NeurolensError, ValueError):
     """An exported lens model that cannot be trusted: truncated, of another schema, for another lens, or not finite."""
+
+
+class NeurolensWarning(UserWarning):
+    """Something that works but that a user should know, such as a glass without dispersion data."""
