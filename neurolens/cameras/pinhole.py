@@ -1,0 +1,54 @@
+"""Pinhole camera: one ray a film point, everything in focus."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from neurolens.cameras.contract import CameraRays, FloatArray
+from neurolens.cameras.sampling import check_film, positive
+
+
+class Pinhole:
+    """A hole at distance `focal_mm` from the film.
+
+    The hole stands for a lens of the nominal f-number, E = pi L / (4 N^2) on the axis, so the weight is cos^4 of the
+    angle to the axis, 1 on the axis; `f_number` is kept in the settings and changes no ray.
+
+    Args:
+        focal_mm: distance from hole to film.
+        film_mm: width and height of the film.
+        f_number: nominal.
+
+    Raises:
+        InputError: a length or the f-number is not a finite number above 0.
+    """
+
+    name = "pinhole"
+    dispersive = False
+    wavelength_nm: tuple[float, float] | None = None
+
+    def __init__(self, focal_mm: float, film_mm: tuple[float, float] = (36.0, 24.0), f_number: float = 8.0) -> None:
+        self.focal_mm = positive("focal_mm", focal_mm)
+        self.film_mm = check_film(film_mm)
+        self.f_number = positive("f_number", f_number)
+        self.settings: dict[str, Any] = {
+            "camera": self.name,
+            "efl_mm": self.focal_mm,
+            "f_number": self.f_number,
+            "focus_m": None,
+            "film_mm": list(self.film_mm),
+        }
+
+    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """Rays through the hole for film points [2, N] in mm; pupil and wavelength change nothing."""
+        count = film_mm.shape[1]
+        direction = np.empty((3, count), np.float32)
+        np.divide(film_mm, np.float32(-self.focal_mm), out=direction[:2])
+        direction[2] = -1.0
+        cos2 = 1.0 / (1.0 + direction[0] ** 2 + direction[1] ** 2)
+        direction *= np.sqrt(cos2)
+        origin = np.zeros((3, count), np.float32)
+        origin[2] = -1e-3 * self.focal_mm
+        return CameraRays(origin, direction, (cos2 * cos2).astype(np.float32), np.zeros(count, np.int32))

@@ -1,0 +1,88 @@
+"""Thin-lens camera: perfect focus on one plane, a circular aperture, no aberration."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from neurolens.cameras.contract import CameraRays, FloatArray
+from neurolens.cameras.sampling import check_film, concentric_disk, positive
+from neurolens.errors import InputError
+
+
+def image_distance_mm(focal_mm: float, focus_m: float) -> float:
+    """Distance s' from lens to film when an object `focus_m` from the film is in focus.
+
+    With D = s + s' and 1/f = 1/s + 1/s', s' = (D - sqrt(D (D - 4 f))) / 2, the root with the lens nearer to the film.
+
+    Raises:
+        InputError: D < 4 f, nearer than a lens of this focal length can focus.
+    """
+    if math.isinf(focus_m):
+        return focal_mm
+    distance_mm = 1e3 * focus_m
+    if distance_mm < 4 * focal_mm:
+        raise InputError("camera", "focus_m", focus_m, f"at least 4 focal lengths, {4e-3 * focal_mm:g} m")
+    # 2 D f / (D + sqrt(...)) is the same root without the difference of two large numbers.
+    return 2 * distance_mm * focal_mm / (distance_mm + math.sqrt(distance_mm * (distance_mm - 4 * focal_mm)))
+
+
+class ThinLens:
+    """A thin lens of focal length `focal_mm` and diameter `focal_mm / f_number`.
+
+    Args:
+        focal_mm: focal length.
+        f_number: focal length over aperture diameter; it does not change with focus.
+        focus_m: distance from film to the object in focus, or infinity.
+        film_mm: width and height of the film.
+
+    Raises:
+        InputError: a value is not above 0, or `focus_m` is below 4 focal lengths.
+    """
+
+    name = "thin"
+    dispersive = False
+    wavelength_nm: tuple[float, float] | None = None
+
+    def __init__(
+        self, focal_mm: float, f_number: float, focus_m: float, film_mm: tuple[float, float] = (36.0, 24.0)
+    ) -> None:
+        self.focal_mm = positive("focal_mm", focal_mm)
+        self.f_number = positive("f_number", f_number)
+        self.focus_m = positive("focus_m", focus_m, infinite=True)
+        self.film_mm = check_film(film_mm)
+        self.image_distance_mm = image_distance_mm(self.focal_mm, self.focus_m)
+        self.radius_mm = self.focal_mm / (2 * self.f_number)
+        self.settings: dict[str, Any] = {
+            "camera": self.name,
+            "efl_mm": self.focal_mm,
+            "f_number": self.f_number,
+            "focus_m": None if math.isinf(self.focus_m) else self.focus_m,
+            "film_mm": list(self.film_mm),
+        }
+
+    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """Rays for film points [2, N] in mm and pupil samples [2, N]; the wavelength changes nothing."""
+        count = film_mm.shape[1]
+        behind = np.float32(self.image_distance_mm)
+        in_front = np.float32(1e3 * self.focus_m - self.image_distance_mm)
+        lens = concentric_disk(pupil) * np.float32(self.radius_mm)  # [2, N] mm
+
+        # All rays of a film point leave for the point where its ray through the lens centre meets the focus plane;
+        # written per unit of depth, infinity is no special case.
+        direction = np.empty((3, count), np.float32)
+        direction[:2] = -film_mm / behind - lens / in_front
+        direction[2] = -1.0
+        direction /= np.sqrt(np.einsum("in,in->n", direction, direction))
+
+        origin = np.empty((3, count), np.float32)
+        np.multiply(lens, np.float32(1e-3), out=origin[:2])
+        origin[2] = -1e-3 * behind
+
+        # w = A cos^4 / s'^2 over the on-axis integral of cos over solid angle, pi R^2 / (R^2 + s'^2).
+        tangent = (lens - film_mm) / behind
+        cos2 = 1.0 / (1.0 + np.einsum("in,in->n", tangent, tangent))
+        weight = cos2 * cos2 * np.float32(1.0 + (self.radius_mm / self.image_distance_mm) ** 2)
+        return CameraRays(origin, direction, weight, np.zeros(count, np.int32))

@@ -1,0 +1,33 @@
+"""Make neurolens/render/data/spectra.csv: CIE 1931 2-degree observer, D65 and the Mallett-Yuksel 2019 sRGB basis.
+
+Needs colour-science, which is no dependency of neurolens, so run it in an environment of its own:
+
+    python -m venv /tmp/spectra && /tmp/spectra/bin/pip install colour-science==0.4.7
+    /tmp/spectra/bin/python tools/make_spectral_tables.py
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import colour
+import numpy as np
+from colour.recovery import MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019
+
+TARGET = Path(__file__).parent.parent / "neurolens" / "render" / "data" / "spectra.csv"
+SHAPE = colour.SpectralShape(380, 780, 5)
+
+
+def main() -> None:
+    """Write one row every 5 nm, 380-780 nm: wavelength_nm, x, y, z, d65 (100 at 560 nm), basis red, green, blue."""
+    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(SHAPE)
+    daylight = colour.SDS_ILLUMINANTS["D65"].copy().align(SHAPE)
+    basis = MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019.copy().align(SHAPE)
+    rows = np.column_stack([SHAPE.wavelengths, observer.values, daylight.values, basis.values])
+    header = "wavelength_nm,x,y,z,d65,red,green,blue"
+    formats = ["%.0f"] + ["%.7g"] * 7
+    np.savetxt(TARGET, rows, fmt=formats, delimiter=",", header=header, comments="")
+
+
+if __name__ == "__main__":
+    main()
