@@ -1,8 +1,8 @@
 """Settings as frozen dataclasses, read strictly from TOML, with `--set fit.terms=40` on top.
 
 A settings class is a plain frozen dataclass; nested dataclasses are TOML tables. Field types understood: bool, int,
-float (takes an integer too, refuses NaN), str, Path, Literal, Optional and other unions, tuple, list, dict with text keys,
-dataclass. Checks of values belong in `__post_init__`, as `raise InputError("settings", field, value, expected)`: file and
+float (takes an integer too, refuses NaN), str, Path, Literal, Optional and other unions, tuple, list, dict with text
+keys. Checks of values belong in `__post_init__`, as `raise InputError("settings", field, value, expected)`: file and
 table are added here.
 """
 

@@ -54,6 +54,7 @@ class Configuration:
     name: str
     efl_mm: float
     thickness_mm: tuple[tuple[int, float], ...]
+    half_field_deg: float | None = None  # None: that of the lens
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ class Lens:
 
     Attributes:
         name, designer, source, notes: as cited in the lens file.
+        rims: whether the rim diameters are the source's own or "estimated" by somebody.
         f_number: nominal, of the source; the stop's own diameter rules the trace.
         image_radius_mm: radius of the image circle, None where only the field is known.
         half_field_deg: half field of view, None where unknown.
@@ -78,6 +80,7 @@ class Lens:
     half_field_deg: float | None = None
     designer: str = ""
     notes: str = ""
+    rims: str = "source"
     film_z_mm: float | None = None
     configurations: tuple[Configuration, ...] = ()
     path: str = "lens"
@@ -117,7 +120,9 @@ class Lens:
             for s in self.surfaces[:-1]
         ]
         last = self.surfaces[-1]
-        rows.append([float(last.radius_mm), None, None if last.stop else last.diameter_mm, float(last.n_d), last.V_d, last.stop])
+        rows.append(
+            [float(last.radius_mm), None, None if last.stop else last.diameter_mm, float(last.n_d), last.V_d, last.stop]
+        )
         return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
     def at(
@@ -167,7 +172,7 @@ class Lens:
             for s in self.surfaces
         )
         configurations = tuple(
-            Configuration(c.name, c.efl_mm * factor, tuple((k, t * factor) for k, t in c.thickness_mm))
+            replace(c, efl_mm=c.efl_mm * factor, thickness_mm=tuple((k, t * factor) for k, t in c.thickness_mm))
             for c in self.configurations
         )
         return replace(
@@ -189,6 +194,7 @@ class Lens:
             if c.name == name:
                 thickness = dict(c.thickness_mm)
                 rows = (replace(s, thickness_mm=thickness.get(k, s.thickness_mm)) for k, s in enumerate(self.surfaces))
-                return replace(self, surfaces=tuple(rows))
+                field = self.half_field_deg if c.half_field_deg is None else c.half_field_deg
+                return replace(self, surfaces=tuple(rows), half_field_deg=field)
         known = ", ".join(c.name for c in self.configurations) or "none in this file"
         raise InputError(self.path, "configuration", name, f"one of: {known}")

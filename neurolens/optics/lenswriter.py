@@ -1,0 +1,95 @@
+"""Lenses written to files: aligned columns for people, every figure exact for `read_lens`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from neurolens.files import atomic_write_text
+from neurolens.optics.lensfile import SCHEMA
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.tomlfile import format_value
+
+ROWS_COMMENT = """\
+# From the scene to the film, numbered from 0. radius_mm is positive when the centre of curvature lies towards the film; inf is
+# a plane. n_d and V_d are of the glass after the surface; air where they are left out.
+"""
+WRAP = 110
+
+
+def write_lens(lens: Lens, path: str | Path) -> None:
+    """Write a lens file that `read_lens` reads back to the same lens (but for its `path`).
+
+    A lens that was focused keeps its film plane: it becomes the last thickness.
+    """
+    atomic_write_text(path, format_lens(lens))
+
+
+def format_lens(lens: Lens) -> str:
+    """The text of a lens file."""
+    head = {
+        "schema": SCHEMA,
+        "name": lens.name,
+        "designer": lens.designer or None,
+        "source": lens.source,
+        "f_number": float(lens.f_number),
+        "image_radius_mm": lens.image_radius_mm,
+        "half_field_deg": lens.half_field_deg,
+        "rims": lens.rims,
+    }
+    lines = [f"{key} = {format_value(value)}" for key, value in head.items() if value is not None]
+    if lens.notes:
+        lines.append(f"notes = {_wrapped(lens.notes)}")
+    text = "\n".join(lines) + "\n\n" + ROWS_COMMENT + "surfaces = [\n" + _rows(lens) + "]\n"
+    for c in lens.configurations:
+        text += f"\n[[configuration]]\nname = {format_value(c.name)}\nefl_mm = {format_value(float(c.efl_mm))}\n"
+        text += "" if c.half_field_deg is None else f"half_field_deg = {format_value(float(c.half_field_deg))}\n"
+        text += f"thickness_mm = {format_value({str(k): float(t) for k, t in c.thickness_mm})}\n"
+    return text
+
+
+def _rows(lens: Lens) -> str:
+    """One inline table a surface, keys in columns; a column that no surface uses is left out."""
+    surfaces = list(lens.surfaces)
+    cells = [_cells(s) for s in surfaces]
+    if lens.film_z_mm is not None:
+        cells[-1]["thickness_mm"] = repr(float(lens.film_z_mm) - float(lens.vertices_mm[-2]))
+    widths = {
+        key: max(len(row.get(key, "")) for row in cells) for key in dict.fromkeys(k for row in cells for k in row)
+    }
+    text = ""
+    for row in cells:
+        columns = [f"{key} = {row[key].rjust(widths[key])}" for key in row if key not in ("stop", "material")]
+        # Texts go last and unpadded: a column of glass names needs no right edge.
+        columns += [f"{key} = {row[key]}" for key in ("material", "stop") if key in row]
+        text += "  { " + ", ".join(columns) + " },\n"
+    return text
+
+
+def _cells(s: Surface) -> dict[str, str]:
+    cells = {key: repr(float(getattr(s, key))) for key in ("radius_mm", "thickness_mm", "diameter_mm")}
+    if float(s.n_d) != 1 or s.V_d is not None or s.material is not None:
+        cells["n_d"] = repr(float(s.n_d))
+    if s.V_d is not None:
+        cells["V_d"] = repr(float(s.V_d))
+    if s.material is not None:
+        cells["material"] = format_value(s.material)
+    if s.stop:
+        cells["stop"] = "true"
+    return cells
+
+
+def _wrapped(text: str) -> str:
+    """A text in short lines. TOML drops a backslash at the end of a line and the blanks after it."""
+    if len(text) <= WRAP:
+        return format_value(text)
+    lines, line = [], ""
+    for position, letter in enumerate(text):
+        line += letter
+        following = text[position + 1 : position + 2]
+        end_of_word = letter == " " and following.strip() != ""
+        next_word = text[position + 1 :].split(" ", 1)[0] if end_of_word else ""
+        if end_of_word and len(line) + len(next_word) > WRAP:
+            lines.append(format_value(line)[1:-1])
+            line = ""
+    lines.append(format_value(line)[1:-1])
+    return '"""\\\n' + "\\\n".join(lines) + '"""'
