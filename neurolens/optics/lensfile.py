@@ -61,8 +61,8 @@ def read_lens(path: str | Path) -> Lens:
         NeurolensWarning: glasses whose V_d is unknown; their index is taken as constant.
 
     Raises:
-        InputError: the first mistake met: an unknown or missing key, a wrong type, a value out of range, no stop or two,
-            surfaces that overlap inside their rims in any zoom state. The message names file, surface and field.
+        InputError: the first mistake met: an unknown or missing key, a wrong type, a value out of range, no stop or
+            two, surfaces that overlap inside their rims in any zoom state. It names file, surface and field.
     """
     data, file = read_toml(path), str(path)
     reject_unknown(file, "", data, LENS_KEYS)
@@ -89,6 +89,10 @@ def read_lens(path: str | Path) -> Lens:
         moved = dict(c.thickness_mm)
         rows = [replace(s, thickness_mm=moved.get(k, s.thickness_mm)) for k, s in enumerate(surfaces)]
         check_clearance(rows, file, f'configuration "{c.name}", ')
+    unknown = ", ".join(str(k) for k, s in enumerate(surfaces) if s.n_d != 1 and s.V_d is None)
+    if unknown:
+        text = f"{file}: V_d is not given after surface {unknown}: the index is taken as constant"
+        warnings.warn(text, NeurolensWarning, stacklevel=2)
     return lens
 
 
@@ -109,12 +113,6 @@ def _surfaces(data: Mapping[str, Any], file: str) -> tuple[Surface, ...]:
         raise InputError(
             file, f"surface {len(surfaces) - 1}, n_d", surfaces[-1].n_d, "air between last surface and film"
         )
-    unknown = [str(k) for k, s in enumerate(surfaces) if s.n_d != 1 and s.V_d is None]
-    if unknown:
-        text = (
-            f"{file}: surface {', '.join(unknown)}: V_d is not given, the index is taken as constant over the spectrum"
-        )
-        warnings.warn(text, NeurolensWarning, stacklevel=3)
     return surfaces
 
 

@@ -10,8 +10,8 @@ from neurolens.optics.prescription import Lens, Surface
 from neurolens.tomlfile import format_value
 
 ROWS_COMMENT = """\
-# From the scene to the film, numbered from 0. radius_mm is positive when the centre of curvature lies towards the film; inf is
-# a plane. n_d and V_d are of the glass after the surface; air where they are left out.
+# From the scene to the film, numbered from 0. radius_mm is positive when the centre of curvature lies towards the film;
+# inf is a plane. n_d and V_d are of the glass after the surface; air where they are left out.
 """
 WRAP = 110
 

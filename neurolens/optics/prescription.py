@@ -26,7 +26,7 @@ class Surface:
         material: name of the glass in the source, for people only.
         stop: whether this row is the aperture stop.
 
-    `radius_mm`, `thickness_mm` and `n_d` may be 0-d tensors where gradients with respect to the prescription are wanted.
+    `radius_mm`, `thickness_mm` and `n_d` may be 0-d tensors where gradients with respect to them are wanted.
     """
 
     radius_mm: Any
@@ -67,7 +67,7 @@ class Lens:
         f_number: nominal, of the source; the stop's own diameter rules the trace.
         image_radius_mm: radius of the image circle, None where only the field is known.
         half_field_deg: half field of view, None where unknown.
-        film_z_mm: film plane in the lens frame; None until `at` has focused the lens (then the table's thickness rules).
+        film_z_mm: film plane in the lens frame; None until `at` has focused the lens: the table's thickness rules.
         configurations: zoom states of the source.
         path: the file it was read from, for error messages.
     """
