@@ -1,0 +1,142 @@
+"""First-order (paraxial) data: focal length, principal planes, pupils, focus. Plain numbers, d line unless told."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from neurolens.errors import InputError
+from neurolens.optics.glass import LINE_D_NM, index_at
+from neurolens.optics.prescription import Lens
+
+
+@dataclass(frozen=True)
+class FirstOrder:
+    """First-order data of a lens in air, lens frame, mm.
+
+    Attributes:
+        efl_mm: effective focal length (negative for a diverging lens).
+        back_focus_mm: last vertex to rear focal point.
+        rear_focal_z_mm, front_focal_z_mm: focal points on the axis.
+        rear_principal_z_mm, front_principal_z_mm: H' and H.
+        entrance_pupil_z_mm, entrance_pupil_diameter_mm: paraxial image of the stop seen from the scene.
+        exit_pupil_z_mm, exit_pupil_diameter_mm: seen from the film; z is infinite for an image-telecentric lens.
+        f_number: efl / entrance-pupil diameter.
+    """
+
+    efl_mm: float
+    back_focus_mm: float
+    rear_focal_z_mm: float
+    front_focal_z_mm: float
+    rear_principal_z_mm: float
+    front_principal_z_mm: float
+    entrance_pupil_z_mm: float
+    entrance_pupil_diameter_mm: float
+    exit_pupil_z_mm: float
+    exit_pupil_diameter_mm: float
+    f_number: float
+
+
+def _march(lens: Lens, indices: list[Any], y: float, u: float, start: int, stop: int) -> tuple[Any, Any]:
+    """Follow a paraxial ray (height y mm, angle u rad in the medium before `start`) through surfaces start..stop-1.
+
+    Returns the height at surface stop-1 and the angle after it. y-nu trace (Smith, Modern Optical Engineering, ch. 2).
+    """
+    for k in range(start, stop):
+        if k > start:
+            y = y + u * lens.surfaces[k - 1].thickness_mm
+        u = (indices[k] * u - y * lens.surfaces[k].curvature * (indices[k + 1] - indices[k])) / indices[k + 1]
+    return y, u
+
+
+def _reversed(lens: Lens) -> Lens:
+    """The lens turned round, so that one march serves both directions."""
+    rows = lens.surfaces
+    turned = []
+    for k in range(len(rows) - 1, -1, -1):
+        glass_before = rows[k - 1] if k else None
+        turned.append(
+            type(rows[k])(
+                radius_mm=-rows[k].radius_mm,
+                thickness_mm=glass_before.thickness_mm if glass_before else 0.0,
+                diameter_mm=rows[k].diameter_mm,
+                n_d=glass_before.n_d if glass_before else 1.0,
+                V_d=glass_before.V_d if glass_before else None,
+                stop=rows[k].stop,
+            )
+        )
+    return Lens(lens.name, lens.source, tuple(turned), lens.f_number, path=lens.path)
+
+
+def _pupil(lens: Lens, indices: list[Any]) -> tuple[Any, Any]:
+    """Distance of the stop's image behind the last vertex, and its magnification, through the surfaces after the stop."""
+    k, n = lens.stop_index, len(lens.surfaces)
+    if k == n - 1:
+        return 0.0, 1.0
+    gap = lens.surfaces[k].thickness_mm
+    y, u = _march(lens, indices, gap * 1.0, 1.0, k + 1, n)  # from the axial point of the stop
+    y1, u1 = _march(lens, indices, 1.0, 0.0, k + 1, n)  # parallel, at height 1 in the stop
+    distance = -y / u if u != 0 else math.inf
+    return distance, (y1 + u1 * distance if math.isfinite(distance) else math.inf)
+
+
+def first_order(lens: Lens, wavelength_nm: float = LINE_D_NM) -> FirstOrder:
+    """First-order data at one wavelength.
+
+    Raises:
+        InputError: an afocal lens (no finite focal length).
+    """
+    indices = [1.0, *(index_at(s.n_d, s.V_d, wavelength_nm) for s in lens.surfaces)]
+    turned = _reversed(lens)
+    back_indices = [1.0, *(index_at(s.n_d, s.V_d, wavelength_nm) for s in turned.surfaces)]
+    n = len(lens.surfaces)
+    last_z = lens.vertices_mm[n - 1]
+    y, u = _march(lens, indices, 1.0, 0.0, 0, n)
+    if u == 0:
+        raise InputError(lens.path, "surfaces", "(an afocal system)", "a lens with a finite focal length")
+    y_back, u_back = _march(turned, back_indices, 1.0, 0.0, 0, n)
+    efl, back_focus = -1.0 / u, -y / u
+    rear_focal, front_focal = last_z + back_focus, y_back / u_back
+    exit_distance, exit_magnification = _pupil(lens, indices)
+    entrance_distance, entrance_magnification = _pupil(turned, back_indices)
+    opening = 2 * lens.stop_radius_mm
+    entrance_diameter = opening * abs(entrance_magnification)
+    return FirstOrder(
+        efl_mm=efl,
+        back_focus_mm=back_focus,
+        rear_focal_z_mm=rear_focal,
+        front_focal_z_mm=front_focal,
+        rear_principal_z_mm=rear_focal - efl,
+        front_principal_z_mm=front_focal + efl,
+        entrance_pupil_z_mm=-entrance_distance,
+        entrance_pupil_diameter_mm=entrance_diameter,
+        exit_pupil_z_mm=last_z + exit_distance,
+        exit_pupil_diameter_mm=opening * abs(exit_magnification),
+        f_number=abs(efl) / entrance_diameter,
+    )
+
+
+def stop_radius_mm(lens: Lens, f_number: float) -> float:
+    """Radius of the stop for f-number N = EFL / paraxial entrance-pupil diameter at infinity focus."""
+    now = first_order(lens)
+    return lens.stop_radius_mm * now.f_number / f_number
+
+
+def film_z_mm(lens: Lens, focus_m: float) -> float:
+    """Film plane that focuses an object `focus_m` metres from the film (unit focusing, first order).
+
+    With D that distance less the separation of the principal planes, s' = (D - sqrt(D (D - 4 f))) / 2 behind H'.
+
+    Raises:
+        InputError: D below four focal lengths, where no film plane exists.
+    """
+    data = first_order(lens)
+    f = data.efl_mm
+    if math.isinf(focus_m):
+        return data.rear_principal_z_mm + f
+    d = 1000.0 * focus_m - (data.rear_principal_z_mm - data.front_principal_z_mm)
+    if not d >= 4 * f:
+        nearest = (4 * f + data.rear_principal_z_mm - data.front_principal_z_mm) / 1000
+        raise InputError(lens.path, "focus_m", focus_m, f"at least {nearest:.4g} m (four focal lengths) for this lens")
+    return data.rear_principal_z_mm + (d - math.sqrt(d * (d - 4 * f))) / 2

@@ -1,0 +1,179 @@
+"""From film points and pupil points to camera rays, and where on the pupil plane the passing rays lie."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neurolens.errors import InputError
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.optics.surfaces import Rays
+from neurolens.optics.trace import trace
+
+
+def pupil_plane_z_mm(lens: Lens) -> float:
+    """z of the plane on which pupil points lie: the paraxial exit pupil, where passing rays crowd together.
+
+    The rear vertex stands in where the exit pupil lies near or behind the film or too far in front of it to be useful.
+    """
+    data = first_order(lens)
+    rear = float(lens.vertices_mm[len(lens.surfaces) - 1])
+    film = data.rear_focal_z_mm
+    z = data.exit_pupil_z_mm
+    useful = math.isfinite(z) and 0.25 * (film - rear) < film - z < 20 * abs(data.efl_mm)
+    return float(z) if useful else rear
+
+
+def camera_rays(film_x: Tensor, film_y: Tensor, film_z: Tensor | float, pupil_x: Tensor, pupil_y: Tensor, pupil_z: float) -> Rays:
+    """Camera rays from film points towards (or away from) pupil points, all [N] in mm, lens frame; dz is negative."""
+    x, y = pupil_x - film_x, pupil_y - film_y
+    z = torch.as_tensor(pupil_z, dtype=film_x.dtype, device=film_x.device) - film_z
+    scale = -torch.sign(z) / torch.sqrt(x * x + y * y + z * z)
+    start_z = torch.as_tensor(film_z, dtype=film_x.dtype, device=film_x.device).expand_as(film_x)
+    return Rays(film_x, film_y, start_z, x * scale, y * scale, (z * scale).expand_as(film_x))
+
+
+@dataclass(frozen=True)
+class PupilBounds:
+    """Bounds of the passing rays on the pupil plane for film points at equally spaced radii, as in pbrt (Pharr et al. 2016, 6.4.5).
+
+    For a film point at radius r along +x, passing rays lie within `low` <= u <= `high` along +x and |v| <= `half` across.
+
+    Attributes:
+        pupil_z_mm: the plane.
+        film_radius_mm: radius of the last row; the first row is the axis.
+        low_mm, high_mm, half_mm: one value a film radius; an empty row (low > high) where no ray passes.
+        disc_mm: radius of the axial disc that holds all passing rays.
+    """
+
+    pupil_z_mm: float
+    film_radius_mm: float
+    low_mm: tuple[float, ...]
+    high_mm: tuple[float, ...]
+    half_mm: tuple[float, ...]
+    disc_mm: float
+
+
+def pupil_bounds(
+    lens: Lens,
+    film_radius_mm: float,
+    film_z_mm: tuple[float, float],
+    wavelength_nm: tuple[float, float],
+    *,
+    rows: int = 33,
+    points: int = 128,
+) -> PupilBounds:
+    """Search the pupil plane for passing rays, row by row of film radii, in two steps (coarse grid, then its bounding box).
+
+    Each row is widened by the step of its grid and by its neighbours, so that bounds hold between rows too.
+
+    Raises:
+        InputError: when no ray passes from any film point.
+    """
+    plane = pupil_plane_z_mm(lens)
+    film_planes = sorted(set(film_z_mm))
+    wavelengths = sorted(set(wavelength_nm))
+    boxes = [_row(lens, film_radius_mm * i / (rows - 1), film_planes, wavelengths, plane, points) for i in range(rows)]
+    if not any(boxes):
+        raise InputError(lens.path, "surfaces", "(no ray passes the lens)", f"rays from a film of radius {film_radius_mm:.4g} mm")
+    merged = [_union([b for b in boxes[max(i - 1, 0) : i + 2] if b]) for i in range(rows)]
+    return PupilBounds(
+        plane,
+        film_radius_mm,
+        tuple(b.low for b in merged),
+        tuple(b.high for b in merged),
+        tuple(b.half for b in merged),
+        max(b.radius for b in boxes if b),
+    )
+
+
+class _Box(NamedTuple):
+    """Bounds of passing points for a film point on +x: along it, across it, and from the axis. mm."""
+
+    low: float
+    high: float
+    half: float
+    radius: float
+
+
+def _union(boxes: list[_Box]) -> _Box:
+    if not boxes:
+        return _Box(1.0, -1.0, 0.0, 0.0)
+    return _Box(
+        min(b.low for b in boxes), max(b.high for b in boxes), max(b.half for b in boxes), max(b.radius for b in boxes)
+    )
+
+
+def _row(
+    lens: Lens, radius: float, film_planes: list[float], wavelengths: list[float], plane: float, points: int
+) -> _Box | None:
+    """Box of the passing rays from one film radius, over all film planes and wavelengths given."""
+    rear = lens.surfaces[-1].semi_diameter_mm
+    rear_z = float(lens.vertices_mm[len(lens.surfaces) - 1])
+    found = []
+    for film_z in film_planes:
+        # The rear rim, seen from the film point and projected on the pupil plane, holds every ray that enters.
+        stretch = (film_z - plane) / (film_z - rear_z)
+        centre, reach = radius * (1 - stretch), 1.02 * rear * abs(stretch)
+        start = _Box(centre - reach, centre + reach, reach, 0.0)
+        coarse = _search(lens, radius, film_z, wavelengths, plane, start, points)
+        if coarse is not None:
+            found.append(_search(lens, radius, film_z, wavelengths, plane, coarse, points) or coarse)
+    return _union(found) if found else None
+
+
+def _search(
+    lens: Lens, radius: float, film_z: float, wavelengths: list[float], plane: float, box: _Box, points: int
+) -> _Box | None:
+    """Bounding box of the passing points of a grid over `box` (upper half only: the lens is symmetric), a step wider."""
+    u = torch.linspace(box.low, box.high, points, dtype=torch.float64)
+    v = torch.linspace(0, box.half, points // 2, dtype=torch.float64)
+    pu, pv = (t.reshape(-1) for t in torch.meshgrid(u, v, indexing="ij"))
+    rays = camera_rays(torch.full_like(pu, radius), torch.zeros_like(pu), film_z, pu, pv, plane)
+    passed = torch.stack([trace(lens, rays, w).status == 0 for w in wavelengths]).any(0)
+    if not passed.any():
+        return None
+    du, dv = float(u[1] - u[0]), float(v[1] - v[0])
+    pu, pv = pu[passed], pv[passed]
+    return _Box(
+        float(pu.min()) - du, float(pu.max()) + du, float(pv.max()) + dv, float(torch.hypot(pu, pv).max()) + math.hypot(du, dv) / 2
+    )
+
+
+def image_radius_mm(lens: Lens) -> tuple[float, str]:
+    """Radius of the lit film, and where it comes from.
+
+    The file's own; else f tan(half field) below 60 degrees; beyond, the film radius whose mean passing ray leaves at the
+    half field; else where the relative illumination falls to 10%.
+    """
+    if lens.image_radius_mm is not None:
+        return lens.image_radius_mm, "the lens file"
+    f = first_order(lens).efl_mm
+    if lens.half_field_deg is not None and lens.half_field_deg < 60:
+        return f * math.tan(math.radians(lens.half_field_deg)), "f tan(half field)"
+    radii = torch.linspace(0, 3 * f, 241, dtype=torch.float64)
+    share, angle = _illumination(lens, radii)
+    lit = radii[share >= 0.1 * share[0]].max()
+    if lens.half_field_deg is not None:
+        reached = radii[(angle <= math.radians(lens.half_field_deg)) & (share > 0)].max()
+        return float(torch.minimum(reached, lit)), "traced to the half field"
+    return float(lit), "relative illumination of 10%"
+
+
+def _illumination(lens: Lens, radii: Tensor, points: int = 48) -> tuple[Tensor, Tensor]:
+    """Relative film irradiance (any unit) and mean angle (rad) of the passing rays at each film radius."""
+    film_z = lens.film_z_mm if lens.film_z_mm is not None else float(lens.vertices_mm[-1])
+    rear, rear_z = lens.surfaces[-1].semi_diameter_mm, float(lens.vertices_mm[len(lens.surfaces) - 1])
+    grid = torch.linspace(-rear, rear, points, dtype=torch.float64)
+    film, px, py = (t.reshape(-1) for t in torch.meshgrid(radii, grid, grid, indexing="ij"))
+    rays = camera_rays(film, torch.zeros_like(film), film_z, px, py, rear_z)
+    traced = trace(lens, rays)
+    passed = ((traced.status == 0) & (px * px + py * py <= rear * rear)).reshape(len(radii), -1)
+    weight = passed * (rays.dz**4).reshape(passed.shape)
+    theta = torch.atan2(torch.hypot(traced.rays.dx, traced.rays.dy), -traced.rays.dz).reshape(passed.shape)
+    return weight.sum(1), (theta * weight).sum(1) / weight.sum(1).clamp_min(1e-30)

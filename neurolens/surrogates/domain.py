@@ -1,0 +1,168 @@
+"""The rays that a surrogate is asked to know: film, pupil, wavelengths and film positions (focus)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.quasirandom import SobolEngine
+
+from neurolens.errors import InputError
+from neurolens.optics.glass import LINE_D_NM
+from neurolens.optics.paraxial import film_z_mm, first_order
+from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import PupilBounds, image_radius_mm, pupil_bounds
+
+# The disc on the pupil plane is that of all passing rays, enlarged by this much (design: "enlarged by 5%").
+PUPIL_MARGIN = 1.05
+
+
+@dataclass(frozen=True)
+class Domain:
+    """A set of camera rays. Lengths in mm, lens frame.
+
+    Attributes:
+        film_radius_mm: film points lie within this distance of the axis.
+        film_z_mm: film planes, nearest to the lens first (infinity focus) to farthest (near limit).
+        focus_m: the object distances that those planes focus (far, near), from film to object.
+        pupil_z_mm: plane of the pupil points.
+        pupil_radius_mm: pupil points lie within this distance of the axis; 1.05 times the disc of passing rays.
+        wavelength_nm: shortest and longest wavelength; equal for a lens whose dispersion is unknown.
+        stop_radius_mm: the widest stop for which the surrogate is fitted.
+        bounds: where passing rays lie on the pupil plane, by film radius (for sampling in a render).
+    """
+
+    film_radius_mm: float
+    film_z_mm: tuple[float, float]
+    focus_m: tuple[float, float]
+    pupil_z_mm: float
+    pupil_radius_mm: float
+    wavelength_nm: tuple[float, float]
+    stop_radius_mm: float
+    bounds: PupilBounds
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able, with infinity written as the string "inf"."""
+        data = asdict(self)
+        data["focus_m"] = ["inf" if math.isinf(f) else f for f in self.focus_m]
+        return data
+
+    @staticmethod
+    def from_dict(data: dict[str, Any]) -> Domain:
+        """The inverse of `to_dict`."""
+        bounds = {k: tuple(v) if isinstance(v, list) else v for k, v in data["bounds"].items()}
+        pairs = {k: tuple(float(v) for v in data[k]) for k in ("film_z_mm", "focus_m", "wavelength_nm")}
+        return Domain(**{**data, **pairs, "bounds": PupilBounds(**bounds)})
+
+
+@dataclass(frozen=True)
+class FilmRays:
+    """Camera rays as film point, pupil point and wavelength, each [N] float64; mm and nm, lens frame."""
+
+    film_x: Tensor
+    film_y: Tensor
+    film_z: Tensor
+    pupil_x: Tensor
+    pupil_y: Tensor
+    wavelength_nm: Tensor
+
+    def __len__(self) -> int:
+        return self.film_x.shape[0]
+
+    def select(self, index: Tensor | slice) -> FilmRays:
+        return FilmRays(*(c[index] for c in self.columns()))
+
+    def columns(self) -> tuple[Tensor, ...]:
+        return (self.film_x, self.film_y, self.film_z, self.pupil_x, self.pupil_y, self.wavelength_nm)
+
+
+def domain_of(
+    lens: Lens,
+    *,
+    film_radius_mm: float | None = None,
+    focus_m: tuple[float, float] = (math.inf, math.inf),
+    wavelength_nm: tuple[float, float] = (400.0, 700.0),
+) -> Domain:
+    """The domain of a lens at its present stop.
+
+    Args:
+        film_radius_mm: None takes the lit film (see `pupils.image_radius_mm`).
+        focus_m: two object distances from the film; the domain holds every film plane between theirs.
+        wavelength_nm: replaced by the d line where no glass of the lens has a known dispersion.
+
+    Raises:
+        InputError: a radius that is not positive, wavelengths outside 300..2500 nm or in the wrong order.
+    """
+    if film_radius_mm is not None and not film_radius_mm > 0:
+        raise InputError("domain", "film_radius_mm", film_radius_mm, "a positive length in mm")
+    low, high = wavelength_nm
+    if not 300 <= low <= high <= 2500:
+        raise InputError("domain", "wavelength_nm", wavelength_nm, "shortest then longest, within 300 to 2500 nm")
+    if not lens.dispersive:
+        low = high = LINE_D_NM
+    planes = sorted(film_z_mm(lens, f) for f in focus_m)
+    radius = film_radius_mm if film_radius_mm is not None else image_radius_mm(lens)[0]
+    bounds = pupil_bounds(lens, radius, (planes[0], planes[1]), (low, high))
+    return Domain(
+        film_radius_mm=radius,
+        film_z_mm=(planes[0], planes[1]),
+        focus_m=(max(focus_m), min(focus_m)),
+        pupil_z_mm=bounds.pupil_z_mm,
+        pupil_radius_mm=PUPIL_MARGIN * bounds.disc_mm,
+        wavelength_nm=(low, high),
+        stop_radius_mm=lens.stop_radius_mm,
+        bounds=bounds,
+    )
+
+
+def domain_from_camera(
+    lens: Lens,
+    *,
+    film_mm: tuple[float, float],
+    focus_m: float,
+    f_number: float | None = None,
+    wavelength_nm: tuple[float, float] = (400.0, 700.0),
+) -> tuple[Lens, Domain]:
+    """Only what one shot requires: its film crop, stop, focus and wavelengths. Returns the stopped lens and its domain.
+
+    The lit film may be smaller than the crop (fisheyes); the smaller radius rules.
+    """
+    stopped = lens.at(f_number=f_number, focus_m=focus_m) if f_number is not None else lens.at(focus_m=focus_m)
+    corner = math.hypot(*film_mm) / 2
+    radius = min(corner, image_radius_mm(lens)[0])
+    return stopped, domain_of(stopped, film_radius_mm=radius, focus_m=(focus_m, focus_m), wavelength_nm=wavelength_nm)
+
+
+def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:
+    """z (mm, lens frame, negative; -inf at infinity focus) of the object plane in focus for each film plane z, first order."""
+    data = first_order(lens)
+    f = data.efl_mm
+    extension = film_z - data.rear_principal_z_mm - f  # Newton: object distance beyond the front focus is f^2 / extension
+    far = extension <= 1e-9 * f
+    distance = f + f * f / torch.where(far, torch.ones_like(extension), extension)
+    return data.front_principal_z_mm - torch.where(far, torch.full_like(distance, math.inf), distance)
+
+
+def sample_domain(domain: Domain, count: int, seed: int, skip: int = 0) -> FilmRays:
+    """Rays of a domain: uniform on the film and pupil discs, in wavelength and in film position.
+
+    Scrambled Sobol points (Owen scrambling, torch): the same seed gives the same rays; `skip` continues the sequence,
+    so that splits never share a ray.
+    """
+    engine = SobolEngine(6, scramble=True, seed=seed)
+    if skip:
+        engine.fast_forward(skip)
+    s = engine.draw(count, dtype=torch.float64).T
+    film_x, film_y = _disc(s[0], s[1], domain.film_radius_mm)
+    pupil_x, pupil_y = _disc(s[2], s[3], domain.pupil_radius_mm)
+    low, high = domain.wavelength_nm
+    near, far = domain.film_z_mm
+    return FilmRays(film_x, film_y, near + (far - near) * s[5], pupil_x, pupil_y, low + (high - low) * s[4])
+
+
+def _disc(a: Tensor, b: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+    r, phi = radius * torch.sqrt(a), 2 * math.pi * b
+    return r * torch.cos(phi), r * torch.sin(phi)

@@ -1,0 +1,114 @@
+"""The light field in the coordinates that surrogates see: two planes fixed to the glass, centred, scaled, rotation-free.
+
+A camera ray is its crossing p with a plane near the film and u with the pupil plane. Free space is linear, so another
+film position only moves where the ray starts. For a rotationally symmetric lens every output vector is
+
+    out = A(rho, sigma, tau, w) p + B(rho, sigma, tau, w) u,   rho = p.p,  sigma = p.u,  tau = u.u,
+
+which holds the symmetry and the mirror symmetry exactly and has no singular point on the axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neurolens.optics.glass import inverse_square_um
+from neurolens.surrogates.domain import Domain, FilmRays
+from neurolens.surrogates.pairs import PairSet
+
+
+class LightField(NamedTuple):
+    """Scaled coordinates of N rays: p and u [2, N] within about the unit disc, w [N] in [-1, 1]."""
+
+    p: Tensor
+    u: Tensor
+    w: Tensor
+
+    def invariants(self) -> Tensor:
+        """[4, N]: rho, sigma, tau, w."""
+        p, u = self.p, self.u
+        return torch.stack([p[0] * p[0] + p[1] * p[1], p[0] * u[0] + p[1] * u[1], u[0] * u[0] + u[1] * u[1], self.w])
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """From raw millimetres and nanometres to the light field.
+
+    Attributes:
+        film_plane_z_mm, pupil_plane_z_mm: the two planes (lens frame).
+        chief: k of the chief ray's u = k p, subtracted so that u is centred on the passing rays.
+        film_scale_mm, pupil_scale_mm: largest |p| and |u - k p| of the domain's passing rays.
+        w_middle, w_half: w = (1 / lambda^2 - middle) / half in 1/um^2; the index is linear in 1 / lambda^2 (Cauchy).
+            half is 0 for a lens without known dispersion, and then w = 0.
+    """
+
+    film_plane_z_mm: float
+    pupil_plane_z_mm: float
+    chief: float
+    film_scale_mm: float
+    pupil_scale_mm: float
+    w_middle: float
+    w_half: float
+
+    def planes(self, rays: FilmRays) -> tuple[Tensor, Tensor]:
+        """Crossings with the two planes in mm, [2, N] each."""
+        u = torch.stack([rays.pupil_x, rays.pupil_y])
+        film = torch.stack([rays.film_x, rays.film_y])
+        along = (self.film_plane_z_mm - self.pupil_plane_z_mm) / (rays.film_z - self.pupil_plane_z_mm)
+        return u + (film - u) * along, u
+
+    def __call__(self, rays: FilmRays) -> LightField:
+        p, u = self.planes(rays)
+        u = (u - self.chief * p) / self.pupil_scale_mm
+        if self.w_half == 0:
+            w = torch.zeros_like(rays.wavelength_nm)
+        else:
+            w = (inverse_square_um(rays.wavelength_nm) - self.w_middle) / self.w_half
+        return LightField(p / self.film_scale_mm, u, w)
+
+
+def fit_encoding(domain: Domain, passing: PairSet) -> Encoding:
+    """Centre and scale by the passing rays of a domain."""
+    plain = Encoding(domain.film_z_mm[0], domain.pupil_z_mm, 0.0, 1.0, 1.0, 0.0, 0.0)
+    p, u = plain.planes(passing.inputs)
+    chief = float((p * u).sum() / (p * p).sum())
+    shortest, longest = (float(inverse_square_um(v)) for v in domain.wavelength_nm)
+    return Encoding(
+        film_plane_z_mm=plain.film_plane_z_mm,
+        pupil_plane_z_mm=plain.pupil_plane_z_mm,
+        chief=chief,
+        film_scale_mm=float(p.norm(dim=0).max()),
+        pupil_scale_mm=float((u - chief * p).norm(dim=0).max()),
+        w_middle=(shortest + longest) / 2,
+        w_half=(shortest - longest) / 2,
+    )
+
+
+def angle_vector(dx: Tensor, dy: Tensor, dz: Tensor) -> Tensor:
+    """[2, N] v = theta (dx, dy) / |(dx, dy)| with theta from -z: smooth through 90 degrees, equivariant."""
+    sine = torch.hypot(dx, dy)
+    theta = torch.atan2(sine, -dz)
+    # theta / sine tends to 1 on the axis; the guard also keeps the exact axis finite.
+    ratio = torch.where(sine > 1e-12, theta / torch.where(sine > 1e-12, sine, 1.0), 1.0)
+    return torch.stack([ratio * dx, ratio * dy])
+
+
+# Taylor coefficients of sin(x)/x and cos(x) in x^2; 12 terms hold 1e-14 to 130 degrees.
+_SINC = [1.0]
+_COS = [1.0]
+for _k in range(1, 12):
+    _SINC.append(-_SINC[-1] / ((2 * _k) * (2 * _k + 1)))
+    _COS.append(-_COS[-1] / ((2 * _k - 1) * (2 * _k)))
+
+
+def direction_of(v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Unit direction (dx, dy, dz) of angle vectors [2, N], by series in |v|^2 (no square root, no special case at 0)."""
+    square = v[0] * v[0] + v[1] * v[1]
+    sinc, cos = torch.full_like(square, _SINC[-1]), torch.full_like(square, _COS[-1])
+    for a, b in zip(_SINC[-2::-1], _COS[-2::-1], strict=True):
+        sinc, cos = sinc * square + a, cos * square + b
+    return v[0] * sinc, v[1] * sinc, -cos

@@ -1,0 +1,208 @@
+"""Ray pairs: camera rays of a domain and what the exact tracer makes of them, in three splits, saved and reloaded bit for bit."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neurolens import status as st
+from neurolens.errors import InputError
+from neurolens.files import atomic_path
+from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import camera_rays
+from neurolens.optics.trace import Rays, trace
+from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
+
+SCHEMA = 1
+# Rays beyond this many rim radii are too far from any boundary to teach a model where it lies.
+RIM_REACH = 1.25
+_BATCH = 65536
+
+
+@dataclass(frozen=True)
+class PairSettings:
+    """How many rays of each split, and the seed."""
+
+    train: int = 30000
+    held_out: int = 30000
+    rim: int = 30000
+    seed: int = 1
+
+
+@dataclass(frozen=True)
+class PairSet:
+    """Camera rays and their exact images, all float64 and [N] unless said.
+
+    Attributes:
+        inputs: film point, pupil point, wavelength.
+        scene: point on the front surface and unit direction (lens frame, mm).
+        transmittance: product of (Ts + Tp) / 2.
+        status: [N] int32.
+        cross_x, cross_y: [S, N] crossings with every surface, mm.
+        meets, refracts: [S, N] margins under the square roots of intersection and of refraction.
+    """
+
+    inputs: FilmRays
+    scene: Rays
+    transmittance: Tensor
+    status: Tensor
+    cross_x: Tensor
+    cross_y: Tensor
+    meets: Tensor
+    refracts: Tensor
+
+    def __len__(self) -> int:
+        return len(self.inputs)
+
+    def select(self, index: Tensor | slice) -> PairSet:
+        return PairSet(
+            self.inputs.select(index),
+            Rays(*(c[index] for c in self.scene)),
+            self.transmittance[index],
+            self.status[index],
+            *(c[:, index] for c in (self.cross_x, self.cross_y, self.meets, self.refracts)),
+        )
+
+
+@dataclass(frozen=True)
+class RayPairs:
+    """The splits of one lens and domain.
+
+    Attributes:
+        lens, domain, settings: what was traced.
+        train, held_out: rays that pass; no ray is in both.
+        rim: rays that reach the scene but for a rim or the stop, inside and outside it by up to a quarter of its radius.
+        tested: rays drawn until `train` was full, so that len(train) / tested is the share of the disc that passes.
+    """
+
+    lens: Lens
+    domain: Domain
+    settings: PairSettings
+    train: PairSet
+    held_out: PairSet
+    rim: PairSet
+    tested: int
+
+
+def trace_pairs(lens: Lens, inputs: FilmRays, pupil_z: float) -> PairSet:
+    """Exact images of camera rays, with every crossing."""
+    rays = camera_rays(inputs.film_x, inputs.film_y, inputs.film_z, inputs.pupil_x, inputs.pupil_y, pupil_z)
+    every = range(len(lens.surfaces))
+    with torch.no_grad():
+        out = trace(lens, rays, inputs.wavelength_nm, transmittance=True, record=every)
+    assert out.transmittance is not None
+    fields = (torch.stack([getattr(out.crossings[k], name) for k in every]) for name in ("x", "y", "meets", "refracts"))
+    return PairSet(inputs, out.rays, out.transmittance, out.status, *fields)
+
+
+def make_pairs(
+    lens: Lens, domain: Domain, settings: PairSettings | None = None, progress: Callable[[float], None] | None = None
+) -> RayPairs:
+    """Sample a domain and trace it in float64 until every split is full.
+
+    Raises:
+        InputError: fewer than one ray in 10,000 of the domain passes.
+    """
+    settings = settings or PairSettings()
+    wanted = {"train": settings.train, "held_out": settings.held_out}
+    found: dict[str, list[PairSet]] = {"train": [], "held_out": [], "rim": []}
+    counts = dict.fromkeys(found, 0)
+    drawn, tested = 0, 0
+    total = sum(wanted.values())
+    while counts["train"] < wanted["train"] or counts["held_out"] < wanted["held_out"]:
+        split = "train" if counts["train"] < wanted["train"] else "held_out"
+        batch = trace_pairs(lens, sample_domain(domain, _BATCH, settings.seed, drawn), domain.pupil_z_mm)
+        passed = batch.status == st.PASSED
+        if split == "train":
+            needed = wanted["train"] - counts["train"]
+            order = torch.nonzero(passed)[:, 0]
+            tested += int(order[needed - 1]) + 1 if len(order) >= needed else len(batch)
+            if counts["rim"] < settings.rim:
+                near = batch.select(_teaches_rims(lens, batch))
+                found["rim"].append(near.select(slice(0, settings.rim - counts["rim"])))
+                counts["rim"] += len(found["rim"][-1])
+        found[split].append(batch.select(passed).select(slice(0, wanted[split] - counts[split])))
+        counts[split] += len(found[split][-1])
+        drawn += len(batch)
+        if drawn > 10000 * (counts["train"] + counts["held_out"] + 10):
+            raise InputError(lens.path, "domain", f"({drawn} rays, {sum(counts.values())} passed)", "a domain that the lens can reach")
+        if progress:
+            progress((counts["train"] + counts["held_out"]) / total)
+    joined = {name: _join(sets) for name, sets in found.items()}
+    return RayPairs(lens, domain, settings, joined["train"], joined["held_out"], joined["rim"], tested)
+
+
+def _teaches_rims(lens: Lens, batch: PairSet) -> Tensor:
+    """Rays that refract all the way and cross no surface far beyond its rim."""
+    # Status cannot tell: a ray that a rim stops may end for another reason later. A lost ray comes back along the axis.
+    refracts = (batch.meets > 0).all(0) & (batch.refracts > 0).all(0) & torch.isfinite(batch.cross_x).all(0)
+    radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
+    return refracts & (batch.cross_x**2 + batch.cross_y**2 <= (RIM_REACH * radii) ** 2).all(0)
+
+
+def _join(sets: list[PairSet]) -> PairSet:
+    def cat(name: str, dim: int = 0) -> Tensor:
+        return torch.cat([getattr(s, name) for s in sets], dim)
+
+    return PairSet(
+        FilmRays(*(torch.cat(c) for c in zip(*(s.inputs.columns() for s in sets), strict=True))),
+        Rays(*(torch.cat(c) for c in zip(*(s.scene for s in sets), strict=True))),
+        cat("transmittance"),
+        cat("status"),
+        *(cat(name, 1) for name in ("cross_x", "cross_y", "meets", "refracts")),
+    )
+
+
+def save_pairs(pairs: RayPairs, path: str | Path) -> None:
+    """Write a .npz (plain arrays, no pickle) with the configuration as JSON; whole or not at all."""
+    header = {
+        "schema": SCHEMA,
+        "lens_sha256": pairs.lens.sha256,
+        "domain": pairs.domain.to_dict(),
+        "settings": asdict(pairs.settings),
+        "tested": pairs.tested,
+    }
+    arrays: dict[str, Any] = {"header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
+    for name in ("train", "held_out", "rim"):
+        s: PairSet = getattr(pairs, name)
+        arrays[f"{name}_vectors"] = torch.stack([*s.inputs.columns(), *s.scene, s.transmittance]).numpy()
+        arrays[f"{name}_status"] = s.status.numpy()
+        arrays[f"{name}_surfaces"] = torch.stack([s.cross_x, s.cross_y, s.meets, s.refracts]).numpy()
+    with atomic_path(path) as temporary, open(temporary, "wb") as stream:
+        np.savez(stream, **arrays)
+
+
+def load_pairs(path: str | Path, lens: Lens) -> RayPairs:
+    """Read what `save_pairs` wrote, bit for bit.
+
+    Raises:
+        InputError: not such a file, another schema, or pairs of another lens.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {k: data[k] for k in data.files}
+        header = json.loads(arrays["header"].tobytes())
+        if header["schema"] != SCHEMA:
+            raise InputError(path, "schema", header["schema"], str(SCHEMA))
+        if header["lens_sha256"] != lens.sha256:
+            raise InputError(path, "lens_sha256", header["lens_sha256"], f"{lens.sha256} ({lens.path})")
+        sets = {name: _unpack(arrays, name) for name in ("train", "held_out", "rim")}
+        domain, settings = Domain.from_dict(header["domain"]), PairSettings(**header["settings"])
+        return RayPairs(lens, domain, settings, **sets, tested=header["tested"])
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(path, "file", f"({type(error).__name__}: {error})", "ray pairs written by neurolens") from error
+
+
+def _unpack(arrays: dict[str, Any], name: str) -> PairSet:
+    v = torch.from_numpy(arrays[f"{name}_vectors"])
+    surfaces = torch.from_numpy(arrays[f"{name}_surfaces"])
+    return PairSet(FilmRays(*v[:6]), Rays(*v[6:12]), v[12], torch.from_numpy(arrays[f"{name}_status"]), *surfaces)
