@@ -1,0 +1,97 @@
+"""What a core is fitted to: the exact vectors and scalars of ray pairs, scaled, with weights that say what counts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neurolens import status as st
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.lightfield import Encoding, LightField, angle_vector
+from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate, Scales
+from neurolens.surrogates.pairs import PairSet
+
+
+def scales_of(lens: Lens) -> Scales:
+    """Front-surface positions in units of the front rim, stop crossings in units of the stop."""
+    return Scales(lens.surfaces[0].semi_diameter_mm, lens.stop_radius_mm)
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Inputs and outputs of a fit.
+
+    Attributes:
+        field: light field of the rays.
+        vectors: [3, 2, N] position, direction (angle vector), stop crossing, scaled.
+        transmittance: [N].
+    """
+
+    field: LightField
+    vectors: Tensor
+    transmittance: Tensor
+
+
+def targets_of(lens: Lens, encoding: Encoding, pairs: PairSet) -> Targets:
+    """Targets of rays that reach the scene."""
+    scales, scene, stop = scales_of(lens), pairs.scene, lens.stop_index
+    vectors = torch.empty((3, 2, len(pairs)), dtype=scene.x.dtype)
+    vectors[POSITION] = torch.stack([scene.x, scene.y]) / scales.position_mm
+    vectors[DIRECTION] = angle_vector(scene.dx, scene.dy, scene.dz)
+    vectors[STOP] = torch.stack([pairs.cross_x[stop], pairs.cross_y[stop]]) / scales.stop_mm
+    return Targets(encoding(pairs.inputs), vectors, pairs.transmittance)
+
+
+def film_equivalent_weights(lens: Lens, domain: Domain) -> tuple[float, float]:
+    """Micrometres on the film per unit of scaled position and per radian, first order.
+
+    A direction error d moves the image by f d; a position error e on the front surface moves a point in the nearest
+    focused plane by e, and so its image by e times the magnification there. At infinity position does not count;
+    the fit uses at least the magnification of 20 focal lengths, so that near objects keep their place.
+    """
+    f = abs(first_order(lens).efl_mm)
+    nearest_mm = min(1000 * min(domain.focus_m), 20 * f)
+    magnification = f / max(nearest_mm - f, f)
+    return 1000 * magnification * scales_of(lens).position_mm, 1000 * f
+
+
+def gate_values(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
+    """[G, N] exact values of the gates, positive where the surface stops the ray; NaN-free for rays that reach it."""
+    rows = []
+    for gate in gates:
+        k = gate.surface
+        if gate.reason == st.RIM:
+            radius = lens.surfaces[k].semi_diameter_mm
+            rows.append((pairs.cross_x[k] ** 2 + pairs.cross_y[k] ** 2) / radius**2 - 1)
+        else:
+            rows.append(-(pairs.meets[k] if gate.reason == st.MISSED else pairs.refracts[k]))
+    return torch.stack(rows) if rows else torch.empty((0, len(pairs)), dtype=pairs.transmittance.dtype)
+
+
+def choose_gates(lens: Lens, blocked: PairSet, unexplained: float = 1e-4, most: int = 10) -> tuple[Gate, ...]:
+    """The rims that block anything in the domain: the one that explains most blocked rays, then the next (greedy).
+
+    Args:
+        blocked: rays that did not pass, drawn uniformly over the domain; only those that refract all the way count.
+        unexplained: stop when no more than this share of them is left.
+
+    Returns the gates in the order in which camera rays meet them. The stop is no gate: it is tested on its crossing.
+    """
+    radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
+    outside = (blocked.cross_x**2 + blocked.cross_y**2) > radii**2  # [S, N]
+    total = outside.shape[1]
+    outside = outside & ~outside[lens.stop_index]
+    chosen: list[int] = []
+    while total and len(chosen) < most:
+        counts = outside.sum(1)
+        best = int(counts.argmax())
+        if int(counts[best]) <= max(0, math.floor(unexplained * total)):
+            break
+        chosen.append(best)
+        outside = outside & ~outside[best]
+    return tuple(Gate(k, st.RIM) for k in sorted(chosen, reverse=True))
