@@ -45,6 +45,9 @@ class ImageSettings:
             raise InputError("image settings", "trim", self.trim, "a share in [0, 1)")
 
 
+DEFAULT = ImageSettings()
+
+
 def checked_image(image: ArrayLike, name: str) -> Image:
     """`image` as float64 [H, W, 3].
 
@@ -76,14 +79,14 @@ def to_srgb(linear: ArrayLike, exposure: float = 1.0) -> Image:
     return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
 
 
-def rel_squared_error_map(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = ImageSettings()) -> Image:
+def rel_squared_error_map(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DEFAULT) -> Image:
     """(a - b)^2 / (b^2 + eps) for each pixel, mean over the channels, [H, W]; a the test, b the reference picture."""
     a, b = _checked_pair(test, reference)
     ratio: Image = ((a - b) ** 2 / (b**2 + settings.eps)).mean(axis=2)
     return ratio
 
 
-def rel_mse(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = ImageSettings()) -> float:
+def rel_mse(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DEFAULT) -> float:
     """Relative mean squared error on linear radiance: mean over pixels and channels of (a - b)^2 / (b^2 + eps).
 
     Rousselle, Knaus, Zwicker 2011, "Adaptive sampling and reconstruction using greedy error minimization", with their
@@ -99,7 +102,7 @@ def rel_mse(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = Ima
     return float(errors[:kept].mean())
 
 
-def flip_map(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = ImageSettings()) -> Image:
+def flip_map(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DEFAULT) -> Image:
     """LDR-FLIP for each pixel, [H, W] in [0, 1]: what an observer sees when flipping between the two pictures.
 
     Andersson et al. 2020, "FLIP: a difference evaluator for alternating images", through their `flip-evaluator`.
@@ -116,12 +119,17 @@ def flip_map(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = Im
         raise NeurolensError('FLIP needs flip-evaluator: pip install "neurolens[train]"') from error
     shown_a, shown_b = (np.ascontiguousarray(to_srgb(x, settings.exposure), dtype=np.float32) for x in (a, b))
     errors, _, _ = flip_evaluator.evaluate(
-        shown_b, shown_a, "LDR", applyMagma=False, computeMeanError=False, parameters={"ppd": settings.pixels_per_degree}
+        shown_b,
+        shown_a,
+        "LDR",
+        applyMagma=False,
+        computeMeanError=False,
+        parameters={"ppd": settings.pixels_per_degree},
     )
     return np.asarray(errors, dtype=np.float64).reshape(a.shape[:2])
 
 
-def flip(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = ImageSettings()) -> float:
+def flip(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DEFAULT) -> float:
     """Mean of `flip_map`: 0 for equal pictures, 1 at most."""
     return float(flip_map(test, reference, settings).mean())
 
@@ -137,7 +145,7 @@ def seed_pairs(count: int) -> list[tuple[int, int]]:
     return [(i, (i + 1) % count) for i in range(count)]
 
 
-def noise_floor(exact_renders: Sequence[ArrayLike], settings: ImageSettings = ImageSettings()) -> dict[str, Any]:
+def noise_floor(exact_renders: Sequence[ArrayLike], settings: ImageSettings = DEFAULT) -> dict[str, Any]:
     """How much exact renders of different seeds differ from each other, mean over the pairs of `seed_pairs`.
 
     Args:
@@ -153,7 +161,7 @@ def noise_floor(exact_renders: Sequence[ArrayLike], settings: ImageSettings = Im
 
 
 def compare(
-    renders: Sequence[ArrayLike], exact_renders: Sequence[ArrayLike], settings: ImageSettings = ImageSettings()
+    renders: Sequence[ArrayLike], exact_renders: Sequence[ArrayLike], settings: ImageSettings = DEFAULT
 ) -> dict[str, Any]:
     """Error of a surrogate's renders against exact ones, beside the noise floor.
 
@@ -196,7 +204,7 @@ def compare(
     }
 
 
-def error_maps(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = ImageSettings()) -> dict[str, Image]:
+def error_maps(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DEFAULT) -> dict[str, Image]:
     """Both errors for each pixel, [H, W]: `flip` in [0, 1], `rel_squared_error` without unit."""
     return {
         "flip": flip_map(test, reference, settings),
@@ -205,7 +213,10 @@ def error_maps(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = 
 
 
 def _over_pairs(
-    tests: Sequence[ArrayLike], references: Sequence[ArrayLike], pairs: Iterable[tuple[int, int]], settings: ImageSettings
+    tests: Sequence[ArrayLike],
+    references: Sequence[ArrayLike],
+    pairs: Iterable[tuple[int, int]],
+    settings: ImageSettings,
 ) -> tuple[list[float], list[float]]:
     """FLIP and relative MSE of each pair (i, j): test i against reference j."""
     both = [(flip(tests[i], references[j], settings), rel_mse(tests[i], references[j], settings)) for i, j in pairs]

@@ -62,7 +62,7 @@ class ModelRecord(TypedDict, total=False):
 
 
 class ExactRecord(TypedDict, total=False):
-    """One exact tracer, or thin lens and pinhole, on the clock: `available` false with a `reason` where it cannot run."""
+    """One exact tracer, thin lens or pinhole on the clock; `available` false, with a `reason`, where it cannot run."""
 
     name: str
     ns_per_ray: Timing | None
@@ -85,7 +85,7 @@ class CameraRecord(TypedDict, total=False):
 
 
 class ImageRecord(TypedDict, total=False):
-    """One picture: files relative to the run folder; errors against the exact render of other seeds (`image.compare`)."""
+    """One picture: files relative to the run folder, errors as of `image.compare` against exact renders."""
 
     name: str
     scene: str
@@ -114,8 +114,7 @@ class FigureRecord(TypedDict, total=False):
 class DomainGain(TypedDict, total=False):
     """What a domain taken from the scene gains: one row of `rows` for the whole lens, one for the scene.
 
-    A row is a ModelRecord with `domain` (its name) and the domain's own film_radius_mm, f_number, wavelength_nm
-    [low, high], focus_m [near, far].
+    A row is a ModelRecord with `domain` (its name), film_radius_mm, f_number, wavelength_nm [low, high], focus_m.
     """
 
     scene: str
@@ -130,7 +129,9 @@ class Results(TypedDict, total=False):
     title: str
     command: str
     lens: dict[str, Any]  # name, source, sha256, refractions, efl_mm, f_number, half_field_deg, image_radius_mm, ...
-    domain: dict[str, Any]  # film_radius_mm, wavelength_nm [low, high], focus_m, rays_train, rays_held_out, pixel_um, ...
+    domain: dict[
+        str, Any
+    ]  # film_radius_mm, wavelength_nm [low, high], focus_m, rays_train, rays_held_out, pixel_um, ...
     settings: dict[str, Any]  # the resolved configuration
     models: list[ModelRecord]
     exact: list[ExactRecord]

@@ -1,0 +1,7 @@
+"""Every plot of the report in one place. Matplotlib is imported when one is drawn, not before."""
+
+from neurolens.evaluate.plots_image import image_caption, side_by_side
+from neurolens.evaluate.plots_lens import lens_layout
+from neurolens.evaluate.plots_trade import error_against_coefficients_plot, pareto_plot
+
+__all__ = ["error_against_coefficients_plot", "image_caption", "lens_layout", "pareto_plot", "side_by_side"]
