@@ -1,0 +1,99 @@
+"""The folders are layers: imports go one way, a render needs no torch, and modules stay short enough to read.
+
+errors, status, files, tomlfile, config <- optics <- surrogates <- evaluate <- cli
+                                        <- cameras <- render     <- evaluate
+"""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+MODULES = sorted((ROOT / "neurolens").rglob("*.py"))
+MAX_LINES = 300
+
+BASE = {"errors", "status", "files", "tomlfile", "config"}
+# Parts of the package that each part may import, besides itself and the base.
+PARTS = {
+    "optics": set(),
+    "surrogates": {"optics"},
+    "cameras": set(),
+    "render": {"cameras"},
+    "evaluate": {"optics", "surrogates", "cameras", "render"},
+    "cli": {"optics", "surrogates", "cameras", "render", "evaluate"},
+}
+# Packages from elsewhere that each part may import; what is not listed here is not restricted.
+PACKAGES = {
+    "base": {"numpy"},
+    "optics": {"numpy", "torch"},
+    "cameras": {"numpy", "onnxruntime"},
+    "render": {"numpy", "OpenEXR", "PIL"},
+}
+# The one camera that traces rays exactly.
+EXACT_CAMERA = {"neurolens.cameras.exact": ({"optics"}, {"torch"})}
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imported(path: Path) -> set[str]:
+    """Dotted names of everything a module imports, anywhere in it."""
+    package = module_name(path).split(".")
+    if path.name != "__init__.py":
+        package = package[:-1]
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else []
+            origin = ".".join([*above, *([node.module] if node.module else [])])
+            names |= {f"{origin}.{alias.name}" for alias in node.names}
+    return names
+
+
+def part_of(module: str) -> str:
+    """First folder or module below the package; "base" for the modules that everybody may import."""
+    name = module.split(".")[1] if "." in module else "__init__"
+    return "base" if name in BASE else name
+
+
+@pytest.mark.parametrize("path", MODULES, ids=module_name)
+def test_imports_go_one_way(path: Path) -> None:
+    module = module_name(path)
+    part = part_of(module)
+    assert part in {*PARTS, "base", "__init__", "__main__"}, f"{module}: give this part its place in {__name__}"
+    own_parts, own_packages = EXACT_CAMERA.get(module, (set(), set()))
+    packages = {name.split(".")[0] for name in imported(path)} - set(sys.stdlib_module_names) - {"neurolens"}
+    if part in PACKAGES:
+        assert packages <= PACKAGES[part] | own_packages, f"{module} imports {packages}"
+    if part != "__main__":
+        # `from neurolens import __version__` is open to all.
+        parts = {part_of(name) for name in imported(path) if name.startswith("neurolens.")} - {"__version__"}
+        allowed = {part, "base"} | PARTS.get(part, set()) | own_parts
+        assert parts <= allowed, f"{module} imports {sorted(parts - allowed)}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=module_name)
+def test_modules_stay_short(path: Path) -> None:
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= MAX_LINES
+
+
+def test_cameras_renderer_and_command_line_load_without_the_training_packages() -> None:
+    wanted = [m for m in map(module_name, MODULES) if part_of(m) in ("cameras", "render", "cli", "base")]
+    wanted = [m for m in wanted if m not in EXACT_CAMERA]
+    forbidden = ["torch", "sklearn", "onnx", "matplotlib", "scipy", "flip_evaluator"]
+    code = (
+        f"import importlib, sys\n"
+        f"sys.modules.update(dict.fromkeys({forbidden!r}))\n"  # None makes an import fail
+        f"for name in {wanted!r}: importlib.import_module(name)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr
