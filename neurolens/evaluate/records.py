@@ -62,7 +62,7 @@ class ModelRecord(TypedDict, total=False):
 
 
 class ExactRecord(TypedDict, total=False):
-    """One exact tracer, thin lens or pinhole on the clock; `available` false, with a `reason`, where it cannot run."""
+    """One exact tracer on the clock; `available` is false, with a `reason`, where it cannot run."""
 
     name: str
     ns_per_ray: Timing | None
@@ -71,13 +71,14 @@ class ExactRecord(TypedDict, total=False):
 
 
 class CameraRecord(TypedDict, total=False):
-    """One render of one scene through one camera."""
+    """One render of one scene through one camera: exact, model, thin lens, pinhole."""
 
     name: str
     scene: str
     render_s: float | None
     camera_s: float | None  # spent inside the camera
     camera_share: float | None  # camera_s / render_s
+    ns_per_ray: Timing | None  # of the camera alone
     samples: int
     width: int
     height: int

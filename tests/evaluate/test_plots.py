@@ -1,0 +1,181 @@
+"""Plots: whole PNG files with something on them, units on the axes, geometry of the lens section, bad input."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from neurolens.errors import InputError
+from neurolens.evaluate import plots, plots_lens, plots_style
+
+MODELS = [
+    {"name": "thin lens", "family": "paraxial", "rms_um": 300.0, "ns_per_ray": {"min": 2.0, "median": 2.1}},
+    {
+        "name": "raw", "family": "omp", "variables": "raw", "rms_um": 20.0, "direction_rms_deg": 0.01,
+        "coefficients_per_vector": 80, "ns_per_ray": {"min": 15.0, "median": 16.0, "threads": 1},
+    },
+    {
+        "name": "inv", "family": "ols", "variables": "invariants", "rms_um": 1.8, "direction_rms_deg": 0.001,
+        "coefficients_per_vector": 40, "ns_per_ray": {"min": 12.0, "median": 13.0, "threads": 1},
+    },
+    {"name": "$MLP_8 <x>", "family": "mlp", "variables": "invariants", "rms_um": 0.7, "ns_per_ray": {"min": 16.0}},
+    {"name": "not timed", "family": "dense", "variables": "raw", "rms_um": 4.0, "coefficients_per_vector": 70},
+]  # fmt: skip
+EXACT = [
+    {"name": "exact, eager", "available": True, "ns_per_ray": {"min": 160.0, "median": 170.0, "threads": 1}},
+    {"name": "exact, compiled", "available": False, "reason": "no C++ compiler"},
+]
+
+
+def biconvex(**changes: Any) -> dict[str, Any]:
+    front = {"z_mm": 0.0, "radius_mm": 50.0, "semi_diameter_mm": 12.0, "n_after": 1.5168, "stop": False}
+    back = {"z_mm": 6.0, "radius_mm": -50.0, "semi_diameter_mm": 11.0, "n_after": 1.0, "stop": False}
+    stop = {"z_mm": 9.0, "radius_mm": math.inf, "semi_diameter_mm": 5.0, "n_after": 1.0, "stop": True}
+    rays = [{"label": f"{a}°", "points": [[-20, y], [0, y], [6, 0.9 * y], [55, 0]]} for a in (0, 10) for y in (-4, 4)]
+    profile = {
+        "surfaces": [front, back, stop],
+        "rays": rays,
+        "film_z_mm": 55.0,
+        "film_half_height_mm": 20.0,
+        "title": "B",
+    }
+    return {**profile, **changes}
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Every figure made, so that a test can read its axes."""
+    made: list[Any] = []
+    for module in (plots.__name__, "plots_trade", "plots_lens", "plots_image"):
+        name = module if module.startswith("neurolens") else f"neurolens.evaluate.{module}"
+        if hasattr(__import__(name, fromlist=["x"]), "new_figure"):
+            monkeypatch.setattr(
+                f"{name}.new_figure", lambda *size: made.append(plots_style.new_figure(*size)) or made[-1]
+            )
+    return made
+
+
+def pixels(path: Path) -> np.ndarray:
+    with Image.open(path) as opened:
+        assert opened.format == "PNG"
+        return np.asarray(opened.convert("RGB"))
+
+
+def texts(figure: Any) -> str:
+    return "\n".join(text.get_text() for text in figure.findobj(lambda artist: hasattr(artist, "get_text")))
+
+
+@pytest.mark.parametrize("error", ["rms_um", "direction_rms_deg"])
+@pytest.mark.parametrize("exact", [(), EXACT])
+def test_pareto_plot(error: str, exact: list[dict[str, Any]], tmp_path: Path, figures: list[Any]) -> None:
+    path = plots.pareto_plot(MODELS, tmp_path / "pareto.png", exact, error=error)
+    assert pixels(path).std() > 5
+    axes = figures[0].axes[0]
+    assert "(ns" in axes.get_xlabel() and ("µm" if error == "rms_um" else "degrees") in axes.get_ylabel()
+    assert axes.get_xscale() == axes.get_yscale() == "log"
+    assert "not shown" in texts(figures[0])
+    if exact:
+        assert "160 ns" in texts(figures[0]) and "no C++ compiler" in texts(figures[0])
+    assert [p.name for p in tmp_path.iterdir()] == ["pareto.png"]
+
+
+def test_labels_stay_clear_of_each_other(tmp_path: Path, figures: list[Any]) -> None:
+    """A cloud of models one marker apart: no two labels cover each other."""
+    models = [
+        {**MODELS[2], "coefficients_per_vector": 20 + i, "rms_um": 2.0 * 1.6**-i, "ns_per_ray": {"min": 10 * 1.04**i}}
+        for i in range(10)
+    ]
+    plots.pareto_plot(models, tmp_path / "p.png", EXACT)
+    wanted = {str(20 + i) for i in range(10)}
+    notes = [t for t in figures[0].axes[0].texts if t.get_text() in wanted]
+    boxes = [t.get_window_extent() for t in notes]
+    assert len(boxes) == 10
+    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
+
+
+def test_error_against_coefficients_plot(tmp_path: Path, figures: list[Any]) -> None:
+    path = plots.error_against_coefficients_plot(MODELS, tmp_path / "c.png", targets=[(40, 2.0)])
+    assert pixels(path).std() > 5
+    axes = figures[0].axes[0]
+    assert "coefficients per vector" in axes.get_xlabel() and "µm" in axes.get_ylabel()
+    assert "thin lens" in texts(figures[0]) and "$MLP_8 <x>" in texts(figures[0]) and "target" in texts(figures[0])
+
+
+@pytest.mark.parametrize("profile", [biconvex(), biconvex(rays=[], film_z_mm=None, subtitle="one element")])
+def test_lens_layout(profile: dict[str, Any], tmp_path: Path, figures: list[Any]) -> None:
+    path = plots.lens_layout(profile, tmp_path / "lens.png")
+    assert pixels(path).std() > 5
+    axes = figures[0].axes[0]
+    assert "(mm)" in axes.get_xlabel() and "(mm)" in axes.get_ylabel() and axes.get_aspect() == 1.0
+    assert len(axes.patches) == 1  # one piece of glass
+    assert "stop" in texts(figures[0]) and ("10°" in texts(figures[0])) == bool(profile["rays"])
+
+
+@pytest.mark.parametrize(("radius", "h"), [(50.0, 12.0), (-30.0, 29.9), (math.inf, 7.0), (10.0, 10.0)])
+def test_an_arc_lies_on_its_sphere_up_to_the_rim(radius: float, h: float) -> None:
+    points = plots_lens.arc({"z_mm": 3.0, "radius_mm": radius, "semi_diameter_mm": h})
+    assert points[0, 1] == pytest.approx(-h) and points[-1, 1] == pytest.approx(h)
+    if math.isfinite(radius):
+        assert np.hypot(points[:, 0] - 3.0 - radius, points[:, 1]) == pytest.approx(abs(radius))
+        assert (np.sign(points[0, 0] - 3.0)) == np.sign(radius)
+    else:
+        assert points[:, 0] == pytest.approx(3.0)
+
+
+def test_an_element_reaches_out_to_its_wider_rim() -> None:
+    profile = biconvex()
+    outline = plots_lens.element_outline(*profile["surfaces"][:2])
+    assert np.abs(outline[:, 1]).max() == 12.0 and outline[:, 0].min() == 0.0 and outline[:, 0].max() == 6.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"surfaces": []}, "surfaces"),
+        ({"surfaces": [{"z_mm": 0.0, "radius_mm": 5.0, "n_after": 1.0}]}, "surface 0, semi_diameter_mm"),
+        ({"surfaces": [{"z_mm": 0.0, "radius_mm": 5.0, "n_after": 1.0, "semi_diameter_mm": -1}]}, "above 0"),
+        ({"surfaces": [{"z_mm": math.nan, "radius_mm": 5.0, "n_after": 1.0, "semi_diameter_mm": 1}]}, "z_mm"),
+        ({"rays": [{"label": "a", "points": [[0, 1, 2]]}]}, "ray 0"),
+    ],
+)
+def test_a_bad_profile_is_refused(changes: dict[str, Any], words: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=words):
+        plots.lens_layout(biconvex(**changes), tmp_path / "lens.png")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("count", [1, 3, 5])
+def test_side_by_side(count: int, tmp_path: Path, figures: list[Any]) -> None:
+    draw = np.random.default_rng(0)
+    images = {f"camera {i}": draw.uniform(0, 1, (18, 32, 3)) for i in range(count)}
+    maps = {name: draw.uniform(0, 0.3, (18, 32)) for name in list(images)[1:]}
+    figures_of = {"flip": 0.1, "noise_floor_flip": 0.09, "rel_mse": 0.02}
+    captions = {name: plots.image_caption(figures_of) for name in images}
+    path = plots.side_by_side(images, maps, tmp_path / "side.png", captions, title="Room")
+    assert pixels(path).std() > 5
+    assert "FLIP 0.1 (noise 0.09)\nrelMSE 0.02" in texts(figures[0])
+    assert all(name in texts(figures[0]) for name in images)
+    assert any("FLIP (0 to 1)" in axes.get_ylabel() for axes in figures[0].axes) == bool(maps)
+
+
+def test_bad_images_and_error_keys_are_refused(tmp_path: Path) -> None:
+    picture = np.ones((4, 6, 3))
+    path = tmp_path / "x.png"
+    with pytest.raises(InputError, match="images"):
+        plots.side_by_side({}, {}, path)
+    with pytest.raises(InputError, match="image b"):
+        plots.side_by_side({"a": picture, "b": picture[:2]}, {}, path)
+    with pytest.raises(InputError, match="error map"):
+        plots.side_by_side({"a": picture}, {"a": np.full((4, 6), math.nan)}, path)
+    with pytest.raises(InputError, match="name of an image"):
+        plots.side_by_side({"a": picture}, {"b": np.ones((4, 6))}, path)
+    with pytest.raises(InputError, match="rms_um"):
+        plots.pareto_plot(MODELS, path, error="rms")
+    with pytest.raises(InputError, match="models"):
+        plots.pareto_plot([{"name": "a"}], path)
+    assert not list(tmp_path.iterdir())
