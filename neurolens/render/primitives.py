@@ -1,0 +1,241 @@
+"""Analytic shapes: where rays of a batch meet them.
+
+Each shape improves, in place, the nearest hit known so far: `best` [N] float32 distances in metres and `found` [N] int32
+surface numbers. A shape owns `count` surface numbers from `first` on. Arithmetic stays in a few arrays the size of the
+batch, which live in the L2 cache; tests are ordered so that the cheap rejection of a whole batch comes first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.cameras.contract import FloatArray
+
+IntArray = NDArray[np.int32]
+_TINY = np.float32(1e-20)
+_NEAREST = np.float32(1e-6)  # hits closer than this, in metres, are the surface that a ray leaves
+
+
+@dataclass(frozen=True)
+class Rays:
+    """A batch of rays: origin and direction [3, N] float32 in metres, and 1 / direction, finite also where it is 0."""
+
+    origin: FloatArray
+    direction: FloatArray
+    inverse: FloatArray
+
+    @classmethod
+    def of(cls, origin: FloatArray, direction: FloatArray) -> Rays:
+        """Rays with their inverse directions."""
+        inverse = direction + _TINY
+        np.divide(np.float32(1), inverse, out=inverse)
+        return cls(origin, direction, inverse)
+
+
+class Primitive(Protocol):
+    """A shape that rays can hit."""
+
+    first: int
+    count: int
+
+    def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
+        """Where this shape is hit nearer than `best`, write distance and surface number."""
+        ...
+
+
+def dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Dot products [N] of vectors [3, N], or of one vector [3] with vectors [3, N]."""
+    out: FloatArray = a[0] * b[0]
+    out += a[1] * b[1]
+    out += a[2] * b[2]
+    return out
+
+
+def _keep(ok: NDArray[np.bool_], distance: FloatArray, surface: int, best: FloatArray, found: IntArray) -> None:
+    """Write hits where `ok`, unless there are none."""
+    if ok.any():
+        np.copyto(best, distance, where=ok)
+        np.copyto(found, np.int32(surface), where=ok)
+
+
+def is_axis_aligned(edge: NDArray[np.float64]) -> bool:
+    """Whether only one component of a vector [3] differs from 0."""
+    return np.count_nonzero(edge) == 1
+
+
+class Plane:
+    """An infinite plane through `point` with unit `normal`."""
+
+    count = 1
+
+    def __init__(self, first: int, point: NDArray[np.float64], normal: NDArray[np.float64]) -> None:
+        self.first = first
+        self._normal = normal.astype(np.float32)
+        self._offset = np.float32(point @ normal)
+
+    def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
+        """See `Primitive`."""
+        distance = self._offset - dot(self._normal, rays.origin)
+        distance /= dot(self._normal, rays.direction) + _TINY
+        ok = distance > _NEAREST
+        ok &= distance < best
+        _keep(ok, distance, self.first, best, found)
+
+
+class AxisQuad:
+    """A rectangle perpendicular to an axis: the common case, at half the cost of `Quad`."""
+
+    count = 1
+
+    def __init__(self, first: int, corner: NDArray[np.float64], far_corner: NDArray[np.float64], axis: int) -> None:
+        self.first = first
+        self._axis = axis
+        self._others = [k for k in range(3) if k != axis]
+        self._centre = (0.5 * (corner + far_corner)).astype(np.float32)
+        self._half = (0.5 * np.abs(far_corner - corner)).astype(np.float32)
+
+    def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
+        """See `Primitive`."""
+        distance = self._centre[self._axis] - rays.origin[self._axis]
+        distance *= rays.inverse[self._axis]
+        ok = distance > _NEAREST
+        ok &= distance < best
+        for k in self._others:
+            across = distance * rays.direction[k]
+            across += rays.origin[k]
+            across -= self._centre[k]
+            np.abs(across, out=across)
+            ok &= across < self._half[k]
+        _keep(ok, distance, self.first, best, found)
+
+
+class Quad:
+    """A rectangle of any orientation: `corner` and two perpendicular edges."""
+
+    count = 1
+
+    def __init__(
+        self, first: int, corner: NDArray[np.float64], edge_u: NDArray[np.float64], edge_v: NDArray[np.float64]
+    ) -> None:
+        self.first = first
+        normal = np.cross(edge_u, edge_v)
+        self._normal = (normal / np.linalg.norm(normal)).astype(np.float32)
+        self._offset = np.float32(corner @ normal / np.linalg.norm(normal))
+        self._across = [(e / (e @ e)).astype(np.float32) for e in (edge_u, edge_v)]
+        self._start = [np.float32(corner @ e / (e @ e)) for e in (edge_u, edge_v)]
+
+    def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
+        """See `Primitive`."""
+        distance = self._offset - dot(self._normal, rays.origin)
+        distance /= dot(self._normal, rays.direction) + _TINY
+        ok = distance > _NEAREST
+        ok &= distance < best
+        if not ok.any():
+            return
+        for across, start in zip(self._across, self._start, strict=True):
+            along = dot(across, rays.direction)
+            along *= distance
+            along += dot(across, rays.origin)
+            along -= start
+            ok &= along > 0
+            ok &= along < 1
+        _keep(ok, distance, self.first, best, found)
+
+
+class Sphere:
+    """A sphere, hit from outside and inside."""
+
+    count = 1
+
+    def __init__(self, first: int, centre: NDArray[np.float64], radius: float) -> None:
+        self.first = first
+        self._centre = centre.astype(np.float32)
+        self._radius = np.float32(radius)
+
+    def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
+        """See `Primitive`.
+
+        The discriminant comes from the distance between centre and ray, which stays exact in float32 for a small
+        sphere far away (Haines et al. 2019, "Precision improvements for ray/sphere intersection").
+        """
+        to_centre = [self._centre[k] - rays.origin[k] for k in range(3)]
+        middle = to_centre[0] * rays.direction[0]
+        middle += to_centre[1] * rays.direction[1]
+        middle += to_centre[2] * rays.direction[2]
+        half2 = np.full_like(middle, self._radius * self._radius)
+        for k in range(3):
+            away = middle * rays.direction[k]
+            away -= to_centre[k]
+            away *= away
+            half2 -= away
+        ok = half2 > 0
+        ok &= middle > -self._radius
+        rows = np.flatnonzero(ok)
+        if not rows.size:
+            return
+        middle, half = middle[rows], np.sqrt(half2[rows])
+        distance = middle - half
+        np.copyto(distance, middle + half, where=distance < _NEAREST)
+        rows_ok = (distance > _NEAREST) & (distance < best[rows])
+        rows = rows[rows_ok]
+        best[rows] = distance[rows_ok]
+        found[rows] = self.first
+
+
+class Box:
+    """An axis-aligned box: six surfaces, in the order x-, x+, y-, y+, z-, z+.
+
+    With `room`, only the inner sides of its walls exist: rays from outside pass in, so that a camera may stand behind
+    a wall of the room that it photographs.
+    """
+
+    count = 6
+
+    def __init__(self, first: int, low: NDArray[np.float64], high: NDArray[np.float64], room: bool) -> None:
+        self.first = first
+        self.room = room
+        self.low, self.high = low.astype(np.float32), high.astype(np.float32)
+        self._centre = (0.5 * (low + high)).astype(np.float32)
+        self._scale = (2.0 / (high - low)).astype(np.float32)
+
+    def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
+        """See `Primitive`; writes the number of the first face, `face` tells which."""
+        entry, exit_ = slabs(rays, self.low, self.high)
+        ok = entry < exit_
+        if self.room:
+            distance = exit_
+        else:
+            distance = np.where(entry > _NEAREST, entry, exit_)
+        ok &= distance > _NEAREST
+        ok &= distance < best
+        _keep(ok, distance, self.first, best, found)
+
+    def face(self, point: FloatArray) -> IntArray:
+        """Surface number [N] of points [3, N] on the box: the face to which they are nearest."""
+        relative = point - self._centre[:, None]
+        relative *= self._scale[:, None]
+        axis = np.argmax(np.abs(relative), axis=0)
+        positive = np.take_along_axis(relative, axis[None], axis=0)[0] > 0
+        return (self.first + 2 * axis + positive).astype(np.int32)
+
+
+def slabs(rays: Rays, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distances [N] at which rays enter and leave an axis-aligned box; entry < exit where they meet it."""
+    entry: FloatArray | None = None
+    exit_: FloatArray | None = None
+    for k in range(3):
+        to_low = low[k] - rays.origin[k]
+        to_low *= rays.inverse[k]
+        to_high = high[k] - rays.origin[k]
+        to_high *= rays.inverse[k]
+        if entry is None or exit_ is None:
+            entry, exit_ = np.minimum(to_low, to_high), np.maximum(to_low, to_high)
+        else:
+            np.maximum(entry, np.minimum(to_low, to_high), out=entry)
+            np.minimum(exit_, np.maximum(to_low, to_high, out=to_high), out=exit_)
+    assert entry is not None and exit_ is not None
+    return entry, exit_

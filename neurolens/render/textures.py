@@ -1,0 +1,113 @@
+"""Patterns on flat surfaces: checker, lines, pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.cameras.contract import FloatArray
+from neurolens.render.scene import Texture, Vector
+from neurolens.render.spectrum import SpectralRange
+
+Index = NDArray[np.intp]
+Frame = NDArray[np.float64]
+
+
+def _frame(origin: Frame, u: Frame, v: Frame, size: tuple[float, float]) -> Frame:
+    """Coordinates in metres along unit vectors u and v as affine functions of a point, [2, 4], and the size [2, 1]."""
+    rows = [[*axis, -(origin @ axis), length] for axis, length in zip((u, v), size, strict=True)]
+    return np.array(rows)
+
+
+def quad_frame(corner: Frame, edge_u: Frame, edge_v: Frame) -> Frame:
+    """From the corner of a rectangle along its edges."""
+    lengths = float(np.linalg.norm(edge_u)), float(np.linalg.norm(edge_v))
+    return _frame(corner, edge_u / lengths[0], edge_v / lengths[1], lengths)
+
+
+def plane_frame(point: Frame, normal: Frame) -> Frame:
+    """From a point of a plane along the axes of the scene as far as they lie in it: x first, else z."""
+    axis = np.eye(3)[2 if abs(normal[0]) > 0.9 else 0]
+    u = axis - normal * (axis @ normal)
+    u /= np.linalg.norm(u)
+    return _frame(point, u, np.cross(normal, u), (1.0, 1.0))
+
+
+def box_frame(low: Frame, axis: int) -> Frame:
+    """From the lowest corner of a box along the two axes of a face: x or z across, y up; x and z on floor and ceiling."""
+    u, v = {0: (2, 1), 1: (0, 2), 2: (0, 1)}[axis]
+    return _frame(low, np.eye(3)[u], np.eye(3)[v], (1.0, 1.0))
+
+
+class TextureTable:
+    """The textures of a scene, looked up by surface.
+
+    Args:
+        textures: by name. images: linear RGB [H, W, 3] of those of kind "image". names: texture of each surface, or None.
+        frames: [2, 5] from `_frame` of each surface, or None. colour: gives a colour's row of the palette.
+    """
+
+    def __init__(
+        self,
+        textures: dict[str, Texture],
+        images: dict[str, FloatArray],
+        names: list[str | None],
+        frames: list[Frame | None],
+        colour: Callable[[Vector], int],
+        spectral: SpectralRange,
+    ) -> None:
+        self._textures = list(textures.items())
+        self._images = images
+        self._basis = spectral.basis.astype(np.float32)
+        numbers = {name: k for k, name in enumerate(textures)}
+        self._number = np.array([-1 if name is None else numbers[name] for name in names])
+        self._rows = [np.array([colour(c) for c in t.colours or ()], np.intp) for t in textures.values()]
+        self._frames = np.zeros((2, 4, len(names)), np.float32)
+        for surface, (name, frame) in enumerate(zip(names, frames, strict=True)):
+            if name is not None and frame is not None:
+                texture = textures[name]
+                cell = texture.cell_m
+                size = texture.size_m or ((cell, cell) if cell else frame[:, 4])
+                self._frames[:, :, surface] = frame[:, :4] / np.array(size)[:, None]  # in cells, or in pictures
+        self._used = bool(np.any(self._number >= 0))
+
+    def apply(
+        self,
+        value: FloatArray,
+        surface: Index,
+        point: FloatArray,
+        bins: Index,
+        look_up: Callable[[Index, Index], FloatArray],
+    ) -> None:
+        """Write the reflectance at points [3, N] into `value` [N] where surfaces [N] have a texture."""
+        if not self._used:
+            return
+        number = self._number.take(surface)
+        for k, (name, texture) in enumerate(self._textures):
+            rows = np.flatnonzero(number == k)
+            if not rows.size:
+                continue
+            at, frame = point.take(rows, axis=1), self._frames.take(surface[rows], axis=2)
+            u, v = frame[:, 0] * at[0] + frame[:, 1] * at[1] + frame[:, 2] * at[2] + frame[:, 3]
+            if texture.kind == "image":
+                value[rows] = self._picture(self._images[name], u, v, bins[rows])
+                continue
+            if texture.kind == "checker":
+                # 2e-4 of a cell of slack: a shape that begins on a cell's edge shows no speckle of rounding there.
+                which = (np.floor(u + 2e-4).astype(np.intp) + np.floor(v + 2e-4).astype(np.intp)) & 1
+            else:
+                reach = np.float32(0.5 * (texture.line_m or 0) / (texture.cell_m or 1))
+                on_line = (np.abs(u - np.rint(u)) <= reach) | (np.abs(v - np.rint(v)) <= reach)
+                which = 1 - on_line.astype(np.intp)
+            value[rows] = look_up(self._rows[k].take(which), bins[rows])
+
+    def _picture(self, image: FloatArray, u: FloatArray, v: FloatArray, bins: Index) -> FloatArray:
+        """Reflectance [N] of the texel at (u, v), counted in pictures from the lower left corner; the film smooths it."""
+        height, width = image.shape[:2]
+        column = ((u - np.floor(u)) * width).astype(np.intp)
+        row = ((1 - (v - np.floor(v))) * height).astype(np.intp)
+        rgb = image[np.minimum(row, height - 1), np.minimum(column, width - 1)]
+        result: FloatArray = np.einsum("nc,cn->n", rgb, self._basis[:, bins])
+        return result
