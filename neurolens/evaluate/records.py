@@ -2,6 +2,7 @@
 
 Every key is optional but `name`: what was not measured is absent or null, never a made-up number. Shares
 (`false_pass`, `camera_share`, ...) are fractions of 1. Errors are those of surrogates.md, "Error, defined once".
+JSON has no infinity: focus at infinity is the text "infinity".
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class ModelRecord(TypedDict, total=False):
     transmittance_max: float | None
     false_pass: float | None  # passed by the model, blocked by the lens / passed by the model
     false_block: float | None  # blocked by the model, passed by the lens / passed by the lens
-    false_pass_near_rim: float | None  # the same within 2% of a rim
+    false_pass_near_rim: float | None  # within 2% of a rim; false_block_near_rim likewise
     false_block_near_rim: float | None
     coefficients_per_vector: int | None  # A and B terms both count; a raw basis: all scalars of the vector
     parameters: int | None  # of the whole model: coefficients or weights, rims included
@@ -80,7 +81,7 @@ class CameraRecord(TypedDict, total=False):
     camera_share: float | None  # camera_s / render_s
     ns_per_ray: Timing | None  # of the camera alone
     samples: int
-    width: int
+    width: int  # pixels, as height
     height: int
     threads: int
 
@@ -110,6 +111,7 @@ class FigureRecord(TypedDict, total=False):
     file: str
     title: str
     caption: str
+    wide: bool  # across the page, for renders side by side
 
 
 class DomainGain(TypedDict, total=False):
@@ -156,10 +158,9 @@ def check_results(results: Mapping[str, Any], file: str | Path = "results") -> N
     """Raise an InputError unless `results` has the shape of `Results`: known keys, lists of named tables."""
     if not isinstance(results, Mapping):
         raise InputError(file, "top level", type(results).__name__, "a table")
-    known = sorted(Results.__annotations__)
     for key, value in results.items():
-        if key not in known:
-            raise InputError(file, "key", key, "one of " + ", ".join(known))
+        if key not in Results.__annotations__:
+            raise InputError(file, "key", key, "one of " + ", ".join(Results.__annotations__))
         if key in _LISTS and not isinstance(value, list | tuple):
             raise InputError(file, key, type(value).__name__, "a list")
         if key in _TABLES and value is not None and not isinstance(value, Mapping):
@@ -173,8 +174,8 @@ def check_results(results: Mapping[str, Any], file: str | Path = "results") -> N
 def write_results(path: str | Path, results: Mapping[str, Any]) -> None:
     """Write `results.json` whole or not at all; numbers that are not finite become null, as JSON has no NaN."""
     check_results(results, path)
-    text = json.dumps({"schema_version": SCHEMA_VERSION, **_plain(results)}, indent=1, allow_nan=False)
-    atomic_write_text(path, text + "\n")
+    versioned = {"schema_version": SCHEMA_VERSION, **_plain(results)}
+    atomic_write_text(path, json.dumps(versioned, indent=1, allow_nan=False) + "\n")
 
 
 def read_results(path: str | Path) -> dict[str, Any]:
@@ -243,9 +244,8 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     A point is bettered by one that is at most equal in both coordinates and smaller in one. Points with a NaN are left
     out; equal points are all kept.
     """
-    order = sorted((i for i, p in enumerate(points) if not any(map(math.isnan, p))), key=lambda i: points[i])
     front: list[int] = []
-    for i in order:
+    for i in sorted((i for i, p in enumerate(points) if not any(map(math.isnan, p))), key=lambda i: points[i]):
         if not front or points[i][1] < points[front[-1]][1] or points[i] == points[front[-1]]:
             front.append(i)
     return front

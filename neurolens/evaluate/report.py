@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.errors import InputError
-from neurolens.evaluate.html import DASH, facts, figure_grid, page, section, show, table, text
+from neurolens.evaluate.markup import DASH, facts, figure_grid, page, section, show, table, text
 from neurolens.evaluate.records import check_results, number, pareto_front
 from neurolens.files import atomic_write_text
 
@@ -24,16 +24,16 @@ _MODEL_COLUMNS: tuple[Column, ...] = (
     ("p99 (µm)", "p99_um", 1, 3),
     ("max (µm)", "max_um", 1, 3),
     ("direction RMS (°)", "direction_rms_deg", 1, 2),
-    ("position RMS (µm)", "position_rms_um", 1, 3),
-    ("transmittance RMS", "transmittance_rms", 1, 2),
+    ("time min (ns/ray)", "ns_per_ray.min", 1, 3),
+    ("speed-up over compiled exact", "speedup_over_compiled", 1, 3),
+    ("coefficients per vector", "coefficients_per_vector", 1, 6),
     ("false pass (%)", "false_pass", 100, 2),
     ("false block (%)", "false_block", 100, 2),
-    ("coefficients per vector", "coefficients_per_vector", 1, 6),
+    ("position RMS (µm)", "position_rms_um", 1, 3),
+    ("transmittance RMS", "transmittance_rms", 1, 2),
+    ("median (ns/ray)", "ns_per_ray.median", 1, 3),
     ("size (kB)", "bytes", 1e-3, 3),
     ("fit (s)", "fit_s", 1, 3),
-    ("time min (ns/ray)", "ns_per_ray.min", 1, 3),
-    ("median (ns/ray)", "ns_per_ray.median", 1, 3),
-    ("speed-up over compiled exact", "speedup_over_compiled", 1, 3),
     ("break-even (Mray)", "break_even_rays", 1e-6, 3),
 )
 _EXACT_COLUMNS: tuple[Column, ...] = (
@@ -133,7 +133,7 @@ def _worst_ratios(results: Mapping[str, Any]) -> list[dict[str, Any]]:
     worst: dict[str, float] = {}
     for record in results.get("images", ()):
         ratio, camera = number(record, "flip_ratio"), str(record.get("camera", ""))
-        if ratio is not None:
+        if ratio is not None and not camera.startswith("exact"):  # which is 1 by definition
             worst[camera] = max(ratio, worst.get(camera, 0.0))
     return [{"name": camera, "ratio": ratio} for camera, ratio in worst.items()]
 
@@ -231,7 +231,7 @@ def _domain_gain(results: Mapping[str, Any]) -> str:
     gain = results.get("domain_gain") or {}
     rows: Sequence[Record] = gain.get("rows", ())
     names = [" · ".join(str(r[key]) for key in ("domain", "name") if r.get(key)) for r in rows]
-    told = " ".join(str(gain[key]) for key in ("scene", "text") if gain.get(key))
+    told = ": ".join(str(gain[key]) for key in ("scene", "text") if gain.get(key))
     return (f"<p>{text(told)}</p>" if told else "") + table(names, rows, _GAIN_COLUMNS + _MODEL_COLUMNS)
 
 

@@ -44,7 +44,8 @@ tbody th { text-align: left; font-weight: 500; position: sticky; left: 0; backgr
 th:first-child { text-align: left; } tbody tr:hover > * { background: var(--card); }
 .figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 520px), 1fr)); gap: 1.4rem;
   margin-bottom: 1.4rem; } .figures.small { grid-template-columns: repeat(auto-fill, minmax(min(100%, 340px), 1fr)); }
-figure { margin: 0; } figure img { width: 100%; height: auto; display: block; border-radius: 6px; background: #fff;
+figure { margin: 0; } figure.wide { grid-column: 1 / -1; }
+figure img { width: 100%; height: auto; display: block; border-radius: 6px; background: #fff;
   border: 1px solid var(--line); }
 figcaption { font-size: .85rem; margin-top: .35rem; } figcaption b { color: var(--ink); }
 .small img { image-rendering: auto; border: 0; }
@@ -129,7 +130,8 @@ def _figure(folder: Path, figure: Mapping[str, Any]) -> str:
     if url is None:
         return f"<p class='note'>Picture missing: {text(figure.get('file'))}</p>"
     picture = f"<a href='{url}'><img src='{url}' alt='{text(name or caption)}' loading='lazy'></a>"
-    return f"<figure>{picture}<figcaption>{words}</figcaption></figure>"
+    kind = " class='wide'" if figure.get("wide") else ""
+    return f"<figure{kind}>{picture}<figcaption>{words}</figcaption></figure>"
 
 
 def local_url(folder: Path, file: Any) -> str | None:
