@@ -15,7 +15,11 @@ from __future__ import annotations
 PASSED = 0
 OUTSIDE_DOMAIN = 1
 MISSED, RIM, TOTAL_REFLECTION = 1, 2, 3
-_REASONS = {MISSED: "missed surface", RIM: "blocked by the rim of surface", TOTAL_REFLECTION: "total reflection at surface"}
+_REASONS = {
+    MISSED: "missed surface",
+    RIM: "blocked by the rim of surface",
+    TOTAL_REFLECTION: "total reflection at surface",
+}
 
 
 def blocked(surface: int, reason: int) -> int:

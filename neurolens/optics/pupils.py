@@ -29,7 +29,9 @@ def pupil_plane_z_mm(lens: Lens) -> float:
     return float(z) if useful else rear
 
 
-def camera_rays(film_x: Tensor, film_y: Tensor, film_z: Tensor | float, pupil_x: Tensor, pupil_y: Tensor, pupil_z: float) -> Rays:
+def camera_rays(
+    film_x: Tensor, film_y: Tensor, film_z: Tensor | float, pupil_x: Tensor, pupil_y: Tensor, pupil_z: float
+) -> Rays:
     """Camera rays from film points towards (or away from) pupil points, all [N] in mm, lens frame; dz is negative."""
     x, y = pupil_x - film_x, pupil_y - film_y
     z = torch.as_tensor(pupil_z, dtype=film_x.dtype, device=film_x.device) - film_z
@@ -80,7 +82,9 @@ def pupil_bounds(
     wavelengths = sorted(set(wavelength_nm))
     boxes = [_row(lens, film_radius_mm * i / (rows - 1), film_planes, wavelengths, plane, points) for i in range(rows)]
     if not any(boxes):
-        raise InputError(lens.path, "surfaces", "(no ray passes the lens)", f"rays from a film of radius {film_radius_mm:.4g} mm")
+        raise InputError(
+            lens.path, "surfaces", "(no ray passes the lens)", f"rays from a film of radius {film_radius_mm:.4g} mm"
+        )
     merged = [_union([b for b in boxes[max(i - 1, 0) : i + 2] if b]) for i in range(rows)]
     return PupilBounds(
         plane,
@@ -141,7 +145,10 @@ def _search(
     du, dv = float(u[1] - u[0]), float(v[1] - v[0])
     pu, pv = pu[passed], pv[passed]
     return _Box(
-        float(pu.min()) - du, float(pu.max()) + du, float(pv.max()) + dv, float(torch.hypot(pu, pv).max()) + math.hypot(du, dv) / 2
+        float(pu.min()) - du,
+        float(pu.max()) + du,
+        float(pv.max()) + dv,
+        float(torch.hypot(pu, pv).max()) + math.hypot(du, dv) / 2,
     )
 
 

@@ -100,7 +100,9 @@ def refract(r: Rays, hit: Hit, curvature: Any, sense: int, mu: Any, guard: bool)
     not positive where the ray is totally reflected.
     """
     mu2 = mu * mu
-    cos2_t = torch.addcmul(1 - mu2, mu2, hit.discriminant) if isinstance(mu, Tensor) else hit.discriminant * mu2 + (1 - mu2)
+    cos2_t = (
+        torch.addcmul(1 - mu2, mu2, hit.discriminant) if isinstance(mu, Tensor) else hit.discriminant * mu2 + (1 - mu2)
+    )
     cos_t = _root(cos2_t, guard)
     bend = cos_t - mu * hit.cos_i
     pull = bend * (curvature * sense)

@@ -125,9 +125,13 @@ def _check(rays: Rays, wavelength_nm: Tensor | float) -> None:
     shape, dtype = rays.x.shape, rays.x.dtype
     for name, c in zip(Rays._fields, rays, strict=True):
         if c.shape != shape or c.dtype != dtype or c.ndim != 1:
-            raise InputError("trace", f"rays.{name}", f"({tuple(c.shape)}, {c.dtype})", f"[N] like x: {tuple(shape)}, {dtype}")
+            raise InputError(
+                "trace", f"rays.{name}", f"({tuple(c.shape)}, {c.dtype})", f"[N] like x: {tuple(shape)}, {dtype}"
+            )
     if isinstance(wavelength_nm, Tensor) and wavelength_nm.ndim and wavelength_nm.shape != shape:
-        raise InputError("trace", "wavelength_nm", f"({tuple(wavelength_nm.shape)})", f"a number or a tensor {tuple(shape)}")
+        raise InputError(
+            "trace", "wavelength_nm", f"({tuple(wavelength_nm.shape)})", f"a number or a tensor {tuple(shape)}"
+        )
 
 
 def _trace_chunk(

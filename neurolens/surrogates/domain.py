@@ -140,7 +140,9 @@ def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:
     """z (mm, lens frame, negative; -inf at infinity focus) of the object plane in focus for each film plane z, first order."""
     data = first_order(lens)
     f = data.efl_mm
-    extension = film_z - data.rear_principal_z_mm - f  # Newton: object distance beyond the front focus is f^2 / extension
+    extension = (
+        film_z - data.rear_principal_z_mm - f
+    )  # Newton: object distance beyond the front focus is f^2 / extension
     far = extension <= 1e-9 * f
     distance = f + f * f / torch.where(far, torch.ones_like(extension), extension)
     return data.front_principal_z_mm - torch.where(far, torch.full_like(distance, math.inf), distance)

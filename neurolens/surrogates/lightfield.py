@@ -112,3 +112,9 @@ def direction_of(v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     for a, b in zip(_SINC[-2::-1], _COS[-2::-1], strict=True):
         sinc, cos = sinc * square + a, cos * square + b
     return v[0] * sinc, v[1] * sinc, -cos
+
+
+def direction_of_slope(slope: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Unit direction of slopes (dx, dy) / -dz [2, N], as first-order models give them."""
+    inverse = torch.rsqrt(1 + slope[0] * slope[0] + slope[1] * slope[1])
+    return slope[0] * inverse, slope[1] * inverse, -inverse

@@ -7,7 +7,7 @@ round it (scaling, symmetry, decoding, stop, rims, domain guard) is here, once, 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from neurolens import status as st
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.domain import Domain, FilmRays
-from neurolens.surrogates.lightfield import Encoding, LightField, direction_of
+from neurolens.surrogates.lightfield import Encoding, LightField, direction_of, direction_of_slope
 
 # Order of the vector outputs of every core.
 POSITION, DIRECTION, STOP = 0, 1, 2
@@ -88,6 +88,7 @@ class LensModel:
         method: name of the fit, for tables ("ols invariants", "mlp 16x2").
         settings: JSON-able settings of the fit.
         fit_s: seconds that the fit took.
+        direction: what the core's direction vector is: the angle vector, or the slope for first-order models.
     """
 
     lens: Lens
@@ -99,6 +100,7 @@ class LensModel:
     method: str
     settings: dict[str, Any] = field(default_factory=dict)
     fit_s: float = 0.0
+    direction: Literal["angle", "slope"] = "angle"
 
     def predict(self, rays: FilmRays, stop_radius_mm: float | None = None) -> Prediction:
         """Evaluate the model in the dtype of `rays`.
@@ -111,7 +113,8 @@ class LensModel:
         vectors, scalars = core(self.encoding(rays))
         x, y = vectors[POSITION] * self.scales.position_mm
         stop_x, stop_y = vectors[STOP] * self.scales.stop_mm
-        dx, dy, dz = direction_of(vectors[DIRECTION])
+        decode = direction_of if self.direction == "angle" else direction_of_slope
+        dx, dy, dz = decode(vectors[DIRECTION])
         radius = self.domain.stop_radius_mm if stop_radius_mm is None else stop_radius_mm
         status = self._status(rays, scalars[1:], stop_x * stop_x + stop_y * stop_y, radius)
         return Prediction(Rays(x, y, self._sag(x, y), dx, dy, dz), scalars[0], stop_x, stop_y, status)

@@ -132,7 +132,12 @@ def make_pairs(
         counts[split] += len(found[split][-1])
         drawn += len(batch)
         if drawn > 10000 * (counts["train"] + counts["held_out"] + 10):
-            raise InputError(lens.path, "domain", f"({drawn} rays, {sum(counts.values())} passed)", "a domain that the lens can reach")
+            raise InputError(
+                lens.path,
+                "domain",
+                f"({drawn} rays, {sum(counts.values())} passed)",
+                "a domain that the lens can reach",
+            )
         if progress:
             progress((counts["train"] + counts["held_out"]) / total)
     joined = {name: _join(sets) for name, sets in found.items()}
@@ -199,7 +204,9 @@ def load_pairs(path: str | Path, lens: Lens) -> RayPairs:
     except InputError:
         raise
     except Exception as error:
-        raise InputError(path, "file", f"({type(error).__name__}: {error})", "ray pairs written by neurolens") from error
+        raise InputError(
+            path, "file", f"({type(error).__name__}: {error})", "ray pairs written by neurolens"
+        ) from error
 
 
 def _unpack(arrays: dict[str, Any], name: str) -> PairSet:

@@ -1,0 +1,96 @@
+"""Candidate terms and their columns: monomials of the invariants (times p or u), or of the raw coordinates."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from neurolens.surrogates.cores import monomials
+from neurolens.surrogates.lightfield import LightField
+
+Exponents = NDArray[np.int64]
+
+
+def invariant_exponents(degree: int, *, dispersive: bool = True) -> Exponents:
+    """[M, 4] exponents of rho, sigma, tau, w up to a total `degree` in the first three.
+
+    The wavelength multiplies lower degrees only: the index is nearly linear in w, and dispersion is small beside
+    refraction. w^1 goes with degrees up to degree - 2, w^2 with degree - 4, w^3 with degree - 5.
+    """
+    reach = [degree, degree - 2, degree - 4, degree - 5] if dispersive else [degree]
+    rows = [
+        (*powers, w)
+        for w, most in enumerate(reach)
+        for powers in itertools.product(range(max(most, 0) + 1), repeat=3)
+        if sum(powers) <= most
+    ]
+    return _ordered(rows)
+
+
+def raw_exponents(degree: int, *, dispersive: bool = True) -> Exponents:
+    """[M, 5] exponents of p_x, p_y, u_x, u_y, w up to a total `degree`: the basis of the published lens polynomials."""
+    variables = 5 if dispersive else 4
+    rows = [r for r in itertools.product(range(degree + 1), repeat=variables) if sum(r) <= degree]
+    return _ordered([(*r, 0) for r in rows] if not dispersive else rows)
+
+
+def _ordered(rows: Sequence[tuple[int, ...]]) -> Exponents:
+    return np.array(sorted(rows, key=lambda r: (sum(r), r)), dtype=np.int64)
+
+
+def raw_variables(field: LightField) -> Tensor:
+    """[5, N]: p_x, p_y, u_x, u_y, w."""
+    return torch.cat([field.p, field.u, field.w[None]])
+
+
+def vector_columns(features: Tensor, field: LightField) -> Tensor:
+    """[2 M, 2 N] columns m p and m u of features m [M, N]; both components of a ray stand in one row of 2 N entries."""
+    halves = [torch.cat([features * v[0], features * v[1]], 1) for v in (field.p, field.u)]
+    return torch.cat(halves)
+
+
+def vector_gram(
+    features: Tensor, field: LightField, outputs: Tensor
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Gram matrix [2 M, 2 M] of the columns of `vector_columns`, and their products [2 M, R] with outputs [R, 2, N].
+
+    Formed from rho, sigma and tau, since (m p).(m' u) = m m' sigma: the long columns are never stored.
+    """
+    rho, sigma, tau, _ = field.invariants()
+    pp, pu, uu = ((features * s) @ features.T for s in (rho, sigma, tau))
+    gram = torch.cat([torch.cat([pp, pu], 1), torch.cat([pu, uu], 1)])
+    along_p, along_u = ((outputs * v).sum(1) for v in (field.p, field.u))
+    moments = torch.cat([features @ along_p.T, features @ along_u.T])
+    return gram.numpy(), moments.numpy()
+
+
+def solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Least squares: coefficients [R, C] with coefficients @ columns [C, N] near outputs [R, N], rows weighted by [N].
+
+    By singular values of unit-length columns, so that dependent columns share their effect instead of blowing up.
+    """
+    if weights is not None:
+        columns, outputs = columns * weights, outputs * weights
+    norms = columns.norm(dim=1).clamp_min(1e-300)
+    scaled = (columns / norms[:, None]).T
+    # The Gram matrix would square the condition; QR first, then the small factor by singular values.
+    q, r = torch.linalg.qr(scaled)
+    found = torch.linalg.lstsq(r, q.T @ outputs.T, rcond=1e-13, driver="gelsd").solution
+    return (found / norms[:, None]).T
+
+
+__all__ = [
+    "Exponents",
+    "invariant_exponents",
+    "monomials",
+    "raw_exponents",
+    "raw_variables",
+    "solve",
+    "vector_columns",
+    "vector_gram",
+]

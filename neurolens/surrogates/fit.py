@@ -1,0 +1,147 @@
+"""One interface to every surrogate: settings in, complete model out."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+
+from neurolens import status as st
+from neurolens.errors import InputError, NeurolensWarning
+from neurolens.surrogates.cores import Basis
+from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.lightfield import Encoding, fit_encoding
+from neurolens.surrogates.mlp import fit_network
+from neurolens.surrogates.model import Core, Gate, LensModel
+from neurolens.surrogates.pairs import RayPairs, trace_pairs
+from neurolens.surrogates.paraxial import fit_paraxial
+from neurolens.surrogates.polynomial import PolynomialSettings, fit_polynomial
+from neurolens.surrogates.targets import choose_gates, scales_of
+
+Method = Literal["thin", "thick", "dense", "omp", "ols", "adaptive", "mlp"]
+POLYNOMIALS = ("dense", "omp", "ols", "adaptive")
+# Rays drawn over the domain to find the rims that block anything: a share of 1e-4 is 20 of them.
+_GATE_RAYS = 200_000
+
+
+@dataclass(frozen=True)
+class ModelSettings:
+    """One surrogate of an experiment.
+
+    Attributes:
+        name: of the file and of the table's row; made from the other settings where empty.
+        method: "thin", "thick" (first order); "dense", "omp", "ols", "adaptive" (polynomials); "mlp".
+        basis, terms, degree, replacement: see `PolynomialSettings`.
+        units, layers, seconds: of the network, and the time its training may take.
+        seed: of the network's first weights.
+    """
+
+    method: Method = "ols"
+    name: str = ""
+    basis: Basis = "invariants"
+    terms: int = 40
+    degree: int = 7
+    replacement: bool = True
+    units: int = 16
+    layers: int = 2
+    seconds: float = 60.0
+    seed: int = 0
+
+    @property
+    def label(self) -> str:
+        """The name, or one made from the settings: "ols-40", "raw-omp-80", "dense-d4", "mlp-16x2"."""
+        if self.name:
+            return self.name
+        if self.method == "mlp":
+            return f"mlp-{self.units}x{self.layers}"
+        if self.method in ("thin", "thick"):
+            return self.method
+        size = f"d{self.degree}" if self.method == "dense" else str(self.terms)
+        return f"{'raw-' if self.basis == 'raw' else ''}{self.method}-{size}"
+
+    @property
+    def family(self) -> str:
+        return "paraxial" if self.method in ("thin", "thick") else self.method
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Ray pairs with what all fits share: encoding and gates. `lost_share`: rays that no rim gate can explain."""
+
+    pairs: RayPairs
+    encoding: Encoding
+    gates: tuple[Gate, ...]
+    lost_share: float
+
+
+def prepare(pairs: RayPairs) -> Prepared:
+    """Find the encoding, and the rims that block anything in the domain.
+
+    Warns:
+        NeurolensWarning: more than one ray in 10,000 ends by missing a surface or by total reflection.
+    """
+    seed = pairs.settings.seed + 1_000_003
+    drawn = trace_pairs(pairs.lens, sample_domain(pairs.domain, _GATE_RAYS, seed), pairs.domain.pupil_z_mm)
+    blocked = drawn.status != st.PASSED
+    reason = drawn.status % 4
+    lost = float((blocked & (reason != st.RIM)).double().mean())
+    if lost > 1e-4:
+        warnings.warn(
+            f"{pairs.lens.path}: {100 * lost:.2f}% of the domain's rays end by missing a surface or by total reflection; "
+            "the rims near by stand in for that boundary",
+            NeurolensWarning,
+            stacklevel=2,
+        )
+    gates = choose_gates(pairs.lens, drawn.select(blocked & (reason == st.RIM)))
+    return Prepared(pairs, fit_encoding(pairs.domain, pairs.train), gates, lost)
+
+
+def fit_model(
+    prepared: Prepared, settings: ModelSettings, progress: Callable[[float], None] | None = None
+) -> LensModel:
+    """Fit one surrogate.
+
+    Raises:
+        InputError: an unknown method, or settings that the method refuses.
+    """
+    start = time.perf_counter()
+    core = _fit_core(prepared, settings, progress)
+    pairs = prepared.pairs
+    return LensModel(
+        lens=pairs.lens,
+        domain=pairs.domain,
+        encoding=prepared.encoding,
+        scales=scales_of(pairs.lens),
+        gates=prepared.gates,
+        core=core,
+        method=settings.label,
+        settings={**asdict(settings), "rays": len(pairs.train), "rays_seed": pairs.settings.seed},
+        fit_s=time.perf_counter() - start,
+        direction="slope" if settings.family == "paraxial" else "angle",
+    )
+
+
+def _fit_core(prepared: Prepared, settings: ModelSettings, progress: Callable[[float], None] | None) -> Core:
+    pairs, encoding, gates = prepared.pairs, prepared.encoding, prepared.gates
+    if settings.method == "thin" or settings.method == "thick":
+        return fit_paraxial(pairs, encoding, gates, settings.method)
+    if settings.method == "mlp":
+        return fit_network(
+            pairs,
+            encoding,
+            gates,
+            units=settings.units,
+            layers=settings.layers,
+            seed=settings.seed,
+            seconds=settings.seconds,
+            progress=progress,
+        )
+    if settings.method not in POLYNOMIALS:
+        raise InputError(
+            "fit", "method", settings.method, f"one of {', '.join(('thin', 'thick', *POLYNOMIALS, 'mlp'))}"
+        )
+    chosen = PolynomialSettings(settings.method, settings.basis, settings.terms, settings.degree, settings.replacement)
+    return fit_polynomial(pairs, encoding, gates, chosen)

@@ -1,0 +1,207 @@
+"""Polynomial surrogates: dense, matching pursuit, orthogonal least squares with replacement, adaptive growth.
+
+One support serves position and direction, chosen by the film-equivalent error in the nearest focused plane and at
+infinity. The stop crossing, the transmittance and the gates are then fitted on the monomials that are computed anyway.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neurolens.errors import InputError
+from neurolens.surrogates.bases import (
+    Exponents,
+    invariant_exponents,
+    monomials,
+    raw_exponents,
+    raw_variables,
+    solve,
+    vector_columns,
+    vector_gram,
+)
+from neurolens.surrogates.cores import Basis, InvariantPolynomial, RawPolynomial
+from neurolens.surrogates.growth import grow
+from neurolens.surrogates.lightfield import Encoding, LightField
+from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate
+from neurolens.surrogates.pairs import RayPairs
+from neurolens.surrogates.selection import Sweep, forward, replace_terms
+from neurolens.surrogates.targets import Targets, film_equivalent_weights, gate_values, targets_of
+
+Method = Literal["dense", "omp", "ols", "adaptive"]
+
+# Only the neighbourhood of a rim decides who passes: rows of the gate fit weigh 1 / sqrt(1 + (g / width)^2).
+GATE_WIDTH = 0.1
+
+
+@dataclass(frozen=True)
+class PolynomialSettings:
+    """How a polynomial is fitted.
+
+    Attributes:
+        method: "dense" (all terms up to `degree`), "omp" (matching pursuit), "ols" (orthogonal least squares with
+            replacement), "adaptive" (terms of any degree grown from chosen terms).
+        basis: "invariants" (rotational symmetry held exactly) or "raw" (p_x, p_y, u_x, u_y, w).
+        terms: coefficients per vector output; ignored by "dense".
+        degree: largest total degree of the candidates; ignored by "adaptive".
+        replacement: whether "ols" exchanges terms afterwards.
+    """
+
+    method: Method = "ols"
+    basis: Basis = "invariants"
+    terms: int = 40
+    degree: int = 7
+    replacement: bool = True
+
+
+@dataclass(frozen=True)
+class FitData:
+    """What every polynomial fit of one set of ray pairs shares."""
+
+    pairs: RayPairs
+    encoding: Encoding
+    gates: tuple[Gate, ...]
+
+    @property
+    def train(self) -> Targets:
+        return targets_of(self.pairs.lens, self.encoding, self.pairs.train)
+
+    @property
+    def rim(self) -> LightField:
+        return self.encoding(self.pairs.rim.inputs)
+
+    def film_equivalent(self, targets: Targets) -> Tensor:
+        """[2, 2, N] micrometres on the film: in the nearest focused plane, and at infinity."""
+        position, direction = film_equivalent_weights(self.pairs.lens, self.pairs.domain)
+        at_infinity = direction * targets.vectors[DIRECTION]
+        return torch.stack([at_infinity + position * targets.vectors[POSITION], at_infinity])
+
+
+def fit_polynomial(
+    pairs: RayPairs, encoding: Encoding, gates: tuple[Gate, ...], settings: PolynomialSettings
+) -> InvariantPolynomial | RawPolynomial:
+    """Fit by one of the methods of `PolynomialSettings`.
+
+    Raises:
+        InputError: fewer than two terms, a negative degree, or fewer training rays than terms.
+    """
+    if settings.terms < 2:
+        raise InputError("fit", "terms", settings.terms, "at least 2 coefficients per vector output")
+    if settings.degree < 0:
+        raise InputError("fit", "degree", settings.degree, "a total degree of 0 or more")
+    if len(pairs.train) <= settings.terms:
+        raise InputError("fit", "train", len(pairs.train), f"more training rays than the {settings.terms} terms")
+    data = FitData(pairs, encoding, gates)
+    return _fit_invariant(data, settings) if settings.basis == "invariants" else _fit_raw(data, settings)
+
+
+def _fit_invariant(data: FitData, settings: PolynomialSettings) -> InvariantPolynomial:
+    train = data.train
+    invariants, outputs = train.field.invariants(), data.film_equivalent(train)
+    dispersive = data.encoding.w_half != 0
+    exponents = invariant_exponents(settings.degree, dispersive=dispersive)
+    if settings.method == "adaptive":
+        exponents, chosen = grow(invariants, train.field, outputs, settings.terms, dispersive=dispersive)
+    else:
+        features = monomials(invariants, exponents)
+        gram, moments = vector_gram(features, train.field, outputs)
+        chosen = _choose(Sweep(gram, moments, _squares(outputs)), settings)
+    count = len(exponents)
+    kept = sorted({k % count for k in chosen})
+    place = {k: i for i, k in enumerate(kept)}
+    exponents = exponents[kept]
+    features = monomials(invariants, exponents)
+    # The chosen columns only; position and direction share them.
+    columns = [place[k % count] + (k >= count) * len(kept) for k in chosen]
+    coefficients = solve(vector_columns(features, train.field)[columns], train.vectors[:2].flatten(1))
+    ab = torch.zeros((3, 2 * len(kept)), dtype=torch.float64)
+    ab[:2, columns] = coefficients
+    ab[STOP] = fit_stop(data, exponents)
+    return InvariantPolynomial(exponents, ab.reshape(3, 2, -1), fit_scalars(data, exponents))
+
+
+def _choose(sweep: Sweep, settings: PolynomialSettings) -> list[int]:
+    if settings.method == "dense":
+        return list(range(sweep.count))
+    forward(sweep, settings.terms, "omp" if settings.method == "omp" else "ols")
+    if settings.method == "ols" and settings.replacement:
+        replace_terms(sweep)
+    return sorted(sweep.chosen)
+
+
+def _squares(outputs: Tensor) -> np.ndarray:
+    return (outputs.flatten(1) ** 2).sum(1).numpy()
+
+
+def fit_stop(data: FitData, exponents: Exponents) -> Tensor:
+    """[2 M]: A and B of the stop crossing on the monomials given, fitted on rays to both sides of every rim; stop radii."""
+    pairs, stop = data.pairs.rim, data.pairs.lens.stop_index
+    crossing = torch.cat([pairs.cross_x[stop], pairs.cross_y[stop]]) / data.pairs.lens.stop_radius_mm
+    field = data.rim
+    return solve(vector_columns(monomials(field.invariants(), exponents), field), crossing[None])[0]
+
+
+def fit_scalars(data: FitData, exponents: Exponents) -> Tensor:
+    """[1 + G, M]: transmittance and gates on the monomials of the invariants given."""
+    train = data.train
+    rim_features = monomials(data.rim.invariants(), exponents)
+    return _scalars(data, monomials(train.field.invariants(), exponents), train.transmittance, rim_features)
+
+
+def _scalars(data: FitData, features: Tensor, transmittance: Tensor, rim_features: Tensor) -> Tensor:
+    """Transmittance on the passing rays, gates on the rays near the rims."""
+    rows = [solve(features, transmittance[None])]
+    for value in gate_values(data.pairs.lens, data.gates, data.pairs.rim):
+        weight = 1 / torch.sqrt(1 + (value / GATE_WIDTH) ** 2)
+        rows.append(solve(rim_features, value[None], weight))
+    return torch.cat(rows)
+
+
+def _fit_raw(data: FitData, settings: PolynomialSettings) -> RawPolynomial:
+    """Every component with a support of its own, as published; half of `terms` each. One more support for the scalars."""
+    train = data.train
+    variables, rim_variables = raw_variables(train.field), raw_variables(data.rim)
+    dispersive = data.encoding.w_half != 0
+    half = replace(settings, terms=max(settings.terms // 2, 1))
+    supports: dict[str, Exponents] = {}
+    rim, stop = data.pairs.rim, data.pairs.lens.stop_index
+    crossing = torch.stack([rim.cross_x[stop], rim.cross_y[stop]]) / data.pairs.lens.stop_radius_mm
+    gates = gate_values(data.pairs.lens, data.gates, rim)
+    wanted = {"scalars": (rim_variables, torch.cat([gates, rim.transmittance[None]]))}
+    for axis in (0, 1):
+        wanted[f"stop {axis}"] = (rim_variables, crossing[axis][None])
+        for vector in (POSITION, DIRECTION):
+            wanted[f"{vector} {axis}"] = (variables, train.vectors[vector, axis][None])
+    for name, (inputs, outputs) in wanted.items():
+        supports[name] = _raw_support(inputs, outputs, half, dispersive)
+    place: dict[tuple[int, ...], int] = {}
+    columns = {n: [place.setdefault(tuple(map(int, e)), len(place)) for e in s] for n, s in supports.items()}
+    exponents = np.array(list(place), dtype=np.int64)
+    features, rim_features = monomials(variables, exponents), monomials(rim_variables, exponents)
+    components = torch.zeros((3, 2, len(place)), dtype=torch.float64)
+    for axis in (0, 1):
+        for vector in (POSITION, DIRECTION):
+            at = columns[f"{vector} {axis}"]
+            components[vector, axis, at] = solve(features[at], train.vectors[vector, axis][None])[0]
+        at = columns[f"stop {axis}"]
+        components[STOP, axis, at] = solve(rim_features[at], crossing[axis][None])[0]
+    at = columns["scalars"]
+    scalars = torch.zeros((1 + len(data.gates), len(place)), dtype=torch.float64)
+    scalars[:, at] = _scalars(data, features[at], train.transmittance, rim_features[at])
+    return RawPolynomial(exponents, components, scalars)
+
+
+def _raw_support(variables: Tensor, outputs: Tensor, settings: PolynomialSettings, dispersive: bool) -> Exponents:
+    """Exponents [K, 5] chosen for outputs [R, N] in common."""
+    outputs = outputs / outputs.norm(dim=1, keepdim=True).clamp_min(1e-300)
+    if settings.method == "adaptive":
+        exponents, chosen = grow(variables, None, outputs[:, None], settings.terms, dispersive=dispersive)
+        return exponents[chosen]
+    exponents = raw_exponents(settings.degree, dispersive=dispersive)
+    features = monomials(variables, exponents)
+    gram = (features @ features.T).numpy()
+    return exponents[_choose(Sweep(gram, (features @ outputs.T).numpy(), _squares(outputs)), settings)]

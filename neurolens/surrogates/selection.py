@@ -1,0 +1,112 @@
+"""Which terms of a basis to keep: orthogonal matching pursuit, orthogonal least squares, replacement.
+
+All work on the Gram matrix of the candidate columns, so that their cost does not grow with the number of rays. The
+sweep operator (Goodnight 1979, "A Tutorial on the SWEEP Operator") moves a column into or out of the fit in one rank-one
+update; afterwards the diagonal holds what every candidate has left after orthogonalisation, and the right-hand side
+its correlation with the residual.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Rule = Literal["omp", "ols"]
+
+# A candidate of which less than this share is left after orthogonalisation is a combination of the chosen ones.
+DEPENDENT = 1e-11
+
+
+class Sweep:
+    """Normal equations of M unit-length candidate columns and R outputs, with some columns swept in."""
+
+    def __init__(self, gram: Floats, moments: Floats, squares: Floats) -> None:
+        """Take the Gram matrix [M, M], column-output products [M, R] and squared norms of the outputs [R]."""
+        self.count, outputs = moments.shape
+        norms = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        table = np.zeros((self.count + outputs, self.count + outputs))
+        table[: self.count, : self.count] = gram / np.outer(norms, norms)
+        table[: self.count, self.count :] = moments / norms[:, None]
+        table[self.count :, : self.count] = table[: self.count, self.count :].T
+        table[self.count :, self.count :] = np.diag(squares)
+        self._start = table
+        self.chosen: list[int] = []
+        self._table = table.copy()
+
+    @property
+    def residual(self) -> float:
+        """Sum over outputs of the squared residual."""
+        return float(np.trace(self._table[self.count :, self.count :]))
+
+    def add(self, k: int) -> None:
+        self._sweep(k, 1.0)
+        self.chosen.append(k)
+
+    def drop(self, k: int) -> None:
+        self._sweep(k, -1.0)
+        self.chosen.remove(k)
+
+    def refresh(self) -> None:
+        """Sweep the chosen columns again from the start, which clears the rounding of many updates."""
+        chosen, self.chosen, self._table = self.chosen, [], self._start.copy()
+        for k in chosen:
+            self.add(k)
+
+    def scores(self, rule: Rule) -> Floats:
+        """[M] gain of every candidate: squared correlation with the residual ("omp"), or the true fall of the residual ("ols")."""
+        left = np.diag(self._table)[: self.count]
+        correlation = (self._table[: self.count, self.count :] ** 2).sum(1)
+        usable = left > DEPENDENT
+        usable[self.chosen] = False
+        gain = correlation / np.where(usable, left, 1.0) if rule == "ols" else correlation
+        return np.where(usable, gain, -1.0)
+
+    def _sweep(self, k: int, sign: float) -> None:
+        t = self._table
+        pivot, row = t[k, k], t[k].copy()
+        t -= np.outer(t[:, k], row) / pivot
+        t[k] = row / pivot * sign
+        t[:, k] = t[k]
+        t[k, k] = -1.0 / pivot
+
+
+def forward(sweep: Sweep, terms: int, rule: Rule = "ols", among: list[int] | None = None) -> None:
+    """Add the best-scored candidate until `terms` are chosen or none helps. `among` restricts the candidates."""
+    allowed = np.full(sweep.count, among is None)
+    if among is not None:
+        allowed[among] = True
+    while len(sweep.chosen) < terms:
+        scores = np.where(allowed, sweep.scores(rule), -1.0)
+        best = int(scores.argmax())
+        if scores[best] <= 0:
+            return
+        sweep.add(best)
+
+
+def replace_terms(sweep: Sweep, passes: int = 10, among: list[int] | None = None) -> int:
+    """Take each chosen term out and put the best candidate in (Schrade et al. 2016), until a pass changes nothing.
+
+    Returns the number of terms exchanged. The residual never grows.
+    """
+    allowed = np.full(sweep.count, among is None)
+    if among is not None:
+        allowed[among] = True
+    exchanged = 0
+    for _ in range(passes):
+        before = exchanged
+        for k in list(sweep.chosen):
+            sweep.drop(k)
+            scores = np.where(allowed, sweep.scores("ols"), -1.0)
+            best = int(scores.argmax())
+            # The old term wins ties, so that rounding cannot cycle.
+            if scores[best] <= scores[k] * (1 + 1e-9):
+                best = k
+            sweep.add(best)
+            exchanged += best != k
+        sweep.refresh()
+        if exchanged == before:
+            break
+    return exchanged
