@@ -1,4 +1,4 @@
-"""The one contract between cameras and the renderer: film point, pupil sample and wavelength in, weighted scene ray out."""
+"""The one contract between cameras and the renderer: film and pupil sample, wavelength in; scene ray out."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ def _reversed(lens: Lens) -> Lens:
 
 
 def _pupil(lens: Lens, indices: list[Any]) -> tuple[Any, Any]:
-    """Distance of the stop's image behind the last vertex, and its magnification, through the surfaces after the stop."""
+    """Distance of the stop's image behind the last vertex, and its magnification, by the surfaces after the stop."""
     k, n = lens.stop_index, len(lens.surfaces)
     if k == n - 1:
         return 0.0, 1.0

@@ -42,9 +42,10 @@ def camera_rays(
 
 @dataclass(frozen=True)
 class PupilBounds:
-    """Bounds of the passing rays on the pupil plane for film points at equally spaced radii, as in pbrt (Pharr et al. 2016, 6.4.5).
+    """Bounds of the passing rays on the pupil plane at equally spaced film radii (as pbrt: Pharr et al. 2016, 6.4.5).
 
-    For a film point at radius r along +x, passing rays lie within `low` <= u <= `high` along +x and |v| <= `half` across.
+    For a film point at radius r along +x, passing rays lie within `low` <= u <= `high` along +x and |v| <= `half`
+    across.
 
     Attributes:
         pupil_z_mm: the plane.
@@ -70,7 +71,7 @@ def pupil_bounds(
     rows: int = 33,
     points: int = 128,
 ) -> PupilBounds:
-    """Search the pupil plane for passing rays, row by row of film radii, in two steps (coarse grid, then its bounding box).
+    """Search the pupil plane for passing rays, film radius by film radius: a coarse grid, then its bounding box.
 
     Each row is widened by the step of its grid and by its neighbours, so that bounds hold between rows too.
 
@@ -134,7 +135,7 @@ def _row(
 def _search(
     lens: Lens, radius: float, film_z: float, wavelengths: list[float], plane: float, box: _Box, points: int
 ) -> _Box | None:
-    """Bounding box of the passing points of a grid over `box` (upper half only: the lens is symmetric), a step wider."""
+    """Box of the passing points of a grid over `box` (upper half only: the lens is symmetric), a step wider."""
     u = torch.linspace(box.low, box.high, points, dtype=torch.float64)
     v = torch.linspace(0, box.half, points // 2, dtype=torch.float64)
     pu, pv = (t.reshape(-1) for t in torch.meshgrid(u, v, indexing="ij"))
@@ -155,8 +156,8 @@ def _search(
 def image_radius_mm(lens: Lens) -> tuple[float, str]:
     """Radius of the lit film, and where it comes from.
 
-    The file's own; else f tan(half field) below 60 degrees; beyond, the film radius whose mean passing ray leaves at the
-    half field; else where the relative illumination falls to 10%.
+    The file's own; else f tan(half field) below 60 degrees; beyond, the film radius whose mean passing ray leaves at
+    the half field; else where the relative illumination falls to 10%.
     """
     if lens.image_radius_mm is not None:
         return lens.image_radius_mm, "the lens file"

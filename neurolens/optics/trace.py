@@ -181,7 +181,7 @@ def _trace_chunk(
 
 
 class _Tests:
-    """The three tests at each surface (met, inside the rim, not totally reflected), in that order; the first that fails is kept."""
+    """The tests at each surface (met, inside the rim, not totally reflected), in that order; first failure rules."""
 
     def __init__(self, like: Tensor) -> None:
         self.status = torch.zeros_like(like, dtype=torch.int32)

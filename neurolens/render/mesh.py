@@ -105,7 +105,9 @@ class Mesh:
         self._node_high = np.ascontiguousarray((bounds[..., 3:] + grow).transpose(2, 0, 1), np.float32)
         self._children = np.array(children)
         self._leaf_rows = np.array(leaves, np.int32)  # [leaves, 8]
-        self._leaf_planes = np.ascontiguousarray(self.planes[self._leaf_rows].transpose(2, 3, 0, 1))  # [3, 4, leaves, 8]
+        self._leaf_planes = np.ascontiguousarray(
+            self.planes[self._leaf_rows].transpose(2, 3, 0, 1)
+        )  # [3, 4, leaves, 8]
 
     def _build(
         self,

@@ -98,7 +98,9 @@ def _check_references(
                 if kind in ("spheres", "meshes"):
                     raise InputError(path, f"{kind}[{k}].{part}", used, "a material without texture on a curved shape")
                 if kind != "quads" and texture.kind == "image" and texture.size_m is None:
-                    raise InputError(path, f"textures.{materials[used].texture}.size_m", "(missing)", "width, height in m")
+                    raise InputError(
+                        path, f"textures.{materials[used].texture}.size_m", "(missing)", "width, height in m"
+                    )
 
 
 def _read_image(scene: Path, field: str, path: Path) -> FloatArray:
@@ -132,7 +134,9 @@ def _read_mesh(scene: Path, field: str, mesh: MeshSettings) -> TriangleSet:
     area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     # Height over the longest side: a needle this thin has no normal in float32.
     for k in np.flatnonzero(area <= 1e-6 * np.max(np.sum(edges**2, axis=2), axis=1))[:1]:
-        raise InputError(scene, f"{field}.faces[{k}]", faces[k].tolist(), "a triangle with an area, not a degenerate one")
+        raise InputError(
+            scene, f"{field}.faces[{k}]", faces[k].tolist(), "a triangle with an area, not a degenerate one"
+        )
     angle = math.radians(mesh.rotate_y_deg)
     turn = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
     return TriangleSet(mesh.scale * vertices @ turn.T + np.array(mesh.translate_m), faces)

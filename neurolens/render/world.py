@@ -191,7 +191,9 @@ class World:
         if not isinstance(shape, Box) or not shape.room:
             return False
         settings = self.scene.settings
-        points = [np.add(s.centre_m, side * s.radius_m) for s in settings.spheres if any(s.emission) for side in (-1, 1)]
+        points = [
+            np.add(s.centre_m, side * s.radius_m) for s in settings.spheres if any(s.emission) for side in (-1, 1)
+        ]
         for q in settings.quads:
             points += [np.array(q.corner_m), np.sum([q.corner_m, q.edge_u_m, q.edge_v_m], axis=0)] * any(q.emission)
         return all(bool(np.all((p > shape.low) & (p < shape.high))) for p in points)

@@ -104,7 +104,7 @@ class Network:
     """A multilayer perceptron from the four invariants to the coefficients A and B of each vector and to the scalars.
 
     Attributes:
-        hidden: weight [units, inputs] and bias [units] of each tanh layer; the first takes `shift`ed, `scale`d invariants.
+        hidden: weight [units, inputs] and bias [units] of each tanh layer; the first takes scaled invariants.
         output: weight [6 + S, units] and bias [6 + S]; rows 2 v and 2 v + 1 are A and B of vector v, then the scalars.
             The bias of those rows holds the paraxial map.
         shift, scale: [4] each: the network sees (invariants - shift) * scale.

@@ -53,7 +53,7 @@ class Domain:
     @staticmethod
     def from_dict(data: dict[str, Any]) -> Domain:
         """The inverse of `to_dict`."""
-        bounds = {k: tuple(v) if isinstance(v, list) else v for k, v in data["bounds"].items()}
+        bounds: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data["bounds"].items()}
         pairs = {k: tuple(float(v) for v in data[k]) for k in ("film_z_mm", "focus_m", "wavelength_nm")}
         return Domain(**{**data, **pairs, "bounds": PupilBounds(**bounds)})
 
@@ -137,7 +137,7 @@ def domain_from_camera(
 
 
 def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:
-    """z (mm, lens frame, negative; -inf at infinity focus) of the object plane in focus for each film plane z, first order."""
+    """z (mm, lens frame; -inf at infinity focus) of the object plane in focus for each film plane z, first order."""
     data = first_order(lens)
     f = data.efl_mm
     extension = (

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Literal
 
-
 from neurolens import status as st
 from neurolens.errors import InputError, NeurolensWarning
 from neurolens.surrogates.cores import Basis
@@ -90,8 +89,8 @@ def prepare(pairs: RayPairs) -> Prepared:
     lost = float((blocked & (reason != st.RIM)).double().mean())
     if lost > 1e-4:
         warnings.warn(
-            f"{pairs.lens.path}: {100 * lost:.2f}% of the domain's rays end by missing a surface or by total reflection; "
-            "the rims near by stand in for that boundary",
+            f"{pairs.lens.path}: {100 * lost:.2f}% of the domain's rays end by missing a surface or by total "
+            "reflection; the rims near by stand in for that boundary",
             NeurolensWarning,
             stacklevel=2,
         )

@@ -1,4 +1,4 @@
-"""The light field in the coordinates that surrogates see: two planes fixed to the glass, centred, scaled, rotation-free.
+"""The light field in the coordinates that surrogates see: two planes fixed to the glass, centred and scaled.
 
 A camera ray is its crossing p with a plane near the film and u with the pupil plane. Free space is linear, so another
 film position only moves where the ray starts. For a rotationally symmetric lens every output vector is
@@ -106,7 +106,7 @@ for _k in range(1, 12):
 
 
 def direction_of(v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Unit direction (dx, dy, dz) of angle vectors [2, N], by series in |v|^2 (no square root, no special case at 0)."""
+    """Unit direction (dx, dy, dz) of angle vectors [2, N], by series in |v|^2 (no root, no special case at 0)."""
     square = v[0] * v[0] + v[1] * v[1]
     sinc, cos = torch.full_like(square, _SINC[-1]), torch.full_like(square, _COS[-1])
     for a, b in zip(_SINC[-2::-1], _COS[-2::-1], strict=True):

@@ -36,7 +36,7 @@ class Core(Protocol):
     coefficients: int
 
     def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
-        """Vectors [3, 2, N] (position, direction, stop; scaled, see `Scales`) and scalars [1 + G, N] (transmittance, gates)."""
+        """Vectors [3, 2, N] (position, direction, stop; see `Scales`) and scalars [1 + G, N] (transmittance, gates)."""
         ...
 
     def to(self, dtype: torch.dtype) -> Core:

@@ -1,4 +1,4 @@
-"""Ray pairs: camera rays of a domain and what the exact tracer makes of them, in three splits, saved and reloaded bit for bit."""
+"""Ray pairs: camera rays of a domain and their exact images, in three splits, saved and reloaded bit for bit."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class RayPairs:
     Attributes:
         lens, domain, settings: what was traced.
         train, held_out: rays that pass; no ray is in both.
-        rim: rays that reach the scene but for a rim or the stop, inside and outside it by up to a quarter of its radius.
+        rim: rays that reach the scene but for a rim or the stop, up to a quarter of a radius beyond it.
         tested: rays drawn until `train` was full, so that len(train) / tested is the share of the disc that passes.
     """
 

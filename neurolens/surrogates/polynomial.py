@@ -138,7 +138,7 @@ def _squares(outputs: Tensor) -> np.ndarray:
 
 
 def fit_stop(data: FitData, exponents: Exponents) -> Tensor:
-    """[2 M]: A and B of the stop crossing on the monomials given, fitted on rays to both sides of every rim; stop radii."""
+    """[2 M]: A and B of the stop crossing (in stop radii) on the monomials given, from rays on both sides of rims."""
     pairs, stop = data.pairs.rim, data.pairs.lens.stop_index
     crossing = torch.cat([pairs.cross_x[stop], pairs.cross_y[stop]]) / data.pairs.lens.stop_radius_mm
     field = data.rim
@@ -162,7 +162,7 @@ def _scalars(data: FitData, features: Tensor, transmittance: Tensor, rim_feature
 
 
 def _fit_raw(data: FitData, settings: PolynomialSettings) -> RawPolynomial:
-    """Every component with a support of its own, as published; half of `terms` each. One more support for the scalars."""
+    """Every component with a support of its own, as published, half of `terms` each; one more for the scalars."""
     train = data.train
     variables, rim_variables = raw_variables(train.field), raw_variables(data.rim)
     dispersive = data.encoding.w_half != 0

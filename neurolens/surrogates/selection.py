@@ -1,9 +1,9 @@
 """Which terms of a basis to keep: orthogonal matching pursuit, orthogonal least squares, replacement.
 
 All work on the Gram matrix of the candidate columns, so that their cost does not grow with the number of rays. The
-sweep operator (Goodnight 1979, "A Tutorial on the SWEEP Operator") moves a column into or out of the fit in one rank-one
-update; afterwards the diagonal holds what every candidate has left after orthogonalisation, and the right-hand side
-its correlation with the residual.
+sweep operator (Goodnight 1979, "A Tutorial on the SWEEP Operator") moves a column into or out of the fit in one
+rank-one update; afterwards the diagonal holds what every candidate has left after orthogonalisation, and the
+right-hand side its correlation with the residual.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Sweep:
             self.add(k)
 
     def scores(self, rule: Rule) -> Floats:
-        """[M] gain of every candidate: squared correlation with the residual ("omp"), or the true fall of the residual ("ols")."""
+        """[M] gain of every candidate: squared correlation with the residual ("omp") or its true fall ("ols")."""
         left = np.diag(self._table)[: self.count]
         correlation = (self._table[: self.count, self.count :] ** 2).sum(1)
         usable = left > DEPENDENT
