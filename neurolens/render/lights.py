@@ -1,6 +1,6 @@
 """Lights that can be aimed at: rectangles and spheres that emit.
 
-Each light is chosen with equal probability. A rectangle is sampled uniformly over its area, a sphere over the cone that
+A light is chosen partly by how much it lights the point that the camera looks at, partly at random. A rectangle is sampled uniformly over its area, a sphere over the cone that
 it fills. The environment is no such light: only scattered rays find it.
 """
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
 from neurolens.render.primitives import dot
-from neurolens.render.scene import Quad, Sphere
+from neurolens.render.scene import BLACK, Quad, Sphere, Vector
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,10 @@ class Lights:
 
     Args:
         quads, spheres: those that emit.
+        target_m: the point whose light matters most.
     """
 
-    def __init__(self, quads: list[Quad], spheres: list[Sphere]) -> None:
+    def __init__(self, quads: list[Quad], spheres: list[Sphere], target_m: Vector = BLACK) -> None:
         self.count, self._quads = len(quads) + len(spheres), len(quads)
         self.black = self.count == 0
         corner = np.array([q.corner_m for q in quads], np.float64).reshape(-1, 3)
@@ -58,16 +59,31 @@ class Lights:
         edge_v = np.array([q.edge_v_m for q in quads], np.float64).reshape(-1, 3)
         normal = np.cross(edge_u, edge_v)
         area = np.linalg.norm(normal, axis=1)
-        self._corner, self._edge_u, self._edge_v = (np.float32(a.T) for a in (corner, edge_u, edge_v))
-        self._normal = np.float32((normal / area[:, None]).T)
+        self._corner, self._edge_u, self._edge_v = (a.T.astype(np.float32) for a in (corner, edge_u, edge_v))
+        self._normal = (normal / area[:, None]).T.astype(np.float32)
         # 0 for spheres, so that one table serves both kinds.
         self._area = np.concatenate([area, np.zeros(len(spheres))]).astype(np.float32)
-        self._centre = np.float32(np.array([s.centre_m for s in spheres]).reshape(-1, 3).T)
-        self._radius2 = np.float32([s.radius_m**2 for s in spheres])
+        self._centre = np.array([s.centre_m for s in spheres], np.float32).reshape(-1, 3).T
+        self._radius2 = np.array([s.radius_m**2 for s in spheres], np.float32)
+        middle = np.concatenate([corner + 0.5 * (edge_u + edge_v), self._centre.T])
+        shone = np.concatenate([area, np.pi * self._radius2]) * [sum(x.emission) for x in (*quads, *spheres)]
+        self._choose_by(shone / np.maximum(np.sum((middle - target_m) ** 2, axis=1), 1e-6))
+
+    def _choose_by(self, importance: NDArray[np.float64]) -> None:
+        """Make the table by which lights are chosen: half of it in equal parts, half by importance.
+
+        Each light has a whole number of the table's entries, at least one, and their share is its exact probability.
+        """
+        if self.black:
+            return
+        parts = importance / importance.sum() + 1 / self.count
+        entries = np.maximum(1, np.rint(parts / parts.sum() * max(1024, 16 * self.count))).astype(np.intp)
+        self._table = np.repeat(np.arange(self.count), entries)
+        self._probability = (entries / entries.sum()).astype(np.float32)
 
     def sample(self, point: FloatArray, choice: FloatArray, square: FloatArray) -> LightSamples:
         """A direction from each point [3, N] to one of the lights, for numbers [N] and [2, N] in [0, 1)."""
-        light = (choice * np.float32(self.count)).astype(np.intp)
+        light = self._table.take((choice * np.float32(len(self._table))).astype(np.intp), mode="clip")
         if self._quads == self.count:
             direction, distance, inverse_pdf = self._sample_quads(light, point, square)
         elif self._quads == 0:
@@ -79,7 +95,7 @@ class Lights:
             for rows, sampled in ((is_quad, self._sample_quads), (~is_quad, self._sample_spheres)):
                 number = light[rows] - (0 if rows is is_quad else self._quads)
                 direction[:, rows], distance[rows], inverse_pdf[rows] = sampled(number, point[:, rows], square[:, rows])
-        inverse_pdf *= np.float32(self.count)
+        inverse_pdf /= self._probability.take(light)
         return LightSamples(direction, distance, light, inverse_pdf)
 
     def _sample_quads(
@@ -134,7 +150,7 @@ class Lights:
             away = self._centre.take(number, axis=1) - point[:, rows]
             one_less_cos = _cone(self._radius2.take(number) / dot(away, away))
             density[rows] = np.float32(0.5 / math.pi) / one_less_cos
-        density /= np.float32(self.count)
+        density *= self._probability.take(light)
         return density
 
 

@@ -104,7 +104,7 @@ class Mesh:
         self._node_low = np.ascontiguousarray((bounds[..., :3] - grow).transpose(2, 0, 1), np.float32)
         self._node_high = np.ascontiguousarray((bounds[..., 3:] + grow).transpose(2, 0, 1), np.float32)
         self._children = np.array(children)
-        self._leaf_rows = np.array(leaves, np.int32)  # [leaves, 8]
+        self._leaf_rows = np.array(leaves, np.int32)  # [L, 8]
         self._leaf_planes = np.ascontiguousarray(
             self.planes[self._leaf_rows].transpose(2, 3, 0, 1)
         )  # [3, 4, leaves, 8]
@@ -124,7 +124,7 @@ class Mesh:
         A child is a node number, or -1 - leaf number.
         """
         number = len(boxes)
-        box = np.tile([np.inf] * 3 + [-np.inf] * 3, (_BRANCHES, 1))  # no ray meets an empty child
+        box = np.full((_BRANCHES, 6), np.nan)  # no ray meets an empty child, as NaN fails every comparison
         child = np.zeros(_BRANCHES, np.int32)
         boxes.append(box)
         children.append(child)
@@ -175,7 +175,7 @@ class Mesh:
         return result
 
     def _meet_leaves(
-        self, rays: Rays, best: FloatArray, found: IntArray, ray: NDArray[np.intp], leaf: NDArray[np.intp]
+        self, rays: Rays, best: FloatArray, found: IntArray, ray: NDArray[np.intp], leaf: IntArray
     ) -> None:
         """Test pairs of rays and leaves, and keep the nearest triangle of each ray."""
         origin = [rays.origin[k].take(ray)[:, None] for k in range(3)]

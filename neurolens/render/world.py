@@ -86,7 +86,7 @@ class World:
         settings = scene.settings
         quads = [q for q in settings.quads if any(q.emission)]
         spheres = [s for s in settings.spheres if any(s.emission)]
-        self.lights = Lights(quads, spheres)
+        self.lights = Lights(quads, spheres, settings.camera.look_at_m)
         self._primitives: list[Primitive] = []
         self._boxes: list[Box] = []
         self._sphere_centre: dict[int, tuple[FloatArray, float]] = {}

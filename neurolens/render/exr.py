@@ -1,0 +1,101 @@
+"""OpenEXR in and out, and the PNG preview: the only place that touches the OpenEXR library.
+
+The library writes garbage for arrays that are not contiguous, changes the header it is given, and refuses float64 and
+int32; `write_exr` takes care of all three.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from numpy.typing import ArrayLike
+from PIL import Image
+
+from neurolens.cameras.contract import FloatArray
+from neurolens.errors import InputError
+from neurolens.files import atomic_path
+from neurolens.render.spectrum import linear_to_srgb
+
+METADATA_KEY = "neurolens"
+_HALF_MAX = 65504.0
+
+
+def write_exr(path: str | Path, rgb: ArrayLike, *, half: bool = False, metadata: dict[str, Any] | None = None) -> None:
+    """Write a picture as OpenEXR: channels R, G and B, ZIP compression, whole or not at all.
+
+    Args:
+        path: where to; the folder exists.
+        rgb: [H, W, 3] linear, any real type and memory layout; stored as float32, or as float16 with `half`, where values
+            beyond 65504 become 65504.
+        metadata: JSON-able settings, kept as one JSON text in the attribute "neurolens".
+
+    Raises:
+        InputError: another shape, no pixels, complex or text, not finite, metadata that is not JSON, no such folder.
+    """
+    path = Path(path)
+    picture = np.asarray(rgb)
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
+        raise InputError(path, "rgb shape", picture.shape, "[height, width, 3]")
+    if picture.dtype.kind not in "fiub":
+        raise InputError(path, "rgb type", str(picture.dtype), "real numbers")
+    with np.errstate(over="ignore"):
+        picture = picture.astype(np.float32)
+    if not np.all(np.isfinite(picture)):
+        raise InputError(
+            path, "rgb", f"({int(np.sum(~np.isfinite(picture)))} values not finite)", "finite float32 values"
+        )
+    try:
+        text = json.dumps(metadata or {}, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise InputError(path, "metadata", f"({error})", "values that JSON can hold") from None
+    if not path.parent.is_dir():
+        raise InputError(path, "folder", str(path.parent), "a folder that exists")
+    stored = np.clip(picture, -_HALF_MAX, _HALF_MAX).astype(np.float16) if half else picture
+    channels = {name: np.ascontiguousarray(stored[..., k]) for k, name in enumerate("RGB")}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, METADATA_KEY: text}
+    with atomic_path(path) as temporary:
+        OpenEXR.File([OpenEXR.Part(header, channels)]).write(str(temporary))
+
+
+def read_exr(path: str | Path) -> tuple[FloatArray, dict[str, Any]]:
+    """A picture [H, W, 3] float32 and its metadata, {} where it has none of ours.
+
+    Raises:
+        InputError: missing, no OpenEXR file, truncated, or without channels R, G and B.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(path, "file", "(missing)", "an OpenEXR file")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            part = file.parts[0]
+            planes = {name: np.array(channel.pixels, np.float32) for name, channel in part.channels.items()}
+            text = part.header.get(METADATA_KEY, "{}")
+    except Exception as error:  # the library raises bare RuntimeError, ValueError and its own
+        raise InputError(path, "file", f"({error})", "a whole OpenEXR file") from None
+    missing = [name for name in "RGB" if name not in planes]
+    if missing:
+        raise InputError(path, "channels", sorted(planes), "R, G and B")
+    try:
+        metadata = json.loads(text)
+    except ValueError:
+        raise InputError(path, METADATA_KEY, text, "JSON text") from None
+    return np.stack([planes[name] for name in "RGB"], axis=-1), metadata
+
+
+def write_png(path: str | Path, rgb: ArrayLike, exposure: float = 0.0) -> None:
+    """Write an 8-bit sRGB preview of a linear picture [H, W, 3], brighter by `exposure` stops, whole or not at all.
+
+    Raises:
+        InputError: another shape.
+    """
+    picture = np.asarray(rgb, np.float32)
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
+        raise InputError(path, "rgb shape", picture.shape, "[height, width, 3]")
+    encoded = np.rint(255 * linear_to_srgb(picture * np.float32(2.0**exposure))).astype(np.uint8)
+    with atomic_path(path) as temporary:
+        Image.fromarray(encoded).save(temporary)

@@ -1,0 +1,107 @@
+"""Pictures survive the disk: layouts, types, metadata, and errors worth reading."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from neurolens.errors import InputError
+from neurolens.render.exr import read_exr, write_exr, write_png
+
+PICTURE = np.random.default_rng(0).random((5, 7, 3), np.float32) * 10
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        lambda a: a,
+        lambda a: np.asfortranarray(a),
+        lambda a: np.ascontiguousarray(a[::-1])[::-1],
+        lambda a: np.ascontiguousarray(a.transpose(2, 0, 1)).transpose(1, 2, 0),
+        lambda a: np.repeat(np.repeat(a, 2, axis=0), 2, axis=1)[::2, ::2],
+        lambda a: a.astype(np.float64),
+        lambda a: a.astype(">f4"),
+    ],
+)
+def test_float_picture_comes_back_exactly_from_any_layout(layout: Callable, tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    write_exr(path, layout(PICTURE), half=False)
+    rgb, metadata = read_exr(path)
+    assert rgb.dtype == np.float32 and np.array_equal(rgb, PICTURE) and metadata == {}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_half_rounds_and_clips(tmp_path: Path) -> None:
+    write_exr(tmp_path / "h.exr", PICTURE * 1e4, half=True)
+    rgb, _ = read_exr(tmp_path / "h.exr")
+    assert np.array_equal(rgb, np.minimum(PICTURE * 1e4, 65504).astype(np.float16).astype(np.float32))
+
+
+def test_integers_are_taken(tmp_path: Path) -> None:
+    write_exr(tmp_path / "i.exr", np.arange(12, dtype=np.int32).reshape(2, 2, 3))
+    assert np.array_equal(read_exr(tmp_path / "i.exr")[0].ravel(), np.arange(12))
+
+
+def test_channels_are_named_and_metadata_is_one_json_text(tmp_path: Path) -> None:
+    metadata = {"camera": {"efl_mm": 50.1, "name": "Doppel-Gauß"}, "focus_m": None, "list": [1, 2]}
+    kept = {"camera": dict(metadata["camera"]), "focus_m": None, "list": [1, 2]}  # type: ignore[call-overload]
+    for half in (False, True):
+        path = tmp_path / f"{half}.exr"
+        write_exr(path, PICTURE, half=half, metadata=metadata)
+        assert metadata == kept and read_exr(path)[1] == kept
+        file = OpenEXR.File(str(path), separate_channels=True)
+        assert sorted(file.channels()) == ["B", "G", "R"]
+        assert file.channels()["R"].pixels.dtype == (np.float16 if half else np.float32)
+        assert isinstance(file.header()["neurolens"], str)
+
+
+@pytest.mark.parametrize(
+    ("rgb", "metadata", "field"),
+    [
+        (np.zeros((4, 4)), {}, "shape"),
+        (np.zeros((0, 4, 3)), {}, "shape"),
+        (np.full((2, 2, 3), np.nan), {}, "not finite"),
+        (np.full((2, 2, 3), 1e300), {}, "not finite"),
+        (np.zeros((2, 2, 3), complex), {}, "type"),
+        (PICTURE, {"a": {1, 2}}, "metadata"),
+        (PICTURE, {"a": float("nan")}, "metadata"),
+    ],
+)
+def test_bad_pictures_are_refused_and_leave_the_old_file(
+    rgb: np.ndarray, metadata: dict, field: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.exr"
+    write_exr(path, PICTURE)
+    with pytest.raises(InputError, match=field):
+        write_exr(path, rgb, metadata=metadata)
+    assert np.array_equal(read_exr(path)[0], PICTURE) and list(tmp_path.iterdir()) == [path]
+
+
+def test_bad_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="missing"):
+        read_exr(tmp_path / "none.exr")
+    with pytest.raises(InputError, match="folder"):
+        write_exr(tmp_path / "no" / "a.exr", PICTURE)
+    path = tmp_path / "a.exr"
+    write_exr(path, np.random.default_rng(1).random((64, 64, 3)))
+    whole = path.read_bytes()
+    for content in (b"", b"not a picture", whole[: len(whole) // 2]):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"a\.exr"):
+            read_exr(path)
+
+
+def test_preview_is_srgb_at_the_asked_exposure(tmp_path: Path) -> None:
+    path = tmp_path / "p.png"
+    write_png(path, np.full((2, 3, 3), 0.5), exposure=-1.0)
+    # 0.25 linear is 137 in 8-bit sRGB; above 1 clips.
+    assert np.all(np.asarray(Image.open(path)) == 137)
+    write_png(path, np.full((2, 3, 3), 7.0))
+    assert np.all(np.asarray(Image.open(path)) == 255)
+    with pytest.raises(InputError, match="shape"):
+        write_png(path, np.zeros((2, 3)))
