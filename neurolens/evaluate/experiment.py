@@ -1,0 +1,162 @@
+"""An experiment: one TOML file, one run. Strict dataclasses; see `neurolens.config` for what is read and refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from neurolens.config import from_dict, read_config
+from neurolens.errors import InputError
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.fit import ModelSettings
+from neurolens.surrogates.pairs import PairSettings
+
+# Near limit where none is stated: 14 focal lengths, 0.7 m for a 50 mm lens.
+NEAR_LIMIT_FOCAL_LENGTHS = 14
+
+
+@dataclass(frozen=True)
+class LensChoice:
+    """Which lens, in which state: rescaled to a focal length, a zoom state of its file, a stop other than its own."""
+
+    file: Path
+    efl_mm: float | None = None
+    configuration: str | None = None
+    f_number: float | None = None
+
+    def read(self) -> Lens:
+        """The lens at infinity focus."""
+        return read_lens(self.file).at(
+            efl_mm=self.efl_mm, configuration=self.configuration, f_number=self.f_number, focus_m=None
+        )
+
+
+@dataclass(frozen=True)
+class DomainChoice:
+    """What the models must know.
+
+    Attributes:
+        film_radius_mm: None takes the lit film.
+        focus_m: two object distances from the film; every film position between theirs is in the domain.
+            None takes infinity and 14 focal lengths.
+        wavelength_nm: shortest and longest.
+    """
+
+    film_radius_mm: float | None = None
+    focus_m: tuple[float, float] | None = None
+    wavelength_nm: tuple[float, float] = (400.0, 700.0)
+
+
+@dataclass(frozen=True)
+class EvaluationChoice:
+    """Rays for false passes and blocks; rounds and threads of the race for speed; whether to compile the exact tracer."""
+
+    vignetting_rays: int = 200_000
+    rounds: int = 15
+    threads: int = 1
+    compile_exact: bool = True
+
+
+@dataclass(frozen=True)
+class RenderChoice:
+    """Scenes to render through every camera.
+
+    Attributes:
+        scenes: scene files.
+        models: names of the models that render; empty: the best polynomial and the best network.
+        width, height, samples: of each picture; the height follows the film's shape where it is left out.
+        seeds: renders of each camera, so that errors have a noise floor; at least 4.
+        threads: workers.
+    """
+
+    scenes: tuple[Path, ...] = ()
+    models: tuple[str, ...] = ()
+    width: int = 320
+    height: int = 180
+    samples: int = 16
+    seeds: int = 4
+    threads: int = 2
+
+    def __post_init__(self) -> None:
+        if self.seeds < 4:
+            raise InputError("settings", "seeds", self.seeds, "at least 4 renders, for the noise floor")
+
+
+@dataclass(frozen=True)
+class SceneDomainChoice:
+    """A scene whose camera settings alone are modelled, to show what that gains; the settings of the model to refit."""
+
+    scene: Path
+    model: ModelSettings = field(default_factory=ModelSettings)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One run, resolved: lens, domain, ray pairs, models, what is measured and rendered."""
+
+    title: str
+    lens: LensChoice
+    model: tuple[ModelSettings, ...]
+    domain: DomainChoice = field(default_factory=DomainChoice)
+    pairs: PairSettings = field(default_factory=PairSettings)
+    evaluation: EvaluationChoice = field(default_factory=EvaluationChoice)
+    render: RenderChoice = field(default_factory=RenderChoice)
+    scene_domain: SceneDomainChoice | None = None
+    save_pairs: bool = False
+
+    def __post_init__(self) -> None:
+        labels = [m.label for m in self.model]
+        twice = sorted({n for n in labels if labels.count(n) > 1})
+        if not labels or twice:
+            raise InputError("settings", "model", labels, "at least one [[model]], and names that differ")
+        unknown = [n for n in self.render.models if n not in labels]
+        if unknown:
+            raise InputError("settings", "render.models", unknown, f"names of models: {', '.join(labels)}")
+
+    def domain_of(self, lens: Lens) -> Domain:
+        """The domain of the lens as this experiment asks for it."""
+        focus = self.domain.focus_m
+        if focus is None:
+            focus = (math.inf, NEAR_LIMIT_FOCAL_LENGTHS * abs(first_order(lens).efl_mm) / 1000)
+        return domain_of(
+            lens,
+            film_radius_mm=self.domain.film_radius_mm,
+            focus_m=focus,
+            wavelength_nm=self.domain.wavelength_nm,
+        )
+
+
+def read_experiment(path: str | Path, overrides: Sequence[str] = ()) -> Experiment:
+    """Read an experiment; files that it names lie relative to it.
+
+    Raises:
+        InputError: names file, key, value and what was expected.
+    """
+    experiment = read_config(Experiment, path, overrides)
+    folder = Path(path).parent
+    lens = replace(experiment.lens, file=folder / experiment.lens.file)
+    scenes = tuple(folder / s for s in experiment.render.scenes)
+    gain = experiment.scene_domain
+    return replace(
+        experiment,
+        lens=lens,
+        render=replace(experiment.render, scenes=scenes),
+        scene_domain=None if gain is None else replace(gain, scene=folder / gain.scene),
+    )
+
+
+def default_experiment(lens_file: str | Path, overrides: Sequence[str] = ()) -> Experiment:
+    """What `neurolens train --lens FILE` runs: a good polynomial and a network, no renders."""
+    from neurolens.config import apply_overrides
+
+    tables = {
+        "title": f"Models of {Path(lens_file).stem}",
+        "lens": {"file": str(lens_file)},
+        "model": [{"method": "ols", "terms": 60}, {"method": "mlp", "units": 16, "layers": 2}],
+    }
+    return from_dict(Experiment, apply_overrides(tables, overrides), "--set")

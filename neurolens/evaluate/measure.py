@@ -1,0 +1,131 @@
+"""Fits, exports and measures the models of an experiment; a model already in the run folder is not fitted again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neurolens import __version__
+from neurolens.cameras.model import OnnxLens, load_model
+from neurolens.evaluate.rays import ray_errors
+from neurolens.evaluate.vignetting import vignetting_errors
+from neurolens.files import atomic_write_text
+from neurolens.optics.prescription import Lens
+from neurolens.optics.surfaces import Rays
+from neurolens.progress import Report
+from neurolens.surrogates.domain import Domain, FilmRays
+from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model
+from neurolens.surrogates.model import Prediction
+from neurolens.surrogates.pairs import PairSet
+
+# Keys of the ray and vignetting errors that a model's card promises and its record shows.
+_RAY_KEYS = (
+    "rms_um p99_um max_um rms_infinity_um rms_px direction_rms_deg position_rms_um transmittance_rms transmittance_max"
+).split()
+_VIGNETTING_KEYS = ("false_pass", "false_block", "false_pass_near_rim", "false_block_near_rim")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One model: its settings, the exported file, its record for `results.json`."""
+
+    settings: ModelSettings
+    file: Path
+    record: dict[str, Any]
+
+
+def onnx_predictor(model: OnnxLens, batch: int = 16384) -> Any:
+    """An exported model as the functions of `rays` and `vignetting` want it: film rays and a stop radius in, `Prediction` out."""
+
+    def predict(rays: FilmRays, stop_radius_mm: float | None = None) -> Prediction:
+        columns = [np.ascontiguousarray(c.numpy(), dtype=np.float32) for c in rays.columns()]
+        parts = []
+        for i in range(0, len(rays), batch):
+            fx, fy, fz, px, py, wavelength = (c[i : i + batch] for c in columns)
+            parts.append(model.rays(np.stack([fx, fy]), np.stack([px, py]), wavelength, fz, stop_radius_mm))
+        scene, stop = (np.concatenate([getattr(p, k) for p in parts], 1) for k in ("scene_ray", "stop_xy_mm"))
+        power, status = (np.concatenate([getattr(p, k) for p in parts]) for k in ("transmittance", "status"))
+        ray = Rays(*(torch.from_numpy(np.ascontiguousarray(c)) for c in scene))
+        stop_x, stop_y = (torch.from_numpy(np.ascontiguousarray(c)) for c in stop)
+        return Prediction(ray, torch.from_numpy(power), stop_x, stop_y, torch.from_numpy(status))
+
+    return predict
+
+
+def measure_errors(
+    model: OnnxLens, lens: Lens, domain: Domain, held_out: PairSet, vignetting_rays: int
+) -> dict[str, float | None]:
+    """Errors of an exported model on held-out rays, NaN written as None; keys with units."""
+    predict = onnx_predictor(model)
+    rays = ray_errors(lens, domain, held_out, predict)
+    vignetting = vignetting_errors(lens, domain, predict, count=vignetting_rays)
+    found = {k: rays[k] for k in _RAY_KEYS} | {k: vignetting[k] for k in _VIGNETTING_KEYS}
+    return {k: None if v is None or not math.isfinite(v) else v for k, v in found.items()}
+
+
+def fit_and_measure(
+    prepared: Prepared, settings: ModelSettings, folder: Path, vignetting_rays: int, report: Report
+) -> Measured:
+    """Fit, export and measure one model, or take what the folder holds if it was made by the same settings and version.
+
+    The errors are those of the exported float32 graph, in onnxruntime: what ships is what is measured.
+    """
+    file, note = folder / f"{settings.label}.onnx", folder / f"{settings.label}.json"
+    fingerprint = _fingerprint(prepared, settings, vignetting_rays)
+    known = _known_record(note, file, fingerprint)
+    if known is not None:
+        return Measured(settings, file, known)
+    pairs = prepared.pairs
+    model = fit_model(prepared, settings, report)
+    export_onnx(model, file, errors={})
+    errors = measure_errors(load_model(file), pairs.lens, pairs.domain, pairs.held_out, vignetting_rays)
+    export_onnx(model, file, errors=errors)
+    start = time.perf_counter()
+    load_model(file)
+    load_s = time.perf_counter() - start
+    network = settings.method == "mlp"
+    record: dict[str, Any] = {
+        "name": settings.label,
+        "family": settings.family,
+        "variables": settings.basis,
+        "file": f"models/{file.name}",
+        **{("rms_inf_um" if k == "rms_infinity_um" else k): v for k, v in errors.items()},
+        "coefficients_per_vector": None if network else model.core.coefficients_per_vector,
+        "parameters": model.core.coefficients,
+        "bytes": file.stat().st_size,
+        "fit_s": model.fit_s,
+        "load_s": load_s,
+    }
+    atomic_write_text(note, json.dumps({"fingerprint": fingerprint, "record": record}, indent=1))
+    return Measured(settings, file, record)
+
+
+def _fingerprint(prepared: Prepared, settings: ModelSettings, vignetting_rays: int) -> str:
+    pairs = prepared.pairs
+    asked = [
+        __version__,
+        pairs.lens.sha256,
+        pairs.domain.to_dict(),
+        asdict(pairs.settings),
+        asdict(settings),
+        vignetting_rays,
+    ]
+    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+
+
+def _known_record(note: Path, file: Path, fingerprint: str) -> dict[str, Any] | None:
+    """The record of an earlier, finished fit of the very same settings."""
+    try:
+        data = json.loads(note.read_text(encoding="utf-8"))
+        return data["record"] if data["fingerprint"] == fingerprint and file.exists() else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

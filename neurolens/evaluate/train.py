@@ -1,0 +1,268 @@
+"""One experiment from lens file to report: the whole line of the project, stage by stage, in one run folder."""
+
+from __future__ import annotations
+
+import platform
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from neurolens.cameras.model import load_model
+from neurolens.config import to_dict, to_toml
+from neurolens.evaluate.experiment import Experiment
+from neurolens.evaluate.layout import layout_profile
+from neurolens.evaluate.measure import Measured, fit_and_measure
+from neurolens.evaluate.pictures import Pictures, render_all
+from neurolens.evaluate.plots import error_against_coefficients_plot, lens_layout, pareto_plot
+from neurolens.evaluate.rays import pixel_um, pupil_disc_share
+from neurolens.evaluate.records import break_even_rays, write_results
+from neurolens.evaluate.report import write_report
+from neurolens.evaluate.speed import Race, exact_candidates, model_candidate, race
+from neurolens.files import atomic_write_text
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.progress import Progress
+from neurolens.render.scenefile import load_scene
+from neurolens.surrogates.domain import Domain, domain_from_camera
+from neurolens.surrogates.fit import Prepared, prepare
+from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs
+
+_PACKAGES = ("neurolens", "torch", "numpy", "onnxruntime", "onnx", "OpenEXR")
+
+
+def run_experiment(
+    experiment: Experiment, out: str | Path, *, progress: Progress | None = None, command: str = ""
+) -> dict[str, Any]:
+    """Run an experiment and leave everything in one folder.
+
+    Writes config.toml (resolved), models/*.onnx, pictures/, results.json and report.html. A run that was interrupted
+    goes on where it stopped when it is started again: models that are there are not fitted again.
+
+    Returns:
+        The results, as in results.json (`records.Results`).
+
+    Raises:
+        InputError: whatever is wrong with the lens, the domain, the fits or the scenes.
+    """
+    folder, started, clock = Path(out), datetime.now(UTC), time.perf_counter()
+    progress = progress or Progress(quiet=True)
+    models, pictures = folder / "models", folder / "pictures"
+    for each in (models, pictures):
+        each.mkdir(parents=True, exist_ok=True)
+    atomic_write_text(folder / "config.toml", to_toml(experiment))
+    progress.plan(_plan(experiment))
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        lens = experiment.lens.read()
+        domain = experiment.domain_of(lens)
+        with progress.stage("trace ray pairs") as report:
+            pairs = make_pairs(lens, domain, experiment.pairs, report)
+            if experiment.save_pairs:
+                save_pairs(pairs, folder / "pairs.npz")
+            prepared = prepare(pairs)
+        measured = []
+        for settings in experiment.model:
+            with progress.stage(f"fit {settings.label}") as report:
+                measured.append(
+                    fit_and_measure(prepared, settings, models, experiment.evaluation.vignetting_rays, report)
+                )
+        timed = _race(experiment, prepared, measured, progress)
+        gain = _scene_gain(experiment, measured, folder, progress)
+        drawn = _render(experiment, lens, domain, measured, pictures, progress)
+    results = {
+        "title": experiment.title,
+        "command": command,
+        "lens": _describe_lens(lens),
+        "domain": _describe_domain(lens, pairs),
+        "settings": to_dict(experiment),
+        "models": [m.record for m in measured],
+        "exact": [timed.record(name) for name in ("exact eager", "exact compiled") if _ran(timed, name)],
+        "cameras": drawn.cameras,
+        "images": drawn.images,
+        "domain_gain": gain,
+        "figures": _draw(lens, domain, measured, timed, pictures) + drawn.figures,
+        "versions": versions(),
+        "seed": experiment.pairs.seed,
+        "started": started.isoformat(timespec="seconds"),
+        "wall_s": time.perf_counter() - clock,
+        "warnings": sorted({str(w.message) for w in heard if issubclass(w.category, UserWarning)}),
+    }
+    write_results(folder / "results.json", results)
+    write_report(folder, results)
+    return results
+
+
+def _plan(experiment: Experiment) -> dict[str, float]:
+    """Seconds that each stage may take on two cores, for the time left."""
+    plan: dict[str, float] = {"trace ray pairs": 3}
+    for m in experiment.model:
+        plan[f"fit {m.label}"] = m.seconds if m.method == "mlp" else 3
+    plan["race for speed"] = 45 if experiment.evaluation.compile_exact else 10
+    if experiment.scene_domain is not None:
+        plan["fit the scene's domain"] = 5
+    if experiment.render.scenes:
+        plan["render"] = 40
+    return plan
+
+
+def _race(experiment: Experiment, prepared: Prepared, measured: Sequence[Measured], progress: Progress) -> Race:
+    """Time the exact tracers and all models in one run, and add times, speed-ups and break-even to the records."""
+    chosen, lens, domain = experiment.evaluation, prepared.pairs.lens, prepared.pairs.domain
+    candidates = exact_candidates(lens, domain, compiled=chosen.compile_exact)
+    for m in measured:
+        model = load_model(m.file, threads=chosen.threads)
+        candidates.append(model_candidate(m.settings.label, model, domain.stop_radius_mm))
+    with progress.stage("race for speed"):
+        timed = race(candidates, domain, threads=chosen.threads, rounds=chosen.rounds)
+    compiled = timed.timing("exact compiled")
+    for m in measured:
+        timing, speedup = timed.timing(m.settings.label), timed.speedup(m.settings.label, "exact compiled")
+        m.record["ns_per_ray"] = timing
+        m.record["speedup_over_compiled"] = speedup["min"] if speedup else None
+        if compiled and timing:
+            m.record["break_even_rays"] = break_even_rays(
+                m.record["fit_s"], m.record["load_s"], compiled["min"], timing["min"]
+            )
+    return timed
+
+
+def _ran(timed: Race, name: str) -> bool:
+    return name in timed.ns or name in timed.unavailable
+
+
+def _render(
+    experiment: Experiment, lens: Lens, domain: Domain, measured: Sequence[Measured], folder: Path, progress: Progress
+) -> Pictures:
+    if not experiment.render.scenes:
+        return Pictures()
+    names = experiment.render.models or best_models(measured)
+    files = {m.settings.label: m.file for m in measured if m.settings.label in names}
+    with progress.stage("render") as report:
+        return render_all(experiment.render, lens, domain, files, folder, report)
+
+
+def best_models(measured: Sequence[Measured]) -> tuple[str, ...]:
+    """Names of the polynomial and of the network with the smallest error."""
+    names = []
+    for networks in (False, True):
+        rows = [m for m in measured if (m.settings.method == "mlp") == networks and m.settings.family != "paraxial"]
+        if rows:
+            names.append(min(rows, key=_error).settings.label)
+    return tuple(names)
+
+
+def _error(m: Measured) -> float:
+    """Film-equivalent error, or the angle where no ray is within 60 degrees."""
+    value = m.record.get("rms_um")
+    return float(value if value is not None else m.record.get("direction_rms_deg") or 1e9)
+
+
+def _scene_gain(
+    experiment: Experiment, measured: Sequence[Measured], folder: Path, progress: Progress
+) -> dict[str, Any] | None:
+    """The same model for the whole lens and for what one shot requires: error, size and time side by side."""
+    choice = experiment.scene_domain
+    if choice is None:
+        return None
+    scene = load_scene(choice.scene)
+    shot = scene.settings.camera
+    lens = experiment.lens.read()
+    whole_number = first_order(lens).f_number
+    with progress.stage("fit the scene's domain") as report:
+        shot_lens, shot_domain = domain_from_camera(
+            lens,
+            film_mm=(shot.film_width_mm, shot.film_height_mm),
+            focus_m=shot.focus_m,
+            f_number=max(shot.f_number or whole_number, whole_number),
+            wavelength_nm=shot.wavelengths_nm,
+        )
+        rows = []
+        models = folder / "models" / f"scene-{scene.name}"
+        models.mkdir(parents=True, exist_ok=True)
+        for name, state, domain in (("whole lens", lens, experiment.domain_of(lens)), (scene.name, shot_lens, shot_domain)):
+            prepared = prepare(make_pairs(state, domain, experiment.pairs))
+            place = models / name.replace(" ", "-")
+            place.mkdir(exist_ok=True)
+            m = fit_and_measure(prepared, choice.model, place, experiment.evaluation.vignetting_rays, report)
+            rows.append({**m.record, "domain": name, **_domain_facts(state, domain)})
+    return {"scene": scene.name, "text": _gain_text(rows), "rows": rows}
+
+
+def _gain_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    whole, scene = (row["rms_um"] for row in rows)
+    if not whole or not scene:
+        return ""
+    return f"The same {rows[0]['name']} fit has {whole:.3g} um RMS for the whole lens and {scene:.3g} um for this shot."
+
+
+def _draw(
+    lens: Lens, domain: Domain, measured: Sequence[Measured], timed: Race, folder: Path
+) -> list[dict[str, Any]]:
+    """Trade and layout plots."""
+    records = [m.record for m in measured]
+    exact = [timed.record(n) for n in ("exact eager", "exact compiled") if n in timed.ns]
+    error = "rms_um" if any(r.get("rms_um") for r in records) else "direction_rms_deg"
+    pareto_plot(records, folder / "pareto.png", exact=exact, error=error, title=f"{lens.name}: error against time")
+    error_against_coefficients_plot(records, folder / "coefficients.png", error, title=f"{lens.name}: error against size")
+    lens_layout(layout_profile(lens, domain), folder / "layout.png")
+    texts = (
+        ("pareto", "Error against speed", "Held-out rays, full aperture; the Pareto front is what is worth choosing from."),
+        ("coefficients", "Error against coefficients", "Coefficients per vector output, A and B terms both counted."),
+        ("layout", "The lens", "Rays of three fields, traced exactly."),
+    )
+    return [{"file": f"{folder.name}/{stem}.png", "title": t, "caption": c} for stem, t, c in texts]
+
+
+def _describe_lens(lens: Lens) -> dict[str, Any]:
+    data = first_order(lens)
+    return {
+        "name": lens.name,
+        "source": lens.source,
+        "file": Path(lens.path).name,
+        "sha256": lens.sha256,
+        "refractions": sum(1 for s in lens.surfaces if not s.stop),
+        "efl_mm": data.efl_mm,
+        "f_number": data.f_number,
+        "half_field_deg": lens.half_field_deg,
+        "image_radius_mm": lens.image_radius_mm,
+        "dispersive": lens.dispersive,
+    }
+
+
+def _domain_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
+    return {
+        "film_radius_mm": domain.film_radius_mm,
+        "f_number": first_order(lens).f_number,
+        "wavelength_nm": list(domain.wavelength_nm),
+        "focus_m": ["infinity" if f == float("inf") else f for f in domain.focus_m],
+    }
+
+
+def _describe_domain(lens: Lens, pairs: RayPairs) -> dict[str, Any]:
+    domain = pairs.domain
+    return {
+        **_domain_facts(lens, domain),
+        "pupil_plane_z_mm": domain.pupil_z_mm,
+        "pupil_radius_mm": domain.pupil_radius_mm,
+        "pupil_disc_holds": pupil_disc_share(lens, domain),
+        "passing_share": len(pairs.train) / pairs.tested,
+        "rays_train": len(pairs.train),
+        "rays_held_out": len(pairs.held_out),
+        "rays_rim": len(pairs.rim),
+        "pixel_um": pixel_um(domain),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on."""
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found

@@ -1,0 +1,107 @@
+"""The whole line on a small experiment: lens file to report, and on again after an interruption."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from neurolens.errors import InputError
+from neurolens.evaluate.experiment import default_experiment, read_experiment
+from neurolens.evaluate.train import run_experiment
+from neurolens.progress import Progress
+
+ROOT = Path(__file__).parents[2]
+SMALL = f"""
+title = "small"
+[lens]
+file = "{ROOT}/lenses/brendel_tessar_100.toml"
+efl_mm = 50
+[pairs]
+train = 3000
+held_out = 2000
+rim = 3000
+[[model]]
+method = "thick"
+[[model]]
+method = "ols"
+terms = 24
+[[model]]
+method = "mlp"
+units = 8
+seconds = 2
+[evaluation]
+vignetting_rays = 20000
+rounds = 1
+compile_exact = false
+[render]
+scenes = ["{ROOT}/experiments/scenes/grid.toml"]
+width = 32
+height = 18
+samples = 4
+[scene_domain]
+scene = "{ROOT}/experiments/scenes/grid.toml"
+model = {{ method = "ols", terms = 24 }}
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    folder = tmp_path_factory.mktemp("run")
+    (folder / "small.toml").write_text(SMALL)
+    experiment = read_experiment(folder / "small.toml")
+    return folder, run_experiment(experiment, folder / "out", progress=Progress(quiet=True))
+
+
+def test_leaves_everything_in_one_folder(run: tuple[Path, dict]) -> None:
+    out = run[0] / "out"
+    written = json.loads((out / "results.json").read_text())
+    assert (out / "report.html").read_text().startswith("<!")
+    for record in written["models"]:
+        assert (out / record["file"]).stat().st_size == record["bytes"]
+    for record in [*written["images"], *written["figures"]]:
+        picture = out / (record.get("file_png") or record["file"])
+        assert picture.stat().st_size > 1000, picture
+    assert (out / "config.toml").exists()
+
+
+def test_errors_are_in_the_order_that_physics_gives(run: tuple[Path, dict]) -> None:
+    thick, fitted, network = run[1]["models"]
+    assert thick["rms_um"] > 20 * fitted["rms_um"] > 0
+    assert network["rms_um"] < thick["rms_um"] / 5
+    assert fitted["false_pass"] < 0.005 and fitted["false_block"] < 0.005
+
+
+def test_less_to_model_is_modelled_better(run: tuple[Path, dict]) -> None:
+    whole, shot = run[1]["domain_gain"]["rows"]
+    assert shot["film_radius_mm"] < whole["film_radius_mm"]
+    assert shot["rms_um"] < whole["rms_um"]
+
+
+def test_resolved_configuration_runs_again_without_fitting(run: tuple[Path, dict]) -> None:
+    out = run[0] / "out"
+    before = {f: f.stat().st_mtime_ns for f in (out / "models").glob("*.onnx")}
+    again = run_experiment(read_experiment(out / "config.toml"), out)
+    assert {f: f.stat().st_mtime_ns for f in (out / "models").glob("*.onnx")} == before
+    assert [m["rms_um"] for m in again["models"]] == [m["rms_um"] for m in run[1]["models"]]
+
+
+@pytest.mark.parametrize(
+    ("override", "field"),
+    [
+        ("render.seeds=2", "seeds"),
+        ("model=[]", "model"),
+        ("lens.efl_mm=-3", "efl_mm"),
+        ("domain.wavelength_nm=[700, 400]", "wavelength_nm"),
+        ("nonsense=1", "nonsense"),
+    ],
+)
+def test_bad_settings_name_the_field(tmp_path: Path, override: str, field: str) -> None:
+    (tmp_path / "small.toml").write_text(SMALL)
+    with pytest.raises(InputError, match=field):
+        run_experiment(read_experiment(tmp_path / "small.toml", [override]), tmp_path / "out")
+
+
+def test_a_lens_file_alone_makes_an_experiment() -> None:
+    experiment = default_experiment(ROOT / "lenses/brendel_tessar_100.toml", ["pairs.train=5000"])
+    assert [m.label for m in experiment.model] == ["ols-60", "mlp-16x2"]
+    assert experiment.pairs.train == 5000
