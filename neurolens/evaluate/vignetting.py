@@ -1,0 +1,190 @@
+"""Vignetting of a surrogate against the exact lens: rays passed or blocked in error, and relative illumination.
+
+False pass: rays that the model passes and the exact lens blocks, over the rays that the model passes. False block: rays
+that the model blocks and the exact lens passes, over the rays that the exact lens passes. Rays are uniform over the lit
+film and over the domain's pupil disc, which is that of all passing rays enlarged by 5%.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from neurolens import status as st
+from neurolens.errors import InputError
+from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import camera_rays
+from neurolens.optics.trace import trace
+from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
+from neurolens.surrogates.pairs import PairSet, trace_pairs
+
+NEAR_RIM = 0.02  # relative distance to a rim's radius that counts as near
+ZONES = {"centre": (0.0, 1 / 3), "mid": (1 / 3, 2 / 3), "edge": (2 / 3, 1.0)}  # shares of the film radius
+_BATCH = 65536
+
+
+class Gated(Protocol):
+    """What `predict` gives for N rays: status [N], 0 where the ray passes."""
+
+    @property
+    def status(self) -> Tensor: ...
+
+
+class Lit(Gated, Protocol):
+    """The same with transmittance [N]."""
+
+    @property
+    def transmittance(self) -> Tensor: ...
+
+
+def vignetting_errors(
+    lens: Lens,
+    domain: Domain,
+    predict: Callable[[FilmRays, float | None], Gated],
+    *,
+    stop_radius_mm: float | None = None,
+    count: int = 300_000,
+    seed: int = 11,
+) -> dict[str, Any]:
+    """False passes and false blocks at one stop.
+
+    Args:
+        lens: the exact lens in the model's state.
+        domain: of the model.
+        predict: takes rays and the stop radius in mm.
+        stop_radius_mm: None takes the domain's, full aperture; a smaller one tests the same fit stopped down.
+        count, seed: rays, scrambled Sobol points.
+
+    Returns: false_pass, false_block (shares of 1; None where no ray counts), false_pass_near_rim, false_block_near_rim
+        (rays whose nearest deciding rim, the stop included, they cross within 2% of its radius), stop_radius_mm, rays,
+        passing_share (of the exact lens over the disc), zones: the first two by third of the film radius.
+
+    Raises:
+        InputError: a stop wider than the domain's, or not positive.
+    """
+    radius = domain.stop_radius_mm if stop_radius_mm is None else stop_radius_mm
+    if not 0 < radius <= domain.stop_radius_mm:
+        raise InputError(
+            "vignetting_errors", "stop_radius_mm", radius, f"above 0, up to {domain.stop_radius_mm:.6g} mm"
+        )
+    stopped = lens.with_stop_radius(radius)
+    passes, model, near, place = [], [], [], []
+    for start in range(0, count, _BATCH):
+        rays = sample_domain(domain, min(_BATCH, count - start), seed, start)
+        exact = trace_pairs(stopped, rays, domain.pupil_z_mm)
+        passes.append(exact.status == st.PASSED)
+        model.append(predict(rays, radius).status == st.PASSED)
+        near.append((deciding_rim_ratio(stopped, exact) - 1).abs() <= NEAR_RIM)
+        place.append(torch.hypot(rays.film_x, rays.film_y) / domain.film_radius_mm)
+    right, said, close, where = (torch.cat(v) for v in (passes, model, near, place))
+    near_rim = false_shares(right[close], said[close])
+    zones = {}
+    for name, (low, high) in ZONES.items():
+        part = (where >= low) & ((where < high) | (high == 1.0))
+        zones[name] = false_shares(right[part], said[part])
+    return {
+        **false_shares(right, said),
+        **{f"{key}_near_rim": value for key, value in near_rim.items()},
+        "stop_radius_mm": radius,
+        "rays": count,
+        "passing_share": float(right.double().mean()),
+        "zones": zones,
+    }
+
+
+def stopped_down(
+    lens: Lens,
+    domain: Domain,
+    predict: Callable[[FilmRays, float | None], Gated],
+    *,
+    stops: tuple[int, ...] = (0, 2, 4),
+    count: int = 300_000,
+) -> dict[str, dict[str, Any]]:
+    """`vignetting_errors` at full aperture and closed by whole stops, with the same fit; keys "full", "2_stops", ..."""
+    results = {}
+    for closed in stops:
+        radius = domain.stop_radius_mm / math.sqrt(2) ** closed
+        name = "full" if closed == 0 else f"{closed}_stops"
+        results[name] = vignetting_errors(lens, domain, predict, stop_radius_mm=radius, count=count)
+    return results
+
+
+def false_shares(exact_passes: Tensor, model_passes: Tensor) -> dict[str, float | None]:
+    """false_pass and false_block of [N] booleans; None where the denominator is empty."""
+    wrong_pass, wrong_block = model_passes & ~exact_passes, exact_passes & ~model_passes
+    return {"false_pass": _share(wrong_pass, model_passes), "false_block": _share(wrong_block, exact_passes)}
+
+
+def _share(part: Tensor, whole: Tensor) -> float | None:
+    total = int(whole.sum())
+    return int(part.sum()) / total if total else None
+
+
+def deciding_rim_ratio(lens: Lens, pairs: PairSet) -> Tensor:
+    """[N] largest crossing radius over rim radius along each ray, stop included: at most 1 where every rim passes it.
+
+    Surfaces beyond one that the ray misses, or that reflects it totally, do not count.
+    """
+    radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
+    ratio = torch.hypot(pairs.cross_x, pairs.cross_y) / radii
+    on_the_way, largest = torch.ones(len(pairs), dtype=torch.bool), torch.zeros(len(pairs), dtype=torch.float64)
+    for k in range(len(lens.surfaces) - 1, -1, -1):  # camera rays meet the last surface first
+        on_the_way = on_the_way & (pairs.meets[k] > 0)
+        largest = torch.where(on_the_way, torch.maximum(largest, ratio[k]), largest)
+        on_the_way = on_the_way & (pairs.refracts[k] > 0)
+    return largest
+
+
+def relative_illumination(
+    lens: Lens,
+    domain: Domain,
+    predict: Callable[[FilmRays, float | None], Lit],
+    *,
+    film_z_mm: float | None = None,
+    stop_radius_mm: float | None = None,
+    points: int = 16384,
+    rows: int = 17,
+    seed: int = 13,
+) -> dict[str, Any]:
+    """Film irradiance of a uniform environment by film radius, of the exact lens and of the model.
+
+    The weight of a ray is T cos^4(theta) / Z^2 over the pupil disc, T the transmittance; wavelengths are uniform over
+    the domain. Both curves are divided by the exact lens's value on the axis, so that a model too dark all over shows.
+
+    Args:
+        film_z_mm: film plane; None takes the domain's nearest to the lens (its farthest focus).
+        stop_radius_mm: None takes the domain's.
+        points: rays a film radius, the same pupil points and wavelengths for all.
+
+    Returns: film_radius_mm, exact, model (lists of `rows`), max_difference (of the two, a share of the axis value).
+    """
+    plane = domain.film_z_mm[0] if film_z_mm is None else film_z_mm
+    radius = domain.stop_radius_mm if stop_radius_mm is None else stop_radius_mm
+    stopped = lens.with_stop_radius(radius)
+    sample = sample_domain(domain, points, seed)
+    film_z = torch.full_like(sample.film_z, plane)
+    radii = [domain.film_radius_mm * i / (rows - 1) for i in range(rows)]
+    sums: tuple[list[float], list[float]] = ([], [])
+    for r in radii:
+        rays = FilmRays(torch.full_like(film_z, r), torch.zeros_like(film_z), film_z, *sample.columns()[3:])
+        start = camera_rays(rays.film_x, rays.film_y, film_z, rays.pupil_x, rays.pupil_y, domain.pupil_z_mm)
+        with torch.no_grad():
+            traced = trace(stopped, start, rays.wavelength_nm, transmittance=True)
+        said = predict(rays, radius)
+        assert traced.transmittance is not None
+        both = ((traced.status, traced.transmittance), (said.status, said.transmittance))
+        for values, (status, transmittance) in zip(sums, both, strict=True):
+            power = torch.where(status == st.PASSED, transmittance.to(torch.float64), 0.0)
+            values.append(float((power * start.dz**4).sum()))  # one film plane and pupil plane: Z is the same for all
+    on_axis = sums[0][0]
+    if not on_axis > 0:
+        raise InputError(
+            lens.path, "domain", "(no ray passes on the axis)", "a lens that lights the middle of the film"
+        )
+    exact, model = ([v / on_axis for v in values] for values in sums)
+    difference = max(abs(a - b) for a, b in zip(exact, model, strict=True))
+    return {"film_radius_mm": radii, "exact": exact, "model": model, "max_difference": difference}

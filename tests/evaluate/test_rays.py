@@ -1,0 +1,240 @@
+"""Ray errors: small perturbations of exact rays whose film-equivalent error is known in closed form."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from neurolens.errors import InputError
+from neurolens.evaluate.film_equivalent import focused_vergence, local_jacobian, pupil_middle
+from neurolens.evaluate.rays import angles_deg, frame_width_mm, pupil_disc_share, ray_errors
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.pupils import PupilBounds, camera_rays, image_radius_mm
+from neurolens.optics.surfaces import Rays
+from neurolens.optics.trace import trace
+from neurolens.surrogates.domain import Domain, FilmRays, domain_of
+from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, trace_pairs
+
+LENSES = Path(__file__).parents[2] / "lenses"
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+
+
+def lens_and_domain(
+    name: str, efl_mm: float | None, focus_m: float, film_radius_mm: float | None = None
+) -> tuple[Lens, Domain]:
+    lens = read_lens(LENSES / f"{name}.toml").at(efl_mm=efl_mm, focus_m=focus_m)
+    return lens, domain_of(lens, focus_m=(focus_m, focus_m), film_radius_mm=film_radius_mm)
+
+
+def held_out(lens: Lens, domain: Domain, count: int = 2000) -> PairSet:
+    return make_pairs(lens, domain, PairSettings(train=1, held_out=count, rim=1)).held_out
+
+
+def says(rays: Rays, transmittance: torch.Tensor) -> SimpleNamespace:
+    return SimpleNamespace(rays=rays, transmittance=transmittance)
+
+
+@pytest.fixture(scope="module")
+def gauss() -> tuple[Lens, Domain, PairSet]:
+    lens, domain = lens_and_domain("laikin_double_gauss_50", None, 2.0)
+    return lens, domain, held_out(lens, domain)
+
+
+def turned(rays: Rays, angle: float) -> Rays:
+    """Directions turned by `angle` radians about y."""
+    c, s = math.cos(angle), math.sin(angle)
+    return rays._replace(dx=c * rays.dx + s * rays.dz, dz=c * rays.dz - s * rays.dx)
+
+
+def test_the_exact_lens_has_no_error(gauss: tuple[Lens, Domain, PairSet]) -> None:
+    lens, domain, rays = gauss
+    errors = ray_errors(lens, domain, rays, lambda _: says(rays.scene, rays.transmittance))
+    settings = ("pixel_um", "rays", "share_beyond_60_deg")
+    assert all(value == 0 for key, value in errors.items() if key not in settings)
+    assert errors["rays"] == len(rays)
+
+
+def test_a_direction_error_at_infinity_is_f_times_the_angle() -> None:
+    lens, domain = lens_and_domain("laikin_double_gauss_50", None, math.inf, film_radius_mm=0.01)
+    lens = lens.with_stop_radius(1.0)  # paraxial rays only
+    domain = domain_of(lens, film_radius_mm=0.01)
+    rays, epsilon = held_out(lens, domain), 1e-6
+    errors = ray_errors(lens, domain, rays, lambda _: says(turned(rays.scene, epsilon), rays.transmittance))
+    expected = 1000 * first_order(lens).efl_mm * epsilon
+    for key in ("rms_um", "rms_infinity_um", "p99_um", "max_um"):
+        assert errors[key] == pytest.approx(expected, rel=5e-3)  # the d line's f, over 400-700 nm
+    assert errors["direction_max_deg"] == pytest.approx(math.degrees(epsilon), rel=1e-6)
+
+
+def test_a_shift_at_a_finite_plane_is_magnification_times_the_shift() -> None:
+    lens, _ = lens_and_domain("laikin_double_gauss_50", None, 1.0)
+    lens = lens.with_stop_radius(1.0)
+    domain = domain_of(lens, focus_m=(1.0, 1.0), film_radius_mm=0.01)
+    rays, shift = held_out(lens, domain), 1e-3
+    errors = ray_errors(
+        lens, domain, rays, lambda _: says(rays.scene._replace(x=rays.scene.x + shift), rays.transmittance)
+    )
+    data = first_order(lens)
+    extension = domain.film_z_mm[0] - data.rear_focal_z_mm
+    magnification = extension / data.efl_mm  # Newton
+    assert errors["rms_um"] == pytest.approx(1000 * magnification * shift, rel=5e-3)
+    assert errors["rms_infinity_um"] == 0
+    assert errors["position_rms_um"] == pytest.approx(1000 * shift, rel=1e-3)  # directions are not quite along the axis
+
+
+@pytest.mark.parametrize(
+    "name, efl_mm, focus_m", [("laikin_double_gauss_50", None, 0.7), ("muller_fisheye_100", 14.0, 1.0)]
+)
+@pytest.mark.parametrize("radial, tangential", [(1e-3, 0.0), (0.0, 1e-3), (6e-4, -8e-4)])
+def test_a_ray_from_one_micrometre_beside_is_an_error_of_one_micrometre(
+    name: str, efl_mm: float | None, focus_m: float, radial: float, tangential: float
+) -> None:
+    """The definition itself, at every film radius and azimuth, for rays through the middle of the pupil."""
+    lens, domain = lens_and_domain(name, efl_mm, focus_m)
+    radius = torch.linspace(0.02, 0.9, 23, dtype=torch.float64) * domain.film_radius_mm
+    azimuth = torch.linspace(0, 6, 23, dtype=torch.float64)
+    cos, sin, middle = torch.cos(azimuth), torch.sin(azimuth), pupil_middle(domain, radius)
+    film_z = torch.full_like(radius, domain.film_z_mm[0])
+    place = (film_z, cos * middle, sin * middle, torch.full_like(radius, 550.0))
+    rays = trace_pairs(lens, FilmRays(radius * cos, radius * sin, *place), domain.pupil_z_mm)
+    rays = rays.select((rays.status == 0) & (rays.scene.dz < -0.6))
+    inputs = rays.inputs
+    cos, sin = (
+        inputs.film_x / torch.hypot(inputs.film_x, inputs.film_y),
+        inputs.film_y / torch.hypot(inputs.film_x, inputs.film_y),
+    )
+    beside = replace(
+        inputs,
+        film_x=inputs.film_x + cos * radial - sin * tangential,
+        film_y=inputs.film_y + sin * radial + cos * tangential,
+    )
+    moved = trace_pairs(lens, beside, domain.pupil_z_mm)
+    errors = ray_errors(lens, domain, rays, lambda _: says(moved.scene, moved.transmittance))
+    assert len(rays) > 10
+    for key in ("rms_um", "max_um", "rms_infinity_um", "max_infinity_um"):
+        assert errors[key] == pytest.approx(1.0, rel=1e-3)
+
+
+def test_the_jacobian_on_the_axis_is_paraxial() -> None:
+    for focus_m in (math.inf, 0.7):
+        lens, domain = lens_and_domain("laikin_double_gauss_50", None, focus_m)
+        zero = torch.zeros(1, dtype=torch.float64)
+        rays = FilmRays(zero, zero, zero + domain.film_z_mm[0], zero, zero, zero + 587.5618)
+        vergence = focused_vergence(lens, rays.film_z)
+        data = first_order(lens)
+        if math.isinf(focus_m):
+            expected = 1 / data.efl_mm
+        else:
+            expected = (
+                data.efl_mm / (domain.film_z_mm[0] - data.rear_focal_z_mm) * float(vergence)
+            )  # object size / distance
+        for value in local_jacobian(lens, domain, rays, vergence):
+            assert float(value) == pytest.approx(expected, rel=1e-5)
+
+
+def test_angles_have_no_floor_and_no_ceiling() -> None:
+    zero, one = torch.zeros(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+    ahead = Rays(zero, zero, zero, zero, zero, -one)
+    for angle in (0.0, 1e-9, 1e-4, 45.0, 120.0, 180.0):
+        assert float(angles_deg(ahead, turned(ahead, math.radians(angle)))) == pytest.approx(angle, rel=1e-9, abs=1e-14)
+
+
+def test_the_point_on_the_ray_does_not_matter(gauss: tuple[Lens, Domain, PairSet]) -> None:
+    lens, domain, rays = gauss
+    s = rays.scene
+    further = s._replace(x=s.x + 30 * s.dx, y=s.y + 30 * s.dy, z=s.z + 30 * s.dz)
+    errors = ray_errors(lens, domain, rays, lambda _: says(further, rays.transmittance))
+    assert errors["position_rms_um"] < 1e-9 and errors["max_um"] < 1e-8
+
+
+def test_transmittance_errors(gauss: tuple[Lens, Domain, PairSet]) -> None:
+    lens, domain, rays = gauss
+    errors = ray_errors(lens, domain, rays, lambda _: says(rays.scene, rays.transmittance - 0.01))
+    assert errors["transmittance_rms"] == pytest.approx(0.01)
+    assert errors["transmittance_max"] == pytest.approx(0.01)
+
+
+def test_pixels_and_the_common_scale(gauss: tuple[Lens, Domain, PairSet]) -> None:
+    lens, domain, rays = gauss
+    assert frame_width_mm(math.hypot(36, 24) / 2) == pytest.approx(36)
+
+    def slightly_off(_: FilmRays) -> SimpleNamespace:
+        return says(turned(rays.scene, 1e-5), rays.transmittance)
+
+    errors = ray_errors(lens, domain, rays, slightly_off)
+    assert errors["pixel_um"] == pytest.approx(9, rel=3e-3)
+    assert errors["rms_px"] == pytest.approx(errors["rms_um"] / errors["pixel_um"])
+    assert ray_errors(lens, domain, rays, slightly_off, pitch_um=2.0)["rms_px"] == pytest.approx(errors["rms_um"] / 2)
+    half = lens.scaled(0.5)
+    small = domain_of(half, focus_m=(1.0, 1.0))
+    few = held_out(half, small)
+    scaled = ray_errors(half, small, few, lambda _: says(turned(few.scene, 1e-5), few.transmittance))
+    assert scaled["rms_um_at_21_6"] == pytest.approx(2 * scaled["rms_um"])
+    assert scaled["rms_um_at_21_6"] == pytest.approx(errors["rms_um_at_21_6"], rel=0.01)
+
+
+def test_beyond_60_degrees_only_angles_count() -> None:
+    lens, domain = lens_and_domain("muller_fisheye_100", 14.0, math.inf)
+    rays = held_out(lens, domain)
+    wide = -rays.scene.dz < 0.5
+    bent = turned(rays.scene, 1e-3)
+    mixed = Rays(*(torch.where(wide, b, s) for b, s in zip(bent, rays.scene, strict=True)))
+    errors = ray_errors(lens, domain, rays, lambda _: says(mixed, rays.transmittance))
+    assert errors["max_um"] == 0
+    assert errors["direction_max_deg"] == pytest.approx(
+        math.degrees(1e-3), rel=1e-4
+    )  # of a ray nearly across the y axis
+    assert 0.1 < errors["share_beyond_60_deg"] == pytest.approx(float(wide.double().mean()))
+    far = rays.select(wide)
+    only_far = ray_errors(lens, domain, far, lambda _: says(far.scene, far.transmittance))
+    assert math.isnan(only_far["rms_um"]) and only_far["direction_rms_deg"] == 0
+
+
+def test_nonsense_is_not_averaged_away(gauss: tuple[Lens, Domain, PairSet]) -> None:
+    lens, domain, rays = gauss
+    first = torch.arange(len(rays)) == 0
+    s = rays.scene
+    backwards = s._replace(dz=torch.where(first, -s.dz, s.dz))
+    errors = ray_errors(lens, domain, rays, lambda _: says(backwards, rays.transmittance))
+    assert math.isinf(errors["max_um"]) and errors["direction_max_deg"] > 90
+    broken = s._replace(dx=torch.where(first, math.nan, s.dx))
+    errors = ray_errors(lens, domain, rays, lambda _: says(broken, rays.transmittance))
+    assert math.isnan(errors["rms_um"]) and math.isnan(errors["direction_rms_deg"])
+
+
+def test_blocked_or_no_rays_are_refused(gauss: tuple[Lens, Domain, PairSet]) -> None:
+    lens, domain, rays = gauss
+    blocked = replace(rays, status=torch.full_like(rays.status, 6))
+    for wrong in (blocked, rays.select(slice(0, 0))):
+        with pytest.raises(InputError, match="held_out"):
+            ray_errors(lens, domain, wrong, lambda _: says(rays.scene, rays.transmittance))
+
+
+def test_the_pupil_disc_of_a_hole() -> None:
+    """A hole of radius 10: a disc of half that radius holds a quarter of its rays."""
+    hole = Lens("hole", "test", (Surface(math.inf, 50.0, 20.0, stop=True),), 2.5)
+    bounds = PupilBounds(0.0, 15.0, (-10.0, -10.0), (10.0, 10.0), (10.0, 10.0), 10.0)
+    domain = Domain(15.0, (50.0, 50.0), (math.inf, math.inf), 0.0, 10.5, (500.0, 600.0), 10.0, bounds)
+    assert pupil_disc_share(hole, domain, 65536) == 1.0
+    assert pupil_disc_share(hole, replace(domain, pupil_radius_mm=5.0), 65536) == pytest.approx(0.25, rel=2e-3)
+
+
+@pytest.mark.parametrize("name, efl_mm", [("laikin_double_gauss_50", None), ("brendel_tessar_100", 50.0)])
+def test_the_domain_holds_the_passing_rays(name: str, efl_mm: float | None) -> None:
+    lens, domain = lens_and_domain(name, efl_mm, math.inf)
+    assert pupil_disc_share(lens, domain, 131072) >= 0.9999
+
+
+def test_the_middle_of_the_pupil_passes() -> None:
+    lens, domain = lens_and_domain("laikin_double_gauss_50", None, math.inf)
+    radius = torch.linspace(0, image_radius_mm(lens)[0], 50, dtype=torch.float64)
+    zero = torch.zeros_like(radius)
+    rays = camera_rays(radius, zero, domain.film_z_mm[0], pupil_middle(domain, radius), zero, domain.pupil_z_mm)
+    assert bool((trace(lens, rays).status == 0).all())

@@ -1,0 +1,124 @@
+"""The timing harness: what it reports, never how fast. Thresholds belong to `make bench`."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.thin import ThinLens
+from neurolens.errors import InputError
+from neurolens.evaluate.speed import (
+    Call,
+    Candidate,
+    Race,
+    Unavailable,
+    camera_candidate,
+    exact_candidates,
+    pinned_threads,
+    race,
+    time_per_ray,
+)
+from neurolens.optics.lensfile import read_lens
+from neurolens.surrogates.domain import Domain, FilmRays, domain_of
+
+LENSES = Path(__file__).parents[2] / "lenses"
+
+
+@pytest.fixture(scope="module")
+def domain() -> Domain:
+    return domain_of(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml").at(), film_radius_mm=10.0)
+
+
+def test_one_call(domain: Domain) -> None:
+    before = torch.get_num_threads()
+    seen = []
+    result = time_per_ray(lambda: seen.append(torch.get_num_threads()), rays=100, threads=1, repeats=3)
+    assert 0 < result["min"] <= result["median"]
+    assert (result["threads"], result["batch"], result["repeats"]) == (1, 100, 3)
+    assert set(seen) == {1}
+    assert torch.get_num_threads() == before
+
+
+def test_threads_come_back_after_an_error() -> None:
+    before = torch.get_num_threads()
+    with pytest.raises(RuntimeError), pinned_threads(before + 1):
+        assert torch.get_num_threads() == before + 1
+        raise RuntimeError
+    assert torch.get_num_threads() == before
+
+
+def test_a_race_of_cameras_and_the_eager_tracer(domain: Domain) -> None:
+    lens = read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml").at()
+    eager = exact_candidates(lens, domain, compiled=False)
+    cameras = [camera_candidate(c, domain) for c in (Pinhole(50.0), ThinLens(50.0, 2.0, math.inf))]
+    result = race([*eager, *cameras], domain, rounds=3)
+    assert list(result.ns) == ["exact eager", "pinhole", "thin"]
+    for name in result.ns:
+        timing = result.timing(name)
+        assert timing is not None
+        assert 0 < timing["min"] <= timing["median"]
+        assert timing["repeats"] == 3
+    there, back = result.speedup("thin", "exact eager"), result.speedup("exact eager", "thin")
+    assert there is not None and back is not None
+    assert there["min"] * back["min"] == pytest.approx(1)
+    assert result.speedup("thin", "thin") == {"min": 1.0, "median": 1.0}
+
+
+def test_ratios_are_taken_within_rounds() -> None:
+    """A machine that slows down tenfold half way changes both times and no ratio."""
+    drifting = Race({"model": [1.0, 10.0, 10.0], "exact": [4.0, 40.0, 40.0]}, {"model": 1, "exact": 1}, 1, 3)
+    assert drifting.speedup("model", "exact") == {"min": 4.0, "median": 4.0}
+    assert drifting.speedup("model", "absent") is None
+
+
+def test_every_batch_covers_the_same_rays(domain: Domain) -> None:
+    done: dict[int, int] = {}
+
+    def prepare(rays: FilmRays) -> Call:
+        done[len(rays)] = done.get(len(rays), 0) + len(rays)
+        return lambda: None
+
+    race([Candidate("idle", prepare, (4096, 16384))], domain, rounds=1)
+    assert done[4096] == done[16384] > 0
+
+
+def test_what_cannot_run_is_reported_with_its_reason(domain: Domain) -> None:
+    def refuse(_: FilmRays) -> Call:
+        raise Unavailable("no such thing here")
+
+    result = race([Candidate("absent", refuse), camera_candidate(Pinhole(50.0), domain)], domain, rounds=1)
+    assert result.unavailable == {"absent": "no such thing here"}
+    assert result.record("absent") == {
+        "name": "absent",
+        "available": False,
+        "reason": "no such thing here",
+        "ns_per_ray": None,
+    }
+    assert result.record("pinhole")["available"]
+    assert result.timing("absent") is None
+    assert result.speedup("pinhole", "absent") is None
+
+
+def test_without_a_compiler_the_compiled_tracer_is_unavailable(monkeypatch: pytest.MonkeyPatch, domain: Domain) -> None:
+    import torch._inductor.config as inductor
+
+    monkeypatch.setattr(inductor.cpp, "cxx", ("/nowhere/c++",))
+    monkeypatch.setattr(inductor, "fx_graph_cache", False)  # a kernel compiled before would need no compiler
+    lens = read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml").at()
+    result = race(exact_candidates(lens, domain), domain, rounds=1)
+    assert "exact eager" in result.ns
+    assert "compiler" in result.unavailable["exact compiled"].lower()
+
+
+def test_bad_settings_are_refused(domain: Domain) -> None:
+    pinhole = camera_candidate(Pinhole(50.0), domain)
+    with pytest.raises(InputError, match="threads"):
+        race([pinhole], domain, threads=0)
+    with pytest.raises(InputError, match="differ"):
+        race([pinhole, pinhole], domain)
+    with pytest.raises(InputError, match="round"):
+        race([pinhole], domain, rounds=0)

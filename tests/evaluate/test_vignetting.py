@@ -1,0 +1,137 @@
+"""Vignetting errors: a hole has closed forms; a real lens must agree with itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from neurolens import status as st
+from neurolens.errors import InputError
+from neurolens.evaluate.vignetting import deciding_rim_ratio, relative_illumination, stopped_down, vignetting_errors
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.pupils import PupilBounds
+from neurolens.surrogates.domain import Domain, FilmRays, domain_of, sample_domain
+from neurolens.surrogates.pairs import trace_pairs
+
+LENSES = Path(__file__).parents[2] / "lenses"
+FILM_Z, FILM_RADIUS = 50.0, 15.0
+
+
+def hole(radius_mm: float) -> tuple[Lens, Domain]:
+    """A hole in an opaque plane, its rays sampled on that plane to 1.05 radii."""
+    lens = Lens("hole", "test", (Surface(math.inf, FILM_Z, 2 * radius_mm, stop=True),), 2.5)
+    row = (radius_mm, radius_mm)
+    bounds = PupilBounds(0.0, FILM_RADIUS, (-radius_mm, -radius_mm), row, row, radius_mm)
+    planes, focus, nanometres = (FILM_Z, FILM_Z), (math.inf, math.inf), (500.0, 600.0)
+    return lens, Domain(FILM_RADIUS, planes, focus, 0.0, 1.05 * radius_mm, nanometres, radius_mm, bounds)
+
+
+def opening(
+    factor: float, transmittance: float = 1.0, beyond_mm: float = 0.0
+) -> Callable[[FilmRays, float | None], SimpleNamespace]:
+    """A model of the hole whose radius is wrong by `factor` for film points beyond `beyond_mm`."""
+
+    def predict(rays: FilmRays, stop_radius_mm: float | None) -> SimpleNamespace:
+        assert stop_radius_mm is not None
+        wrong = torch.hypot(rays.film_x, rays.film_y) >= beyond_mm
+        limit = stop_radius_mm * torch.where(wrong, factor, 1.0)
+        passes = torch.hypot(rays.pupil_x, rays.pupil_y) <= limit
+        status = torch.where(passes, st.PASSED, st.blocked(0, st.RIM))
+        return SimpleNamespace(status=status, transmittance=torch.full_like(rays.film_x, transmittance))
+
+    return predict
+
+
+def test_the_true_opening_has_no_false_rays() -> None:
+    result = vignetting_errors(*hole(10.0), opening(1.0), count=32768)
+    assert [result[k] for k in ("false_pass", "false_block", "false_pass_near_rim", "false_block_near_rim")] == [
+        0,
+        0,
+        0,
+        0,
+    ]
+    assert result["passing_share"] == pytest.approx(1 / 1.05**2, rel=2e-3)
+
+
+def test_an_opening_too_large_passes_the_ring() -> None:
+    result = vignetting_errors(*hole(10.0), opening(1.01), count=131072)
+    assert result["false_pass"] == pytest.approx((1.01**2 - 1) / 1.01**2, rel=0.02)
+    assert result["false_pass_near_rim"] == pytest.approx((1.01**2 - 1) / (1.01**2 - 0.98**2), rel=0.02)
+    assert result["false_block"] == 0
+
+
+def test_an_opening_too_small_blocks_the_ring() -> None:
+    result = vignetting_errors(*hole(10.0), opening(0.99), count=131072)
+    assert result["false_block"] == pytest.approx(1 - 0.99**2, rel=0.02)
+    assert result["false_block_near_rim"] == pytest.approx((1 - 0.99**2) / (1 - 0.98**2), rel=0.02)
+    assert result["false_pass"] == 0
+
+
+def test_stopping_down_keeps_the_shares_of_a_hole() -> None:
+    lens, domain = hole(10.0)
+    results = stopped_down(lens, domain, opening(1.01), count=262144)
+    assert [results[k]["stop_radius_mm"] for k in ("full", "2_stops", "4_stops")] == pytest.approx([10, 5, 2.5])
+    for result in results.values():
+        assert result["false_pass"] == pytest.approx((1.01**2 - 1) / 1.01**2, rel=0.05)
+
+
+def test_zones_tell_where_on_the_film() -> None:
+    zones = vignetting_errors(*hole(10.0), opening(1.01, beyond_mm=FILM_RADIUS * 2 / 3), count=65536)["zones"]
+    assert zones["centre"]["false_pass"] == zones["mid"]["false_pass"] == 0
+    assert zones["edge"]["false_pass"] == pytest.approx((1.01**2 - 1) / 1.01**2, rel=0.05)
+
+
+def test_a_model_that_passes_nothing() -> None:
+    result = vignetting_errors(*hole(10.0), opening(0.0), count=4096)
+    assert result["false_pass"] is None
+    assert result["false_block"] == 1
+
+
+@pytest.mark.parametrize("radius", [0.0, -1.0, 10.01, math.nan])
+def test_a_stop_outside_the_domain_is_refused(radius: float) -> None:
+    with pytest.raises(InputError, match="stop_radius_mm"):
+        vignetting_errors(*hole(10.0), opening(1.0), stop_radius_mm=radius)
+
+
+def test_illumination_of_a_small_hole_is_cos4() -> None:
+    result = relative_illumination(*hole(0.2), opening(1.0, 0.9), points=4096, rows=9)
+    expected = [math.cos(math.atan2(r, FILM_Z)) ** 4 for r in result["film_radius_mm"]]
+    assert result["exact"] == pytest.approx(expected, rel=1e-4)
+    assert result["model"] == pytest.approx([0.9 * e for e in expected], rel=1e-4)
+    assert result["max_difference"] == pytest.approx(0.1, rel=1e-4)
+    assert result["film_radius_mm"][-1] == FILM_RADIUS
+
+
+def test_the_deciding_rim_agrees_with_the_tracer() -> None:
+    lens = read_lens(LENSES / "laikin_double_gauss_50.toml").at()
+    domain = domain_of(lens)
+    rays = trace_pairs(lens, sample_domain(domain, 20000, 1), domain.pupil_z_mm)
+    ratio = deciding_rim_ratio(lens, rays)
+    passed, by_rim = rays.status == st.PASSED, rays.status % 4 == st.RIM
+    assert bool((ratio[passed] <= 1).all())
+    assert bool((ratio[by_rim] > 1).all())
+    assert int(by_rim.sum()) > 1000
+
+
+def test_a_real_lens_against_itself_stopped_down() -> None:
+    lens = read_lens(LENSES / "laikin_double_gauss_50.toml").at()
+    domain = domain_of(lens)
+
+    def exactly(rays: FilmRays, stop_radius_mm: float | None) -> SimpleNamespace:
+        assert stop_radius_mm is not None
+        traced = trace_pairs(lens.with_stop_radius(stop_radius_mm), rays, domain.pupil_z_mm)
+        return SimpleNamespace(status=traced.status, transmittance=traced.transmittance)
+
+    for result in stopped_down(lens, domain, exactly, count=32768).values():
+        assert result["false_pass"] == result["false_block"] == 0
+    light = relative_illumination(lens, domain, exactly, points=2048, rows=5)
+    assert light["max_difference"] == 0
+    assert (
+        light["exact"][0] == 1 and light["exact"][-1] < 0.5
+    )  # a fast double Gauss darkens by over a stop in the corner
