@@ -11,13 +11,12 @@ import torch
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.errors import InputError
+from neurolens.evaluate.candidates import camera_candidate, exact_candidates
 from neurolens.evaluate.speed import (
     Call,
     Candidate,
     Race,
     Unavailable,
-    camera_candidate,
-    exact_candidates,
     pinned_threads,
     race,
     time_per_ray,
