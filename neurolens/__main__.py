@@ -1,0 +1,7 @@
+"""`python -m neurolens`."""
+
+import sys
+
+from neurolens.cli import main
+
+sys.exit(main())

@@ -1,0 +1,91 @@
+"""A camera from what a command line names: a lens file, an exported model, "thin" or "pinhole".
+
+Only a lens file needs torch, which is imported when one is asked for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from neurolens.cameras.contract import Camera
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.thin import ThinLens
+from neurolens.errors import InputError
+
+IDEAL = ("thin", "pinhole")
+_EFL_MM, _THIN_F_NUMBER, _PINHOLE_F_NUMBER = 50.0, 4.0, 8.0
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What a photographer sets.
+
+    Attributes:
+        film_mm: width and height of the film.
+        focus_m: distance from the film to the object in focus, inf allowed.
+        f_number: None: the widest stop of a lens or model; f/4 for the thin lens, nominally f/8 for the pinhole.
+        efl_mm: None: a lens file as tabled; 50 mm for thin lens and pinhole. A model has its own.
+        configuration: zoom state of a lens file.
+        wavelength_nm: shortest and longest wavelength of the light.
+    """
+
+    film_mm: tuple[float, float]
+    focus_m: float
+    f_number: float | None = None
+    efl_mm: float | None = None
+    configuration: str | None = None
+    wavelength_nm: tuple[float, float] = (400.0, 700.0)
+
+
+def make_camera(spec: str | Path, shot: Shot) -> Camera:
+    """The camera that `spec` names, set for a shot.
+
+    Args:
+        spec: "thin", "pinhole", the path of a lens file (.toml) or of a model (.onnx).
+
+    Raises:
+        InputError: an unknown kind of camera, a missing file, a setting that this kind does not have or cannot reach.
+        ModelError: a model that cannot be trusted.
+        ModuleNotFoundError: a lens file without torch.
+    """
+    if str(spec) in IDEAL:
+        return _ideal(str(spec), shot)
+    path = Path(spec)
+    if path.suffix not in (".toml", ".onnx"):
+        expected = f"a lens file (.toml), a model (.onnx), {' or '.join(IDEAL)}"
+        raise InputError("camera", "--camera", str(spec), expected)
+    if not path.is_file():
+        raise InputError(path, "file", "(missing)", "a lens file" if path.suffix == ".toml" else "an ONNX model")
+    return _exact(path, shot) if path.suffix == ".toml" else _model(path, shot)
+
+
+def _ideal(kind: str, shot: Shot) -> Camera:
+    _refuse(kind, "configuration", shot.configuration, "left out: only a lens file has zoom states")
+    focal = _EFL_MM if shot.efl_mm is None else shot.efl_mm
+    if kind == "thin":
+        return ThinLens(focal, shot.f_number or _THIN_F_NUMBER, shot.focus_m, shot.film_mm)
+    return Pinhole(focal, shot.film_mm, shot.f_number or _PINHOLE_F_NUMBER)
+
+
+def _exact(path: Path, shot: Shot) -> Camera:
+    from neurolens.cameras.exact import ExactCamera
+    from neurolens.optics.lensfile import read_lens
+
+    lens = read_lens(path).at(efl_mm=shot.efl_mm, configuration=shot.configuration)
+    return ExactCamera(
+        lens, film_mm=shot.film_mm, focus_m=shot.focus_m, f_number=shot.f_number, wavelength_nm=shot.wavelength_nm
+    )
+
+
+def _model(path: Path, shot: Shot) -> Camera:
+    from neurolens.cameras.model import OnnxCamera, load_model
+
+    for field, value in (("efl_mm", shot.efl_mm), ("configuration", shot.configuration)):
+        _refuse(str(path), field, value, "left out: a model is of one state of its lens")
+    return OnnxCamera(load_model(path), film_mm=shot.film_mm, focus_m=shot.focus_m, f_number=shot.f_number)
+
+
+def _refuse(camera: str, field: str, value: object, expected: str) -> None:
+    if value is not None:
+        raise InputError(f"camera {camera}", field, value, expected)

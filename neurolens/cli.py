@@ -1,0 +1,94 @@
+"""The command line: `neurolens lens | train | evaluate | render`. Errors are one line and exit code 2."""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from neurolens import __version__
+from neurolens.commands import evaluate, lens, render, train
+from neurolens.commands.arguments import Parser
+from neurolens.errors import NeurolensError, NeurolensWarning
+
+# Packages of the extra that a base install lacks.
+_TRAIN_PACKAGES = {"torch", "sklearn", "onnx", "matplotlib", "flip_evaluator"}
+_INTERRUPTED, _BROKEN_PIPE = 130, 141  # 128 plus the signal's number, as shells report it
+
+_DESCRIPTION = "Any lens prescription as a fast camera model with a measured error."
+_EPILOG = """\
+examples:
+  neurolens lens lenses/laikin_double_gauss_50.toml --layout layout.png
+  neurolens train experiments/quickstart.toml
+  neurolens evaluate models/NAME.onnx
+  neurolens render experiments/scenes/room.toml --camera models/NAME.onnx -o room.exr
+
+exit codes: 0 done, 1 a promise of a model does not hold, 2 bad input, 130 interrupted.
+Each command explains itself: neurolens COMMAND --help"""
+
+
+def build_parser() -> Parser:
+    """The whole command line."""
+    parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
+    parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
+    subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
+    for command in (lens, train, evaluate, render):
+        command.add_parser(subparsers)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code; a wrong command line exits with code 2 as argparse does."""
+    args = build_parser().parse_args(argv)
+    try:
+        with _plain_warnings():
+            code: int = args.run(args)
+        sys.stdout.flush()
+        return code
+    except NeurolensError as error:
+        return _fail(str(error))
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in _TRAIN_PACKAGES:
+            raise
+        return _fail(f"this needs {package}, which is not installed: pip install 'neurolens[train]'")
+    except BrokenPipeError:
+        # The reader (head, less) has left; the interpreter must not complain again while it flushes stdout.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _BROKEN_PIPE
+    except OSError as error:
+        if error.filename is None:
+            raise
+        return _fail(f"{error.filename}: {error.strerror}")
+    except KeyboardInterrupt:
+        print(f"\nneurolens: interrupted; {args.kept}", file=sys.stderr)
+        return _INTERRUPTED
+
+
+def _fail(message: str) -> int:
+    print(f"neurolens: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Show the project's own warnings as one line each, without the place in the code."""
+    with warnings.catch_warnings():
+        usual = warnings.showwarning
+
+        def show(message: Any, category: type[Warning], *place: Any, **more: Any) -> None:
+            if issubclass(category, NeurolensWarning):
+                print(f"neurolens: warning: {message}", file=sys.stderr)
+            else:
+                usual(message, category, *place, **more)
+
+        warnings.showwarning = show
+        warnings.simplefilter("default", NeurolensWarning)
+        yield
+
+
+if __name__ == "__main__":
+    sys.exit(main())

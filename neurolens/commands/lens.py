@@ -1,0 +1,175 @@
+"""`neurolens lens FILE`: what a lens file holds, computed and drawn."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens.commands.arguments import add_json, add_lens_state
+from neurolens.commands.output import number, print_json, table
+from neurolens.errors import InputError, NeurolensWarning
+
+if TYPE_CHECKING:
+    from neurolens.optics.prescription import Lens
+    from neurolens.surrogates.domain import Domain
+
+_DESCRIPTION = """\
+Read a lens file strictly and print what follows from it: focal length, pupils, film plane,
+image circle, how much of the light gets through and what stops the rest, and anything
+doubtful about it.
+
+Lengths are in mm along the axis, z = 0 at the front vertex, light travelling to +z; angles
+are from the axis in degrees; first-order data is for the d line (587.56 nm). Needs the extra
+"train" (torch)."""
+_EPILOG = """\
+examples:
+  neurolens lens lenses/laikin_double_gauss_50.toml
+  neurolens lens lenses/brendel_tessar_100.toml --efl 50 --focus 1.5 --layout tessar.png
+  neurolens lens lenses/ogawa_zoom_70_200.toml --configuration 135mm --json"""
+_LAYOUT_SUFFIXES = (".png", ".pdf", ".svg")
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser(
+        "lens", help="first-order data, field and layout of a lens file", description=_DESCRIPTION, epilog=_EPILOG
+    )
+    parser.add_argument("file", metavar="FILE", type=Path, help="lens file (lenses/*.toml)")
+    add_lens_state(parser, {"efl": "as tabled", "f_number": "the tabled stop", "focus": "inf"})
+    parser.add_argument(
+        "--layout", metavar="OUT.png", type=Path,
+        help="draw the lens with rays from three field points: axis, 70%% and edge of the film (.png, .pdf, .svg)",
+    )  # fmt: skip
+    add_json(parser)
+    parser.set_defaults(run=run, kept="nothing is written but a finished --layout picture")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the data of a lens, and draw it where asked."""
+    if args.layout is not None:
+        check_layout_path(args.layout)
+    from neurolens.evaluate.describe import describe_lens, glass_table
+    from neurolens.optics.lensfile import read_lens
+    from neurolens.surrogates.domain import domain_of
+
+    began = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NeurolensWarning)  # `describe_lens` says the same among its warnings
+        tabled = read_lens(args.file)
+    lens = tabled.at(configuration=args.configuration, efl_mm=args.efl, f_number=args.f_number, focus_m=args.focus)
+    focus = math.inf if args.focus is None else args.focus
+    domain = domain_of(lens, focus_m=(focus, focus))
+    configurations = [{"name": c.name, "efl_mm": c.efl_mm} for c in tabled.configurations]
+    data = {
+        "file": str(args.file),
+        **describe_lens(lens, domain),
+        "configuration": args.configuration,
+        "configurations": configurations,
+        "surfaces": glass_table(lens),
+        "layout": None if args.layout is None else str(args.layout),
+    }
+    if args.layout is not None:
+        draw_layout(lens, domain, args.layout)
+    data["seconds"] = time.perf_counter() - began
+    if args.json:
+        print_json(data)
+    else:
+        print(_text(data))
+    return 0
+
+
+def check_layout_path(path: Path) -> None:
+    """Refuse a picture that could not be written before any work is done for it.
+
+    Raises:
+        InputError: another suffix, or no such folder.
+    """
+    if path.suffix.lower() not in _LAYOUT_SUFFIXES:
+        raise InputError(path, "--layout", path.suffix or "(no suffix)", f"one of {', '.join(_LAYOUT_SUFFIXES)}")
+    if not path.parent.is_dir():
+        raise InputError(path, "--layout", str(path.parent), "a folder that exists")
+
+
+def draw_layout(lens: Lens, domain: Domain, path: Path) -> None:
+    """Draw the section of a lens with rays."""
+    from neurolens.evaluate.layout import layout_profile
+    from neurolens.evaluate.plots import lens_layout
+
+    lens_layout(layout_profile(lens, domain), path)
+
+
+def _text(data: dict[str, Any]) -> str:
+    """The data as a page of text."""
+    parts = [_head(data), _first_order(data), _light(data), _surfaces(data)]
+    if data["configurations"]:
+        states = ", ".join(f"{c['name']} ({number(c['efl_mm'])} mm)" for c in data["configurations"])
+        parts.append(f"Zoom states (--configuration): {states}")
+    parts += [f"Warning: {text}" for text in data["warnings"]]
+    if data["layout"]:
+        parts.append(f"Layout drawn in {data['layout']}")
+    return "\n\n".join(parts)
+
+
+def _head(data: dict[str, Any]) -> str:
+    by = f", {data['designer']}" if data["designer"] else ""
+    return f"{data['name']}{by}\n{data['source']}"
+
+
+def _first_order(data: dict[str, Any]) -> str:
+    focus = "infinity" if math.isinf(data["focus_m"]) else f"{data['focus_m']:g} m"
+
+    def mm(key: str) -> str:
+        return f"{number(data[key], 6)} mm"
+
+    rows = [
+        ("focal length", mm("efl_mm"), ""),
+        ("back focus", mm("back_focus_mm"), "last vertex to rear focal point"),
+        ("f-number", f"f/{number(data['f_number'])}", "focal length over entrance pupil, infinity focus"),
+        ("working f-number", f"f/{number(data['working_f_number'])}", "of the real marginal ray at this focus"),
+        ("principal planes", f"{mm('front_principal_z_mm')}, {mm('rear_principal_z_mm')}", "front H, rear H'"),
+        ("entrance pupil", mm("entrance_pupil_z_mm"), f"diameter {mm('entrance_pupil_diameter_mm')}"),
+        ("exit pupil", mm("exit_pupil_z_mm"), f"diameter {mm('exit_pupil_diameter_mm')}"),
+        ("film plane", mm("film_z_mm"), f"focus at {focus}"),
+        ("stop", f"surface {data['stop_surface']}", f"diameter {mm('stop_diameter_mm')}"),
+        ("refractions", str(data["refractions"]), ""),
+    ]
+    return _columns(rows)
+
+
+def _light(data: dict[str, Any]) -> str:
+    reached, stated = data["half_field_reached_deg"], data["half_field_deg"]
+    rows = [
+        ("image radius", f"{number(data['image_radius_mm'])} mm", f"from {data['image_radius_from']}"),
+        (
+            "half field",
+            "-" if reached is None else f"{reached:.2f} degrees",
+            "reached at the edge of the film" + ("" if stated is None else f"; the file states {stated:g}"),
+        ),
+        (
+            "rays that pass",
+            f"{100 * data['passing_share']:.1f}%",
+            "of rays uniform over the film and over the disc of all passing rays, 5% wider",
+        ),
+        *(("", f"{100 * e['share']:.1f}%", e["text"]) for e in data["ended"]),
+    ]
+    return _columns(rows)
+
+
+def _columns(rows: list[tuple[str, str, str]]) -> str:
+    wide = max(len(value) for _, value, _ in rows)
+    return "\n".join(f"{name:18}{value:{wide}}  {note}".rstrip() for name, value, note in rows)
+
+
+def _surfaces(data: dict[str, Any]) -> str:
+    header = ("surface", "radius mm", "thickness mm", "diameter mm", "n_d", "V_d", "")
+    rows = []
+    for s in data["surfaces"]:
+        radius = "plane" if math.isinf(s["radius_mm"]) else f"{s['radius_mm']:.4f}"
+        glass = ("", "") if s["n_d"] == 1 else (f"{s['n_d']:.4f}", "-" if s["V_d"] is None else f"{s['V_d']:.2f}")
+        note = "stop" if s["stop"] else s["material"] or ""
+        rows.append((str(s["surface"]), radius, f"{s['thickness_mm']:.4f}", f"{s['diameter_mm']:.4f}", *glass, note))
+    return table(header, rows)

@@ -1,0 +1,49 @@
+"""What the commands print: JSON that every parser takes, and tables of aligned columns."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+
+def plain(value: Any) -> Any:
+    """`value` as JSON has it: paths as text, infinity as "infinity", NaN as null, arrays as lists."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else "infinity" if value > 0 else "-infinity"
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def print_json(data: Mapping[str, Any]) -> None:
+    """Print one JSON object on stdout."""
+    print(json.dumps(plain(data), indent=1, allow_nan=False, ensure_ascii=False))
+
+
+def number(value: Any, digits: int = 4) -> str:
+    """A number with so many significant digits, "-" where there is none."""
+    if value is None or isinstance(value, str):
+        return value or "-"
+    if isinstance(value, int):
+        return str(value)
+    if math.isnan(value):
+        return "-"
+    return "infinity" if math.isinf(value) else f"{value:.{digits}g}"
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
+    """Columns aligned by two spaces: the first `left` to the left, the others to the right."""
+    lines = [list(header), *(list(row) for row in rows)]
+    widths = [max(len(line[k]) for line in lines) for k in range(len(header))]
+
+    def row(cells: Sequence[str]) -> str:
+        placed = (c.ljust(w) if k < left else c.rjust(w) for k, (c, w) in enumerate(zip(cells, widths, strict=True)))
+        return "  ".join(placed).rstrip()
+
+    return "\n".join(row(line) for line in lines)

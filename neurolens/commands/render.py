@@ -1,0 +1,154 @@
+"""`neurolens render SCENE --camera ...`: a picture of a scene through a lens, a model, a thin lens or a pinhole."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens import __version__
+from neurolens.commands.arguments import add_json, add_lens_state, whole
+from neurolens.commands.output import plain, print_json
+from neurolens.errors import InputError
+from neurolens.progress import Progress, duration
+
+if TYPE_CHECKING:
+    from neurolens.cameras.build import Shot
+    from neurolens.render.scene import CameraSettings
+
+_DESCRIPTION = """\
+Path-trace a scene (experiments/scenes/*.toml) and write OpenEXR, linear sRGB, with a PNG
+preview beside it. The settings, the camera and the card of a model are kept in the EXR's
+metadata, attribute "neurolens", as JSON.
+
+The same seed gives the same picture, whatever the number of threads; all cameras share its
+random numbers. A model (.onnx), the thin lens and the pinhole need no torch; a lens file
+(.toml) is traced exactly and does (extra "train")."""
+_EPILOG = """\
+examples:
+  neurolens render experiments/scenes/room.toml --camera pinhole --samples 4 -o quick.exr
+  neurolens render experiments/scenes/room.toml --camera lenses/laikin_double_gauss_50.toml -o exact.exr
+  neurolens render experiments/scenes/lights.toml --camera models/NAME.onnx --f-number 2.8 \\
+      --half -o lights.exr
+  neurolens render experiments/scenes/grid.toml --camera lenses/ogawa_zoom_70_200.toml \\
+      --configuration 135mm -o zoom.exr"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser(
+        "render", help="render a scene through a lens, a model, a thin lens or a pinhole",
+        description=_DESCRIPTION, epilog=_EPILOG,
+    )  # fmt: skip
+    parser.add_argument("scene", metavar="SCENE", type=Path, help="scene file (.toml)")
+    parser.add_argument(
+        "--camera", metavar="CAMERA", required=True,
+        help="lens file (.toml, traced exactly), model (.onnx), thin or pinhole",
+    )  # fmt: skip
+    parser.add_argument(
+        "-o", "--out", metavar="OUT.exr", type=Path, required=True, help="picture to write; the preview is OUT.png"
+    )
+    picture = parser.add_argument_group("picture")
+    count = whole(1, 1 << 20)
+    picture.add_argument("--samples", metavar="N", type=count, help="samples a pixel (default: the scene's)")
+    picture.add_argument(
+        "--width", metavar="PIXELS", type=whole(1, 16384),
+        help="width (default: the scene's, or from --height and the film's shape)",
+    )  # fmt: skip
+    picture.add_argument(
+        "--height", metavar="PIXELS", type=whole(1, 16384),
+        help="height (default: the scene's, or from --width and the film's shape)",
+    )  # fmt: skip
+    picture.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the random numbers (default: 0)")
+    picture.add_argument("--max-depth", metavar="N", type=whole(1, 1000), help="bounces (default: the scene's)")
+    picture.add_argument("--half", action="store_true", help="16-bit floats in the EXR (default: 32-bit)")
+    picture.add_argument(
+        "--exposure", metavar="STOPS", type=float, default=0.0, help="brightens the preview only (default: 0)"
+    )
+    add_lens_state(
+        parser,
+        {
+            "efl": "as tabled; 50 for thin and pinhole; a model has its own",
+            "f_number": "the scene's, else the widest stop; 4 for thin",
+            "focus": "the scene's",
+        },
+    )
+    parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=2, help="workers (default: 2)")
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_json(parser)
+    parser.set_defaults(run=run, kept="no picture was written; older files of that name are untouched")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Render, write both pictures, say how it went."""
+    preview = _preview_path(args.out)
+    from neurolens.cameras.build import make_camera
+    from neurolens.render.exr import write_exr, write_png
+    from neurolens.render.renderer import render
+    from neurolens.render.scenefile import load_scene
+
+    scene = load_scene(args.scene)
+    settings = scene.settings.camera
+    camera = make_camera(args.camera, shot_of(settings, args))
+    width, height = picture_size(settings, args.width, args.height)
+    with Progress(quiet=args.quiet).stage(f"render {scene.name}, {camera.name}") as report:
+        result = render(
+            scene, camera, width=width, height=height, samples=args.samples, seed=args.seed,
+            threads=args.threads, max_depth=args.max_depth, progress=report,
+        )  # fmt: skip
+    stats = plain(result.stats)
+    metadata = {"version": __version__, "scene": str(args.scene), "camera": plain(camera.settings), "render": stats}
+    write_exr(args.out, result.rgb, half=args.half, metadata=metadata)
+    write_png(preview, result.rgb, args.exposure)
+    if args.json:
+        print_json({"file": str(args.out), "preview": str(preview), "camera": camera.settings, **stats})
+    else:
+        print(_text(stats, args.out, preview))
+    return 0
+
+
+def shot_of(settings: CameraSettings, args: argparse.Namespace) -> Shot:
+    """The scene's camera settings with the command line's on top."""
+    from neurolens.cameras.build import Shot
+
+    return Shot(
+        film_mm=(settings.film_width_mm, settings.film_height_mm),
+        focus_m=settings.focus_m if args.focus is None else args.focus,
+        f_number=settings.f_number if args.f_number is None else args.f_number,
+        efl_mm=args.efl,
+        configuration=args.configuration,
+        wavelength_nm=settings.wavelengths_nm,
+    )
+
+
+def picture_size(settings: CameraSettings, width: int | None, height: int | None) -> tuple[int, int]:
+    """Pixels; one that is left out follows from the other and the film's shape."""
+    shape = settings.film_width_mm / settings.film_height_mm
+    if width is None and height is None:
+        return settings.width, settings.height
+    if height is None:
+        assert width is not None
+        return width, max(1, round(width / shape))
+    return (max(1, round(height * shape)) if width is None else width), height
+
+
+def _preview_path(out: Path) -> Path:
+    """The PNG beside the EXR; refuses names that cannot be written before anything is rendered.
+
+    Raises:
+        InputError: not .exr, or no such folder.
+    """
+    if out.suffix.lower() != ".exr":
+        raise InputError(out, "--out", out.suffix or "(no suffix)", "a name that ends in .exr")
+    if not out.parent.is_dir():
+        raise InputError(out, "--out", str(out.parent), "a folder that exists")
+    return out.with_suffix(".png")
+
+
+def _text(stats: dict[str, Any], out: Path, preview: Path) -> str:
+    return (
+        f"{stats['scene']} through {stats['camera']}: {stats['width']} x {stats['height']}, {stats['samples']} samples "
+        f"in {duration(stats['seconds'])} ({stats['mpaths_per_s']:.2f} Mpath/s, "
+        f"{100 * stats['passed_fraction']:.0f}% of the rays pass, "
+        f"{100 * stats['camera_fraction']:.0f}% of the time in the camera)\n{out}\n{preview}"
+    )

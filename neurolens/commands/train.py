@@ -1,0 +1,136 @@
+"""`neurolens train`: from a lens file to measured models, renders and a report, in one run folder."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from neurolens.commands.arguments import add_json
+from neurolens.commands.output import number, print_json, table
+from neurolens.errors import InputError
+from neurolens.progress import Progress
+
+_DESCRIPTION = """\
+Run an experiment: trace ray pairs of the lens, fit the surrogates, export them as ONNX,
+measure errors and speed against the exact tracer, render the scenes, and write one report.
+Needs the extra "train" (torch).
+
+Without an experiment file, --lens fits a polynomial and a network to that lens over its whole
+film, all wavelengths from 400 to 700 nm, focus from infinity to 14 focal lengths.
+
+A run that was interrupted goes on where it stopped: models that are there, made by the same
+settings, are kept."""
+_EPILOG = """\
+examples:
+  neurolens train experiments/quickstart.toml
+  neurolens train experiments/quickstart.toml --out runs/try --set render.samples=4 --set pairs.seed=2
+  neurolens train --lens lenses/brendel_tessar_100.toml --out runs/tessar \\
+      --set lens.efl_mm=50
+
+The folder holds report.html, results.json, config.toml (all settings, defaults written out),
+models/ and pictures/."""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser(
+        "train", help="fit, measure and render the models of an experiment", description=_DESCRIPTION, epilog=_EPILOG
+    )
+    parser.add_argument("experiment", metavar="EXPERIMENT.toml", nargs="?", type=Path, help="experiment file")
+    parser.add_argument("--lens", metavar="FILE", type=Path, help="lens file, instead of an experiment; needs --out")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, help="run folder, made if needed (default: runs/NAME of the experiment file)"
+    )
+    parser.add_argument(
+        "--set", metavar="KEY=VALUE", dest="overrides", action="append", default=[],
+        help="change a setting, for example --set pairs.train=10000; values are TOML, may be repeated",
+    )  # fmt: skip
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_json(parser)
+    parser.set_defaults(run=run, kept="models already fitted are kept in the run folder; the same command goes on")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the experiment and say where to look."""
+    folder = _run_folder(args)
+    from neurolens.evaluate.experiment import default_experiment, read_experiment
+    from neurolens.evaluate.train import run_experiment
+
+    if args.lens is not None:
+        experiment = default_experiment(args.lens, args.overrides)
+    else:
+        experiment = read_experiment(args.experiment, args.overrides)
+    progress = Progress(quiet=args.quiet)
+    results = run_experiment(experiment, folder, progress=progress, command=_command(args))
+    if args.json:
+        print_json({"folder": str(folder), "report": str(folder / "report.html"), **results})
+    else:
+        print(_text(results, folder))
+    return 0
+
+
+def _run_folder(args: argparse.Namespace) -> Path:
+    """The run folder of the arguments.
+
+    Raises:
+        InputError: both or neither of experiment and --lens, --lens without --out, a folder that is a file.
+    """
+    if (args.experiment is None) == (args.lens is None):
+        found = "(neither)" if args.lens is None else "(both)"
+        raise InputError("neurolens train", "EXPERIMENT.toml or --lens", found, "one of them")
+    if args.lens is not None and args.out is None:
+        raise InputError("neurolens train", "--out", "(missing)", "a run folder, as --lens names none")
+    folder: Path = args.out if args.out is not None else Path("runs") / args.experiment.stem
+    if folder.exists() and not folder.is_dir():
+        raise InputError("neurolens train", "--out", str(folder), "a folder, not a file")
+    return folder
+
+
+def _command(args: argparse.Namespace) -> str:
+    """The command line, for the report."""
+    parts = ["neurolens", "train"]
+    parts += ["--lens", str(args.lens)] if args.lens is not None else [str(args.experiment)]
+    parts += ["--out", str(args.out)] if args.out is not None else []
+    for override in args.overrides:
+        parts += ["--set", override]
+    return shlex.join(parts)
+
+
+def _text(results: Mapping[str, Any], folder: Path) -> str:
+    """A short table of the models, what the run warned of, and where to look."""
+    header = ("model", "rms um", "p99 um", "angle rms deg", "false pass", "false block", "ns/ray", "x exact", "fit s")
+    rows = [_row(model) for model in results.get("models", ())]
+    parts = [str(results.get("title") or folder.name), table(header, rows)]
+    parts += [f"Warning: {text}" for text in _sequence(results.get("warnings"))]
+    places = [f"  {folder / 'report.html'}  everything on one page", f"  {folder / 'models'}  the ONNX models"]
+    if (folder / "pictures").is_dir():
+        places.append(f"  {folder / 'pictures'}  renders, lens layout, plots")
+    places.append(f"  {folder / 'results.json'}  all figures")
+    return "\n\n".join(parts) + "\n\nLook at\n" + "\n".join(places)
+
+
+def _row(model: Mapping[str, Any]) -> tuple[str, ...]:
+    timing = model.get("ns_per_ray") or {}
+
+    def percent(key: str) -> str:
+        value = model.get(key)
+        return "-" if value is None else f"{100 * value:.2f}%"
+
+    return (
+        str(model.get("name")),
+        number(model.get("rms_um"), 3),
+        number(model.get("p99_um"), 3),
+        number(model.get("direction_rms_deg"), 3),
+        percent("false_pass"),
+        percent("false_block"),
+        number(timing.get("min"), 3),
+        number(model.get("speedup_over_compiled"), 3),
+        number(model.get("fit_s"), 3),
+    )
+
+
+def _sequence(value: Any) -> Sequence[str]:
+    return value if isinstance(value, list | tuple) else ()

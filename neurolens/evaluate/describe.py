@@ -1,0 +1,145 @@
+"""A lens in figures: first-order data, film, field and how much light gets through, with units in the keys."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+import torch
+
+from neurolens import status as st
+from neurolens.evaluate.layout import refractions
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import camera_rays, image_radius_mm
+from neurolens.optics.trace import trace
+from neurolens.surrogates.domain import Domain, sample_domain
+
+_RAYS = 65536
+_NEGLIGIBLE = 1e-4  # share of the rays below which a blocking surface is not worth a line
+_TABLE_TOLERANCE = 0.02  # film or f-number of the table against the computed one, relative to the focal length
+
+
+def describe_lens(lens: Lens, domain: Domain) -> dict[str, Any]:
+    """Figures of a lens placed by `Lens.at`, over a domain; d line where no other wavelength is named.
+
+    Returns: name, designer, source, rims, sha256; the first-order data of `paraxial.FirstOrder`; working_f_number of
+        the real marginal ray; film_z_mm, focus_m, refractions, stop_surface, stop_diameter_mm; image_radius_mm and
+        image_radius_from; half_field_deg as the file states it and half_field_reached_deg, the mean angle of the rays
+        that reach the edge of the domain's film; passing_share of rays uniform over the film and pupil discs of the
+        domain; ended: what stops the others, a list of {status, text, share}, largest share first; warnings.
+    """
+    data = first_order(lens)
+    radius, radius_from = image_radius_mm(lens)
+    film_z = float(lens.film_z_mm if lens.film_z_mm is not None else domain.film_z_mm[0])
+    passing, ended = passing_share(lens, domain)
+    reached = field_reached_deg(lens, domain, film_z)
+    return {
+        "name": lens.name,
+        "designer": lens.designer,
+        "source": lens.source,
+        "rims": lens.rims,
+        "sha256": lens.sha256,
+        "refractions": refractions(lens),
+        **{key: float(value) for key, value in asdict(data).items()},
+        "working_f_number": working_f_number(lens, domain, film_z),
+        "film_z_mm": film_z,
+        "focus_m": domain.focus_m[0],
+        "stop_surface": lens.stop_index,
+        "stop_diameter_mm": 2 * lens.stop_radius_mm,
+        "image_radius_mm": radius,
+        "image_radius_from": radius_from,
+        "half_field_deg": lens.half_field_deg,
+        "half_field_reached_deg": reached,
+        "passing_share": passing,
+        "ended": ended,
+        "warnings": warnings_of(lens, data.f_number, data.rear_focal_z_mm, reached),
+    }
+
+
+def glass_table(lens: Lens) -> list[dict[str, Any]]:
+    """The prescription row by row: surface, z_mm, radius_mm, thickness_mm, diameter_mm, n_d, V_d, material, stop."""
+    return [
+        {
+            "surface": k,
+            "z_mm": float(z),
+            "radius_mm": float(s.radius_mm),
+            "thickness_mm": float(s.thickness_mm),
+            "diameter_mm": s.diameter_mm,
+            "n_d": float(s.n_d),
+            "V_d": s.V_d,
+            "material": s.material,
+            "stop": s.stop,
+        }
+        for k, (s, z) in enumerate(zip(lens.surfaces, lens.vertices_mm[:-1], strict=True))
+    ]
+
+
+def working_f_number(lens: Lens, domain: Domain, film_z: float) -> float | None:
+    """1 / (2 sin theta') of the outermost ray that reaches the middle of the film; None where none does."""
+    u = torch.linspace(0, domain.pupil_radius_mm, 4001, dtype=torch.float64)
+    zero = torch.zeros_like(u)
+    rays = camera_rays(zero, zero, film_z, u, zero, domain.pupil_z_mm)
+    with torch.no_grad():
+        passed = trace(lens, rays).status == st.PASSED
+    sine = float(rays.dx[passed].abs().max()) if passed.any() else 0.0
+    return 1 / (2 * sine) if sine > 0 else None
+
+
+def field_reached_deg(lens: Lens, domain: Domain, film_z: float, points: int = 200) -> float | None:
+    """Mean angle to the axis (degrees) of the rays from the edge of the film to the scene; None where none passes."""
+    grid = torch.linspace(-domain.pupil_radius_mm, domain.pupil_radius_mm, points, dtype=torch.float64)
+    u, v = (t.reshape(-1) for t in torch.meshgrid(grid, grid[points // 2 :], indexing="ij"))  # symmetric across
+    edge = torch.full_like(u, domain.film_radius_mm)
+    with torch.no_grad():
+        out = trace(lens, camera_rays(edge, torch.zeros_like(u), film_z, u, v, domain.pupil_z_mm))
+    passed = out.status == st.PASSED
+    if not passed.any():
+        return None
+    angle = torch.atan2(torch.hypot(out.rays.dx, out.rays.dy), -out.rays.dz)[passed].mean()
+    return math.degrees(float(angle))
+
+
+def passing_share(lens: Lens, domain: Domain, seed: int = 5) -> tuple[float, list[dict[str, Any]]]:
+    """Share of a domain's rays that pass, and what ends the others: {status, text, share}, largest share first."""
+    rays = sample_domain(domain, _RAYS, seed)
+    with torch.no_grad():
+        start = camera_rays(rays.film_x, rays.film_y, rays.film_z, rays.pupil_x, rays.pupil_y, domain.pupil_z_mm)
+        status = trace(lens, start, rays.wavelength_nm).status
+    codes, counts = (t.tolist() for t in torch.unique(status, return_counts=True))
+    share = {int(code): count / _RAYS for code, count in zip(codes, counts, strict=True)}
+    passed = share.pop(st.PASSED, 0.0)
+    stop = st.blocked(lens.stop_index, st.RIM)
+    ended = [
+        {"status": code, "text": "blocked by the stop" if code == stop else st.describe(code), "share": part}
+        for code, part in sorted(share.items(), key=lambda item: -item[1])
+        if part >= _NEGLIGIBLE
+    ]
+    return passed, ended
+
+
+def warnings_of(lens: Lens, f_number: float, rear_focal_z_mm: float, reached_deg: float | None) -> list[str]:
+    """What a user of this lens should know, in sentences."""
+    found = []
+    focal_mm = first_order(lens).efl_mm
+    if focal_mm <= 0:
+        found.append("the focal length is negative: a diverging lens forms no picture on a film")
+    if lens.rims == "estimated":
+        found.append("rim diameters are estimated, not the source's: vignetting is a guess")
+    unknown = [str(k) for k, s in enumerate(lens.surfaces) if s.n_d != 1 and s.V_d is None]
+    if unknown:
+        found.append(f"V_d is unknown after surface {', '.join(unknown)}: the index there is constant")
+    tabled = float(lens.vertices_mm[-1])
+    if abs(tabled - rear_focal_z_mm) > _TABLE_TOLERANCE * abs(focal_mm):
+        found.append(
+            f"the table's last thickness puts the film at z = {tabled:.2f} mm, "
+            f"its focus at infinity is at {rear_focal_z_mm:.2f} mm"
+        )
+    if abs(f_number / lens.f_number - 1) > 0.05 and f_number < lens.f_number:
+        found.append(f"the stop gives f/{f_number:.3g}, wider than the f/{lens.f_number:.3g} of the source")
+    if reached_deg is None:
+        found.append("no ray reaches the edge of the film")
+    elif lens.half_field_deg is not None and reached_deg < lens.half_field_deg - 2:
+        found.append(f"the edge of the film sees {reached_deg:.1f} degrees, the source says {lens.half_field_deg:.1f}")
+    return found

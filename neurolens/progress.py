@@ -1,0 +1,157 @@
+"""Progress on stderr: one line a stage, with the time left for the stage and for the whole run."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Protocol, TextIO
+
+
+class Report(Protocol):
+    """What a stage calls now and then with the fraction done, and the seconds left where it knows better."""
+
+    def __call__(self, fraction: float, seconds_left: float | None = None) -> None: ...
+
+
+def duration(seconds: float) -> str:
+    """A time in words: "0.4 s", "12 s", "3 min 05 s", "2 h 10 min"."""
+    if seconds < 9.95:
+        return f"{max(seconds, 0.0):.1f} s"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+class Progress:
+    """Reports the stages of a run, one line each.
+
+        progress = Progress({"trace ray pairs": 2, "fit": 60})
+        with progress.stage("trace ray pairs") as report:
+            report(0.3)
+
+    On a terminal the line is rewritten in place; elsewhere a line is printed at most every `interval_s`, and one when
+    the stage ends.
+
+    Args:
+        plan: stages to come with the seconds they may take; what they really take corrects the rest of the plan.
+        quiet: print nothing.
+        stream: None takes stderr as it is at each call.
+        interval_s: seconds between lines where there is no terminal.
+        clock: seconds, never going back.
+    """
+
+    def __init__(
+        self,
+        plan: Mapping[str, float] | None = None,
+        *,
+        quiet: bool = False,
+        stream: TextIO | None = None,
+        interval_s: float = 5.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._waiting = dict(plan or {})
+        self._quiet, self._stream, self._interval_s, self._clock = quiet, stream, interval_s, clock
+        self._expected_s, self._taken_s = 0.0, 0.0  # of the planned stages that are done
+        self._open_line = False
+        self._printed_at = -float("inf")
+
+    def plan(self, stages: Mapping[str, float]) -> None:
+        """Add stages to come, with the seconds expected of each."""
+        self._waiting.update(stages)
+
+    @contextmanager
+    def stage(self, name: str, seconds_expected: float | None = None) -> Iterator[Report]:
+        """Time one stage; gives the function that reports the fraction done, from 0 to 1.
+
+        Args:
+            seconds_expected: replaces that of the plan; a stage may be in no plan.
+        """
+        expected = self._waiting.pop(name, None)
+        if seconds_expected is not None:
+            expected = seconds_expected
+        began = self._clock()
+        self._printed_at = began  # the first line comes after a whole interval: short stages print one line only
+
+        def report(fraction: float, seconds_left: float | None = None) -> None:
+            share = min(max(float(fraction), 0.0), 1.0)
+            elapsed = self._clock() - began
+            left = self._left(share, elapsed, expected) if seconds_left is None else seconds_left
+            self._show(self._line(name, share, elapsed, left))
+
+        if self._terminal():
+            report(0.0)
+        try:
+            yield report
+        except BaseException:
+            self._end_line()
+            raise
+        taken = self._clock() - began
+        if expected is not None:
+            self._expected_s += expected
+            self._taken_s += taken
+        self._show(f"{name}: done in {duration(taken)}{self._total(0.0)}", last=True)
+
+    def note(self, text: str) -> None:
+        """Print a line that stays."""
+        self._show(text, last=True)
+
+    def _left(self, share: float, elapsed: float, expected: float | None) -> float | None:
+        """Seconds left of a stage: from its pace once it has one, from the plan before."""
+        if share > 0.02:
+            return elapsed * (1 / share - 1)
+        return None if expected is None else max(expected * self._pace() - elapsed, 0.0)
+
+    def _pace(self) -> float:
+        """Seconds taken over seconds expected, of what is done; kept within reason."""
+        if self._expected_s <= 0:
+            return 1.0
+        return min(max(self._taken_s / self._expected_s, 0.2), 10.0)
+
+    def _line(self, name: str, share: float, elapsed: float, left: float | None) -> str:
+        text = f"{name}: {100 * share:3.0f}%, {duration(elapsed)}"
+        if left is None:
+            return text
+        return text + f", {duration(left)} left{self._total(left)}"
+
+    def _total(self, left: float) -> str:
+        """The time left of the whole run, where more stages wait."""
+        if not self._waiting:
+            return ""
+        return f" (in all {duration(left + self._pace() * sum(self._waiting.values()))} left)"
+
+    def _terminal(self) -> bool:
+        stream = self._stream or sys.stderr
+        return not self._quiet and stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
+
+    def _show(self, text: str, last: bool = False) -> None:
+        stream = self._stream or sys.stderr
+        if self._quiet or stream is None:
+            return
+        now = self._clock()
+        if self._terminal():
+            if not last and self._open_line and now - self._printed_at < 0.1:
+                return
+            width = shutil.get_terminal_size().columns - 1
+            stream.write(f"\r{text[:width]}\x1b[K" + ("\n" if last else ""))
+            self._open_line = not last
+        elif last or now - self._printed_at >= self._interval_s:
+            stream.write(text + "\n")
+        else:
+            return
+        self._printed_at = now
+        stream.flush()
+
+    def _end_line(self) -> None:
+        """Leave the line as it stands, so that what is printed next does not overwrite it."""
+        if self._open_line:
+            stream = self._stream or sys.stderr
+            stream.write("\n")
+            stream.flush()
+            self._open_line = False
