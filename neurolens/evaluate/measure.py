@@ -48,15 +48,18 @@ def onnx_predictor(model: OnnxLens, batch: int = 16384) -> Any:
 
     def predict(rays: FilmRays, stop_radius_mm: float | None = None) -> Prediction:
         columns = [np.ascontiguousarray(c.numpy(), dtype=np.float32) for c in rays.columns()]
-        parts = []
-        for i in range(0, len(rays), batch):
-            fx, fy, fz, px, py, wavelength = (c[i : i + batch] for c in columns)
-            parts.append(model.rays(np.stack([fx, fy]), np.stack([px, py]), wavelength, fz, stop_radius_mm))
-        scene, stop = (np.concatenate([getattr(p, k) for p in parts], 1) for k in ("scene_ray", "stop_xy_mm"))
-        power, status = (np.concatenate([getattr(p, k) for p in parts]) for k in ("transmittance", "status"))
-        ray = Rays(*(torch.from_numpy(np.ascontiguousarray(c)) for c in scene))
-        stop_x, stop_y = (torch.from_numpy(np.ascontiguousarray(c)) for c in stop)
-        return Prediction(ray, torch.from_numpy(power), stop_x, stop_y, torch.from_numpy(status))
+        scene, stop = np.empty((6, len(rays)), np.float32), np.empty((2, len(rays)), np.float32)
+        power, status = np.empty(len(rays), np.float32), np.empty(len(rays), np.int32)
+        planes, plane_of = np.unique(columns[2], return_inverse=True)
+        for k, film_z in enumerate(planes):
+            of_plane = np.flatnonzero(plane_of == k)
+            for i in range(0, len(of_plane), batch):
+                at = of_plane[i : i + batch]
+                fx, fy, _, px, py, wavelength = (c[at] for c in columns)
+                out = model.rays(np.stack([fx, fy]), np.stack([px, py]), wavelength, float(film_z), stop_radius_mm)
+                scene[:, at], power[at], stop[:, at], status[at] = out
+        x, y, z, dx, dy, dz = torch.from_numpy(scene)
+        return Prediction(Rays(x, y, z, dx, dy, dz), torch.from_numpy(power), *torch.from_numpy(stop), torch.from_numpy(status))
 
     return predict
 

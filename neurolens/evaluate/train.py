@@ -21,7 +21,8 @@ from neurolens.evaluate.plots import error_against_coefficients_plot, lens_layou
 from neurolens.evaluate.rays import pixel_um, pupil_disc_share
 from neurolens.evaluate.records import break_even_rays, write_results
 from neurolens.evaluate.report import write_report
-from neurolens.evaluate.speed import Race, exact_candidates, model_candidate, race
+from neurolens.evaluate.candidates import exact_candidates, model_candidate
+from neurolens.evaluate.speed import Race, race
 from neurolens.files import atomic_write_text
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens

@@ -19,6 +19,10 @@ from neurolens.optics.pupils import PupilBounds, image_radius_mm, pupil_bounds
 # The disc on the pupil plane is that of all passing rays, enlarged by this much (design: "enlarged by 5%").
 PUPIL_MARGIN = 1.05
 
+# Film positions of sampled rays, both limits of focus among them: a picture has one film position, and so has a call of
+# an exported model.
+FILM_PLANES = 17
+
 
 @dataclass(frozen=True)
 class Domain:
@@ -149,7 +153,7 @@ def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:
 
 
 def sample_domain(domain: Domain, count: int, seed: int, skip: int = 0) -> FilmRays:
-    """Rays of a domain: uniform on the film and pupil discs, in wavelength and in film position.
+    """Rays of a domain: uniform on the film and pupil discs and in wavelength; film positions are `FILM_PLANES` equal steps.
 
     Scrambled Sobol points (Owen scrambling, torch): the same seed gives the same rays; `skip` continues the sequence,
     so that splits never share a ray.
@@ -162,7 +166,8 @@ def sample_domain(domain: Domain, count: int, seed: int, skip: int = 0) -> FilmR
     pupil_x, pupil_y = _disc(s[2], s[3], domain.pupil_radius_mm)
     low, high = domain.wavelength_nm
     near, far = domain.film_z_mm
-    return FilmRays(film_x, film_y, near + (far - near) * s[5], pupil_x, pupil_y, low + (high - low) * s[4])
+    step = torch.floor(s[5] * FILM_PLANES).clamp_max(FILM_PLANES - 1) / (FILM_PLANES - 1)
+    return FilmRays(film_x, film_y, near + (far - near) * step, pupil_x, pupil_y, low + (high - low) * s[4])
 
 
 def _disc(a: Tensor, b: Tensor, radius: float) -> tuple[Tensor, Tensor]:
