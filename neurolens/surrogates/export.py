@@ -1,0 +1,78 @@
+"""Complete ONNX graphs of surrogates: raw mm and nm in; scene ray, transmittance, stop crossing and status out.
+
+Written node by node in float32. The speed comes from few passes over the rays: linear steps (planes, centring,
+scaling, the two coefficients of every vector, tests) are rows of a few matrix products.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neurolens import status as st
+from neurolens.errors import InputError
+from neurolens.files import atomic_path
+from neurolens.surrogates.card import card_of, card_to_json
+from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.onnx_cores import add_core
+from neurolens.surrogates.onnx_graph import FLOAT, INT32, Graph
+from neurolens.surrogates.onnx_light import TEST_SCALE, DirectionSeries, add_decoder, add_light_field, add_status
+
+CARD_KEY = "neurolens"
+
+
+def export_onnx(model: LensModel, path: str | Path, errors: dict[str, Any] | None = None) -> Path:
+    """Write a model with its card.
+
+    Inputs: rays [5, N] float32 (film_x_mm, film_y_mm, pupil_x_mm, pupil_y_mm, wavelength_nm), film_z_mm [1],
+    stop_radius_mm [1]. Outputs, as `LensModel.predict`: scene_ray [6, N] (x, y, z mm, unit direction; lens frame),
+    transmittance [N], stop_xy_mm [2, N], status [N] int32.
+
+    Args:
+        errors: held-out errors for the card, JSON-able.
+
+    Returns the path.
+
+    Raises:
+        InputError: weights or errors that are not finite; two gates on one surface.
+    """
+    surfaces = [gate.surface for gate in model.gates]
+    if len({*surfaces, model.lens.stop_index}) <= len(surfaces):
+        raise InputError("export", "gates", surfaces, "one gate a surface, and none on the stop")
+    g = Graph()
+    field, inside = add_light_field(g, model)
+    series = DirectionSeries(largest_angle(model))
+    scale = np.array([model.scales.position_mm, series.kappa, model.scales.stop_mm])
+    rows = add_core(g, model.core, field, scale, TEST_SCALE)
+    stop_square = add_decoder(g, model, rows.vectors, series)
+    add_status(g, model, rows, stop_square, inside)
+    g.reshape(rows.transmittance, [-1], out="transmittance")
+    proto = g.model(
+        [("rays", [5, "N"]), ("film_z_mm", [1]), ("stop_radius_mm", [1])],
+        [
+            ("scene_ray", FLOAT, [6, "N"]),
+            ("transmittance", FLOAT, ["N"]),
+            ("stop_xy_mm", FLOAT, [2, "N"]),
+            ("status", INT32, ["N"]),
+        ],
+        {CARD_KEY: card_to_json(card_of(model, errors or {}))},
+    )
+    target = Path(path)
+    with atomic_path(target) as temporary:
+        temporary.write_bytes(proto.SerializeToString())
+    return target
+
+
+def largest_angle(model: LensModel, count: int = 32768) -> float:
+    """Largest angle (rad) from the axis of the model's passing rays, a little enlarged. Sets the length of series."""
+    rays = sample_domain(model.domain, count, seed=5)
+    with torch.no_grad():
+        out = model.predict(rays)
+    passed = out.status == st.PASSED
+    angle = torch.atan2(torch.hypot(out.rays.dx, out.rays.dy), -out.rays.dz)
+    return 1.03 * float(angle[passed].max()) if bool(passed.any()) else math.pi / 2

@@ -1,0 +1,162 @@
+"""The ends of an exported graph: from raw rays to the light field, and from vectors and tests to the named outputs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens import status as st
+from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.onnx_cores import CoreRows, Field
+from neurolens.surrogates.onnx_graph import INT32, Graph
+
+Array = NDArray[np.float64]
+
+# Any positive float32 test times this exceeds every status code, so that one minimum turns a failed test into its code.
+TEST_SCALE = 1e30
+SLACK = 1.00001  # of the domain's bounds, as in LensModel.inside_domain
+
+
+def add_light_field(g: Graph, model: LensModel) -> tuple[Field, str]:
+    """The light field, and whether each ray is inside the domain, bool [1, N]."""
+    e, d = model.encoding, model.domain
+    film_pupil, wavelength = g.split("rays", [4, 1])
+    inside = _inside(g, d, film_pupil)
+    if e.w_half:
+        # v = 1000 / (lambda sqrt(half)), so that w = v^2 - middle / half.
+        unit = 1000 / math.sqrt(e.w_half)
+        v = g.op("Div", g.const(unit), wavelength)
+        low, high = d.wavelength_nm
+        clipped = g.op("Clip", v, g.const(unit / (high * SLACK)), g.const(unit * SLACK / low))
+        inside = g.op("And", inside, g.op("Equal", v, clipped))  # false for NaN, whatever Clip makes of it
+        film_pupil = g.concat(film_pupil, v)
+    matrix = _plane_matrix(g, e)
+    planes = g.op("MatMul", matrix, film_pupil)  # rows p, u, p + u, v
+    squares = g.op("Mul", planes, planes)
+    # rho = p.p, tau = u.u, sigma = (|p + u|^2 - rho - tau) / 2: squares only, so that one pass makes them all.
+    pairs = np.kron(np.array([[1, 0, 0], [-0.5, -0.5, 0.5], [0, 1, 0]]), [1.0, 1.0])
+    weight, bias = np.zeros((4, 7 if e.w_half else 6)), np.zeros(4)
+    weight[:3, :6] = pairs
+    if e.w_half:
+        weight[3, 6], bias[3] = 1, -e.w_middle / e.w_half
+    p, u, *_ = g.split(planes, [2, 2, len(weight[0]) - 4])
+    return Field(p, u, squares, weight, bias, e.w_half != 0), inside
+
+
+def _plane_matrix(g: Graph, e: Encoding) -> str:
+    """[7 or 6, 5 or 4] from rays to planes. It depends on the film position, so it is made in the graph."""
+
+    def rows(along: float) -> Array:
+        """p = u + (film - u) along, centred and scaled; columns film_x, film_y, pupil_x, pupil_y, v."""
+        film, pupil = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+        p = along * film + (1 - along) * pupil
+        u = (pupil - e.chief * p) / e.pupil_scale_mm
+        p = p / e.film_scale_mm
+        matrix = np.kron(np.stack([p, u, p + u]), np.eye(2))
+        return np.asarray(np.pad(matrix, ((0, 1), (0, 1))) if e.w_half else matrix, dtype=np.float64)
+
+    base, slope = rows(0.0), rows(1.0) - rows(0.0)
+    if e.w_half:
+        base[-1, -1] = 1
+    gap = g.op("Sub", "film_z_mm", g.const([e.pupil_plane_z_mm]))
+    along = g.op("Div", g.const([e.film_plane_z_mm - e.pupil_plane_z_mm]), gap)
+    return g.op("Add", g.op("Mul", along, g.const(slope)), g.const(base))
+
+
+def _inside(g: Graph, d: Domain, film_pupil: str) -> str:
+    """Film point, pupil point, film position and stop inside the domain, bool [1, N]; comparisons that NaN fails."""
+    square = g.reshape(g.op("Mul", film_pupil, film_pupil), [2, 2, -1])
+    square = g.op("ReduceSum", square, g.const([1], np.int64), keepdims=0)
+    limits = np.square([[d.film_radius_mm * SLACK], [d.pupil_radius_mm * SLACK]])
+    within = g.split(g.op("LessOrEqual", square, g.const(limits)), [1, 1])
+    near, far = d.film_z_mm
+    call = g.op("LessOrEqual", "film_z_mm", g.const([far * SLACK]))
+    call = g.op("And", call, g.op("GreaterOrEqual", "film_z_mm", g.const([near / SLACK])))
+    call = g.op("And", call, g.op("LessOrEqual", "stop_radius_mm", g.const([d.stop_radius_mm * SLACK])))
+    return g.op("And", g.op("And", within[0], within[1]), call)
+
+
+def add_decoder(g: Graph, model: LensModel, vectors: str, series: DirectionSeries) -> str:
+    """Outputs scene_ray and stop_xy_mm from vectors [3, 2, N]; returns the stop crossing's squared radius [1, N]."""
+    position, direction, stop = g.split(vectors, [1, 1, 1])
+    g.reshape(stop, [2, -1], out="stop_xy_mm")
+    position, direction = (g.reshape(v, [2, -1]) for v in (position, direction))
+    square = g.op("ReduceSum", g.op("Mul", vectors, vectors), g.const([1], np.int64), keepdims=0)
+    r2, t, stop2 = g.split(square, [1, 1, 1])
+    z = _sag(g, model, r2)
+    xy = g.op("Mul", direction, _horner(g, t, series.sinc))
+    g.concat(position, z, xy, _horner(g, t, series.minus_cos), out="scene_ray")
+    return stop2
+
+
+def _sag(g: Graph, model: LensModel, r2: str) -> str:
+    """z on the front surface at squared radius r2: a short series where it is weak, else R - sqrt(R^2 - r2)."""
+    front = model.lens.surfaces[0]
+    c = float(front.curvature)
+    reach = (1.3 * front.semi_diameter_mm) ** 2
+    if c * c * reach < 0.05:
+        series = fit_series(lambda s: c * s / (1 + np.sqrt(1 - c * c * s)), reach, 1e-6)
+        return _horner(g, r2, series)
+    radius = g.const(abs(1 / c))
+    root = g.op("Sqrt", g.op("Relu", g.op("Sub", g.const(1 / c**2), r2)))
+    return g.op("Sub", radius, root) if c > 0 else g.op("Sub", root, radius)
+
+
+def _horner(g: Graph, t: str, coefficients: Array) -> str:
+    """Polynomial in t, lowest coefficient first. A leading 1 costs nothing."""
+    *rest, lead = coefficients
+    value = t if lead == 1 else g.op("Mul", t, g.const(lead))
+    for i, c in enumerate(reversed(rest)):
+        value = g.op("Add", value, g.const(c))
+        if i < len(rest) - 1:
+            value = g.op("Mul", value, t)
+    return value
+
+
+def add_status(g: Graph, model: LensModel, rows: CoreRows, stop_square: str, inside: str) -> None:
+    """Output status: the code of the first failed test along a camera ray, then the domain.
+
+    Camera rays meet the last surface first, so the first failure is the largest code.
+    """
+    limit = g.op("Mul", g.op("Mul", "stop_radius_mm", "stop_radius_mm"), g.const([TEST_SCALE]))
+    over = g.op("Sub", g.op("Mul", stop_square, g.const(TEST_SCALE)), limit)
+    failed = [g.op("Min", over, g.const(float(st.blocked(model.lens.stop_index, st.RIM))))]
+    if rows.gates is not None:
+        codes = np.array([[float(gate.status)] for gate in model.gates])
+        failed += g.split(g.op("Min", rows.gates, g.const(codes)), [1] * len(codes))
+    code = g.op("Relu", g.op("Max", *failed) if len(failed) > 1 else failed[0])
+    code = g.op("Where", inside, code, g.const(float(st.OUTSIDE_DOMAIN)))
+    g.reshape(g.op("Cast", code, to=INT32), [-1], out="status")
+
+
+class DirectionSeries:
+    """(v sinc|v|, -cos|v|) as polynomials in t = |kappa v|^2 to float32 precision, up to an angle.
+
+    Attributes:
+        kappa: factor on v that makes the polynomial of sinc monic, which saves a pass over the rays.
+        sinc, minus_cos: coefficients, lowest first; kappa v times sinc(t) is the direction's x and y.
+    """
+
+    def __init__(self, angle: float) -> None:
+        sinc = fit_series(lambda t: np.sinc(np.sqrt(t) / np.pi), angle**2, 3e-8 / max(angle, 0.1))
+        self.minus_cos = fit_series(lambda t: -np.cos(np.sqrt(t)), angle**2, 3e-8)
+        n = len(sinc) - 1
+        self.kappa = math.copysign(abs(sinc[n]) ** (1 / (2 * n + 1)), sinc[n])
+        self.sinc = sinc / self.kappa ** (2.0 * np.arange(n + 1) + 1)
+        self.sinc[n] = 1.0
+        self.minus_cos = self.minus_cos / self.kappa ** (2.0 * np.arange(len(self.minus_cos)))
+
+
+def fit_series(function: Callable[[Array], Array], upper: float, tolerance: float) -> Array:
+    """Power series of the lowest degree that holds the tolerance on [0, upper] (Chebyshev interpolation)."""
+    t = np.linspace(0, upper, 400)
+    for degree in range(1, 16):
+        fit = np.polynomial.Chebyshev.interpolate(function, degree, [0, upper])
+        if np.abs(fit(t) - function(t)).max() < tolerance:
+            break
+    return np.asarray(fit.convert(kind=np.polynomial.Polynomial).coef, dtype=np.float64)
