@@ -93,7 +93,7 @@ def camera_candidate(camera: Camera, domain: Domain, name: str | None = None) ->
 
 
 def model_candidate(name: str, model: Any, stop_radius_mm: float) -> Candidate:
-    """An exported model (`cameras.model.OnnxLens`, loaded with as many threads as the race has)."""
+    """An exported model (`cameras.model.OnnxLens`, loaded with one thread: the race shares out batches)."""
 
     def prepare(rays: FilmRays) -> Call:
         columns = [np.ascontiguousarray(c.numpy(), dtype=np.float32) for c in rays.columns()]

@@ -1,9 +1,9 @@
 """Speed in nanoseconds per ray, so that a ratio means something.
 
-Candidates run in turn, round after round, in one process with the same pinned threads, so that a machine that slows
-down slows all of them; ratios are taken within rounds. Every candidate does the same rays: uniform over the film and
-over the pupil disc of the domain, those that are blocked included, because a render pays for them too. Each may choose
-the batch that suits it best.
+Candidates run in turn, round after round, in one process with the same number of threads, so that a machine that
+slows down slows all of them; ratios are taken within rounds. Every candidate does the same rays: uniform over the film
+and over the pupil disc of the domain, those that are blocked included, because a render pays for them too. Each may
+choose the batch that suits it best.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import os
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 
@@ -69,25 +69,13 @@ def pinned_threads(threads: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def onnx_session_options(threads: int) -> Any:
-    """onnxruntime options for a session with pinned threads: `threads` within an operator, one operator at a time."""
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-    # Spinning threads would take the core from the next candidate.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    return options
-
-
 def time_per_ray(call: Call, rays: int, threads: int = 1, repeats: int = 20) -> Timing:
     """Nanoseconds per ray of one call that does `rays` rays, after one call to warm up; torch's threads are pinned."""
     with pinned_threads(threads):
-        call()
-        inner = _calls_for_a_sample(call)
-        samples = [_sample_ns(call, inner, rays) for _ in range(repeats)]
+        one = _Pass(rays, (call,), None, 1)
+        one.sample_ns(1)
+        inner = _calls_for_a_sample(one.sample_ns(1))
+        samples = [one.sample_ns(inner) / rays for _ in range(repeats)]
     return _timing(samples, threads, rays)
 
 
@@ -132,6 +120,9 @@ class Race:
 def race(candidates: Sequence[Candidate], domain: Domain, *, threads: int = 1, rounds: int = 20, seed: int = 3) -> Race:
     """Time candidates in turn on the same rays of a domain.
 
+    Each call runs on one thread; with more threads, that many workers share out the batches, as a renderer does
+    (torch and onnxruntime gain nothing from threads within an operator at batches that fit the caches).
+
     Raises:
         InputError: no rounds, fewer than one thread, or two candidates of one name.
     """
@@ -140,53 +131,84 @@ def race(candidates: Sequence[Candidate], domain: Domain, *, threads: int = 1, r
         raise InputError("race", "rounds, candidates", (rounds, names), "at least one round, and names that differ")
     pool = sample_domain(domain, POOL, seed)
     unavailable: dict[str, str] = {}
-    passes: dict[str, Call] = {}
-    batch: dict[str, int] = {}
+    passes: dict[str, _Pass] = {}
     before = _load()
-    with pinned_threads(threads), torch.no_grad():
+    with _workers(threads) as pool_of_workers, pinned_threads(1), torch.no_grad():
         torch._dynamo.reset()  # torch compiles one function only so often before it gives up; a race starts afresh
         for c in candidates:
             try:
-                passes[c.name], batch[c.name] = _best_batch(c, pool)
+                passes[c.name] = _best_batch(c, pool, pool_of_workers)
             except Unavailable as reason:
                 unavailable[c.name] = str(reason)
-        inner = {name: _calls_for_a_sample(call) for name, call in passes.items()}
+        inner = {name: _calls_for_a_sample(each.sample_ns(1)) for name, each in passes.items()}
         ns: dict[str, list[float]] = {name: [] for name in passes}
         for i in range(rounds):
             order = list(passes) if i % 2 == 0 else list(reversed(passes))  # nobody always follows the same neighbour
             for name in order:
-                passes[name]()  # warms the caches for this candidate
-                ns[name].append(_sample_ns(passes[name], inner[name], len(pool)))
-    return Race(ns, batch, threads, rounds, unavailable, before, _load())
+                passes[name].sample_ns(1)  # warms the caches for this candidate
+                ns[name].append(passes[name].sample_ns(inner[name]) / len(pool))
+    return Race(ns, {n: p.batch for n, p in passes.items()}, threads, rounds, unavailable, before, _load())
 
 
-def _best_batch(candidate: Candidate, pool: FilmRays) -> tuple[Call, int]:
+@dataclass(frozen=True)
+class _Pass:
+    """The calls of one candidate that together do every ray of the pool once, shared out among workers."""
+
+    batch: int
+    calls: tuple[Call, ...]
+    workers: ThreadPoolExecutor | None
+    threads: int
+
+    def sample_ns(self, inner: int) -> float:
+        """Nanoseconds of one pass, mean of `inner` in a row."""
+        start = time.perf_counter_ns()
+        if self.workers is None:
+            _repeat(self.calls, inner)
+        else:
+            # A worker repeats its own share: handing it out anew for every pass would be part of the time.
+            shares = [self.calls[i :: self.threads] for i in range(self.threads)]
+            for done in [self.workers.submit(_repeat, share, inner) for share in shares]:
+                done.result()
+        return max(time.perf_counter_ns() - start, 1) / inner
+
+
+def _repeat(calls: Sequence[Call], times: int) -> None:
+    with torch.no_grad():  # gradients are a setting of each thread
+        for _ in range(times):
+            for call in calls:
+                call()
+
+
+@contextmanager
+def _workers(threads: int) -> Iterator[ThreadPoolExecutor | None]:
+    """Threads that share out batches; None for one, which needs no handing over."""
+    if threads < 1:
+        raise InputError("race", "threads", threads, "at least 1")
+    if threads == 1:
+        yield None
+        return
+    # The number of threads within an operator is a setting of each thread, too.
+    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as workers:
+        yield workers
+
+
+def _best_batch(candidate: Candidate, pool: FilmRays, workers: ThreadPoolExecutor | None) -> _Pass:
     """One pass over the pool in the fastest of the candidate's batch sizes."""
-    best, call, size = math.inf, None, 0
+    threads = 1 if workers is None else workers._max_workers
+    best, found = math.inf, None
     for batch in candidate.batches:
-        calls = [candidate.prepare(pool.select(slice(i, i + batch))) for i in range(0, len(pool), batch)]
-
-        def one_pass(calls: list[Call] = calls) -> None:
-            for each in calls:
-                each()
-
-        one_pass()
-        took = min(_sample_ns(one_pass, 1, len(pool)) for _ in range(3 if len(candidate.batches) > 1 else 1))
+        calls = tuple(candidate.prepare(pool.select(slice(i, i + batch))) for i in range(0, len(pool), batch))
+        each = _Pass(batch, calls, workers, threads)
+        each.sample_ns(1)
+        took = min(each.sample_ns(1) for _ in range(3)) if len(candidate.batches) > 1 else 0.0
         if took < best:
-            best, call, size = took, one_pass, batch
-    assert call is not None
-    return call, size
+            best, found = took, each
+    assert found is not None
+    return found
 
 
-def _calls_for_a_sample(call: Call) -> int:
-    return max(1, math.ceil(_SAMPLE_S * 1e9 / max(_sample_ns(call, 1, 1), 1.0)))
-
-
-def _sample_ns(call: Call, inner: int, rays: int) -> float:
-    start = time.perf_counter_ns()
-    for _ in range(inner):
-        call()
-    return max(time.perf_counter_ns() - start, 1) / (inner * rays)
+def _calls_for_a_sample(ns: float) -> int:
+    return max(1, math.ceil(_SAMPLE_S * 1e9 / ns))
 
 
 def _timing(samples: list[float], threads: int, batch: int) -> Timing:
