@@ -1,0 +1,284 @@
+"""The command line from outside: help, one line an error, JSON with units in its keys, files that are whole."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from neurolens.cli import main
+from neurolens.render.exr import read_exr
+
+ROOT = Path(__file__).parents[1]
+LENSES = sorted((ROOT / "lenses").glob("*.toml"))
+GAUSS = ROOT / "lenses" / "laikin_double_gauss_50.toml"
+ZOOM = ROOT / "lenses" / "ogawa_zoom_70_200.toml"
+COMMANDS = ("lens", "train", "evaluate", "render")
+
+SCENE = """\
+[camera]
+position_m = [0.0, 0.0, 2.0]
+look_at_m = [0.0, 0.0, 0.0]
+focus_m = 2.0
+f_number = 4.0
+width = 32
+height = 18
+samples = 2
+
+[environment]
+colour = [1.0, 1.0, 1.0]
+
+[materials]
+grey = { kind = "diffuse", reflectance = [0.5, 0.5, 0.5] }
+
+[[spheres]]
+centre_m = [0.4, 0.0, 0.0]
+radius_m = 0.1
+material = "grey"
+"""
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    path = tmp_path / "ball.toml"
+    path.write_text(SCENE)
+    return path
+
+
+def run_json(capsys: pytest.CaptureFixture[str], *args: object) -> dict[str, Any]:
+    """Run a command with --json and parse all of its stdout."""
+    assert main([*map(str, args), "--json"]) == 0
+    data: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return data
+
+
+def failure(capsys: pytest.CaptureFixture[str], *args: object) -> str:
+    """Run a command that must fail with exit code 2, nothing on stdout, and one line on stderr; returns the line."""
+    try:
+        code = main([*map(str, args)])
+    except SystemExit as stopped:
+        code = int(stopped.code or 0)
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    assert (code, captured.out, len(lines)) == (2, "", 1), captured
+    return lines[0]
+
+
+# Help
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_explains_every_option_and_shows_examples(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main([command, "--help"])
+    text = capsys.readouterr().out
+    assert stopped.value.code == 0
+    assert "examples:\n" in text and f"  neurolens {command} " in text and "--json" in text
+    assert max(map(len, text.splitlines())) <= 110
+    for line in text.splitlines():  # an option without a help text stands alone and is followed by another option
+        assert "None" not in line and "SUPPRESS" not in line
+
+
+def test_main_help_lists_the_commands_and_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = capsys.readouterr().out
+    assert all(f"  {command} " in text for command in COMMANDS) and "exit codes" in text
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        ([], ["COMMAND"]),
+        (["lense"], ["lense", "lens"]),
+        (["lens"], ["FILE"]),
+        (["lens", "no.toml"], ["no.toml", "missing"]),
+        (["lens", GAUSS, "--focus", "near"], ["--focus", "near", "metres"]),
+        (["lens", GAUSS, "--focus", "0"], ["--focus", "above 0"]),
+        (["lens", GAUSS, "--focus", "nan"], ["--focus", "above 0"]),
+        (["lens", GAUSS, "--focus", "0.1"], ["focus_m", "0.1", "four focal lengths"]),
+        (["lens", GAUSS, "--efl", "inf"], ["--efl", "mm"]),
+        (["lens", GAUSS, "--f-number", "-2"], ["--f-number", "above 0"]),
+        (["lens", GAUSS, "--configuration", "wide"], ["configuration", "wide", "none in this file"]),
+        (["lens", ZOOM, "--configuration", "wide"], ["configuration", "wide", "72mm"]),
+        (["lens", GAUSS, "--layout", "a.exr"], ["--layout", ".png"]),
+        (["lens", GAUSS, "--layout", "/no/such/folder/a.png"], ["--layout", "folder"]),
+        (["lens", GAUSS, "--foc", "1"], ["--foc"]),
+        (["train"], ["EXPERIMENT.toml", "--lens"]),
+        (["train", "a.toml", "--lens", GAUSS], ["both"]),
+        (["train", "--lens", GAUSS], ["--out"]),
+        (["train", "no.toml"], ["no.toml", "missing"]),
+        (["train", "--lens", GAUSS, "--out", GAUSS], ["--out", "folder"]),
+    ],
+)
+def test_a_mistake_is_one_line(args: list[object], words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    line = failure(capsys, *args)
+    assert line.startswith("neurolens") and all(word in line for word in words), line
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--camera", "fish"], ["fish", ".toml", ".onnx", "thin", "pinhole"]),
+        (["--camera", "no.onnx"], ["no.onnx", "missing"]),
+        (["--camera", "no.toml"], ["no.toml", "missing"]),
+        (["--camera", "thin", "--samples", "0"], ["--samples", "from 1"]),
+        (["--camera", "thin", "--seed", "x"], ["--seed", "integer"]),
+        (["--camera", "thin", "--focus", "0.1"], ["focus_m", "focal lengths"]),
+        (["--camera", "thin", "--configuration", "72mm"], ["configuration", "lens file"]),
+        (["--camera", "thin", "--width", "32", "--height", "32"], ["shape of the film"]),
+        (["--camera", "thin", "-o", "a.png"], ["--out", ".exr"]),
+        (["--camera", "thin", "-o", "/no/such/folder/a.exr"], ["folder"]),
+        ([], ["--camera"]),
+    ],
+)
+def test_a_mistake_in_a_render_is_one_line_and_leaves_no_file(
+    args: list[str], words: list[str], scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = failure(capsys, "render", scene, "-o", tmp_path / "a.exr", "--quiet", *args)
+    assert all(word in line for word in words), line
+    assert not list(tmp_path.glob("*.exr")) and not list(tmp_path.glob("*.png"))
+
+
+def test_a_file_that_is_no_model_is_one_line(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = tmp_path / "broken.onnx"
+    model.write_bytes(b"not a model")
+    line = failure(capsys, "render", scene, "--camera", model, "-o", tmp_path / "a.exr", "--quiet")
+    assert "broken.onnx" in line
+    assert "broken.onnx" in failure(capsys, "evaluate", model)
+
+
+# lens
+
+
+@pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
+def test_lens_describes_every_shipped_lens(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = run_json(capsys, "lens", path)
+    assert data["efl_mm"] > 0 and data["film_z_mm"] > 0 and data["image_radius_mm"] > 0
+    assert data["f_number"] == pytest.approx(data["efl_mm"] / data["entrance_pupil_diameter_mm"])
+    assert data["rear_focal_z_mm"] == pytest.approx(data["film_z_mm"])  # infinity focus
+    assert 0.2 < data["passing_share"] < 1
+    blocked = sum(part["share"] for part in data["ended"])
+    assert data["passing_share"] + blocked == pytest.approx(1, abs=3e-3)
+    assert sum(s["stop"] for s in data["surfaces"]) == 1
+    # In air the real marginal ray meets the sine condition to within the spherical aberration of these lenses.
+    assert data["working_f_number"] == pytest.approx(data["f_number"], rel=0.12)
+    assert data["focus_m"] == "infinity"
+
+
+def test_lens_counts_refractions_and_reaches_the_field(capsys: pytest.CaptureFixture[str]) -> None:
+    """The Laikin double Gauss has 12 refractions and is a 50 mm lens that covers 24 x 36 mm."""
+    data = run_json(capsys, "lens", GAUSS)
+    assert data["refractions"] == 12
+    assert data["efl_mm"] == pytest.approx(49.64, abs=0.01)
+    assert data["half_field_reached_deg"] == pytest.approx(23.5, abs=1.5)  # atan(21.6 / 49.64), and its distortion
+
+
+def test_lens_state_is_applied(capsys: pytest.CaptureFixture[str]) -> None:
+    data = run_json(capsys, "lens", ZOOM, "--configuration", "135mm", "--f-number", "5.6", "--focus", "5")
+    assert data["efl_mm"] == pytest.approx(135, rel=0.01)
+    assert data["f_number"] == pytest.approx(5.6)
+    assert data["film_z_mm"] > data["rear_focal_z_mm"]
+    # The working f-number grows with the magnification, f / (5 m - f).
+    assert data["working_f_number"] > 5.6
+    assert run_json(capsys, "lens", GAUSS, "--efl", "35")["efl_mm"] == pytest.approx(35)
+
+
+def test_lens_text_and_layout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "layout.png"
+    assert main(["lens", str(GAUSS), "--layout", str(picture)]) == 0
+    text = capsys.readouterr().out
+    assert "focal length" in text and "49.6" in text and "12" in text
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+# render
+
+
+@pytest.mark.parametrize("camera", ["thin", "pinhole", GAUSS], ids=["thin", "pinhole", "lens"])
+def test_render_writes_the_picture_with_its_settings(
+    camera: object, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "ball.exr"
+    data = run_json(capsys, "render", scene, "--camera", camera, "-o", out, "--samples", "16", "--quiet")
+    picture, metadata = read_exr(out)
+    assert picture.shape == (18, 32, 3)
+    # Radiance 1 gives 1 in the middle of the film of every camera.
+    assert picture[7:11, 14:18].mean() == pytest.approx(1, rel=0.15)
+    assert (data["width"], data["height"], data["samples"]) == (32, 18, 16)
+    assert metadata["render"]["samples"] == 16 and metadata["camera"] == data["camera"]
+    assert metadata["camera"]["f_number"] == pytest.approx(4.0)
+    assert Path(data["preview"]).read_bytes().startswith(b"\x89PNG")
+
+
+def test_render_repeats_with_its_seed_and_takes_one_side_of_the_picture(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def shot(seed: int, name: str) -> Any:
+        args = ("render", scene, "--camera", "thin", "--width", 16, "--seed", seed, "-o", tmp_path / name, "--quiet")
+        assert run_json(capsys, *args, "--threads", 1)["height"] == 9
+        return read_exr(tmp_path / name)[0]
+
+    first = shot(3, "a.exr")
+    assert (first == shot(3, "b.exr")).all()
+    assert not (first == shot(4, "c.exr")).all()
+
+
+# Signals and missing packages
+
+
+def test_an_interrupt_says_what_is_kept(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("neurolens.render.renderer.render", interrupted)
+    assert main(["render", str(scene), "--camera", "thin", "-o", str(tmp_path / "a.exr"), "--quiet"]) == 130
+    assert "no picture was written" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.exr"))
+
+
+def python(code: str, *args: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", code, *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+
+
+WITHOUT_TORCH = (
+    "import sys; sys.modules.update(dict.fromkeys(['torch', 'matplotlib', 'onnx', 'sklearn']))\n"
+    "from neurolens.cli import main; sys.exit(main(sys.argv[1:]))"
+)
+
+
+def test_without_torch_a_lens_file_names_the_extra_and_the_thin_lens_renders(scene: Path, tmp_path: Path) -> None:
+    done = python(WITHOUT_TORCH, "render", scene, "--camera", GAUSS, "-o", tmp_path / "a.exr", "--quiet")
+    assert done.returncode == 2 and "neurolens[train]" in done.stderr and len(done.stderr.splitlines()) == 1
+    done = python(WITHOUT_TORCH, "render", scene, "--camera", "thin", "-o", tmp_path / "a.exr", "--quiet")
+    assert done.returncode == 0 and (tmp_path / "a.exr").exists()
+
+
+def test_a_reader_that_leaves_is_no_error(scene: Path, tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "neurolens",
+        "render",
+        scene,
+        "--camera",
+        "thin",
+        "-o",
+        tmp_path / "a.exr",
+        "--quiet",
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == ""
+        assert process.wait() == 141
