@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from neurolens.cameras.model import load_model
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.errors import InputError, NeurolensError
 from neurolens.evaluate.candidates import camera_candidate, exact_candidates, model_candidate
 from neurolens.evaluate.layout import refractions
+from neurolens.evaluate.rays import frame_width_mm
 from neurolens.evaluate.speed import Race, race
 from neurolens.evaluate.speed_table import COMPILED, markdown, notes, table_rows
 from neurolens.files import atomic_write_text
@@ -65,15 +65,19 @@ def read_index(folder: Path) -> list[dict[str, Any]]:
         raise InputError(
             path, "file", f"({type(error).__name__}: {error})", "the index that `make models` writes"
         ) from error
+    if not isinstance(rows, list):
+        raise InputError(path, "models", type(rows).__name__, "a list")
     for i, row in enumerate(rows):
         for key in ("file", "lens_file"):
             if not isinstance(row, dict) or not isinstance(row.get(key), str):
                 raise InputError(path, f"models {i}, {key}", "(missing)", "the name of a file")
-    return list(rows)
+    return rows
 
 
 def bench_models(folder: Path, only: str, threads: int, rounds: int) -> Outcome:
     """Race the models of an index, lens by lens."""
+    from neurolens.cameras.model import load_model  # the exact tracer is timed without onnxruntime
+
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in read_index(folder):
         if only in row["file"]:
@@ -87,16 +91,16 @@ def bench_models(folder: Path, only: str, threads: int, rounds: int) -> Outcome:
         lens = read_lens(ROOT / lens_file).at(configuration=configuration, efl_mm=efl_mm)
         models = {row["file"]: load_model(folder / row["file"]) for row in rows}
         domain = Domain.from_dict(next(iter(models.values())).card["domain"])
+        lens = lens.with_stop_radius(domain.stop_radius_mm)
         candidates = exact_candidates(lens, domain)
         for name, model in models.items():
-            if model.card["lens_sha256"] != lens.sha256:
-                raise InputError(
-                    folder / name, "lens_sha256", model.card["lens_sha256"], f"{lens.sha256} ({lens_file})"
-                )
+            made_for = model.card["lens"]["sha256"]
+            if made_for != lens.sha256:
+                raise InputError(folder / name, "card, lens.sha256", made_for, f"{lens.sha256} ({lens_file})")
             candidates.append(model_candidate(name, model, domain.stop_radius_mm))
         data = first_order(lens)
-        focal_mm, width_mm = abs(data.efl_mm), domain.film_radius_mm
-        frame = (1.6641 * width_mm, 1.1094 * width_mm)  # 3:2, inscribed in the film circle
+        focal_mm, width_mm = abs(data.efl_mm), frame_width_mm(domain.film_radius_mm)
+        frame = (width_mm, width_mm * 2 / 3)
         thin = ThinLens(focal_mm, data.f_number, np.inf, frame)
         candidates += [camera_candidate(c, domain) for c in (thin, Pinhole(focal_mm, frame))]
         timed = race(candidates, domain, threads=threads, rounds=rounds)

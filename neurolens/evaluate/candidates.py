@@ -47,9 +47,9 @@ def exact_candidates(
     run: Callable[..., Traced] = whole if build_rays else tracing
 
     def arguments(rays: FilmRays) -> tuple[Any, ...]:
-        columns = tuple(c.to(dtype).contiguous() for c in rays.columns())
-        fx, fy, fz, px, py, wavelength = columns
-        return columns if build_rays else (camera_rays(fx, fy, fz, px, py, domain.pupil_z_mm), wavelength)
+        fx, fy, fz, px, py, wavelength = columns = [c.to(dtype).contiguous() for c in rays.columns()]
+        columns[2] = fz = fz[0].clone()  # one film plane, as in a picture
+        return tuple(columns) if build_rays else (camera_rays(fx, fy, fz, px, py, domain.pupil_z_mm), wavelength)
 
     def eager(rays: FilmRays) -> Call:
         given = arguments(rays)
@@ -97,7 +97,7 @@ def model_candidate(name: str, model: Any, stop_radius_mm: float) -> Candidate:
 
     def prepare(rays: FilmRays) -> Call:
         columns = [np.ascontiguousarray(c.numpy(), dtype=np.float32) for c in rays.columns()]
-        film, pupil = np.stack(columns[0:2]), np.stack(columns[3:5])
-        return lambda: model.rays(film, pupil, columns[5], columns[2], stop_radius_mm)
+        film, pupil, film_z_mm = np.stack(columns[0:2]), np.stack(columns[3:5]), float(rays.film_z[0])
+        return lambda: model.rays(film, pupil, columns[5], film_z_mm, stop_radius_mm)
 
     return Candidate(name, prepare)

@@ -2,8 +2,8 @@
 
 Candidates run in turn, round after round, in one process with the same number of threads, so that a machine that
 slows down slows all of them; ratios are taken within rounds. Every candidate does the same rays: uniform over the film
-and over the pupil disc of the domain, those that are blocked included, because a render pays for them too. Each may
-choose the batch that suits it best.
+and over the pupil disc of the domain, those that are blocked included, because a render pays for them too, and all from
+one film plane, as in a picture. Each candidate may choose the batch that suits it best.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 
@@ -42,8 +42,8 @@ class Candidate:
 
     Attributes:
         name: for tables.
-        prepare: takes the rays of one batch (float64) and gives the call to be timed; conversions belong here, off the
-            clock. Raises `Unavailable` where it cannot run.
+        prepare: takes the rays of one batch (float64, one film plane) and gives the call to be timed; conversions
+            belong here, off the clock. Raises `Unavailable` where it cannot run.
         batches: batch sizes to choose from.
     """
 
@@ -130,6 +130,7 @@ def race(candidates: Sequence[Candidate], domain: Domain, *, threads: int = 1, r
     if rounds < 1 or len(set(names)) < len(names):
         raise InputError("race", "rounds, candidates", (rounds, names), "at least one round, and names that differ")
     pool = sample_domain(domain, POOL, seed)
+    pool = replace(pool, film_z=torch.full_like(pool.film_z, domain.film_z_mm[0]))
     unavailable: dict[str, str] = {}
     passes: dict[str, _Pass] = {}
     before = _load()

@@ -60,8 +60,8 @@ def _ratio(found: dict[str, float] | None) -> str:
 def notes(threads: str, rounds: int) -> str:
     """What a reader must know of the conditions."""
     return (
-        f"Rays uniform over film and pupil disc of each domain, blocked ones included; {threads}, {rounds} rounds in turn; "
-        "float32 unless told. Exact tracer and models do the same work: film and pupil points in; scene ray, "
+        f"Rays uniform over film and pupil disc of each domain, blocked ones included; {threads}, {rounds} rounds in "
+        "turn; float32 unless told. Exact tracer and models do the same work: film and pupil points in; scene ray, "
         "transmittance and status out, with stop, rims and dispersion. Thin lens and pinhole give ray and weight. "
         "Ratios: by the best times (median within rounds); above 1 is faster. "
         f"Python {platform.python_version()}, torch {torch.__version__}, {platform.machine()}."

@@ -1,0 +1,73 @@
+"""What `make bench` reads, promises and prints; no model and no clock is needed for that."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from neurolens.errors import InputError
+from neurolens.evaluate.bench import Outcome, hold_to_promises, main, read_index
+from neurolens.evaluate.speed import Race
+from neurolens.evaluate.speed_table import markdown, table_rows
+
+TIMES = {"exact eager": [200.0, 220.0], "exact compiled": [30.0, 33.0], "a.onnx": [15.0, 16.5], "b.onnx": [20.0, 22.0]}
+
+
+def raced(times: dict[str, list[float]]) -> Race:
+    return Race(times, dict.fromkeys(times, 4096), 1, 2)
+
+
+def test_promises_kept_and_missed() -> None:
+    rows = [{"file": "a.onnx", "promised_speedup": 1.9}, {"file": "b.onnx", "promised_speedup": 1.6}]
+    outcome = Outcome()
+    hold_to_promises(rows, raced(TIMES), outcome)
+    assert outcome.checked == 2
+    assert len(outcome.missed) == 1
+    assert "b.onnx" in outcome.missed[0] and "1.6" in outcome.missed[0]
+
+
+def test_a_model_without_a_promise_is_only_timed() -> None:
+    outcome = Outcome()
+    hold_to_promises([{"file": "a.onnx"}, {"file": "b.onnx", "promised_speedup": None}], raced(TIMES), outcome)
+    assert (outcome.checked, outcome.missed, outcome.unchecked) == (0, [], [])
+
+
+def test_without_the_compiled_tracer_promises_are_unchecked_and_say_why() -> None:
+    times = {k: v for k, v in TIMES.items() if k != "exact compiled"}
+    timed = Race(times, dict.fromkeys(times, 4096), 1, 2, {"exact compiled": "no C++ compiler"})
+    outcome = Outcome()
+    hold_to_promises([{"file": "a.onnx", "promised_speedup": 9.0}], timed, outcome)
+    assert outcome.missed == [] and outcome.checked == 0
+    assert "no C++ compiler" in outcome.unchecked[0]
+    rows = table_rows("lens", timed)
+    assert rows[-1]["reason"] == "no C++ compiler"
+    assert rows[-1]["ns_per_ray"] is None
+    text = markdown("Title", "Notes.", rows)
+    assert "unavailable: no C++ compiler" in text
+    assert text.count("\n| lens |") == len(rows) + 1  # the head is one of them
+    json.dumps(rows, allow_nan=False)
+
+
+def test_the_table_holds_best_median_and_both_ratios() -> None:
+    row = next(r for r in table_rows("lens", raced(TIMES)) if r["name"] == "a.onnx")
+    assert row["ns_per_ray"] == {"min": 15.0, "median": 15.75, "threads": 1, "batch": 4096, "repeats": 2}
+    assert row["speedup_over_compiled"] == {"min": 2.0, "median": 2.0}
+    assert row["speedup_over_eager"]["min"] == pytest.approx(200 / 15)
+    assert "| lens | a.onnx | 15.0 | 15.8 | 66.7 | 4096 | 1 | 2.00 (2.00) |" in markdown("T", "N", [row])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [None, "", "{", "[]", '{"models": 3}', '{"models": [{"file": "a.onnx"}]}', '{"models": [3]}', '{"rows": []}'],
+)
+def test_a_bad_index_is_one_clear_error(tmp_path: Path, text: str | None, capsys: pytest.CaptureFixture[str]) -> None:
+    if text is not None:
+        (tmp_path / "index.json").write_text(text)
+    with pytest.raises(InputError, match="index.json"):
+        read_index(tmp_path)
+    assert main(["--models", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    shown = capsys.readouterr().err.strip()
+    assert "index.json" in shown and "\n" not in shown
+    assert not (tmp_path / "out").exists()
