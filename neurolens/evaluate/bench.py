@@ -76,14 +76,14 @@ def read_index(folder: Path) -> list[dict[str, Any]]:
 
 def bench_models(folder: Path, only: str, threads: int, rounds: int) -> Outcome:
     """Race the models of an index, lens by lens."""
-    from neurolens.cameras.model import load_model  # the exact tracer is timed without onnxruntime
-
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in read_index(folder):
         if only in row["file"]:
             groups.setdefault((row["lens_file"], row.get("configuration"), row.get("efl_mm")), []).append(row)
     if not groups:
         raise InputError(folder / "index.json", "models", "(none)", f"models with {only!r} in the file's name")
+    from neurolens.cameras.model import load_model  # only here: the exact tracer is timed without onnxruntime
+
     outcome = Outcome()
     for (lens_file, configuration, efl_mm), rows in groups.items():
         state = " ".join([Path(lens_file).stem, *([str(configuration)] if configuration else [])])
