@@ -13,7 +13,7 @@ from PIL import Image
 TARGET = Path(__file__).parent.parent / "experiments" / "scenes"
 
 
-def knot(around: int = 120, across: int = 10) -> tuple[np.ndarray, np.ndarray]:
+def knot(around: int = 96, across: int = 10) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] and faces [T, 3] (from 0) of a (2, 3) torus knot about 1 m wide that stands on y = 0."""
     t = np.linspace(0, 2 * np.pi, around, endpoint=False)
 
@@ -46,7 +46,8 @@ def poster(size: int = 384) -> np.ndarray:
     picture = np.empty((height, width, 3))
     picture[:] = np.array([250, 226, 190]) - 90 * y[..., None] * np.array([0.1, 0.5, 0.6])
     picture[np.hypot(x - 0.9, y - 0.38) < 0.17] = (226, 92, 58)
-    hills = [(0.52, 0.07, 5, 0.3, (231, 168, 108)), (0.62, 0.06, 7, 2.0, (92, 142, 146)), (0.74, 0.08, 4, 4.1, (38, 76, 98))]
+    # Level, swing, waves, phase and colour of each hill, from far to near.
+    hills = [(0.52, 0.07, 5, 0.3, (231, 168, 108)), (0.62, 0.06, 7, 2, (92, 142, 146)), (0.74, 0.08, 4, 4.1, (38, 76, 98))]
     for level, swing, waves, phase, colour in hills:
         picture[y > level + swing * np.sin(waves * x + phase)] = colour
     border = (np.minimum(x, width / size - x) < 0.05) | (np.minimum(y, 1 - y) < 0.05)

@@ -95,12 +95,15 @@ def trace(
     weight: FloatArray,
     bins: Index,
     max_depth: int,
+    *,
+    aim: bool = True,
 ) -> FloatArray:
     """Weight times radiance [N] that arrives along camera rays.
 
     Args:
         keys: random numbers of the paths. origin, direction: [3, N], m. weight: [N], paths of weight 0 cost nothing.
         bins: [N] wavelength bins. max_depth: number of surfaces along a path at which light is scattered.
+        aim: sample lights directly; without it the mean is the same, found by scattering alone.
     """
     radiance = np.zeros(len(weight), np.float32)
     slot = np.flatnonzero(weight)
@@ -115,7 +118,7 @@ def trace(
             point += paths.origin
             surface = world.surfaces(found, point)
             _add_environment(world, paths, found, radiance)
-            _add_emission(world, paths, surface, point, distance, radiance)
+            _add_emission(world, paths, surface, point, distance, aim, radiance)
             if depth == max_depth:
                 break
             kind = world.kind.take(surface)
@@ -125,7 +128,7 @@ def trace(
             paths = paths.take(order)
             hits = _hits(world, paths, surface.take(order), point.take(order, axis=1), distance.take(order))
             alive = keys.take(paths.slot)
-            paths = _scatter(world, sampler, alive, paths, hits, ends, depth, radiance)
+            paths = _scatter(world, sampler, alive, paths, hits, ends, depth, aim, radiance)
     return radiance
 
 
@@ -140,7 +143,7 @@ def _add_environment(world: World, paths: Paths, found: NDArray[np.int32], radia
 
 
 def _add_emission(
-    world: World, paths: Paths, surface: Index, point: FloatArray, distance: FloatArray, radiance: FloatArray
+    world: World, paths: Paths, surface: Index, point: FloatArray, distance: FloatArray, aim: bool, radiance: FloatArray
 ) -> None:
     """Light from paths that run into a light, weighted against aiming at it."""
     if world.lights.black:
@@ -153,10 +156,13 @@ def _add_emission(
     cosine = -dot(normal, paths.direction.take(rows, axis=1))
     front = np.flatnonzero(cosine > 0)  # the back of a light is dark
     rows, cosine = rows[front], cosine[front]
-    aimed = world.lights.pdf(light[rows], paths.origin.take(rows, axis=1), distance[rows], cosine)
-    ratio = aimed / paths.density[rows]
     emitted = world.palette.look_up(world.emission_row.take(surface[rows]), paths.bins[rows])
-    radiance[paths.slot[rows]] += paths.throughput[rows] * emitted / (1 + ratio * ratio)
+    emitted *= paths.throughput[rows]
+    if aim:
+        aimed = world.lights.pdf(light[rows], paths.origin.take(rows, axis=1), distance[rows], cosine)
+        ratio = aimed / paths.density[rows]
+        emitted /= 1 + ratio * ratio
+    radiance[paths.slot[rows]] += emitted
 
 
 def _hits(world: World, paths: Paths, surface: Index, point: FloatArray, distance: FloatArray) -> Hits:
@@ -184,6 +190,7 @@ def _scatter(
     hits: Hits,
     ends: Index,
     depth: int,
+    aim: bool,
     radiance: FloatArray,
 ) -> Paths:
     """Light aimed at from each surface, and the paths on their way to the next one."""
@@ -205,7 +212,7 @@ def _scatter(
         )
         return np.concatenate([base[diffuse] * cosine, shiny]), np.concatenate([cosine, shiny_density])
 
-    if rough and not world.lights.black:
+    if rough and aim and not world.lights.black:
         _add_direct(world, sampler, keys.cut(0, rough), first, paths, hits.cut(slice(0, rough)), evaluate, radiance)
 
     direction, density = np.empty_like(paths.direction), np.full(total, _SPECULAR)

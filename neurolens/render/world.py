@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from neurolens.cameras.contract import FloatArray
 from neurolens.render.lights import Lights
 from neurolens.render.mesh import Mesh, vertex_normals
-from neurolens.render.primitives import AxisQuad, Box, IntArray, Plane, Primitive, Quad, Rays, Sphere, is_axis_aligned
+from neurolens.render.primitives import AxisQuad, Box, IntArray, Plane, Primitive, Quad, Rays, Spheres, is_axis_aligned
 from neurolens.render.scene import BLACK, Environment, Material, Texture, Vector
 from neurolens.render.scenefile import Scene
 from neurolens.render.spectrum import SpectralRange
@@ -89,7 +89,7 @@ class World:
         self.lights = Lights(quads, spheres, settings.camera.look_at_m)
         self._primitives: list[Primitive] = []
         self._boxes: list[Box] = []
-        self._sphere_centre: dict[int, tuple[FloatArray, float]] = {}
+        self._has_spheres = bool(settings.spheres)
         self._smooth: list[tuple[Mesh, FloatArray]] = []
         surfaces: list[_Surface] = []
         self._add_flat(surfaces)
@@ -139,10 +139,12 @@ class World:
                 surfaces.append(_Surface(tuple(normal), self._material(name), frame=box_frame(low, face // 2)))
 
     def _add_spheres(self, surfaces: list[_Surface], lights: int) -> None:
-        for sphere in self.scene.settings.spheres:
-            first, centre = len(surfaces), np.array(sphere.centre_m, np.float64)
-            self._primitives.append(Sphere(first, centre, sphere.radius_m))
-            self._sphere_centre[first] = (centre.astype(np.float32), sphere.radius_m)
+        spheres, self._first_sphere = self.scene.settings.spheres, len(surfaces)
+        if not spheres:
+            return
+        centres, radii = np.array([s.centre_m for s in spheres]), np.array([s.radius_m for s in spheres])
+        self._primitives.append(Spheres(self._first_sphere, centres, radii))
+        for sphere in spheres:
             light = lights if any(sphere.emission) else -1
             lights += light >= 0
             surfaces.append(_Surface((0, 0, 0), self._material(sphere.material), light, sphere.emission))
@@ -172,10 +174,10 @@ class World:
         self.specular_row = np.array([colour((m and m.specular) or BLACK) for m in materials], np.intp)
         self.index_row = np.array([palette.index(m.n_d, m.V_d) if m and m.n_d else 0 for m in materials], np.intp)
         self.alpha = np.array([m.roughness**2 if m and m.roughness else 1 for m in materials], np.float32)
-        centres = np.zeros((4, len(rows)), np.float32)
-        for number, (centre, radius) in self._sphere_centre.items():
-            centres[:3, number], centres[3, number] = centre, 1 / radius
-        self._spheres = centres
+        # Centre and 1 / radius of each sphere, 0 for other surfaces.
+        self._spheres = np.zeros((4, len(rows)), np.float32)
+        for number, sphere in enumerate(self.scene.settings.spheres, self._first_sphere):
+            self._spheres[:, number] = (*sphere.centre_m, 1 / sphere.radius_m)
         named: dict[str, Texture] = self.scene.settings.textures or {}
         names = [m.texture if m else None for m in materials]
         self.textures = TextureTable(named, self.scene.images, names, [s.frame for s in rows], colour, spectral)
@@ -226,7 +228,7 @@ class World:
     def normals(self, surface: Index, point: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Outward geometric and shading normals [3, N] at points [3, N] of surfaces [N]."""
         normal = self.normal.take(surface, axis=1)
-        if self._sphere_centre:
+        if self._has_spheres:
             rows = np.flatnonzero(self._spheres[3].take(surface))
             number = surface[rows]
             local = point.take(rows, axis=1) - self._spheres[:3].take(number, axis=1)

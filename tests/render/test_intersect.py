@@ -1,0 +1,156 @@
+"""Shapes against brute force in float64."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from render_helpers import diffuse, world
+
+from neurolens.errors import InputError
+from neurolens.render.mesh import Mesh, read_obj
+from neurolens.render.primitives import Rays
+
+RANDOM = np.random.default_rng(11)
+
+
+def rays(count: int, spread: float = 3.0) -> Rays:
+    """Rays from all around towards points near the origin, some exactly along an axis."""
+    origin = RANDOM.normal(size=(3, count)) * spread
+    direction = RANDOM.normal(size=(3, count)) * 0.5 - origin
+    direction[:, :30] = np.repeat(np.eye(3), 10, axis=1) * RANDOM.choice([-1, 1], 30)
+    direction /= np.linalg.norm(direction, axis=0)
+    return Rays.of(origin.astype(np.float32), direction.astype(np.float32))
+
+
+def meet_triangles(corners: np.ndarray, batch: Rays) -> np.ndarray:
+    """Nearest distance [N] by Moeller and Trumbore, every pair, float64."""
+    o, d = batch.origin.T.astype(float)[:, None], batch.direction.T.astype(float)[:, None]
+    a, b, c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    p = np.cross(d, c)
+    with np.errstate(all="ignore"):
+        scale = 1 / np.sum(p * b, axis=-1)
+        s = o - a
+        u, q = np.sum(s * p, axis=-1) * scale, np.cross(s, b)
+        v, t = np.sum(d * q, axis=-1) * scale, np.sum(c * q, axis=-1) * scale
+        return np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-6), t, np.inf).min(axis=1)
+
+
+def agree(found: np.ndarray, expected: np.ndarray, allowed: float = 2e-3) -> None:
+    """Same distances but for a few rays that graze an edge."""
+    same = np.isclose(found, expected, rtol=1e-4, atol=1e-4) | (np.isinf(found) & np.isinf(expected))
+    assert np.mean(~same) <= allowed
+    assert 0.02 < np.mean(np.isfinite(expected)) < 0.98
+
+
+@pytest.mark.parametrize("count", [1, 8, 9, 40, 129, 700])
+def test_mesh_of_any_size_matches_every_triangle_in_turn(count: int) -> None:
+    centre = RANDOM.normal(size=(count, 1, 3))
+    corners = centre + RANDOM.normal(size=(count, 3, 3)) * (2.0 / count**0.4)
+    batch = rays(1500)
+    mesh = Mesh(5, corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))
+    best, found = np.full(1500, np.inf, np.float32), np.full(1500, -1, np.int32)
+    mesh.nearer(batch, best, found)
+    expected = meet_triangles(corners, batch)
+    agree(best, expected)
+    hit = np.flatnonzero(found >= 0)
+    assert np.array_equal(found >= 0, np.isfinite(best)) and found.max() < 5 + count
+    # The triangle named is the one that was met.
+    own = corners[found[hit] - 5]
+    normal = np.cross(own[:, 1] - own[:, 0], own[:, 2] - own[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    point = (batch.origin + batch.direction * np.where(np.isfinite(best), best, 0))[:, hit].T
+    assert np.abs(np.sum((point - own[:, 0]) * normal, axis=1)).max() < 1e-4
+
+
+def test_shapes_match_float64_formulas() -> None:
+    quads = [
+        {"corner_m": [-1, 0.5, -1], "edge_u_m": [2, 0, 0], "edge_v_m": [0, 0, 1.5]},
+        {"corner_m": [0.2, 0, 0], "edge_u_m": [1, 1, 0], "edge_v_m": [0, 0, -2]},
+    ]
+    spheres = [{"centre_m": RANDOM.normal(size=3).tolist(), "radius_m": 0.3, "material": "m"} for _ in range(5)]
+    made = world(
+        materials={"m": diffuse(0.5, 0.5, 0.5)},
+        quads=[q | {"material": "m"} for q in quads],
+        spheres=spheres,
+        boxes=[{"min_m": [-2, -1, 0], "max_m": [-1, 0, 1], "material": "m"}],
+        planes=[{"point_m": [0, -2, 0], "normal": [0.1, 1, 0], "material": "m"}],
+    )
+    batch = rays(20000)
+    best, found = made.nearest(batch)
+    o, d = batch.origin.astype(float), batch.direction.astype(float)
+    triangles = []
+    for quad in quads:
+        a, u, v = (np.array(quad[k], float) for k in ("corner_m", "edge_u_m", "edge_v_m"))
+        triangles += [[a, a + u, a + v], [a + u + v, a + u, a + v]]
+    x0, x1 = np.array([-2, -1, 0.0]), np.array([-1, 0, 1.0])
+    for axis in range(3):
+        for side in (x0, x1):
+            k, m = [j for j in range(3) if j != axis]
+            a, b, c, e = (side * (np.arange(3) == axis) for _ in range(4))
+            for corner, (first, second) in zip((a, b, c, e), ((x0, x0), (x1, x0), (x0, x1), (x1, x1)), strict=True):
+                corner[k], corner[m] = first[k], second[m]
+            triangles += [[a, b, c], [e, b, c]]
+    expected = meet_triangles(np.array(triangles), batch)
+    for sphere in spheres:
+        f = np.array(sphere["centre_m"])[:, None] - o
+        middle = np.sum(f * d, axis=0)
+        half2 = 0.09 - np.sum(f**2, axis=0) + middle**2
+        half = np.sqrt(np.maximum(half2, 0))
+        near, far = middle - half, middle + half
+        distance = np.where(near > 1e-6, near, far)
+        expected = np.where((half2 > 0) & (distance > 1e-6) & (distance < expected), distance, expected)
+    normal = np.array([0.1, 1, 0]) / np.hypot(0.1, 1)
+    with np.errstate(divide="ignore"):
+        t = (normal @ [0, -2, 0] - normal @ o) / (normal @ d)
+    expected = np.where((t > 1e-6) & (t < expected), t, expected)
+    agree(best, expected)
+
+    rows = np.flatnonzero(found >= 0)
+    point = (batch.origin + batch.direction * np.where(found >= 0, best, 0))[:, rows]
+    outward, _ = made.normals(made.surfaces(found[rows], point), point)
+    assert np.allclose(np.sum(outward**2, axis=0), 1, atol=1e-3)
+    on_box = np.flatnonzero((found[rows] >= 3) & (found[rows] < 9))
+    relative = (point[:, on_box].T - [-1.5, -0.5, 0.5]) * 2
+    assert len(on_box) > 100 and np.allclose(np.sum(relative * outward[:, on_box].T, axis=1), 1, atol=1e-3)
+
+
+def test_small_sphere_far_away_is_hit_within_its_radius() -> None:
+    made = world(spheres=[{"centre_m": [0, 0, -500], "radius_m": 0.01, "emission": [1, 1, 1]}])
+    offset = np.linspace(-0.02, 0.02, 401)
+    direction = np.stack([offset / 500, 0 * offset, -np.ones(401)])
+    batch = Rays.of(np.zeros((3, 401), np.float32), (direction / np.linalg.norm(direction, axis=0)).astype(np.float32))
+    hit = np.isfinite(made.nearest(batch)[0])
+    assert np.all(hit[np.abs(offset) < 0.0099]) and not np.any(hit[np.abs(offset) > 0.0101])
+
+
+def test_smooth_normals_follow_the_curve() -> None:
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    vertices = [[x, y, z] for z in (-1.0, 1.0) for x, y in ring]
+    faces = [[k, (k + 1) % 24, 24 + k] for k in range(24)] + [[(k + 1) % 24, 24 + (k + 1) % 24, 24 + k] for k in range(24)]
+    mesh = {"material": "m", "vertices_m": vertices, "faces": faces, "smooth": True}
+    made = world(materials={"m": diffuse(1, 1, 1)}, meshes=[mesh])
+    start = RANDOM.uniform(0, 2 * np.pi, 500)
+    radial = np.stack([np.cos(start), np.sin(start), 0 * start])
+    origin = 3 * radial + np.array([[0], [0], [0.3]])
+    batch = Rays.of(origin.astype(np.float32), (-radial).astype(np.float32))
+    best, found = made.nearest(batch)
+    assert np.all(np.isfinite(best))
+    point = batch.origin + best * batch.direction
+    flat, smooth = made.normals(made.surfaces(found, point), point)
+    assert np.sum(smooth * radial, axis=0).min() > 0.9995 > np.sum(flat * radial, axis=0).min()
+
+
+def test_obj_reads_polygons_and_names_bad_lines(tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text("# square\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvn 0 0 1\nf 1/1/1 2//1 3 -1\n")
+    vertices, faces = read_obj(path)
+    assert vertices.shape == (4, 3) and faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+    for bad in ("v 0 0", "v 0 0 x", "f 1 2", "f 1 b 3"):
+        path.write_text(f"v 0 0 0\n{bad}\n")
+        with pytest.raises(InputError, match="line 2"):
+            read_obj(path)
+    with pytest.raises(InputError, match=r"none\.obj"):
+        read_obj(tmp_path / "none.obj")

@@ -1,0 +1,143 @@
+"""Light transport against closed forms: furnaces, direct light, two ways to the same mean."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from render_helpers import WHITE, diffuse, radiance, world
+
+MATERIALS: dict[str, Any] = {
+    "white": diffuse(1, 1, 1),
+    "grey": diffuse(0.5, 0.5, 0.5),
+    "mirror": {"kind": "mirror", "reflectance": [1, 1, 1]},
+    "glass": {"kind": "glass", "n_d": 1.6, "V_d": 35.0},
+    "plastic": {"kind": "glossy", "specular": [0.05] * 3, "roughness": 0.3, "reflectance": [0.5] * 3},
+}
+FLOOR = {"point_m": [0, 0, 0], "normal": [0, 1, 0], "material": "grey"}
+
+
+def box_of_lights(half: float, emission: float) -> list[dict[str, Any]]:
+    """Six squares that look inwards."""
+    quads = []
+    for axis in range(3):
+        for side in (-1, 1):
+            u, v = np.roll(np.eye(3), axis, axis=1)[[1, 2]] * 2 * half
+            corner = -(u + v) / 2 + side * half * np.roll(np.eye(3), axis, axis=1)[0]
+            if side > 0:
+                u, v = v, u
+            quads.append({"corner_m": corner.tolist(), "edge_u_m": u.tolist(), "edge_v_m": v.tolist()})
+    return [q | {"material": "grey", "emission": [emission] * 3} for q in quads]
+
+
+@pytest.mark.parametrize("material", ["white", "mirror", "glass"])
+def test_what_absorbs_nothing_vanishes_in_uniform_light(material: str) -> None:
+    made = world(
+        materials=MATERIALS,
+        environment=WHITE,
+        spheres=[{"centre_m": [0, 0, 0], "radius_m": 1, "material": material}],
+        boxes=[{"min_m": [0.5, -2, -2], "max_m": [2, 2, 2], "material": "white"}],
+    )
+    values = radiance(made, [0, 0.3, 5], [0, 0.2, 0], samples=2048, max_depth=300)
+    assert np.abs(values.mean() - 1) < 0.01
+
+
+def test_closed_box_of_glowing_walls_reaches_the_geometric_sum() -> None:
+    made = world(materials=MATERIALS, quads=box_of_lights(1.0, 0.75))
+    values = radiance(made, [0.2, 0.1, 0], [0.3, -1, 0.4], samples=8192, max_depth=40)
+    assert values.mean() == pytest.approx(0.75 / (1 - 0.5), rel=0.01)
+
+
+def test_an_object_never_brightens_uniform_light() -> None:
+    for roughness in (0.05, 0.3, 1.0):
+        glossy = {"kind": "glossy", "specular": [0.04] * 3, "roughness": roughness, "reflectance": [1, 1, 1]}
+        metal = {"kind": "glossy", "specular": [1, 1, 1], "roughness": roughness, "reflectance": [0, 0, 0]}
+        for material in (glossy, metal):
+            sphere = {"centre_m": [0, 0, 0], "radius_m": 1, "material": "m"}
+            made = world(materials={"m": material}, environment=WHITE, spheres=[sphere])
+            for target in ([0, 0, 0], [0, 0.95, 0]):
+                mean = radiance(made, [0, 0, 5], target, samples=8192).mean()
+                assert 0.25 < mean < 1.005
+                if material is metal and roughness == 0.05:
+                    assert mean > 0.99
+
+
+def test_square_light_over_a_floor() -> None:
+    light = {"corner_m": [-0.5, 2, -0.5], "edge_u_m": [1, 0, 0], "edge_v_m": [0, 0, 1], "emission": [3, 3, 3]}
+    made = world(materials=MATERIALS, planes=[FLOOR], quads=[light])
+    values = radiance(made, [0, 1, 4], [0, 0, 0], samples=16384, max_depth=1)
+    # Form factor of a rectangle a x b at distance c over one corner, four of them around the point below the middle.
+    x = y = 0.5 / 2.0
+    part = x / math.hypot(1, x) * math.atan(y / math.hypot(1, x))
+    factor = 4 * (part + y / math.hypot(1, y) * math.atan(x / math.hypot(1, y))) / (2 * math.pi)
+    assert values.mean() == pytest.approx(0.5 * 3 * factor, rel=2e-3)
+
+
+def test_back_of_a_square_light_is_dark() -> None:
+    light = {"corner_m": [-0.5, 2, -0.5], "edge_u_m": [0, 0, 1], "edge_v_m": [1, 0, 0], "emission": [3, 3, 3]}
+    made = world(materials=MATERIALS, planes=[FLOOR], quads=[light])
+    assert not radiance(made, [0, 1, 4], [0, 0, 0], max_depth=1).any()
+    assert not radiance(made, [0, 1, 0.1], [0, 2, 0.1], max_depth=1).any()
+    assert np.allclose(radiance(made, [0, 3, 0.1], [0, 2, 0.1], max_depth=1), 3)
+
+
+@pytest.mark.parametrize(("radius", "height", "aside"), [(0.5, 2.0, 1.0), (0.01, 30.0, 40.0), (1e-3, 100.0, 0.0)])
+def test_sphere_light_obeys_the_inverse_square_law(radius: float, height: float, aside: float) -> None:
+    light = {"centre_m": [aside, height, 0], "radius_m": radius, "emission": [7, 7, 7]}
+    made = world(materials=MATERIALS, planes=[FLOOR], spheres=[light])
+    values = radiance(made, [0, 1, 1], [0, 0, 0], samples=16384, max_depth=1)
+    distance2 = height**2 + aside**2
+    expected = 0.5 * 7 * radius**2 / distance2 * height / math.sqrt(distance2)
+    assert values.mean() == pytest.approx(expected, rel=5e-3)
+
+
+def test_shadow_of_a_sphere() -> None:
+    light = {"centre_m": [0, 4, 0], "radius_m": 0.01, "emission": [100, 100, 100]}
+    ball = {"centre_m": [0, 2, 0], "radius_m": 0.5, "material": "grey"}
+    made = world(materials=MATERIALS, planes=[FLOOR], spheres=[ball, light])
+    # The shadow's edge lies 4 tan(asin(0.5 / 2)) = 1.033 m from the middle.
+    assert not radiance(made, [0, 1, 3], [1.0, 0, 0], samples=256, max_depth=1).any()
+    assert radiance(made, [0, 1, 3], [1.07, 0, 0], samples=256, max_depth=1).all()
+
+
+@pytest.mark.parametrize("floor", ["grey", "plastic"])
+def test_aiming_at_lights_changes_the_noise_and_not_the_mean(floor: str) -> None:
+    lamps = [
+        {"centre_m": [-0.4, 0.7, 0.2], "radius_m": 0.3, "emission": [2, 2, 2]},
+        {"centre_m": [0.9, 0.8, 0.2], "radius_m": 0.2, "emission": [5, 3, 1]},
+        {"centre_m": [0.2, 0.25, -0.6], "radius_m": 0.25, "material": "plastic"},
+    ]
+    panel = {"corner_m": [-0.5, 1.5, -0.5], "edge_u_m": [1, 0, 0], "edge_v_m": [0, 0, 1], "emission": [1, 2, 3]}
+    plane = FLOOR | {"material": floor}
+    made = world(materials=MATERIALS, environment=WHITE, planes=[plane], spheres=lamps, quads=[panel])
+    aimed = radiance(made, [0, 1, 3], [0.1, 0, 0], samples=16384, max_depth=3)
+    found = radiance(made, [0, 1, 3], [0.1, 0, 0], samples=65536, max_depth=3, aim=False, seed=1)
+    assert aimed.std() < 0.7 * found.std()
+    tolerance = 4 * math.hypot(aimed.std() / 128, found.std() / 256)
+    assert tolerance < 0.03 * aimed.mean()
+    assert abs(aimed.mean() - found.mean()) < tolerance
+
+
+def test_light_is_seen_in_a_mirror_and_through_glass() -> None:
+    panel = {"corner_m": [-9, 5, -9], "edge_u_m": [18, 0, 0], "edge_v_m": [0, 0, 18], "emission": [2, 2, 2]}
+    mirror = world(materials=MATERIALS, planes=[FLOOR | {"material": "mirror"}], quads=[panel])
+    assert np.allclose(radiance(mirror, [0, 1, 3], [0, 0, 2], max_depth=1), 2)
+    slab = {"min_m": [-9, 1, -9], "max_m": [9, 2, 9], "material": "glass"}
+    glass = world(materials=MATERIALS, boxes=[slab], quads=[panel])
+    straight = radiance(glass, [0, 0, 0], [0, 1, 0], samples=4096, max_depth=30)
+    # Two faces with all their reflections in between let (1 - R) / (1 + R) pass.
+    reflectance = (0.6 / 2.6) ** 2
+    assert straight.mean() == pytest.approx(2 * (1 - reflectance) / (1 + reflectance), rel=0.01)
+
+
+def test_a_room_is_seen_from_behind_its_walls_and_keeps_light_out() -> None:
+    room = {"min_m": [-1, -1, -1], "max_m": [1, 1, 1], "material": "grey"}
+    lamp = {"corner_m": [-0.5, 0.9, -0.5], "edge_u_m": [1, 0, 0], "edge_v_m": [0, 0, 1], "emission": [3, 3, 3]}
+    made = world(materials=MATERIALS, rooms=[room], quads=[lamp])
+    outside = radiance(made, [0, 0, 3], [0, -0.2, -1], samples=16384, max_depth=2)
+    inside = radiance(made, [0, -0.1, 1], [0, -0.2, -1], samples=16384, max_depth=2)
+    assert outside.mean() == pytest.approx(inside.mean(), rel=0.01) and inside.mean() > 0.1
+    dark = world(materials=MATERIALS, environment=WHITE, rooms=[room])
+    assert not radiance(dark, [0, 0, 3], [0, -0.2, -1], max_depth=5).any()

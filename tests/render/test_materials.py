@@ -1,0 +1,97 @@
+"""Scattering: energy, densities, Snell and Fresnel."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from neurolens.render.materials import (
+    cosine_direction,
+    fresnel_dielectric,
+    glass_direction,
+    glossy_evaluate,
+    glossy_sample,
+)
+
+RANDOM = np.random.default_rng(7)
+COUNT = 200_000
+
+
+def repeated(vector: tuple[float, float, float], count: int = COUNT) -> np.ndarray:
+    return np.repeat(np.float32(vector)[:, None], count, axis=1)
+
+
+def full(value: float, count: int = COUNT) -> np.ndarray:
+    return np.full(count, value, np.float32)
+
+
+def test_cosine_directions_have_the_moments_of_the_cosine_law() -> None:
+    normal = np.float32([0.36, 0.48, -0.8])
+    direction, cosine = cosine_direction(repeated(tuple(normal)), RANDOM.random((2, COUNT), np.float32))
+    assert np.allclose(np.sum(direction**2, axis=0), 1, atol=1e-5)
+    assert cosine.mean() == pytest.approx(2 / 3, abs=3e-3) and (cosine**2).mean() == pytest.approx(0.5, abs=3e-3)
+    assert np.allclose(direction.mean(axis=1), 2 / 3 * normal, atol=4e-3)
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 45.0, 80.0])
+@pytest.mark.parametrize(("base", "coat", "roughness"), [(0.0, 0.9, 0.2), (0.8, 0.04, 0.5), (0.3, 0.2, 1.0)])
+def test_glossy_sampling_and_evaluation_agree(angle_deg: float, base: float, coat: float, roughness: float) -> None:
+    angle = math.radians(angle_deg)
+    normal, out = repeated((0, 0, 1)), repeated((math.sin(angle), 0, math.cos(angle)))
+    material = (full(base), full(coat), full(roughness**2))
+    square, lobe = RANDOM.random((2, COUNT), np.float32), RANDOM.random(COUNT, np.float32)
+    inward = glossy_sample(normal, out, *material, square, lobe)
+    value, density = glossy_evaluate(normal, out, inward, *material)
+    above = inward[2] > 0
+    sampled = np.where(above, value / density, 0).mean()
+
+    uniform = np.empty((3, COUNT), np.float32)
+    u, v = RANDOM.random((2, COUNT), np.float32)
+    uniform[2], side = u, np.sqrt(1 - u * u)
+    uniform[0], uniform[1] = side * np.cos(2 * np.pi * v), side * np.sin(2 * np.pi * v)
+    value, density = glossy_evaluate(normal, out, uniform, *material)
+    error = float(5 * 2 * np.pi * value.std() / math.sqrt(COUNT))
+    assert sampled == pytest.approx(float(2 * np.pi * value.mean()), abs=error + 2e-3)
+    assert sampled <= 1.0 + 2e-3
+    # The density integrates to the share of samples that stay above the surface.
+    error = float(5 * 2 * np.pi * density.std() / math.sqrt(COUNT))
+    assert 2 * np.pi * density.mean() == pytest.approx(above.mean(), abs=error + 2e-3)
+
+
+def test_glossy_scattering_is_reciprocal() -> None:
+    a, b = RANDOM.normal(size=(2, 3, 1000)).astype(np.float32)
+    for v in (a, b):
+        v[2] = np.abs(v[2]) + 0.05
+        v /= np.linalg.norm(v, axis=0)
+    normal = repeated((0, 0, 1), 1000)
+    material = (full(0.5, 1000), full(0.1, 1000), full(0.16, 1000))
+    forth, back = (glossy_evaluate(normal, *pair, *material)[0] for pair in ((a, b), (b, a)))
+    assert np.allclose(forth / b[2], back / a[2], rtol=1e-3)
+
+
+def test_fresnel_known_values() -> None:
+    index = np.float32([1.5] * 3)
+    cosines = np.float32([1.0, math.cos(math.atan(1.5)), 1e-4])
+    reflectance, _ = fresnel_dielectric(cosines, index)
+    assert reflectance[0] == pytest.approx(0.04, abs=1e-6)
+    # At Brewster's angle only s reflects: ((1 - n^2) / (1 + n^2))^2 of it, half of the light.
+    assert reflectance[1] == pytest.approx(0.5 * ((1 - 2.25) / (1 + 2.25)) ** 2, abs=1e-6)
+    assert reflectance[2] == pytest.approx(1, abs=2e-3)
+    critical = math.sqrt(1 - 1 / 1.5**2)
+    inside, cos_out = fresnel_dielectric(np.float32([critical - 1e-3, critical + 1e-3]), 1 / index[:2])
+    assert inside[0] == 1 and cos_out[0] == 0 and inside[1] < 1
+
+
+@pytest.mark.parametrize("outside", [True, False])
+def test_glass_bends_by_snell_and_splits_by_fresnel(outside: bool) -> None:
+    angle = math.radians(35)
+    travel, normal = repeated((math.sin(angle), 0, -math.cos(angle))), repeated((0, 0, 1))
+    index = full(1.5)
+    direction, refracts = glass_direction(travel, normal, np.full(COUNT, outside), index, RANDOM.random(COUNT, np.float32))
+    relative = 1.5 if outside else 1 / 1.5
+    assert np.allclose(direction[0, refracts], math.sin(angle) / relative, atol=1e-6) and np.all(direction[2, refracts] < 0)
+    assert np.allclose(direction[:, ~refracts].T, (math.sin(angle), 0, math.cos(angle)), atol=1e-6)
+    reflectance, _ = fresnel_dielectric(full(math.cos(angle), 1), full(relative, 1))
+    assert np.mean(~refracts) == pytest.approx(float(reflectance[0]), abs=2e-3)

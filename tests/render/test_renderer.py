@@ -1,0 +1,145 @@
+"""Whole renders: exposure, orientation, the same numbers for everybody, errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from render_helpers import WHITE, diffuse, scene
+
+from neurolens.cameras.contract import CameraRays
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.thin import ThinLens
+from neurolens.errors import InputError, NeurolensError
+from neurolens.render.renderer import render
+
+FILM = (36.0, 24.0)
+LETTER_F = ["#####", "#....", "####.", "#....", "#....", "#...."]
+
+
+def letter_quads() -> list[dict[str, Any]]:
+    """The letter F of glowing squares 1 m wide on the plane z = -10, as one standing at the origin reads it."""
+    rows, columns = len(LETTER_F), len(LETTER_F[0])
+    return [
+        {
+            "corner_m": [c - columns / 2, rows / 2 - r - 1, -10],
+            "edge_u_m": [1, 0, 0],
+            "edge_v_m": [0, 1, 0],
+            "emission": [1, 1, 1],
+        }
+        for r in range(rows)
+        for c in range(columns)
+        if LETTER_F[r][c] == "#"
+    ]
+
+
+@pytest.mark.parametrize("camera", [Pinhole(20.0, (10.0, 12.0)), ThinLens(20.0, 8.0, 10.0, (10.0, 12.0))])
+@pytest.mark.parametrize("turn", [0, 1])
+def test_letter_is_upright_and_unmirrored(camera: Any, turn: int) -> None:
+    # The second pose looks at the letter's place from elsewhere: right of it, towards -x.
+    quads = letter_quads()
+    pose: dict[str, Any] = {"position_m": [0, 0, 0], "look_at_m": [0, 0, -10]}
+    if turn:
+        pose = {"position_m": [10, 0, -10], "look_at_m": [0, 0, -10]}
+        for quad in quads:
+            x, y, _ = quad["corner_m"]
+            quad |= {"corner_m": [0, y, -10 - x], "edge_u_m": [0, 0, -1]}
+    picture = render(scene(pose, quads=quads), camera, width=50, height=60, samples=16, max_depth=1).rgb[..., 1]
+    cells = picture.reshape(6, 10, 5, 10).mean(axis=(1, 3))
+    expected = np.array([[cell == "#" for cell in row] for row in LETTER_F])
+    assert np.all(cells[expected] > 0.7) and np.all(cells[~expected] < 0.1)
+
+
+def test_white_environment_is_white() -> None:
+    for camera in (Pinhole(400.0, FILM), ThinLens(400.0, 4.0, 5.0, FILM)):
+        rgb = render(scene(environment=WHITE), camera, width=48, height=32, samples=64).rgb
+        assert rgb.mean(axis=(0, 1)) == pytest.approx([1, 1, 1], abs=5e-3)
+
+
+def test_coloured_wall_in_white_light_keeps_its_colour() -> None:
+    wall = {"point_m": [0, 0, -1], "normal": [0, 0, 1], "material": "m"}
+    made = scene(environment=WHITE, materials={"m": diffuse(0.7, 0.2, 0.05)}, planes=[wall])
+    rgb = render(made, Pinhole(400.0, FILM), width=48, height=32, samples=64).rgb
+    assert rgb.mean(axis=(0, 1)) == pytest.approx([0.7, 0.2, 0.05], abs=5e-3)
+
+
+def test_uniform_light_falls_off_with_the_fourth_power_of_the_cosine() -> None:
+    rgb = render(scene(environment=WHITE), Pinhole(20.0, FILM), width=36, height=24, samples=256).rgb
+    x, y = np.meshgrid(np.arange(36) - 17.5, np.arange(24) - 11.5)
+    cos4 = (20**2 / (20**2 + x**2 + y**2)) ** 2
+    assert np.abs(rgb.mean(axis=2) - cos4).max() < 0.05
+    assert np.abs((rgb - cos4[..., None]).mean()) < 2e-3
+
+
+def lit_scene() -> Any:
+    ball = {"centre_m": [0, 0, -2], "radius_m": 0.7, "material": "m"}
+    lamp = {"centre_m": [1, 1, -1], "radius_m": 0.3, "emission": [9, 8, 7]}
+    return scene(environment=WHITE, materials={"m": diffuse(0.7, 0.6, 0.5)}, spheres=[ball, lamp])
+
+
+def test_workers_do_not_change_the_picture_and_seeds_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.render.renderer.BATCH", 1024)
+    made, camera = lit_scene(), ThinLens(50.0, 2.0, 3.0, FILM)
+    options: dict[str, Any] = {"width": 36, "height": 24, "samples": 40}
+    one = render(made, camera, threads=1, **options)
+    seen: list[float] = []
+    two = render(made, camera, threads=2, progress=lambda fraction, left: seen.append(fraction), **options)
+    assert np.array_equal(one.rgb, two.rgb)
+    assert not np.array_equal(one.rgb, render(made, camera, threads=1, seed=1, **options).rgb)
+    assert seen == sorted(seen) and all(0 < x <= 1 for x in seen)
+    assert one.stats["paths"] == 36 * 24 * 40 and one.stats["passed_fraction"] == 1
+    assert one.rgb.shape == (24, 36, 3) and one.rgb.dtype == np.float32
+
+
+def test_cameras_share_their_noise() -> None:
+    made = lit_scene()
+    options: dict[str, Any] = {"width": 36, "height": 24, "samples": 4, "threads": 1}
+    pinhole = render(made, Pinhole(50.0, FILM), **options).rgb
+    almost = render(made, ThinLens(50.0, 1e5, np.inf, FILM), **options).rgb
+    other = render(made, Pinhole(50.0, FILM), seed=1, **options).rgb
+    assert np.abs(pinhole - almost).mean() < 0.02 * np.abs(pinhole - other).mean()
+
+
+class HalfBlocked(Pinhole):
+    """Blocks the left half of the film, with rays that must not be used."""
+
+    def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
+        rays = super().sample(film_mm, pupil, wavelength_nm)
+        blocked = film_mm[0] > 0
+        direction = np.where(blocked, np.float32(np.nan), rays.direction)
+        return CameraRays(rays.origin_m, direction, rays.weight, np.where(blocked, 6, 0).astype(np.int32))
+
+
+def test_rays_that_do_not_pass_are_black_whatever_they_hold() -> None:
+    result = render(lit_scene(), HalfBlocked(50.0, FILM), width=36, height=24, samples=4)
+    assert not result.rgb[:, :18].any() and result.rgb[:, 18:].mean() > 0.5
+    assert result.stats["passed_fraction"] == pytest.approx(0.5, abs=1e-6)
+
+
+class Prism(Pinhole):
+    """Disperses, and knows only part of the spectrum."""
+
+    dispersive = True
+    wavelength_nm = (450.0, 650.0)
+
+
+class Broken(Pinhole):
+    """Fails in the middle of the work."""
+
+    def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
+        raise RuntimeError("no rays today")
+
+
+def test_errors_are_clear(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, small = scene(environment=WHITE), {"width": 36, "height": 24, "samples": 1}
+    for change, field in (({"samples": 0}, "samples"), ({"threads": 0}, "threads"), ({"width": 20}, "width x height")):
+        with pytest.raises(InputError, match=field):
+            render(made, Pinhole(50.0, FILM), **(small | change))
+    with pytest.raises(InputError, match="450-650 nm"):
+        render(made, Prism(50.0, FILM), **small)
+    narrow = scene({"wavelengths_nm": [460, 640]}, environment=WHITE)
+    assert render(narrow, Prism(50.0, FILM), **small).rgb.shape == (24, 36, 3)
+    monkeypatch.setattr("neurolens.render.renderer.BATCH", 64)
+    with pytest.raises(NeurolensError, match="no rays today"):
+        render(made, Broken(50.0, FILM), threads=2, **small)
