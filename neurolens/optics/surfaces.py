@@ -80,7 +80,11 @@ def intersect_sphere(r: Rays, curvature: Any, sense: int, entering: bool, guard:
         t = f / denominator
     x = torch.addcmul(mx, t, r.dx)
     y = torch.addcmul(my, t, r.dy)
-    return Hit(x, y, torch.addcmul(mz, t, r.dz), cos_i, discriminant, met)
+    z = torch.addcmul(mz, t, r.dz)
+    if entering:
+        # A ray from anywhere may meet the far half of the sphere, where there is no glass.
+        met = met & (z * curvature <= 1)
+    return Hit(x, y, z, cos_i, discriminant, met)
 
 
 def intersect_plane(r: Rays, sense: int) -> Hit:

@@ -26,6 +26,9 @@ Towards = Literal["scene", "film"]
 # Rays per chunk: long enough to hide the cost of calling an operator, short enough for a core's second-level cache.
 CHUNK = 32768
 
+# How far the squared length of a direction may be from 1; float32 rounding is a thousandth of this.
+UNIT_SLACK = 1e-3
+
 
 class Crossing(NamedTuple):
     """Where rays cross one surface, each [N]; mm, and the margins of Snell's and the sphere's square roots.
@@ -71,17 +74,22 @@ def trace(
     Args:
         lens: the prescription; its stop's diameter is the opening that clips.
         rays: points and unit directions [N], lens frame, mm. The dtype (float32 or float64) is that of the result.
-        wavelength_nm: one number, or a tensor [N].
+        wavelength_nm: one number, or a tensor [N]; NaN and what is not positive pass no dispersive glass.
         towards: "scene" for camera rays (-z), "film" for light from the scene (+z).
         transmittance: whether to follow the Fresnel transmittance.
         record: surfaces whose crossings are wanted.
 
     Raises:
-        InputError: components of unequal shapes or dtypes, or a wavelength of another shape.
+        InputError: components of unequal shapes or dtypes or of another dtype, a wavelength of another shape or a
+            number that is not positive, an unknown `towards`, a surface to record that the lens does not have.
 
+    A direction that is not a unit vector counts as a miss of the first surface.
     Differentiable with respect to rays, wavelength and prescription fields given as tensors.
     """
-    _check(rays, wavelength_nm)
+    _check(lens, rays, wavelength_nm, towards, record)
+    if isinstance(wavelength_nm, Tensor):
+        # In the precision of the rays, or a float64 wavelength would turn float32 rays into float64 halfway.
+        wavelength_nm = torch.where(wavelength_nm > 0, wavelength_nm, math.nan).to(rays.x.dtype)
     needs_grad = torch.is_grad_enabled() and any(
         isinstance(v, Tensor) and v.requires_grad for v in (*rays, wavelength_nm, *_parameters(lens))
     )
@@ -121,17 +129,26 @@ def _parameters(lens: Lens) -> list[Any]:
     return [v for s in lens.surfaces for v in (s.radius_mm, s.thickness_mm, s.n_d)]
 
 
-def _check(rays: Rays, wavelength_nm: Tensor | float) -> None:
+def _check(lens: Lens, rays: Rays, wavelength_nm: Tensor | float, towards: str, record: Sequence[int]) -> None:
     shape, dtype = rays.x.shape, rays.x.dtype
+    if dtype not in (torch.float32, torch.float64):
+        raise InputError("trace", "rays.x", f"({dtype})", "torch.float32 or torch.float64")
     for name, c in zip(Rays._fields, rays, strict=True):
         if c.shape != shape or c.dtype != dtype or c.ndim != 1:
             raise InputError(
                 "trace", f"rays.{name}", f"({tuple(c.shape)}, {c.dtype})", f"[N] like x: {tuple(shape)}, {dtype}"
             )
-    if isinstance(wavelength_nm, Tensor) and wavelength_nm.ndim and wavelength_nm.shape != shape:
-        raise InputError(
-            "trace", "wavelength_nm", f"({tuple(wavelength_nm.shape)})", f"a number or a tensor {tuple(shape)}"
-        )
+    if isinstance(wavelength_nm, Tensor):
+        if wavelength_nm.ndim and wavelength_nm.shape != shape:
+            raise InputError(
+                "trace", "wavelength_nm", f"({tuple(wavelength_nm.shape)})", f"a number or a tensor {tuple(shape)}"
+            )
+    elif not 0 < wavelength_nm < math.inf:
+        raise InputError("trace", "wavelength_nm", wavelength_nm, "a positive number")
+    if towards not in ("scene", "film"):
+        raise InputError("trace", "towards", towards, '"scene" or "film"')
+    if any(not 0 <= k < len(lens.surfaces) for k in record):
+        raise InputError("trace", "record", tuple(record), f"surfaces from 0 to {len(lens.surfaces) - 1}")
 
 
 def _trace_chunk(
@@ -147,7 +164,13 @@ def _trace_chunk(
     vertices = lens.vertices_mm
     media = _indices(lens, wavelength_nm)  # media[k] lies before surface k as light travels to the film
     guard = freeze or bool(record)
-    tests = _Tests(rays.x)
+    length2 = torch.addcmul(torch.addcmul(rays.dx * rays.dx, rays.dy, rays.dy), rays.dz, rays.dz)
+    sound = (length2 - 1).abs() < UNIT_SLACK
+    if freeze:
+        # Not even a NaN that comes in may reach the gradients of the others.
+        sound = sound & torch.isfinite(rays.x + rays.y + rays.z)
+        rays = _along_axis(rays, sound, sense, 0.0)
+    tests = _Tests(sound, st.blocked(order[0], st.MISSED))
     power = torch.ones_like(rays.x) if transmittance else None
     crossings: dict[int, Crossing] = {}
     r, vertex = rays, 0.0
@@ -160,7 +183,11 @@ def _trace_chunk(
         c = 0.0 if _is_plane(surface) else surface.curvature
         hit = intersect_plane(r, sense) if _is_plane(surface) else intersect_sphere(r, c, sense, position == 0, guard)
         tests.require(hit.met, k, st.MISSED)
-        tests.require(torch.addcmul(hit.x * hit.x, hit.y, hit.y) <= surface.semi_diameter_mm**2, k, st.RIM)
+        distance2 = torch.addcmul(hit.x * hit.x, hit.y, hit.y)
+        tests.require(distance2 <= surface.semi_diameter_mm**2, k, st.RIM)
+        if _is_plane(surface):
+            # A sphere's square root turns NaN and overflow into a miss; a plane would let them go on.
+            tests.goes_on = tests.goes_on & (distance2 < math.inf)
         if before is after:
             r, cos2_t = Rays(hit.x, hit.y, hit.z, r.dx, r.dy, r.dz), hit.discriminant
         else:
@@ -183,9 +210,10 @@ def _trace_chunk(
 class _Tests:
     """The tests at each surface (met, inside the rim, not totally reflected), in that order; first failure rules."""
 
-    def __init__(self, like: Tensor) -> None:
-        self.status = torch.zeros_like(like, dtype=torch.int32)
-        self.goes_on = torch.ones_like(like, dtype=torch.bool)
+    def __init__(self, sound: Tensor, otherwise: int) -> None:
+        """Start with rays whose direction is `sound` [N]; the others have the status `otherwise`."""
+        self.status = (~sound).to(torch.int32) * otherwise
+        self.goes_on = sound
 
     def require(self, passed: Tensor, surface: int, reason: int) -> None:
         """Apply the next test. A rim alone lets a ray go on (its crossings are learnt from); the other two end it."""
