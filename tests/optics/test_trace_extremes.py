@@ -1,0 +1,229 @@
+"""The exact tracer under what should not happen: bad input, rays without a meeting, gradients beside lost rays."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as hs
+from torch import Tensor
+
+from neurolens import status as st
+from neurolens.errors import InputError, NeurolensWarning
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.trace import Rays, trace
+
+ROOT = Path(__file__).parents[2] / "lenses"
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", NeurolensWarning)  # glasses of unknown dispersion
+    DOUBLE_GAUSS = read_lens(ROOT / "laikin_double_gauss_50.toml").at()
+    FISHEYE = read_lens(ROOT / "muller_fisheye_100.toml").at()
+PLATE = Lens(
+    "plate", "", (Surface(math.inf, 5, 20, 1.5), Surface(math.inf, 5, 20), Surface(math.inf, 1, 10, stop=True)), 2.0
+)
+BALL = Lens(
+    "ball", "", (Surface(10.0, 20, 19.9, 1.5), Surface(-10.0, 5, 19.9), Surface(math.inf, 1, 10, stop=True)), 2.0
+)
+TABLES = {"double gauss": DOUBLE_GAUSS, "fisheye": FISHEYE, "plate": PLATE, "ball": BALL}
+WILD = (math.nan, math.inf, -math.inf, 1e-310, 1e-42, 1e20, 1e39, 1e300, -1e300, 0.0)
+
+
+def rays(rows: list[list[float]], dtype: torch.dtype = torch.float64) -> Rays:
+    return Rays(*torch.tensor(rows, dtype=torch.float64).to(dtype).T.contiguous())
+
+
+def start_z(table: Lens, towards: str) -> float:
+    return -30.0 if towards == "film" else float(table.vertices_mm[-1])
+
+
+def good(table: Lens, towards: str) -> list[float]:
+    return [0.1, 0.2, start_z(table, towards), 0.0, 0.0, 1.0 if towards == "film" else -1.0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("towards", ["film", "scene"])
+@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize("record", [(), (0, 1, 2)])
+def test_wild_numbers_end_a_ray_and_never_leave_as_one(
+    name: str, towards: str, dtype: torch.dtype, record: tuple[int, ...]
+) -> None:
+    table = TABLES[name]
+    rows = [good(table, towards) for _ in range(6 * len(WILD))]
+    for i, row in enumerate(rows):
+        row[i % 6] = WILD[i // 6]
+    rows += [[0.0] * 6, [1.0, 1.0, 1.0, 1e-320, 0, -1e-320], [0.1, 0.2, 0.3, 0, 0, 2.0], good(table, towards)]
+    start = rays(rows, dtype)
+    out = trace(table, start, 500.0, towards=towards, transmittance=True, record=record)  # type: ignore[arg-type]
+    assert out.transmittance is not None
+    for c in (*out.rays, out.transmittance):
+        assert torch.isfinite(c).all()
+    sound = torch.stack([torch.isfinite(c) for c in start]).all(0)
+    unit = (start.dx**2 + start.dy**2 + start.dz**2 - 1).abs() < 1e-3
+    assert (out.status[~(sound & unit)] != 0).all()
+    assert out.status[-1] == 0
+
+
+@given(
+    hs.lists(
+        hs.lists(hs.floats(width=32) | hs.floats(-50, 50), min_size=6, max_size=6),
+        min_size=1,
+        max_size=8,
+    ),
+    hs.sampled_from(sorted(TABLES)),
+    hs.sampled_from(["film", "scene"]),
+    hs.booleans(),
+)
+def test_any_floats_give_a_status_and_finite_rays(rows: list[list[float]], name: str, towards: str, unit: bool) -> None:
+    start = rays(rows)
+    if unit:
+        length = torch.stack(start[3:]).norm(dim=0)
+        start = Rays(*start[:3], *(c / length for c in start[3:]))
+    out = trace(TABLES[name], start, towards=towards)  # type: ignore[arg-type]
+    assert all(torch.isfinite(c).all() for c in out.rays)
+    passed = out.status == 0
+    square = out.rays.dx**2 + out.rays.dy**2 + out.rays.dz**2
+    assert ((square[passed] - 1).abs() < 2e-3).all()
+
+
+@pytest.mark.parametrize("wavelength", [math.nan, -500.0, 0.0, math.inf])
+def test_a_wavelength_that_is_none(wavelength: float) -> None:
+    start = rays([good(DOUBLE_GAUSS, "scene")] * 2)
+    with pytest.raises(InputError, match="wavelength_nm"):
+        trace(DOUBLE_GAUSS, start, wavelength)
+    if wavelength == math.inf:
+        return  # Cauchy's limit is finite
+    out = trace(DOUBLE_GAUSS, start, torch.tensor([500.0, wavelength], dtype=torch.float64))
+    assert (out.status != 0).tolist() == [False, True]
+    assert all(torch.isfinite(c).all() for c in out.rays)
+
+
+def test_the_rays_decide_the_precision() -> None:
+    """A float64 wavelength beside float32 rays leaves float32."""
+    start = rays([good(DOUBLE_GAUSS, "scene")] * 2, torch.float32)
+    for wavelength in (torch.tensor([500.0, 600.0], dtype=torch.float64), torch.tensor([500, 600])):
+        out = trace(DOUBLE_GAUSS, start, wavelength, transmittance=True, record=[3])
+        assert {c.dtype for c in (*out.rays, out.transmittance, *out.crossings[3])} == {torch.float32}  # type: ignore[union-attr]
+
+
+def fields(**changes: Tensor) -> Rays:
+    return rays([good(PLATE, "film")] * 3)._replace(**changes)
+
+
+@pytest.mark.parametrize(
+    ("call", "named"),
+    [
+        (lambda: trace(PLATE, fields(y=torch.zeros(2).double())), "rays.y"),
+        (lambda: trace(PLATE, fields(dz=torch.ones(3))), "rays.dz"),
+        (lambda: trace(PLATE, Rays(*torch.zeros((6, 3, 1)))), "rays.x"),
+        (lambda: trace(PLATE, Rays(*torch.zeros(6))), "rays.x"),
+        (lambda: trace(PLATE, Rays(*torch.zeros((6, 3), dtype=torch.int64))), "int64"),
+        (lambda: trace(PLATE, Rays(*torch.zeros((6, 3), dtype=torch.float16))), "float16"),
+        (lambda: trace(PLATE, fields(), torch.full((2,), 500.0)), "wavelength_nm"),
+        (lambda: trace(PLATE, fields(), torch.full((3, 1), 500.0)), "wavelength_nm"),
+        (lambda: trace(PLATE, fields(), towards="sky"), "towards"),  # type: ignore[arg-type]
+        (lambda: trace(PLATE, fields(), record=[3]), "record"),
+        (lambda: trace(PLATE, fields(), record=[-1]), "record"),
+    ],
+)
+def test_bad_arguments_name_themselves(call: Callable[[], object], named: str) -> None:
+    with pytest.raises(InputError, match=named):
+        call()
+
+
+def test_camera_rays_that_start_away_from_the_lens_are_lost() -> None:
+    for table in TABLES.values():
+        row = good(table, "scene")
+        row[5] = 1.0
+        last = len(table.surfaces) - 1
+        assert trace(table, rays([row])).status.tolist() == [st.blocked(last, st.MISSED)]
+
+
+# ---- gradients ----
+
+
+def with_parameters(values: Tensor) -> Lens:
+    """A doublet with radius, thickness and index of its first element, from a tensor [3]."""
+    return Lens(
+        "doublet",
+        "",
+        (
+            Surface(values[0], values[1], 22, values[2], V_d=60.0),
+            Surface(-45.0, 2.0, 22, 1.65, V_d=35.0),
+            Surface(-200.0, 3.0, 22),
+            Surface(math.inf, 50.0, 14, stop=True),
+        ),
+        4.0,
+    )
+
+
+VALUES = torch.tensor([40.0, 5.0, 1.55], dtype=torch.float64)
+# The last five are lost: outside the rim, beyond the sphere, past every surface, backwards, NaN.
+BUNDLE = [[x, y, -20.0, 0.02, 0.05, math.sqrt(1 - 0.0029)] for x in (-4.0, 0.0, 3.0) for y in (-5.0, 0.0, 2.0)] + [
+    [10.0, 0.0, -20.0, 0.0, 0.0, 1.0],
+    [100.0, 0.0, -20.0, 0.0, 0.0, 1.0],
+    [0.0, 0.0, -20.0, 0.0, 0.8, 0.6],
+    [0.0, 0.0, -20.0, 0.0, 0.0, -1.0],
+    [math.nan, 0.0, -20.0, 0.0, 0.0, 1.0],
+]
+
+
+def moments(values: Tensor, start: Rays, wavelength: Tensor) -> Tensor:
+    """A number that every output of the passing rays enters."""
+    out = trace(with_parameters(values), start, wavelength, towards="film", transmittance=True)
+    assert out.transmittance is not None
+    passed = out.status == 0
+    assert 5 <= passed.sum() < len(start.x)
+    terms = [
+        (torch.cos(0.3 * (k + 1) * c) * (k + 1))[passed].sum() for k, c in enumerate((*out.rays, out.transmittance))
+    ]
+    return torch.stack(terms).sum()
+
+
+def test_gradients_of_the_prescription_and_of_rays() -> None:
+    """Against central differences; lost rays beside the others leave no NaN."""
+    values, start = VALUES.clone().requires_grad_(), Rays(*(c.requires_grad_() for c in rays(BUNDLE)))
+    wavelength = torch.linspace(420, 680, len(BUNDLE), dtype=torch.float64).requires_grad_()
+    inputs = [values, *start, wavelength]
+    grads = torch.autograd.grad(moments(values, start, wavelength), inputs)
+    assert all(torch.isfinite(g[:9]).all() for g in grads)
+    assert torch.isfinite(grads[0]).all()
+    for which, (tensor, grad) in enumerate(zip(inputs, grads, strict=True)):
+        for i in range(len(tensor) if which == 0 else 9):
+            step = 1e-5 * max(1.0, abs(float(tensor.detach()[i])))
+            ends = []
+            for sign in (1, -1):
+                moved = [t.detach().clone() for t in inputs]
+                moved[which][i] += sign * step
+                ends.append(float(moments(moved[0], Rays(*moved[1:7]), moved[7])))
+            assert float(grad.detach()[i]) == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=2e-6, abs=2e-7), (
+                which,
+                i,
+            )
+
+
+@pytest.mark.parametrize("towards", ["film", "scene"])
+def test_no_nan_gradient_where_most_rays_are_lost(towards: str) -> None:
+    """Misses, rims and total reflection in one batch, as the fisheye has them all."""
+    g = torch.Generator().manual_seed(3)
+    d = torch.randn((3, 2000), generator=g, dtype=torch.float64)
+    d[2] = d[2].abs() * (1 if towards == "film" else -1)
+    p = torch.randn((3, 2000), generator=g, dtype=torch.float64) * 60
+    p[2] = start_z(FISHEYE, towards) + 0.1 * p[2]
+    start = Rays(*(c.clone().requires_grad_() for c in (*p, *(d / d.norm(dim=0)))))
+    first = replace(FISHEYE.surfaces[0], radius_mm=torch.tensor(float(FISHEYE.surfaces[0].radius_mm)).double())
+    first.radius_mm.requires_grad_()
+    table = replace(FISHEYE, surfaces=(first, *FISHEYE.surfaces[1:]))
+    out = trace(table, start, 550.0, towards=towards, transmittance=True)  # type: ignore[arg-type]
+    assert {st.MISSED, st.RIM} <= {st.reason_of(int(s)) for s in out.status}
+    assert out.transmittance is not None
+    total = sum(c.sum() for c in out.rays) + out.transmittance.sum()
+    assert isinstance(total, Tensor)
+    for grad in torch.autograd.grad(total, [first.radius_mm, *start]):
+        assert torch.isfinite(grad).all()
