@@ -1,0 +1,195 @@
+"""Networks: accuracy on a simple lens, exact symmetry, repeatability, and the optimiser against autograd."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from neurolens.errors import InputError
+from neurolens.optics.lensfile import read_lens
+from neurolens.surrogates.cores import Network
+from neurolens.surrogates.domain import domain_of, sample_domain
+from neurolens.surrogates.lightfield import LightField, fit_encoding
+from neurolens.surrogates.mlp import fit_network
+from neurolens.surrogates.model import DIRECTION, POSITION, STOP, LensModel
+from neurolens.surrogates.pairs import PairSettings, make_pairs, trace_pairs
+from neurolens.surrogates.projection import Problem, activations, project
+from neurolens.surrogates.targets import choose_gates, film_equivalent_weights, scales_of, targets_of
+from neurolens.surrogates.training import minimise, normal_equations
+
+LENSES = Path(__file__).parents[2] / "lenses"
+F64 = torch.float64
+
+
+def _setup(name, **kwargs):
+    lens = read_lens(LENSES / name)
+    pairs = make_pairs(lens, domain_of(lens, **kwargs), PairSettings(train=2000, held_out=2000, rim=2000))
+    gates = choose_gates(lens, pairs.rim.select(pairs.rim.status != 0))
+    return pairs, fit_encoding(pairs.domain, pairs.train), gates
+
+
+@pytest.fixture(scope="module")
+def singlet():
+    return _setup("thorlabs_lb1471_biconvex_50.toml", film_radius_mm=12.0, focus_m=(math.inf, 1.0))
+
+
+@pytest.fixture(scope="module")
+def network(singlet):
+    return fit_network(*singlet, units=8, steps=25, seed=3)
+
+
+@pytest.mark.parametrize("dtype", [F64, torch.float32])
+def test_held_out_rays_of_a_singlet(singlet, network, dtype):
+    pairs, encoding, _ = singlet
+    targets = targets_of(pairs.lens, encoding, pairs.held_out)
+    vectors, scalars = network.to(dtype)(LightField(*(c.to(dtype) for c in targets.field)))
+    error = (vectors.to(F64) - targets.vectors).norm(dim=1).square().mean(1).sqrt()
+    position_um, direction_um = film_equivalent_weights(pairs.lens, pairs.domain)
+    assert math.hypot(error[POSITION] * position_um, error[DIRECTION] * direction_um) < 1.0
+    assert error[STOP] * pairs.lens.stop_radius_mm < 5e-3
+    assert (scalars[0].to(F64) - targets.transmittance).square().mean().sqrt() < 1e-3
+
+
+def test_float32_evaluation_keeps_a_twentieth_of_a_micrometre(singlet, network):
+    pairs, encoding, _ = singlet
+    field = targets_of(pairs.lens, encoding, pairs.held_out).field
+    single = network.to(torch.float32)(LightField(*(c.to(torch.float32) for c in field)))[0]
+    difference = (single.to(F64) - network(field)[0]).norm(dim=1).quantile(0.99, dim=1)
+    for vector, um in zip((POSITION, DIRECTION), film_equivalent_weights(pairs.lens, pairs.domain), strict=True):
+        assert difference[vector] * um < 0.05
+
+
+def test_rims_and_stop_block_what_the_exact_lens_blocks(singlet, network):
+    pairs, encoding, gates = singlet
+    rays = sample_domain(pairs.domain, 50000, seed=77)
+    exact = trace_pairs(pairs.lens, rays, pairs.domain.pupil_z_mm).status == 0
+    model = LensModel(pairs.lens, pairs.domain, encoding, scales_of(pairs.lens), gates, network, "mlp")
+    passed = model.predict(rays).status == 0
+    assert (passed & ~exact).sum() < 0.003 * passed.sum()
+    assert (exact & ~passed).sum() < 0.003 * exact.sum()
+
+
+@pytest.mark.parametrize("mirror", [1.0, -1.0])
+def test_turning_or_mirroring_the_ray_does_the_same_to_every_output(singlet, network, mirror):
+    pairs, encoding, _ = singlet
+    field = encoding(pairs.held_out.inputs)
+    c, s = math.cos(0.7), math.sin(0.7)
+    turn = torch.tensor([[c, -s], [s, c]], dtype=F64) @ torch.diag(torch.tensor([1.0, mirror], dtype=F64))
+    vectors, scalars = network(field)
+    turned, same = network(LightField(turn @ field.p, turn @ field.u, field.w))
+    assert torch.allclose(turned, turn @ vectors, atol=1e-11, rtol=0)
+    assert torch.allclose(same, scalars, atol=1e-11, rtol=0)
+
+
+def _weights(network: Network) -> torch.Tensor:
+    return torch.cat([t.reshape(-1) for pair in (*network.hidden, network.output) for t in pair])
+
+
+def test_the_seed_decides_every_bit_on_any_number_of_threads(singlet):
+    threads = torch.get_num_threads()
+    first = _weights(fit_network(*singlet, units=4, steps=6, seed=5))
+    try:
+        torch.set_num_threads(2)
+        assert torch.equal(first, _weights(fit_network(*singlet, units=4, steps=6, seed=5)))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+    assert not torch.equal(first, _weights(fit_network(*singlet, units=4, steps=6, seed=6)))
+
+
+@pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+def test_a_lens_without_dispersion_ignores_the_wavelength():
+    pairs, encoding, gates = _setup("muller_fisheye_100.toml")
+    network = fit_network(pairs, encoding, gates, units=6, layers=1, steps=20)
+    assert torch.equal(network.hidden[0][0][:, 3], torch.zeros(6, dtype=F64))
+    targets = targets_of(pairs.lens, encoding, pairs.held_out)
+    error = (network(targets.field)[0] - targets.vectors)[DIRECTION].norm(dim=0)
+    assert torch.rad2deg(error.square().mean().sqrt()) < 0.05
+
+
+def test_progress_grows_to_one_and_a_time_limit_that_has_passed_still_gives_a_network(singlet):
+    shares: list[float] = []
+    network = fit_network(*singlet, units=4, layers=1, steps=5, starts=2, progress=shares.append)
+    assert shares == sorted(shares) and shares[-1] == 1.0 and 0 < shares[0] < 0.5
+    assert torch.isfinite(_weights(network)).all()
+    assert torch.isfinite(_weights(fit_network(*singlet, units=4, seconds=1e-9))).all()
+
+
+def test_an_interrupt_passes_through_and_leaves_the_threads_as_they_were(singlet):
+    def interrupt(share: float) -> None:
+        raise KeyboardInterrupt
+
+    before = torch.get_num_threads()
+    with pytest.raises(KeyboardInterrupt):
+        fit_network(*singlet, units=4, progress=interrupt)
+    assert torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize("name", ["units", "layers", "steps", "starts", "seconds", "rays"])
+def test_numbers_that_are_not_positive_are_named(singlet, name):
+    with pytest.raises(InputError, match=name):
+        fit_network(*singlet, **{name: 0})
+
+
+def _random_problem(rays: int = 60) -> Problem:
+    g = torch.Generator().manual_seed(4)
+    normal = lambda *shape: torch.randn(shape, generator=g, dtype=F64)  # noqa: E731
+    return Problem(
+        normal(rays, 4),
+        normal(2, rays),
+        normal(2, rays),
+        normal(3, 2, rays),
+        normal(3, rays).abs(),
+        normal(2, rays),
+        normal(2, rays).abs(),
+    )
+
+
+def _random_hidden(depth: int) -> list[torch.Tensor]:
+    g = torch.Generator().manual_seed(9)
+    widths = [4, 3, 4, 3][: depth + 1]
+    return [0.5 * torch.randn((b, a + 1), generator=g, dtype=F64) for a, b in zip(widths[:-1], widths[1:], strict=True)]
+
+
+def _residuals(problem: Problem, hidden: list[torch.Tensor], output: torch.Tensor) -> torch.Tensor:
+    y = (activations(hidden, problem.inputs)[-1] @ output.T).T
+    ab = y[:6].reshape(3, 2, 1, -1)
+    vectors = (ab[:, 0] * problem.p + ab[:, 1] * problem.u - problem.vectors) * problem.vector_weights[:, None]
+    return torch.cat([vectors.reshape(-1), ((y[6:] - problem.scalars) * problem.scalar_weights).reshape(-1)])
+
+
+@pytest.mark.parametrize("depth", [1, 2, 3])
+def test_normal_equations_are_those_of_the_jacobian_with_the_last_layer_eliminated(depth):
+    problem = _random_problem()
+    at = project(problem, _random_hidden(depth))
+    sizes = [w.numel() for w in (*at.hidden, at.output)]
+
+    def flat(v: torch.Tensor) -> torch.Tensor:
+        parts = [t.reshape(w.shape) for t, w in zip(v.split(sizes), (*at.hidden, at.output), strict=True)]
+        return _residuals(problem, parts[:-1], parts[-1])
+
+    point = torch.cat([w.reshape(-1) for w in (*at.hidden, at.output)])
+    jacobian = torch.func.jacrev(flat)(point)
+    left, right = jacobian[:, : -sizes[-1]], jacobian[:, -sizes[-1] :]
+    rest = left - right @ torch.linalg.lstsq(right, left).solution
+    matrix, gradient, diagonal = normal_equations(problem, at)
+    assert torch.allclose(matrix, rest.T @ rest, rtol=1e-6, atol=1e-6 * float(diagonal.max()))
+    assert torch.allclose(gradient, left.T @ flat(point), rtol=1e-6, atol=1e-9 * float(diagonal.max()))
+    assert torch.allclose(diagonal, left.square().sum(0), rtol=1e-9)
+    assert at.loss * len(problem) == pytest.approx(float(flat(point).square().sum()), rel=1e-4)
+
+
+def test_a_network_that_made_the_data_is_found_again():
+    problem = _random_problem(400)
+    truth = _random_hidden(1)
+    y = (
+        activations(truth, problem.inputs)[-1]
+        @ torch.randn(8, 4, generator=torch.Generator().manual_seed(2), dtype=F64).T
+    ).T
+    vectors = y[:6].reshape(3, 2, 1, -1)[:, 0] * problem.p + y[:6].reshape(3, 2, 1, -1)[:, 1] * problem.u
+    weights = problem.vector_weights, problem.scalar_weights
+    made = Problem(problem.inputs, problem.p, problem.u, vectors, weights[0], y[6:], weights[1])
+    start = [w + 0.2 * torch.ones_like(w) for w in truth]
+    assert project(made, truth).loss < 1e-10
+    assert minimise(made, start, 40, math.inf).loss < 1e-8
