@@ -27,7 +27,8 @@ POOL = (
     65536  # rays of one pass: every batch size divides it, and float32 inputs of a pass stay in the third-level cache
 )
 BATCHES = (4096, 8192, 16384)
-_SAMPLE_S = 0.01  # a sample of the clock lasts at least this long
+_SAMPLE_S = 0.001  # a sample lasts at least this long; short ones fall between the interruptions of a busy machine
+_SAMPLES = 5  # the best of so many is the time of a round
 
 Call = Callable[[], object]
 
@@ -84,7 +85,7 @@ class Race:
     """Times of candidates that ran in turn.
 
     Attributes:
-        ns: nanoseconds per ray of each round, by candidate.
+        ns: nanoseconds per ray of each round (the best of a few short samples), by candidate.
         batch: rays a call, the best of those tried.
         threads, rounds: of all.
         unavailable: reason, by candidate that could not run.
@@ -147,7 +148,7 @@ def race(candidates: Sequence[Candidate], domain: Domain, *, threads: int = 1, r
             order = list(passes) if i % 2 == 0 else list(reversed(passes))  # nobody always follows the same neighbour
             for name in order:
                 passes[name].sample_ns(1)  # warms the caches for this candidate
-                ns[name].append(passes[name].sample_ns(inner[name]) / len(pool))
+                ns[name].append(min(passes[name].sample_ns(inner[name]) for _ in range(_SAMPLES)) / len(pool))
     return Race(ns, {n: p.batch for n, p in passes.items()}, threads, rounds, unavailable, before, _load())
 
 
@@ -201,7 +202,7 @@ def _best_batch(candidate: Candidate, pool: FilmRays, workers: ThreadPoolExecuto
         calls = tuple(candidate.prepare(pool.select(slice(i, i + batch))) for i in range(0, len(pool), batch))
         each = _Pass(batch, calls, workers, threads)
         each.sample_ns(1)
-        took = min(each.sample_ns(1) for _ in range(3)) if len(candidate.batches) > 1 else 0.0
+        took = min(each.sample_ns(1) for _ in range(2 * _SAMPLES)) if len(candidate.batches) > 1 else 0.0
         if took < best:
             best, found = took, each
     assert found is not None

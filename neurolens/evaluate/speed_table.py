@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 from collections.abc import Sequence
 from typing import Any
@@ -50,6 +51,9 @@ def markdown(title: str, notes: str, rows: Sequence[dict[str, Any]]) -> str:
         figures = f"{t['min']:.1f} | {t['median']:.1f} | {1000 / t['min']:.1f} | {t['batch']} | {t['threads']}"
         ratios = " | ".join(_ratio(row[key]) for key in ("speedup_over_compiled", "speedup_over_eager"))
         lines.append(f"| {row['lens']} | {row['name']} | {figures} | {ratios} |")
+    loads = [v for row in rows for v in row["load"] if v is not None]
+    if loads:
+        notes += f" Load average of the machine meanwhile: up to {max(loads):.1f} on {os.cpu_count()} cores."
     return f"# {title}\n\n{notes}\n\n" + "\n".join(lines) + "\n"
 
 
@@ -61,8 +65,9 @@ def notes(threads: str, rounds: int) -> str:
     """What a reader must know of the conditions."""
     return (
         f"Rays uniform over film and pupil disc of each domain, blocked ones included; {threads}, {rounds} rounds in "
-        "turn; float32 unless told. Exact tracer and models do the same work: film and pupil points in; scene ray, "
-        "transmittance and status out, with stop, rims and dispersion. Thin lens and pinhole give ray and weight. "
-        "Ratios: by the best times (median within rounds); above 1 is faster. "
+        "turn, each the best of a few short samples; float32 unless told. Exact tracer and models do the same work: film "
+        "and pupil points in; scene ray, transmittance and status out, with stop, rims and dispersion (models give the "
+        "crossing with the stop as well). Thin lens and pinhole give ray and weight. Rows named trace start from rays "
+        "made beforehand and leave out transmittance. Ratios: by the best times (median within rounds); above 1 is faster. "
         f"Python {platform.python_version()}, torch {torch.__version__}, {platform.machine()}."
     )
