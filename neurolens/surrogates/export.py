@@ -47,7 +47,8 @@ def export_onnx(model: LensModel, path: str | Path, errors: dict[str, Any] | Non
     g = Graph()
     field, inside = add_light_field(g, model)
     series = DirectionSeries(largest_angle(model))
-    scale = np.array([model.scales.position_mm, series.kappa, model.scales.stop_mm])
+    kappa = series.kappa if model.direction == "angle" else 1.0
+    scale = np.array([model.scales.position_mm, kappa, model.scales.stop_mm])
     rows = add_core(g, model.core, field, scale, TEST_SCALE)
     stop_square = add_decoder(g, model, rows.vectors, series)
     add_status(g, model, rows, stop_square, inside)

@@ -89,8 +89,13 @@ def add_decoder(g: Graph, model: LensModel, vectors: str, series: DirectionSerie
     square = g.op("ReduceSum", g.op("Mul", vectors, vectors), g.const([1], np.int64), keepdims=0)
     r2, t, stop2 = g.split(square, [1, 1, 1])
     z = _sag(g, model, r2)
-    xy = g.op("Mul", direction, _horner(g, t, series.sinc))
-    g.concat(position, z, xy, _horner(g, t, series.minus_cos), out="scene_ray")
+    if model.direction == "slope":
+        # (dx, dy) = slope / sqrt(1 + slope^2), dz = -1 / sqrt(1 + slope^2).
+        factor = g.op("Reciprocal", g.op("Sqrt", g.op("Add", t, g.const(1.0))))
+        dz = g.op("Neg", factor)
+    else:
+        factor, dz = _horner(g, t, series.sinc), _horner(g, t, series.minus_cos)
+    g.concat(position, z, g.op("Mul", direction, factor), dz, out="scene_ray")
     return stop2
 
 

@@ -1,0 +1,114 @@
+"""The exact lens as a camera: every ray traced through every surface. The one camera that needs torch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from neurolens.cameras.contract import CameraRays, FloatArray
+from neurolens.cameras.lens_film import LensFilm, PupilTable, SceneRays
+from neurolens.cameras.sampling import check_film, positive
+from neurolens.optics.glass import LINE_D_NM
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import PupilBounds, camera_rays, pupil_bounds
+from neurolens.optics.trace import CHUNK, Traced, compile_trace, trace
+
+
+class ExactCamera:
+    """A camera whose lens is the prescription itself.
+
+    Args:
+        lens: in the zoom state wanted.
+        film_mm: width and height of the film.
+        focus_m: distance from film to the object in focus; inf allowed.
+        f_number: None keeps the lens's stop.
+        wavelength_nm: range of the wavelengths; the d line stands in for a lens without known dispersion.
+        dtype: precision of the trace.
+        compiled: trace with torch's compiler; needs a C++ compiler, and a minute for the first rays.
+        bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
+            the same random numbers. None searches for them, over the whole film.
+
+    Raises:
+        InputError: a focus nearer than four focal lengths, a lens that no ray passes.
+    """
+
+    def __init__(
+        self,
+        lens: Lens,
+        *,
+        film_mm: tuple[float, float],
+        focus_m: float,
+        f_number: float | None = None,
+        wavelength_nm: tuple[float, float] = (400.0, 700.0),
+        dtype: Literal["float32", "float64"] = "float32",
+        compiled: bool = False,
+        bounds: PupilBounds | None = None,
+    ) -> None:
+        self.film_mm = check_film(film_mm)
+        self.focus_m = positive("focus_m", focus_m, infinite=True)
+        self.lens = lens.at(f_number=f_number, focus_m=self.focus_m)
+        self.name = lens.name
+        self.dispersive = lens.dispersive
+        self.wavelength_nm = wavelength_nm if self.dispersive else None
+        used = wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
+        film_z = self.lens.film_z_mm
+        assert film_z is not None  # `at` places the film
+        stopped = bounds is not None and self.lens.stop_radius_mm < 0.99 * lens.stop_radius_mm
+        if bounds is None:
+            corner = math.hypot(*self.film_mm) / 2
+            bounds = pupil_bounds(self.lens, 1.0001 * corner, (film_z, film_z), used)
+        self._pupil_z_mm = bounds.pupil_z_mm
+        self._dtype = torch.float32 if dtype == "float32" else torch.float64
+        self._compiled: Callable[..., Traced] | None = (
+            compile_trace(self.lens, transmittance=True) if compiled else None
+        )
+        self.film = LensFilm(PupilTable.of(asdict(bounds)), float(film_z), used, self._scene, stopped)
+        data = first_order(self.lens)
+        self.settings: dict[str, Any] = {
+            "camera": "exact",
+            "lens": {"id": lens.lens_id, "name": lens.name, "sha256": lens.sha256},
+            "efl_mm": float(data.efl_mm),
+            "f_number": float(data.f_number),
+            "focus_m": None if math.isinf(self.focus_m) else self.focus_m,
+            "film_mm": list(self.film_mm),
+            "film_z_mm": float(film_z),
+            "stop_radius_mm": float(self.lens.stop_radius_mm),
+            "dtype": dtype,
+        }
+
+    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
+        return self.film.sample(film_mm, pupil, wavelength_nm)
+
+    def _scene(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SceneRays:
+        fx, fy, px, py, wavelength = (
+            torch.from_numpy(np.ascontiguousarray(a)).to(self._dtype) for a in (*film, *pupil, wavelength_nm)
+        )
+        film_z = self.lens.film_z_mm
+        assert film_z is not None
+        rays = camera_rays(fx, fy, film_z, px, py, self._pupil_z_mm)
+        with torch.no_grad():
+            done = self._trace(rays, wavelength)
+        assert done.transmittance is not None
+        scene = torch.stack(list(done.rays)).to(torch.float32).numpy()
+        return SceneRays(scene, done.transmittance.to(torch.float32).numpy(), done.status.numpy())
+
+    def _trace(self, rays: Any, wavelength: torch.Tensor) -> Traced:
+        if self._compiled is None:
+            return trace(self.lens, rays, wavelength, transmittance=True)
+        # Compiled code is for one length: fill up the last chunk with its last ray.
+        count = len(wavelength)
+        index = torch.arange(math.ceil(count / CHUNK) * CHUNK).clamp_max(count - 1)
+        parts = []
+        for start in range(0, len(index), CHUNK):
+            chosen = index[start : start + CHUNK]
+            parts.append(self._compiled(type(rays)(*(c[chosen] for c in rays)), wavelength[chosen]))
+        joined = type(rays)(*(torch.cat(c)[:count] for c in zip(*(p.rays for p in parts), strict=True)))
+        power = torch.cat([p.transmittance for p in parts if p.transmittance is not None])[:count]
+        return Traced(joined, torch.cat([p.status for p in parts])[:count], power, {})

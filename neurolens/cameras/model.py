@@ -1,0 +1,104 @@
+"""Exported lens models as cameras, with onnxruntime and numpy alone."""
+
+from __future__ import annotations
+
+import math
+from copy import copy
+from dataclasses import dataclass
+from typing import Any
+
+from neurolens.cameras.contract import CameraRays, FloatArray
+from neurolens.cameras.lens_film import LensFilm, PupilTable, SceneRays, film_z_mm
+from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
+from neurolens.cameras.sampling import check_film, positive
+from neurolens.errors import InputError
+
+__all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
+
+_SLACK = 1.00001  # of the domain's bounds, as inside the graph
+
+
+class OnnxCamera:
+    """A camera whose lens is an exported model.
+
+    Args:
+        model: see `load_model`.
+        film_mm: width and height of the film. What lies beyond the model's film radius stays dark.
+        focus_m: distance from film to the object in focus; inf allowed.
+        f_number: None takes the model's widest stop.
+
+    Raises:
+        InputError: a focus or stop outside the model's domain.
+    """
+
+    def __init__(
+        self, model: OnnxLens, *, film_mm: tuple[float, float], focus_m: float, f_number: float | None = None
+    ) -> None:
+        card = model.card
+        lens, domain = card["lens"], card["domain"]
+        self.model = model
+        self.name = str(lens.get("name", model.path.stem))
+        self.film_mm = check_film(film_mm)
+        self.focus_m = positive("focus_m", focus_m, infinite=True)
+        low, high = (float(v) for v in domain["wavelength_nm"])
+        self.dispersive = low < high
+        self.wavelength_nm = (low, high) if self.dispersive else None
+        film_z = _film_z(model, self.focus_m)
+        stop = _stop_radius(model, f_number)
+        stopped = stop < 0.99 * float(domain["stop_radius_mm"])
+        self.film = LensFilm(PupilTable.of(domain["bounds"]), film_z, (low, high), _Scene(model, film_z, stop), stopped)
+        self.settings: dict[str, Any] = {
+            "camera": "model",
+            "model": str(model.path),
+            "efl_mm": lens["efl_mm"],
+            "f_number": lens["f_number"] * lens["stop_radius_mm"] / stop,
+            "focus_m": None if math.isinf(self.focus_m) else self.focus_m,
+            "film_mm": list(self.film_mm),
+            "film_z_mm": film_z,
+            "stop_radius_mm": stop,
+            "card": {k: v for k, v in card.items() if k not in ("reference", "units", "frame", "status_codes")},
+        }
+
+    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
+        return self.film.sample(film_mm, pupil, wavelength_nm)
+
+    def for_worker(self) -> OnnxCamera:
+        """The same camera with a session of its own, for another process or thread."""
+        other = copy(self)
+        other.model, other.film = self.model.reopened(), copy(self.film)
+        other.film.scene = _Scene(other.model, self.film.film_z_mm, self.settings["stop_radius_mm"])
+        return other
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """A model at one focus and stop."""
+
+    model: OnnxLens
+    film_z_mm: float
+    stop_radius_mm: float
+
+    def __call__(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SceneRays:
+        out = self.model.rays(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm)
+        return SceneRays(out.scene_ray, out.transmittance, out.status)
+
+
+def _film_z(model: OnnxLens, focus_m: float) -> float:
+    lens, (near, far) = model.card["lens"], model.card["domain"]["film_z_mm"]
+    z = film_z_mm(lens["efl_mm"], lens["front_principal_z_mm"], lens["rear_principal_z_mm"], focus_m)
+    if not near / _SLACK <= z <= far * _SLACK:
+        limits = " to ".join(f"{v} m" for v in reversed(model.card["domain"]["focus_m"]))
+        raise InputError(model.path, "focus_m", focus_m, f"a focus within the model's domain, {limits}")
+    return min(max(z, near), far)
+
+
+def _stop_radius(model: OnnxLens, f_number: float | None) -> float:
+    lens, widest = model.card["lens"], float(model.card["domain"]["stop_radius_mm"])
+    if f_number is None:
+        return widest
+    radius = lens["stop_radius_mm"] * lens["f_number"] / positive("f_number", f_number)
+    if radius > widest * _SLACK:
+        least = lens["stop_radius_mm"] * lens["f_number"] / widest
+        raise InputError(model.path, "f_number", f_number, f"at least {least:.4g}, the model's widest stop")
+    return float(min(radius, widest))

@@ -1,0 +1,173 @@
+"""Reading exported models with suspicion: a small protobuf reader that checks a file before onnxruntime sees it.
+
+It needs no onnx package. It refuses what a lens model never holds: operators that are not on the list, functions,
+subgraphs, tensors in other files, numbers that are not finite. Format: onnx.proto3 of the ONNX project; field numbers
+below are its.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neurolens.errors import ModelError
+
+MAX_BYTES = 64 * 2**20
+CARD_KEY = "neurolens"
+KIND, SCHEMA = "neurolens.lens_model", 1
+OPERATORS = frozenset(
+    "Abs Add And Cast Clip Concat Cos Div Equal Gather Gemm GreaterOrEqual LessOrEqual MatMul Max Min Mul Neg "
+    "Reciprocal ReduceSum Relu Reshape Sin Slice Split Sqrt Sub Tanh Where".split()
+)
+# TensorProto.DataType: what models hold, and the numpy type of their raw bytes.
+_TYPES: dict[int, str] = {1: "<f4", 6: "<i4", 7: "<i8"}
+_EXTERNAL = 1  # TensorProto.DataLocation
+
+Fields = dict[int, list[Any]]
+
+
+def read_checked(path: str | Path) -> tuple[bytes, dict[str, Any]]:
+    """Bytes and card of a model file.
+
+    Raises:
+        ModelError: a file that is missing, too large, truncated, no ONNX model, without a card of this schema, or that
+            holds something a lens model never does.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise ModelError(f"{file}: no such file, expected an exported lens model (.onnx)")
+    size = file.stat().st_size
+    if size > MAX_BYTES:
+        raise ModelError(f"{file}: {size} bytes, expected at most {MAX_BYTES}")
+    data = file.read_bytes()
+    try:
+        model = _fields(memoryview(data))
+        graph = _one(model, 7)
+        metadata = {_text(entry, 1): _text(entry, 2) for entry in map(_fields, model.get(14, []))}
+        opsets = [_text(_fields(entry), 1) for entry in model.get(8, [])]
+    except (ValueError, TypeError) as error:
+        raise ModelError(f"{file}: truncated, or not an ONNX model ({error})") from error
+    try:
+        _check_graph(_fields(graph), opsets, bool(model.get(25)))
+    except ModelError as error:
+        raise ModelError(f"{file}: {error}") from error
+    except (ValueError, TypeError) as error:
+        raise ModelError(f"{file}: truncated or damaged ({error})") from error
+    return data, _card(file, metadata)
+
+
+def _card(file: Path, metadata: dict[str, str]) -> dict[str, Any]:
+    if CARD_KEY not in metadata:
+        raise ModelError(f"{file}: no card: its metadata has no {CARD_KEY!r}, so this is no model made by neurolens")
+    try:
+        card = json.loads(metadata[CARD_KEY], parse_constant=_refuse_constant)
+    except ValueError as error:
+        raise ModelError(f"{file}: the card is not strict JSON ({error})") from error
+    kind = card.get("kind") if isinstance(card, dict) else None
+    if kind != KIND:
+        raise ModelError(f"{file}: card: kind: got {kind!r}, expected {KIND!r}")
+    if card.get("schema") != SCHEMA:
+        raise ModelError(f"{file}: card: schema: got {card.get('schema')!r}, expected {SCHEMA}")
+    return card
+
+
+def _refuse_constant(name: str) -> Any:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def _check_graph(graph: Fields, opsets: list[str], functions: bool) -> None:
+    if functions or any(domain not in ("", "ai.onnx") for domain in opsets):
+        raise ModelError(f"operator sets {opsets}, functions {functions}: expected the standard operators only")
+    if graph.get(15):
+        raise ModelError("sparse tensors, expected none")
+    for node in map(_fields, graph.get(1, [])):
+        kind, domain = _text(node, 4), _text(node, 7)
+        if domain not in ("", "ai.onnx") or kind not in OPERATORS:
+            raise ModelError(f"operator {domain + '.' if domain else ''}{kind}: expected one of {sorted(OPERATORS)}")
+        for attribute in map(_fields, node.get(5, [])):
+            if set(attribute) & {5, 6, 10, 11, 22, 23}:  # tensors, graphs, sparse tensors
+                raise ModelError(f"operator {kind}: an attribute holds a tensor or a graph, expected numbers only")
+    for tensor in map(_fields, graph.get(5, [])):
+        _check_tensor(tensor)
+
+
+def _check_tensor(tensor: Fields) -> None:
+    name = _text(tensor, 8) or "(unnamed)"
+    if tensor.get(13) or tensor.get(14, [0])[-1] == _EXTERNAL:
+        raise ModelError(f"tensor {name}: its data lie in another file, expected them in the model")
+    kind = int(tensor.get(2, [0])[-1])
+    if kind not in _TYPES:
+        raise ModelError(f"tensor {name}: data type {kind}, expected float32, int32 or int64")
+    raw = tensor.get(9, [b""])[-1]
+    if kind == 1:
+        values = np.frombuffer(raw, _TYPES[1]) if len(raw) else _floats(tensor.get(4, []))
+        if not np.isfinite(values).all():
+            raise ModelError(f"tensor {name}: {int((~np.isfinite(values)).sum())} weights are NaN or infinite")
+
+
+def _floats(chunks: list[Any]) -> np.ndarray:
+    """float_data, packed or one by one."""
+    return np.frombuffer(b"".join(bytes(c) for c in chunks), "<f4")
+
+
+def _one(fields: Fields, number: int) -> Any:
+    if number not in fields:
+        raise ValueError(f"field {number} is missing")
+    return fields[number][-1]
+
+
+def _text(fields: Fields, number: int) -> str:
+    return bytes(fields[number][-1]).decode("utf-8") if number in fields else ""
+
+
+def _fields(data: memoryview) -> Fields:
+    """The fields of one protobuf message, by number; values are ints or bytes, in the order of the file.
+
+    Raises:
+        ValueError: bytes that are no message.
+    """
+    found: Fields = {}
+    if isinstance(data, int):
+        raise ValueError("a number where a message should be")
+    for number, value in _walk(data):
+        found.setdefault(number, []).append(value)
+    return found
+
+
+def _walk(data: memoryview) -> Iterator[tuple[int, Any]]:
+    at, end = 0, len(data)
+    while at < end:
+        key, at = _varint(data, at)
+        number, wire = key >> 3, key & 7
+        if number == 0:
+            raise ValueError("field number 0")
+        if wire == 0:
+            value, at = _varint(data, at)
+            yield number, value
+            continue
+        if wire == 2:
+            length, at = _varint(data, at)
+        elif wire in (1, 5):
+            length = 8 if wire == 1 else 4
+        else:
+            raise ValueError(f"wire type {wire}")
+        if length > end - at:
+            raise ValueError(f"{length} bytes announced where {end - at} are left")
+        yield number, data[at : at + length]
+        at += length
+
+
+def _varint(data: memoryview, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while True:
+        if at >= len(data) or shift > 63:
+            raise ValueError("a number without end")
+        byte = data[at]
+        value |= (byte & 0x7F) << shift
+        at, shift = at + 1, shift + 7
+        if byte < 0x80:
+            return value, at

@@ -1,0 +1,237 @@
+"""Exported lens models, loaded with suspicion and run with onnxruntime: rays in, rays out, numpy arrays."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import onnxruntime
+from numpy.typing import ArrayLike, NDArray
+
+from neurolens import status as st
+from neurolens.cameras.contract import FloatArray
+from neurolens.cameras.lens_film import PupilTable
+from neurolens.cameras.onnxfile import read_checked
+from neurolens.errors import InputError, ModelError
+
+INPUTS = {"rays": ("tensor(float)", 5, None), "film_z_mm": ("tensor(float)", 1), "stop_radius_mm": ("tensor(float)", 1)}
+OUTPUTS = {
+    "scene_ray": ("tensor(float)", 6, None),
+    "transmittance": ("tensor(float)", None),
+    "stop_xy_mm": ("tensor(float)", 2, None),
+    "status": ("tensor(int32)", None),
+}
+# Rays a call of onnxruntime: enough to hide the cost of its operators, few enough for a core's second-level cache.
+BATCH = 8192
+MAX_RAYS = 2**27
+_NUMBERS = {
+    "lens": (*("efl_mm", "f_number", "stop_radius_mm", "front_principal_z_mm", "rear_principal_z_mm"),),
+    "domain": ("film_radius_mm", "pupil_z_mm", "pupil_radius_mm", "stop_radius_mm"),
+}
+
+
+class LensRays(NamedTuple):
+    """What a model gives for N rays; lens frame, mm. Rays mean something where status is 0.
+
+    scene_ray [6, N] float32 (x, y, z, unit direction), transmittance [N], stop_xy_mm [2, N] (crossing with the stop),
+    status [N] int32 (see `neurolens.status`).
+    """
+
+    scene_ray: FloatArray
+    transmittance: FloatArray
+    stop_xy_mm: FloatArray
+    status: NDArray[np.int32]
+
+
+class OnnxLens:
+    """An exported model, loaded and checked. Make it with `load_model`.
+
+    Attributes:
+        card: see `neurolens.surrogates.card`.
+        path: of the file.
+    """
+
+    def __init__(self, path: Path, data: bytes, card: dict[str, Any], threads: int) -> None:
+        self.path, self.card, self.threads = path, card, threads
+        self._data = data
+        self._session = _session(path, data, threads)
+
+    def reopened(self) -> OnnxLens:
+        """The same model with a session of its own, for another process or thread."""
+        return OnnxLens(self.path, self._data, self.card, self.threads)
+
+    def rays(
+        self,
+        film_xy_mm: ArrayLike,
+        pupil_xy_mm: ArrayLike,
+        wavelength_nm: ArrayLike,
+        film_z_mm: float | ArrayLike | None = None,
+        stop_radius_mm: float | None = None,
+    ) -> LensRays:
+        """Scene-side rays of camera rays.
+
+        Args:
+            film_xy_mm, pupil_xy_mm: [2, N], lens frame, on the film plane and on the plane domain.pupil_z_mm.
+            wavelength_nm: [N], or one number.
+            film_z_mm: film plane; None takes that of infinity focus. An array [N] costs a call for each distinct value.
+            stop_radius_mm: None takes the widest stop.
+
+        Raises:
+            InputError: arrays of other shapes. Rays outside the domain are no error: their status says so.
+        """
+        film, pupil, wavelength = _columns(film_xy_mm, pupil_xy_mm, wavelength_nm)
+        domain = self.card["domain"]
+        stop = np.array([domain["stop_radius_mm"] if stop_radius_mm is None else stop_radius_mm], np.float32)
+        plane = np.atleast_1d(np.asarray(domain["film_z_mm"][0] if film_z_mm is None else film_z_mm, np.float32))
+        count = film.shape[1]
+        if plane.shape == (count,) and count > 1:
+            return self._by_plane(film, pupil, wavelength, plane, stop)
+        if plane.shape != (1,):
+            raise InputError("OnnxLens.rays", "film_z_mm", plane.shape, f"a number or an array ({count},)")
+        if 0 < count <= BATCH:
+            return self._run(film, pupil, wavelength, plane, stop)
+        out = _empty(count)
+        for start in range(0, count, BATCH):
+            part = slice(start, start + BATCH)
+            done = self._run(film[:, part], pupil[:, part], wavelength[part], plane, stop)
+            for whole, piece in zip(out, done, strict=True):
+                whole[..., part] = piece
+        return out
+
+    def _by_plane(
+        self, film: FloatArray, pupil: FloatArray, wavelength: FloatArray, plane: FloatArray, stop: FloatArray
+    ) -> LensRays:
+        out = _empty(film.shape[1])
+        for z in np.unique(plane):
+            at = np.flatnonzero((plane == z) | (np.isnan(plane) & np.isnan(z)))
+            done = self.rays(film[:, at], pupil[:, at], wavelength[at], float(z), float(stop[0]))
+            for whole, piece in zip(out, done, strict=True):
+                whole[..., at] = piece
+        return out
+
+    def _run(
+        self, film: FloatArray, pupil: FloatArray, wavelength: FloatArray, plane: FloatArray, stop: FloatArray
+    ) -> LensRays:
+        count = film.shape[1]
+        # Rows a power of two apart share cache lines, which makes matrix products a third slower: pad such batches.
+        width = count + 16 if count % 1024 == 0 else count
+        rays = np.empty((5, width), np.float32)
+        rays[:2, :count], rays[2:4, :count], rays[4, :count] = film, pupil, wavelength
+        rays[:, count:] = 0
+        out = self._session.run(list(OUTPUTS), {"rays": rays, "film_z_mm": plane, "stop_radius_mm": stop})
+        return LensRays(*(a[..., :count] for a in out))
+
+
+def load_model(path: str | Path, lens: str | None = None, threads: int = 1) -> OnnxLens:
+    """Load an exported model and check it.
+
+    Args:
+        lens: SHA-256 of the prescription (`Lens.sha256`) that the model must stand for; None takes any.
+        threads: of onnxruntime, within one operator. Batches that fit a core's cache gain nothing from more than one.
+
+    Raises:
+        ModelError: a file that is missing, truncated, too large, no ONNX model, without a card or with one of another
+            schema, with other inputs and outputs, with operators or weights that no lens model has, of another lens, or
+            whose reference rays come out wrong.
+        InputError: fewer than one thread.
+    """
+    if threads < 1:
+        raise InputError("load_model", "threads", threads, "at least 1")
+    file = Path(path)
+    data, card = read_checked(file)
+    _check_card(file, card)
+    if lens is not None and card["lens"].get("sha256") != lens:
+        found = str(card["lens"].get("sha256"))
+        raise ModelError(
+            f"{file}: card: lens.sha256: got {found[:16]}... ({card['lens'].get('name')}), expected {lens[:16]}...: "
+            "the model stands for another lens"
+        )
+    model = OnnxLens(file, data, card, threads)
+    _check_reference(model)
+    return model
+
+
+def _columns(film: ArrayLike, pupil: ArrayLike, wavelength: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+    where = "OnnxLens.rays"
+    try:
+        arrays = [np.asarray(a, dtype=np.float32) for a in (film, pupil, wavelength)]
+    except (ValueError, TypeError) as error:
+        raise InputError(where, "film_xy_mm, pupil_xy_mm, wavelength_nm", "(no arrays)", "arrays of numbers") from error
+    f, p, w = arrays
+    if f.ndim != 2 or f.shape[0] != 2 or f.shape[1] > MAX_RAYS:
+        raise InputError(where, "film_xy_mm", f"({f.shape})", f"an array (2, N) with N up to {MAX_RAYS}")
+    if p.shape != f.shape:
+        raise InputError(where, "pupil_xy_mm", f"({p.shape})", f"the shape of film_xy_mm, {f.shape}")
+    if w.shape not in ((), (f.shape[1],)):
+        raise InputError(where, "wavelength_nm", f"({w.shape})", f"a number or an array ({f.shape[1]},)")
+    return f, p, np.broadcast_to(w, (f.shape[1],))
+
+
+def _empty(count: int) -> LensRays:
+    shapes = ((6, count), (count,), (2, count))
+    scene, power, stop = (np.empty(shape, np.float32) for shape in shapes)
+    return LensRays(scene, power, stop, np.empty(count, np.int32))
+
+
+def _session(path: Path, data: bytes, threads: int) -> Any:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    try:
+        session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime raises types of its own, without a common base
+        raise ModelError(f"{path}: onnxruntime cannot load it ({str(error).splitlines()[0]})") from error
+    for what, expected, found in (
+        ("input", INPUTS, session.get_inputs()),
+        ("output", OUTPUTS, session.get_outputs()),
+    ):
+        shapes = {v.name: (v.type, *(None if isinstance(d, str) else d for d in v.shape)) for v in found}
+        if shapes != expected:
+            raise ModelError(f"{path}: {what}s: got {shapes}, expected {expected} (None: the number of rays)")
+    return session
+
+
+def _check_card(file: Path, card: dict[str, Any]) -> None:
+    """Everything that this module reads from a card, so that a mistake shows on loading."""
+    for section, names in _NUMBERS.items():
+        for name in names:
+            value = card.get(section, {}).get(name) if isinstance(card.get(section), dict) else None
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+                raise ModelError(f"{file}: card: {section}.{name}: got {value!r}, expected a finite number")
+    domain = card["domain"]
+    for name in ("film_z_mm", "wavelength_nm"):
+        value = domain.get(name)
+        if not isinstance(value, list) or len(value) != 2 or not all(isinstance(v, (int, float)) for v in value):
+            raise ModelError(f"{file}: card: domain.{name}: got {value!r}, expected two numbers")
+    try:
+        PupilTable.of(domain["bounds"])
+    except (InputError, KeyError, TypeError, ValueError) as error:
+        raise ModelError(f"{file}: card: domain.bounds: {error}") from error
+
+
+def _check_reference(model: OnnxLens) -> None:
+    """Recompute the card's reference rays: what is loaded here is what was exported."""
+    try:
+        reference = model.card["reference"]
+        rays = np.asarray(reference["rays"], np.float32)
+        wanted = [np.asarray(reference[k], np.float64) for k in ("scene_ray", "transmittance", "stop_xy_mm", "status")]
+        found = model.rays(rays[:2], rays[2:4], rays[4], float(reference["film_z_mm"][0]), reference["stop_radius_mm"])
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise ModelError(f"{model.path}: card: reference: {type(error).__name__}: {error}") from error
+    passed = wanted[3] == st.PASSED
+    if not np.array_equal(found.status, wanted[3]) or not passed.any():
+        raise ModelError(
+            f"{model.path}: reference rays: got status {found.status.tolist()}, expected {wanted[3].tolist()}"
+        )
+    scale = max(1.0, abs(float(model.card["lens"]["efl_mm"])))
+    for name, a, b, tolerance in zip(
+        LensRays._fields, found, wanted, (1e-4 * scale, 1e-4, 1e-4 * scale, 0.5), strict=True
+    ):
+        off = np.abs(a[..., passed] - b[..., passed])
+        if not (off <= tolerance).all():  # NaN fails
+            raise ModelError(
+                f"{model.path}: reference rays: {name} is wrong by {off.max():.3g}: the weights are damaged"
+            )
