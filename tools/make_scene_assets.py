@@ -1,6 +1,6 @@
 """Make what the scenes in experiments/scenes load: knot.obj (a torus knot) and poster.png (a test picture).
 
-    python tools/make_scene_assets.py
+python tools/make_scene_assets.py
 """
 
 from __future__ import annotations
@@ -47,7 +47,11 @@ def poster(size: int = 384) -> np.ndarray:
     picture[:] = np.array([250, 226, 190]) - 90 * y[..., None] * np.array([0.1, 0.5, 0.6])
     picture[np.hypot(x - 0.9, y - 0.38) < 0.17] = (226, 92, 58)
     # Level, swing, waves, phase and colour of each hill, from far to near.
-    hills = [(0.52, 0.07, 5, 0.3, (231, 168, 108)), (0.62, 0.06, 7, 2, (92, 142, 146)), (0.74, 0.08, 4, 4.1, (38, 76, 98))]
+    hills = [
+        (0.52, 0.07, 5, 0.3, (231, 168, 108)),
+        (0.62, 0.06, 7, 2, (92, 142, 146)),
+        (0.74, 0.08, 4, 4.1, (38, 76, 98)),
+    ]
     for level, swing, waves, phase, colour in hills:
         picture[y > level + swing * np.sin(waves * x + phase)] = colour
     border = (np.minimum(x, width / size - x) < 0.05) | (np.minimum(y, 1 - y) < 0.05)

@@ -1,4 +1,4 @@
-"""How fast the renderer is: `python -m neurolens.render.bench SCENE [--threads 2] [--depth 3] [--samples 16] [--repeats 5]`.
+"""How fast the renderer is: `python -m neurolens.render.bench SCENE --threads 2 --depth 3 --samples 16 --repeats 5`.
 
 Prints minimum and median time and the speeds they stand for, through a thin lens with the scene's focus and aperture.
 """
@@ -14,7 +14,9 @@ from neurolens.render.renderer import render
 from neurolens.render.scenefile import load_scene
 
 
-def measure(scene: str | Path, threads: int = 2, depth: int = 3, samples: int = 16, repeats: int = 5) -> dict[str, float]:
+def measure(
+    scene: str | Path, threads: int = 2, depth: int = 3, samples: int = 16, repeats: int = 5
+) -> dict[str, float]:
     """Speed of a scene file at its own picture size.
 
     Returns:

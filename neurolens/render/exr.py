@@ -29,8 +29,8 @@ def write_exr(path: str | Path, rgb: ArrayLike, *, half: bool = False, metadata:
 
     Args:
         path: where to; the folder exists.
-        rgb: [H, W, 3] linear, any real type and memory layout; stored as float32, or as float16 with `half`, where values
-            beyond 65504 become 65504.
+        rgb: [H, W, 3] linear, any real type and memory layout; stored as float32.
+        half: store as float16, where values beyond 65504 become 65504.
         metadata: JSON-able settings, kept as one JSON text in the attribute "neurolens".
 
     Raises:

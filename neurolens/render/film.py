@@ -39,7 +39,7 @@ class PixelGrid:
             raise InputError("picture", "width x height", (self.width, self.height), f"the shape of the film, {shape}")
 
     def film_points(self, pixel: NDArray[np.intp], jitter: FloatArray) -> FloatArray:
-        """Film points [2, N] in mm of pixel numbers [N] (row by row from the top left) and places [2, N] inside them."""
+        """Film points [2, N] in mm of pixels [N], numbered row by row from the top left, and places [2, N] in them."""
         row, column = np.divmod(pixel, self.width)
         points = np.empty((2, len(pixel)), np.float32)
         across, down = (column + jitter[0]) / self.width, (row + jitter[1]) / self.height

@@ -1,7 +1,8 @@
 """Lights that can be aimed at: rectangles and spheres that emit.
 
-A light is chosen partly by how much it lights the point that the camera looks at, partly at random. A rectangle is sampled uniformly over its area, a sphere over the cone that
-it fills. The environment is no such light: only scattered rays find it.
+A light is chosen partly by how much it lights the point that the camera looks at, partly at random. A rectangle is
+sampled uniformly over its area, a sphere over the cone that it fills. The environment is no such light: only scattered
+rays find it.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
+from neurolens.render.checks import BLACK, Vector
 from neurolens.render.primitives import dot
-from neurolens.render.scene import BLACK, Quad, Sphere, Vector
+from neurolens.render.shapes import Quad, Sphere
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,8 @@ class Lights:
         self._centre = np.array([s.centre_m for s in spheres], np.float32).reshape(-1, 3).T
         self._radius2 = np.array([s.radius_m**2 for s in spheres], np.float32)
         middle = np.concatenate([corner + 0.5 * (edge_u + edge_v), self._centre.T])
-        shone = np.concatenate([area, np.pi * self._radius2]) * [sum(x.emission) for x in (*quads, *spheres)]
+        emissions = [q.emission for q in quads] + [s.emission for s in spheres]
+        shone = np.concatenate([area, np.pi * self._radius2]) * [sum(emission) for emission in emissions]
         self._choose_by(shone / np.maximum(np.sum((middle - target_m) ** 2, axis=1), 1e-6))
 
     def _choose_by(self, importance: NDArray[np.float64]) -> None:

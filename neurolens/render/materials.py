@@ -1,10 +1,10 @@
 """How surfaces scatter: Lambert, a GGX coat over a Lambert base, mirror, smooth glass.
 
-Everything is for one wavelength a path: reflectances are numbers [N]. Directions are unit vectors [3, N] that point away
-from the surface, normals lie on the side of the incoming ray.
+Everything is for one wavelength a path: reflectances are numbers [N]. Directions are unit vectors [3, N] that point
+away from the surface, normals lie on the side of the incoming ray.
 
-Sources: Walter et al. 2007 (GGX); Heitz 2014 (Smith shadowing); Dupuy and Benyoub 2023, "Sampling visible GGX normals with
-spherical caps"; Schlick 1994.
+Sources: Walter et al. 2007 (GGX); Heitz 2014 (Smith shadowing); Dupuy and Benyoub 2023, "Sampling visible GGX normals
+with spherical caps"; Schlick 1994.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def glossy_evaluate(
     """Scattering times cosine [N] of the glossy material, and the density [N] with which `glossy_sample` finds it.
 
     Args:
-        out: towards the camera. inward: towards the light. base: diffuse reflectance. coat: Fresnel reflectance head on.
-        alpha: GGX width, roughness squared.
+        out: towards the camera. inward: towards the light.
+        base: diffuse reflectance. coat: Fresnel reflectance head on. alpha: GGX width, roughness squared.
 
     The base is dimmed by 1 - F on the way in and out, so that coat and base never reflect more than arrives.
     """

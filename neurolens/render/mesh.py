@@ -1,8 +1,8 @@
 """Triangle meshes: OBJ reading and a bounding-volume tree traversed by whole batches of rays.
 
 Nodes have 16 children and leaves 8 triangles: few levels, and at each level one dense test of every (ray, node) pair
-against 16 boxes or 8 triangles, which is what numpy does fast. Triangles carry the three planes of Havel and Herout 2010,
-"Yet faster ray-triangle intersection".
+against 16 boxes or 8 triangles, which is what numpy does fast. Triangles carry the three planes of Havel and Herout
+2010, "Yet faster ray-triangle intersection".
 """
 
 from __future__ import annotations
@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
 from neurolens.errors import InputError
-from neurolens.render.primitives import IntArray, Rays, slabs
+from neurolens.render.primitives import NEAREST, IntArray, Rays, slabs
 
 _BRANCHES, _LEAF = 16, 8
 _PAIRS_AT_ONCE = 4096  # keeps the [pairs, 8] temporaries inside the L2 cache
-_NEAREST = np.float32(1e-6)
 
 
 def read_obj(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -141,7 +140,7 @@ class Mesh:
         """See `Primitive`."""
         entry, exit_ = slabs(rays, self._low, self._high)
         np.minimum(exit_, best, out=exit_)
-        np.maximum(entry, _NEAREST, out=entry)
+        np.maximum(entry, NEAREST, out=entry)
         ray = np.flatnonzero(entry <= exit_)
         node = np.zeros(len(ray), np.intp)
         while ray.size:
@@ -159,7 +158,7 @@ class Mesh:
         self, rays: Rays, best: FloatArray, ray: NDArray[np.intp], node: NDArray[np.intp]
     ) -> NDArray[np.bool_]:
         """Which of the 16 children [pairs, 16] each ray enters before its nearest hit."""
-        entry = np.full((len(ray), _BRANCHES), _NEAREST)
+        entry = np.full((len(ray), _BRANCHES), NEAREST)
         exit_ = np.repeat(best[ray][:, None], _BRANCHES, axis=1)
         for k in range(3):
             origin, inverse = rays.origin[k].take(ray)[:, None], rays.inverse[k].take(ray)[:, None]
@@ -197,7 +196,7 @@ class Mesh:
         u, v = plane(1, point, True), plane(2, point, True)
         # A sliver of tolerance closes the seams between neighbours; a NaN of an overflow fails every comparison.
         edge = np.float32(-1e-6)
-        ok = (distance > _NEAREST) & (u >= edge) & (v >= edge) & (u + v <= 1 - edge)
+        ok = (distance > NEAREST) & (u >= edge) & (v >= edge) & (u + v <= 1 - edge)
         distance[~ok] = np.inf
         column = np.argmin(distance, axis=1)
         nearest = distance[np.arange(len(ray)), column]

@@ -1,8 +1,8 @@
 """Analytic shapes: where rays of a batch meet them.
 
-Each shape improves, in place, the nearest hit known so far: `best` [N] float32 distances in metres and `found` [N] int32
-surface numbers. A shape owns `count` surface numbers from `first` on. Arithmetic stays in a few arrays the size of the
-batch, which live in the L2 cache; tests are ordered so that the cheap rejection of a whole batch comes first.
+Each shape improves, in place, the nearest hit known so far: `best` [N] float32 distances in metres and `found` [N]
+int32 surface numbers. A shape owns `count` surface numbers from `first` on. Arithmetic stays in a few arrays the size
+of the batch, which live in the cache; tests are ordered so that the cheap rejection of a whole batch comes first.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from neurolens.cameras.contract import FloatArray
 
 IntArray = NDArray[np.int32]
 _TINY = np.float32(1e-20)
-_NEAREST = np.float32(1e-6)  # hits closer than this, in metres, are the surface that a ray leaves
+NEAREST = np.float32(1e-6)  # hits closer than this, in metres, are the surface that a ray leaves
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Plane:
         """See `Primitive`."""
         distance = self._offset - dot(self._normal, rays.origin)
         distance /= dot(self._normal, rays.direction) + _TINY
-        ok = distance > _NEAREST
+        ok = distance > NEAREST
         ok &= distance < best
         _keep(ok, distance, self.first, best, found)
 
@@ -102,7 +102,7 @@ class AxisQuad:
         """See `Primitive`."""
         distance = self._centre[self._axis] - rays.origin[self._axis]
         distance *= rays.inverse[self._axis]
-        ok = distance > _NEAREST
+        ok = distance > NEAREST
         ok &= distance < best
         for k in self._others:
             across = distance * rays.direction[k]
@@ -132,7 +132,7 @@ class Quad:
         """See `Primitive`."""
         distance = self._offset - dot(self._normal, rays.origin)
         distance /= dot(self._normal, rays.direction) + _TINY
-        ok = distance > _NEAREST
+        ok = distance > NEAREST
         ok &= distance < best
         if not ok.any():
             return
@@ -144,71 +144,6 @@ class Quad:
             ok &= along > 0
             ok &= along < 1
         _keep(ok, distance, self.first, best, found)
-
-
-class Spheres:
-    """All spheres of a scene, hit from outside and inside.
-
-    Most rays miss most spheres, so a cheap test rejects them: the discriminant r^2 - |f|^2 + (f . d)^2, with f from ray
-    origin o to centre c, is a polynomial in products of (c, 1) with (d, o.d) and (o, |o|^2), that is, two small matrix
-    products. It is loose by its rounding error; what it lets through is tested exactly, pair by pair.
-
-    Args:
-        first: surface number of the first sphere.
-        centres: [S, 3] m. radii: [S] m.
-    """
-
-    def __init__(self, first: int, centres: NDArray[np.float64], radii: NDArray[np.float64]) -> None:
-        self.first, self.count = first, len(radii)
-        self._centre = centres.T.astype(np.float32)
-        self._radius = radii.astype(np.float32)
-        # A hair of 2e-6 of the squared distances covers the rounding of the products.
-        slack, ones = 2e-6, np.ones(self.count)
-        constant = radii**2 - (1 - slack) * np.sum(centres**2, axis=1)
-        self._along = np.column_stack([centres, -ones]).astype(np.float32)
-        self._rest = np.column_stack([2 * centres, constant, (slack - 1) * ones]).astype(np.float32)
-        # As many rays as keep the product so small that BLAS does not start threads of its own.
-        self._rays_at_once = int(np.clip(200_000 // (5 * self.count), 64, 4096))
-
-    def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
-        """See `Primitive`."""
-        origin, direction = rays.origin, rays.direction
-        right = np.empty((9, origin.shape[1]), np.float32)
-        right[:3], right[3], right[4:7], right[7] = direction, dot(origin, direction), origin, 1
-        right[8] = dot(origin, origin)
-        for start in range(0, origin.shape[1], self._rays_at_once):
-            part = slice(start, start + self._rays_at_once)
-            loose = self._along @ right[:4, part]
-            loose *= loose
-            loose += self._rest @ right[4:, part]
-            number, ray = np.nonzero(loose > 0)
-            if ray.size:
-                ray += start
-                self._meet(rays, best, found, number, ray)
-
-    def _meet(
-        self, rays: Rays, best: FloatArray, found: IntArray, number: NDArray[np.intp], ray: NDArray[np.intp]
-    ) -> None:
-        """Test pairs of spheres and rays.
-
-        The discriminant comes from the distance between centre and ray, which stays exact in float32 for a small
-        sphere far away (Haines et al. 2019, "Precision improvements for ray/sphere intersection").
-        """
-        direction = rays.direction.take(ray, axis=1)
-        to_centre = self._centre.take(number, axis=1) - rays.origin.take(ray, axis=1)
-        radius = self._radius.take(number)
-        middle = dot(to_centre, direction)
-        direction *= middle
-        direction -= to_centre
-        half2 = radius * radius - dot(direction, direction)
-        half = np.sqrt(np.maximum(half2, 0))
-        distance = middle - half
-        np.copyto(distance, middle + half, where=distance < _NEAREST)
-        hit = np.flatnonzero((half2 > 0) & (distance > _NEAREST) & (distance < best.take(ray)))
-        ray, distance = ray[hit], distance[hit]
-        np.minimum.at(best, ray, distance)
-        won = distance == best.take(ray)
-        found[ray[won]] = self.first + number[hit[won]]
 
 
 class Box:
@@ -234,8 +169,8 @@ class Box:
         if self.room:
             distance = exit_
         else:
-            distance = np.where(entry > _NEAREST, entry, exit_)
-        ok &= distance > _NEAREST
+            distance = np.where(entry > NEAREST, entry, exit_)
+        ok &= distance > NEAREST
         ok &= distance < best
         _keep(ok, distance, self.first, best, found)
 

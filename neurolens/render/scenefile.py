@@ -16,7 +16,8 @@ from neurolens.cameras.contract import FloatArray
 from neurolens.config import from_dict
 from neurolens.errors import InputError
 from neurolens.render.mesh import read_obj
-from neurolens.render.scene import Material, MeshSettings, SceneSettings, Texture
+from neurolens.render.scene import Material, SceneSettings, Texture
+from neurolens.render.shapes import MeshSettings
 from neurolens.render.spectrum import srgb_to_linear
 from neurolens.tomlfile import read_toml, suggestion
 
@@ -50,8 +51,9 @@ def load_scene(path: str | Path) -> Scene:
     """Read a scene file; pictures and meshes lie beside it.
 
     Raises:
-        InputError: names file, field, value and what was expected, for an unknown or missing key, a wrong type or value,
-            a material or texture that is not defined, a picture or mesh that is missing or broken, a degenerate triangle.
+        InputError: names file, field, value and what was expected, for an unknown or missing key, a wrong type or
+            value, a material or texture that is not defined, a picture or mesh that is missing or broken, a
+            degenerate triangle.
     """
     return scene_from_tables(read_toml(path), path)
 

@@ -41,9 +41,9 @@ class SpectralRange:
     Attributes:
         centres_nm: [bins] float64.
         basis: [3, bins] float64, in [0, 1], adding up to 1.
-        response: [3, bins] float32, linear sRGB film value of radiance 1 at a wavelength drawn uniformly from the range.
-            The mean of response times basis is the unit matrix, so a colour lit by white light comes back as itself
-            whatever the range. A range too narrow to tell colours apart gives a grey film.
+        response: [3, bins] float32, linear sRGB film value of radiance 1 at a wavelength drawn uniformly from the
+            range. The mean of response times basis is the unit matrix, so a colour lit by white light comes back as
+            itself whatever the range. A range too narrow to tell colours apart gives a grey film.
         colours: whether the range tells colours apart.
     """
 
@@ -75,7 +75,7 @@ class SpectralRange:
         return (np.asarray(rgb, np.float64) @ self.basis).astype(np.float32)
 
     def refractive_index(self, n_d: float, v_d: float | None) -> FloatArray:
-        """Index [bins] by Cauchy's A + B / lambda^2 through n_d and n_F - n_C = (n_d - 1) / V_d; constant without V_d."""
+        """Index [bins], Cauchy's A + B / lambda^2 through n_d and n_F - n_C = (n_d - 1) / V_d; constant without V_d."""
         if v_d is None:
             return np.full(self.bins, n_d, np.float32)
         inverse = {line: 1 / nm**2 for line, nm in FRAUNHOFER_NM.items()}

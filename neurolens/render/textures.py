@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.scene import Texture, Vector
+from neurolens.render.checks import Vector
+from neurolens.render.palette import Index
+from neurolens.render.scene import Texture
 from neurolens.render.spectrum import SpectralRange
 
-Index = NDArray[np.intp]
 Frame = NDArray[np.float64]
 
 
@@ -36,7 +37,7 @@ def plane_frame(point: Frame, normal: Frame) -> Frame:
 
 
 def box_frame(low: Frame, axis: int) -> Frame:
-    """From the lowest corner of a box along the two axes of a face: x or z across, y up; x and z on floor and ceiling."""
+    """From the lowest corner of a box along the axes of a face: x or z across, y up; x and z on floor and ceiling."""
     u, v = {0: (2, 1), 1: (0, 2), 2: (0, 1)}[axis]
     return _frame(low, np.eye(3)[u], np.eye(3)[v], (1.0, 1.0))
 
@@ -45,7 +46,8 @@ class TextureTable:
     """The textures of a scene, looked up by surface.
 
     Args:
-        textures: by name. images: linear RGB [H, W, 3] of those of kind "image". names: texture of each surface, or None.
+        textures: by name. images: linear RGB [H, W, 3] of those of kind "image".
+        names: texture of each surface, or None.
         frames: [2, 5] from `_frame` of each surface, or None. colour: gives a colour's row of the palette.
     """
 
@@ -104,7 +106,7 @@ class TextureTable:
             value[rows] = look_up(self._rows[k].take(which), bins[rows])
 
     def _picture(self, image: FloatArray, u: FloatArray, v: FloatArray, bins: Index) -> FloatArray:
-        """Reflectance [N] of the texel at (u, v), counted in pictures from the lower left corner; the film smooths it."""
+        """Reflectance [N] of the texel at (u, v), in pictures from the lower left corner; the film smooths it."""
         height, width = image.shape[:2]
         column = ((u - np.floor(u)) * width).astype(np.intp)
         row = ((1 - (v - np.floor(v))) * height).astype(np.intp)

@@ -13,51 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
+from neurolens.render.checks import BLACK, Vector
 from neurolens.render.lights import Lights
 from neurolens.render.mesh import Mesh, vertex_normals
-from neurolens.render.primitives import AxisQuad, Box, IntArray, Plane, Primitive, Quad, Rays, Spheres, is_axis_aligned
-from neurolens.render.scene import BLACK, Environment, Material, Texture, Vector
+from neurolens.render.palette import Index, Palette
+from neurolens.render.primitives import AxisQuad, Box, IntArray, Plane, Primitive, Quad, Rays, is_axis_aligned
+from neurolens.render.scene import Environment, Material, Texture
 from neurolens.render.scenefile import Scene
 from neurolens.render.spectrum import SpectralRange
+from neurolens.render.spheres import Spheres
 from neurolens.render.textures import TextureTable, box_frame, plane_frame, quad_frame
 
 DIFFUSE, GLOSSY, MIRROR, GLASS, NOTHING = range(5)
 _KINDS = {"diffuse": DIFFUSE, "glossy": GLOSSY, "mirror": MIRROR, "glass": GLASS}
-Index = NDArray[np.intp]
-
-
-class Palette:
-    """Spectra [rows, bins], looked up by row and wavelength bin; colours that occur twice share a row."""
-
-    def __init__(self, spectral: SpectralRange) -> None:
-        self._spectral = spectral
-        self._rows: list[FloatArray] = []
-        self._numbers: dict[object, int] = {}
-        self._flat: FloatArray = np.zeros(0, np.float32)
-
-    def colour(self, rgb: Vector) -> int:
-        """Row of a colour."""
-        return self._row(rgb, lambda: self._spectral.spectrum(rgb))
-
-    def index(self, n_d: float, v_d: float | None) -> int:
-        """Row of a refractive index."""
-        return self._row(("index", n_d, v_d), lambda: self._spectral.refractive_index(n_d, v_d))
-
-    def _row(self, key: object, make: object) -> int:
-        if key not in self._numbers:
-            self._numbers[key] = len(self._rows)
-            self._rows.append(make())  # type: ignore[operator]
-        return self._numbers[key]
-
-    def freeze(self) -> None:
-        """Lay the rows out for `look_up`."""
-        self._flat = np.concatenate(self._rows) if self._rows else np.zeros(self._spectral.bins, np.float32)
-
-    def look_up(self, row: Index, bins: Index) -> FloatArray:
-        """Values [N] of rows [N] at wavelength bins [N]."""
-        where = row * self._spectral.bins
-        where += bins
-        return self._flat.take(where)
 
 
 @dataclass
@@ -126,10 +94,10 @@ class World:
             surfaces.append(_Surface(tuple(normal), material, frame=plane_frame(point, normal)))
 
     def _add_boxes(self, surfaces: list[_Surface]) -> None:
-        walls = [(room, room.walls(), True) for room in self.scene.settings.rooms]
-        sides = [(box, (box.material,) * 6, False) for box in self.scene.settings.boxes]
-        for shape, materials, inside in [*walls, *sides]:
-            low, high = np.array(shape.min_m, np.float64), np.array(shape.max_m, np.float64)
+        rooms = [(room.min_m, room.max_m, room.walls(), True) for room in self.scene.settings.rooms]
+        boxes = [(box.min_m, box.max_m, (box.material,) * 6, False) for box in self.scene.settings.boxes]
+        for low_m, high_m, materials, inside in [*rooms, *boxes]:
+            low, high = np.array(low_m, np.float64), np.array(high_m, np.float64)
             box = Box(len(surfaces), low, high, inside)
             self._primitives.append(box)
             self._boxes.append(box)
@@ -192,16 +160,17 @@ class World:
         """Whether no shadow ray can be blocked: the walls of a room around every light, as walls let light in."""
         if not isinstance(shape, Box) or not shape.room:
             return False
-        settings = self.scene.settings
-        points = [
-            np.add(s.centre_m, side * s.radius_m) for s in settings.spheres if any(s.emission) for side in (-1, 1)
-        ]
-        for q in settings.quads:
-            points += [np.array(q.corner_m), np.sum([q.corner_m, q.edge_u_m, q.edge_v_m], axis=0)] * any(q.emission)
+        points: list[NDArray[np.float64]] = []
+        for sphere in self.scene.settings.spheres:
+            if any(sphere.emission):
+                points += [np.add(sphere.centre_m, side * sphere.radius_m) for side in (-1, 1)]
+        for quad in self.scene.settings.quads:
+            if any(quad.emission):
+                points += [np.array(quad.corner_m), np.sum([quad.corner_m, quad.edge_u_m, quad.edge_v_m], axis=0)]
         return all(bool(np.all((p > shape.low) & (p < shape.high))) for p in points)
 
     def nearest(self, rays: Rays) -> tuple[FloatArray, IntArray]:
-        """Distance [N] in m (inf for none) and surface [N] (-1 for none, of a box its first face) that rays hit first."""
+        """Distance [N] in m (inf: none) and surface [N] that rays hit first; -1 for none, of a box its first face."""
         count = rays.origin.shape[1]
         best, found = np.full(count, np.inf, np.float32), np.full(count, -1, np.int32)
         for shape in self._primitives:

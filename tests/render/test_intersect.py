@@ -129,7 +129,9 @@ def test_smooth_normals_follow_the_curve() -> None:
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     vertices = [[x, y, z] for z in (-1.0, 1.0) for x, y in ring]
-    faces = [[k, (k + 1) % 24, 24 + k] for k in range(24)] + [[(k + 1) % 24, 24 + (k + 1) % 24, 24 + k] for k in range(24)]
+    faces = [[k, (k + 1) % 24, 24 + k] for k in range(24)] + [
+        [(k + 1) % 24, 24 + (k + 1) % 24, 24 + k] for k in range(24)
+    ]
     mesh = {"material": "m", "vertices_m": vertices, "faces": faces, "smooth": True}
     made = world(materials={"m": diffuse(1, 1, 1)}, meshes=[mesh])
     start = RANDOM.uniform(0, 2 * np.pi, 500)

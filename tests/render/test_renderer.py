@@ -79,7 +79,7 @@ def lit_scene() -> Any:
 
 
 def test_workers_do_not_change_the_picture_and_seeds_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.renderer.BATCH", 1024)
+    monkeypatch.setattr("neurolens.render.workers.BATCH", 1024)
     made, camera = lit_scene(), ThinLens(50.0, 2.0, 3.0, FILM)
     options: dict[str, Any] = {"width": 36, "height": 24, "samples": 40}
     one = render(made, camera, threads=1, **options)
@@ -140,6 +140,6 @@ def test_errors_are_clear(monkeypatch: pytest.MonkeyPatch) -> None:
         render(made, Prism(50.0, FILM), **small)
     narrow = scene({"wavelengths_nm": [460, 640]}, environment=WHITE)
     assert render(narrow, Prism(50.0, FILM), **small).rgb.shape == (24, 36, 3)
-    monkeypatch.setattr("neurolens.render.renderer.BATCH", 64)
+    monkeypatch.setattr("neurolens.render.workers.BATCH", 64)
     with pytest.raises(NeurolensError, match="no rays today"):
         render(made, Broken(50.0, FILM), threads=2, **small)

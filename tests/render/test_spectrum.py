@@ -8,7 +8,6 @@ import pytest
 from neurolens.render.spectrum import SpectralRange, linear_to_srgb, srgb_to_linear
 
 
-
 @pytest.mark.parametrize("limits", [(380, 780), (400, 700), (450, 650)])
 @pytest.mark.parametrize("rgb", [(1, 1, 1), (0.9, 0.1, 0.05), (0, 1, 0), (0.2, 0.3, 0.7)])
 def test_colour_in_white_light_comes_back(limits: tuple[float, float], rgb: tuple[float, float, float]) -> None:

@@ -1,0 +1,45 @@
+"""Checks of values in scene tables; the reader adds the file to the error."""
+
+from __future__ import annotations
+
+import math
+
+from neurolens.errors import InputError
+
+Vector = tuple[float, float, float]
+BLACK: Vector = (0.0, 0.0, 0.0)
+
+
+def require(ok: bool, field: str, value: object, expected: str) -> None:
+    if not ok:
+        raise InputError("scene", field, value, expected)
+
+
+def require_finite(field: str, value: tuple[float, ...]) -> None:
+    require(all(math.isfinite(x) for x in value), field, value, "finite numbers")
+
+
+def require_positive(field: str, value: float) -> None:
+    require(0 < value < math.inf, field, value, "a finite number above 0")
+
+
+def require_reflectance(field: str, value: Vector) -> None:
+    require(all(0 <= x <= 1 for x in value), field, value, "three numbers from 0 to 1")
+
+
+def require_emission(field: str, value: Vector) -> None:
+    require(all(0 <= x < math.inf for x in value), field, value, "three finite numbers, 0 or more")
+
+
+def length(vector: Vector) -> float:
+    return math.sqrt(sum(x * x for x in vector))
+
+
+def check_fields(item: object, what: str, needed: tuple[str, ...], optional: tuple[str, ...]) -> None:
+    """Every needed field is there, and none that the kind does not know."""
+    for field, value in vars(item).items():
+        if field == "kind":
+            continue
+        require(value is not None or field not in needed, field, "(missing)", f"given for {what}")
+        known = field in needed or field in optional
+        require(value is None or known, field, value, f"left out: {what} has {', '.join(needed + optional)}")

@@ -1,0 +1,48 @@
+"""Spectra of a scene in one table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.cameras.contract import FloatArray
+from neurolens.render.checks import Vector
+from neurolens.render.spectrum import SpectralRange
+
+Index = NDArray[np.intp]
+
+
+class Palette:
+    """Spectra [rows, bins], looked up by row and wavelength bin; colours that occur twice share a row."""
+
+    def __init__(self, spectral: SpectralRange) -> None:
+        self._spectral = spectral
+        self._rows: list[FloatArray] = []
+        self._numbers: dict[object, int] = {}
+        self._flat: FloatArray = np.zeros(0, np.float32)
+
+    def colour(self, rgb: Vector) -> int:
+        """Row of a colour."""
+        return self._row(rgb, lambda: self._spectral.spectrum(rgb))
+
+    def index(self, n_d: float, v_d: float | None) -> int:
+        """Row of a refractive index."""
+        return self._row(("index", n_d, v_d), lambda: self._spectral.refractive_index(n_d, v_d))
+
+    def _row(self, key: object, make: Callable[[], FloatArray]) -> int:
+        if key not in self._numbers:
+            self._numbers[key] = len(self._rows)
+            self._rows.append(make())
+        return self._numbers[key]
+
+    def freeze(self) -> None:
+        """Lay the rows out for `look_up`."""
+        self._flat = np.concatenate(self._rows) if self._rows else np.zeros(self._spectral.bins, np.float32)
+
+    def look_up(self, row: Index, bins: Index) -> FloatArray:
+        """Values [N] of rows [N] at wavelength bins [N]."""
+        where = row * self._spectral.bins
+        where += bins
+        return self._flat.take(where)

@@ -1,0 +1,188 @@
+"""What happens where paths meet surfaces: light is aimed at, and the paths go on.
+
+The paths of a vertex are sorted by kind of material, so that each kind is one slice: diffuse, glossy, mirror, glass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.cameras.contract import FloatArray
+from neurolens.render import sampler as dims
+from neurolens.render.materials import (
+    cosine_direction,
+    glass_direction,
+    glossy_evaluate,
+    glossy_sample,
+    mirror_direction,
+)
+from neurolens.render.palette import Index
+from neurolens.render.primitives import dot
+from neurolens.render.sampler import PathKeys, Sampler
+from neurolens.render.world import GLASS, GLOSSY, MIRROR, World
+
+_ONE_OVER_PI = np.float32(1 / np.pi)
+SPECULAR = np.float32(np.inf)  # density of a direction that has no choice
+
+
+@dataclass
+class Paths:
+    """The paths still alive.
+
+    Attributes:
+        origin, direction: [3, N] of their rays. throughput: [N]. bins: [N] wavelength bin.
+        slot: [N] place in the batch.
+        density: [N] per solid angle with which the ray's direction was chosen.
+    """
+
+    origin: FloatArray
+    direction: FloatArray
+    throughput: FloatArray
+    bins: Index
+    slot: Index
+    density: FloatArray
+
+    def take(self, rows: Index) -> Paths:
+        """Some of the paths."""
+        vectors = (self.origin.take(rows, axis=1), self.direction.take(rows, axis=1))
+        return Paths(
+            *vectors, self.throughput.take(rows), self.bins.take(rows), self.slot.take(rows), self.density.take(rows)
+        )
+
+
+class Vertex:
+    """Paths at the surfaces they have met.
+
+    Args:
+        surface: [N] numbers, sorted by kind. point: [3, N]. distance: [N] travelled since the last surface, m.
+        ends: [kinds] end of the slice of each kind.
+
+    Attributes:
+        facing: [3, N] true normals on the ray's side. shading: [3, N] the interpolated ones, where the scene has such
+        (`smooth`). outside: [N] whether the ray's side is the outside. rough: number of diffuse and glossy paths.
+    """
+
+    def __init__(
+        self, world: World, paths: Paths, surface: Index, point: FloatArray, distance: FloatArray, ends: Index
+    ) -> None:
+        self.world, self.paths, self._surface, self._point = world, paths, surface, point
+        glossy, rough, mirror, glass = (int(end) for end in ends[:4])
+        self.diffuse, self.glossy = slice(0, glossy), slice(glossy, rough)
+        self.mirror, self.glass, self.rough = slice(rough, mirror), slice(mirror, glass), rough
+        assert (GLOSSY, MIRROR, GLASS) == (1, 2, 3)
+
+        normal, shading = world.normals(surface, point)
+        self.smooth = shading is not normal
+        self.outside = dot(normal, paths.direction) < 0
+        sign = np.where(self.outside, np.float32(1), np.float32(-1))
+        normal *= sign
+        if self.smooth:
+            shading *= sign
+            # An interpolated normal that turns away from the ray is of no use: take the true one.
+            np.copyto(shading, normal, where=dot(shading, paths.direction) > -1e-3)
+        self.facing, self.shading = normal, shading
+        # How far to step off the surface, m: the rounding of a hit grows with the distance travelled.
+        self._reach = distance * np.float32(1e-6)
+        self._reach += np.float32(1e-4)
+
+        self.base = world.reflectance(surface[:mirror], point[:, :mirror], paths.bins[:mirror])
+        self.coat = world.palette.look_up(world.specular_row.take(surface[self.glossy]), paths.bins[self.glossy])
+        self.alpha = world.alpha.take(surface[self.glossy])
+
+    def start(self, side: FloatArray | None = None) -> FloatArray:
+        """Origins [3, N] of rays that leave on the near side, or where `side` is negative on the far side."""
+        return self._point + self.facing * (self._reach if side is None else self._reach * side)
+
+    def evaluate(self, inward: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Scattering times cosine, and density, [rough] for directions towards light [3, rough]."""
+        d, g = self.diffuse, self.glossy
+        cosine = np.maximum(dot(self.shading[:, d], inward[:, d]), np.float32(0))
+        cosine *= _ONE_OVER_PI
+        value = self.base[d] * cosine
+        if g.start == g.stop:
+            return value, cosine
+        out = -self.paths.direction[:, g]
+        shiny, density = glossy_evaluate(self.shading[:, g], out, inward[:, g], self.base[g], self.coat, self.alpha)
+        return np.concatenate([value, shiny]), np.concatenate([cosine, density])
+
+    def index(self) -> FloatArray:
+        """Refractive index of the glass paths."""
+        rows = self.world.index_row.take(self._surface[self.glass])
+        return self.world.palette.look_up(rows, self.paths.bins[self.glass])
+
+
+def aim_at_lights(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int, radiance: FloatArray) -> None:
+    """Light from one point on one light, where nothing stands in between, weighted against scattering into it."""
+    rough, world, paths = vertex.rough, vertex.world, vertex.paths
+    keys = keys.cut(0, rough)
+    origin = vertex.start()[:, :rough]
+    if world.lights.count == 1:
+        choice = np.zeros(rough, np.float32)
+    else:
+        choice = sampler.draw(keys, first + dims.LIGHT_CHOICE)
+    aimed = world.lights.sample(origin, choice, sampler.draw2(keys, first + dims.LIGHT))
+    value, density = vertex.evaluate(aimed.direction)
+    value *= aimed.inverse_pdf
+    if vertex.smooth:
+        value *= dot(vertex.facing[:, :rough], aimed.direction) > 0
+    rows = np.flatnonzero(value > 0)
+    value, ratio = value[rows], density[rows] * aimed.inverse_pdf[rows]
+    value /= 1 + ratio * ratio
+    value *= world.palette.look_up(world.light_emission_row.take(aimed.light[rows]), paths.bins[rows])
+    value *= paths.throughput[rows]
+    value *= world.visible(origin.take(rows, axis=1), aimed.direction.take(rows, axis=1), aimed.distance[rows])
+    radiance[paths.slot[rows]] += value
+
+
+def scatter(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int) -> Paths:
+    """The paths on their way to the next surface; a throughput of 0 ends a path."""
+    paths = vertex.paths
+    direction, density = np.empty_like(paths.direction), np.full(len(paths.slot), SPECULAR)
+    if vertex.rough:
+        density[: vertex.rough] = _scatter_rough(vertex, sampler, keys, first, direction)
+    if vertex.mirror.stop > vertex.mirror.start:
+        m = vertex.mirror
+        direction[:, m] = mirror_direction(paths.direction[:, m], vertex.shading[:, m])
+        paths.throughput[m] *= vertex.base[m]
+    side = None
+    if vertex.glass.stop > vertex.glass.start:
+        refracts = _scatter_glass(vertex, sampler, keys, first, direction)
+        side = np.ones(len(paths.slot), np.float32)
+        side[vertex.glass] -= 2 * refracts
+    if vertex.smooth:
+        # Interpolated normals can send a ray through the surface: it ends there.
+        leaving = dot(direction, vertex.facing)
+        paths.throughput *= (leaving if side is None else leaving * side) > 0
+    return Paths(vertex.start(side), direction, paths.throughput, paths.bins, paths.slot, density)
+
+
+def _scatter_rough(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int, direction: FloatArray) -> FloatArray:
+    """Write the directions of the diffuse and glossy paths, update their throughput, return the densities."""
+    d, g, paths = vertex.diffuse, vertex.glossy, vertex.paths
+    square = sampler.draw2(keys.cut(0, vertex.rough), first + dims.SCATTER)
+    direction[:, d], cosine = cosine_direction(vertex.shading[:, d], square[:, d])
+    paths.throughput[d] *= vertex.base[d]
+    cosine *= _ONE_OVER_PI
+    if g.start == g.stop:
+        return cosine
+    lobe = sampler.draw(keys.cut(g.start, g.stop), first + dims.LOBE)
+    normal, out, material = vertex.shading[:, g], -paths.direction[:, g], (vertex.base[g], vertex.coat, vertex.alpha)
+    direction[:, g] = glossy_sample(normal, out, *material, square[:, g], lobe)
+    value, density = glossy_evaluate(normal, out, direction[:, g], *material)
+    paths.throughput[g] *= value / density
+    return np.concatenate([cosine, density])
+
+
+def _scatter_glass(
+    vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int, direction: FloatArray
+) -> NDArray[np.bool_]:
+    """Write the directions of the glass paths; which of them refract."""
+    g = vertex.glass
+    choice = sampler.draw(keys.cut(g.start, g.stop), first + dims.LOBE)
+    direction[:, g], refracts = glass_direction(
+        vertex.paths.direction[:, g], vertex.shading[:, g], vertex.outside[g], vertex.index(), choice
+    )
+    return refracts
