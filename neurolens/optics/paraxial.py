@@ -22,7 +22,7 @@ class FirstOrder:
         rear_principal_z_mm, front_principal_z_mm: H' and H.
         entrance_pupil_z_mm, entrance_pupil_diameter_mm: paraxial image of the stop seen from the scene.
         exit_pupil_z_mm, exit_pupil_diameter_mm: seen from the film; z is infinite for an image-telecentric lens.
-        f_number: efl / entrance-pupil diameter.
+        f_number: efl / entrance-pupil diameter; infinite for a shut stop.
     """
 
     efl_mm: float
@@ -113,7 +113,7 @@ def first_order(lens: Lens, wavelength_nm: float = LINE_D_NM) -> FirstOrder:
         entrance_pupil_diameter_mm=entrance_diameter,
         exit_pupil_z_mm=last_z + exit_distance,
         exit_pupil_diameter_mm=opening * abs(exit_magnification),
-        f_number=abs(efl) / entrance_diameter,
+        f_number=abs(efl) / entrance_diameter if entrance_diameter else math.inf,
     )
 
 

@@ -142,7 +142,8 @@ class Lens:
             focus_m: distance from object to film in metres, `inf` allowed; None focuses at infinity.
 
         Raises:
-            InputError: an unknown configuration, a value that is not positive, or focus nearer than four focal lengths.
+            InputError: an unknown configuration, a value that is not positive, focus nearer than four focal lengths,
+                or `efl_mm` for a lens that diverges.
         """
         from neurolens.optics import paraxial  # paraxial needs this module's types
 
@@ -151,7 +152,10 @@ class Lens:
             if value is not None and not value > 0:
                 raise InputError(self.path, field, value, "a positive number")
         if efl_mm is not None:
-            lens = lens.scaled(efl_mm / paraxial.first_order(lens).efl_mm)
+            now_mm = paraxial.first_order(lens).efl_mm
+            if now_mm < 0:
+                raise InputError(self.path, "efl_mm", efl_mm, f"none: this lens diverges (EFL {now_mm:.4g} mm)")
+            lens = lens.scaled(efl_mm / now_mm)
         if f_number is not None:
             lens = lens.with_stop_radius(paraxial.stop_radius_mm(lens, f_number))
         return replace(lens, film_z_mm=paraxial.film_z_mm(lens, math.inf if focus_m is None else focus_m))

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from neurolens.errors import InputError
+from neurolens.optics.clearance import sag_mm
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
@@ -118,14 +119,19 @@ def _row(
     lens: Lens, radius: float, film_planes: list[float], wavelengths: list[float], plane: float, points: int
 ) -> _Box | None:
     """Box of the passing rays from one film radius, over all film planes and wavelengths given."""
-    rear = lens.surfaces[-1].semi_diameter_mm
+    rear = lens.surfaces[-1]
     rear_z = float(lens.vertices_mm[len(lens.surfaces) - 1])
+    limit = min(rear.semi_diameter_mm, abs(float(rear.radius_mm)))
     found = []
     for film_z in film_planes:
-        # The rear rim, seen from the film point and projected on the pupil plane, holds every ray that enters.
-        stretch = (film_z - plane) / (film_z - rear_z)
-        centre, reach = radius * (1 - stretch), 1.02 * rear * abs(stretch)
-        start = _Box(centre - reach, centre + reach, reach, 0.0)
+        # Every ray that enters crosses the rear surface between the planes of its vertex and of its rim, within the
+        # rim's radius; seen from the film point, that cylinder's two ends bound it on the pupil plane.
+        ends = []
+        for z in (rear_z, rear_z + sag_mm(float(rear.radius_mm), limit)):
+            stretch = (film_z - plane) / (film_z - z)
+            centre, reach = radius * (1 - stretch), 1.02 * rear.semi_diameter_mm * abs(stretch)
+            ends.append(_Box(centre - reach, centre + reach, reach, 0.0))
+        start = _union(ends)
         coarse = _search(lens, radius, film_z, wavelengths, plane, start, points)
         if coarse is not None:
             found.append(_search(lens, radius, film_z, wavelengths, plane, coarse, points) or coarse)
