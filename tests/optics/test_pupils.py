@@ -1,0 +1,106 @@
+"""Pupil bounds hold what passes; the pupil plane and the image radius are what the rules say."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from neurolens.errors import InputError
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.pupils import camera_rays, image_radius_mm, pupil_bounds, pupil_plane_z_mm
+from neurolens.optics.trace import trace
+
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+LENSES = sorted((Path(__file__).parents[2] / "lenses").glob("*.toml"))
+
+
+def outside(lens: Lens, film_radius: float, rows: int, points: int) -> tuple[int, int, int]:
+    """Passing rays of a brute-force search over a larger disc; those outside their row's box; outside the disc."""
+    film_z = lens.film_z_mm
+    assert film_z is not None
+    bounds = pupil_bounds(lens, film_radius, (film_z, film_z), (587.5618, 587.5618), rows=rows, points=points)
+    g = torch.Generator().manual_seed(0)
+    u = torch.rand((4, 60000), generator=g, dtype=torch.float64)
+    n = len(lens.surfaces)
+    # Through everything that lies within 1.5 rear radii of the axis on the rear vertex plane.
+    r, a = 1.5 * lens.surfaces[-1].semi_diameter_mm * u[0].sqrt(), 2 * math.pi * u[1]
+    film_x = film_radius * u[2].sqrt()
+    rays = camera_rays(film_x, torch.zeros_like(r), film_z, r * a.cos(), r * a.sin(), float(lens.vertices_mm[n - 1]))
+    passed = trace(lens, rays).status == 0
+    along = (bounds.pupil_z_mm - film_z) / rays.dz
+    x, y = (film_x + along * rays.dx)[passed], (along * rays.dy)[passed]
+    low, high, half = (torch.tensor(v, dtype=torch.float64) for v in (bounds.low_mm, bounds.high_mm, bounds.half_mm))
+    row = (film_x[passed] / film_radius * (rows - 1)).round().long()
+    in_row = (x >= low[row]) & (x <= high[row]) & (y.abs() <= half[row])
+    return int(passed.sum()), int((~in_row).sum()), int((torch.hypot(x, y) > bounds.disc_mm).sum())
+
+
+@pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
+def test_bounds_hold_what_passes(path: Path) -> None:
+    lens = read_lens(path).at()
+    passed, beyond_row, beyond_disc = outside(lens, image_radius_mm(lens)[0], rows=17, points=64)
+    assert passed > 1000
+    assert beyond_row <= 1e-4 * passed + 1
+    assert beyond_disc <= 1e-4 * passed
+
+
+@pytest.mark.parametrize("radius", [14.0, -14.0])
+def test_bounds_hold_at_a_deep_rear_surface(radius: float) -> None:
+    """The rear rim lies millimetres from the rear vertex plane: nearer to the film where the surface is hollow."""
+    # A shell of nearly no power: every ray through its rear rim passes.
+    rows = (Surface(math.inf, 9, 200, stop=True), Surface(radius + 1, 1.0, 28, 1.5), Surface(radius, 20, 26))
+    lens = replace(Lens("deep", "", rows, 2.0), film_z_mm=30.0)
+    passed, beyond_row, beyond_disc = outside(lens, 15.0, rows=17, points=64)
+    assert passed > 1000
+    assert beyond_row <= 1e-4 * passed + 1
+    assert beyond_disc <= 1e-4 * passed
+
+
+@pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
+def test_the_pupil_plane_is_apart_from_the_film(path: Path) -> None:
+    lens = read_lens(path).at()
+    assert lens.film_z_mm is not None
+    rear = lens.vertices_mm[len(lens.surfaces) - 1]
+    assert lens.film_z_mm - pupil_plane_z_mm(lens) >= 0.25 * (lens.film_z_mm - rear)
+
+
+def test_no_ray_passes() -> None:
+    """The stop is shut."""
+    shut = read_lens(next(p for p in LENSES if "thorlabs" in p.stem)).at().with_stop_radius(0.0)
+    with pytest.raises(InputError, match="no ray passes"):
+        pupil_bounds(shut, 10.0, (60.0, 60.0), (500.0, 500.0), rows=3, points=16)
+
+
+def test_camera_rays_run_towards_the_lens() -> None:
+    """Unit directions with dz < 0, for a pupil before and behind the film; through the pupil point."""
+    x = torch.tensor([0.0, 3.0, -2.0], dtype=torch.float64)
+    for plane in (10.0, 90.0):
+        rays = camera_rays(x, 2 * x, 50.0, x + 1, x - 1, plane)
+        assert (rays.dz < 0).all()
+        torch.testing.assert_close(rays.dx**2 + rays.dy**2 + rays.dz**2, torch.ones_like(x), rtol=0, atol=1e-15)
+        along = (plane - 50.0) / rays.dz
+        torch.testing.assert_close(rays.x + along * rays.dx, x + 1, rtol=0, atol=1e-12)
+        torch.testing.assert_close(rays.y + along * rays.dy, x - 1, rtol=0, atol=1e-12)
+
+
+def test_image_radius_rules() -> None:
+    tessar = read_lens(next(p for p in LENSES if "tessar" in p.stem)).at()
+    f = first_order(tessar).efl_mm
+    stated = replace(tessar, image_radius_mm=33.0)
+    assert image_radius_mm(stated) == (33.0, "the lens file")
+    by_field = replace(tessar, image_radius_mm=None, half_field_deg=20.0)
+    assert image_radius_mm(by_field)[0] == pytest.approx(f * math.tan(math.radians(20)))
+    dark, why = image_radius_mm(replace(tessar, image_radius_mm=None, half_field_deg=None))
+    assert "illumination" in why and dark > f * math.tan(math.radians(20))
+    fisheye = read_lens(next(p for p in LENSES if "muller" in p.stem)).at()
+    radius, why = image_radius_mm(fisheye)
+    assert "half field" in why
+    # Rays from there leave at about the half field; a scaled lens has a scaled image.
+    assert radius / first_order(fisheye).efl_mm == pytest.approx(1.3, abs=0.1)
+    assert image_radius_mm(fisheye.scaled(0.14))[0] == pytest.approx(0.14 * radius, rel=1e-9)
