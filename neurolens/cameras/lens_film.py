@@ -195,7 +195,8 @@ class LensFilm:
         middle = ((np.arange(_QUADRATURE) + 0.5) / _QUADRATURE).astype(np.float32)
         square = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
         film = np.zeros_like(square)
-        used = np.linspace(*wavelength_nm, _WAVELENGTHS if wavelength_nm[0] < wavelength_nm[1] else 1)
+        low, high = wavelength_nm
+        used = low + (high - low) * (np.arange(_WAVELENGTHS) + 0.5) / _WAVELENGTHS if low < high else [low]
         means = [
             self.sample(film, square, np.full(square.shape[1], w, np.float32)).weight.mean(dtype=np.float64)
             for w in used

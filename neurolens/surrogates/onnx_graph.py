@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from onnx import ModelProto, NodeProto, TensorProto, checker, helper, numpy_helper
 
+from neurolens.errors import InputError
+
 # Opset 17 and IR 8 are read by every onnxruntime since 1.12.
 OPSET, IR_VERSION = 17, 8
 FLOAT, INT32 = TensorProto.FLOAT, TensorProto.INT32
@@ -32,7 +34,7 @@ class Graph:
         """A constant, float32 unless told; equal ones are stored once."""
         array: NDArray[Any] = np.ascontiguousarray(np.asarray(value, dtype=dtype))
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise ValueError("a constant of the graph is not finite")
+            raise InputError("export", "weights", "(NaN or infinity)", "finite numbers, in float32 too")
         key = (array.tobytes(), array.dtype.str, array.shape)
         if key not in self.constants:
             self.constants[key] = f"c{len(self.constants)}"

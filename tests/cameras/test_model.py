@@ -1,0 +1,256 @@
+"""Exported models: loading checks, rays in batches, the camera; without torch."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import lens_models
+import numpy as np
+import onnx
+import pytest
+from onnx import ModelProto, TensorProto, helper, numpy_helper
+
+from neurolens import status as st
+from neurolens.cameras import onnxfile
+from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
+from neurolens.errors import InputError, ModelError
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def path() -> Path:
+    return lens_models.exported("invariants")
+
+
+@pytest.fixture(scope="module")
+def model(path: Path) -> OnnxLens:
+    return load_model(path, lens_models.lens().sha256)
+
+
+def some_rays(model: OnnxLens, count: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    domain = model.card["domain"]
+    film, pupil = ((rng.random((2, count)) - 0.5) * 1.4 * domain[k] for k in ("film_radius_mm", "pupil_radius_mm"))
+    return film, pupil, rng.uniform(*domain["wavelength_nm"], count)
+
+
+def damaged(path: Path, tmp_path: Path, change: Callable[[ModelProto], object]) -> Path:
+    proto = onnx.load(path)
+    change(proto)
+    target = tmp_path / "damaged.onnx"
+    target.write_bytes(proto.SerializeToString())
+    return target
+
+
+def change_card(change: Callable[[dict], object]) -> Callable[[ModelProto], None]:
+    def apply(proto: ModelProto) -> None:
+        card = json.loads(proto.metadata_props[0].value)
+        change(card)
+        proto.metadata_props[0].value = json.dumps(card)
+
+    return apply
+
+
+def change_weights(factor: float) -> Callable[[ModelProto], None]:
+    def apply(proto: ModelProto) -> None:
+        largest = max(
+            (t for t in proto.graph.initializer if t.data_type == TensorProto.FLOAT), key=lambda t: t.dims[0:2]
+        )
+        values = numpy_helper.to_array(largest).copy()
+        values *= factor
+        largest.CopyFrom(numpy_helper.from_array(values, largest.name))
+
+    return apply
+
+
+def external(proto: ModelProto) -> None:
+    tensor = proto.graph.initializer[0]
+    tensor.data_location = TensorProto.EXTERNAL
+    entry = tensor.external_data.add()
+    entry.key, entry.value = "location", "/etc/passwd"
+
+
+def rename(proto: ModelProto, old: str, new: str) -> None:
+    for value in (*proto.graph.output, *proto.graph.input):
+        if value.name == old:
+            value.name = new
+    for node in proto.graph.node:
+        for names in (node.input, node.output):
+            for i, name in enumerate(names):
+                names[i] = new if name == old else name
+
+
+def fewer_inputs(proto: ModelProto) -> None:
+    proto.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 4
+
+
+DAMAGE: dict[str, tuple[Callable[[ModelProto], object], str]] = {
+    "no card": (lambda p: p.ClearField("metadata_props"), "no card"),
+    "card cut": (lambda p: setattr(p.metadata_props[0], "value", p.metadata_props[0].value[:-9]), "JSON"),
+    "card with NaN": (
+        lambda p: setattr(p.metadata_props[0], "value", p.metadata_props[0].value.replace('{"rms_um": 1.0}', "NaN")),
+        "NaN",
+    ),
+    "card a list": (lambda p: setattr(p.metadata_props[0], "value", "[1]"), "kind"),
+    "other kind": (change_card(lambda c: c.update(kind="x")), "kind"),
+    "later schema": (change_card(lambda c: c.update(schema=2)), r"schema: got 2, expected 1"),
+    "no focal length": (change_card(lambda c: c["lens"].pop("efl_mm")), "lens.efl_mm"),
+    "text for a number": (change_card(lambda c: c["domain"].update(film_radius_mm="20")), "domain.film_radius_mm"),
+    "no bounds": (change_card(lambda c: c["domain"].pop("bounds")), "domain.bounds"),
+    "no reference rays": (change_card(lambda c: c.pop("reference")), "reference"),
+    "NaN weight": (change_weights(math.nan), "NaN"),
+    "infinite weight": (change_weights(math.inf), "infinite"),
+    "other weights": (change_weights(1.02), "reference rays"),
+    "output renamed": (lambda p: rename(p, "scene_ray", "rays_out"), "outputs"),
+    "input renamed": (lambda p: rename(p, "film_z_mm", "z"), "inputs"),
+    "an output gone": (lambda p: p.graph.output.pop(), "outputs"),
+    "input of another shape": (fewer_inputs, "inputs|cannot load"),
+    "external data": (external, "another file"),
+    "custom operator": (lambda p: p.graph.node.append(helper.make_node("Mul", ["rays"], ["q"], domain="evil")), "evil"),
+    "unknown operator": (lambda p: p.graph.node.append(helper.make_node("Loop", [], ["q"])), "Loop"),
+    "function": (
+        lambda p: p.functions.append(helper.make_function("f", "F", ["x"], ["x"], [], [helper.make_opsetid("", 17)])),
+        "functions",
+    ),
+    "string tensor": (
+        lambda p: p.graph.initializer.append(helper.make_tensor("s", TensorProto.STRING, [1], [b"x"])),
+        "type 8",
+    ),
+    "broken graph": (lambda p: p.graph.node.pop(0), "cannot load"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damaged_models_are_refused(name: str, path: Path, tmp_path: Path) -> None:
+    change, message = DAMAGE[name]
+    with pytest.raises(ModelError, match=message) as error:
+        load_model(damaged(path, tmp_path, change))
+    assert "damaged.onnx" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_files_that_are_no_models(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = path.read_bytes()
+    file = tmp_path / "x.onnx"
+    with pytest.raises(ModelError, match="no such file"):
+        load_model(file)
+    with pytest.raises(ModelError, match="no such file"):
+        load_model(tmp_path)
+    for content in (b"", b"hello world\n" * 9, bytes(1000), np.random.default_rng(0).bytes(5000)):
+        file.write_bytes(content)
+        with pytest.raises(ModelError):
+            load_model(file)
+    for cut in (1, 2, 50, *(len(data) * k // 23 for k in range(1, 23)), len(data) - 1):
+        file.write_bytes(data[:cut])
+        with pytest.raises(ModelError):
+            load_model(file)
+    monkeypatch.setattr(onnxfile, "MAX_BYTES", 1000)
+    with pytest.raises(ModelError, match="at most 1000"):
+        load_model(path)
+
+
+def test_flipped_bytes_never_crash(path: Path, tmp_path: Path) -> None:
+    data, rng, file = path.read_bytes(), np.random.default_rng(2), tmp_path / "x.onnx"
+    refused = 0
+    for _ in range(150):
+        broken = bytearray(data)
+        broken[rng.integers(len(data))] ^= 1 << rng.integers(8)
+        file.write_bytes(broken)
+        try:
+            load_model(file)
+        except ModelError:
+            refused += 1
+    assert refused > 10
+
+
+def test_model_of_another_lens(path: Path) -> None:
+    with pytest.raises(ModelError, match="another lens"):
+        load_model(path, lens_models.lens("muller_fisheye_100").sha256)
+    with pytest.raises(InputError, match="threads"):
+        load_model(path, threads=0)
+
+
+def test_rays_do_not_depend_on_batches(model: OnnxLens) -> None:
+    film, pupil, wavelength = some_rays(model, 20_000)
+    whole = model.rays(film, pupil, wavelength, model.card["domain"]["film_z_mm"][1], 5.0)
+    assert [a.shape for a in whole] == [(6, 20_000), (20_000,), (2, 20_000), (20_000,)]
+    for part in (slice(0, 1), slice(5, 2000), slice(1024, 2048)):
+        piece = model.rays(film[:, part], pupil[:, part], wavelength[part], model.card["domain"]["film_z_mm"][1], 5.0)
+        for a, b in zip(whole, piece, strict=True):
+            assert np.allclose(a[..., part], b, rtol=0, atol=2e-5)
+    nothing = model.rays(np.empty((2, 0)), np.empty((2, 0)), np.empty(0))
+    assert nothing.scene_ray.shape == (6, 0) and nothing.status.shape == (0,)
+
+
+def test_film_position_of_every_ray(model: OnnxLens) -> None:
+    film, pupil, wavelength = some_rays(model, 600)
+    near, far = model.card["domain"]["film_z_mm"]
+    planes = np.resize([near, far, math.nan], 600)
+    mixed = model.rays(film, pupil, wavelength, planes)
+    for z in (near, far):
+        one = model.rays(film, pupil, wavelength, z)
+        assert np.allclose(mixed.scene_ray[:, planes == z], one.scene_ray[:, planes == z], atol=2e-5)
+    assert np.all(mixed.status[np.isnan(planes)] == st.OUTSIDE_DOMAIN)
+
+
+@pytest.mark.parametrize(
+    ("film", "pupil", "wavelength", "field"),
+    [
+        (np.zeros((3, 5)), np.zeros((2, 5)), 550.0, "film_xy_mm"),
+        (np.zeros(5), np.zeros(5), 550.0, "film_xy_mm"),
+        (np.zeros((2, 5)), np.zeros((2, 4)), 550.0, "pupil_xy_mm"),
+        (np.zeros((2, 5)), np.zeros((2, 5)), np.zeros(4), "wavelength_nm"),
+        ("film", np.zeros((2, 5)), 550.0, "film_xy_mm"),
+    ],
+)
+def test_shapes_are_checked(model: OnnxLens, film: object, pupil: object, wavelength: object, field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        model.rays(film, pupil, wavelength)  # type: ignore[arg-type]
+
+
+def test_camera_settings_outside_the_domain(model: OnnxLens) -> None:
+    with pytest.raises(InputError, match="0.7 m"):
+        OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=0.5)
+    with pytest.raises(InputError, match="four focal lengths"):
+        OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=0.1)
+    with pytest.raises(InputError, match="widest stop"):
+        OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=2.0, f_number=1.2)
+    for bad in (0.0, -1.0, math.nan):
+        with pytest.raises(InputError):
+            OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=bad)
+
+
+def test_film_beyond_the_model_is_dark(model: OnnxLens) -> None:
+    camera = OnnxCamera(model, film_mm=(60.0, 60.0), focus_m=2.0)
+    film = np.array([[25.0, 0.0, np.nan], [25.0, 0.0, 1.0]], np.float32)
+    rays = camera.sample(film, np.full((2, 3), 0.4, np.float32), np.full(3, 550, np.float32))
+    assert rays.weight[0] == rays.weight[2] == 0 and rays.status[0] == rays.status[2] == st.OUTSIDE_DOMAIN
+    assert rays.weight[1] > 0 and rays.status[1] == 0
+
+
+def test_worker_camera_gives_the_same_rays(model: OnnxLens) -> None:
+    camera = OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=2.0, f_number=4.0)
+    film, square, wavelength = (a.astype(np.float32) for a in some_rays(model, 500))
+    square = np.abs(square) % 1
+    a, b = (c.sample(film, square, wavelength) for c in (camera, camera.for_worker()))
+    assert np.array_equal(a.direction, b.direction) and np.array_equal(a.weight, b.weight)
+    assert json.loads(json.dumps(camera.settings, allow_nan=False))["f_number"] == pytest.approx(4.0)
+
+
+def test_models_need_no_torch_and_no_onnx(path: Path) -> None:
+    code = (
+        "import sys\n"
+        "sys.modules.update(dict.fromkeys(['torch', 'onnx', 'sklearn', 'matplotlib']))\n"
+        "from neurolens.cameras.model import OnnxCamera, load_model\n"
+        f"camera = OnnxCamera(load_model({str(path)!r}), film_mm=(36, 24), focus_m=2)\n"
+        "import numpy as np\n"
+        "rays = camera.sample(np.zeros((2, 9), 'f4'), np.full((2, 9), .5, 'f4'), np.full(9, 550, 'f4'))\n"
+        "assert (rays.status == 0).all() and (rays.direction[2] < -.9).all()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,101 @@
+"""Small surrogates of real lenses for tests, fitted in about a second each and kept while the tests run."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import warnings
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from neurolens.errors import NeurolensWarning
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens
+from neurolens.surrogates.cores import Network
+from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs
+from neurolens.surrogates.targets import gate_values, scales_of, targets_of
+
+LENSES = Path(__file__).parents[1] / "lenses"
+KINDS = ("invariants", "raw", "network", "thick", "fisheye")
+
+
+@cache
+def lens(name: str = "laikin_double_gauss_50") -> Lens:
+    return read_lens(LENSES / f"{name}.toml").at(efl_mm=14.0 if "muller" in name else None)
+
+
+@cache
+def domain(name: str = "laikin_double_gauss_50") -> Domain:
+    return domain_of(lens(name), focus_m=(math.inf, 0.7))
+
+
+@cache
+def prepared(name: str = "laikin_double_gauss_50") -> Prepared:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NeurolensWarning)
+        return prepare(make_pairs(lens(name), domain(name), PairSettings(train=6000, held_out=100, rim=6000)))
+
+
+@cache
+def model(kind: str) -> LensModel:
+    """One of `KINDS`: each kind of core, first order, and a lens that sees beyond 75 degrees."""
+    if kind == "invariants":
+        return fit_model(prepared(), ModelSettings("dense", degree=4))
+    if kind == "raw":
+        return fit_model(prepared(), ModelSettings("dense", basis="raw", degree=3))
+    if kind == "thick":
+        return fit_model(prepared(), ModelSettings("thick"))
+    if kind == "fisheye":
+        return fit_model(prepared("muller_fisheye_100"), ModelSettings("dense", degree=4))
+    return _network(prepared(), 12)
+
+
+@cache
+def exported(kind: str) -> Path:
+    """The ONNX file of `model(kind)`."""
+    return export_onnx(model(kind), Path(_folder().name) / f"{kind}.onnx", {"rms_um": 1.0})
+
+
+@cache
+def _folder() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix="neurolens-tests-")
+
+
+def _network(known: Prepared, units: int) -> LensModel:
+    """Two layers of random tanh units whose outputs are fitted by ridge regression: a network without a training."""
+    pairs, encoding = known.pairs, known.encoding
+    generator = torch.Generator().manual_seed(0)
+
+    def random(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    targets = targets_of(pairs.lens, encoding, pairs.train)
+    invariants = targets.field.invariants()
+    low, high = invariants.min(1).values, invariants.max(1).values
+    hidden = ((random(units, 4) / 2, random(units) * 0.3), (random(units, units) / units**0.5, random(units) * 0.3))
+    shift, scale = (low + high) / 2, 2 / (high - low)
+
+    def features(pairs: PairSet) -> Tensor:
+        h = (encoding(pairs.inputs).invariants() - shift[:, None]) * scale[:, None]
+        for weight, bias in hidden:
+            h = torch.tanh(weight @ h + bias[:, None])
+        return torch.cat([h, torch.ones_like(h[:1])])
+
+    def ridge(a: Tensor, b: Tensor) -> Tensor:
+        gram = a @ a.T
+        return torch.linalg.solve(gram + 1e-7 * gram.trace() * torch.eye(len(gram), dtype=gram.dtype), a @ b.T).T
+
+    m, f = features(pairs.train), targets.field
+    both = torch.cat([torch.cat([m * f.p[i], m * f.u[i]]) for i in (0, 1)], dim=1)
+    ab = ridge(both, targets.vectors.reshape(3, -1)).reshape(6, -1)
+    gates = ridge(features(pairs.rim), gate_values(pairs.lens, known.gates, pairs.rim))
+    out = torch.cat([ab, ridge(m, targets.transmittance[None]), gates])
+    core = Network(hidden, (out[:, :-1].contiguous(), out[:, -1].contiguous()), shift, scale)
+    return LensModel(pairs.lens, pairs.domain, encoding, scales_of(pairs.lens), known.gates, core, "random network")
