@@ -133,7 +133,7 @@ def film_z_mm(lens: Lens, focus_m: float) -> float:
     """
     data = first_order(lens)
     f = data.efl_mm
-    if math.isinf(focus_m):
+    if focus_m == math.inf:
         return data.rear_principal_z_mm + f
     d = 1000.0 * focus_m - (data.rear_principal_z_mm - data.front_principal_z_mm)
     if not d >= 4 * f:

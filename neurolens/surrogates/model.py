@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from neurolens import status as st
+from neurolens.errors import InputError
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.domain import Domain, FilmRays
@@ -108,7 +109,13 @@ class LensModel:
         Args:
             rays: film point, pupil point and wavelength, [N] each.
             stop_radius_mm: any radius up to that of the domain; None takes the domain's.
+
+        Raises:
+            InputError: a stop wider than the model was fitted for.
         """
+        if stop_radius_mm is not None and not 0 <= stop_radius_mm <= 1.00001 * self.domain.stop_radius_mm:
+            expected = f"0 to {self.domain.stop_radius_mm:.6g} mm, the widest stop of the fit"
+            raise InputError(self.method, "stop_radius_mm", stop_radius_mm, expected)
         core = self.core.to(rays.film_x.dtype)
         vectors, scalars = core(self.encoding(rays))
         x, y = vectors[POSITION] * self.scales.position_mm

@@ -108,9 +108,12 @@ def make_pairs(
     """Sample a domain and trace it in float64 until every split is full.
 
     Raises:
-        InputError: fewer than one ray in 10,000 of the domain passes.
+        InputError: an empty split, or fewer than one ray in 10,000 of the domain passes.
     """
     settings = settings or PairSettings()
+    for name in ("train", "held_out", "rim"):
+        if getattr(settings, name) < 1:
+            raise InputError("pairs", name, getattr(settings, name), "at least one ray")
     wanted = {"train": settings.train, "held_out": settings.held_out}
     found: dict[str, list[PairSet]] = {"train": [], "held_out": [], "rim": []}
     counts = dict.fromkeys(found, 0)

@@ -7,7 +7,7 @@ infinity. The stop crossing, the transmittance and the gates are then fitted on 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -87,8 +87,14 @@ def fit_polynomial(
     """Fit by one of the methods of `PolynomialSettings`.
 
     Raises:
-        InputError: fewer than two terms, a negative degree, or fewer training rays than terms.
+        InputError: an unknown method or basis, fewer than two terms, a negative degree, or too few training rays.
     """
+    for name, value, known in (
+        ("method", settings.method, get_args(Method)),
+        ("basis", settings.basis, get_args(Basis)),
+    ):
+        if value not in known:
+            raise InputError("fit", name, value, f"one of {', '.join(known)}")
     if settings.terms < 2:
         raise InputError("fit", "terms", settings.terms, "at least 2 coefficients per vector output")
     if settings.degree < 0:

@@ -98,11 +98,14 @@ def replace_terms(sweep: Sweep, passes: int = 10, among: list[int] | None = None
     for _ in range(passes):
         before = exchanged
         for k in list(sweep.chosen):
+            with_k = sweep.residual
             sweep.drop(k)
+            # Its true gain, because the score of a term that the later ones nearly span counts as none.
+            gain = max(sweep.residual - with_k, 0.0)
             scores = np.where(allowed, sweep.scores("ols"), -1.0)
             best = int(scores.argmax())
             # The old term wins ties, so that rounding cannot cycle.
-            if scores[best] <= scores[k] * (1 + 1e-9):
+            if scores[best] <= gain * (1 + 1e-9):
                 best = k
             sweep.add(best)
             exchanged += best != k
