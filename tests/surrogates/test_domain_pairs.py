@@ -1,0 +1,247 @@
+"""Domains and ray pairs: uniform, repeatable, apart, and saved so that nothing wrong comes back."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from neurolens.errors import InputError
+from neurolens.optics.glass import LINE_D_NM
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.paraxial import film_z_mm, first_order
+from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import PupilBounds
+from neurolens.surrogates.domain import (
+    Domain,
+    domain_from_camera,
+    domain_of,
+    focused_plane_z_mm,
+    sample_domain,
+)
+from neurolens.surrogates.pairs import PairSet, PairSettings, RayPairs, load_pairs, make_pairs, save_pairs, trace_pairs
+
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+ROOT = Path(__file__).parents[2] / "lenses"
+BOUNDS = PupilBounds(10.0, 20.0, (-5.0, -4.0), (5.0, 6.0), (5.0, 5.0), 7.0)
+DOMAIN = Domain(20.0, (50.0, 55.0), (math.inf, 0.5), 10.0, 7.35, (400.0, 700.0), 6.0, BOUNDS)
+
+
+def singlet() -> Lens:
+    return read_lens(ROOT / "thorlabs_lb1471_biconvex_50.toml").at(f_number=4.0)
+
+
+@pytest.fixture(scope="module")
+def pairs() -> RayPairs:
+    lens = singlet()
+    domain = domain_of(lens, film_radius_mm=12.0, focus_m=(math.inf, 1.0))
+    return make_pairs(lens, domain, PairSettings(train=3000, held_out=2000, rim=2500, seed=3))
+
+
+def tensors(pairs: PairSet) -> list[Tensor]:
+    surfaces = [pairs.cross_x, pairs.cross_y, pairs.meets, pairs.refracts]
+    return [*pairs.inputs.columns(), *pairs.scene, pairs.transmittance, pairs.status, *surfaces]
+
+
+# ---- sampling ----
+
+
+def test_sampling_is_uniform() -> None:
+    """Radii and azimuths of both discs, wavelength and film position: largest deviation of their distributions."""
+    count = 20000
+    rays = sample_domain(DOMAIN, count, seed=7)
+    film, pupil = torch.hypot(rays.film_x, rays.film_y), torch.hypot(rays.pupil_x, rays.pupil_y)
+    turn = 2 * math.pi
+    uniform = {
+        "film area": (film / 20) ** 2,
+        "pupil area": (pupil / 7.35) ** 2,
+        "film azimuth": torch.atan2(rays.film_y, rays.film_x) / turn + 0.5,
+        "pupil azimuth": torch.atan2(rays.pupil_y, rays.pupil_x) / turn + 0.5,
+        "wavelength": (rays.wavelength_nm - 400) / 300,
+    }
+    steps = (torch.arange(count, dtype=torch.float64) + 0.5) / count
+    columns = torch.stack([*uniform.values(), rays.film_z])
+    for name, u in uniform.items():
+        assert (u >= 0).all() and (u <= 1).all(), name
+        assert (u.sort().values - steps).abs().max() < 2e-3, name  # random numbers would give 1e-2
+    assert (torch.corrcoef(columns) - torch.eye(6)).abs().max() < 0.01
+    # Film positions: equally many rays at equal steps, both limits among them.
+    planes, shares = rays.film_z.unique(return_counts=True)
+    torch.testing.assert_close(planes, torch.linspace(50, 55, len(planes), dtype=torch.float64))
+    assert len(planes) > 8 and (shares / count * len(planes) - 1).abs().max() < 0.01
+
+
+def test_sampling_is_repeatable_and_continues() -> None:
+    whole = sample_domain(DOMAIN, 3000, seed=7).columns()
+    assert all(torch.equal(a, b) for a, b in zip(whole, sample_domain(DOMAIN, 3000, seed=7).columns(), strict=True))
+    for skip in (1, 1000, 1024):
+        rest = sample_domain(DOMAIN, 3000 - skip, seed=7, skip=skip).columns()
+        assert all(torch.equal(a[skip:], b) for a, b in zip(whole, rest, strict=True))
+    assert not torch.equal(whole[0], sample_domain(DOMAIN, 3000, seed=8).film_x)
+
+
+# ---- domains ----
+
+
+def test_domain_survives_json() -> None:
+    assert Domain.from_dict(json.loads(json.dumps(DOMAIN.to_dict()))) == DOMAIN
+
+
+def test_one_shot_needs_less_than_the_whole_lens() -> None:
+    lens = read_lens(ROOT / "brendel_tessar_100.toml").at(efl_mm=50)
+    full = domain_of(lens, focus_m=(math.inf, 0.7))
+    stopped, shot = domain_from_camera(lens, film_mm=(24.0, 16.0), focus_m=2.0, f_number=8.0, wavelength_nm=(500, 600))
+    assert first_order(stopped).f_number == pytest.approx(8.0)
+    assert shot.film_radius_mm == pytest.approx(math.hypot(12, 8)) and shot.film_radius_mm < full.film_radius_mm
+    assert shot.pupil_radius_mm < 0.6 * full.pupil_radius_mm
+    assert shot.stop_radius_mm < 0.5 * full.stop_radius_mm
+    assert shot.film_z_mm[0] == shot.film_z_mm[1] == film_z_mm(lens, 2.0)
+    assert full.film_z_mm[0] < shot.film_z_mm[0] < full.film_z_mm[1]
+    assert shot.wavelength_nm == (500, 600)
+    # A film larger than the image: the image rules.
+    _, wide = domain_from_camera(lens, film_mm=(60.0, 60.0), focus_m=2.0)
+    assert wide.film_radius_mm == full.film_radius_mm
+
+
+@pytest.mark.parametrize("focus_m", [0.3, 1.0, 100.0])
+def test_focused_plane_is_the_inverse_of_focusing(focus_m: float) -> None:
+    lens = singlet()
+    film = film_z_mm(lens, focus_m)
+    plane = float(focused_plane_z_mm(lens, torch.tensor([film], dtype=torch.float64))[0])
+    assert film - plane == pytest.approx(1000 * focus_m, rel=1e-9)
+
+
+def test_infinity_focus_has_no_plane() -> None:
+    lens = singlet()
+    film = torch.tensor([film_z_mm(lens, math.inf), film_z_mm(lens, math.inf) - 0.1], dtype=torch.float64)
+    assert torch.equal(focused_plane_z_mm(lens, film), torch.full((2,), -math.inf, dtype=torch.float64))
+
+
+def test_without_dispersion_there_is_one_wavelength() -> None:
+    fisheye = read_lens(ROOT / "muller_fisheye_100.toml").at(efl_mm=14, f_number=16)
+    plain = replace(fisheye, surfaces=tuple(replace(s, V_d=None) for s in fisheye.surfaces))
+    domain = domain_of(plain, film_radius_mm=5.0)
+    assert domain.wavelength_nm == (LINE_D_NM, LINE_D_NM)
+    assert (sample_domain(domain, 10, 1).wavelength_nm == LINE_D_NM).all()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"film_radius_mm": 0.0}, "film_radius_mm"),
+        ({"film_radius_mm": math.nan}, "film_radius_mm"),
+        ({"wavelength_nm": (700.0, 400.0)}, "wavelength_nm"),
+        ({"wavelength_nm": (0.4, 0.7)}, "wavelength_nm"),
+        ({"wavelength_nm": (math.nan, 700.0)}, "wavelength_nm"),
+        ({"focus_m": (math.inf, 0.05)}, "focus_m"),
+        ({"focus_m": (math.inf, math.nan)}, "focus_m"),
+        ({"focus_m": (math.inf, -1.0)}, "focus_m"),
+        ({"focus_m": (-math.inf, 1.0)}, "focus_m"),
+    ],
+)
+def test_domains_that_are_none(wrong: dict[str, object], named: str) -> None:
+    with pytest.raises(InputError, match=named):
+        domain_of(singlet(), **{"film_radius_mm": 5.0, **wrong})  # type: ignore[arg-type]
+
+
+# ---- pairs ----
+
+
+def test_splits_have_their_sizes_and_share_no_ray(pairs: RayPairs) -> None:
+    assert (len(pairs.train), len(pairs.held_out), len(pairs.rim)) == (3000, 2000, 2500)
+    assert (pairs.train.status == 0).all() and (pairs.held_out.status == 0).all()
+    keys = [{tuple(r) for r in torch.stack(s.inputs.columns()).T.tolist()} for s in (pairs.train, pairs.held_out)]
+    assert [len(k) for k in keys] == [3000, 2000]
+    assert not keys[0] & keys[1]
+
+
+def test_rim_rays_lie_on_both_sides_of_a_rim(pairs: RayPairs) -> None:
+    radii = torch.tensor(pairs.lens.semi_diameters_mm, dtype=torch.float64)[:, None]
+    ratio = (torch.hypot(pairs.rim.cross_x, pairs.rim.cross_y) / radii).max(0).values
+    assert 0.05 < (ratio > 1).double().mean() < 0.95
+    assert ratio.max() <= 1.25
+    assert all(torch.isfinite(c).all() for c in tensors(pairs.rim))
+    # Outside every rim and blocked are the same thing for rays that refract all the way.
+    assert torch.equal(ratio > 1, pairs.rim.status != 0)
+
+
+def test_tested_gives_the_share_that_passes(pairs: RayPairs) -> None:
+    drawn = sample_domain(pairs.domain, 20000, seed=99)
+    share = float((trace_pairs(pairs.lens, drawn, pairs.domain.pupil_z_mm).status == 0).double().mean())
+    assert len(pairs.train) / pairs.tested == pytest.approx(share, abs=0.02)
+
+
+def test_the_seed_decides(pairs: RayPairs) -> None:
+    small = PairSettings(train=100, held_out=50, rim=50, seed=5)
+    one, two = (make_pairs(pairs.lens, pairs.domain, small) for _ in range(2))
+    for a, b in zip(tensors(one.train) + tensors(one.rim), tensors(two.train) + tensors(two.rim), strict=True):
+        assert torch.equal(a, b)
+    other = make_pairs(pairs.lens, pairs.domain, replace(small, seed=6))
+    assert not torch.equal(one.train.scene.x, other.train.scene.x)
+
+
+def test_saved_and_reloaded_bit_for_bit(pairs: RayPairs, tmp_path: Path) -> None:
+    path = tmp_path / "pairs.npz"
+    save_pairs(pairs, path)
+    back = load_pairs(path, pairs.lens)
+    assert (back.domain, back.settings, back.tested) == (pairs.domain, pairs.settings, pairs.tested)
+    for name in ("train", "held_out", "rim"):
+        for a, b in zip(tensors(getattr(pairs, name)), tensors(getattr(back, name)), strict=True):
+            assert a.dtype == b.dtype and torch.equal(a, b)
+
+
+def test_pairs_of_another_lens_are_refused(pairs: RayPairs, tmp_path: Path) -> None:
+    path = tmp_path / "pairs.npz"
+    save_pairs(pairs, path)
+    with pytest.raises(InputError, match="lens_sha256"):
+        load_pairs(path, pairs.lens.scaled(1.001))
+    load_pairs(path, pairs.lens.at(f_number=8.0, focus_m=2.0))  # stop and focus are no part of the glass
+
+
+@pytest.mark.parametrize("kind", ["missing", "empty", "text", "truncated", "flipped", "pickled", "no header", "schema"])
+def test_files_that_are_no_pairs(pairs: RayPairs, tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "pairs.npz"
+    save_pairs(pairs, path)
+    data = path.read_bytes()
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    match kind:
+        case "missing":
+            path.unlink()
+        case "empty":
+            path.write_bytes(b"")
+        case "text":
+            path.write_text("radius_mm = 3")
+        case "truncated":
+            path.write_bytes(data[: len(data) // 2])
+        case "flipped":
+            middle = len(data) // 2
+            path.write_bytes(data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :])
+        case "pickled":
+            np.savez(path, **{**arrays, "train_status": np.array([{"a": 1}], dtype=object)})
+        case "no header":
+            np.savez(path, **{k: v for k, v in arrays.items() if k != "header"})
+        case "schema":
+            header = {**json.loads(arrays["header"].tobytes()), "schema": 99}
+            np.savez(path, **{**arrays, "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)})
+    with pytest.raises(InputError, match="pairs.npz"):
+        load_pairs(path, pairs.lens)
+
+
+@pytest.mark.parametrize("wrong", [{"train": 0}, {"held_out": 0}, {"rim": 0}, {"train": -5}])
+def test_settings_that_are_none(pairs: RayPairs, wrong: dict[str, int]) -> None:
+    name = next(iter(wrong))
+    with pytest.raises(InputError, match=name):
+        make_pairs(pairs.lens, pairs.domain, replace(PairSettings(10, 10, 10), **wrong))
+
+
+def test_a_domain_that_nothing_reaches(pairs: RayPairs) -> None:
+    shut = pairs.lens.with_stop_radius(1e-6)
+    with pytest.raises(InputError, match="domain"):
+        make_pairs(shut, pairs.domain, PairSettings(10, 10, 10))

@@ -1,0 +1,94 @@
+"""The coordinates that surrogates see: what the symmetry and free space promise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from neurolens.surrogates.domain import FilmRays
+from neurolens.surrogates.lightfield import Encoding, angle_vector, direction_of, direction_of_slope
+
+ENCODING = Encoding(50.0, 10.0, 0.3, 20.0, 7.0, 4.1, 2.1)
+
+
+def some_rays(count: int = 500) -> FilmRays:
+    g = torch.Generator().manual_seed(0)
+    u = 2 * torch.rand((6, count), generator=g, dtype=torch.float64) - 1
+    return FilmRays(20 * u[0], 20 * u[1], 52 + 2 * u[2], 7 * u[3], 7 * u[4], 550 + 150 * u[5])
+
+
+def turn(v: Tensor, angle: float, mirror: bool) -> Tensor:
+    c, s = math.cos(angle), math.sin(angle)
+    x = -v[0] if mirror else v[0]
+    return torch.stack([c * x - s * v[1], s * x + c * v[1]])
+
+
+@pytest.mark.parametrize(("angle", "mirror"), [(0.3, False), (math.pi / 2, False), (-2.0, True), (0.0, True)])
+def test_invariants_do_not_turn_and_vectors_do(angle: float, mirror: bool) -> None:
+    rays = some_rays()
+    film = turn(torch.stack([rays.film_x, rays.film_y]), angle, mirror)
+    pupil = turn(torch.stack([rays.pupil_x, rays.pupil_y]), angle, mirror)
+    turned = replace(rays, film_x=film[0], film_y=film[1], pupil_x=pupil[0], pupil_y=pupil[1])
+    one, two = ENCODING(rays), ENCODING(turned)
+    torch.testing.assert_close(one.invariants(), two.invariants(), rtol=0, atol=1e-13)
+    torch.testing.assert_close(turn(one.p, angle, mirror), two.p, rtol=0, atol=1e-14)
+    torch.testing.assert_close(turn(one.u, angle, mirror), two.u, rtol=0, atol=1e-14)
+
+
+def test_the_start_may_move_along_the_ray() -> None:
+    """Free space is linear: one ray, described from any film plane, is one light field."""
+    rays = some_rays()
+    for z in (45.0, 50.0, 80.0):
+        k = (z - 10.0) / (rays.film_z - 10.0)
+        moved = replace(
+            rays,
+            film_x=rays.pupil_x + k * (rays.film_x - rays.pupil_x),
+            film_y=rays.pupil_y + k * (rays.film_y - rays.pupil_y),
+            film_z=torch.full_like(rays.film_z, z),
+        )
+        for a, b in zip(ENCODING(rays), ENCODING(moved), strict=True):
+            torch.testing.assert_close(a, b, rtol=0, atol=1e-13)
+
+
+def test_wavelength_ends_at_one_and_unknown_dispersion_at_zero() -> None:
+    ends = [1e6 / 700**2, 1e6 / 400**2]
+    encoding = replace(ENCODING, w_middle=sum(ends) / 2, w_half=(ends[1] - ends[0]) / 2)
+    rays = replace(some_rays(2), wavelength_nm=torch.tensor([400.0, 700.0], dtype=torch.float64))
+    torch.testing.assert_close(encoding(rays).w, torch.tensor([1.0, -1.0], dtype=torch.float64))
+    assert torch.equal(replace(ENCODING, w_middle=3.0, w_half=0.0)(rays).w, torch.zeros(2, dtype=torch.float64))
+
+
+def directions(count: int = 2000, most_degrees: float = 125.0) -> Tensor:
+    """[3, count] unit camera directions from the axis to `most_degrees`, the axis and tiny angles among them."""
+    theta = torch.cat([torch.tensor([0.0, 1e-300, 1e-15, 1e-8, 1e-4]), torch.linspace(0, most_degrees, count - 5)])
+    theta = torch.deg2rad(theta.double())
+    phi = torch.linspace(0, 40, count, dtype=torch.float64)
+    return torch.stack([theta.sin() * phi.cos(), theta.sin() * phi.sin(), -theta.cos()])
+
+
+def test_directions_come_back_from_angle_vectors() -> None:
+    d = directions()
+    torch.testing.assert_close(torch.stack(direction_of(angle_vector(*d))), d, rtol=0, atol=1e-13)
+
+
+def test_angle_vectors_are_angles() -> None:
+    d = directions()
+    v = angle_vector(*d)
+    torch.testing.assert_close(v.norm(dim=0), torch.atan2(d[:2].norm(dim=0), -d[2]), rtol=0, atol=1e-15)
+    turned = angle_vector(*turn(d[:2], 1.0, True), d[2])
+    torch.testing.assert_close(turned, turn(v, 1.0, True), rtol=0, atol=1e-14)
+
+
+def test_decoded_directions_are_unit_in_float32() -> None:
+    d = torch.stack(direction_of(angle_vector(*directions().float())))
+    assert d.dtype == torch.float32
+    torch.testing.assert_close(d.norm(dim=0), torch.ones(d.shape[1]), rtol=0, atol=1e-6)
+
+
+def test_directions_come_back_from_slopes() -> None:
+    d = directions(most_degrees=85.0)
+    torch.testing.assert_close(torch.stack(direction_of_slope(d[:2] / -d[2])), d, rtol=0, atol=1e-13)

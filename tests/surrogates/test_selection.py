@@ -1,0 +1,197 @@
+"""Choosing terms: the sweep against plain least squares, and what each rule promises."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from neurolens.surrogates.bases import invariant_exponents, raw_exponents, solve, vector_columns, vector_gram
+from neurolens.surrogates.cores import monomials
+from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.selection import Sweep, forward, replace_terms
+
+Floats = NDArray[np.float64]
+
+
+def sweep_of(columns: Floats, outputs: Floats) -> Sweep:
+    """Columns [M, N], outputs [R, N]."""
+    return Sweep(columns @ columns.T, columns @ outputs.T, (outputs**2).sum(1))
+
+
+def residual(columns: Floats, outputs: Floats, chosen: list[int]) -> float:
+    """The same by numpy's least squares."""
+    if not chosen:
+        return float((outputs**2).sum())
+    found = np.linalg.lstsq(columns[chosen].T, outputs.T, rcond=None)[0]
+    return float(((outputs - found.T @ columns[chosen]) ** 2).sum())
+
+
+def correlated(seed: int = 0, count: int = 40, rays: int = 400) -> Floats:
+    """Columns with large common parts and lengths from 1e-3 to 1e3, as monomials have."""
+    rng = np.random.default_rng(seed)
+    mixed = rng.normal(size=(count, rays)) + 3 * rng.normal(size=(count, 4)) @ rng.normal(size=(4, rays))
+    return mixed * 10.0 ** rng.uniform(-3, 3, size=(count, 1))
+
+
+def test_sweep_is_least_squares() -> None:
+    columns, outputs = correlated(), np.random.default_rng(1).normal(size=(3, 400))
+    sweep, rng = sweep_of(columns, outputs), np.random.default_rng(2)
+    assert sweep.residual == pytest.approx(residual(columns, outputs, []))
+    for step in range(60):  # in and out at random
+        k = int(rng.integers(40))
+        (sweep.drop if k in sweep.chosen else sweep.add)(k)
+        assert sweep.residual == pytest.approx(residual(columns, outputs, sweep.chosen), rel=1e-9), step
+    before, chosen = sweep.residual, list(sweep.chosen)
+    sweep.refresh()
+    assert sweep.chosen == chosen and sweep.residual == pytest.approx(before, rel=1e-9)
+
+
+def test_ols_scores_are_the_true_gains() -> None:
+    columns, outputs = correlated(3), np.random.default_rng(4).normal(size=(2, 400))
+    sweep = sweep_of(columns, outputs)
+    for k in (5, 17, 30):
+        sweep.add(k)
+    scores = sweep.scores("ols")
+    for k in range(40):
+        if k in sweep.chosen:
+            assert scores[k] < 0
+        else:
+            gain = sweep.residual - residual(columns, outputs, [*sweep.chosen, k])
+            assert scores[k] == pytest.approx(gain, rel=1e-7, abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_ols_with_replacement_finds_planted_terms(seed: int) -> None:
+    """Six terms among forty correlated ones, for two outputs that share them."""
+    rng = np.random.default_rng(seed)
+    columns = correlated(seed)
+    unit = columns / np.linalg.norm(columns, axis=1, keepdims=True)
+    planted = sorted(int(k) for k in rng.choice(40, 6, replace=False))
+    outputs = rng.uniform(1, 2, size=(2, 6)) * rng.choice([-1, 1], size=(2, 6)) @ unit[planted]
+    sweep = sweep_of(columns, outputs)
+    forward(sweep, 6)
+    replace_terms(sweep)
+    assert sorted(sweep.chosen) == planted
+    assert sweep.residual < 1e-12 * float((outputs**2).sum())
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_replacement_never_raises_the_residual(seed: int) -> None:
+    columns, outputs = correlated(seed, rays=60), np.random.default_rng(seed + 50).normal(size=(2, 60))
+    sweep = sweep_of(columns, outputs)
+    forward(sweep, 8, "omp")
+    before = residual(columns, outputs, sweep.chosen)
+    exchanged = replace_terms(sweep)
+    after = residual(columns, outputs, sweep.chosen)
+    assert len(set(sweep.chosen)) == 8
+    assert after <= before * (1 + 1e-9)
+    assert (after < before * (1 - 1e-9)) == (exchanged > 0)
+
+
+def test_replacement_with_no_other_candidate_keeps_all() -> None:
+    """All terms are in, and some are nearly spanned by the others: none may be lost for a worse one."""
+    rng = np.random.default_rng(0)
+    base = rng.normal(size=(5, 200))
+    base /= np.linalg.norm(base, axis=1, keepdims=True)
+    columns = np.vstack([base, base.mean(0) + 2e-6 * rng.normal(size=200) / 14, rng.normal(size=(1, 200))])
+    outputs = rng.normal(size=(1, 7)) @ columns
+    sweep = sweep_of(columns, outputs)
+    for k in range(7):
+        sweep.add(k)
+    before = sweep.residual
+    assert replace_terms(sweep) == 0
+    assert sorted(sweep.chosen) == list(range(7))
+    assert sweep.residual <= before + 1e-9
+
+
+def test_dependent_columns_are_not_chosen() -> None:
+    """Copies, sums and a zero column add nothing: the forward search stops at the rank."""
+    rng = np.random.default_rng(0)
+    base = rng.normal(size=(6, 100))
+    columns = np.vstack([base, 2 * base[:3], base[:1] + base[1:2], np.zeros((1, 100))])
+    for rule in ("omp", "ols"):
+        sweep = sweep_of(columns, rng.normal(size=(2, 100)))
+        forward(sweep, 11, rule)
+        assert len(sweep.chosen) == 6
+        assert np.linalg.matrix_rank(columns[sweep.chosen]) == 6
+        replace_terms(sweep)
+        assert np.linalg.matrix_rank(columns[sweep.chosen]) == 6
+
+
+def test_omp_looks_at_correlation_and_ols_at_what_is_left() -> None:
+    """The candidate that correlates best with the residual may hardly be new: OLS divides by what is left of it."""
+    e = np.eye(4)
+    first = e[0]
+    nearly_chosen = np.sqrt(1 - 0.09) * e[0] + 0.3 * e[1]  # only 0.3 of it is new, but all of that is wanted
+    fresh = 0.6 * e[2] + 0.8 * e[3]  # all new, half of it wanted
+    columns, outputs = np.vstack([first, nearly_chosen, fresh]), (10 * e[0] + e[1] + 0.9 * e[2])[None]
+    picks = {}
+    for rule in ("omp", "ols"):
+        sweep = sweep_of(columns, outputs)
+        forward(sweep, 2, rule)
+        picks[rule] = sweep.chosen
+    assert picks == {"omp": [0, 2], "ols": [0, 1]}
+
+
+def test_the_search_may_be_restricted() -> None:
+    columns = correlated(9)
+    sweep = sweep_of(columns, np.random.default_rng(0).normal(size=(1, 400)))
+    forward(sweep, 5, among=[3, 4, 5, 6, 7, 8])
+    replace_terms(sweep, among=[3, 4, 5, 6, 7, 8])
+    assert set(sweep.chosen) <= {3, 4, 5, 6, 7, 8} and len(sweep.chosen) == 5
+
+
+# ---- bases ----
+
+
+def field(count: int = 300) -> LightField:
+    g = torch.Generator().manual_seed(0)
+    u = 2 * torch.rand((5, count), generator=g, dtype=torch.float64) - 1
+    return LightField(u[:2], u[2:4], u[4])
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3, 7])
+def test_exponents_are_complete_and_unique(degree: int) -> None:
+    """n over k counts of the monomials up to a total degree; without dispersion no wavelength occurs."""
+    for exponents in (invariant_exponents(degree, dispersive=False), raw_exponents(degree, dispersive=False)):
+        variables = exponents.shape[1] - 1
+        assert len(exponents) == len({tuple(e) for e in exponents}) == math.comb(degree + variables, variables)
+        assert (exponents[:, -1] == 0).all() and exponents.sum(1).max() == degree
+    raw = raw_exponents(degree)
+    assert len(raw) == len({tuple(e) for e in raw}) == math.comb(degree + 5, 5)
+    coloured = invariant_exponents(degree)
+    assert len(coloured) == len({tuple(e) for e in coloured}) and coloured[:, :3].sum(1).max() == degree
+
+
+def test_monomials_are_products_of_powers() -> None:
+    variables = field().invariants()
+    exponents = invariant_exponents(3)
+    expected = torch.stack([torch.prod(variables ** torch.tensor(e)[:, None], dim=0) for e in exponents])
+    torch.testing.assert_close(monomials(variables, exponents), expected, rtol=1e-12, atol=1e-14)
+
+
+def test_the_gram_matrix_is_that_of_the_columns() -> None:
+    rays = field()
+    features = monomials(rays.invariants(), invariant_exponents(2))
+    columns = vector_columns(features, rays)
+    outputs = torch.randn((3, 2, 300), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    gram, moments = vector_gram(features, rays, outputs)
+    np.testing.assert_allclose(gram, (columns @ columns.T).numpy(), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(moments, (columns @ outputs.flatten(1).T).numpy(), rtol=0, atol=1e-10)
+
+
+def test_solve_is_weighted_least_squares_and_survives_dependence() -> None:
+    rng = np.random.default_rng(0)
+    columns, outputs, weights = rng.normal(size=(5, 80)), rng.normal(size=(2, 80)), rng.uniform(0.1, 1, 80)
+    expected = np.linalg.lstsq((columns * weights).T, (outputs * weights).T, rcond=None)[0].T
+    found = solve(*(torch.from_numpy(a) for a in (columns, outputs, weights))).numpy()
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    twice = torch.from_numpy(np.vstack([columns, columns[:1], np.zeros((1, 80))]))
+    shared = solve(twice, torch.from_numpy(outputs))
+    assert torch.isfinite(shared).all() and shared.abs().max() < 10
+    best = np.linalg.lstsq(columns.T, outputs.T, rcond=None)[0].T @ columns
+    np.testing.assert_allclose((shared @ twice).numpy(), best, rtol=0, atol=1e-9)
