@@ -69,7 +69,7 @@ class Job:
 
     Attributes:
         film: [pixels, 3] float64 sums. done: [tiles] passes finished. tallies: [3] seconds in the camera, paths passed,
-        seconds in all. message: text of a worker's error.
+        seconds in all. message: text of a worker's error. stop: set to end the work early.
     """
 
     def __init__(self, scene: Scene, camera: Camera, grid: PixelGrid, samples: int, seed: int, max_depth: int) -> None:
@@ -86,7 +86,7 @@ class Job:
         self.film = _shared((self.pixels, 3), np.float64)
         self.done = _shared((-(-self.pixels // self.tile),), np.int64)
         self.tallies = _shared((3,), np.float64)
-        self.message = _shared((4096,), np.uint8)
+        self.message, self.stop = _shared((4096,), np.uint8), _shared((1,), np.uint8)
 
     def work(self, claimed: Any) -> None:
         """Take tiles, all of one pass before the next, until none is left; `claimed` counts them over all workers."""
@@ -98,11 +98,11 @@ class Job:
                     number = claimed.value
                     claimed.value += 1
                 part, tile = divmod(number, len(self.done))
-                if part >= self.passes:
+                if part >= self.passes or self.stop[0]:
                     return
                 # Sums are added in the order of passes, so that rounding does not depend on the workers.
                 while self.done[tile] != part:
-                    if self.message[0]:
+                    if self.stop[0]:
                         return
                     time.sleep(1e-4)
                 tallies = self._render_tile(camera, tile, part)
@@ -112,6 +112,7 @@ class Job:
         except BaseException:
             text = traceback.format_exc().encode()[-len(self.message) :]
             self.message[: len(text)] = np.frombuffer(text, np.uint8)
+            self.stop[0] = 1
             raise
 
     def _render_tile(self, camera: Camera, tile: int, part: int) -> NDArray[np.float64]:
@@ -182,9 +183,12 @@ def run(job: Job, workers: int, progress: Progress | None) -> None:
             fraction = float(job.done.sum()) / (len(job.done) * job.passes)
             if progress is not None and fraction > 0:
                 progress(fraction, (time.perf_counter() - began) * (1 / fraction - 1))
+            if fork and any(worker.exitcode for worker in team):
+                break  # killed, and the others may wait for its tile for ever
     finally:
+        job.stop[0] = 1
         for worker in team:
-            if fork and worker.is_alive():
+            if fork:
                 worker.terminate()
             worker.join()
     if job.message[0]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from typing import Any
 
 import numpy as np
@@ -129,6 +131,37 @@ class Broken(Pinhole):
 
     def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
         raise RuntimeError("no rays today")
+
+
+class Killed(Pinhole):
+    """Takes its process along."""
+
+    def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
+        os._exit(9)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="workers are threads")
+def test_a_killed_worker_ends_the_render(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.render.workers.BATCH", 64)
+    with pytest.raises(NeurolensError, match="killed"):
+        render(scene(environment=WHITE), Killed(50.0, FILM), width=36, height=24, samples=40, threads=2)
+
+
+class Reopened(Pinhole):
+    """Works only where a worker has opened it."""
+
+    def for_worker(self) -> Pinhole:
+        return Pinhole(self.focal_mm, self.film_mm)
+
+    def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
+        raise AssertionError("not opened")
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_each_worker_opens_its_own_camera(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.render.workers.BATCH", 256)
+    made = scene(environment=WHITE)
+    assert render(made, Reopened(50.0, FILM), width=36, height=24, samples=1, threads=threads).rgb.any()
 
 
 def test_errors_are_clear(monkeypatch: pytest.MonkeyPatch) -> None:
