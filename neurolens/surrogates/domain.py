@@ -153,7 +153,7 @@ def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:
 
 
 def sample_domain(domain: Domain, count: int, seed: int, skip: int = 0) -> FilmRays:
-    """Rays of a domain: uniform on the film and pupil discs and in wavelength; film positions are `FILM_PLANES` equal steps.
+    """Rays of a domain: uniform on the film and pupil discs and in wavelength, film positions in `FILM_PLANES` steps.
 
     Scrambled Sobol points (Owen scrambling, torch): the same seed gives the same rays; `skip` continues the sequence,
     so that splits never share a ray.

@@ -33,8 +33,11 @@ class Core(Protocol):
         coefficients: all of them.
     """
 
-    coefficients_per_vector: int
-    coefficients: int
+    @property
+    def coefficients_per_vector(self) -> int: ...
+
+    @property
+    def coefficients(self) -> int: ...
 
     def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
         """Vectors [3, 2, N] (position, direction, stop; see `Scales`) and scalars [1 + G, N] (transmittance, gates)."""

@@ -203,7 +203,8 @@ def _fit_raw(data: FitData, settings: PolynomialSettings) -> RawPolynomial:
 
 def _raw_support(variables: Tensor, outputs: Tensor, settings: PolynomialSettings, dispersive: bool) -> Exponents:
     """Exponents [K, 5] chosen for outputs [R, N] in common."""
-    outputs = outputs / outputs.norm(dim=1, keepdim=True).clamp_min(1e-300)
+    # Outputs count by how much they vary: transmittance varies little about a large mean, which one term explains.
+    outputs = outputs / (outputs - outputs.mean(1, keepdim=True)).norm(dim=1, keepdim=True).clamp_min(1e-300)
     if settings.method == "adaptive":
         exponents, chosen = grow(variables, None, outputs[:, None], settings.terms, dispersive=dispersive)
         return exponents[chosen]
