@@ -11,7 +11,7 @@ import argparse
 import json
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,9 @@ class Outcome:
     unchecked: list[str] = field(default_factory=list)
 
 
+Save = Callable[[Outcome], None]
+
+
 def read_index(folder: Path) -> list[dict[str, Any]]:
     """Rows of models/index.json.
 
@@ -75,8 +78,8 @@ def read_index(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def bench_models(folder: Path, only: str, threads: int, rounds: int) -> Outcome:
-    """Race the models of an index, lens by lens."""
+def bench_models(folder: Path, only: str, threads: int, rounds: int, save: Save) -> Outcome:
+    """Race the models of an index, lens by lens; `save` what there is after each."""
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in read_index(folder):
         if only in row["file"]:
@@ -102,6 +105,7 @@ def bench_models(folder: Path, only: str, threads: int, rounds: int) -> Outcome:
         timed = race(candidates, domain, threads=threads, rounds=rounds)
         outcome.rows += table_rows(state, timed)
         hold_to_promises(rows, timed, outcome)
+        save(outcome)
     return outcome
 
 
@@ -125,7 +129,7 @@ def hold_to_promises(rows: Sequence[dict[str, Any]], timed: Race, outcome: Outco
             outcome.missed.append(f"{row['file']}: {best:.3g} times the compiled exact tracer, promised {promised:g}")
 
 
-def bench_trace(only: str, rounds: int, threads: Sequence[int], dtypes: Sequence[torch.dtype]) -> Outcome:
+def bench_trace(only: str, rounds: int, threads: Sequence[int], dtypes: Sequence[torch.dtype], save: Save) -> Outcome:
     """Race the exact tracer on every lens file: tracing alone by precision, and all that a camera needs."""
     outcome = Outcome()
     for path in sorted((ROOT / "lenses").glob("*.toml")):
@@ -137,6 +141,7 @@ def bench_trace(only: str, rounds: int, threads: Sequence[int], dtypes: Sequence
             _say(f"{path.stem}: compiling and timing on {count} thread{'s' * (count > 1)} ...")
             timed = race(trace_candidates(lens, domain, dtypes), domain, threads=count, rounds=rounds)
             outcome.rows += table_rows(f"{path.stem} ({_work(lens)})", timed)
+            save(outcome)
     return outcome
 
 
@@ -173,21 +178,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     a = parser.parse_args(argv)
     warnings.simplefilter("ignore")
+    name, title = ("trace", "The exact tracer") if a.trace else ("bench", "Models against the exact tracer")
+    threads = "1 and 2 threads" if a.trace else f"{a.threads} thread" + "s" * (a.threads > 1)
+
+    def save(outcome: Outcome) -> None:
+        a.out.mkdir(parents=True, exist_ok=True)
+        atomic_write_text(a.out / f"{name}.md", markdown(title, notes(threads, a.rounds), outcome.rows))
+        atomic_write_text(a.out / f"{name}.json", json.dumps({"rows": outcome.rows}, indent=1) + "\n")
+
     try:
         if a.trace:
-            outcome = bench_trace(a.only, a.rounds, (1, 2), (torch.float32, torch.float64))
-            name, title, threads = "trace", "The exact tracer", "1 and 2 threads"
+            outcome = bench_trace(a.only, a.rounds, (1, 2), (torch.float32, torch.float64), save)
         else:
-            outcome = bench_models(a.models, a.only, a.threads, a.rounds)
-            name, title, threads = "bench", "Models against the exact tracer", f"{a.threads} thread(s)"
+            outcome = bench_models(a.models, a.only, a.threads, a.rounds, save)
     except NeurolensError as error:
         print(error, file=sys.stderr)
         return 2
-    text = markdown(title, notes(threads, a.rounds), outcome.rows)
-    a.out.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(a.out / f"{name}.md", text)
-    atomic_write_text(a.out / f"{name}.json", json.dumps({"rows": outcome.rows}, indent=1) + "\n")
-    print(text)
+    print(markdown(title, notes(threads, a.rounds), outcome.rows))
     for line in outcome.unchecked:
         print(f"not checked: {line}")
     for line in outcome.missed:
