@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any, Literal
@@ -50,6 +51,7 @@ class ExactCamera:
         compiled: bool = False,
         bounds: PupilBounds | None = None,
     ) -> None:
+        self._pid = os.getpid()
         self.film_mm = check_film(film_mm)
         self.focus_m = positive("focus_m", focus_m, infinite=True)
         self.lens = lens.at(f_number=f_number, focus_m=self.focus_m)
@@ -85,6 +87,12 @@ class ExactCamera:
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
         return self.film.sample(film_mm, pupil, wavelength_nm)
+
+    def for_worker(self) -> ExactCamera:
+        """This camera, in a render worker. A forked process must not enter torch's thread pool: it waits for ever there."""
+        if os.getpid() != self._pid:
+            torch.set_num_threads(1)
+        return self
 
     def _scene(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SceneRays:
         fx, fy, px, py, wavelength = (

@@ -20,7 +20,7 @@ MAX_BYTES = 64 * 2**20
 CARD_KEY = "neurolens"
 KIND, SCHEMA = "neurolens.lens_model", 1
 OPERATORS = frozenset(
-    "Abs Add And Cast Clip Concat Cos Div Equal Gather Gemm GreaterOrEqual LessOrEqual MatMul Max Min Mul Neg "
+    "Abs Add And Cast Clip Concat Cos Div Equal Gather Gemm GreaterOrEqual Identity LessOrEqual MatMul Max Min Mul Neg "
     "Reciprocal ReduceSum Relu Reshape Sin Slice Split Sqrt Sub Tanh Where".split()
 )
 # TensorProto.DataType: what models hold, and the numpy type of their raw bytes.

@@ -50,7 +50,7 @@ def export_onnx(model: LensModel, path: str | Path, errors: dict[str, Any] | Non
     kappa = series.kappa if model.direction == "angle" else 1.0
     scale = np.array([model.scales.position_mm, kappa, model.scales.stop_mm])
     rows = add_core(g, model.core, field, scale, TEST_SCALE)
-    stop_square = add_decoder(g, model, rows.vectors, series)
+    stop_square = add_decoder(g, model, rows, series)
     add_status(g, model, rows, stop_square, inside)
     g.reshape(rows.transmittance, [-1], out="transmittance")
     proto = g.model(

@@ -6,6 +6,7 @@ no pass over the rays is spent on scaling.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import product
 
@@ -41,9 +42,11 @@ class Field:
 
 @dataclass(frozen=True)
 class CoreRows:
-    """What a core gives: vectors [3, 2, N]; transmittance [1, N]; gates [G, N] or None without gates."""
+    """What a core gives: vectors [2, N] each, transmittance [1, N], gates [G, N] or None without gates."""
 
-    vectors: str
+    position: str
+    direction: str
+    stop: str
     transmittance: str
     gates: str | None
 
@@ -106,10 +109,12 @@ def _network(g: Graph, core: Network, field: Field, vector_scale: Array, gate_sc
 
 def _ab_rows(g: Graph, out: str, field: Field, count: int) -> CoreRows:
     """A p + B u for three vectors, from rows A, A, A, B, B, B, transmittance, gates."""
-    parts = g.split(out, [3, 3, 1, count - 7] if count > 7 else [3, 3, 1])
-    a, b = (g.reshape(v, [3, 1, -1]) for v in parts[:2])
-    vectors = g.op("Add", g.op("Mul", a, field.p), g.op("Mul", b, field.u))
-    return CoreRows(vectors, parts[2], parts[3] if count > 7 else None)
+    *ab, transmittance, gates = g.split(out, [1] * 7 + [count - 7] * (count > 7)) + [""] * (count == 7)
+    # Vector by vector: products of two rows stay in the first-level cache, and nothing has to be taken apart later.
+    vectors = [
+        g.op("Add", g.op("Mul", a, field.p), g.op("Mul", b, field.u)) for a, b in zip(ab[:3], ab[3:], strict=True)
+    ]
+    return CoreRows(*vectors, transmittance, gates or None)
 
 
 def _raw_polynomial(g: Graph, core: RawPolynomial, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
@@ -122,8 +127,8 @@ def _raw_polynomial(g: Graph, core: RawPolynomial, field: Field, vector_scale: A
         first.append(g.affine(field.weight[3:], field.squares, field.bias[3:]))
     out = add_polynomial(g, g.concat(*first), exponents, weight)
     gates = len(weight) - 7
-    parts = g.split(out, [6, 1, gates] if gates else [6, 1])
-    return CoreRows(g.reshape(parts[0], [3, 2, -1]), parts[1], parts[2] if gates else None)
+    parts = g.split(out, [2, 2, 2, 1, gates] if gates else [2, 2, 2, 1])
+    return CoreRows(*parts[:4], parts[4] if gates else None)
 
 
 def _without_constants(
@@ -139,7 +144,7 @@ def add_polynomial(g: Graph, first: str, exponents: list[Exponent], weight: Arra
     """[M, N] = weight [M, K] @ monomials [K, N] of the variables in `first` [V, N].
 
     Monomials of degree 2, 3 to 4, 5 to 8 ... are each the product of two lower ones, gathered from the blocks where
-    those lie. Blocks are not joined: one matrix product a block, added up, costs less than copying them.
+    those lie.
     """
     variables = len(exponents[0])
     table = dict(zip(exponents, weight.T, strict=True))
@@ -155,7 +160,7 @@ def add_polynomial(g: Graph, first: str, exponents: list[Exponent], weight: Arra
         else:
             blocks += made
     out = ""
-    for name, known in blocks:
+    for name, known in _joined(g, blocks):
         block_weight = np.stack([table.get(e, nothing) for e in known], axis=1)
         if not out:
             out = g.affine(block_weight, name, table.get((0,) * variables, nothing))
@@ -175,6 +180,19 @@ def _by_block(blocks: list[Block], pairs: dict[Exponent, Pair]) -> list[dict[Exp
     for e, (a, b) in sorted(pairs.items()):
         groups.setdefault((home[a], home[b]), {})[e] = (a, b)
     return list(groups.values())
+
+
+def _joined(g: Graph, blocks: list[Block]) -> list[Block]:
+    """Blocks as the matrix products take them: joined where copying them costs less than another product."""
+    copy_row, product = 0.07, 1.2  # ns a ray, measured in onnxruntime (12 outputs)
+    best, cut = math.inf, 0
+    for first in range(len(blocks)):  # blocks before `first` stay alone, the others become one
+        rows = sum(len(known) for _, known in blocks[first:])
+        cost = product * first + (copy_row * rows if first < len(blocks) - 1 else 0.0)
+        if cost < best:
+            best, cut = cost, first
+    names, lists = zip(*blocks[cut:], strict=True)
+    return [*blocks[:cut], (g.concat(*names), [e for known in lists for e in known])]
 
 
 def _products(g: Graph, blocks: list[Block], pairs: dict[Exponent, Pair]) -> Block:

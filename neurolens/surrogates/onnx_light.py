@@ -81,22 +81,24 @@ def _inside(g: Graph, d: Domain, film_pupil: str) -> str:
     return g.op("And", g.op("And", within[0], within[1]), call)
 
 
-def add_decoder(g: Graph, model: LensModel, vectors: str, series: DirectionSeries) -> str:
-    """Outputs scene_ray and stop_xy_mm from vectors [3, 2, N]; returns the stop crossing's squared radius [1, N]."""
-    position, direction, stop = g.split(vectors, [1, 1, 1])
-    g.reshape(stop, [2, -1], out="stop_xy_mm")
-    position, direction = (g.reshape(v, [2, -1]) for v in (position, direction))
-    square = g.op("ReduceSum", g.op("Mul", vectors, vectors), g.const([1], np.int64), keepdims=0)
-    r2, t, stop2 = g.split(square, [1, 1, 1])
-    z = _sag(g, model, r2)
+def add_decoder(g: Graph, model: LensModel, rows: CoreRows, series: DirectionSeries) -> str:
+    """Outputs scene_ray and stop_xy_mm; returns the stop crossing's squared radius [1, N]."""
+    g.op("Identity", rows.stop, out="stop_xy_mm")
+    z = _sag(g, model, _square(g, rows.position))
+    t = _square(g, rows.direction)
     if model.direction == "slope":
         # (dx, dy) = slope / sqrt(1 + slope^2), dz = -1 / sqrt(1 + slope^2).
         factor = g.op("Reciprocal", g.op("Sqrt", g.op("Add", t, g.const(1.0))))
         dz = g.op("Neg", factor)
     else:
         factor, dz = _horner(g, t, series.sinc), _horner(g, t, series.minus_cos)
-    g.concat(position, z, g.op("Mul", direction, factor), dz, out="scene_ray")
-    return stop2
+    g.concat(rows.position, z, g.op("Mul", rows.direction, factor), dz, out="scene_ray")
+    return _square(g, rows.stop)
+
+
+def _square(g: Graph, vector: str) -> str:
+    """Squared length [1, N] of a vector [2, N]."""
+    return g.op("MatMul", g.const([[1.0, 1.0]]), g.op("Mul", vector, vector))
 
 
 def _sag(g: Graph, model: LensModel, r2: str) -> str:
@@ -130,11 +132,11 @@ def add_status(g: Graph, model: LensModel, rows: CoreRows, stop_square: str, ins
     """
     limit = g.op("Mul", g.op("Mul", "stop_radius_mm", "stop_radius_mm"), g.const([TEST_SCALE]))
     over = g.op("Sub", g.op("Mul", stop_square, g.const(TEST_SCALE)), limit)
-    failed = [g.op("Min", over, g.const(float(st.blocked(model.lens.stop_index, st.RIM))))]
+    failed = [g.op("Clip", over, g.const(0.0), g.const(float(st.blocked(model.lens.stop_index, st.RIM))))]
     if rows.gates is not None:
         codes = np.array([[float(gate.status)] for gate in model.gates])
         failed += g.split(g.op("Min", rows.gates, g.const(codes)), [1] * len(codes))
-    code = g.op("Relu", g.op("Max", *failed) if len(failed) > 1 else failed[0])
+    code = g.op("Max", *failed)
     code = g.op("Where", inside, code, g.const(float(st.OUTSIDE_DOMAIN)))
     g.reshape(g.op("Cast", code, to=INT32), [-1], out="status")
 
