@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ from neurolens.render.exr import read_exr
 ROOT = Path(__file__).parents[1]
 LENSES = sorted((ROOT / "lenses").glob("*.toml"))
 GAUSS = ROOT / "lenses" / "laikin_double_gauss_50.toml"
+SINGLET = ROOT / "lenses" / "thorlabs_lb1471_biconvex_50.toml"
 ZOOM = ROOT / "lenses" / "ogawa_zoom_70_200.toml"
 COMMANDS = ("lens", "train", "evaluate", "render")
 
@@ -282,3 +284,95 @@ def test_a_reader_that_leaves_is_no_error(scene: Path, tmp_path: Path) -> None:
         process.stdout.close()
         assert process.stderr.read() == ""
         assert process.wait() == 141
+
+
+# A model: fitted once, small and rough, of the biconvex singlet
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A polynomial of the singlet, exported with the errors that it has."""
+    from neurolens.cameras.model import load_model
+    from neurolens.evaluate.measure import measure_errors
+    from neurolens.optics.lensfile import read_lens
+    from neurolens.surrogates.domain import domain_of
+    from neurolens.surrogates.export import export_onnx
+    from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
+    from neurolens.surrogates.pairs import PairSettings, make_pairs
+
+    lens = read_lens(SINGLET).at(f_number=8, efl_mm=50)
+    domain = domain_of(lens, film_radius_mm=21.0, focus_m=(math.inf, 1.0))
+    pairs = make_pairs(lens, domain, PairSettings(train=4000, held_out=4000, rim=2000))
+    fitted = fit_model(prepare(pairs), ModelSettings(method="ols", terms=12))
+    path = tmp_path_factory.mktemp("models") / "singlet.onnx"
+    export_onnx(fitted, path)
+    errors = measure_errors(load_model(path), lens, domain, pairs.held_out, 20_000)
+    return export_onnx(fitted, path, errors=errors)
+
+
+def with_errors(model: Path, path: Path, **errors: float) -> Path:
+    """The same model with other promises on its card."""
+    import onnx
+
+    proto = onnx.load(model)
+    entry = next(p for p in proto.metadata_props if p.key == "neurolens")
+    card = json.loads(entry.value)
+    card["errors"].update(errors)
+    entry.value = json.dumps(card)
+    onnx.save(proto, path)
+    return path
+
+
+def test_evaluate_confirms_a_card_on_fresh_rays(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = run_json(capsys, "evaluate", model, "--rays", 4000)
+    assert data["holds"] and data["lens"]["id"] == SINGLET.stem
+    assert 0 < data["rms_um"] <= data["p99_um"] <= data["max_um"]
+    assert data["direction_rms_deg"] > 0 and 0 <= data["false_pass"] < 0.02 and data["ns_per_ray"]["min"] > 0
+    again = run_json(capsys, "evaluate", model, "--rays", 4000, "--seed", data["seed"])
+    assert again["rms_um"] == data["rms_um"]
+    assert run_json(capsys, "evaluate", model, "--rays", 4000, "--seed", 77)["rms_um"] != data["rms_um"]
+
+
+def test_evaluate_exits_1_where_a_promise_does_not_hold(
+    model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    promising = with_errors(model, tmp_path / "promising.onnx", rms_um=1e-3)
+    assert main(["evaluate", str(promising), "--rays", "4000"]) == 1
+    assert "Does not hold: rms_um." in capsys.readouterr().out
+
+
+def test_evaluate_refuses_another_lens(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = failure(capsys, "evaluate", model, "--lens", GAUSS)
+    assert GAUSS.name in line and "sha256" in line
+
+
+def test_render_through_a_model_needs_no_torch_and_keeps_its_card(model: Path, scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "model.exr"
+    done = python(WITHOUT_TORCH, "render", scene, "--camera", model, "--f-number", 8, "--samples", 16, "-o", out)
+    assert done.returncode == 0, done.stderr
+    picture, metadata = read_exr(out)
+    assert picture[7:11, 14:18].mean() == pytest.approx(1, rel=0.15)
+    assert SINGLET.stem in json.dumps(metadata["camera"])
+
+
+def test_a_scene_wider_than_the_model_gets_its_widest_stop(
+    model: Path, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The scene asks for f/4, the model was made at f/8."""
+    data = run_json(capsys, "render", scene, "--camera", model, "-o", tmp_path / "a.exr", "--quiet")
+    assert data["camera"]["f_number"] == pytest.approx(8)
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--f-number", "8", "--focus", "0.5"], ["focus", "0.5"]),
+        (["--f-number", "4"], ["f_number", "4"]),
+        (["--f-number", "8", "--efl", "35"], ["efl_mm", "one state"]),
+    ],
+)
+def test_a_shot_outside_the_model_is_one_line(
+    args: list[str], words: list[str], model: Path, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = failure(capsys, "render", scene, "--camera", model, "-o", tmp_path / "a.exr", "--quiet", *args)
+    assert all(word in line for word in words), line

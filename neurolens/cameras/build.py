@@ -27,6 +27,8 @@ class Shot:
         f_number: None: the widest stop of a lens or model; f/4 for the thin lens, nominally f/8 for the pinhole.
         efl_mm: None: a lens file as tabled; 50 mm for thin lens and pinhole. A model has its own.
         configuration: zoom state of a lens file.
+        clamp_f_number: an f-number wider than the lens opens becomes its widest; else it is an error of a model, and
+            opens the stop of a lens file as far as the rims let light through.
         wavelength_nm: shortest and longest wavelength of the light.
     """
 
@@ -36,6 +38,12 @@ class Shot:
     efl_mm: float | None = None
     configuration: str | None = None
     wavelength_nm: tuple[float, float] = (400.0, 700.0)
+    clamp_f_number: bool = False
+
+    def f_number_for(self, widest: float) -> float | None:
+        """The f-number of a lens that opens to `widest`; None stands for its widest."""
+        too_wide = self.clamp_f_number and self.f_number is not None and self.f_number < widest
+        return None if too_wide else self.f_number
 
 
 def make_camera(spec: str | Path, shot: Shot) -> Camera:
@@ -71,10 +79,12 @@ def _ideal(kind: str, shot: Shot) -> Camera:
 def _exact(path: Path, shot: Shot) -> Camera:
     from neurolens.cameras.exact import ExactCamera
     from neurolens.optics.lensfile import read_lens
+    from neurolens.optics.paraxial import first_order
 
     lens = read_lens(path).at(efl_mm=shot.efl_mm, configuration=shot.configuration)
+    f_number = shot.f_number_for(first_order(lens).f_number)
     return ExactCamera(
-        lens, film_mm=shot.film_mm, focus_m=shot.focus_m, f_number=shot.f_number, wavelength_nm=shot.wavelength_nm
+        lens, film_mm=shot.film_mm, focus_m=shot.focus_m, f_number=f_number, wavelength_nm=shot.wavelength_nm
     )
 
 
@@ -83,7 +93,10 @@ def _model(path: Path, shot: Shot) -> Camera:
 
     for field, value in (("efl_mm", shot.efl_mm), ("configuration", shot.configuration)):
         _refuse(str(path), field, value, "left out: a model is of one state of its lens")
-    return OnnxCamera(load_model(path), film_mm=shot.film_mm, focus_m=shot.focus_m, f_number=shot.f_number)
+    model = load_model(path)
+    lens, domain = model.card["lens"], model.card["domain"]
+    widest = float(lens["f_number"] * lens["stop_radius_mm"] / domain["stop_radius_mm"])
+    return OnnxCamera(model, film_mm=shot.film_mm, focus_m=shot.focus_m, f_number=shot.f_number_for(widest))
 
 
 def _refuse(camera: str, field: str, value: object, expected: str) -> None:

@@ -69,7 +69,7 @@ def add_parser(subparsers: Any) -> None:
         parser,
         {
             "efl": "as tabled; 50 for thin and pinhole; a model has its own",
-            "f_number": "the scene's, else the widest stop; 4 for thin",
+            "f_number": "the scene's, or the widest that the lens opens to; 4 for thin",
             "focus": "the scene's",
         },
     )
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
     write_exr(args.out, result.rgb, half=args.half, metadata=metadata)
     write_png(preview, result.rgb, args.exposure)
     if args.json:
-        print_json({"file": str(args.out), "preview": str(preview), "camera": camera.settings, **stats})
+        print_json({"file": str(args.out), "preview": str(preview), **stats, "camera": camera.settings})
     else:
         print(_text(stats, args.out, preview))
     return 0
@@ -118,6 +118,8 @@ def shot_of(settings: CameraSettings, args: argparse.Namespace) -> Shot:
         efl_mm=args.efl,
         configuration=args.configuration,
         wavelength_nm=settings.wavelengths_nm,
+        # A scene's f-number is for any lens; one that is asked for must be had.
+        clamp_f_number=args.f_number is None,
     )
 
 
