@@ -144,7 +144,7 @@ class Mesh:
         ray = np.flatnonzero(entry <= exit_)
         node = np.zeros(len(ray), np.intp)
         while ray.size:
-            pair, slot = np.nonzero(self._meets_children(rays, best, ray, node))
+            pair, slot = np.divmod(np.flatnonzero(self._meets_children(rays, best, ray, node)), _BRANCHES)
             child = self._children[node[pair], slot]
             ray = ray[pair]
             is_leaf = child < 0
@@ -194,8 +194,8 @@ class Mesh:
         distance /= -(plane(0, direction, False) + np.float32(1e-30))
         point = [origin[k] + distance * direction[k] for k in range(3)]
         u, v = plane(1, point, True), plane(2, point, True)
-        # A sliver of tolerance closes the seams between neighbours; a NaN of an overflow fails every comparison.
-        edge = np.float32(-1e-6)
+        # A sliver of overlap closes the seams that rounding opens between neighbours; NaN fails every comparison.
+        edge = np.float32(-5e-5)
         ok = (distance > NEAREST) & (u >= edge) & (v >= edge) & (u + v <= 1 - edge)
         distance[~ok] = np.inf
         column = np.argmin(distance, axis=1)

@@ -44,8 +44,9 @@ class Spheres:
             loose = self._along @ right[:4, part]
             loose *= loose
             loose += self._rest @ right[4:, part]
-            number, ray = np.nonzero(loose > 0)
-            if ray.size:
+            near = np.flatnonzero(loose > 0)
+            if near.size:
+                number, ray = np.divmod(near, loose.shape[1])
                 ray += start
                 self._meet(rays, best, found, number, ray)
 

@@ -64,6 +64,24 @@ def test_mesh_of_any_size_matches_every_triangle_in_turn(count: int) -> None:
     assert np.abs(np.sum((point - own[:, 0]) * normal, axis=1)).max() < 1e-4
 
 
+def test_closed_mesh_has_no_seams() -> None:
+    rows, columns = 40, 60
+    polar, turn = np.meshgrid(np.linspace(0.02, np.pi - 0.02, rows), np.linspace(0, 2 * np.pi, columns, endpoint=False))
+    shell = np.stack([np.sin(polar) * np.cos(turn), np.cos(polar), np.sin(polar) * np.sin(turn)], axis=-1) * 0.3
+    i, j = np.meshgrid(np.arange(columns), np.arange(rows - 1), indexing="ij")
+    a, b, c, d = i * rows + j, i * rows + j + 1, (i + 1) % columns * rows + j + 1, (i + 1) % columns * rows + j
+    faces = np.concatenate([np.stack(x, axis=-1).reshape(-1, 3) for x in ((a, b, c), (a, c, d))])
+    mesh = Mesh(0, shell.reshape(-1, 3) + [2.0, 1.0, -3.0], faces)
+    direction = RANDOM.normal(size=(3, 60000))
+    direction /= np.linalg.norm(direction, axis=0)
+    direction = direction[:, np.abs(direction[1]) < 0.99]  # but for the holes at the poles
+    count = direction.shape[1]
+    origin = np.repeat([[2.0], [1.0], [-3.0]], count, axis=1) + RANDOM.normal(size=(3, count)) * 0.002
+    best, found = np.full(count, np.inf, np.float32), np.full(count, -1, np.int32)
+    mesh.nearer(Rays.of(origin.astype(np.float32), direction.astype(np.float32)), best, found)
+    assert np.all(found >= 0) and np.ptp(best) < 0.02
+
+
 def test_shapes_match_float64_formulas() -> None:
     quads = [
         {"corner_m": [-1, 0.5, -1], "edge_u_m": [2, 0, 0], "edge_v_m": [0, 0, 1.5]},
