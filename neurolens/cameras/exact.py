@@ -89,7 +89,7 @@ class ExactCamera:
         return self.film.sample(film_mm, pupil, wavelength_nm)
 
     def for_worker(self) -> ExactCamera:
-        """This camera, in a render worker. A forked process must not enter torch's thread pool: it waits for ever there."""
+        """This camera, in a render worker. A forked process must not enter torch's thread pool: it never returns."""
         if os.getpid() != self._pid:
             torch.set_num_threads(1)
         return self

@@ -54,7 +54,7 @@ class DomainChoice:
 
 @dataclass(frozen=True)
 class EvaluationChoice:
-    """Rays for false passes and blocks; rounds and threads of the race for speed; whether to compile the exact tracer."""
+    """Rays for false passes and blocks; rounds and threads of the race for speed; whether the compiled tracer runs."""
 
     vignetting_rays: int = 200_000
     rounds: int = 15

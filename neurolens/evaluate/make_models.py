@@ -37,7 +37,7 @@ _KEPT = (
 
 
 def _default_models() -> tuple[ModelSettings, ...]:
-    return ModelSettings(method="ols", terms=60), ModelSettings(method="mlp", units=16, seconds=60.0)
+    return ModelSettings(method="ols", terms=60), ModelSettings(method="mlp", units=16)
 
 
 @dataclass(frozen=True)
@@ -108,8 +108,8 @@ def write_index(rows: list[dict[str, Any]], out: Path) -> None:
     index = {"schema": 1, "command": "make models", "versions": versions(), "models": rows}
     atomic_write_text(out / "index.json", json.dumps(index, indent=1, allow_nan=False) + "\n")
     head = (
-        "# Models that ship\n\nMade by `make models` from experiments/models.toml; errors on held-out rays at full aperture "
-        "(definition: `neurolens.evaluate.rays`), times on one core in onnxruntime with stop, rims and transmittance, "
+        "# Models that ship\n\nMade by `make models` from experiments/models.toml; errors on held-out rays at full "
+        "aperture (definition: `neurolens.evaluate.rays`), times on one core in onnxruntime with stop, rims and transmittance, "
         "speed-up over the compiled exact tracer doing the same work in the same run. Check a model with "
         "`neurolens evaluate models/FILE`, all of them with `make bench`.\n\n"
         "| model | RMS um | p99 um | direction RMS deg | false pass / block % | coefficients per vector | kB | "
@@ -117,8 +117,8 @@ def write_index(rows: list[dict[str, Any]], out: Path) -> None:
     )
     lines = [
         f"| {r['file']} | {_n(r['rms_um'])} | {_n(r['p99_um'])} | {_n(r['direction_rms_deg'])} | "
-        f"{_n(r['false_pass'], 100)} / {_n(r['false_block'], 100)} | {r['coefficients_per_vector'] or r['parameters']} | "
-        f"{r['bytes'] / 1000:.0f} | {_n((r['ns_per_ray'] or {}).get('min'))} | {_n(r['speedup_over_compiled'])} |"
+        f"{_n(r['false_pass'], 100)} / {_n(r['false_block'], 100)} | "
+        f"{r['coefficients_per_vector'] or r['parameters']} | {r['bytes'] / 1000:.0f} | {_n((r['ns_per_ray'] or {}).get('min'))} | {_n(r['speedup_over_compiled'])} |"
         for r in rows
     ]
     atomic_write_text(out / "README.md", head + "\n".join(lines) + "\n")

@@ -43,23 +43,17 @@ class Measured:
     record: dict[str, Any]
 
 
-def onnx_predictor(model: OnnxLens, batch: int = 16384) -> Any:
-    """An exported model as the functions of `rays` and `vignetting` want it: film rays and a stop radius in, `Prediction` out."""
+def onnx_predictor(model: OnnxLens) -> Any:
+    """An exported model as `rays` and `vignetting` want it: film rays and a stop radius in, `Prediction` out."""
 
     def predict(rays: FilmRays, stop_radius_mm: float | None = None) -> Prediction:
         columns = [np.ascontiguousarray(c.numpy(), dtype=np.float32) for c in rays.columns()]
-        scene, stop = np.empty((6, len(rays)), np.float32), np.empty((2, len(rays)), np.float32)
-        power, status = np.empty(len(rays), np.float32), np.empty(len(rays), np.int32)
-        planes, plane_of = np.unique(columns[2], return_inverse=True)
-        for k, film_z in enumerate(planes):
-            of_plane = np.flatnonzero(plane_of == k)
-            for i in range(0, len(of_plane), batch):
-                at = of_plane[i : i + batch]
-                fx, fy, _, px, py, wavelength = (c[at] for c in columns)
-                out = model.rays(np.stack([fx, fy]), np.stack([px, py]), wavelength, float(film_z), stop_radius_mm)
-                scene[:, at], power[at], stop[:, at], status[at] = out
-        x, y, z, dx, dy, dz = torch.from_numpy(scene)
-        return Prediction(Rays(x, y, z, dx, dy, dz), torch.from_numpy(power), *torch.from_numpy(stop), torch.from_numpy(status))
+        film, pupil = np.stack(columns[0:2]), np.stack(columns[3:5])
+        out = model.rays(film, pupil, columns[5], columns[2], stop_radius_mm)
+        x, y, z, dx, dy, dz = torch.from_numpy(out.scene_ray)
+        stop_x, stop_y = torch.from_numpy(out.stop_xy_mm)
+        power, status = torch.from_numpy(out.transmittance), torch.from_numpy(out.status)
+        return Prediction(Rays(x, y, z, dx, dy, dz), power, stop_x, stop_y, status)
 
     return predict
 

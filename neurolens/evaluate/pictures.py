@@ -36,11 +36,8 @@ class Pictures:
     figures: list[dict[str, Any]] = field(default_factory=list)
 
 
-def scene_cameras(
-    lens: Lens, domain: Domain, models: Mapping[str, Path], shot: CameraSettings
-) -> dict[str, Camera]:
-    """Exact lens, each model, thin lens and pinhole, set as a scene's [camera] asks; f-numbers that the lens cannot open
-    to become its widest."""
+def scene_cameras(lens: Lens, domain: Domain, models: Mapping[str, Path], shot: CameraSettings) -> dict[str, Camera]:
+    """Exact lens, each model, thin lens and pinhole, set as a scene's [camera] asks; no wider than the lens opens."""
     film = (shot.film_width_mm, shot.film_height_mm)
     data = first_order(lens)
     f_number = max(shot.f_number or data.f_number, data.f_number)
@@ -133,7 +130,9 @@ def _compare_scene(
     maps[EXACT] = error_maps(exact[0], exact[1])["flip"]
     captions[EXACT] = "two seeds: the noise floor"
     file = folder / f"{scene.name}-side-by-side.png"
-    side_by_side({n: r[0] for n, r in renders.items()}, maps, file, captions, title=f"{scene.name}, error against exact")
+    side_by_side(
+        {n: r[0] for n, r in renders.items()}, maps, file, captions, title=f"{scene.name}, error against exact"
+    )
     found.figures.append(
         {
             "file": f"{folder.name}/{file.name}",

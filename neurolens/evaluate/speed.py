@@ -22,6 +22,7 @@ import torch
 from neurolens.errors import InputError, NeurolensError
 from neurolens.evaluate.records import ExactRecord, Timing
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
+from neurolens.surrogates.threads import pinned_threads
 
 POOL = (
     65536  # rays of one pass: every batch size divides it, and float32 inputs of a pass stay in the third-level cache
@@ -51,23 +52,6 @@ class Candidate:
     name: str
     prepare: Callable[[FilmRays], Call]
     batches: tuple[int, ...] = BATCHES
-
-
-@contextmanager
-def pinned_threads(threads: int) -> Iterator[None]:
-    """Give torch this many threads inside the block, and what it had before after it.
-
-    Raises:
-        InputError: fewer than one.
-    """
-    if threads < 1:
-        raise InputError("speed", "threads", threads, "at least 1")
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def time_per_ray(call: Call, rays: int, threads: int = 1, repeats: int = 20) -> Timing:

@@ -13,6 +13,7 @@ from typing import Any
 
 from neurolens.cameras.model import load_model
 from neurolens.config import to_dict, to_toml
+from neurolens.evaluate.candidates import exact_candidates, model_candidate
 from neurolens.evaluate.experiment import Experiment
 from neurolens.evaluate.layout import layout_profile
 from neurolens.evaluate.measure import Measured, fit_and_measure
@@ -21,7 +22,6 @@ from neurolens.evaluate.plots import error_against_coefficients_plot, lens_layou
 from neurolens.evaluate.rays import pixel_um, pupil_disc_share
 from neurolens.evaluate.records import break_even_rays, write_results
 from neurolens.evaluate.report import write_report
-from neurolens.evaluate.candidates import exact_candidates, model_candidate
 from neurolens.evaluate.speed import Race, race
 from neurolens.files import atomic_write_text
 from neurolens.optics.paraxial import first_order
@@ -31,6 +31,7 @@ from neurolens.render.scenefile import load_scene
 from neurolens.surrogates.domain import Domain, domain_from_camera
 from neurolens.surrogates.fit import Prepared, prepare
 from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs
+from neurolens.surrogates.threads import pinned_threads
 
 _PACKAGES = ("neurolens", "torch", "numpy", "onnxruntime", "onnx", "OpenEXR")
 
@@ -56,7 +57,7 @@ def run_experiment(
         each.mkdir(parents=True, exist_ok=True)
     atomic_write_text(folder / "config.toml", to_toml(experiment))
     progress.plan(_plan(experiment))
-    with warnings.catch_warnings(record=True) as heard:
+    with warnings.catch_warnings(record=True) as heard, pinned_threads():
         warnings.simplefilter("always")
         lens = experiment.lens.read()
         domain = experiment.domain_of(lens)
@@ -184,7 +185,8 @@ def _scene_gain(
         rows = []
         models = folder / "models" / f"scene-{scene.name}"
         models.mkdir(parents=True, exist_ok=True)
-        for name, state, domain in (("whole lens", lens, experiment.domain_of(lens)), (scene.name, shot_lens, shot_domain)):
+        states = (("whole lens", lens, experiment.domain_of(lens)), (scene.name, shot_lens, shot_domain))
+        for name, state, domain in states:
             prepared = prepare(make_pairs(state, domain, experiment.pairs))
             place = models / name.replace(" ", "-")
             place.mkdir(exist_ok=True)
@@ -200,18 +202,20 @@ def _gain_text(rows: Sequence[Mapping[str, Any]]) -> str:
     return f"The same {rows[0]['name']} fit has {whole:.3g} um RMS for the whole lens and {scene:.3g} um for this shot."
 
 
-def _draw(
-    lens: Lens, domain: Domain, measured: Sequence[Measured], timed: Race, folder: Path
-) -> list[dict[str, Any]]:
+def _draw(lens: Lens, domain: Domain, measured: Sequence[Measured], timed: Race, folder: Path) -> list[dict[str, Any]]:
     """Trade and layout plots."""
     records = [m.record for m in measured]
     exact = [timed.record(n) for n in ("exact eager", "exact compiled") if n in timed.ns]
     error = "rms_um" if any(r.get("rms_um") for r in records) else "direction_rms_deg"
     pareto_plot(records, folder / "pareto.png", exact=exact, error=error, title=f"{lens.name}: error against time")
-    error_against_coefficients_plot(records, folder / "coefficients.png", error, title=f"{lens.name}: error against size")
+    error_against_coefficients_plot(records, folder / "coefficients.png", error, title=f"{lens.name}: error, size")
     lens_layout(layout_profile(lens, domain), folder / "layout.png")
     texts = (
-        ("pareto", "Error against speed", "Held-out rays, full aperture; the Pareto front is what is worth choosing from."),
+        (
+            "pareto",
+            "Error against speed",
+            "Held-out rays, full aperture; choose from the Pareto front.",
+        ),
         ("coefficients", "Error against coefficients", "Coefficients per vector output, A and B terms both counted."),
         ("layout", "The lens", "Rays of three fields, traced exactly."),
     )

@@ -19,6 +19,7 @@ from neurolens.surrogates.pairs import RayPairs, trace_pairs
 from neurolens.surrogates.paraxial import fit_paraxial
 from neurolens.surrogates.polynomial import PolynomialSettings, fit_polynomial
 from neurolens.surrogates.targets import choose_gates, scales_of
+from neurolens.surrogates.threads import pinned_threads
 
 Method = Literal["thin", "thick", "dense", "omp", "ols", "adaptive", "mlp"]
 POLYNOMIALS = ("dense", "omp", "ols", "adaptive")
@@ -34,7 +35,8 @@ class ModelSettings:
         name: of the file and of the table's row; made from the other settings where empty.
         method: "thin", "thick" (first order); "dense", "omp", "ols", "adaptive" (polynomials); "mlp".
         basis, terms, degree, replacement: see `PolynomialSettings`.
-        units, layers, seconds: of the network, and the time its training may take.
+        units, layers: of the network. steps, seconds: its training ends by either; results repeat bit for bit where
+            the steps end it.
         seed: of the network's first weights.
     """
 
@@ -46,6 +48,7 @@ class ModelSettings:
     replacement: bool = True
     units: int = 16
     layers: int = 2
+    steps: int = 60
     seconds: float = 60.0
     seed: int = 0
 
@@ -83,7 +86,8 @@ def prepare(pairs: RayPairs) -> Prepared:
         NeurolensWarning: more than one ray in 10,000 ends by missing a surface or by total reflection.
     """
     seed = pairs.settings.seed + 1_000_003
-    drawn = trace_pairs(pairs.lens, sample_domain(pairs.domain, _GATE_RAYS, seed), pairs.domain.pupil_z_mm)
+    with pinned_threads():
+        drawn = trace_pairs(pairs.lens, sample_domain(pairs.domain, _GATE_RAYS, seed), pairs.domain.pupil_z_mm)
     blocked = drawn.status != st.PASSED
     reason = drawn.status % 4
     lost = float((blocked & (reason != st.RIM)).double().mean())
@@ -107,7 +111,8 @@ def fit_model(
         InputError: an unknown method, or settings that the method refuses.
     """
     start = time.perf_counter()
-    core = _fit_core(prepared, settings, progress)
+    with pinned_threads():
+        core = _fit_core(prepared, settings, progress)
     pairs = prepared.pairs
     return LensModel(
         lens=pairs.lens,
@@ -136,6 +141,7 @@ def _fit_core(prepared: Prepared, settings: ModelSettings, progress: Callable[[f
             layers=settings.layers,
             seed=settings.seed,
             seconds=settings.seconds,
+            steps=settings.steps,
             progress=progress,
         )
     if settings.method not in POLYNOMIALS:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -19,6 +18,7 @@ from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate
 from neurolens.surrogates.pairs import PairSet, RayPairs
 from neurolens.surrogates.targets import film_equivalent_weights, gate_values, targets_of
+from neurolens.surrogates.threads import pinned_threads
 from neurolens.surrogates.training import Problem, Projection, minimise
 
 # What the other outputs weigh against film-equivalent micrometres: so many um for 1 mm at the stop, for a transmittance
@@ -68,7 +68,7 @@ def fit_network(
     if not len(pairs.train):
         raise InputError("mlp", "pairs.train", "(no rays)", "at least one passing ray")
     run = _Run(seconds, progress)
-    with _one_thread():
+    with pinned_threads():
         problem, shift, scale = _problem(pairs, encoding, gates, rays)
         best = _train(problem, (units, layers), seed, steps, starts, run)
     if progress:
@@ -158,15 +158,3 @@ def _part(
 def _near(gate: Tensor) -> Tensor:
     """Weight 1 on the boundary, falling off away from it (its square is that of the residual's square)."""
     return 1 / torch.sqrt(1 + (gate / _BOUNDARY) ** 2)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread: the sums then run in one order on any number of cores, and busy cores cannot stall a parallel product
-    (two threads beside other work took seven times as long as one)."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
