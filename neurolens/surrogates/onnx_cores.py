@@ -114,7 +114,7 @@ def _ab_rows(g: Graph, out: str, field: Field, count: int) -> CoreRows:
     vectors = [
         g.op("Add", g.op("Mul", a, field.p), g.op("Mul", b, field.u)) for a, b in zip(ab[:3], ab[3:], strict=True)
     ]
-    return CoreRows(*vectors, transmittance, gates or None)
+    return CoreRows(vectors[0], vectors[1], vectors[2], transmittance, gates or None)
 
 
 def _raw_polynomial(g: Graph, core: RawPolynomial, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
@@ -128,7 +128,7 @@ def _raw_polynomial(g: Graph, core: RawPolynomial, field: Field, vector_scale: A
     out = add_polynomial(g, g.concat(*first), exponents, weight)
     gates = len(weight) - 7
     parts = g.split(out, [2, 2, 2, 1, gates] if gates else [2, 2, 2, 1])
-    return CoreRows(*parts[:4], parts[4] if gates else None)
+    return CoreRows(parts[0], parts[1], parts[2], parts[3], parts[4] if gates else None)
 
 
 def _without_constants(
