@@ -11,6 +11,10 @@ from contextlib import contextmanager
 from typing import Protocol, TextIO
 
 
+# A plan is trusted like one that held for so many seconds.
+_TRUST_S = 20.0
+
+
 class Report(Protocol):
     """What a stage calls now and then with the fraction done, and the seconds left where it knows better."""
 
@@ -109,10 +113,8 @@ class Progress:
         return None if expected is None else max(expected * self._pace() - elapsed, 0.0)
 
     def _pace(self) -> float:
-        """Seconds taken over seconds expected, of what is done; kept within reason."""
-        if self._expected_s <= 0:
-            return 1.0
-        return min(max(self._taken_s / self._expected_s, 0.2), 10.0)
+        """Seconds taken over seconds expected, of what is done; a few short stages say little of the long ones to come."""
+        return (self._taken_s + _TRUST_S) / (self._expected_s + _TRUST_S)
 
     def _line(self, name: str, share: float, elapsed: float, left: float | None) -> str:
         text = f"{name}: {100 * share:3.0f}%, {duration(elapsed)}"

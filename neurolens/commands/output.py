@@ -34,7 +34,7 @@ def number(value: Any, digits: int = 4) -> str:
         return str(value)
     if math.isnan(value):
         return "-"
-    return "infinity" if math.isinf(value) else f"{value:.{digits}g}"
+    return "infinity" if math.isinf(value) else f"{value + 0.0:.{digits}g}"  # no "-0"
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
