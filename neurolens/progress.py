@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Protocol, TextIO
 
-
 # A plan is trusted like one that held for so many seconds.
 _TRUST_S = 20.0
 
@@ -113,7 +112,7 @@ class Progress:
         return None if expected is None else max(expected * self._pace() - elapsed, 0.0)
 
     def _pace(self) -> float:
-        """Seconds taken over seconds expected, of what is done; a few short stages say little of the long ones to come."""
+        """Seconds taken over seconds expected, of what is done; a few short stages say little of long ones to come."""
         return (self._taken_s + _TRUST_S) / (self._expected_s + _TRUST_S)
 
     def _line(self, name: str, share: float, elapsed: float, left: float | None) -> str:
