@@ -16,6 +16,7 @@ from neurolens.errors import InputError
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 
 _SLACK = 1.00001  # of the domain's bounds, as inside the graph
+_NOMINAL = 1.02  # f-numbers are engraved rounded: up to this much wider than the widest stop means the widest stop
 
 
 class OnnxCamera:
@@ -25,7 +26,7 @@ class OnnxCamera:
         model: see `load_model`.
         film_mm: width and height of the film. What lies beyond the model's film radius stays dark.
         focus_m: distance from film to the object in focus; inf allowed.
-        f_number: None takes the model's widest stop.
+        f_number: None takes the model's widest stop, and so does one up to 2% below it (an engraved f/1.8 may be 1.83).
 
     Raises:
         InputError: a focus or stop outside the model's domain.
@@ -98,7 +99,7 @@ def _stop_radius(model: OnnxLens, f_number: float | None) -> float:
     if f_number is None:
         return widest
     radius = lens["stop_radius_mm"] * lens["f_number"] / positive("f_number", f_number)
-    if radius > widest * _SLACK:
+    if radius > widest * _NOMINAL:
         least = lens["stop_radius_mm"] * lens["f_number"] / widest
         raise InputError(model.path, "f_number", f_number, f"at least {least:.4g}, the model's widest stop")
     return float(min(radius, widest))

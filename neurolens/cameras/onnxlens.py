@@ -23,8 +23,8 @@ OUTPUTS = {
     "stop_xy_mm": ("tensor(float)", 2, None),
     "status": ("tensor(int32)", None),
 }
-# Rays a call of onnxruntime: enough to hide the cost of its operators, few enough for a core's second-level cache.
-BATCH = 8192
+# Rays a call of onnxruntime: enough to hide the cost of its operators, few enough for the caches.
+BATCH = 16384
 MAX_RAYS = 2**27
 _NUMBERS = {
     "lens": (*("efl_mm", "f_number", "stop_radius_mm", "front_principal_z_mm", "rear_principal_z_mm"),),

@@ -42,13 +42,13 @@ class Field:
 
 @dataclass(frozen=True)
 class CoreRows:
-    """What a core gives: vectors [2, N] each, transmittance [1, N], gates [G, N] or None without gates."""
+    """What a core gives: vectors [2, N] each, transmittance and gates [1, N] each."""
 
     position: str
     direction: str
     stop: str
     transmittance: str
-    gates: str | None
+    gates: list[str]
 
 
 def add_core(g: Graph, core: Core, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
@@ -109,12 +109,13 @@ def _network(g: Graph, core: Network, field: Field, vector_scale: Array, gate_sc
 
 def _ab_rows(g: Graph, out: str, field: Field, count: int) -> CoreRows:
     """A p + B u for three vectors, from rows A, A, A, B, B, B, transmittance, gates."""
-    *ab, transmittance, gates = g.split(out, [1] * 7 + [count - 7] * (count > 7)) + [""] * (count == 7)
+    rows = g.split(out, [1] * count)
+    ab = rows[:6]
     # Vector by vector: products of two rows stay in the first-level cache, and nothing has to be taken apart later.
     vectors = [
         g.op("Add", g.op("Mul", a, field.p), g.op("Mul", b, field.u)) for a, b in zip(ab[:3], ab[3:], strict=True)
     ]
-    return CoreRows(vectors[0], vectors[1], vectors[2], transmittance, gates or None)
+    return CoreRows(vectors[0], vectors[1], vectors[2], rows[6], rows[7:])
 
 
 def _raw_polynomial(g: Graph, core: RawPolynomial, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
@@ -126,9 +127,8 @@ def _raw_polynomial(g: Graph, core: RawPolynomial, field: Field, vector_scale: A
     if field.dispersive:
         first.append(g.affine(field.weight[3:], field.squares, field.bias[3:]))
     out = add_polynomial(g, g.concat(*first), exponents, weight)
-    gates = len(weight) - 7
-    parts = g.split(out, [2, 2, 2, 1, gates] if gates else [2, 2, 2, 1])
-    return CoreRows(parts[0], parts[1], parts[2], parts[3], parts[4] if gates else None)
+    parts = g.split(out, [2, 2, 2, *[1] * (len(weight) - 6)])
+    return CoreRows(parts[0], parts[1], parts[2], parts[3], parts[4:])
 
 
 def _without_constants(

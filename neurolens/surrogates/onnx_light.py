@@ -17,7 +17,7 @@ from neurolens.surrogates.onnx_graph import INT32, Graph
 
 Array = NDArray[np.float64]
 
-# Any positive float32 test times this exceeds every status code, so that one minimum turns a failed test into its code.
+# Any positive float32 test times this exceeds every status code, so that clipping turns a failed test into its code.
 TEST_SCALE = 1e30
 SLACK = 1.00001  # of the domain's bounds, as in LensModel.inside_domain
 
@@ -132,10 +132,9 @@ def add_status(g: Graph, model: LensModel, rows: CoreRows, stop_square: str, ins
     """
     limit = g.op("Mul", g.op("Mul", "stop_radius_mm", "stop_radius_mm"), g.const([TEST_SCALE]))
     over = g.op("Sub", g.op("Mul", stop_square, g.const(TEST_SCALE)), limit)
-    failed = [g.op("Clip", over, g.const(0.0), g.const(float(st.blocked(model.lens.stop_index, st.RIM))))]
-    if rows.gates is not None:
-        codes = np.array([[float(gate.status)] for gate in model.gates])
-        failed += g.split(g.op("Min", rows.gates, g.const(codes)), [1] * len(codes))
+    tests = [(over, st.blocked(model.lens.stop_index, st.RIM))]
+    tests += [(row, gate.status) for row, gate in zip(rows.gates, model.gates, strict=True)]
+    failed = [g.op("Clip", test, g.const(0.0), g.const(float(code))) for test, code in tests]
     code = g.op("Max", *failed)
     code = g.op("Where", inside, code, g.const(float(st.OUTSIDE_DOMAIN)))
     g.reshape(g.op("Cast", code, to=INT32), [-1], out="status")
