@@ -23,7 +23,7 @@ _REASONS = {
 
 
 def blocked(surface: int, reason: int) -> int:
-    """Status of a ray that ends at `surface` (0-based, from the scene) for `reason` (MISSED, RIM or TOTAL_REFLECTION)."""
+    """Status of a ray that ends at `surface` (0-based, from the scene): MISSED, RIM or TOTAL_REFLECTION."""
     return 4 * (surface + 1) + reason
 
 

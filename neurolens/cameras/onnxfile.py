@@ -20,8 +20,8 @@ MAX_BYTES = 64 * 2**20
 CARD_KEY = "neurolens"
 KIND, SCHEMA = "neurolens.lens_model", 1
 OPERATORS = frozenset(
-    "Abs Add And Cast Clip Concat Cos Div Equal Gather Gemm GreaterOrEqual Identity LessOrEqual MatMul Max Min Mul Neg "
-    "Reciprocal ReduceSum Relu Reshape Sin Slice Split Sqrt Sub Tanh Where".split()
+    "Abs Add And Cast Clip Concat Cos Div Equal Gather Gemm Greater GreaterOrEqual Identity LessOrEqual MatMul Max Min "
+    "Mul Neg Reciprocal ReduceSum Relu Reshape Sin Slice Split Sqrt Sub Tanh Where".split()
 )
 # TensorProto.DataType: what models hold, and the numpy type of their raw bytes.
 _TYPES: dict[int, str] = {1: "<f4", 6: "<i4", 7: "<i8"}

@@ -28,6 +28,16 @@ from neurolens.surrogates.fit import ModelSettings, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 ROOT = Path(__file__).parents[2]
+_HEAD = """# Models that ship
+
+Made by `make models` from experiments/models.toml. Errors on held-out rays at full aperture (definition:
+`neurolens.evaluate.rays`); times on one core in onnxruntime, with stop, rims and transmittance; speed-up over the
+compiled exact tracer doing the same work in the same run. Coefficients: of one vector output for polynomials, all
+weights for networks. Check one with `neurolens evaluate models/FILE`, the speed of all with `make bench`.
+
+| model | RMS um | p99 um | direction RMS deg | false pass / block % | coefficients | kB | ns per ray | speed-up |
+|---|---|---|---|---|---|---|---|---|
+"""
 # The bench fails below this share of the speed-up measured here: machines and days differ, regressions differ more.
 PROMISE = 0.6
 _KEPT = (
@@ -107,21 +117,14 @@ def write_index(rows: list[dict[str, Any]], out: Path) -> None:
     """index.json and README.md."""
     index = {"schema": 1, "command": "make models", "versions": versions(), "models": rows}
     atomic_write_text(out / "index.json", json.dumps(index, indent=1, allow_nan=False) + "\n")
-    head = (
-        "# Models that ship\n\nMade by `make models` from experiments/models.toml; errors on held-out rays at full "
-        "aperture (definition: `neurolens.evaluate.rays`), times on one core in onnxruntime with stop, rims and transmittance, "
-        "speed-up over the compiled exact tracer doing the same work in the same run. Check a model with "
-        "`neurolens evaluate models/FILE`, all of them with `make bench`.\n\n"
-        "| model | RMS um | p99 um | direction RMS deg | false pass / block % | coefficients per vector | kB | "
-        "ns per ray | speed-up |\n|---|---|---|---|---|---|---|---|---|\n"
-    )
     lines = [
         f"| {r['file']} | {_n(r['rms_um'])} | {_n(r['p99_um'])} | {_n(r['direction_rms_deg'])} | "
         f"{_n(r['false_pass'], 100)} / {_n(r['false_block'], 100)} | "
-        f"{r['coefficients_per_vector'] or r['parameters']} | {r['bytes'] / 1000:.0f} | {_n((r['ns_per_ray'] or {}).get('min'))} | {_n(r['speedup_over_compiled'])} |"
+        f"{r['coefficients_per_vector'] or r['parameters']} | {r['bytes'] / 1000:.0f} | "
+        f"{_n((r['ns_per_ray'] or {}).get('min'))} | {_n(r['speedup_over_compiled'])} |"
         for r in rows
     ]
-    atomic_write_text(out / "README.md", head + "\n".join(lines) + "\n")
+    atomic_write_text(out / "README.md", _HEAD + "\n".join(lines) + "\n")
 
 
 def _n(value: float | None, factor: float = 1.0) -> str:

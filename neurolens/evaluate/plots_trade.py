@@ -196,7 +196,7 @@ def _plot_exact(axes: Any, exact: Sequence[Record]) -> None:
     axes.add_patch(Rectangle((0, 0), 1, _BAND, transform=axes.transAxes, fc="#eceef1", lw=0, zorder=0.5))
     missing = [str(r["name"]) + f": unavailable ({r.get('reason') or '–'})" for r in exact if not _exact_time(r)]
     words = "\n".join(["exact (no error)", *missing])
-    axes.text(0.008, _BAND / 2, words, transform=axes.transAxes, va="center", fontsize=8.2, color="#555b63")
+    axes.text(0.992, _BAND / 2, words, transform=axes.transAxes, va="center", ha="right", fontsize=8.2, color="#555b63")
     low, high = axes.get_ylim()
     for minor in (False, True):  # the band is no error: no ticks beside it
         axes.set_yticks(
@@ -209,7 +209,8 @@ def _plot_exact(axes: Any, exact: Sequence[Record]) -> None:
         height = _BAND * (0.5 if len(timed) < 3 else (0.3, 0.7)[index % 2])
         axes.axvline(time, color=INK, lw=0.9, ls=(0, (4, 3)), alpha=0.55, zorder=1)
         axes.plot([time], [height], "*", ms=12, color=INK, transform=across, zorder=4, clip_on=False)
-        side = -1 if index == 0 else 1  # the fastest is labelled to its left, so that two close tracers stay readable
+        # The fastest of two close tracers is labelled to its left, so that both stay readable.
+        side = -1 if index == 0 and len(timed) > 1 and timed[1][0] < 2 * time else 1
         axes.annotate(
             f"{name} {time:.3g} ns", (time, height), xycoords=across, xytext=(9 * side, 0), fontsize=8.4,
             textcoords="offset points", va="center", ha="right" if side < 0 else "left", zorder=5,

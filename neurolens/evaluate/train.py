@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,6 +15,7 @@ from neurolens.cameras.model import load_model
 from neurolens.config import to_dict, to_toml
 from neurolens.evaluate.candidates import exact_candidates, model_candidate
 from neurolens.evaluate.experiment import Experiment
+from neurolens.evaluate.gain import domain_facts, scene_gain
 from neurolens.evaluate.layout import layout_profile
 from neurolens.evaluate.measure import Measured, fit_and_measure
 from neurolens.evaluate.pictures import Pictures, render_all
@@ -27,8 +28,7 @@ from neurolens.files import atomic_write_text
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.progress import Progress
-from neurolens.render.scenefile import load_scene
-from neurolens.surrogates.domain import Domain, domain_from_camera
+from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.fit import Prepared, prepare
 from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs
 from neurolens.surrogates.threads import pinned_threads
@@ -73,7 +73,7 @@ def run_experiment(
                     fit_and_measure(prepared, settings, models, experiment.evaluation.vignetting_rays, report)
                 )
         timed = _race(experiment, prepared, measured, progress)
-        gain = _scene_gain(experiment, measured, folder, progress)
+        gain = scene_gain(experiment, folder / "models", progress)
         drawn = _render(experiment, lens, domain, measured, pictures, progress)
     results = {
         "title": experiment.title,
@@ -163,45 +163,6 @@ def _error(m: Measured) -> float:
     return float(value if value is not None else m.record.get("direction_rms_deg") or 1e9)
 
 
-def _scene_gain(
-    experiment: Experiment, measured: Sequence[Measured], folder: Path, progress: Progress
-) -> dict[str, Any] | None:
-    """The same model for the whole lens and for what one shot requires: error, size and time side by side."""
-    choice = experiment.scene_domain
-    if choice is None:
-        return None
-    scene = load_scene(choice.scene)
-    shot = scene.settings.camera
-    lens = experiment.lens.read()
-    whole_number = first_order(lens).f_number
-    with progress.stage("fit the scene's domain") as report:
-        shot_lens, shot_domain = domain_from_camera(
-            lens,
-            film_mm=(shot.film_width_mm, shot.film_height_mm),
-            focus_m=shot.focus_m,
-            f_number=max(shot.f_number or whole_number, whole_number),
-            wavelength_nm=shot.wavelengths_nm,
-        )
-        rows = []
-        models = folder / "models" / f"scene-{scene.name}"
-        models.mkdir(parents=True, exist_ok=True)
-        states = (("whole lens", lens, experiment.domain_of(lens)), (scene.name, shot_lens, shot_domain))
-        for name, state, domain in states:
-            prepared = prepare(make_pairs(state, domain, experiment.pairs))
-            place = models / name.replace(" ", "-")
-            place.mkdir(exist_ok=True)
-            m = fit_and_measure(prepared, choice.model, place, experiment.evaluation.vignetting_rays, report)
-            rows.append({**m.record, "domain": name, **_domain_facts(state, domain)})
-    return {"scene": scene.name, "text": _gain_text(rows), "rows": rows}
-
-
-def _gain_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    whole, scene = (row["rms_um"] for row in rows)
-    if not whole or not scene:
-        return ""
-    return f"The same {rows[0]['name']} fit has {whole:.3g} um RMS for the whole lens and {scene:.3g} um for this shot."
-
-
 def _draw(lens: Lens, domain: Domain, measured: Sequence[Measured], timed: Race, folder: Path) -> list[dict[str, Any]]:
     """Trade and layout plots."""
     records = [m.record for m in measured]
@@ -238,19 +199,10 @@ def _describe_lens(lens: Lens) -> dict[str, Any]:
     }
 
 
-def _domain_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
-    return {
-        "film_radius_mm": domain.film_radius_mm,
-        "f_number": first_order(lens).f_number,
-        "wavelength_nm": list(domain.wavelength_nm),
-        "focus_m": ["infinity" if f == float("inf") else f for f in domain.focus_m],
-    }
-
-
 def _describe_domain(lens: Lens, pairs: RayPairs) -> dict[str, Any]:
     domain = pairs.domain
     return {
-        **_domain_facts(lens, domain),
+        **domain_facts(lens, domain),
         "pupil_plane_z_mm": domain.pupil_z_mm,
         "pupil_radius_mm": domain.pupil_radius_mm,
         "pupil_disc_holds": pupil_disc_share(lens, domain),

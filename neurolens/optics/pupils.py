@@ -170,13 +170,14 @@ def image_radius_mm(lens: Lens) -> tuple[float, str]:
     f = first_order(lens).efl_mm
     if lens.half_field_deg is not None and lens.half_field_deg < 60:
         return f * math.tan(math.radians(lens.half_field_deg)), "f tan(half field)"
-    radii = torch.linspace(0, 3 * f, 241, dtype=torch.float64)
+    radii = torch.linspace(0, 3 * abs(f), 481, dtype=torch.float64)
     share, angle = _illumination(lens, radii)
-    lit = radii[share >= 0.1 * share[0]].max()
+    lit = float(radii[share >= 0.1 * share[0]].max())
     if lens.half_field_deg is not None:
-        reached = radii[(angle <= math.radians(lens.half_field_deg)) & (share > 0)].max()
-        return float(torch.minimum(reached, lit)), "traced to the half field"
-    return float(lit), "relative illumination of 10%"
+        reached = float(radii[(angle <= math.radians(lens.half_field_deg)) & (share > 0)].max())
+        if reached <= lit:
+            return reached, "traced to the half field"
+    return lit, "relative illumination of 10%"
 
 
 def _illumination(lens: Lens, radii: Tensor, points: int = 48) -> tuple[Tensor, Tensor]:

@@ -26,7 +26,7 @@ _LARGEST_CONDITION = 30.0
 
 @cache
 def _tables() -> FloatArray64:
-    """Columns wavelength_nm, x, y, z, d65, red, green, blue; made by tools/make_spectral_tables.py."""
+    """Columns wavelength_nm, x, y, z, d65, red, green, blue; made by experiments/make_spectral_tables.py."""
     text = resources.files("neurolens.render").joinpath("data/spectra.csv").read_text(encoding="utf-8")
     return np.array([[float(cell) for cell in line.split(",")] for line in text.splitlines()[1:]])
 

@@ -141,3 +141,37 @@ class Network:
     @cached_property
     def coefficients(self) -> int:
         return sum(w.numel() + b.numel() for w, b in (*self.hidden, self.output))
+
+
+@dataclass(frozen=True, eq=False)
+class Partitioned:
+    """Cores of zones of the light field, split by rho (the squared film radius): the published light-field partition.
+
+    Attributes:
+        edges: rising values of rho between zones.
+        parts: one core a zone, one more than edges.
+    """
+
+    edges: tuple[float, ...]
+    parts: tuple[InvariantPolynomial | RawPolynomial | Network, ...]
+
+    def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
+        vectors, scalars = self.parts[0](field)
+        rho = field.invariants()[0]
+        for edge, part in zip(self.edges, self.parts[1:], strict=True):
+            beyond = rho > edge
+            outer = part(field)
+            vectors, scalars = torch.where(beyond, outer[0], vectors), torch.where(beyond, outer[1], scalars)
+        return vectors, scalars
+
+    def to(self, dtype: torch.dtype) -> Partitioned:
+        return replace(self, parts=tuple(part.to(dtype) for part in self.parts))
+
+    @property
+    def coefficients_per_vector(self) -> int:
+        """Of all zones together."""
+        return sum(part.coefficients_per_vector for part in self.parts)
+
+    @property
+    def coefficients(self) -> int:
+        return sum(part.coefficients for part in self.parts)

@@ -6,17 +6,19 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Literal
+from typing import Literal, cast
 
 from neurolens import status as st
 from neurolens.errors import InputError, NeurolensWarning
-from neurolens.surrogates.cores import Basis
+from neurolens.surrogates.cores import Basis, Network
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.lightfield import Encoding, fit_encoding
 from neurolens.surrogates.mlp import fit_network
 from neurolens.surrogates.model import Core, Gate, LensModel
 from neurolens.surrogates.pairs import RayPairs, trace_pairs
 from neurolens.surrogates.paraxial import fit_paraxial
+from neurolens.surrogates.partition import ZoneCore, fit_partitioned
+from neurolens.surrogates.polynomial import Method as PolynomialMethod
 from neurolens.surrogates.polynomial import PolynomialSettings, fit_polynomial
 from neurolens.surrogates.targets import choose_gates, scales_of
 from neurolens.surrogates.threads import pinned_threads
@@ -35,6 +37,7 @@ class ModelSettings:
         name: of the file and of the table's row; made from the other settings where empty.
         method: "thin", "thick" (first order); "dense", "omp", "ols", "adaptive" (polynomials); "mlp".
         basis, terms, degree, replacement: see `PolynomialSettings`.
+        partitions: zones of the film with a fit of their own (polynomials and networks).
         units, layers: of the network. steps, seconds: its training ends by either; results repeat bit for bit where
             the steps end it.
         seed: of the network's first weights.
@@ -46,6 +49,7 @@ class ModelSettings:
     terms: int = 40
     degree: int = 7
     replacement: bool = True
+    partitions: int = 1
     units: int = 16
     layers: int = 2
     steps: int = 60
@@ -57,12 +61,13 @@ class ModelSettings:
         """The name, or one made from the settings: "ols-40", "raw-omp-80", "dense-d4", "mlp-16x2"."""
         if self.name:
             return self.name
+        zones = f"-{self.partitions}zones" if self.partitions > 1 else ""
         if self.method == "mlp":
-            return f"mlp-{self.units}x{self.layers}"
+            return f"mlp-{self.units}x{self.layers}{zones}"
         if self.method in ("thin", "thick"):
             return self.method
         size = f"d{self.degree}" if self.method == "dense" else str(self.terms)
-        return f"{'raw-' if self.basis == 'raw' else ''}{self.method}-{size}"
+        return f"{'raw-' if self.basis == 'raw' else ''}{self.method}-{size}{zones}"
 
     @property
     def family(self) -> str:
@@ -132,21 +137,39 @@ def _fit_core(prepared: Prepared, settings: ModelSettings, progress: Callable[[f
     pairs, encoding, gates = prepared.pairs, prepared.encoding, prepared.gates
     if settings.method == "thin" or settings.method == "thick":
         return fit_paraxial(pairs, encoding, gates, settings.method)
-    if settings.method == "mlp":
-        return fit_network(
-            pairs,
-            encoding,
-            gates,
-            units=settings.units,
-            layers=settings.layers,
-            seed=settings.seed,
-            seconds=settings.seconds,
-            steps=settings.steps,
-            progress=progress,
-        )
-    if settings.method not in POLYNOMIALS:
+    if settings.method not in (*POLYNOMIALS, "mlp"):
         raise InputError(
             "fit", "method", settings.method, f"one of {', '.join(('thin', 'thick', *POLYNOMIALS, 'mlp'))}"
         )
-    chosen = PolynomialSettings(settings.method, settings.basis, settings.terms, settings.degree, settings.replacement)
-    return fit_polynomial(pairs, encoding, gates, chosen)
+
+    def fit(zone: RayPairs) -> ZoneCore:
+        if settings.method == "mlp":
+            return _fit_network(zone, encoding, gates, settings, progress)
+        return fit_polynomial(zone, encoding, gates, _polynomial_settings(settings))
+
+    return fit_partitioned(pairs, encoding, settings.partitions, fit)
+
+
+def _polynomial_settings(settings: ModelSettings) -> PolynomialSettings:
+    method = cast(PolynomialMethod, settings.method)
+    return PolynomialSettings(method, settings.basis, settings.terms, settings.degree, settings.replacement)
+
+
+def _fit_network(
+    pairs: RayPairs,
+    encoding: Encoding,
+    gates: tuple[Gate, ...],
+    settings: ModelSettings,
+    progress: Callable[[float], None] | None,
+) -> Network:
+    return fit_network(
+        pairs,
+        encoding,
+        gates,
+        units=settings.units,
+        layers=settings.layers,
+        seed=settings.seed,
+        seconds=settings.seconds,
+        steps=settings.steps,
+        progress=progress,
+    )

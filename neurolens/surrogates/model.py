@@ -130,7 +130,8 @@ class LensModel:
         return Prediction(Rays(x, y, self._sag(x, y), dx, dy, dz), scalars[0], stop_x, stop_y, status)
 
     def _sag(self, x: Tensor, y: Tensor) -> Tensor:
-        c = float(self.lens.surfaces[0].curvature)
+        # First-order models give the position in the plane of the front vertex.
+        c = float(self.lens.surfaces[0].curvature) if self.direction == "angle" else 0.0
         square = (x * x + y * y) * c
         return square / (1 + torch.sqrt((1 - c * square).clamp_min(0.0)))
 

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.surrogates.cores import InvariantPolynomial, Network, RawPolynomial
+from neurolens.surrogates.cores import InvariantPolynomial, Network, Partitioned, RawPolynomial
 from neurolens.surrogates.model import Core
 from neurolens.surrogates.onnx_graph import Graph
 
@@ -67,6 +67,8 @@ def add_core(g: Graph, core: Core, field: Field, vector_scale: Array, gate_scale
         return _raw_polynomial(g, core, field, vector_scale, gate_scale)
     if isinstance(core, Network):
         return _network(g, core, field, vector_scale, gate_scale)
+    if isinstance(core, Partitioned):
+        return _partitioned(g, core, field, vector_scale, gate_scale)
     raise TypeError(f"no ONNX form for a core of type {type(core).__name__}")
 
 
@@ -129,6 +131,27 @@ def _raw_polynomial(g: Graph, core: RawPolynomial, field: Field, vector_scale: A
     out = add_polynomial(g, g.concat(*first), exponents, weight)
     parts = g.split(out, [2, 2, 2, *[1] * (len(weight) - 6)])
     return CoreRows(parts[0], parts[1], parts[2], parts[3], parts[4:])
+
+
+def _partitioned(g: Graph, core: Partitioned, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
+    """Every zone's core for every ray, and a choice by rho."""
+    rho = g.affine(field.weight[:1], field.squares, field.bias[:1])
+    chosen = add_core(g, core.parts[0], field, vector_scale, gate_scale)
+    for edge, part in zip(core.edges, core.parts[1:], strict=True):
+        beyond = g.op("Greater", rho, g.const(edge))
+        outer = add_core(g, part, field, vector_scale, gate_scale)
+
+        def choose(new: str, old: str, beyond: str = beyond) -> str:
+            return g.op("Where", beyond, new, old)
+
+        chosen = CoreRows(
+            choose(outer.position, chosen.position),
+            choose(outer.direction, chosen.direction),
+            choose(outer.stop, chosen.stop),
+            choose(outer.transmittance, chosen.transmittance),
+            [choose(a, b) for a, b in zip(outer.gates, chosen.gates, strict=True)],
+        )
+    return chosen
 
 
 def _without_constants(

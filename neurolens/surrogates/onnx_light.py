@@ -104,7 +104,7 @@ def _square(g: Graph, vector: str) -> str:
 def _sag(g: Graph, model: LensModel, r2: str) -> str:
     """z on the front surface at squared radius r2: a short series where it is weak, else R - sqrt(R^2 - r2)."""
     front = model.lens.surfaces[0]
-    c = float(front.curvature)
+    c = 0.0 if model.direction == "slope" else float(front.curvature)
     reach = (1.3 * front.semi_diameter_mm) ** 2
     if c * c * reach < 0.05:
         series = fit_series(lambda s: c * s / (1 + np.sqrt(1 - c * c * s)), reach, 1e-6)

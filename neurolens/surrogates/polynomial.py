@@ -30,7 +30,7 @@ from neurolens.surrogates.lightfield import Encoding, LightField
 from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate
 from neurolens.surrogates.pairs import RayPairs
 from neurolens.surrogates.selection import Sweep, forward, replace_terms
-from neurolens.surrogates.targets import Targets, film_equivalent_weights, gate_values, targets_of
+from neurolens.surrogates.targets import Targets, film_equivalent, gate_values, targets_of
 
 Method = Literal["dense", "omp", "ols", "adaptive"]
 
@@ -74,12 +74,6 @@ class FitData:
     def rim(self) -> LightField:
         return self.encoding(self.pairs.rim.inputs)
 
-    def film_equivalent(self, targets: Targets) -> Tensor:
-        """[2, 2, N] micrometres on the film: in the nearest focused plane, and at infinity."""
-        position, direction = film_equivalent_weights(self.pairs.lens, self.pairs.domain)
-        at_infinity = direction * targets.vectors[DIRECTION]
-        return torch.stack([at_infinity + position * targets.vectors[POSITION], at_infinity])
-
 
 def fit_polynomial(
     pairs: RayPairs, encoding: Encoding, gates: tuple[Gate, ...], settings: PolynomialSettings
@@ -107,7 +101,7 @@ def fit_polynomial(
 
 def _fit_invariant(data: FitData, settings: PolynomialSettings) -> InvariantPolynomial:
     train = data.train
-    invariants, outputs = train.field.invariants(), data.film_equivalent(train)
+    invariants, outputs = train.field.invariants(), film_equivalent(data.pairs.lens, data.pairs.domain, train.vectors)
     dispersive = data.encoding.w_half != 0
     exponents = invariant_exponents(settings.degree, dispersive=dispersive)
     if settings.method == "adaptive":

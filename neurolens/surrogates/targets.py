@@ -60,6 +60,13 @@ def film_equivalent_weights(lens: Lens, domain: Domain) -> tuple[float, float]:
     return 1000 * magnification * scales_of(lens).position_mm, 1000 * f
 
 
+def film_equivalent(lens: Lens, domain: Domain, vectors: Tensor) -> Tensor:
+    """[2, 2, N] micrometres on the film of vectors [3, 2, N]: in the nearest focused plane, and at infinity."""
+    position, direction = film_equivalent_weights(lens, domain)
+    at_infinity = direction * vectors[DIRECTION]
+    return torch.stack([at_infinity + position * vectors[POSITION], at_infinity])
+
+
 def gate_values(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
     """[G, N] exact values of the gates, positive where the surface stops the ray; NaN-free for rays that reach it."""
     rows = []

@@ -72,9 +72,10 @@ def test_errors_are_in_the_order_that_physics_gives(run: tuple[Path, dict]) -> N
 
 
 def test_less_to_model_is_modelled_better(run: tuple[Path, dict]) -> None:
-    whole, shot = run[1]["domain_gain"]["rows"]
+    whole, shot, half = run[1]["domain_gain"]["rows"]
     assert shot["film_radius_mm"] < whole["film_radius_mm"]
     assert shot["rms_um"] < whole["rms_um"]
+    assert half["coefficients_per_vector"] == shot["coefficients_per_vector"] / 2
 
 
 def test_resolved_configuration_runs_again_without_fitting(run: tuple[Path, dict]) -> None:

@@ -1,6 +1,6 @@
 """Make what the scenes in experiments/scenes load: knot.obj (a torus knot) and poster.png (a test picture).
 
-python tools/make_scene_assets.py
+python experiments/scenes/make_assets.py
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def poster(size: int = 384) -> np.ndarray:
 def main() -> None:
     """Write both files."""
     vertices, faces = knot()
-    lines = ["# A (2, 3) torus knot, made by tools/make_scene_assets.py"]
+    lines = ["# A (2, 3) torus knot, made by experiments/scenes/make_assets.py"]
     lines += ["v " + " ".join(f"{x:.4f}" for x in vertex) for vertex in vertices]
     lines += ["f " + " ".join(str(k + 1) for k in face) for face in faces]
     (TARGET / "knot.obj").write_text("\n".join(lines) + "\n", encoding="utf-8")

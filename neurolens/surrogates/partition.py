@@ -1,0 +1,69 @@
+"""Light-field partition: zones of the film with a fit of their own where one fit leaves the error high.
+
+After Zheng and Zheng 2017 (adaptive sparse polynomials) and NeuroLens 2017 (networks), which both split the space of
+rays. Zones are rings of the film, so that the rotational symmetry of the invariants survives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from neurolens.errors import InputError
+from neurolens.surrogates.cores import InvariantPolynomial, Network, Partitioned, RawPolynomial
+from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.pairs import PairSet, RayPairs
+from neurolens.surrogates.targets import film_equivalent, targets_of
+
+ZoneCore = InvariantPolynomial | RawPolynomial | Network
+# A zone's fit sees this share of rho beyond its edges, so that neighbours meet.
+OVERLAP = 0.03
+_FEWEST_RAYS = 200
+
+
+def fit_partitioned(
+    pairs: RayPairs, encoding: Encoding, zones: int, fit: Callable[[RayPairs], ZoneCore]
+) -> Partitioned | ZoneCore:
+    """Split the zone with the largest summed squared error in two halves of its rays, until there are `zones`.
+
+    Args:
+        fit: fits one core to the ray pairs of a zone.
+
+    Raises:
+        InputError: fewer than one zone, or zones with fewer than 200 training rays.
+    """
+    if zones < 1 or len(pairs.train) < zones * _FEWEST_RAYS:
+        most = max(1, len(pairs.train) // _FEWEST_RAYS)
+        raise InputError("fit", "partitions", zones, f"1 to {most} zones for {len(pairs.train)} training rays")
+    rho, rim_rho = (encoding(s.inputs).invariants()[0] for s in (pairs.train, pairs.rim))
+    bounds = [(-torch.inf, torch.inf)]
+    cores = [fit(pairs)]
+    while len(cores) < zones:
+        inside = [(rho > low) & (rho <= high) for low, high in bounds]
+        errors = [_squared_error(pairs, encoding, core, at) for core, at in zip(cores, inside, strict=True)]
+        worst = errors.index(max(errors))
+        low, high = bounds[worst]
+        middle = float(rho[inside[worst]].median())
+        halves = [(low, middle), (middle, high)]
+        bounds[worst : worst + 1] = halves
+        cores[worst : worst + 1] = [fit(_zone(pairs, rho, rim_rho, *half)) for half in halves]
+    if zones == 1:
+        return cores[0]
+    return Partitioned(tuple(high for _, high in bounds[:-1]), tuple(cores))
+
+
+def _squared_error(pairs: RayPairs, encoding: Encoding, core: ZoneCore, at: Tensor) -> float:
+    targets = targets_of(pairs.lens, encoding, pairs.train.select(at))
+    vectors, _ = core(targets.field)
+    found = film_equivalent(pairs.lens, pairs.domain, vectors)
+    return float(((found - film_equivalent(pairs.lens, pairs.domain, targets.vectors)) ** 2).sum())
+
+
+def _zone(pairs: RayPairs, rho: Tensor, rim_rho: Tensor, low: float, high: float) -> RayPairs:
+    def within(values: Tensor, rays: PairSet) -> PairSet:
+        return rays.select((values > low - OVERLAP) & (values <= high + OVERLAP))
+
+    return replace(pairs, train=within(rho, pairs.train), rim=within(rim_rho, pairs.rim))
