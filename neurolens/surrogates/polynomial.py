@@ -29,7 +29,7 @@ from neurolens.surrogates.growth import grow
 from neurolens.surrogates.lightfield import Encoding, LightField
 from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate
 from neurolens.surrogates.pairs import RayPairs
-from neurolens.surrogates.selection import Sweep, forward, replace_terms
+from neurolens.surrogates.selection import Sweep, forward, matching_pursuit, replace_terms
 from neurolens.surrogates.targets import Targets, film_equivalent, gate_values, targets_of
 
 Method = Literal["dense", "omp", "ols", "adaptive"]
@@ -204,5 +204,7 @@ def _raw_support(variables: Tensor, outputs: Tensor, settings: PolynomialSetting
         return exponents[chosen]
     exponents = raw_exponents(settings.degree, dispersive=dispersive)
     features = monomials(variables, exponents)
-    gram = (features @ features.T).numpy()
-    return exponents[_choose(Sweep(gram, (features @ outputs.T).numpy(), _squares(outputs)), settings)]
+    gram, moments = (features @ features.T).numpy(), (features @ outputs.T).numpy()
+    if settings.method == "omp" and len(outputs) == 1:
+        return exponents[matching_pursuit(gram, moments[:, 0], settings.terms)]
+    return exponents[_choose(Sweep(gram, moments, _squares(outputs)), settings)]

@@ -8,6 +8,7 @@ right-hand side its correlation with the residual.
 
 from __future__ import annotations
 
+import warnings
 from typing import Literal
 
 import numpy as np
@@ -71,6 +72,18 @@ class Sweep:
         t[k] = row / pivot * sign
         t[:, k] = t[k]
         t[k, k] = -1.0 / pivot
+
+
+def matching_pursuit(gram: Floats, moments: Floats, terms: int) -> list[int]:
+    """Support of plain orthogonal matching pursuit (scikit-learn's) for one output with products `moments` [M]."""
+    from sklearn.linear_model import orthogonal_mp_gram
+
+    norms = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    with warnings.catch_warnings():
+        # Dependent candidates end the pursuit early, with a warning: the terms found so far are the answer.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        found = orthogonal_mp_gram(gram / np.outer(norms, norms), moments / norms, n_nonzero_coefs=terms)
+    return [int(k) for k in np.flatnonzero(found)]
 
 
 def forward(sweep: Sweep, terms: int, rule: Rule = "ols", among: list[int] | None = None) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from neurolens.surrogates.bases import invariant_exponents, raw_exponents, solve, vector_columns, vector_gram
 from neurolens.surrogates.cores import monomials
 from neurolens.surrogates.lightfield import LightField
-from neurolens.surrogates.selection import Sweep, forward, replace_terms
+from neurolens.surrogates.selection import Sweep, forward, matching_pursuit, replace_terms
 
 Floats = NDArray[np.float64]
 
@@ -195,3 +195,13 @@ def test_solve_is_weighted_least_squares_and_survives_dependence() -> None:
     assert torch.isfinite(shared).all() and shared.abs().max() < 10
     best = np.linalg.lstsq(columns.T, outputs.T, rcond=None)[0].T @ columns
     np.testing.assert_allclose((shared @ twice).numpy(), best, rtol=0, atol=1e-9)
+
+
+def test_forward_omp_is_the_same_pursuit_as_scikit_learns() -> None:
+    rng = np.random.default_rng(5)
+    columns = rng.normal(size=(400, 40)) @ (np.eye(40) + 0.3 * rng.normal(size=(40, 40)))
+    output = columns[:, [2, 11, 17, 30]] @ np.array([3.0, -2.0, 1.5, 0.7]) + 0.01 * rng.normal(size=400)
+    gram, moments = columns.T @ columns, columns.T @ output
+    sweep = Sweep(gram, moments[:, None], np.array([output @ output]))
+    forward(sweep, 6, "omp")
+    assert sorted(sweep.chosen) == matching_pursuit(gram, moments, 6)
