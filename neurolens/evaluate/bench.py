@@ -16,21 +16,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from neurolens.cameras.model import load_model
-from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.errors import InputError, NeurolensError
-from neurolens.evaluate.candidates import camera_candidate, exact_candidates, model_candidate
+from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
 from neurolens.evaluate.layout import refractions
-from neurolens.evaluate.rays import frame_width_mm
 from neurolens.evaluate.speed import Race, race
 from neurolens.evaluate.speed_table import COMPILED, markdown, notes, table_rows
 from neurolens.files import atomic_write_text
 from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain, domain_of
 
@@ -97,11 +92,7 @@ def bench_models(folder: Path, only: str, threads: int, rounds: int, save: Save)
         candidates = exact_candidates(lens, domain)
         for name, model in models.items():
             candidates.append(model_candidate(name, model, domain.stop_radius_mm))
-        data = first_order(lens)
-        focal_mm, width_mm = abs(data.efl_mm), frame_width_mm(domain.film_radius_mm)
-        frame = (width_mm, width_mm * 2 / 3)
-        thin = ThinLens(focal_mm, data.f_number, np.inf, frame)
-        candidates += [camera_candidate(c, domain) for c in (thin, Pinhole(focal_mm, frame))]
+        candidates += ideal_cameras(lens, domain)
         timed = race(candidates, domain, threads=threads, rounds=rounds)
         outcome.rows += table_rows(state, timed)
         hold_to_promises(rows, timed, outcome)

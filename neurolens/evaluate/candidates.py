@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -9,7 +10,11 @@ import numpy as np
 import torch
 
 from neurolens.cameras.contract import Camera
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.thin import ThinLens
+from neurolens.evaluate.rays import frame_width_mm
 from neurolens.evaluate.speed import Call, Candidate, Unavailable
+from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import Traced, trace
@@ -90,6 +95,15 @@ def camera_candidate(camera: Camera, domain: Domain, name: str | None = None) ->
         return lambda: camera.sample(film, pupil, wavelength)
 
     return Candidate(name or camera.name, prepare)
+
+
+def ideal_cameras(lens: Lens, domain: Domain) -> list[Candidate]:
+    """Thin lens and pinhole of the lens's focal length, named "thin lens" and "pinhole"."""
+    data = first_order(lens)
+    focal, width = abs(data.efl_mm), frame_width_mm(domain.film_radius_mm)
+    frame = (width, width * 2 / 3)
+    thin, pinhole = ThinLens(focal, data.f_number, math.inf, frame), Pinhole(focal, frame)
+    return [camera_candidate(thin, domain, "thin lens"), camera_candidate(pinhole, domain, "pinhole")]
 
 
 def model_candidate(name: str, model: Any, stop_radius_mm: float) -> Candidate:

@@ -13,7 +13,7 @@ from typing import Any
 
 from neurolens.cameras.model import load_model
 from neurolens.config import to_dict, to_toml
-from neurolens.evaluate.candidates import exact_candidates, model_candidate
+from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
 from neurolens.evaluate.experiment import Experiment
 from neurolens.evaluate.gain import domain_facts, scene_gain
 from neurolens.evaluate.layout import layout_profile
@@ -33,6 +33,7 @@ from neurolens.surrogates.fit import Prepared, prepare
 from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs
 from neurolens.surrogates.threads import pinned_threads
 
+_IDEAL = ("thin lens", "pinhole")
 _PACKAGES = ("neurolens", "torch", "numpy", "onnxruntime", "onnx", "OpenEXR")
 
 
@@ -83,7 +84,7 @@ def run_experiment(
         "settings": to_dict(experiment),
         "models": [m.record for m in measured],
         "exact": [timed.record(name) for name in ("exact eager", "exact compiled") if _ran(timed, name)],
-        "cameras": drawn.cameras,
+        "cameras": [{"name": n, "ns_per_ray": timed.timing(n)} for n in _IDEAL] + drawn.cameras,
         "images": drawn.images,
         "domain_gain": gain,
         "figures": _draw(lens, domain, measured, timed, pictures) + drawn.figures,
@@ -116,8 +117,8 @@ def _race(experiment: Experiment, prepared: Prepared, measured: Sequence[Measure
     chosen, lens, domain = experiment.evaluation, prepared.pairs.lens, prepared.pairs.domain
     candidates = exact_candidates(lens, domain, compiled=chosen.compile_exact)
     for m in measured:
-        model = load_model(m.file, threads=chosen.threads)
-        candidates.append(model_candidate(m.settings.label, model, domain.stop_radius_mm))
+        candidates.append(model_candidate(m.settings.label, load_model(m.file), domain.stop_radius_mm))
+    candidates += ideal_cameras(lens, domain)
     with progress.stage("race for speed"):
         timed = race(candidates, domain, threads=chosen.threads, rounds=chosen.rounds)
     compiled = timed.timing("exact compiled")
