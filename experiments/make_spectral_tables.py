@@ -2,8 +2,8 @@
 
 Needs colour-science, which is no dependency of neurolens, so run it in an environment of its own:
 
-    python -m venv /tmp/spectra && /tmp/spectra/bin/pip install colour-science==0.4.7
-    /tmp/spectra/bin/python experiments/make_spectral_tables.py
+    python -m venv spectra && spectra/bin/pip install colour-science==0.4.7
+    spectra/bin/python experiments/make_spectral_tables.py
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-TARGET = Path(__file__).parent.parent / "experiments" / "scenes"
+TARGET = Path(__file__).parent
 
 
 def knot(around: int = 96, across: int = 10) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,89 @@
+"""The models that ship: each loads, stands for its lens and keeps on fresh rays what its index says."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from neurolens.cameras.model import OnnxLens, load_model
+from neurolens.evaluate.measure import onnx_predictor
+from neurolens.evaluate.rays import ray_errors
+from neurolens.evaluate.vignetting import vignetting_errors
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens
+from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs
+
+ROOT = Path(__file__).parents[1]
+ROWS: list[dict[str, Any]] = json.loads((ROOT / "models" / "index.json").read_text(encoding="utf-8"))["models"]
+# What is promised: file, figure, limit. Coefficients count A and B terms of one vector output.
+PROMISED = [
+    ("laikin_double_gauss_50.ols-28.onnx", "rms_um", 2.0),
+    ("laikin_double_gauss_50.ols-28.onnx", "coefficients_per_vector", 40),
+    ("laikin_double_gauss_50.ols-60.onnx", "rms_um", 0.25),
+    ("laikin_double_gauss_50.ols-60.onnx", "coefficients_per_vector", 100),
+    ("laikin_double_gauss_50.mlp-16x2.onnx", "rms_um", 0.75),
+    ("laikin_double_gauss_50.mlp-32x2.onnx", "rms_um", 0.35),
+    ("laikin_double_gauss_50.ols-60.onnx", "false_pass", 0.002),
+    ("laikin_double_gauss_50.ols-60.onnx", "false_block", 0.002),
+    ("muller_fisheye_100-14mm.ols-40.onnx", "direction_rms_deg", 0.001),
+    ("muller_fisheye_100-14mm.mlp-16x2.onnx", "direction_rms_deg", 0.0003),
+    ("ogawa_zoom_70_200-72mm.ols-60.onnx", "rms_um", 0.6),
+    ("ogawa_zoom_70_200-72mm.mlp-32x2.onnx", "rms_um", 1.0),
+]
+
+
+@cache
+def model(file: str) -> OnnxLens:
+    return load_model(ROOT / "models" / file)
+
+
+@cache
+def exact(lens_file: str, configuration: str | None, efl_mm: float | None) -> Lens:
+    return read_lens(ROOT / lens_file).at(configuration=configuration, efl_mm=efl_mm)
+
+
+@cache
+def fresh_rays(file: str) -> tuple[Lens, Domain, PairSet]:
+    row = next(r for r in ROWS if r["file"] == file)
+    lens = exact(row["lens_file"], row["configuration"], row["efl_mm"])
+    domain = Domain.from_dict(model(file).card["domain"])
+    pairs = make_pairs(lens, domain, PairSettings(train=1, held_out=4000, rim=1, seed=424_243))
+    return lens, domain, pairs.held_out
+
+
+@pytest.mark.parametrize(("file", "figure", "limit"), PROMISED)
+def test_index_holds_what_is_promised(file: str, figure: str, limit: float) -> None:
+    row = next(r for r in ROWS if r["file"] == file)
+    assert row[figure] is not None and row[figure] <= limit
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda r: r["file"])
+def test_model_keeps_its_index_on_fresh_rays(row: dict[str, Any]) -> None:
+    lens, domain, rays = fresh_rays(row["file"])
+    assert model(row["file"]).card["lens"]["sha256"] == lens.sha256
+    errors = ray_errors(lens, domain, rays, onnx_predictor(model(row["file"])))
+    # 4000 rays know a root mean square to a few per cent; its heavy tail to a few more.
+    for figure in ("rms_um", "direction_rms_deg", "position_rms_um"):
+        assert errors[figure] <= 1.25 * row[figure], figure
+
+
+@pytest.mark.parametrize("closed", [1, 2, 4])
+def test_stopped_down_needs_no_new_fit(closed: int) -> None:
+    file = "laikin_double_gauss_50.ols-60.onnx"
+    lens, domain, _ = fresh_rays(file)
+    radius = domain.stop_radius_mm / 2 ** (closed / 2)
+    shares = vignetting_errors(lens, domain, onnx_predictor(model(file)), stop_radius_mm=radius, count=60_000)
+    assert shares["false_pass"] <= 0.002 and shares["false_block"] <= 0.002
+
+
+def test_every_lens_ships_a_polynomial_and_a_network() -> None:
+    states: dict[tuple[str, str | None], set[bool]] = {}
+    for row in ROWS:
+        states.setdefault((row["lens_file"], row["configuration"]), set()).add(row["model"].startswith("mlp"))
+    assert len(states) == 8 and all(kinds == {True, False} for kinds in states.values())
+    assert sum(f.stat().st_size for f in (ROOT / "models").glob("*.onnx")) < 5e6
