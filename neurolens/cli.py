@@ -54,15 +54,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         package = (error.name or "").partition(".")[0]
         if package not in _TRAIN_PACKAGES:
             raise
-        return _fail(f"this needs {package}, which is not installed: pip install 'neurolens[train]'")
+        return _fail(f"this needs {package}, which is not installed: pip install '.[train]' in the project's folder")
     except BrokenPipeError:
         # The reader (head, less) has left; the interpreter must not complain again while it flushes stdout.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _BROKEN_PIPE
     except OSError as error:
-        if error.filename is None:
-            raise
-        return _fail(f"{error.filename}: {error.strerror}")
+        # A full disk names no file.
+        place = "" if error.filename is None else f"{error.filename}: "
+        return _fail(f"{place}{error.strerror or error}")
     except KeyboardInterrupt:
         print(f"\nneurolens: interrupted; {args.kept}", file=sys.stderr)
         return _INTERRUPTED

@@ -35,6 +35,21 @@ def positive(unit: str, *, infinite: bool = False) -> Callable[[str], float]:
     return convert
 
 
+def between(low: float, high: float, unit: str) -> Callable[[str], float]:
+    """Type of an argument that is a number from `low` to `high`."""
+
+    def convert(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:  # false for NaN
+            raise argparse.ArgumentTypeError(f"got {text!r}, expected {unit} from {low:g} to {high:g}")
+        return value
+
+    return convert
+
+
 def whole(least: int, most: int | None = None) -> Callable[[str], int]:
     """Type of an argument that is an integer from `least` to `most`."""
 

@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.cameras.model import load_model
     from neurolens.evaluate.check import check_model, lens_of_card
 
-    model = load_model(args.model, threads=args.threads)
+    model = load_model(args.model)  # on one thread: the race shares out batches
     lens = lens_of_card(model.card, args.lens, args.model)
     progress = Progress({"measure": 10, "time": 2}, quiet=args.quiet)
     with progress.stage("measure"):

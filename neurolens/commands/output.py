@@ -7,18 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-
-def plain(value: Any) -> Any:
-    """`value` as JSON has it: paths as text, infinity as "infinity", NaN as null, arrays as lists."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None if math.isnan(value) else "infinity" if value > 0 else "-infinity"
-    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+from neurolens.evaluate.records import plain
 
 
 def print_json(data: Mapping[str, Any]) -> None:

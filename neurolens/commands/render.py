@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
-from neurolens.commands.arguments import add_json, add_lens_state, whole
-from neurolens.commands.output import plain, print_json
+from neurolens.commands.arguments import add_json, add_lens_state, between, whole
+from neurolens.commands.output import print_json
 from neurolens.errors import InputError
+from neurolens.evaluate.records import plain
 from neurolens.progress import Progress, duration
 
 if TYPE_CHECKING:
@@ -63,8 +64,9 @@ def add_parser(subparsers: Any) -> None:
     picture.add_argument("--max-depth", metavar="N", type=whole(1, 1000), help="bounces (default: the scene's)")
     picture.add_argument("--half", action="store_true", help="16-bit floats in the EXR (default: 32-bit)")
     picture.add_argument(
-        "--exposure", metavar="STOPS", type=float, default=0.0, help="brightens the preview only (default: 0)"
-    )
+        "--exposure", metavar="STOPS", type=between(-40, 40, "stops"), default=0.0,
+        help="brightens the preview only (default: 0)",
+    )  # fmt: skip
     add_lens_state(
         parser,
         {

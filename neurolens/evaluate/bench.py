@@ -2,7 +2,8 @@
 
 Races each model of models/ against the exact tracer of its lens, the thin lens and the pinhole, all in one run, writes
 the table to experiments/results/, and fails when a model is slower, relative to the compiled exact tracer, than
-models/index.json promises. `--trace` times the exact tracer alone on every lens file.
+models/index.json promises, or when tracer or renderer fall below their floors (`floors`). `--trace`
+times the exact tracer alone on every lens file.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import json
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +22,15 @@ import torch
 from neurolens.cameras.model import load_model
 from neurolens.errors import InputError, NeurolensError
 from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
+from neurolens.evaluate.floors import Floor, check_floors, floor_table
 from neurolens.evaluate.layout import refractions
+from neurolens.evaluate.project import project_root
 from neurolens.evaluate.speed import Race, race
 from neurolens.evaluate.speed_table import COMPILED, markdown, notes, table_rows
 from neurolens.files import atomic_write_text
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain, domain_of
-
-ROOT = Path(__file__).parents[2]
 
 
 @dataclass
@@ -40,12 +41,14 @@ class Outcome:
         rows: one a candidate, with units in the keys.
         missed: promises that were not kept, in words.
         checked, unchecked: promises held against a measurement, and those that could not be.
+        floors: of the tracer and the renderer.
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     missed: list[str] = field(default_factory=list)
     checked: int = 0
     unchecked: list[str] = field(default_factory=list)
+    floors: list[Floor] = field(default_factory=list)
 
 
 Save = Callable[[Outcome], None]
@@ -73,8 +76,8 @@ def read_index(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def bench_models(folder: Path, only: str, threads: int, rounds: int, save: Save) -> Outcome:
-    """Race the models of an index, lens by lens; `save` what there is after each."""
+def bench_models(root: Path, folder: Path, only: str, threads: int, rounds: int, save: Save) -> Outcome:
+    """Race the models of an index, lens by lens, their lens files below `root`; `save` what there is after each."""
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in read_index(folder):
         if only in row["file"]:
@@ -85,7 +88,7 @@ def bench_models(folder: Path, only: str, threads: int, rounds: int, save: Save)
     for (lens_file, configuration, efl_mm), rows in groups.items():
         state = " ".join([Path(lens_file).stem, *([str(configuration)] if configuration else [])])
         _say(f"{state}: compiling and timing, {len(rows)} models ...")
-        lens = read_lens(ROOT / lens_file).at(configuration=configuration, efl_mm=efl_mm)
+        lens = read_lens(root / lens_file).at(configuration=configuration, efl_mm=efl_mm)
         models = {row["file"]: load_model(folder / row["file"], lens.sha256) for row in rows}
         domain = Domain.from_dict(next(iter(models.values())).card["domain"])
         lens = lens.with_stop_radius(domain.stop_radius_mm)
@@ -120,10 +123,12 @@ def hold_to_promises(rows: Sequence[dict[str, Any]], timed: Race, outcome: Outco
             outcome.missed.append(f"{row['file']}: {best:.3g} times the compiled exact tracer, promised {promised:g}")
 
 
-def bench_trace(only: str, rounds: int, threads: Sequence[int], dtypes: Sequence[torch.dtype], save: Save) -> Outcome:
+def bench_trace(
+    root: Path, only: str, rounds: int, threads: Sequence[int], dtypes: Sequence[torch.dtype], save: Save
+) -> Outcome:
     """Race the exact tracer on every lens file: tracing alone by precision, and all that a camera needs."""
     outcome = Outcome()
-    for path in sorted((ROOT / "lenses").glob("*.toml")):
+    for path in sorted((root / "lenses").glob("*.toml")):
         if only not in path.stem:
             continue
         lens = read_lens(path).at()
@@ -157,42 +162,70 @@ def _say(text: str) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command: 0 where every promise that could be checked is kept, 1 where one is not, 2 for bad input."""
-    parser = argparse.ArgumentParser(prog="python -m neurolens.evaluate.bench", description=__doc__)
-    parser.add_argument("--models", type=Path, default=ROOT / "models", help="folder with index.json")
-    parser.add_argument("--only", default="", help="models (with --trace: lens files) whose names hold this text")
-    parser.add_argument("--threads", type=int, default=1, help="workers that share out batches (default 1)")
-    parser.add_argument("--rounds", type=int, default=20, help="times that each candidate is timed (default 20)")
-    parser.add_argument("--out", type=Path, default=ROOT / "experiments" / "results", help="folder for the tables")
-    parser.add_argument(
-        "--trace", action="store_true", help="the exact tracer alone, 1 and 2 threads, float32 and float64"
-    )
-    a = parser.parse_args(argv)
+    """The command: 0 where all that could be checked is kept, 1 where something is not, 2 for bad input."""
+    a = _parser().parse_args(argv)
     warnings.simplefilter("ignore")
     name, title = ("trace", "The exact tracer") if a.trace else ("bench", "Models against the exact tracer")
     threads = "1 and 2 threads" if a.trace else f"{a.threads} thread" + "s" * (a.threads > 1)
 
-    def save(outcome: Outcome) -> None:
-        a.out.mkdir(parents=True, exist_ok=True)
-        atomic_write_text(a.out / f"{name}.md", markdown(title, notes(threads, a.rounds), outcome.rows))
-        atomic_write_text(a.out / f"{name}.json", json.dumps({"rows": outcome.rows}, indent=1) + "\n")
+    def page(outcome: Outcome) -> str:
+        floors = f"\n## Floors\n\n{floor_table(outcome.floors)}" if outcome.floors else ""
+        return markdown(title, notes(threads, a.rounds), outcome.rows) + floors
 
     try:
+        root = project_root()
+        out = a.out or root / "experiments" / "results"
+
+        def save(outcome: Outcome) -> None:
+            out.mkdir(parents=True, exist_ok=True)
+            atomic_write_text(out / f"{name}.md", page(outcome))
+            data = {"rows": outcome.rows, "floors": [{**asdict(f), "verdict": f.verdict} for f in outcome.floors]}
+            atomic_write_text(out / f"{name}.json", json.dumps(data, indent=1) + "\n")
+
         if a.trace:
-            outcome = bench_trace(a.only, a.rounds, (1, 2), (torch.float32, torch.float64), save)
+            outcome = bench_trace(root, a.only, a.rounds, (1, 2), (torch.float32, torch.float64), save)
         else:
-            outcome = bench_models(a.models, a.only, a.threads, a.rounds, save)
+            outcome = bench_models(root, a.models or root / "models", a.only, a.threads, a.rounds, save)
+            if not a.only:
+                _say("floors of the tracer and the renderer ...")
+                outcome.floors = check_floors(root, a.rounds)
+                save(outcome)
     except NeurolensError as error:
         print(error, file=sys.stderr)
         return 2
-    print(markdown(title, notes(threads, a.rounds), outcome.rows))
+    print(page(outcome))
+    return 0 if a.trace else verdict(outcome)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m neurolens.evaluate.bench", description=__doc__)
+    parser.add_argument("--models", type=Path, help="folder with index.json (default: the project's models/)")
+    parser.add_argument(
+        "--only", default="", help="models (with --trace: lens files) whose names hold this text; no floors then"
+    )
+    parser.add_argument("--threads", type=int, default=1, help="workers that share out batches (default 1)")
+    parser.add_argument("--rounds", type=int, default=20, help="times that each candidate is timed (default 20)")
+    parser.add_argument("--out", type=Path, help="folder for the tables (default: the project's experiments/results)")
+    parser.add_argument(
+        "--trace", action="store_true", help="the exact tracer alone, 1 and 2 threads, float32 and float64"
+    )
+    return parser
+
+
+def verdict(outcome: Outcome) -> int:
+    """Print what was kept, missed and not checked; 1 where a promise or a floor was missed."""
     for line in outcome.unchecked:
         print(f"not checked: {line}")
     for line in outcome.missed:
         print(f"SLOWER THAN PROMISED: {line}", file=sys.stderr)
-    if not a.trace:
-        print(f"{outcome.checked - len(outcome.missed)} of {outcome.checked + len(outcome.unchecked)} promises kept")
-    return 1 if outcome.missed else 0
+    below = [f for f in outcome.floors if f.verdict == "FAIL"]
+    for f in below:
+        print(f"BELOW ITS FLOOR: {f.name}: {f.measured:.3g} {f.unit}, at least {f.floor:g}", file=sys.stderr)
+    print(f"{outcome.checked - len(outcome.missed)} of {outcome.checked + len(outcome.unchecked)} promises kept")
+    if outcome.unchecked and not outcome.checked:
+        reason = outcome.unchecked[0].partition(": ")[2]
+        print(f"UNCHECKED: no promise could be checked here ({reason})", file=sys.stderr)
+    return 1 if outcome.missed or below else 0
 
 
 if __name__ == "__main__":

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,6 +20,21 @@ from neurolens.surrogates.pairs import PairSettings
 
 # Near limit where none is stated: 14 focal lengths, 0.7 m for a 50 mm lens.
 NEAR_LIMIT_FOCAL_LENGTHS = 14
+
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+
+
+def check_names(field: str, names: Sequence[str]) -> None:
+    """Refuse names that could not be those of files: a name becomes part of a path.
+
+    Raises:
+        InputError: a name with other than letters, digits, dots, underscores and dashes, or that starts with a mark.
+    """
+    for name in names:
+        if not _NAME.fullmatch(name):
+            expected = "a name of letters, digits, '.', '_' and '-', a letter or digit first"
+            raise InputError("settings", field, name, expected)
 
 
 @dataclass(frozen=True)
@@ -69,7 +86,7 @@ class RenderChoice:
     Attributes:
         scenes: scene files.
         models: names of the models that render; empty: the best polynomial and the best network.
-        width, height, samples: of each picture; the height follows the film's shape where it is left out.
+        width, height, samples: of each picture, whose shape must be that of the scenes' film.
         seeds: renders of each camera, so that errors have a noise floor; at least 4.
         threads: workers.
     """
@@ -111,6 +128,9 @@ class Experiment:
 
     def __post_init__(self) -> None:
         labels = [m.label for m in self.model]
+        check_names("model", labels)
+        if self.scene_domain is not None:
+            check_names("scene_domain.model", [self.scene_domain.model.label])
         twice = sorted({n for n in labels if labels.count(n) > 1})
         if not labels or twice:
             raise InputError("settings", "model", labels, "at least one [[model]], and names that differ")
@@ -147,6 +167,25 @@ def read_experiment(path: str | Path, overrides: Sequence[str] = ()) -> Experime
         lens=lens,
         render=replace(experiment.render, scenes=scenes),
         scene_domain=None if gain is None else replace(gain, scene=folder / gain.scene),
+    )
+
+
+def relative_to(experiment: Experiment, folder: Path) -> Experiment:
+    """The same experiment with its files named relative to `folder`, as `read_experiment` takes a file's there."""
+
+    def moved(path: Path) -> Path:
+        place = path.parent.resolve() / path.name
+        try:
+            return Path(os.path.relpath(place, folder.resolve()))
+        except ValueError:  # another drive
+            return place
+
+    gain = experiment.scene_domain
+    return replace(
+        experiment,
+        lens=replace(experiment.lens, file=moved(experiment.lens.file)),
+        render=replace(experiment.render, scenes=tuple(moved(s) for s in experiment.render.scenes)),
+        scene_domain=None if gain is None else replace(gain, scene=moved(gain.scene)),
     )
 
 

@@ -116,7 +116,7 @@ def flip_map(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DE
     try:
         import flip_evaluator
     except ImportError as error:
-        raise NeurolensError('FLIP needs flip-evaluator: pip install "neurolens[train]"') from error
+        raise NeurolensError("FLIP needs flip-evaluator: pip install '.[train]' in the project's folder") from error
     shown_a, shown_b = (np.ascontiguousarray(to_srgb(x, settings.exposure), dtype=np.float32) for x in (a, b))
     errors, _, _ = flip_evaluator.evaluate(
         shown_b,

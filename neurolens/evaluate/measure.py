@@ -31,6 +31,8 @@ from neurolens.surrogates.pairs import PairSet
 _RAY_KEYS = (
     "rms_um p99_um max_um rms_infinity_um rms_px direction_rms_deg position_rms_um transmittance_rms transmittance_max"
 ).split()
+# Added to the seed of the fit's rays: the same seed would give the very rays that the rims were fitted to.
+FRESH = 104729
 _VIGNETTING_KEYS = ("false_pass", "false_block", "false_pass_near_rim", "false_block_near_rim")
 
 
@@ -59,12 +61,15 @@ def onnx_predictor(model: OnnxLens) -> Any:
 
 
 def measure_errors(
-    model: OnnxLens, lens: Lens, domain: Domain, held_out: PairSet, vignetting_rays: int
+    model: OnnxLens, lens: Lens, domain: Domain, held_out: PairSet, vignetting_rays: int, seed: int
 ) -> dict[str, float | None]:
-    """Errors of an exported model on held-out rays, NaN written as None; keys with units."""
+    """Errors of an exported model on held-out rays, NaN written as None; keys with units.
+
+    `seed` is of the rays that test the vignetting; it must not be that of the fit's pairs.
+    """
     predict = onnx_predictor(model)
     rays = ray_errors(lens, domain, held_out, predict)
-    vignetting = vignetting_errors(lens, domain, predict, count=vignetting_rays)
+    vignetting = vignetting_errors(lens, domain, predict, count=vignetting_rays, seed=seed)
     found = {k: rays[k] for k in _RAY_KEYS} | {k: vignetting[k] for k in _VIGNETTING_KEYS}
     return {k: None if v is None or not math.isfinite(v) else v for k, v in found.items()}
 
@@ -84,7 +89,8 @@ def fit_and_measure(
     pairs = prepared.pairs
     model = fit_model(prepared, settings, report)
     export_onnx(model, file, errors={})
-    errors = measure_errors(load_model(file), pairs.lens, pairs.domain, pairs.held_out, vignetting_rays)
+    seed = pairs.settings.seed + FRESH
+    errors = measure_errors(load_model(file), pairs.lens, pairs.domain, pairs.held_out, vignetting_rays, seed)
     export_onnx(model, file, errors=errors)
     start = time.perf_counter()
     load_model(file)
@@ -95,14 +101,15 @@ def fit_and_measure(
         "family": settings.family,
         "variables": settings.basis,
         "file": f"models/{file.name}",
-        **{("rms_inf_um" if k == "rms_infinity_um" else k): v for k, v in errors.items()},
+        **errors,
         "coefficients_per_vector": None if network else model.core.coefficients_per_vector,
         "parameters": model.core.coefficients,
         "bytes": file.stat().st_size,
         "fit_s": model.fit_s,
         "load_s": load_s,
     }
-    atomic_write_text(note, json.dumps({"fingerprint": fingerprint, "record": record}, indent=1))
+    made = {"fingerprint": fingerprint, "sha256": _sha256(file), "record": record}
+    atomic_write_text(note, json.dumps(made, indent=1))
     return Measured(settings, file, record)
 
 
@@ -119,10 +126,15 @@ def _fingerprint(prepared: Prepared, settings: ModelSettings, vignetting_rays: i
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
 
 
+def _sha256(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
 def _known_record(note: Path, file: Path, fingerprint: str) -> dict[str, Any] | None:
-    """The record of an earlier, finished fit of the very same settings."""
+    """The record of an earlier, finished fit of the very same settings, whose model is still as it was written."""
     try:
         data = json.loads(note.read_text(encoding="utf-8"))
-        return data["record"] if data["fingerprint"] == fingerprint and file.exists() else None
+        same = data["fingerprint"] == fingerprint and data["sha256"] == _sha256(file)
+        return data["record"] if same else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

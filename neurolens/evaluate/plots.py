@@ -2,6 +2,14 @@
 
 from neurolens.evaluate.plots_image import image_caption, side_by_side
 from neurolens.evaluate.plots_lens import lens_layout
+from neurolens.evaluate.plots_light import illumination_plot
 from neurolens.evaluate.plots_trade import error_against_coefficients_plot, pareto_plot
 
-__all__ = ["error_against_coefficients_plot", "image_caption", "lens_layout", "pareto_plot", "side_by_side"]
+__all__ = [
+    "error_against_coefficients_plot",
+    "illumination_plot",
+    "image_caption",
+    "lens_layout",
+    "pareto_plot",
+    "side_by_side",
+]

@@ -140,5 +140,5 @@ def _matplotlib() -> Any:
     try:
         import matplotlib
     except ImportError as error:
-        raise NeurolensError('plots need matplotlib: pip install "neurolens[train]"') from error
+        raise NeurolensError("plots need matplotlib: pip install '.[train]' in the project's folder") from error
     return matplotlib

@@ -2,7 +2,7 @@
 
 Every key is optional but `name`: what was not measured is absent or null, never a made-up number. Shares
 (`false_pass`, `camera_share`, ...) are fractions of 1. Errors are those of surrogates.md, "Error, defined once".
-JSON has no infinity: focus at infinity is the text "infinity".
+JSON has no infinity: focus at infinity is the text "infinity"; a number that is not one (NaN) is null.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class ModelRecord(TypedDict, total=False):
     rms_um: float | None  # film-equivalent error, focused plane, rays to 60 degrees from the axis
     p99_um: float | None
     max_um: float | None
-    rms_inf_um: float | None  # the same for the plane at infinity
+    rms_infinity_um: float | None  # the same for the plane at infinity
     rms_px: float | None  # at pixel_um of the domain
     direction_rms_deg: float | None
     position_rms_um: float | None  # distance from the predicted point to the exact ray
@@ -51,6 +51,7 @@ class ModelRecord(TypedDict, total=False):
     false_block: float | None  # blocked by the model, passed by the lens / passed by the lens
     false_pass_near_rim: float | None  # within 2% of a rim; false_block_near_rim likewise
     false_block_near_rim: float | None
+    stopped_down: dict[str, dict[str, float | None]]  # "2_stops", "4_stops" closed, same fit: false_pass, false_block
     coefficients_per_vector: int | None  # A and B terms both count; a raw basis: all scalars of the vector
     parameters: int | None  # of the whole model: coefficients or weights, rims included
     bytes: int | None
@@ -94,7 +95,6 @@ class ImageRecord(TypedDict, total=False):
     camera: str
     file_png: str
     file_exr: str
-    file_error_png: str
     samples: int
     flip: float | None
     rel_mse: float | None
@@ -172,39 +172,26 @@ def check_results(results: Mapping[str, Any], file: str | Path = "results") -> N
 
 
 def write_results(path: str | Path, results: Mapping[str, Any]) -> None:
-    """Write `results.json` whole or not at all; numbers that are not finite become null, as JSON has no NaN."""
+    """Write `results.json` whole or not at all; see `plain`."""
     check_results(results, path)
-    versioned = {"schema_version": SCHEMA_VERSION, **_plain(results)}
+    versioned = {"schema_version": SCHEMA_VERSION, **plain(results)}
     atomic_write_text(path, json.dumps(versioned, indent=1, allow_nan=False) + "\n")
 
 
-def read_results(path: str | Path) -> dict[str, Any]:
-    """Read what `write_results` wrote.
+def plain(value: Any) -> Any:
+    """`value` with only what JSON knows: scalars and arrays of numpy and torch as numbers and lists, paths as text.
 
-    Raises:
-        InputError: not JSON, another schema version, or another shape.
+    Infinity is the text "infinity" or "-infinity", NaN is null.
     """
-    try:
-        results = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(path, "file", f"({error})", "results.json of a neurolens run") from error
-    check_results(results, path)
-    if results.get("schema_version") != SCHEMA_VERSION:
-        raise InputError(path, "schema_version", results.get("schema_version"), str(SCHEMA_VERSION))
-    return dict(results)
-
-
-def _plain(value: Any) -> Any:
-    """`value` with only what JSON knows: numpy and torch scalars and arrays as numbers and lists, paths as text."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if hasattr(value, "tolist"):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if value is None or isinstance(value, bool | int | str) else str(value)
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else "infinity" if value > 0 else "-infinity"
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
 def number(record: Mapping[str, Any], key: str) -> float | None:

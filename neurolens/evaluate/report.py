@@ -23,6 +23,7 @@ _MODEL_COLUMNS: tuple[Column, ...] = (
     ("error RMS (µm)", "rms_um", 1, 3),
     ("p99 (µm)", "p99_um", 1, 3),
     ("max (µm)", "max_um", 1, 3),
+    ("RMS at infinity (µm)", "rms_infinity_um", 1, 3),
     ("direction RMS (°)", "direction_rms_deg", 1, 2),
     ("time min (ns/ray)", "ns_per_ray.min", 1, 3),
     ("speed-up over compiled exact", "speedup_over_compiled", 1, 3),
@@ -35,6 +36,11 @@ _MODEL_COLUMNS: tuple[Column, ...] = (
     ("size (kB)", "bytes", 1e-3, 3),
     ("fit (s)", "fit_s", 1, 3),
     ("break-even (Mray)", "break_even_rays", 1e-6, 3),
+)
+_STOPPED_COLUMNS: tuple[Column, ...] = tuple(
+    (f"{stops} stops closed: {what} (%)", f"stopped_down.{stops}_stops.{key}", 100, 2)
+    for stops in (2, 4)
+    for what, key in (("false pass", "false_pass"), ("false block", "false_block"))
 )
 _EXACT_COLUMNS: tuple[Column, ...] = (
     ("time min (ns/ray)", "ns_per_ray.min", 1, 3),
@@ -186,7 +192,11 @@ def _models(results: Mapping[str, Any]) -> str:
         "★ no other model is both faster and closer."
     )
     notes = [f"{m['name']}: {m['note']}" for m in models if m.get("note")]
-    return table(names, models, _MODEL_COLUMNS) + _notes([note, *notes] if models else [])
+    stopped = [m for m in models if m.get("stopped_down")]
+    closed = table([str(m["name"]) for m in stopped], stopped, _STOPPED_COLUMNS)
+    told = _notes([note, *notes] if models else [])
+    below = f"<h3>The same fits, stopped down</h3>{closed}" if closed else ""
+    return table(names, models, _MODEL_COLUMNS) + told + below
 
 
 def _exact(results: Mapping[str, Any]) -> str:
@@ -224,7 +234,7 @@ def _images(folder: Path, results: Mapping[str, Any]) -> str:
 
 
 def _links(record: Record) -> dict[str, Any]:
-    return {"EXR": record.get("file_exr"), "PNG": record.get("file_png"), "error": record.get("file_error_png")}
+    return {"EXR": record.get("file_exr"), "PNG": record.get("file_png")}
 
 
 def _domain_gain(results: Mapping[str, Any]) -> str:

@@ -47,11 +47,13 @@ class Candidate:
         prepare: takes the rays of one batch (float64, one film plane) and gives the call to be timed; conversions
             belong here, off the clock. Raises `Unavailable` where it cannot run.
         batches: batch sizes to choose from.
+        domain: whose rays it does, where candidates of several domains run in one race; None takes the race's.
     """
 
     name: str
     prepare: Callable[[FilmRays], Call]
     batches: tuple[int, ...] = BATCHES
+    domain: Domain | None = None
 
 
 def time_per_ray(call: Call, rays: int, threads: int = 1, repeats: int = 20) -> Timing:
@@ -103,7 +105,7 @@ class Race:
 
 
 def race(candidates: Sequence[Candidate], domain: Domain, *, threads: int = 1, rounds: int = 20, seed: int = 3) -> Race:
-    """Time candidates in turn on the same rays of a domain.
+    """Time candidates in turn on the same rays of a domain, or each on those of its own.
 
     Each call runs on one thread; with more threads, that many workers share out the batches, as a renderer does
     (torch and onnxruntime gain nothing from threads within an operator at batches that fit the caches).
@@ -114,16 +116,14 @@ def race(candidates: Sequence[Candidate], domain: Domain, *, threads: int = 1, r
     names = [c.name for c in candidates]
     if rounds < 1 or len(set(names)) < len(names):
         raise InputError("race", "rounds, candidates", (rounds, names), "at least one round, and names that differ")
-    pool = sample_domain(domain, POOL, seed)
-    pool = replace(pool, film_z=torch.full_like(pool.film_z, domain.film_z_mm[0]))
     unavailable: dict[str, str] = {}
     passes: dict[str, _Pass] = {}
     before = _load()
-    with _workers(threads) as pool_of_workers, pinned_threads(1), torch.no_grad():
+    with _workers(threads) as team, pinned_threads(1), torch.no_grad():
         torch._dynamo.reset()  # torch compiles one function only so often before it gives up; a race starts afresh
         for c in candidates:
             try:
-                passes[c.name] = _best_batch(c, pool, pool_of_workers)
+                passes[c.name] = _best_batch(c, _pool(c.domain or domain, seed), team)
             except Unavailable as reason:
                 unavailable[c.name] = str(reason)
         inner = {name: _calls_for_a_sample(each.sample_ns(1)) for name, each in passes.items()}
@@ -132,8 +132,14 @@ def race(candidates: Sequence[Candidate], domain: Domain, *, threads: int = 1, r
             order = list(passes) if i % 2 == 0 else list(reversed(passes))  # nobody always follows the same neighbour
             for name in order:
                 passes[name].sample_ns(1)  # warms the caches for this candidate
-                ns[name].append(min(passes[name].sample_ns(inner[name]) for _ in range(_SAMPLES)) / len(pool))
+                ns[name].append(min(passes[name].sample_ns(inner[name]) for _ in range(_SAMPLES)) / POOL)
     return Race(ns, {n: p.batch for n, p in passes.items()}, threads, rounds, unavailable, before, _load())
+
+
+def _pool(domain: Domain, seed: int) -> FilmRays:
+    """The rays of one pass: `POOL` of them, from the domain's film plane nearest to the lens."""
+    rays = sample_domain(domain, POOL, seed)
+    return replace(rays, film_z=torch.full_like(rays.film_z, domain.film_z_mm[0]))
 
 
 @dataclass(frozen=True)

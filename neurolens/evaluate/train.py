@@ -6,6 +6,7 @@ import platform
 import time
 import warnings
 from collections.abc import Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -14,16 +15,18 @@ from typing import Any
 from neurolens.cameras.model import load_model
 from neurolens.config import to_dict, to_toml
 from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
-from neurolens.evaluate.experiment import Experiment
+from neurolens.evaluate.experiment import Experiment, relative_to
 from neurolens.evaluate.gain import domain_facts, scene_gain
-from neurolens.evaluate.layout import layout_profile
+from neurolens.evaluate.image import DEFAULT
+from neurolens.evaluate.layout import layout_profile, refractions
 from neurolens.evaluate.measure import Measured, fit_and_measure
 from neurolens.evaluate.pictures import Pictures, render_all
-from neurolens.evaluate.plots import error_against_coefficients_plot, lens_layout, pareto_plot
+from neurolens.evaluate.plots import error_against_coefficients_plot, illumination_plot, lens_layout, pareto_plot
 from neurolens.evaluate.rays import pixel_um, pupil_disc_share
 from neurolens.evaluate.records import break_even_rays, write_results
 from neurolens.evaluate.report import write_report
 from neurolens.evaluate.speed import Race, race
+from neurolens.evaluate.stopping import stop_down
 from neurolens.files import atomic_write_text
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -56,7 +59,8 @@ def run_experiment(
     models, pictures = folder / "models", folder / "pictures"
     for each in (models, pictures):
         each.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(folder / "config.toml", to_toml(experiment))
+    resolved = relative_to(experiment, folder)
+    atomic_write_text(folder / "config.toml", to_toml(resolved))
     progress.plan(_plan(experiment))
     with warnings.catch_warnings(record=True) as heard, pinned_threads():
         warnings.simplefilter("always")
@@ -74,6 +78,13 @@ def run_experiment(
                     fit_and_measure(prepared, settings, models, experiment.evaluation.vignetting_rays, report)
                 )
         timed = _race(experiment, prepared, measured, progress)
+        with progress.stage("stop down"):
+            light = stop_down(
+                [m for m in measured if m.settings.label in _shown(experiment, measured)],
+                lens,
+                domain,
+                pairs.settings.seed,
+            )
         gain = scene_gain(experiment, folder / "models", progress)
         drawn = _render(experiment, lens, domain, measured, pictures, progress)
     results = {
@@ -81,13 +92,14 @@ def run_experiment(
         "command": command,
         "lens": _describe_lens(lens),
         "domain": _describe_domain(lens, pairs),
-        "settings": to_dict(experiment),
+        "settings": to_dict(resolved),
         "models": [m.record for m in measured],
         "exact": [timed.record(name) for name in ("exact eager", "exact compiled") if _ran(timed, name)],
         "cameras": [{"name": n, "ns_per_ray": timed.timing(n)} for n in _IDEAL] + drawn.cameras,
         "images": drawn.images,
+        "image_settings": asdict(DEFAULT) if drawn.images else None,
         "domain_gain": gain,
-        "figures": _draw(lens, domain, measured, timed, pictures) + drawn.figures,
+        "figures": _draw(lens, domain, measured, timed, light, pictures) + drawn.figures,
         "versions": versions(),
         "seed": experiment.pairs.seed,
         "started": started.isoformat(timespec="seconds"),
@@ -142,10 +154,15 @@ def _render(
 ) -> Pictures:
     if not experiment.render.scenes:
         return Pictures()
-    names = experiment.render.models or best_models(measured)
+    names = _shown(experiment, measured)
     files = {m.settings.label: m.file for m in measured if m.settings.label in names}
     with progress.stage("render") as report:
         return render_all(experiment.render, lens, domain, files, folder, report)
+
+
+def _shown(experiment: Experiment, measured: Sequence[Measured]) -> tuple[str, ...]:
+    """Names of the models that are rendered and stopped down."""
+    return experiment.render.models or best_models(measured)
 
 
 def best_models(measured: Sequence[Measured]) -> tuple[str, ...]:
@@ -164,23 +181,24 @@ def _error(m: Measured) -> float:
     return float(value if value is not None else m.record.get("direction_rms_deg") or 1e9)
 
 
-def _draw(lens: Lens, domain: Domain, measured: Sequence[Measured], timed: Race, folder: Path) -> list[dict[str, Any]]:
-    """Trade and layout plots."""
+def _draw(
+    lens: Lens, domain: Domain, measured: Sequence[Measured], timed: Race, light: dict[str, Any], folder: Path
+) -> list[dict[str, Any]]:
+    """Plots of the trade, the lens and its light; `light` as of `stop_down`."""
     records = [m.record for m in measured]
     exact = [timed.record(n) for n in ("exact eager", "exact compiled") if n in timed.ns]
     error = "rms_um" if any(r.get("rms_um") for r in records) else "direction_rms_deg"
     pareto_plot(records, folder / "pareto.png", exact=exact, error=error, title=f"{lens.name}: error against time")
     error_against_coefficients_plot(records, folder / "coefficients.png", error, title=f"{lens.name}: error, size")
     lens_layout(layout_profile(lens, domain), folder / "layout.png")
-    texts = (
-        (
-            "pareto",
-            "Error against speed",
-            "Held-out rays, full aperture; choose from the Pareto front.",
-        ),
+    texts = [
+        ("pareto", "Error against speed", "Held-out rays, full aperture; choose from the Pareto front."),
         ("coefficients", "Error against coefficients", "Coefficients per vector output, A and B terms both counted."),
         ("layout", "The lens", "Rays of three fields, traced exactly."),
-    )
+    ]
+    if light["models"]:
+        illumination_plot(light, folder / "illumination.png", title=f"{lens.name}: relative illumination")
+        texts.append(("illumination", "Relative illumination", "Of a uniform scene, full aperture, far focus."))
     return [{"file": f"{folder.name}/{stem}.png", "title": t, "caption": c} for stem, t, c in texts]
 
 
@@ -191,7 +209,7 @@ def _describe_lens(lens: Lens) -> dict[str, Any]:
         "source": lens.source,
         "file": Path(lens.path).name,
         "sha256": lens.sha256,
-        "refractions": sum(1 for s in lens.surfaces if not s.stop),
+        "refractions": refractions(lens),
         "efl_mm": data.efl_mm,
         "f_number": data.f_number,
         "half_field_deg": lens.half_field_deg,

@@ -25,6 +25,7 @@ from neurolens.surrogates.pairs import PairSet, trace_pairs
 NEAR_RIM = 0.02  # relative distance to a rim's radius that counts as near
 ZONES = {"centre": (0.0, 1 / 3), "mid": (1 / 3, 2 / 3), "edge": (2 / 3, 1.0)}  # shares of the film radius
 _BATCH = 65536
+SEED = 104729  # no seed that a person would give the rays of a fit
 
 
 class Gated(Protocol):
@@ -48,7 +49,7 @@ def vignetting_errors(
     *,
     stop_radius_mm: float | None = None,
     count: int = 300_000,
-    seed: int = 11,
+    seed: int = SEED,
 ) -> dict[str, Any]:
     """False passes and false blocks at one stop.
 
@@ -57,7 +58,7 @@ def vignetting_errors(
         domain: of the model.
         predict: takes rays and the stop radius in mm.
         stop_radius_mm: None takes the domain's, full aperture; a smaller one tests the same fit stopped down.
-        count, seed: rays, scrambled Sobol points.
+        count, seed: rays, scrambled Sobol points; a seed other than the fit's, so that they are fresh.
 
     Returns: false_pass, false_block (shares of 1; None where no ray counts), false_pass_near_rim, false_block_near_rim
         (rays whose nearest deciding rim, the stop included, they cross within 2% of its radius), stop_radius_mm, rays,
@@ -103,13 +104,14 @@ def stopped_down(
     *,
     stops: tuple[int, ...] = (0, 2, 4),
     count: int = 300_000,
+    seed: int = SEED,
 ) -> dict[str, dict[str, Any]]:
     """`vignetting_errors` at full aperture and closed by whole stops, with the same fit; keys "full", "2_stops", ..."""
     results = {}
     for closed in stops:
         radius = domain.stop_radius_mm / math.sqrt(2) ** closed
         name = "full" if closed == 0 else f"{closed}_stops"
-        results[name] = vignetting_errors(lens, domain, predict, stop_radius_mm=radius, count=count)
+        results[name] = vignetting_errors(lens, domain, predict, stop_radius_mm=radius, count=count, seed=seed)
     return results
 
 
@@ -148,7 +150,7 @@ def relative_illumination(
     stop_radius_mm: float | None = None,
     points: int = 16384,
     rows: int = 17,
-    seed: int = 13,
+    seed: int = SEED,
 ) -> dict[str, Any]:
     """Film irradiance of a uniform environment by film radius, of the exact lens and of the model.
 

@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import argparse
 import statistics
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from neurolens.cameras.thin import ThinLens
+from neurolens.errors import InputError, NeurolensError
 from neurolens.render.renderer import render
 from neurolens.render.scenefile import load_scene
 
@@ -21,7 +24,12 @@ def measure(
 
     Returns:
         mpaths_per_s of the fastest and of the median render, their seconds, threads, depth and paths a render.
+
+    Raises:
+        InputError: a scene that cannot be read, a count below 1.
     """
+    if repeats < 1:
+        raise InputError("bench", "repeats", repeats, "an integer above 0")
     loaded = load_scene(scene)
     settings = loaded.settings.camera
     film_mm = (settings.film_width_mm, settings.film_height_mm)
@@ -42,19 +50,24 @@ def measure(
     }
 
 
-def main() -> None:
-    """The command line."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status, 2 for bad input."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, help="scene file (TOML)")
     for name, default in (("threads", 2), ("depth", 3), ("samples", 16), ("repeats", 5)):
         parser.add_argument(f"--{name}", type=int, default=default, help=f"default {default}")
-    found = measure(**vars(parser.parse_args()))
+    try:
+        found = measure(**vars(parser.parse_args(argv)))
+    except NeurolensError as error:
+        print(error, file=sys.stderr)
+        return 2
     print(
         f"{found['mpaths_per_s']:.2f} Mpath/s fastest, {found['mpaths_per_s_median']:.2f} median "
         f"({found['paths']} paths of depth {found['max_depth']}, {found['threads']} threads, "
         f"{found['seconds_min']:.2f} s fastest, {found['seconds_median']:.2f} s median)"
     )
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import mmap
 import multiprocessing
+import signal
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -174,10 +176,11 @@ def run(job: Job, workers: int, progress: Progress | None) -> None:
     fork = sys.platform.startswith("linux") and workers > 1
     kind: Any = context.Process if fork else threading.Thread
     team = [kind(target=_quiet, args=(job, claimed), daemon=True) for _ in range(workers)]
-    for worker in team:
-        worker.start()
     began = time.perf_counter()
     try:
+        with _interrupts_held():  # which forked workers inherit: the one that hears Ctrl-C is this process
+            for worker in team:
+                worker.start()
         while any(worker.is_alive() for worker in team):
             team[-1].join(0.05)
             fraction = float(job.done.sum()) / (len(job.done) * job.passes)
@@ -188,6 +191,8 @@ def run(job: Job, workers: int, progress: Progress | None) -> None:
     finally:
         job.stop[0] = 1
         for worker in team:
+            if worker.ident is None:
+                continue  # interrupted before it was started
             if fork:
                 worker.terminate()
             worker.join()
@@ -195,6 +200,19 @@ def run(job: Job, workers: int, progress: Progress | None) -> None:
         raise NeurolensError(f"a render worker failed: {bytes(job.message).rstrip(bytes(1)).decode(errors='replace')}")
     if int(job.done.sum()) != len(job.done) * job.passes:
         raise NeurolensError("a render worker was killed before it had finished")
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Keep Ctrl-C waiting inside the block; processes and threads started there never see it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _quiet(job: Job, claimed: Any) -> None:

@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from neurolens.errors import InputError
-from neurolens.evaluate.bench import Outcome, hold_to_promises, main, read_index
+from neurolens.evaluate import make_models
+from neurolens.evaluate.bench import Outcome, hold_to_promises, main, read_index, verdict
+from neurolens.evaluate.floors import Floor, floor_table
 from neurolens.evaluate.speed import Race
 from neurolens.evaluate.speed_table import markdown, table_rows
 
@@ -71,3 +73,30 @@ def test_a_bad_index_is_one_clear_error(tmp_path: Path, text: str | None, capsys
     shown = capsys.readouterr().err.strip()
     assert "index.json" in shown and "\n" not in shown
     assert not (tmp_path / "out").exists()
+
+
+def test_a_speed_below_its_floor_fails(capsys: pytest.CaptureFixture[str]) -> None:
+    good, bad = Floor("tracer", 6.0, 6.1, "Mray/s"), Floor("render", 1.0, 0.9, "Mpath/s")
+    unknown = Floor("compiled", 20.0, None, "Mray/s", "no C++ compiler")
+    assert verdict(Outcome(floors=[good, unknown])) == 0
+    assert verdict(Outcome(floors=[good, bad])) == 1
+    assert "render: 0.9 Mpath/s, at least 1" in capsys.readouterr().err
+    rows = floor_table([good, bad, unknown]).splitlines()[2:]
+    assert [row.split("|")[-2].strip() for row in rows] == ["pass", "FAIL", "UNCHECKED"]
+    assert "no C++ compiler" in rows[2]
+
+
+def test_a_bench_that_could_check_nothing_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    assert verdict(Outcome(unchecked=["a.onnx: no C++ compiler"])) == 0
+    assert "UNCHECKED: no promise could be checked here (no C++ compiler)" in capsys.readouterr().err
+
+
+def test_away_from_the_project_one_line_says_where_to_go(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("neurolens.evaluate.project.__file__", str(tmp_path / "site-packages/neurolens/evaluate/p.py"))
+    assert main([]) == 2 and make_models.main([]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2 and all("experiments/" in line for line in lines)
+    assert not list(tmp_path.iterdir())

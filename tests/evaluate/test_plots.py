@@ -179,3 +179,15 @@ def test_bad_images_and_error_keys_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="models"):
         plots.pareto_plot([{"name": "a"}], path)
     assert not list(tmp_path.iterdir())
+
+
+def test_illumination_shows_every_model_and_refuses_other_lengths(tmp_path: Path) -> None:
+    radius = [0.0, 10.0, 20.0]
+    light = {"film_radius_mm": radius, "exact": [1.0, 0.8, 0.5], "models": {"ols": [1.0, 0.81, 0.52]}}
+    path = plots.illumination_plot(light, tmp_path / "light.png")
+    with Image.open(path) as picture:
+        assert picture.size[0] > 800 and np.unique(np.asarray(picture.convert("L"))).size > 50
+    for bad in ({"models": {"ols": [1.0]}}, {"exact": [1.0, math.nan, 0.5]}):
+        with pytest.raises(InputError, match="illumination"):
+            plots.illumination_plot({**light, **bad}, tmp_path / "no.png")
+    assert not (tmp_path / "no.png").exists()

@@ -66,11 +66,11 @@ def test_results_come_back_as_written(tmp_path: Path) -> None:
     }
     records.write_results(path, results)
     text = path.read_text()
-    assert "NaN" not in text and "Infinity" not in text
-    back = records.read_results(path)
+    assert "NaN" not in text and "Infinity" not in text  # which JSON does not know
+    back = json.loads(text)
     assert back["lens"]["efl_mm"] == 50.0 and back["domain"]["wavelength_nm"] == [400.0, 700.0]
     assert back["models"] == [{"name": "a", "rms_um": None, "ns_per_ray": {"min": 12.5, "threads": 1}}]
-    assert back["domain"]["focus_m"] == [2.0, None] and back["schema_version"] == records.SCHEMA_VERSION
+    assert back["domain"]["focus_m"] == [2.0, "infinity"] and back["schema_version"] == records.SCHEMA_VERSION
     assert [p.name for p in tmp_path.iterdir()] == ["results.json"]
 
 
@@ -89,16 +89,6 @@ def test_results_of_another_shape_are_refused(results: object, words: str, tmp_p
     with pytest.raises(InputError, match=words):
         records.write_results(tmp_path / "results.json", results)  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", json.dumps({"schema_version": 99})])
-def test_a_bad_results_file_is_one_clear_error(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "results.json"
-    path.write_text(text)
-    with pytest.raises(InputError, match="results.json"):
-        records.read_results(path)
-    with pytest.raises(InputError, match="absent.json"):
-        records.read_results(tmp_path / "absent.json")
 
 
 def test_number_takes_only_finite_numbers() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -121,3 +122,21 @@ def test_bad_settings_are_refused(domain: Domain) -> None:
         race([pinhole, pinhole], domain)
     with pytest.raises(InputError, match="round"):
         race([pinhole], domain, rounds=0)
+
+
+def test_candidates_of_several_domains_run_in_one_race() -> None:
+    """Each does rays of its own domain; all are timed round by round together."""
+    wide = domain_of(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml").at(f_number=8), film_radius_mm=20.0)
+    small = replace(wide, film_radius_mm=5.0)
+    reached: dict[str, float] = {}
+
+    def watching(name: str) -> Candidate:
+        def prepare(rays: FilmRays) -> Call:
+            reached[name] = max(reached.get(name, 0.0), float(torch.hypot(rays.film_x, rays.film_y).max()))
+            return lambda: None
+
+        return Candidate(name, prepare)
+
+    timed = race([watching("wide"), replace(watching("small"), domain=small)], wide, rounds=2)
+    assert reached == pytest.approx({"wide": 20.0, "small": 5.0}, rel=1e-2)
+    assert len(timed.ns["wide"]) == len(timed.ns["small"]) == 2

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
 import sys
+import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +18,7 @@ from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.errors import InputError, NeurolensError
+from neurolens.render import bench
 from neurolens.render.renderer import render
 
 FILM = (36.0, 24.0)
@@ -176,3 +181,29 @@ def test_errors_are_clear(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("neurolens.render.workers.BATCH", 64)
     with pytest.raises(NeurolensError, match="no rays today"):
         render(made, Broken(50.0, FILM), threads=2, **small)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="workers are forked on Linux")
+def test_an_interrupt_ends_workers_without_a_word(tmp_path: Path) -> None:
+    """Ctrl-C reaches the whole group of processes: the command says one line, its workers none."""
+    (tmp_path / "white.toml").write_text(
+        "[camera]\nposition_m = [0, 0, 0]\nlook_at_m = [0, 0, -1]\nfocus_m = 2\nwidth = 960\nheight = 540\n"
+        "samples = 4096\n[environment]\ncolour = [1, 1, 1]\n"
+    )
+    arguments = ["render", "white.toml", "--camera", "pinhole", "-o", "a.exr", "--quiet"]
+    command = [sys.executable, "-m", "neurolens", *arguments]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    deadline = time.monotonic() + 60
+    while len(children.read_text().split()) < 2:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    assert said.strip() == "neurolens: interrupted; no picture was written; older files of that name are untouched"
+
+
+def test_the_bench_says_one_line_of_a_missing_scene(capsys: pytest.CaptureFixture[str]) -> None:
+    assert bench.main(["nosuch.toml"]) == 2
+    assert "nosuch.toml" in capsys.readouterr().err
