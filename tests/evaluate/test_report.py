@@ -205,3 +205,13 @@ def test_numbers_as_shown(value: float | None, digits: int, shown: str) -> None:
 def test_a_name_with_a_colon_is_a_file_not_a_scheme(tmp_path: Path) -> None:
     (tmp_path / "javascript:x").write_bytes(b"any")
     assert local_url(tmp_path, "javascript:x") == "./javascript%3Ax"
+
+
+def test_models_that_were_stopped_down_have_a_table(tmp_path: Path) -> None:
+    shares = {"false_pass": 0.0012, "false_block": None}
+    models = [{"name": "a", "stopped_down": {"2_stops": shares, "4_stops": shares}}, {"name": "b"}]
+    page = write_report(tmp_path, {"models": models}).read_text()
+    table = page.partition("stopped down</h3>")[2].partition("</table>")[0]
+    assert "0.12" in table and "4 stops closed: false pass (%)" in table and "false block" not in table
+    assert ">b<" not in table
+    assert "stopped down</h3>" not in write_report(tmp_path, {"models": models[1:]}).read_text()
