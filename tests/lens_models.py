@@ -18,9 +18,10 @@ from neurolens.surrogates.cores import Network
 from neurolens.surrogates.domain import Domain, domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
+from neurolens.surrogates.gates import gate_values
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs
-from neurolens.surrogates.targets import gate_values, scales_of, targets_of
+from neurolens.surrogates.targets import scales_of, targets_of
 
 LENSES = Path(__file__).parents[1] / "lenses"
 KINDS = ("invariants", "raw", "network", "thick", "fisheye")

@@ -1,7 +1,8 @@
 """The folders are layers: imports go one way, a render needs no torch, and modules stay short enough to read.
 
-errors, status, files, tomlfile, config, progress <- optics <- surrogates <- evaluate <- commands <- cli
-                                                  <- cameras <- render     <- evaluate
+base (errors, status, files, tomlfile, config, progress, focus, modelfile)
+base <- optics <- surrogates <- evaluate <- commands <- cli
+     <- cameras <- render    <- evaluate
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 MODULES = sorted((ROOT / "neurolens").rglob("*.py"))
 MAX_LINES = 300
 
-BASE = {"errors", "status", "files", "tomlfile", "config", "progress"}
+BASE = {"errors", "status", "files", "tomlfile", "config", "progress", "focus", "modelfile"}
 # Parts of the package that each part may import, besides itself and the base.
 PARTS = {
     "optics": set(),

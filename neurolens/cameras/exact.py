@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any, Literal
 
@@ -18,7 +17,7 @@ from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import PupilBounds, camera_rays, pupil_bounds
-from neurolens.optics.trace import CHUNK, Traced, compile_trace, trace
+from neurolens.optics.trace import trace
 
 
 class ExactCamera:
@@ -31,7 +30,6 @@ class ExactCamera:
         f_number: None keeps the lens's stop.
         wavelength_nm: range of the wavelengths; the d line stands in for a lens without known dispersion.
         dtype: precision of the trace.
-        compiled: trace with torch's compiler; needs a C++ compiler, and a minute for the first rays.
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
 
@@ -48,7 +46,6 @@ class ExactCamera:
         f_number: float | None = None,
         wavelength_nm: tuple[float, float] = (400.0, 700.0),
         dtype: Literal["float32", "float64"] = "float32",
-        compiled: bool = False,
         bounds: PupilBounds | None = None,
     ) -> None:
         self._pid = os.getpid()
@@ -67,9 +64,6 @@ class ExactCamera:
             bounds = pupil_bounds(self.lens, 1.0001 * corner, (film_z, film_z), used)
         self._pupil_z_mm = bounds.pupil_z_mm
         self._dtype = torch.float32 if dtype == "float32" else torch.float64
-        self._compiled: Callable[..., Traced] | None = (
-            compile_trace(self.lens, transmittance=True) if compiled else None
-        )
         self.film = LensFilm(PupilTable.of(asdict(bounds)), float(film_z), used, self._scene, stopped)
         data = first_order(self.lens)
         self.settings: dict[str, Any] = {
@@ -102,21 +96,7 @@ class ExactCamera:
         assert film_z is not None
         rays = camera_rays(fx, fy, film_z, px, py, self._pupil_z_mm)
         with torch.no_grad():
-            done = self._trace(rays, wavelength)
+            done = trace(self.lens, rays, wavelength, transmittance=True)
         assert done.transmittance is not None
         scene = torch.stack(list(done.rays)).to(torch.float32).numpy()
         return SceneRays(scene, done.transmittance.to(torch.float32).numpy(), done.status.numpy())
-
-    def _trace(self, rays: Any, wavelength: torch.Tensor) -> Traced:
-        if self._compiled is None:
-            return trace(self.lens, rays, wavelength, transmittance=True)
-        # Compiled code is for one length: fill up the last chunk with its last ray.
-        count = len(wavelength)
-        index = torch.arange(math.ceil(count / CHUNK) * CHUNK).clamp_max(count - 1)
-        parts = []
-        for start in range(0, len(index), CHUNK):
-            chosen = index[start : start + CHUNK]
-            parts.append(self._compiled(type(rays)(*(c[chosen] for c in rays)), wavelength[chosen]))
-        joined = type(rays)(*(torch.cat(c)[:count] for c in zip(*(p.rays for p in parts), strict=True)))
-        power = torch.cat([p.transmittance for p in parts if p.transmittance is not None])[:count]
-        return Traced(joined, torch.cat([p.status for p in parts])[:count], power, {})

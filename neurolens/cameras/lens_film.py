@@ -205,23 +205,3 @@ class LensFilm:
         if not exposure > 0:
             raise InputError("camera", "f_number, focus_m", "(no ray passes on the axis)", "a lens that light can pass")
         return exposure
-
-
-def film_z_mm(efl_mm: float, front_principal_z_mm: float, rear_principal_z_mm: float, focus_m: float) -> float:
-    """Film plane that focuses an object `focus_m` metres from the film: s' = (D - sqrt(D (D - 4 f))) / 2 behind H'.
-
-    D is that distance less the separation of the principal planes.
-
-    Raises:
-        InputError: an object nearer than four focal lengths, or a distance that is not a positive number.
-    """
-    if not focus_m > 0:
-        raise InputError("camera", "focus_m", focus_m, "a distance in m above 0, or inf")
-    if np.isinf(focus_m):
-        return rear_principal_z_mm + efl_mm
-    separation = rear_principal_z_mm - front_principal_z_mm
-    d = 1000.0 * focus_m - separation
-    if not d >= 4 * efl_mm:
-        nearest = (4 * efl_mm + separation) / 1000
-        raise InputError("camera", "focus_m", focus_m, f"at least {nearest:.4g} m, four focal lengths")
-    return rear_principal_z_mm + 2 * d * efl_mm / (d + float(np.sqrt(d * (d - 4 * efl_mm))))

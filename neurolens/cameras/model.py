@@ -8,14 +8,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from neurolens.cameras.contract import CameraRays, FloatArray
-from neurolens.cameras.lens_film import LensFilm, PupilTable, SceneRays, film_z_mm
+from neurolens.cameras.lens_film import LensFilm, PupilTable, SceneRays
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.sampling import check_film, positive
 from neurolens.errors import InputError
+from neurolens.focus import film_z_mm
+from neurolens.modelfile import DOMAIN_SLACK
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 
-_SLACK = 1.00001  # of the domain's bounds, as inside the graph
 _NOMINAL = 1.02  # f-numbers are engraved rounded: up to this much wider than the widest stop means the widest stop
 
 
@@ -43,7 +44,8 @@ class OnnxCamera:
         self.focus_m = positive("focus_m", focus_m, infinite=True)
         low, high = (float(v) for v in domain["wavelength_nm"])
         self.dispersive = low < high
-        self.wavelength_nm = (low, high) if self.dispersive else None
+        # A model for one wavelength of a dispersive lens knows that wavelength only; without dispersion any will do.
+        self.wavelength_nm = (low, high) if lens["dispersive"] else None
         film_z = _film_z(model, self.focus_m)
         stop = _stop_radius(model, f_number)
         stopped = stop < 0.99 * float(domain["stop_radius_mm"])
@@ -88,7 +90,7 @@ class _Scene:
 def _film_z(model: OnnxLens, focus_m: float) -> float:
     lens, (near, far) = model.card["lens"], model.card["domain"]["film_z_mm"]
     z = film_z_mm(lens["efl_mm"], lens["front_principal_z_mm"], lens["rear_principal_z_mm"], focus_m)
-    if not near / _SLACK <= z <= far * _SLACK:
+    if not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
         limits = " to ".join(f"{v} m" for v in reversed(model.card["domain"]["focus_m"]))
         raise InputError(model.path, "focus_m", focus_m, f"a focus within the model's domain, {limits}")
     return min(max(z, near), far)

@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 
 from neurolens.errors import ModelError
+from neurolens.modelfile import CARD_KEY, CARD_KIND, CARD_SCHEMA
 
 MAX_BYTES = 64 * 2**20
-CARD_KEY = "neurolens"
-KIND, SCHEMA = "neurolens.lens_model", 1
 OPERATORS = frozenset(
     "Abs Add And Cast Clip Concat Cos Div Equal Gather Gemm Greater GreaterOrEqual Identity LessOrEqual MatMul Max Min "
     "Mul Neg Reciprocal ReduceSum Relu Reshape Sin Slice Split Sqrt Sub Tanh Where".split()
@@ -65,13 +64,13 @@ def _card(file: Path, metadata: dict[str, str]) -> dict[str, Any]:
         raise ModelError(f"{file}: no card: its metadata has no {CARD_KEY!r}, so this is no model made by neurolens")
     try:
         card = json.loads(metadata[CARD_KEY], parse_constant=_refuse_constant)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ModelError(f"{file}: the card is not strict JSON ({error})") from error
     kind = card.get("kind") if isinstance(card, dict) else None
-    if kind != KIND:
-        raise ModelError(f"{file}: card: kind: got {kind!r}, expected {KIND!r}")
-    if card.get("schema") != SCHEMA:
-        raise ModelError(f"{file}: card: schema: got {card.get('schema')!r}, expected {SCHEMA}")
+    if kind != CARD_KIND:
+        raise ModelError(f"{file}: card: kind: got {kind!r}, expected {CARD_KIND!r}")
+    if card.get("schema") != CARD_SCHEMA:
+        raise ModelError(f"{file}: card: schema: got {card.get('schema')!r}, expected {CARD_SCHEMA}")
     return card
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,8 +10,8 @@ import onnxruntime
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens import status as st
+from neurolens.cameras.cardcheck import check_card
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.lens_film import PupilTable
 from neurolens.cameras.onnxfile import read_checked
 from neurolens.errors import InputError, ModelError
 
@@ -26,10 +25,6 @@ OUTPUTS = {
 # Rays a call of onnxruntime: enough to hide the cost of its operators, few enough for the caches.
 BATCH = 16384
 MAX_RAYS = 2**27
-_NUMBERS = {
-    "lens": (*("efl_mm", "f_number", "stop_radius_mm", "front_principal_z_mm", "rear_principal_z_mm"),),
-    "domain": ("film_radius_mm", "pupil_z_mm", "pupil_radius_mm", "stop_radius_mm"),
-}
 
 
 class LensRays(NamedTuple):
@@ -75,7 +70,8 @@ class OnnxLens:
         Args:
             film_xy_mm, pupil_xy_mm: [2, N], lens frame, on the film plane and on the plane domain.pupil_z_mm.
             wavelength_nm: [N], or one number.
-            film_z_mm: film plane; None takes that of infinity focus. An array [N] costs a call for each distinct value.
+            film_z_mm: film plane; None takes the domain's nearest to the lens (its farthest focus). An array [N] costs
+                a call for each distinct value.
             stop_radius_mm: None takes the widest stop.
 
         Raises:
@@ -144,7 +140,7 @@ def load_model(path: str | Path, lens: str | None = None, threads: int = 1) -> O
         raise InputError("load_model", "threads", threads, "at least 1")
     file = Path(path)
     data, card = read_checked(file)
-    _check_card(file, card)
+    check_card(file, card)
     if lens is not None and card["lens"].get("sha256") != lens:
         found = str(card["lens"].get("sha256"))
         raise ModelError(
@@ -201,24 +197,6 @@ def _session(path: Path, data: bytes, threads: int) -> Any:
     return session
 
 
-def _check_card(file: Path, card: dict[str, Any]) -> None:
-    """Everything that this module reads from a card, so that a mistake shows on loading."""
-    for section, names in _NUMBERS.items():
-        for name in names:
-            value = card.get(section, {}).get(name) if isinstance(card.get(section), dict) else None
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-                raise ModelError(f"{file}: card: {section}.{name}: got {value!r}, expected a finite number")
-    domain = card["domain"]
-    for name in ("film_z_mm", "wavelength_nm"):
-        value = domain.get(name)
-        if not isinstance(value, list) or len(value) != 2 or not all(isinstance(v, (int, float)) for v in value):
-            raise ModelError(f"{file}: card: domain.{name}: got {value!r}, expected two numbers")
-    try:
-        PupilTable.of(domain["bounds"])
-    except (InputError, KeyError, TypeError, ValueError) as error:
-        raise ModelError(f"{file}: card: domain.bounds: {error}") from error
-
-
 def _check_reference(model: OnnxLens) -> None:
     """Recompute the card's reference rays: what is loaded here is what was exported."""
     try:
@@ -228,7 +206,7 @@ def _check_reference(model: OnnxLens) -> None:
         found = model.rays(rays[:2], rays[2:4], rays[4], float(reference["film_z_mm"][0]), reference["stop_radius_mm"])
         if any(a.shape != b.shape for a, b in zip(found, wanted, strict=True)):
             raise ValueError("columns of unequal length")
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         raise ModelError(f"{model.path}: card: reference: {type(error).__name__}: {error}") from error
     passed = wanted[3] == st.PASSED
     if not np.array_equal(found.status, wanted[3]) or not passed.any():

@@ -9,24 +9,7 @@ import numpy as np
 
 from neurolens.cameras.contract import CameraRays, FloatArray
 from neurolens.cameras.sampling import check_film, concentric_disk, positive
-from neurolens.errors import InputError
-
-
-def image_distance_mm(focal_mm: float, focus_m: float) -> float:
-    """Distance s' from lens to film when an object `focus_m` from the film is in focus.
-
-    With D = s + s' and 1/f = 1/s + 1/s', s' = (D - sqrt(D (D - 4 f))) / 2, the root with the lens nearer to the film.
-
-    Raises:
-        InputError: D < 4 f, nearer than a lens of this focal length can focus.
-    """
-    if math.isinf(focus_m):
-        return focal_mm
-    distance_mm = 1e3 * focus_m
-    if distance_mm < 4 * focal_mm:
-        raise InputError("camera", "focus_m", focus_m, f"at least 4 focal lengths, {4e-3 * focal_mm:g} m")
-    # 2 D f / (D + sqrt(...)) is the same root without the difference of two large numbers.
-    return 2 * distance_mm * focal_mm / (distance_mm + math.sqrt(distance_mm * (distance_mm - 4 * focal_mm)))
+from neurolens.focus import film_z_mm
 
 
 class ThinLens:
@@ -53,7 +36,7 @@ class ThinLens:
         self.f_number = positive("f_number", f_number)
         self.focus_m = positive("focus_m", focus_m, infinite=True)
         self.film_mm = check_film(film_mm)
-        self.image_distance_mm = image_distance_mm(self.focal_mm, self.focus_m)
+        self.image_distance_mm = film_z_mm(self.focal_mm, 0.0, 0.0, self.focus_m)
         self.radius_mm = self.focal_mm / (2 * self.f_number)
         self.settings: dict[str, Any] = {
             "camera": self.name,

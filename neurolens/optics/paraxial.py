@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from neurolens import focus
 from neurolens.errors import InputError
 from neurolens.optics.glass import LINE_D_NM, index_at
 from neurolens.optics.prescription import Lens
@@ -124,19 +125,10 @@ def stop_radius_mm(lens: Lens, f_number: float) -> float:
 
 
 def film_z_mm(lens: Lens, focus_m: float) -> float:
-    """Film plane that focuses an object `focus_m` metres from the film (unit focusing, first order).
-
-    With D that distance less the separation of the principal planes, s' = (D - sqrt(D (D - 4 f))) / 2 behind H'.
+    """Film plane that focuses an object `focus_m` metres from the film (unit focusing; see `neurolens.focus`).
 
     Raises:
-        InputError: D below four focal lengths, where no film plane exists.
+        InputError: an object nearer than four focal lengths, for which no film plane exists.
     """
     data = first_order(lens)
-    f = data.efl_mm
-    if focus_m == math.inf:
-        return data.rear_principal_z_mm + f
-    d = 1000.0 * focus_m - (data.rear_principal_z_mm - data.front_principal_z_mm)
-    if not d >= 4 * f:
-        nearest = (4 * f + data.rear_principal_z_mm - data.front_principal_z_mm) / 1000
-        raise InputError(lens.path, "focus_m", focus_m, f"at least {nearest:.4g} m (four focal lengths) for this lens")
-    return data.rear_principal_z_mm + (d - math.sqrt(d * (d - 4 * f))) / 2
+    return focus.film_z_mm(data.efl_mm, data.front_principal_z_mm, data.rear_principal_z_mm, focus_m, file=lens.path)

@@ -13,13 +13,12 @@ import torch
 import neurolens
 from neurolens import status as st
 from neurolens.errors import InputError
+from neurolens.modelfile import CARD_KIND, CARD_SCHEMA
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.model import LensModel
 
-SCHEMA = 1
-KIND = "neurolens.lens_model"
 UNITS = {
     "rays": ["film_x mm", "film_y mm", "pupil_x mm", "pupil_y mm", "wavelength nm"],
     "film_z_mm": "mm",
@@ -32,7 +31,7 @@ UNITS = {
 FRAME = (
     "Lens frame: z along the optical axis, front vertex at z = 0, film at z > 0, x right and y up seen from behind the "
     "camera; rays leave the film point towards the pupil point on the plane domain.pupil_z_mm; scene_ray is a point on "
-    "the front surface and a unit direction towards -z."
+    "{place} and a unit direction towards -z."
 )
 
 
@@ -43,11 +42,11 @@ def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
         errors: held-out errors, as the evaluation gives them.
     """
     return {
-        "kind": KIND,
-        "schema": SCHEMA,
+        "kind": CARD_KIND,
+        "schema": CARD_SCHEMA,
         "lens": _lens(model.lens, model.domain.film_z_mm[0]),
         "units": UNITS,
-        "frame": FRAME,
+        "frame": FRAME.format(place="the front surface" if model.direction == "angle" else "the plane z = 0"),
         "domain": model.domain.to_dict(),
         "status_codes": _status_codes(model),
         "gates": [{"surface": g.surface, "reason": g.reason, "status": g.status} for g in model.gates],

@@ -106,7 +106,7 @@ class Network:
     Attributes:
         hidden: weight [units, inputs] and bias [units] of each tanh layer; the first takes scaled invariants.
         output: weight [6 + S, units] and bias [6 + S]; rows 2 v and 2 v + 1 are A and B of vector v, then the scalars.
-            The bias of those rows holds the paraxial map.
+            The bias of those rows is the constant part of A and B.
         shift, scale: [4] each: the network sees (invariants - shift) * scale.
     """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import torch
@@ -37,6 +37,8 @@ class Domain:
         wavelength_nm: shortest and longest wavelength; equal for a lens whose dispersion is unknown.
         stop_radius_mm: the widest stop for which the surrogate is fitted.
         bounds: where passing rays lie on the pupil plane, by film radius (for sampling in a render).
+        nearest_m: distance from the film of the nearest object in view, where one lies before the plane in focus; None:
+            the nearest focus. It changes no ray, only what an error of position counts in a fit.
     """
 
     film_radius_mm: float
@@ -47,6 +49,7 @@ class Domain:
     wavelength_nm: tuple[float, float]
     stop_radius_mm: float
     bounds: PupilBounds
+    nearest_m: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able, with infinity written as the string "inf"."""
@@ -56,10 +59,12 @@ class Domain:
 
     @staticmethod
     def from_dict(data: dict[str, Any]) -> Domain:
-        """The inverse of `to_dict`."""
-        bounds: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data["bounds"].items()}
+        """The inverse of `to_dict`; what was written before `nearest_m` existed has none."""
+        table = {f.name: data["bounds"][f.name] for f in fields(PupilBounds)}
+        bounds: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
         pairs = {k: tuple(float(v) for v in data[k]) for k in ("film_z_mm", "focus_m", "wavelength_nm")}
-        return Domain(**{**data, **pairs, "bounds": PupilBounds(**bounds)})
+        known = {f.name: data[f.name] for f in fields(Domain) if f.name in data}
+        return Domain(**{**known, **pairs, "bounds": PupilBounds(**bounds)})
 
 
 @dataclass(frozen=True)
@@ -89,6 +94,7 @@ def domain_of(
     film_radius_mm: float | None = None,
     focus_m: tuple[float, float] = (math.inf, math.inf),
     wavelength_nm: tuple[float, float] = (400.0, 700.0),
+    nearest_m: float | None = None,
 ) -> Domain:
     """The domain of a lens at its present stop.
 
@@ -96,12 +102,16 @@ def domain_of(
         film_radius_mm: None takes the lit film (see `pupils.image_radius_mm`).
         focus_m: two object distances from the film; the domain holds every film plane between theirs.
         wavelength_nm: replaced by the d line where no glass of the lens has a known dispersion.
+        nearest_m: distance from the film of the nearest object in view; None takes the nearest focus.
 
     Raises:
-        InputError: a radius that is not positive, wavelengths outside 300..2500 nm or in the wrong order.
+        InputError: a radius or `nearest_m` that is not positive and finite, wavelengths outside 300..2500 nm or in the
+            wrong order.
     """
     if film_radius_mm is not None and not film_radius_mm > 0:
         raise InputError("domain", "film_radius_mm", film_radius_mm, "a positive length in mm")
+    if nearest_m is not None and not 0 < nearest_m < math.inf:
+        raise InputError("domain", "nearest_m", nearest_m, "a positive distance in m, or none")
     low, high = wavelength_nm
     if not 300 <= low <= high <= 2500:
         raise InputError("domain", "wavelength_nm", wavelength_nm, "shortest then longest, within 300 to 2500 nm")
@@ -119,6 +129,7 @@ def domain_of(
         wavelength_nm=(low, high),
         stop_radius_mm=lens.stop_radius_mm,
         bounds=bounds,
+        nearest_m=nearest_m,
     )
 
 
@@ -129,15 +140,24 @@ def domain_from_camera(
     focus_m: float,
     f_number: float | None = None,
     wavelength_nm: tuple[float, float] = (400.0, 700.0),
+    nearest_m: float | None = None,
 ) -> tuple[Lens, Domain]:
     """Only what one shot requires: its film crop, stop, focus and wavelengths. Returns the stopped lens and its domain.
 
-    The lit film may be smaller than the crop (fisheyes); the smaller radius rules.
+    The lit film may be smaller than the crop (fisheyes); the smaller radius rules. `nearest_m` is the distance from the
+    film of the nearest object in view: objects before the plane in focus keep their place then.
     """
     stopped = lens.at(f_number=f_number, focus_m=focus_m) if f_number is not None else lens.at(focus_m=focus_m)
     corner = math.hypot(*film_mm) / 2
     radius = min(corner, image_radius_mm(lens)[0])
-    return stopped, domain_of(stopped, film_radius_mm=radius, focus_m=(focus_m, focus_m), wavelength_nm=wavelength_nm)
+    domain = domain_of(
+        stopped,
+        film_radius_mm=radius,
+        focus_m=(focus_m, focus_m),
+        wavelength_nm=wavelength_nm,
+        nearest_m=nearest_m,
+    )
+    return stopped, domain
 
 
 def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:

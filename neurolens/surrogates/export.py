@@ -16,14 +16,13 @@ import torch
 from neurolens import status as st
 from neurolens.errors import InputError
 from neurolens.files import atomic_path
+from neurolens.modelfile import CARD_KEY
 from neurolens.surrogates.card import card_of, card_to_json
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.onnx_cores import add_core
 from neurolens.surrogates.onnx_graph import FLOAT, INT32, Graph
 from neurolens.surrogates.onnx_light import TEST_SCALE, DirectionSeries, add_decoder, add_light_field, add_status
-
-CARD_KEY = "neurolens"
 
 
 def export_onnx(model: LensModel, path: str | Path, errors: dict[str, Any] | None = None) -> Path:
@@ -39,11 +38,11 @@ def export_onnx(model: LensModel, path: str | Path, errors: dict[str, Any] | Non
     Returns the path.
 
     Raises:
-        InputError: weights or errors that are not finite; two gates on one surface.
+        InputError: weights or errors that are not finite; two gates for one reason on one surface, or one on the stop.
     """
-    surfaces = [gate.surface for gate in model.gates]
-    if len({*surfaces, model.lens.stop_index}) <= len(surfaces):
-        raise InputError("export", "gates", surfaces, "one gate a surface, and none on the stop")
+    codes = [gate.status for gate in model.gates]
+    if len({*codes, st.blocked(model.lens.stop_index, st.RIM)}) <= len(codes):
+        raise InputError("export", "gates", codes, "one gate a surface and reason, and none on the rim of the stop")
     g = Graph()
     field, inside = add_light_field(g, model)
     series = DirectionSeries(largest_angle(model))

@@ -12,6 +12,7 @@ from neurolens import status as st
 from neurolens.errors import InputError, NeurolensWarning
 from neurolens.surrogates.cores import Basis, Network
 from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.gates import choose_gates, explained
 from neurolens.surrogates.lightfield import Encoding, fit_encoding
 from neurolens.surrogates.mlp import fit_network
 from neurolens.surrogates.model import Core, Gate, LensModel
@@ -20,13 +21,15 @@ from neurolens.surrogates.paraxial import fit_paraxial
 from neurolens.surrogates.partition import ZoneCore, fit_partitioned
 from neurolens.surrogates.polynomial import Method as PolynomialMethod
 from neurolens.surrogates.polynomial import PolynomialSettings, fit_polynomial
-from neurolens.surrogates.targets import choose_gates, scales_of
+from neurolens.surrogates.targets import scales_of
 from neurolens.surrogates.threads import pinned_threads
 
 Method = Literal["thin", "thick", "dense", "omp", "ols", "adaptive", "mlp"]
 POLYNOMIALS = ("dense", "omp", "ols", "adaptive")
-# Rays drawn over the domain to find the rims that block anything: a share of 1e-4 is 20 of them.
+# Rays drawn over the domain to find what blocks anything: a share of 1e-4 is 20 of them.
 _GATE_RAYS = 200_000
+# About 5000 candidate columns, whose Gram matrix takes 200 MB.
+_MOST_DEGREE = {"invariants": 16, "raw": 11}
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,9 @@ class ModelSettings:
         units, layers: of the network. steps, seconds: its training ends by either; results repeat bit for bit where
             the steps end it.
         seed: of the network's first weights.
+
+    Raises:
+        InputError: numbers that ask for more than a fit can hold, or for less than one.
     """
 
     method: Method = "ols"
@@ -55,6 +61,22 @@ class ModelSettings:
     steps: int = 60
     seconds: float = 60.0
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        most_degree = _MOST_DEGREE[self.basis] if self.basis in _MOST_DEGREE else min(_MOST_DEGREE.values())
+        limits = {
+            "terms": (1, 2000),
+            "degree": (0, most_degree),
+            "partitions": (1, 64),
+            "units": (1, 512),
+            "layers": (1, 8),
+            "steps": (1, 100_000),
+        }
+        for name, (least, most) in limits.items():
+            if not least <= getattr(self, name) <= most:
+                raise InputError("settings", name, getattr(self, name), f"an integer from {least} to {most}")
+        if not 0 < self.seconds:
+            raise InputError("settings", "seconds", self.seconds, "a number above 0")
 
     @property
     def label(self) -> str:
@@ -76,7 +98,10 @@ class ModelSettings:
 
 @dataclass(frozen=True)
 class Prepared:
-    """Ray pairs with what all fits share: encoding and gates. `lost_share`: rays that no rim gate can explain."""
+    """Ray pairs with what all fits share: encoding and gates. `lost_share`: lost rays of the domain that no gate tells.
+
+    Lost rays miss a surface or are totally reflected.
+    """
 
     pairs: RayPairs
     encoding: Encoding
@@ -85,25 +110,26 @@ class Prepared:
 
 
 def prepare(pairs: RayPairs) -> Prepared:
-    """Find the encoding, and the rims that block anything in the domain.
+    """Find the encoding, and the rims and discriminants that block anything in the domain.
 
     Warns:
-        NeurolensWarning: more than one ray in 10,000 ends by missing a surface or by total reflection.
+        NeurolensWarning: more than one ray in 10,000 is lost in a way that no gate can tell (beyond 90 degrees to a
+            plane, or on the far half of a sphere).
     """
     seed = pairs.settings.seed + 1_000_003
     with pinned_threads():
         drawn = trace_pairs(pairs.lens, sample_domain(pairs.domain, _GATE_RAYS, seed), pairs.domain.pupil_z_mm)
-    blocked = drawn.status != st.PASSED
-    reason = drawn.status % 4
-    lost = float((blocked & (reason != st.RIM)).double().mean())
+    blocked = drawn.select(drawn.status != st.PASSED)
+    gates = choose_gates(pairs.lens, blocked, len(drawn))
+    untold = (blocked.status % 4 != st.RIM) & ~explained(pairs.lens, gates, blocked)
+    lost = float(untold.double().sum()) / len(drawn)
     if lost > 1e-4:
         warnings.warn(
             f"{pairs.lens.path}: {100 * lost:.2f}% of the domain's rays end by missing a surface or by total "
-            "reflection; the rims near by stand in for that boundary",
+            "reflection in a way that no gate can tell; the rims near by stand in for that boundary",
             NeurolensWarning,
             stacklevel=2,
         )
-    gates = choose_gates(pairs.lens, drawn.select(blocked & (reason == st.RIM)))
     return Prepared(pairs, fit_encoding(pairs.domain, pairs.train), gates, lost)
 
 

@@ -14,10 +14,11 @@ from neurolens.errors import InputError
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.cores import Network
 from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.gates import boundary_rays, gate_reach, gate_values
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate
 from neurolens.surrogates.pairs import PairSet, RayPairs
-from neurolens.surrogates.targets import film_equivalent_weights, gate_values, targets_of
+from neurolens.surrogates.targets import film_equivalent_weights, targets_of
 from neurolens.surrogates.threads import pinned_threads
 from neurolens.surrogates.training import Problem, Projection, minimise
 
@@ -51,7 +52,7 @@ def fit_network(
     modestly. Several random starts are tried, and the best goes on.
 
     Args:
-        pairs: half the rays come from `train`, half from `rim`, which reaches beyond the rims.
+        pairs: half the rays come from `train`, half from those near the boundaries and beyond (`gates.boundary_rays`).
         steps: most steps of the optimiser (Levenberg-Marquardt); the time limit may end it earlier.
         seconds: wall-clock limit. The same seed gives the same weights bit for bit where it does not bite.
         starts: random starts.
@@ -128,9 +129,10 @@ def _random_layers(inputs: Tensor, units: int, layers: int, seed: int) -> list[T
 
 def _problem(pairs: RayPairs, encoding: Encoding, gates: tuple[Gate, ...], rays: int) -> tuple[Problem, Tensor, Tensor]:
     """The weighted fit, and shift and scale [4] of the invariants."""
-    train = pairs.train.select(slice(0, max(rays - len(pairs.rim), rays - rays // 2)))
-    rim = pairs.rim.select(slice(0, rays - len(train)))
-    parts = [_part(pairs.lens, pairs.domain, encoding, gates, s) for s in (train, rim) if len(s)]
+    boundary = boundary_rays(pairs, gates)
+    train = pairs.train.select(slice(0, max(rays - len(boundary), rays - rays // 2)))
+    boundary = boundary.select(slice(0, rays - len(train)))
+    parts = [_part(pairs.lens, pairs.domain, encoding, gates, s) for s in (train, boundary) if len(s)]
     inputs, *rest = (torch.cat(c, -1) for c in zip(*parts, strict=True))
     low, high = inputs.amin(1), inputs.amax(1)
     shift = (low + high) / 2
@@ -148,9 +150,13 @@ def _part(
     position_um, direction_um = film_equivalent_weights(lens, domain)
     weights = torch.empty((3, len(pairs)), dtype=torch.float64)
     weights[POSITION], weights[DIRECTION] = position_um * passes, direction_um * passes
-    weights[STOP] = _STOP_UM_PER_MM * lens.stop_radius_mm * _near((stop * stop).sum(0) - 1).where(passes == 0, 1.0)
+    near = _near((stop * stop).sum(0) - 1).where(passes == 0, 1.0)
+    arrives = gate_reach(
+        (Gate(lens.stop_index, st.RIM), *gates), pairs
+    )  # rays lost before a boundary say nothing of it
+    weights[STOP] = _STOP_UM_PER_MM * lens.stop_radius_mm * near.where(arrives[0], 0.0)
     scalars = torch.cat([targets.transmittance[None], gate])
-    scalar_weights = torch.cat([_TRANSMITTANCE_UM * passes[None], _GATE_UM * _near(gate)])
+    scalar_weights = torch.cat([_TRANSMITTANCE_UM * passes[None], (_GATE_UM * _near(gate)).where(arrives[1:], 0.0)])
     field = targets.field
     return field.invariants(), field.p, field.u, targets.vectors, weights, scalars, scalar_weights
 

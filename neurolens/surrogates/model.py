@@ -14,6 +14,7 @@ from torch import Tensor
 
 from neurolens import status as st
 from neurolens.errors import InputError
+from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.domain import Domain, FilmRays
@@ -21,7 +22,9 @@ from neurolens.surrogates.lightfield import Encoding, LightField, direction_of, 
 
 # Order of the vector outputs of every core.
 POSITION, DIRECTION, STOP = 0, 1, 2
-VECTORS = ("position", "direction", "stop")
+
+# Positive and finite, in float32 too.
+ANY_WAVELENGTH_NM = (1e-30, 3e38)
 
 
 class Core(Protocol):
@@ -116,7 +119,7 @@ class LensModel:
         Raises:
             InputError: a stop wider than the model was fitted for.
         """
-        if stop_radius_mm is not None and not 0 <= stop_radius_mm <= 1.00001 * self.domain.stop_radius_mm:
+        if stop_radius_mm is not None and not 0 <= stop_radius_mm <= DOMAIN_SLACK * self.domain.stop_radius_mm:
             expected = f"0 to {self.domain.stop_radius_mm:.6g} mm, the widest stop of the fit"
             raise InputError(self.method, "stop_radius_mm", stop_radius_mm, expected)
         core = self.core.to(rays.film_x.dtype)
@@ -148,12 +151,18 @@ class LensModel:
 
     def inside_domain(self, rays: FilmRays) -> Tensor:
         """[N] bool; false for NaN. Bounds have a relative slack of 1e-5, the rounding of float32 inputs."""
-        d, slack = self.domain, 1.00001
+        d, slack = self.domain, DOMAIN_SLACK
         ok = rays.film_x**2 + rays.film_y**2 <= (d.film_radius_mm * slack) ** 2
         ok &= rays.pupil_x**2 + rays.pupil_y**2 <= (d.pupil_radius_mm * slack) ** 2
         near, far = d.film_z_mm
         ok &= (rays.film_z >= near / slack) & (rays.film_z <= far * slack)
-        if self.encoding.w_half:
-            low, high = d.wavelength_nm
-            ok &= (rays.wavelength_nm >= low / slack) & (rays.wavelength_nm <= high * slack)
-        return ok
+        low, high = self.wavelength_limits_nm
+        return ok & (rays.wavelength_nm >= low) & (rays.wavelength_nm <= high)
+
+    @property
+    def wavelength_limits_nm(self) -> tuple[float, float]:
+        """Wavelengths accepted: those of the domain with their slack; any for glass without dispersion."""
+        if not self.lens.dispersive:
+            return ANY_WAVELENGTH_NM
+        low, high = self.domain.wavelength_nm
+        return low / DOMAIN_SLACK, high * DOMAIN_SLACK

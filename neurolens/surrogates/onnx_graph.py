@@ -50,11 +50,6 @@ class Graph:
         self.nodes.append(helper.make_node("Split", inputs, names, name=f"n{len(self.nodes)}", axis=0))
         return names
 
-    def rows(self, value: str, start: int, stop: int) -> str:
-        """Rows start..stop-1 of [K, N]."""
-        bounds = (self.const([v], np.int64) for v in (start, stop, 0))
-        return self.op("Slice", value, *bounds)
-
     def concat(self, *values: str, out: str | None = None) -> str:
         """Stack along the first axis."""
         return values[0] if len(values) == 1 and out is None else self.op("Concat", *values, axis=0, out=out)

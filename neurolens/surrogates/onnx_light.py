@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens import status as st
+from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import LensModel
@@ -19,7 +20,6 @@ Array = NDArray[np.float64]
 
 # Any positive float32 test times this exceeds every status code, so that clipping turns a failed test into its code.
 TEST_SCALE = 1e30
-SLACK = 1.00001  # of the domain's bounds, as in LensModel.inside_domain
 
 
 def add_light_field(g: Graph, model: LensModel) -> tuple[Field, str]:
@@ -27,14 +27,15 @@ def add_light_field(g: Graph, model: LensModel) -> tuple[Field, str]:
     e, d = model.encoding, model.domain
     film_pupil, wavelength = g.split("rays", [4, 1])
     inside = _inside(g, d, film_pupil)
+    low, high = model.wavelength_limits_nm
     if e.w_half:
         # v = 1000 / (lambda sqrt(half)), so that w = v^2 - middle / half.
         unit = 1000 / math.sqrt(e.w_half)
         v = g.op("Div", g.const(unit), wavelength)
-        low, high = d.wavelength_nm
-        clipped = g.op("Clip", v, g.const(unit / (high * SLACK)), g.const(unit * SLACK / low))
-        inside = g.op("And", inside, g.op("Equal", v, clipped))  # false for NaN, whatever Clip makes of it
+        inside = g.op("And", inside, _between(g, v, unit / high, unit / low))
         film_pupil = g.concat(film_pupil, v)
+    else:
+        inside = g.op("And", inside, _between(g, wavelength, low, high))
     matrix = _plane_matrix(g, e)
     planes = g.op("MatMul", matrix, film_pupil)  # rows p, u, p + u, v
     squares = g.op("Mul", planes, planes)
@@ -46,6 +47,11 @@ def add_light_field(g: Graph, model: LensModel) -> tuple[Field, str]:
         weight[3, 6], bias[3] = 1, -e.w_middle / e.w_half
     p, u, *_ = g.split(planes, [2, 2, len(weight[0]) - 4])
     return Field(p, u, squares, weight, bias, e.w_half != 0), inside
+
+
+def _between(g: Graph, value: str, low: float, high: float) -> str:
+    """Whether low <= value <= high; false for NaN, whatever Clip makes of it."""
+    return g.op("Equal", value, g.op("Clip", value, g.const(low), g.const(high)))
 
 
 def _plane_matrix(g: Graph, e: Encoding) -> str:
@@ -72,12 +78,13 @@ def _inside(g: Graph, d: Domain, film_pupil: str) -> str:
     """Film point, pupil point, film position and stop inside the domain, bool [1, N]; comparisons that NaN fails."""
     square = g.reshape(g.op("Mul", film_pupil, film_pupil), [2, 2, -1])
     square = g.op("ReduceSum", square, g.const([1], np.int64), keepdims=0)
-    limits = np.square([[d.film_radius_mm * SLACK], [d.pupil_radius_mm * SLACK]])
+    limits = np.square([[d.film_radius_mm * DOMAIN_SLACK], [d.pupil_radius_mm * DOMAIN_SLACK]])
     within = g.split(g.op("LessOrEqual", square, g.const(limits)), [1, 1])
     near, far = d.film_z_mm
-    call = g.op("LessOrEqual", "film_z_mm", g.const([far * SLACK]))
-    call = g.op("And", call, g.op("GreaterOrEqual", "film_z_mm", g.const([near / SLACK])))
-    call = g.op("And", call, g.op("LessOrEqual", "stop_radius_mm", g.const([d.stop_radius_mm * SLACK])))
+    call = g.op("LessOrEqual", "film_z_mm", g.const([far * DOMAIN_SLACK]))
+    call = g.op("And", call, g.op("GreaterOrEqual", "film_z_mm", g.const([near / DOMAIN_SLACK])))
+    call = g.op("And", call, g.op("GreaterOrEqual", "stop_radius_mm", g.const([0.0])))
+    call = g.op("And", call, g.op("LessOrEqual", "stop_radius_mm", g.const([d.stop_radius_mm * DOMAIN_SLACK])))
     return g.op("And", g.op("And", within[0], within[1]), call)
 
 
@@ -128,14 +135,22 @@ def _horner(g: Graph, t: str, coefficients: Array) -> str:
 def add_status(g: Graph, model: LensModel, rows: CoreRows, stop_square: str, inside: str) -> None:
     """Output status: the code of the first failed test along a camera ray, then the domain.
 
-    Camera rays meet the last surface first, so the first failure is the largest code.
+    Camera rays meet the last surface first, so the first failure is the largest code; of several tests at one surface
+    it is the smallest.
     """
     limit = g.op("Mul", g.op("Mul", "stop_radius_mm", "stop_radius_mm"), g.const([TEST_SCALE]))
     over = g.op("Sub", g.op("Mul", stop_square, g.const(TEST_SCALE)), limit)
     tests = [(over, st.blocked(model.lens.stop_index, st.RIM))]
     tests += [(row, gate.status) for row, gate in zip(rows.gates, model.gates, strict=True)]
-    failed = [g.op("Clip", test, g.const(0.0), g.const(float(code))) for test, code in tests]
-    code = g.op("Max", *failed)
+    failed: dict[int, str] = {}  # by surface
+    for test, status in sorted(tests, key=lambda t: t[1]):
+        code = g.op("Clip", test, g.const(0.0), g.const(float(status)))
+        surface = status // 4
+        if surface in failed:
+            earlier = failed[surface]
+            code = g.op("Where", g.op("Greater", earlier, g.const(0.0)), earlier, code)
+        failed[surface] = code
+    code = g.op("Max", *failed.values())
     code = g.op("Where", inside, code, g.const(float(st.OUTSIDE_DOMAIN)))
     g.reshape(g.op("Cast", code, to=INT32), [-1], out="status")
 

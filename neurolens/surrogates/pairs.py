@@ -1,10 +1,10 @@
-"""Ray pairs: camera rays of a domain and their exact images, in three splits, saved and reloaded bit for bit."""
+"""Ray pairs: camera rays of a domain and their exact images, in four splits, saved and reloaded bit for bit."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import Rays, trace
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
 
-SCHEMA = 1
+SCHEMA = 2
+SPLITS = ("train", "held_out", "rim", "edge")
 # Rays beyond this many rim radii are too far from any boundary to teach a model where it lies.
 RIM_REACH = 1.25
 _BATCH = 65536
@@ -79,6 +80,8 @@ class RayPairs:
         lens, domain, settings: what was traced.
         train, held_out: rays that pass; no ray is in both.
         rim: rays that reach the scene but for a rim or the stop, up to a quarter of a radius beyond it.
+        edge: rays that miss a surface or are totally reflected, and are no further from the rims before that than the
+            rays of `rim`; at most as many as asked for of `rim`. What they never reached is 0. Empty for most lenses.
         tested: rays drawn until `train` was full, so that len(train) / tested is the share of the disc that passes.
     """
 
@@ -88,6 +91,7 @@ class RayPairs:
     train: PairSet
     held_out: PairSet
     rim: PairSet
+    edge: PairSet
     tested: int
 
 
@@ -105,7 +109,9 @@ def trace_pairs(lens: Lens, inputs: FilmRays, pupil_z: float) -> PairSet:
 def make_pairs(
     lens: Lens, domain: Domain, settings: PairSettings | None = None, progress: Callable[[float], None] | None = None
 ) -> RayPairs:
-    """Sample a domain and trace it in float64 until every split is full.
+    """Sample a domain and trace it in float64 until `train` and `held_out` are full.
+
+    `rim` and `edge` come from the rays drawn for `train`, as many as those hold.
 
     Raises:
         InputError: an empty split, or fewer than one ray in 10,000 of the domain passes.
@@ -115,7 +121,7 @@ def make_pairs(
         if getattr(settings, name) < 1:
             raise InputError("pairs", name, getattr(settings, name), "at least one ray")
     wanted = {"train": settings.train, "held_out": settings.held_out}
-    found: dict[str, list[PairSet]] = {"train": [], "held_out": [], "rim": []}
+    found: dict[str, list[PairSet]] = {name: [] for name in SPLITS}
     counts = dict.fromkeys(found, 0)
     drawn, tested = 0, 0
     total = sum(wanted.values())
@@ -127,10 +133,9 @@ def make_pairs(
             needed = wanted["train"] - counts["train"]
             order = torch.nonzero(passed)[:, 0]
             tested += int(order[needed - 1]) + 1 if len(order) >= needed else len(batch)
-            if counts["rim"] < settings.rim:
-                near = batch.select(_teaches_rims(lens, batch))
-                found["rim"].append(near.select(slice(0, settings.rim - counts["rim"])))
-                counts["rim"] += len(found["rim"][-1])
+            for name, near in (("rim", _teaches_rims(lens, batch)), ("edge", _teaches_edges(lens, batch))):
+                found[name].append(batch.select(near).select(slice(0, settings.rim - counts[name])))
+                counts[name] += len(found[name][-1])
         found[split].append(batch.select(passed).select(slice(0, wanted[split] - counts[split])))
         counts[split] += len(found[split][-1])
         drawn += len(batch)
@@ -143,19 +148,54 @@ def make_pairs(
             )
         if progress:
             progress((counts["train"] + counts["held_out"]) / total)
-    joined = {name: _join(sets) for name, sets in found.items()}
-    return RayPairs(lens, domain, settings, joined["train"], joined["held_out"], joined["rim"], tested)
+    joined = {name: join_pairs(sets) for name, sets in found.items()}
+    joined["edge"] = _without_the_rest(joined["edge"])
+    return RayPairs(lens, domain, settings, **joined, tested=tested)
 
 
 def _teaches_rims(lens: Lens, batch: PairSet) -> Tensor:
     """Rays that refract all the way and cross no surface far beyond its rim."""
     # Status cannot tell: a ray that a rim stops may end for another reason later. A lost ray comes back along the axis.
     refracts = (batch.meets > 0).all(0) & (batch.refracts > 0).all(0) & torch.isfinite(batch.cross_x).all(0)
+    refracts &= ~_lost(batch)
     radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
     return refracts & (batch.cross_x**2 + batch.cross_y**2 <= (RIM_REACH * radii) ** 2).all(0)
 
 
-def _join(sets: list[PairSet]) -> PairSet:
+def reached(pairs: PairSet) -> Tensor:
+    """[S, N] bool: whether each camera ray arrives at each surface, having met and passed the glass of those before."""
+    goes_on = ((pairs.meets > 0) & (pairs.refracts > 0)).flip(0)  # camera rays meet the last surface first
+    before = torch.cat([torch.ones_like(goes_on[:1]), goes_on[:-1]])
+    # A ray that meets the far half of a sphere, or a plane from behind, ends there with a positive discriminant.
+    end = torch.where(_lost(pairs), pairs.status // 4 - 1, -1)
+    return (before.cumprod(0).flip(0) > 0) & (torch.arange(len(goes_on))[:, None] >= end)
+
+
+def _lost(pairs: PairSet) -> Tensor:
+    """[N] bool: rays whose status is a missed surface or total reflection."""
+    return (pairs.status >= 4) & (pairs.status % 4 != st.RIM)
+
+
+def _teaches_edges(lens: Lens, batch: PairSet) -> Tensor:
+    """Rays that end at a discriminant, and cross no surface before that far beyond its rim."""
+    lost = ~((batch.meets > 0) & (batch.refracts > 0)).all(0)
+    on_the_way = reached(batch) & (batch.meets > 0) & (batch.refracts > 0)
+    radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
+    return lost & (~on_the_way | (batch.cross_x**2 + batch.cross_y**2 <= (RIM_REACH * radii) ** 2)).all(0)
+
+
+def _without_the_rest(lost: PairSet) -> PairSet:
+    """Lost rays with 0 for what they never reached, where tracing them further gave figures without meaning."""
+    known = reached(lost)
+    meets = lost.meets.where(known, 0.0)
+    met = known & (meets > 0)
+    cross_x, cross_y = lost.cross_x.where(met, 0.0), lost.cross_y.where(met, 0.0)
+    return replace(lost, cross_x=cross_x, cross_y=cross_y, meets=meets, refracts=lost.refracts.where(known, 0.0))
+
+
+def join_pairs(sets: list[PairSet]) -> PairSet:
+    """One set of all the rays, in order."""
+
     def cat(name: str, dim: int = 0) -> Tensor:
         return torch.cat([getattr(s, name) for s in sets], dim)
 
@@ -178,7 +218,7 @@ def save_pairs(pairs: RayPairs, path: str | Path) -> None:
         "tested": pairs.tested,
     }
     arrays: dict[str, Any] = {"header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
-    for name in ("train", "held_out", "rim"):
+    for name in SPLITS:
         s: PairSet = getattr(pairs, name)
         arrays[f"{name}_vectors"] = torch.stack([*s.inputs.columns(), *s.scene, s.transmittance]).numpy()
         arrays[f"{name}_status"] = s.status.numpy()
@@ -201,7 +241,7 @@ def load_pairs(path: str | Path, lens: Lens) -> RayPairs:
             raise InputError(path, "schema", header["schema"], str(SCHEMA))
         if header["lens_sha256"] != lens.sha256:
             raise InputError(path, "lens_sha256", header["lens_sha256"], f"{lens.sha256} ({lens.path})")
-        sets = {name: _unpack(arrays, name) for name in ("train", "held_out", "rim")}
+        sets = {name: _unpack(arrays, name) for name in SPLITS}
         domain, settings = Domain.from_dict(header["domain"]), PairSettings(**header["settings"])
         return RayPairs(lens, domain, settings, **sets, tested=header["tested"])
     except InputError:

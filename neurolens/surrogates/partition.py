@@ -22,6 +22,7 @@ ZoneCore = InvariantPolynomial | RawPolynomial | Network
 # A zone's fit sees this share of rho beyond its edges, so that neighbours meet.
 OVERLAP = 0.03
 _FEWEST_RAYS = 200
+_FITTED = ("train", "rim", "edge")  # the splits that fits see
 
 
 def fit_partitioned(
@@ -38,7 +39,8 @@ def fit_partitioned(
     if zones < 1 or len(pairs.train) < zones * _FEWEST_RAYS:
         most = max(1, len(pairs.train) // _FEWEST_RAYS)
         raise InputError("fit", "partitions", zones, f"1 to {most} zones for {len(pairs.train)} training rays")
-    rho, rim_rho = (encoding(s.inputs).invariants()[0] for s in (pairs.train, pairs.rim))
+    rhos = {name: encoding(getattr(pairs, name).inputs).invariants()[0] for name in _FITTED}
+    rho = rhos["train"]
     bounds = [(-torch.inf, torch.inf)]
     cores = [fit(pairs)]
     while len(cores) < zones:
@@ -49,7 +51,7 @@ def fit_partitioned(
         middle = float(rho[inside[worst]].median())
         halves = [(low, middle), (middle, high)]
         bounds[worst : worst + 1] = halves
-        cores[worst : worst + 1] = [fit(_zone(pairs, rho, rim_rho, *half)) for half in halves]
+        cores[worst : worst + 1] = [fit(_zone(pairs, rhos, *half)) for half in halves]
     if zones == 1:
         return cores[0]
     return Partitioned(tuple(high for _, high in bounds[:-1]), tuple(cores))
@@ -62,8 +64,10 @@ def _squared_error(pairs: RayPairs, encoding: Encoding, core: ZoneCore, at: Tens
     return float(((found - film_equivalent(pairs.lens, pairs.domain, targets.vectors)) ** 2).sum())
 
 
-def _zone(pairs: RayPairs, rho: Tensor, rim_rho: Tensor, low: float, high: float) -> RayPairs:
-    def within(values: Tensor, rays: PairSet) -> PairSet:
-        return rays.select((values > low - OVERLAP) & (values <= high + OVERLAP))
+def _zone(pairs: RayPairs, rhos: dict[str, Tensor], low: float, high: float) -> RayPairs:
+    def within(name: str) -> PairSet:
+        rho, rays = rhos[name], getattr(pairs, name)
+        chosen: PairSet = rays.select((rho > low - OVERLAP) & (rho <= high + OVERLAP))
+        return chosen
 
-    return replace(pairs, train=within(rho, pairs.train), rim=within(rim_rho, pairs.rim))
+    return replace(pairs, train=within("train"), rim=within("rim"), edge=within("edge"))

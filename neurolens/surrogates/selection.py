@@ -82,7 +82,9 @@ def matching_pursuit(gram: Floats, moments: Floats, terms: int) -> list[int]:
     with warnings.catch_warnings():
         # Dependent candidates end the pursuit early, with a warning: the terms found so far are the answer.
         warnings.simplefilter("ignore", RuntimeWarning)
-        found = orthogonal_mp_gram(gram / np.outer(norms, norms), moments / norms, n_nonzero_coefs=terms)
+        found = orthogonal_mp_gram(
+            gram / np.outer(norms, norms), moments / norms, n_nonzero_coefs=min(terms, len(gram))
+        )
     return [int(k) for k in np.flatnonzero(found)]
 
 

@@ -1,8 +1,13 @@
-"""Models that fix what a scene fixes: one wavelength folds every power of w into the coefficients."""
+"""Models that fix what a scene fixes: one wavelength folds every power of w into the coefficients.
+
+For pictures in one colour of light (a laser line, a filter, a measurement at the d line), or one model a channel where
+dispersion within a channel does not count. Pictures in white light take the whole model.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,12 +16,12 @@ from torch import Tensor
 
 from neurolens.errors import InputError
 from neurolens.optics.glass import inverse_square_um
-from neurolens.surrogates.cores import InvariantPolynomial, Network, RawPolynomial
+from neurolens.surrogates.cores import InvariantPolynomial, Network, Partitioned, RawPolynomial
 from neurolens.surrogates.model import Core, LensModel
 
 
 def at_wavelength(model: LensModel, wavelength_nm: float) -> LensModel:
-    """The same model for one wavelength: smaller and faster, and it ignores the wavelength of its rays.
+    """The same model for one wavelength: smaller and faster. Rays of any other wavelength are outside its domain.
 
     Raises:
         InputError: a wavelength outside the model's domain, or a model without a wavelength input.
@@ -36,7 +41,7 @@ def at_wavelength(model: LensModel, wavelength_nm: float) -> LensModel:
     )
 
 
-def _fixed(core: Core, w: float) -> Core:
+def _fixed(core: Core, w: float) -> Any:
     if isinstance(core, InvariantPolynomial):
         exponents, merge = _merge(core.exponents, w)
         return replace(core, exponents=exponents, ab=core.ab @ merge, scalars=core.scalars @ merge)
@@ -46,6 +51,9 @@ def _fixed(core: Core, w: float) -> Core:
     if isinstance(core, Network):
         # With w_half = 0 the network is shown w = 0; its shift makes that the wanted one.
         return replace(core, shift=core.shift - w * torch.tensor([0, 0, 0, 1], dtype=core.shift.dtype))
+    if isinstance(core, Partitioned):
+        # Zones are split by rho, which no wavelength changes.
+        return replace(core, parts=tuple(_fixed(part, w) for part in core.parts))
     raise TypeError(f"no fixed wavelength for a core of type {type(core).__name__}")
 
 

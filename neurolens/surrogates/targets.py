@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neurolens import status as st
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.lightfield import Encoding, LightField, angle_vector
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate, Scales
+from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Scales
 from neurolens.surrogates.pairs import PairSet
 
 
@@ -51,11 +50,13 @@ def film_equivalent_weights(lens: Lens, domain: Domain) -> tuple[float, float]:
     """Micrometres on the film per unit of scaled position and per radian, first order.
 
     A direction error d moves the image by f d; a position error e on the front surface moves a point in the nearest
-    focused plane by e, and so its image by e times the magnification there. At infinity position does not count;
-    the fit uses at least the magnification of 20 focal lengths, so that near objects keep their place.
+    focused plane by e, and so its image by e times the magnification there; objects nearer than that plane count where
+    the domain knows of any (`Domain.nearest_m`). At infinity position does not count; the fit uses at least the
+    magnification of 20 focal lengths, so that near objects keep their place.
     """
     f = abs(first_order(lens).efl_mm)
-    nearest_mm = min(1000 * min(domain.focus_m), 20 * f)
+    nearest_m = min(*domain.focus_m, math.inf if domain.nearest_m is None else domain.nearest_m)
+    nearest_mm = min(1000 * nearest_m, 20 * f)
     magnification = f / max(nearest_mm - f, f)
     return 1000 * magnification * scales_of(lens).position_mm, 1000 * f
 
@@ -65,40 +66,3 @@ def film_equivalent(lens: Lens, domain: Domain, vectors: Tensor) -> Tensor:
     position, direction = film_equivalent_weights(lens, domain)
     at_infinity = direction * vectors[DIRECTION]
     return torch.stack([at_infinity + position * vectors[POSITION], at_infinity])
-
-
-def gate_values(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
-    """[G, N] exact values of the gates, positive where the surface stops the ray; NaN-free for rays that reach it."""
-    rows = []
-    for gate in gates:
-        k = gate.surface
-        if gate.reason == st.RIM:
-            radius = lens.surfaces[k].semi_diameter_mm
-            rows.append((pairs.cross_x[k] ** 2 + pairs.cross_y[k] ** 2) / radius**2 - 1)
-        else:
-            rows.append(-(pairs.meets[k] if gate.reason == st.MISSED else pairs.refracts[k]))
-    return torch.stack(rows) if rows else torch.empty((0, len(pairs)), dtype=pairs.transmittance.dtype)
-
-
-def choose_gates(lens: Lens, blocked: PairSet, unexplained: float = 1e-4, most: int = 10) -> tuple[Gate, ...]:
-    """The rims that block anything in the domain: the one that explains most blocked rays, then the next (greedy).
-
-    Args:
-        blocked: rays that did not pass, drawn uniformly over the domain; only those that refract all the way count.
-        unexplained: stop when no more than this share of them is left.
-
-    Returns the gates in the order in which camera rays meet them. The stop is no gate: it is tested on its crossing.
-    """
-    radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
-    outside = (blocked.cross_x**2 + blocked.cross_y**2) > radii**2  # [S, N]
-    total = outside.shape[1]
-    outside = outside & ~outside[lens.stop_index]
-    chosen: list[int] = []
-    while total and len(chosen) < most:
-        counts = outside.sum(1)
-        best = int(counts.argmax())
-        if int(counts[best]) <= max(0, math.floor(unexplained * total)):
-            break
-        chosen.append(best)
-        outside = outside & ~outside[best]
-    return tuple(Gate(k, st.RIM) for k in sorted(chosen, reverse=True))

@@ -57,6 +57,16 @@ def test_white_surroundings_give_one_on_the_axis(kind: str, f_number: float | No
     assert film_mean(camera(kind, 2.0, f_number), (0.0, 0.0)) == pytest.approx(1, abs=0.004)
 
 
+@pytest.mark.parametrize("f_number", [None, 8.0])
+def test_white_surroundings_off_the_axis_do_not_depend_on_where_the_pupil_is_sampled(f_number: float | None) -> None:
+    """Bounds of the whole domain, bounds of this shot, and the model's: three ways to the same irradiance."""
+    means = [
+        film_mean(camera(k, 2.0, f_number), (15.0, 8.0), 192) for k in ("exact", "exact, own bounds", "invariants")
+    ]
+    assert 0.2 < means[0] < 0.95
+    assert means == pytest.approx([means[0]] * 3, rel=0.005)
+
+
 @pytest.mark.parametrize("focus_m", [math.inf, 1.0])
 def test_model_and_exact_lens_send_the_same_rays(focus_m: float) -> None:
     rng = np.random.default_rng(3)

@@ -9,8 +9,9 @@ import pytest
 
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.sampling import concentric_disk
-from neurolens.cameras.thin import ThinLens, image_distance_mm
+from neurolens.cameras.thin import ThinLens
 from neurolens.errors import InputError
+from neurolens.focus import film_z_mm
 
 
 def square_grid(side: int) -> np.ndarray:
@@ -60,7 +61,7 @@ def test_thin_lens_at_infinity_gives_parallel_rays_towards_the_upside_down_scene
 
 def test_conjugate_distances_obey_the_lens_equation() -> None:
     for focus_m in (0.2, 0.5, 3.0, 1e6):
-        image = image_distance_mm(50.0, focus_m)
+        image = film_z_mm(50.0, 0.0, 0.0, focus_m)
         assert 1 / image + 1 / (1e3 * focus_m - image) == pytest.approx(1 / 50.0, rel=1e-12)
 
 

@@ -26,6 +26,9 @@ SHARED = ROOT.parent / "shared" / "data"
 OWN = json.loads((ROOT / "tests" / "data" / "oracle_rays.json").read_text())["lenses"]
 REASONS = {"miss": st.MISSED, "clipped": st.RIM, "tir": st.TOTAL_REFLECTION}
 TOLERANCE_MM = {torch.float64: 1e-11, torch.float32: 5e-5}
+# Image points lie tens of millimetres behind the last surface, where the rounding of a float32 direction (5e-6 allowed)
+# moves a ray by more than that of its point: 5e-6 times 200 mm.
+IMAGE_TOLERANCE_MM = {torch.float64: 1e-11, torch.float32: 1e-3}
 # The spherical lenses of ../shared: prescription in the file itself, or in data/lenses.
 WHOLE = (
     *("full_double_gauss_n1691", "full_double_gauss_n1961", "full_tessar", "ogawa_canon_70_200_us5537259"),
@@ -100,7 +103,7 @@ def check(case: Case, dtype: torch.dtype) -> Traced:
     """Points, directions and image points of passing rays; the surface and the reason of the others."""
     out = trace(case.lens, launched(case.rays, dtype), towards="film", record=range(len(case.lens.surfaces)))
     assert out.rays.x.dtype == dtype
-    worst = 0.0
+    worst, worst_image = 0.0, 0.0
     for i, ray in enumerate(case.rays):
         status = int(out.status[i])
         if ray["status"] != "ok":
@@ -118,8 +121,8 @@ def check(case: Case, dtype: torch.dtype) -> Traced:
             reach = (case.first_order["image_z"] - point[2]) / point[5]
             for axis in (0, 1):
                 at_image = point[axis] + reach * point[3 + axis]
-                worst = max(worst, abs(at_image - ray["image_point"][axis]) * (1 if dtype == torch.float64 else 0.05))
-    assert worst < TOLERANCE_MM[dtype]
+                worst_image = max(worst_image, abs(at_image - ray["image_point"][axis]))
+    assert worst < TOLERANCE_MM[dtype] and worst_image < IMAGE_TOLERANCE_MM[dtype]
     return out
 
 

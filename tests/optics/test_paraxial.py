@@ -149,6 +149,20 @@ def test_nearer_than_four_focal_lengths_is_an_error_that_names_the_limit() -> No
         lens.at(focus_m=nearest * 0.999)
 
 
+def test_far_objects_move_the_film_by_the_square_of_the_focal_length_over_their_distance() -> None:
+    """To the last digits, where the difference of two nearly equal numbers would lose them."""
+    lens = thick(50, -50, 5, 1.5)
+    efl = first_order(lens).efl_mm
+    at_infinity = film_z_mm(lens, math.inf)
+    for focus_m in (1e4, 1e6):
+        assert film_z_mm(lens, focus_m) - at_infinity == pytest.approx(efl**2 / (1000 * focus_m), rel=2e-5)
+
+
+def test_a_diverging_lens_has_no_film_for_an_object_between_its_principal_planes() -> None:
+    with pytest.raises(InputError, match="focus_m"):
+        thick(-50, 50, 60, 1.5).at(focus_m=1e-3)
+
+
 @pytest.mark.parametrize("field", ["efl_mm", "f_number", "focus_m"])
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
 def test_states_that_are_none(field: str, value: float) -> None:

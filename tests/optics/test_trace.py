@@ -338,7 +338,7 @@ def test_float32_agrees_with_float64(name: str) -> None:
         assert min(edges) < 1e-3 or min(margins) < 1e-4
     passed = (fine.status == 0) & (coarse.status == 0)
     for a, b in zip(fine.rays, coarse.rays, strict=True):
-        assert (a - b)[passed].abs().max() < 2e-3 if name == "shimizu" else 3e-4
+        assert (a - b)[passed].abs().max() < 3e-4
 
 
 def test_recording_changes_no_status() -> None:

@@ -26,6 +26,7 @@ from neurolens.surrogates.domain import (
     sample_domain,
 )
 from neurolens.surrogates.pairs import PairSet, PairSettings, RayPairs, load_pairs, make_pairs, save_pairs, trace_pairs
+from neurolens.surrogates.targets import film_equivalent_weights
 
 pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
 ROOT = Path(__file__).parents[2] / "lenses"
@@ -93,6 +94,28 @@ def test_domain_survives_json() -> None:
     assert Domain.from_dict(json.loads(json.dumps(DOMAIN.to_dict()))) == DOMAIN
 
 
+def test_cards_without_a_nearest_object_still_load() -> None:
+    data = DOMAIN.to_dict()
+    del data["nearest_m"]
+    assert Domain.from_dict({**data, "written_by": "a later version"}) == DOMAIN
+    near = replace(DOMAIN, nearest_m=0.3)
+    assert Domain.from_dict(json.loads(json.dumps(near.to_dict()))) == near
+
+
+def test_near_objects_before_the_plane_in_focus_keep_their_place() -> None:
+    """A position error counts by the magnification of the nearest thing in view, in focus or not."""
+    lens, kwargs = singlet(), {"film_mm": (10.0, 10.0), "focus_m": 5.0}
+    position: dict[float | None, float] = {}
+    for nearest_m in (None, 10.0, 0.5):
+        shot = domain_from_camera(lens, **kwargs, nearest_m=nearest_m)  # type: ignore[arg-type]
+        position[nearest_m] = film_equivalent_weights(*shot)[0]
+        assert shot[1].film_z_mm == domain_from_camera(lens, **kwargs)[1].film_z_mm  # type: ignore[arg-type]
+    f = first_order(lens).efl_mm
+    # No less than the magnification at 20 focal lengths.
+    assert position[None] == position[10.0] == pytest.approx(1000 / 19 * lens.surfaces[0].semi_diameter_mm)
+    assert position[0.5] / position[None] == pytest.approx(f / (500 - f) * 19)
+
+
 def test_one_shot_needs_less_than_the_whole_lens() -> None:
     lens = read_lens(ROOT / "brendel_tessar_100.toml").at(efl_mm=50)
     full = domain_of(lens, focus_m=(math.inf, 0.7))
@@ -136,6 +159,10 @@ def test_without_dispersion_there_is_one_wavelength() -> None:
     [
         ({"film_radius_mm": 0.0}, "film_radius_mm"),
         ({"film_radius_mm": math.nan}, "film_radius_mm"),
+        ({"nearest_m": 0.0}, "nearest_m"),
+        ({"nearest_m": -1.0}, "nearest_m"),
+        ({"nearest_m": math.nan}, "nearest_m"),
+        ({"nearest_m": math.inf}, "nearest_m"),
         ({"wavelength_nm": (700.0, 400.0)}, "wavelength_nm"),
         ({"wavelength_nm": (0.4, 0.7)}, "wavelength_nm"),
         ({"wavelength_nm": (math.nan, 700.0)}, "wavelength_nm"),

@@ -20,6 +20,7 @@ from neurolens.surrogates.card import card_of, card_to_json
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.model import LensModel, Prediction
+from neurolens.surrogates.specialise import at_wavelength
 
 COUNT = 100_000
 
@@ -97,6 +98,8 @@ def test_nothing_outside_the_domain_passes(kind: str) -> None:
         inside &= np.hypot(r[2], r[3]) <= domain.pupil_radius_mm * 1.0001
         if low < high:
             inside &= (r[4] >= low / 1.0001) & (r[4] <= high * 1.0001)
+        else:
+            inside &= (r[4] > 0) & np.isfinite(r[4])
     scene, _, _, status = run(kind, rays, domain.film_z_mm[0], domain.stop_radius_mm)
     assert np.all(status[~inside] == st.OUTSIDE_DOMAIN)
     passed = status == st.PASSED
@@ -112,7 +115,7 @@ def test_film_position_outside_the_domain(bad: float | str) -> None:
         assert np.all(run(kind, rays, float(z), domain.stop_radius_mm)[3] == st.OUTSIDE_DOMAIN)
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, 1.001])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1.001, -1e-6, -0.5, -math.inf])
 def test_stop_wider_than_the_domain_and_closed_stop(bad: float) -> None:
     domain = lens_models.domain()
     rays = domain_rays(domain, 1000, seed=5)
@@ -120,6 +123,27 @@ def test_stop_wider_than_the_domain_and_closed_stop(bad: float) -> None:
     assert np.all(run("invariants", rays, domain.film_z_mm[0], stop)[3] == st.OUTSIDE_DOMAIN)
     closed = run("invariants", rays, domain.film_z_mm[0], 0.0)[3]
     assert not (closed == st.PASSED).any() and not (closed == st.OUTSIDE_DOMAIN).any()
+
+
+@pytest.mark.parametrize("kind", ["laser", "fisheye"])
+def test_one_wavelength_models_refuse_what_is_no_wavelength(kind: str, tmp_path: Path) -> None:
+    """A model for one wavelength knows no other; one of a lens without dispersion takes any that is one."""
+    model = lens_models.model("invariants" if kind == "laser" else kind)
+    path = lens_models.exported(kind) if kind != "laser" else tmp_path / "laser.onnx"
+    if kind == "laser":
+        model = at_wavelength(model, 550.0)
+        export_onnx(model, path)
+    good = [550.0, 550.0 * (1 + 5e-6)] if kind == "laser" else [587.6, 1.0, 1e6]
+    bad = [math.nan, math.inf, -math.inf, 0.0, -550.0, *([551.0, 400.0] if kind == "laser" else [])]
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    rays = domain_rays(model.domain, 500, seed=8)
+    film_z, stop = model.domain.film_z_mm[0], model.domain.stop_radius_mm
+    for wavelength in (*good, *bad):
+        rays[4] = wavelength
+        feeds = {"rays": rays, "film_z_mm": np.float32([film_z]), "stop_radius_mm": np.float32([stop])}
+        status = session.run(["status"], feeds)[0]
+        for found in (status, predict(model, rays, film_z, stop).status.numpy()):
+            assert np.all((found == st.OUTSIDE_DOMAIN) == (wavelength not in good)), wavelength
 
 
 def test_domain_limits_are_inside() -> None:

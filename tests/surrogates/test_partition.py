@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from lens_models import prepared
 
 from neurolens.cameras.model import load_model
 from neurolens.errors import InputError
@@ -16,7 +17,6 @@ from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel
-from tests.lens_models import prepared
 
 
 @pytest.fixture(scope="module")

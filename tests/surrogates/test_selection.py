@@ -205,3 +205,10 @@ def test_forward_omp_is_the_same_pursuit_as_scikit_learns() -> None:
     sweep = Sweep(gram, moments[:, None], np.array([output @ output]))
     forward(sweep, 6, "omp")
     assert sorted(sweep.chosen) == matching_pursuit(gram, moments, 6)
+
+
+def test_matching_pursuit_asked_for_more_terms_than_there_are_takes_all() -> None:
+    rng = np.random.default_rng(6)
+    columns = rng.normal(size=(200, 5))
+    moments = columns.T @ rng.normal(size=200)
+    assert matching_pursuit(columns.T @ columns, moments, 9) == list(range(5))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import lens_models
@@ -13,6 +14,7 @@ from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.errors import InputError
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.specialise import at_wavelength
 
 
@@ -38,7 +40,15 @@ def test_one_wavelength(kind: str, wavelength_nm: float, tmp_path: Path) -> None
     direction = torch.stack(list(expected.rays)[3:]).numpy()
     assert np.abs(out.scene_ray[3:] - direction)[:, passed].max() < 2e-6
     camera = OnnxCamera(lens, film_mm=(36.0, 24.0), focus_m=2.0)
-    assert not camera.dispersive and camera.wavelength_nm is None
+    assert not camera.dispersive and camera.wavelength_nm == (wavelength_nm, wavelength_nm)
+
+
+def test_zones_keep_their_places() -> None:
+    model = fit_model(lens_models.prepared(), ModelSettings("ols", terms=16, partitions=2))
+    rays = lens_models.prepared().pairs.held_out.inputs
+    rays = replace(rays, wavelength_nm=torch.full_like(rays.wavelength_nm, 500.0))
+    for a, b in zip(model.predict(rays).rays, at_wavelength(model, 500.0).predict(rays).rays, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-9)
 
 
 def test_wavelengths_that_the_model_does_not_know() -> None:

@@ -1,0 +1,114 @@
+"""The card of an exported model, checked on loading: everything that is read later is there and makes sense."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from neurolens.cameras.lens_film import PupilTable
+from neurolens.errors import InputError, ModelError
+
+
+def _number(value: Any) -> bool:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    try:
+        return math.isfinite(float(value))
+    except OverflowError:  # an integer beyond every float
+        return False
+
+
+def _positive(value: Any) -> bool:
+    return _number(value) and value > 0
+
+
+def _rising(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(_positive, value)) and value[0] <= value[1]
+
+
+def _distances(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(v == "inf" or _positive(v) for v in value)
+
+
+def _numbers(value: Any) -> bool:
+    return isinstance(value, list) and len(value) >= 2 and all(map(_number, value))
+
+
+def _text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _table(value: Any) -> bool:
+    return isinstance(value, dict)
+
+
+Rule = tuple[Callable[[Any], bool], str]
+NUMBER: Rule = (_number, "a finite number")
+POSITIVE: Rule = (_positive, "a finite number above 0")
+TEXT: Rule = (_text, "a text")
+NUMBERS: Rule = (_numbers, "a list of two or more finite numbers")
+
+# Place in the card to what must be there. A table comes before what is in it.
+_RULES: dict[str, Rule] = {
+    "lens": (_table, "a table"),
+    "lens.id": TEXT,
+    "lens.name": TEXT,
+    "lens.sha256": TEXT,
+    "lens.dispersive": (lambda v: isinstance(v, bool), "true or false"),
+    "lens.efl_mm": (lambda v: _number(v) and v != 0, "a finite number other than 0"),
+    "lens.f_number": POSITIVE,
+    "lens.stop_radius_mm": POSITIVE,
+    "lens.front_principal_z_mm": NUMBER,
+    "lens.rear_principal_z_mm": NUMBER,
+    "domain": (_table, "a table"),
+    "domain.film_radius_mm": POSITIVE,
+    "domain.film_z_mm": (_rising, "two numbers above 0, rising"),
+    "domain.focus_m": (_distances, 'two distances above 0, or "inf"'),
+    "domain.pupil_z_mm": NUMBER,
+    "domain.pupil_radius_mm": POSITIVE,
+    "domain.wavelength_nm": (_rising, "two numbers above 0, rising"),
+    "domain.stop_radius_mm": POSITIVE,
+    "domain.bounds": (_table, "a table"),
+    "domain.bounds.pupil_z_mm": NUMBER,
+    "domain.bounds.film_radius_mm": POSITIVE,
+    "domain.bounds.disc_mm": POSITIVE,
+    "domain.bounds.low_mm": NUMBERS,
+    "domain.bounds.high_mm": NUMBERS,
+    "domain.bounds.half_mm": NUMBERS,
+    "fit": (_table, "a table"),
+    "fit.method": TEXT,
+    "fit.settings": (_table, "a table"),
+    "errors": (_table, "a table"),
+}
+_OPTIONAL: dict[str, Rule] = {
+    "domain.nearest_m": (lambda v: v is None or _positive(v), "a number above 0, or null"),
+    "fit.settings.rays_seed": (lambda v: v is None or (_number(v) and isinstance(v, int)), "an integer, or null"),
+}
+_MISSING = "(missing)"
+
+
+def check_card(file: Any, card: Mapping[str, Any]) -> None:
+    """Check a card.
+
+    Args:
+        file: what an error names.
+
+    Raises:
+        ModelError: the first place that is missing or holds something else, and what belongs there.
+    """
+    for place, (holds, expected) in {**_RULES, **_OPTIONAL}.items():
+        value: Any = card
+        for key in place.split("."):
+            value = value.get(key, _MISSING)
+            if value is _MISSING:
+                break
+        if value is _MISSING and place in _OPTIONAL:
+            continue
+        if value is _MISSING or not holds(value):
+            shown = _MISSING if value is _MISSING else repr(value)[:80]
+            raise ModelError(f"{file}: card: {place}: got {shown}, expected {expected}")
+    try:
+        PupilTable.of(card["domain"]["bounds"])
+    except (InputError, ValueError, OverflowError) as error:
+        raise ModelError(f"{file}: card: domain.bounds: {error}") from error

@@ -1,0 +1,10 @@
+"""What the writer and the reader of exported models must agree on."""
+
+from __future__ import annotations
+
+# The metadata entry that holds the card, and the card's own first words.
+CARD_KEY = "neurolens"
+CARD_KIND, CARD_SCHEMA = "neurolens.lens_model", 1
+
+# Relative slack of a domain's bounds: the rounding of float32 inputs, and no more.
+DOMAIN_SLACK = 1.00001

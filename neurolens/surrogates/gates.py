@@ -1,0 +1,111 @@
+"""Boundaries that block rays: which rims and discriminants a model must test, their exact values, and rays near them.
+
+A rim is tested on the ray's crossing with it. Where rays end by missing a surface or by total reflection there is no
+crossing; there the sign of what stands under the square root (of the intersection, or of Snell's law) decides. It is
+smooth across the boundary, for it depends only on the ray that arrives.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from neurolens import status as st
+from neurolens.optics.prescription import Lens
+from neurolens.surrogates.model import Gate
+from neurolens.surrogates.pairs import PairSet, RayPairs, join_pairs, reached
+
+# Rays of the boundary fits are mixed by this seed: networks use the first of them.
+_MIXING_SEED = 1
+_MOST_GATES = 10
+
+
+def has_edges(gates: tuple[Gate, ...]) -> bool:
+    """Whether any gate is a discriminant."""
+    return any(gate.reason != st.RIM for gate in gates)
+
+
+def gate_reach(gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
+    """[G, N] bool: rays of which the gate's value is known, because they get as far as its surface (and to its rim)."""
+    known = reached(pairs)
+    rows = [known[g.surface] & (pairs.meets[g.surface] > 0 if g.reason == st.RIM else True) for g in gates]
+    return torch.stack(rows) if rows else torch.empty((0, len(pairs)), dtype=torch.bool)
+
+
+def gate_values(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
+    """[G, N] exact values of the gates, positive where the surface stops the ray; 0 where it never gets there."""
+    rows = []
+    for gate in gates:
+        k = gate.surface
+        if gate.reason == st.RIM:
+            radius = lens.surfaces[k].semi_diameter_mm
+            rows.append((pairs.cross_x[k] ** 2 + pairs.cross_y[k] ** 2) / radius**2 - 1)
+        else:
+            rows.append(-(pairs.meets[k] if gate.reason == st.MISSED else pairs.refracts[k]))
+    if not rows:
+        return torch.empty((0, len(pairs)), dtype=pairs.transmittance.dtype)
+    return torch.where(gate_reach(gates, pairs), torch.stack(rows), 0.0)
+
+
+def boundary_rays(pairs: RayPairs, gates: tuple[Gate, ...]) -> PairSet:
+    """The rays that the gates are fitted on: those near the rims, and with them lost rays where a gate is about those.
+
+    Fits without such a gate see no lost ray.
+    """
+    if not has_edges(gates) or not len(pairs.edge):
+        return pairs.rim
+    both = join_pairs([pairs.rim, pairs.edge])
+    return both.select(torch.randperm(len(both), generator=torch.Generator().manual_seed(_MIXING_SEED)))
+
+
+def choose_gates(
+    lens: Lens, blocked: PairSet, drawn: int | None = None, unexplained: float = 1e-4, most: int = _MOST_GATES
+) -> tuple[Gate, ...]:
+    """The boundaries that block anything in the domain: the one that explains most blocked rays, then the next.
+
+    Rims come first, by the rays that refract all the way; then, for what the rims leave, discriminants. A gate of total
+    reflection covers the rays that miss the same surface, whose discriminant is lower still.
+
+    Args:
+        blocked: rays that did not pass, drawn uniformly over the domain.
+        drawn: how many were drawn to find them; None: only they.
+        unexplained: rims end when this share of the blocked rays, discriminants when this share of all rays is left.
+        most: gates of either kind.
+
+    Returns the gates in the order in which camera rays meet them. The stop is no gate: it is tested on its crossing.
+    """
+    known = reached(blocked)
+    radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
+    outside = ((blocked.cross_x**2 + blocked.cross_y**2) > radii**2) & known & (blocked.meets > 0)  # [S, N]
+    whole = ((blocked.meets > 0) & (blocked.refracts > 0)).all(0)
+    left = outside[:, whole & ~outside[lens.stop_index]]
+    rims = _greedy(left, math.floor(unexplained * int(whole.sum())), most)
+    stopped = outside[[*rims, lens.stop_index]].any(0)
+    # Rows: total reflection, then missed. The first of equals is taken.
+    lost = torch.cat([known & ~(blocked.refracts > 0), known & ~(blocked.meets > 0)])
+    edges = _greedy(lost[:, ~stopped], math.floor(unexplained * (drawn or len(blocked))), most)
+    count = len(lens.surfaces)
+    gates = [Gate(k, st.RIM) for k in rims]
+    gates += [Gate(k % count, st.TOTAL_REFLECTION if k < count else st.MISSED) for k in edges]
+    return tuple(sorted(gates, key=lambda g: (-g.surface, g.reason)))
+
+
+def _greedy(stops: Tensor, enough: int, most: int) -> list[int]:
+    """Rows of [K, N] bool: the one with most entries, then the one with most of the rest, until `enough` or fewer."""
+    chosen: list[int] = []
+    while stops.shape[1] and len(chosen) < most:
+        counts = stops.sum(1)
+        best = int(counts.argmax())
+        if int(counts[best]) <= max(0, enough):
+            break
+        chosen.append(best)
+        stops = stops & ~stops[best]
+    return chosen
+
+
+def explained(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
+    """[N] bool: rays that a gate, exact, or the stop would stop."""
+    stop = Gate(lens.stop_index, st.RIM)
+    return (gate_values(lens, (*gates, stop), pairs) > 0).any(0)
