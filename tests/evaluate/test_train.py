@@ -1,20 +1,25 @@
 """The whole line on a small experiment: lens file to report, and on again after an interruption."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
 
+from neurolens.cameras.model import load_model
 from neurolens.errors import InputError
 from neurolens.evaluate.experiment import default_experiment, read_experiment
+from neurolens.evaluate.measure import fit_and_measure
 from neurolens.evaluate.train import run_experiment
 from neurolens.progress import Progress
+from neurolens.surrogates.fit import prepare
+from neurolens.surrogates.pairs import make_pairs
 
 ROOT = Path(__file__).parents[2]
-SMALL = f"""
+SMALL = """
 title = "small"
 [lens]
-file = "{ROOT}/lenses/brendel_tessar_100.toml"
+file = "ROOT/lenses/brendel_tessar_100.toml"
 efl_mm = 50
 [pairs]
 train = 3000
@@ -34,22 +39,25 @@ vignetting_rays = 20000
 rounds = 1
 compile_exact = false
 [render]
-scenes = ["{ROOT}/experiments/scenes/grid.toml"]
+scenes = ["ROOT/experiments/scenes/grid.toml"]
 width = 32
 height = 18
 samples = 4
 [scene_domain]
-scene = "{ROOT}/experiments/scenes/grid.toml"
-model = {{ method = "ols", terms = 24 }}
+scene = "ROOT/experiments/scenes/grid.toml"
+model = { method = "ols", terms = 24 }
 """
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     folder = tmp_path_factory.mktemp("run")
-    (folder / "small.toml").write_text(SMALL)
-    experiment = read_experiment(folder / "small.toml")
-    return folder, run_experiment(experiment, folder / "out", progress=Progress(quiet=True))
+    # Relative paths all along: as files name others, as a person names files, and from another folder than the file's.
+    (folder / "small.toml").write_text(SMALL.replace("ROOT", os.path.relpath(ROOT, folder)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder.parent)
+        experiment = read_experiment(Path(folder.name) / "small.toml")
+        return folder, run_experiment(experiment, Path(folder.name) / "out", progress=Progress(quiet=True))
 
 
 def test_leaves_everything_in_one_folder(run: tuple[Path, dict]) -> None:
@@ -62,6 +70,9 @@ def test_leaves_everything_in_one_folder(run: tuple[Path, dict]) -> None:
         picture = out / (record.get("file_png") or record["file"])
         assert picture.stat().st_size > 1000, picture
     assert (out / "config.toml").exists()
+    assert "illumination" in " ".join(f["file"] for f in written["figures"])
+    assert written["image_settings"]["pixels_per_degree"] == 67
+    assert "67" in (out / "report.html").read_text().partition("Image comparison")[2][:400]
 
 
 def test_errors_are_in_the_order_that_physics_gives(run: tuple[Path, dict]) -> None:
@@ -71,11 +82,37 @@ def test_errors_are_in_the_order_that_physics_gives(run: tuple[Path, dict]) -> N
     assert fitted["false_pass"] < 0.005 and fitted["false_block"] < 0.005
 
 
+def test_the_best_models_hold_when_stopped_down(run: tuple[Path, dict]) -> None:
+    stopped = {m["name"]: m["stopped_down"] for m in run[1]["models"] if "stopped_down" in m}
+    assert set(stopped) == {"ols-24", "mlp-8x2"}
+    for shares in stopped["ols-24"].values():
+        assert shares["false_pass"] < 0.02 and shares["false_block"] < 0.02
+    assert set(stopped["mlp-8x2"]) == {"2_stops", "4_stops"}
+
+
 def test_less_to_model_is_modelled_better(run: tuple[Path, dict]) -> None:
     whole, shot, half = run[1]["domain_gain"]["rows"]
+    assert all(row["ns_per_ray"]["min"] > 0 for row in (whole, shot, half))
+    assert whole["nearest_m"] is None and 0.5 < shot["nearest_m"] < 10
     assert shot["film_radius_mm"] < whole["film_radius_mm"]
     assert shot["rms_um"] < whole["rms_um"]
     assert half["coefficients_per_vector"] == shot["coefficients_per_vector"] / 2
+
+
+def test_a_model_file_that_was_changed_is_fitted_again(tmp_path: Path) -> None:
+    lens = f'lens.file="{ROOT}/lenses/thorlabs_lb1471_biconvex_50.toml"'
+    small = ("pairs.train=1000", "pairs.held_out=500", "pairs.rim=500", "evaluation.vignetting_rays=2000")
+    (tmp_path / "a.toml").write_text('title = "a"\n[lens]\nfile = "a"\n[[model]]\nterms = 6\n')
+    settings = read_experiment(tmp_path / "a.toml", [lens, *small, "lens.f_number=8", "domain.film_radius_mm=21"])
+    lens_ = settings.lens.read()
+    prepared = prepare(make_pairs(lens_, settings.domain_of(lens_), settings.pairs))
+    first = fit_and_measure(prepared, settings.model[0], tmp_path, 2000, lambda _: None)
+    whole = first.file.read_bytes()
+    assert fit_and_measure(prepared, settings.model[0], tmp_path, 2000, lambda _: None).record == first.record
+    first.file.write_bytes(whole[:-1000])
+    again = fit_and_measure(prepared, settings.model[0], tmp_path, 2000, lambda _: None)
+    assert again.record["rms_um"] == first.record["rms_um"]
+    assert load_model(again.file).card["errors"]["rms_um"] == pytest.approx(first.record["rms_um"])
 
 
 def test_resolved_configuration_runs_again_without_fitting(run: tuple[Path, dict]) -> None:
@@ -94,10 +131,13 @@ def test_resolved_configuration_runs_again_without_fitting(run: tuple[Path, dict
         ("lens.efl_mm=-3", "efl_mm"),
         ("domain.wavelength_nm=[700, 400]", "wavelength_nm"),
         ("nonsense=1", "nonsense"),
+        ('model=[{name="../../evil"}]', "model"),
+        ('model=[{name=".hidden"}]', "model"),
+        ('scene_domain.model.name="a/b"', "scene_domain"),
     ],
 )
 def test_bad_settings_name_the_field(tmp_path: Path, override: str, field: str) -> None:
-    (tmp_path / "small.toml").write_text(SMALL)
+    (tmp_path / "small.toml").write_text(SMALL.replace("ROOT", str(ROOT)))
     with pytest.raises(InputError, match=field):
         run_experiment(read_experiment(tmp_path / "small.toml", [override]), tmp_path / "out")
 

@@ -1,0 +1,46 @@
+"""How near the nearest thing in view is: a ball on the axis has it in closed form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from neurolens.evaluate.gain import nearest_depth_m
+from neurolens.render.scenefile import load_scene
+
+CAMERA = """
+[camera]
+position_m = [1.0, 2.0, 3.0]
+look_at_m = [1.0, 2.0, 0.0]
+focus_m = 2.0
+[environment]
+colour = [1.0, 1.0, 1.0]
+[materials]
+grey = { kind = "diffuse", reflectance = [0.5, 0.5, 0.5] }
+"""
+BALL = """
+[[spheres]]
+centre_m = [%s]
+radius_m = 0.5
+material = "grey"
+"""
+
+
+def depth(tmp_path: Path, *centres: str) -> float | None:
+    (tmp_path / "scene.toml").write_text(CAMERA + "".join(BALL % c for c in centres))
+    return nearest_depth_m(load_scene(tmp_path / "scene.toml"), 50.0)
+
+
+def test_the_nearest_ball_counts_from_the_film(tmp_path: Path) -> None:
+    assert depth(tmp_path, "1.0, 2.0, 0.0", "1.0, 2.0, -4.0") == pytest.approx(2.5, abs=1e-3)
+
+
+def test_depth_is_along_the_axis_and_what_is_out_of_view_does_not_count(tmp_path: Path) -> None:
+    # The plane through the ball's front, not the distance to it; the second one is behind the camera.
+    assert depth(tmp_path, "2.0, 2.0, -2.0", "1.0, 2.0, 5.0") == pytest.approx(4.5, abs=0.02)
+
+
+def test_nothing_in_view(tmp_path: Path) -> None:
+    assert depth(tmp_path) is None
+    assert depth(tmp_path, "1.0, 2.0, 5.0") is None
