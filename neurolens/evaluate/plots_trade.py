@@ -196,7 +196,7 @@ def _plot_exact(axes: Any, exact: Sequence[Record]) -> None:
     axes.add_patch(Rectangle((0, 0), 1, _BAND, transform=axes.transAxes, fc="#eceef1", lw=0, zorder=0.5))
     missing = [str(r["name"]) + f": unavailable ({r.get('reason') or '–'})" for r in exact if not _exact_time(r)]
     words = "\n".join(["exact (no error)", *missing])
-    axes.text(0.992, _BAND / 2, words, transform=axes.transAxes, va="center", ha="right", fontsize=8.2, color="#555b63")
+    axes.text(0.008, 0.82 * _BAND, words, transform=axes.transAxes, va="center", fontsize=8.2, color="#555b63")
     low, high = axes.get_ylim()
     for minor in (False, True):  # the band is no error: no ticks beside it
         axes.set_yticks(
