@@ -17,7 +17,7 @@ from neurolens import status as st
 from neurolens.errors import InputError
 from neurolens.optics import glass
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.surfaces import Rays, fresnel_transmittance, intersect_plane, intersect_sphere, refract
+from neurolens.optics.surfaces import Hit, Rays, fresnel_transmittance, intersect_plane, intersect_sphere, refract
 
 __all__ = ["CHUNK", "Crossing", "Rays", "Traced", "compile_trace", "trace"]
 
@@ -178,24 +178,10 @@ def _trace_chunk(
         # Move to this surface's own frame, where float32 keeps its digits.
         r = r._replace(z=r.z + (vertex - vertices[k]))
         vertex = vertices[k]
-        surface = lens.surfaces[k]
         before, after = (media[k], media[k + 1]) if sense > 0 else (media[k + 1], media[k])
-        c = 0.0 if _is_plane(surface) else surface.curvature
-        hit = intersect_plane(r, sense) if _is_plane(surface) else intersect_sphere(r, c, sense, position == 0, guard)
-        tests.require(hit.met, k, st.MISSED)
-        distance2 = torch.addcmul(hit.x * hit.x, hit.y, hit.y)
-        tests.require(distance2 <= surface.semi_diameter_mm**2, k, st.RIM)
-        if _is_plane(surface):
-            # A sphere's square root turns NaN and overflow into a miss; a plane would let them go on.
-            tests.goes_on = tests.goes_on & (distance2 < math.inf)
-        if before is after:
-            r, cos2_t = Rays(hit.x, hit.y, hit.z, r.dx, r.dy, r.dz), hit.discriminant
-        else:
-            mu = before / after
-            r, cos_t, cos2_t = refract(r, hit, c, sense, mu, guard)
-            tests.require(cos2_t > 0, k, st.TOTAL_REFLECTION)
-            if power is not None:
-                power = power * fresnel_transmittance(hit.cos_i, cos_t, mu)
+        hit, r, cos_t, cos2_t = _pass_surface(lens, k, r, (before, after), sense, position == 0, guard, tests)
+        if power is not None and cos_t is not None:
+            power = power * fresnel_transmittance(hit.cos_i, cos_t, before / after)
         if k in record:
             crossings[k] = Crossing(hit.x, hit.y, hit.discriminant, cos2_t)
         if freeze:
@@ -205,6 +191,31 @@ def _trace_chunk(
     if power is not None:
         power = torch.where(tests.goes_on, power, 0.0)
     return Traced(r, tests.status, power, crossings)
+
+
+def _pass_surface(
+    lens: Lens, k: int, r: Rays, media: tuple[Any, Any], sense: int, entering: bool, guard: bool, tests: _Tests
+) -> tuple[Hit, Rays, Tensor | None, Tensor]:
+    """Meet surface k, test its rim, refract.
+
+    Returns the meeting point, the rays after it, their cosine of refraction (None where the medium does not change),
+    and the margin by which they are not totally reflected.
+    """
+    surface = lens.surfaces[k]
+    c = 0.0 if _is_plane(surface) else surface.curvature
+    hit = intersect_plane(r, sense) if _is_plane(surface) else intersect_sphere(r, c, sense, entering, guard)
+    tests.require(hit.met, k, st.MISSED)
+    distance2 = torch.addcmul(hit.x * hit.x, hit.y, hit.y)
+    tests.require(distance2 <= surface.semi_diameter_mm**2, k, st.RIM)
+    if _is_plane(surface):
+        # A sphere's square root turns NaN and overflow into a miss; a plane would let them go on.
+        tests.goes_on = tests.goes_on & (distance2 < math.inf)
+    before, after = media
+    if before is after:
+        return hit, Rays(hit.x, hit.y, hit.z, r.dx, r.dy, r.dz), None, hit.discriminant
+    bent, cos_t, cos2_t = refract(r, hit, c, sense, before / after, guard)
+    tests.require(cos2_t > 0, k, st.TOTAL_REFLECTION)
+    return hit, bent, cos_t, cos2_t
 
 
 class _Tests:
