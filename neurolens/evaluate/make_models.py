@@ -54,7 +54,8 @@ _SHOWN = (*_KEPT, "ns_per_ray", "speedup_over_compiled")  # what the table needs
 
 
 def _default_models() -> tuple[ModelSettings, ...]:
-    return ModelSettings(method="ols", terms=60), ModelSettings(method="mlp", units=16)
+    polynomials = tuple(ModelSettings(method="ols", terms=terms) for terms in (60, 100))
+    return *polynomials, ModelSettings(method="mlp", units=16), ModelSettings(method="mlp", units=32, steps=20)
 
 
 @dataclass(frozen=True)
