@@ -14,6 +14,19 @@ from neurolens.errors import InputError
 
 
 @dataclass(frozen=True)
+class Coating:
+    """Thin films on one surface.
+
+    Attributes:
+        name: of the design, for people and files.
+        layers: (refractive index, thickness in nm), from the scene's side to the film's.
+    """
+
+    name: str
+    layers: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
 class Surface:
     """One surface. Lengths in mm, lens frame.
 
@@ -25,8 +38,17 @@ class Surface:
         V_d: Abbe number of that medium; None where unknown (constant index) or air.
         material: name of the glass in the source, for people only.
         stop: whether this row is the aperture stop.
+        conic: Schwarzschild's K (0 sphere, -1 paraboloid): c r^2 / (1 + sqrt(1 - (1 + K) c^2 r^2)).
+        asphere: (power, coefficient) pairs, sorted by power, added to the conic: sum of A_p r^p, A_p in mm^(1 - p).
+            Odd powers and p = 2 (which adds 2 A_2 to the curvature at the vertex) are allowed.
+        cylinder: None, or the transverse axis, "x" or "y", along which a cylinder is curved (straight along the other).
+        glass: name in the glass catalogue (`neurolens.optics.catalogue`); its dispersion rules over n_d and V_d.
+        absorption_per_mm: Napierian absorption of the medium after the surface at every wavelength (a grey filter),
+            added to that of the glass.
+        coating: the thin films on the surface, None where bare.
 
-    `radius_mm`, `thickness_mm` and `n_d` may be 0-d tensors where gradients with respect to them are wanted.
+    `radius_mm`, `thickness_mm`, `n_d`, `conic` and the coefficients of `asphere` may be 0-d tensors where gradients
+    with respect to them are wanted.
     """
 
     radius_mm: Any
@@ -36,6 +58,12 @@ class Surface:
     V_d: float | None = None
     material: str | None = None
     stop: bool = False
+    conic: Any = 0.0
+    asphere: tuple[tuple[int, Any], ...] = ()
+    cylinder: str | None = None
+    glass: str | None = None
+    absorption_per_mm: float = 0.0
+    coating: Coating | None = None
 
     @property
     def curvature(self) -> Any:
