@@ -20,12 +20,29 @@ def sag_mm(radius_mm: float, height_mm: float) -> float:
     return height_mm * ratio / (1 + math.sqrt(1 - ratio * ratio))
 
 
+def surface_sag_mm(surface: Surface, x_mm: float, y_mm: float) -> float:
+    """Depth of any surface relative to its vertex, towards +z, at a point; NaN beyond the end of its conic."""
+    h2 = (x_mm * x_mm if surface.cylinder != "y" else 0.0) + (y_mm * y_mm if surface.cylinder != "x" else 0.0)
+    c = float(surface.curvature)
+    under_root = 1 - (1 + float(surface.conic)) * c * c * h2
+    if under_root < 0:
+        return math.nan
+    sag = c * h2 / (1 + math.sqrt(under_root))
+    return sag + sum(float(a) * math.sqrt(h2) ** p for p, a in surface.asphere)
+
+
+def end_mm(surface: Surface) -> float:
+    """Distance from the axis at which a surface's conic ends: the radius of a sphere; inf where it goes on."""
+    stretch = 1 + float(surface.conic)
+    return abs(float(surface.radius_mm)) / math.sqrt(stretch) if stretch > 0 else math.inf
+
+
 def check_clearance(surfaces: Sequence[Surface], file: str, state: str = "") -> None:
     """Raise for a rim larger than its radius of curvature and for neighbours that overlap inside their rims.
 
     The gap between two spheres grows or shrinks steadily from the axis outwards, so that axis and the smaller of the
-    two rims decide. Beside the stop only the rim counts: the stop's plane may lie inside the cap of an element; what
-    stands on both sides of the stop must then be clear of each other.
+    two rims decide; other shapes are looked at in between too. The stop's plane may lie inside an element, in front of
+    which (or behind which) it is then listed; what stands on both sides of the stop must be clear of each other.
 
     Args:
         state: words in front of the surface in messages, for a zoom state of the file.
@@ -34,26 +51,41 @@ def check_clearance(surfaces: Sequence[Surface], file: str, state: str = "") -> 
         InputError: names the file, the surface and by how much.
     """
     for k, s in enumerate(surfaces):
-        if s.semi_diameter_mm > abs(s.radius_mm):
-            limit = f"at most twice the radius of curvature, {2 * abs(s.radius_mm):g} mm"
+        if s.semi_diameter_mm > end_mm(s):
+            limit = f"at most {2 * end_mm(s):g} mm, where its {'conic' if s.conic else 'sphere'} ends"
             raise InputError(file, f"{state}surface {k}, diameter_mm", s.diameter_mm, limit)
     for k, after, axis_gap_mm in _neighbours(surfaces):
-        beside_stop = surfaces[k].stop or surfaces[after].stop
-        if axis_gap_mm < -TOUCH_MM and not beside_stop:
+        if axis_gap_mm < -TOUCH_MM:
             raise InputError(
                 file, f"{state}surface {k}, thickness_mm", axis_gap_mm, "at least 0, except beside the stop"
             )
-        rim_mm = min(surfaces[k].semi_diameter_mm, surfaces[after].semi_diameter_mm)
-        gap_mm = axis_gap_mm + sag_mm(surfaces[after].radius_mm, rim_mm) - sag_mm(surfaces[k].radius_mm, rim_mm)
+        gap_mm, height_mm = _narrowest(surfaces[k], surfaces[after], axis_gap_mm)
         if gap_mm < -TOUCH_MM:
-            found = f"(an overlap of {-gap_mm:.4g} mm with surface {after}, {rim_mm:.4g} mm from the axis)"
+            found = f"(an overlap of {-gap_mm:.4g} mm with surface {after}, {height_mm:.4g} mm from the axis)"
             raise InputError(file, f"{state}surface {k}, thickness_mm", found, "surfaces that are clear of each other")
 
 
+def _narrowest(before: Surface, after: Surface, axis_gap_mm: float) -> tuple[float, float]:
+    """The smallest gap between two surfaces inside the smaller of their rims, and its distance from the axis, mm."""
+    rim = min(before.semi_diameter_mm, after.semi_diameter_mm)
+    spheres = all(not s.conic and not s.asphere and not s.cylinder for s in (before, after))
+    steps = 1 if spheres else 32
+    azimuths = [(1.0, 0.0), (0.0, 1.0)] if before.cylinder or after.cylinder else [(1.0, 0.0)]
+    found = (axis_gap_mm, 0.0)
+    for cos, sin in azimuths:
+        for i in range(1, steps + 1):
+            h = rim * i / steps
+            x, y = h * cos, h * sin
+            gap = axis_gap_mm + surface_sag_mm(after, x, y) - surface_sag_mm(before, x, y)
+            found = min(found, (gap, h))
+    return found
+
+
 def _neighbours(surfaces: Sequence[Surface]) -> Iterator[tuple[int, int, float]]:
-    """Pairs of surfaces that may collide, with the distance of their vertices; across the stop too."""
+    """Pairs of surfaces that may collide, the stop aside, with the distance of their vertices."""
     for k in range(len(surfaces) - 1):
-        yield k, k + 1, surfaces[k].thickness_mm
+        if not surfaces[k].stop and not surfaces[k + 1].stop:
+            yield k, k + 1, surfaces[k].thickness_mm
     for k in range(1, len(surfaces) - 1):
         if surfaces[k].stop and math.isinf(surfaces[k].radius_mm):
             yield k - 1, k + 1, surfaces[k - 1].thickness_mm + surfaces[k].thickness_mm

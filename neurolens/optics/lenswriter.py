@@ -14,6 +14,8 @@ ROWS_COMMENT = """\
 # inf is a plane. n_d and V_d are of the glass after the surface; air where they are left out.
 """
 WRAP = 110
+# Texts and tables go last: a column of glass names needs no right edge.
+UNPADDED = ("conic", "asphere", "glass", "material", "absorption_per_mm", "coating", "stop")
 
 
 def write_lens(lens: Lens, path: str | Path) -> None:
@@ -40,9 +42,13 @@ def format_lens(lens: Lens) -> str:
     if lens.notes:
         lines.append(f"notes = {_wrapped(lens.notes)}")
     text = "\n".join(lines) + "\n\n" + ROWS_COMMENT + "surfaces = [\n" + _rows(lens) + "]\n"
+    for name, layers in {s.coating.name: s.coating.layers for s in lens.surfaces if s.coating}.items():
+        text += f"\n[[coating]]\nname = {format_value(name)}\nlayers = {format_value(layers)}\n"
     for c in lens.configurations:
-        text += f"\n[[configuration]]\nname = {format_value(c.name)}\nefl_mm = {format_value(float(c.efl_mm))}\n"
-        text += "" if c.half_field_deg is None else f"half_field_deg = {format_value(float(c.half_field_deg))}\n"
+        text += f"\n[[configuration]]\nname = {format_value(c.name)}\n"
+        for key in ("efl_mm", "half_field_deg", "f_number", "stop_diameter_mm", "object_distance_mm"):
+            value = getattr(c, key)
+            text += "" if value is None else f"{key} = {format_value(float(value))}\n"
         text += f"thickness_mm = {format_value({str(k): float(t) for k, t in c.thickness_mm})}\n"
     return text
 
@@ -58,21 +64,29 @@ def _rows(lens: Lens) -> str:
     }
     text = ""
     for row in cells:
-        columns = [f"{key} = {row[key].rjust(widths[key])}" for key in row if key not in ("stop", "material")]
-        # Texts go last and unpadded: a column of glass names needs no right edge.
-        columns += [f"{key} = {row[key]}" for key in ("material", "stop") if key in row]
+        columns = [f"{key} = {row[key].rjust(widths[key])}" for key in row if key not in UNPADDED]
+        columns += [f"{key} = {row[key]}" for key in UNPADDED if key in row]
         text += "  { " + ", ".join(columns) + " },\n"
     return text
 
 
 def _cells(s: Surface) -> dict[str, str]:
     cells = {key: repr(float(getattr(s, key))) for key in ("radius_mm", "thickness_mm", "diameter_mm")}
-    if float(s.n_d) != 1 or s.V_d is not None or s.material is not None:
+    if float(s.n_d) != 1 or s.V_d is not None or s.material is not None or s.absorption_per_mm:
         cells["n_d"] = repr(float(s.n_d))
     if s.V_d is not None:
         cells["V_d"] = repr(float(s.V_d))
-    if s.material is not None:
-        cells["material"] = format_value(s.material)
+    if s.cylinder is not None:
+        cells["cylinder"] = format_value(s.cylinder)
+    if float(s.conic) != 0:
+        cells["conic"] = repr(float(s.conic))
+    if s.asphere:
+        cells["asphere"] = format_value({str(p): float(a) for p, a in s.asphere})
+    if s.absorption_per_mm:
+        cells["absorption_per_mm"] = repr(s.absorption_per_mm)
+    for key, name in (("glass", s.glass), ("material", s.material), ("coating", s.coating and s.coating.name)):
+        if name is not None:
+            cells[key] = format_value(name)
     if s.stop:
         cells["stop"] = "true"
     return cells

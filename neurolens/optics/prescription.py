@@ -77,12 +77,19 @@ class Surface:
 
 @dataclass(frozen=True)
 class Configuration:
-    """A zoom or focus state of the source: thicknesses that replace those of the table, by surface index."""
+    """A zoom or focus state of the source: thicknesses that replace those of the table, by surface index.
+
+    None stands for what the source does not say: then the lens's own rules. A focus state has an `object_distance_mm`,
+    from the object to the front vertex; without one the object is at infinity.
+    """
 
     name: str
-    efl_mm: float
+    efl_mm: float | None
     thickness_mm: tuple[tuple[int, float], ...]
-    half_field_deg: float | None = None  # None: that of the lens
+    half_field_deg: float | None = None
+    f_number: float | None = None
+    stop_diameter_mm: float | None = None
+    object_distance_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -143,14 +150,8 @@ class Lens:
     @property
     def sha256(self) -> str:
         """Hash of the figures that decide where rays go (glass only: neither film nor stop opening nor texts)."""
-        rows = [
-            [float(s.radius_mm), float(s.thickness_mm), None if s.stop else s.diameter_mm, float(s.n_d), s.V_d, s.stop]
-            for s in self.surfaces[:-1]
-        ]
-        last = self.surfaces[-1]
-        rows.append(
-            [float(last.radius_mm), None, None if last.stop else last.diameter_mm, float(last.n_d), last.V_d, last.stop]
-        )
+        rows = [_figures(s) for s in self.surfaces]
+        rows[-1][1] = None
         return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
     def at(
@@ -200,11 +201,19 @@ class Lens:
                 radius_mm=scale(s.radius_mm),
                 thickness_mm=scale(s.thickness_mm),
                 diameter_mm=s.diameter_mm * factor,
+                asphere=tuple((p, a * factor ** (1 - p)) for p, a in s.asphere),
+                absorption_per_mm=s.absorption_per_mm / factor,
             )
             for s in self.surfaces
         )
         configurations = tuple(
-            replace(c, efl_mm=c.efl_mm * factor, thickness_mm=tuple((k, t * factor) for k, t in c.thickness_mm))
+            replace(
+                c,
+                efl_mm=scale(c.efl_mm),
+                thickness_mm=tuple((k, t * factor) for k, t in c.thickness_mm),
+                stop_diameter_mm=scale(c.stop_diameter_mm),
+                object_distance_mm=scale(c.object_distance_mm),
+            )
             for c in self.configurations
         )
         return replace(
@@ -230,3 +239,18 @@ class Lens:
                 return replace(self, surfaces=tuple(rows), half_field_deg=field)
         known = ", ".join(c.name for c in self.configurations) or "none in this file"
         raise InputError(self.path, "configuration", name, f"one of: {known}")
+
+
+def _figures(s: Surface) -> list[Any]:
+    """What a surface does to rays, for the hash; what a plain sphere of glass has not is left out."""
+    row = [float(s.radius_mm), float(s.thickness_mm), None if s.stop else s.diameter_mm, float(s.n_d), s.V_d, s.stop]
+    more = {
+        "conic": float(s.conic),
+        "asphere": [(p, float(a)) for p, a in s.asphere],
+        "cylinder": s.cylinder,
+        "glass": s.glass,
+        "absorption_per_mm": s.absorption_per_mm,
+        "coating": s.coating and s.coating.layers,
+    }
+    more = {key: value for key, value in more.items() if value}
+    return [*row, more] if more else row
