@@ -7,6 +7,8 @@ The format, complete; keys marked optional may be left out:
     designer = "..."            # optional
     source = "patent or book and page"
     f_number = 1.8              # nominal, of the source; the stop's diameter is what counts
+    efl_mm = 50.0               # optional: as the source states it, in y-z; the surfaces are what counts
+    efl_x_mm = 25.0             # optional: in x-z, of an anamorphic lens
     image_radius_mm = 21.6      # optional
     half_field_deg = 23.3       # optional, from the axis
     rims = "source"             # where the diameters come from: "source", "estimated" (by somebody) or "derived"
@@ -59,8 +61,8 @@ from neurolens.tomlfile import read_toml, reject_unknown
 
 SCHEMA = 1
 LENS_KEYS = (
-    *("schema", "name", "designer", "source", "f_number", "image_radius_mm", "half_field_deg", "rims", "notes"),
-    *("surfaces", "coating", "configuration"),
+    *("schema", "name", "designer", "source", "f_number", "efl_mm", "efl_x_mm", "image_radius_mm", "half_field_deg"),
+    *("rims", "notes", "surfaces", "coating", "configuration"),
 )
 CONFIGURATION_KEYS = (
     *("name", "efl_mm", "half_field_deg", "thickness_mm", "f_number", "stop_diameter_mm", "object_distance_mm"),
@@ -95,6 +97,8 @@ def read_lens(path: str | Path) -> Lens:
         rims=text(data, "rims", file),
         configurations=_configurations(data, len(surfaces), file),
         path=file,
+        stated_efl_mm=number(data, "efl_mm", file, above=0) if "efl_mm" in data else None,
+        stated_efl_x_mm=number(data, "efl_x_mm", file, above=0) if "efl_x_mm" in data else None,
     )
     if lens.rims not in RIMS:
         raise InputError(file, "rims", lens.rims, 'where the diameters come from: "source", "estimated" or "derived"')

@@ -34,6 +34,8 @@ def format_lens(lens: Lens) -> str:
         "designer": lens.designer or None,
         "source": lens.source,
         "f_number": float(lens.f_number),
+        "efl_mm": lens.stated_efl_mm,
+        "efl_x_mm": lens.stated_efl_x_mm,
         "image_radius_mm": lens.image_radius_mm,
         "half_field_deg": lens.half_field_deg,
         "rims": lens.rims,

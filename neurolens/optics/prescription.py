@@ -100,6 +100,8 @@ class Lens:
         name, designer, source, notes: as cited in the lens file.
         rims: whether the rim diameters are the source's own or "estimated" by somebody.
         f_number: nominal, of the source; the stop's own diameter rules the trace.
+        stated_efl_mm: focal length as the source states it, to check the computed one against; of an anamorphic lens in
+            the y-z plane, and `stated_efl_x_mm` in the x-z plane. None where it states none.
         image_radius_mm: radius of the image circle, None where only the field is known.
         half_field_deg: half field of view, None where unknown.
         film_z_mm: film plane in the lens frame; None until `at` has focused the lens: the table's thickness rules.
@@ -119,6 +121,8 @@ class Lens:
     film_z_mm: float | None = None
     configurations: tuple[Configuration, ...] = ()
     path: str = "lens"
+    stated_efl_mm: float | None = None
+    stated_efl_x_mm: float | None = None
 
     @property
     def vertices_mm(self) -> list[Any]:
@@ -222,6 +226,8 @@ class Lens:
             configurations=configurations,
             image_radius_mm=scale(self.image_radius_mm),
             film_z_mm=scale(self.film_z_mm),
+            stated_efl_mm=scale(self.stated_efl_mm),
+            stated_efl_x_mm=scale(self.stated_efl_x_mm),
         )
 
     def with_stop_radius(self, radius_mm: float) -> Lens:
