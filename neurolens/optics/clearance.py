@@ -54,7 +54,7 @@ def check_clearance(surfaces: Sequence[Surface], file: str, state: str = "") -> 
         if s.semi_diameter_mm > end_mm(s):
             limit = f"at most {2 * end_mm(s):g} mm, where its {'conic' if s.conic else 'sphere'} ends"
             raise InputError(file, f"{state}surface {k}, diameter_mm", s.diameter_mm, limit)
-    for k, after, axis_gap_mm in _neighbours(surfaces):
+    for k, after, axis_gap_mm in neighbours(surfaces):
         if axis_gap_mm < -TOUCH_MM:
             raise InputError(
                 file, f"{state}surface {k}, thickness_mm", axis_gap_mm, "at least 0, except beside the stop"
@@ -81,7 +81,7 @@ def _narrowest(before: Surface, after: Surface, axis_gap_mm: float) -> tuple[flo
     return found
 
 
-def _neighbours(surfaces: Sequence[Surface]) -> Iterator[tuple[int, int, float]]:
+def neighbours(surfaces: Sequence[Surface]) -> Iterator[tuple[int, int, float]]:
     """Pairs of surfaces that may collide, the stop aside, with the distance of their vertices."""
     for k in range(len(surfaces) - 1):
         if not surfaces[k].stop and not surfaces[k + 1].stop:
