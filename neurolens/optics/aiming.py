@@ -2,8 +2,8 @@
 
 Searching the front surface for the ray that meets the stop's centre fails where the pupil moves (a fisheye's chief ray
 enters centimetres beside the paraxial pupil) and where most rays miss some surface. From the stop every start is a ray
-that exists: it is followed to the scene, its angle there grows steadily with its angle at the stop, and the wanted field
-is bracketed from the axis outwards.
+that exists: it is followed to the scene, its angle there grows steadily with its angle at the stop, and the wanted
+field is bracketed from the axis outwards.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def _bracket(grid: Tensor, field: Tensor, exists: Tensor, target: Tensor) -> tup
 def _follow(
     front: Lens, height: Tensor, angle: Tensor, axis: Axis, wavelength_nm: float
 ) -> tuple[Rays, Tensor, Tensor]:
-    """From the stop to the scene: rays turned round to travel to the film [n * G], field angle and existence [n, G]."""
+    """From the stop to the scene: the rays turned round, [n * G], their field angle and existence [n, G]."""
     stop, z = front.surfaces[-1], float(front.vertices_mm[-2])
     h, a = height.reshape(-1), angle.reshape(-1)
     known = {float(v): surface_sag_mm(stop, float(v), 0.0) if axis == "x" else surface_sag_mm(stop, 0.0, float(v))

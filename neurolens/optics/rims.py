@@ -2,8 +2,8 @@
 
 The rule: the stop is as wide as the f-number asks; every other rim lets through the whole beam of the axis, and of a
 field the rays whose height in the stop is within a share of the stop's radius that falls linearly from 1 on the axis to
-`vignetting` at the edge of the field. To that comes a clear edge. Where neighbours would
-touch inside their rims, they are shrunk to the height where they meet. Rays are real ones, d line, object at infinity; states of a zoom count all.
+`vignetting` at the edge of the field. To that comes a clear edge. Where neighbours would touch inside their rims, they
+are shrunk to the height where they meet. Rays are real ones, d line, object at infinity; a zoom counts all its states.
 """
 
 from __future__ import annotations
