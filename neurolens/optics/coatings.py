@@ -1,0 +1,179 @@
+"""Antireflection coatings by name, and what they do to light.
+
+The designs are the textbook ones (Macleod, Thin-Film Optical Filters, chapter 3), computed for normal incidence with
+layers of constant index. Films are listed from the scene's side, so the order of a design turns round where the light
+from the scene leaves the glass: its outermost film lies on the side of the lower index. Powers and amplitudes of any
+stack come from `thinfilm`.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from neurolens.errors import InputError
+from neurolens.optics.prescription import Coating
+from neurolens.optics.thinfilm import (
+    Amplitudes,
+    Layers,
+    Powers,
+    amplitudes,
+    power_amplitudes,
+    powers,
+    reflectance,
+    transmittance,
+)
+
+__all__ = [
+    "Amplitudes",
+    "Layers",
+    "Powers",
+    "amplitudes",
+    "bare",
+    "broadband",
+    "design",
+    "power_amplitudes",
+    "powers",
+    "quarter_wave",
+    "reflectance",
+    "transmittance",
+    "v_coat",
+]
+
+DESIGN_NM = 550.0
+MAGNESIUM_FLUORIDE = 1.38
+ALUMINA = 1.63
+TANTALA = 2.10  # zirconia is close
+
+# Pairs of (outer, inner) films in the order tried: the second where the glass is too dense for the first.
+V_PAIRS = ((MAGNESIUM_FLUORIDE, TANTALA), (MAGNESIUM_FLUORIDE, ALUMINA))
+
+KNOWN = '"bare", "quarter-wave", "v-coat" or "broadband", the last three with a wavelength in nm if not 550'
+
+
+def bare() -> Coating:
+    """No film."""
+    return Coating("bare", ())
+
+
+def quarter_wave(index: float = MAGNESIUM_FLUORIDE, at_nm: float = DESIGN_NM) -> Coating:
+    """One film a quarter of a wave thick: R = ((n0 ns - n^2) / (n0 ns + n^2))^2 at `at_nm` and normal incidence."""
+    return Coating(f"quarter-wave {at_nm:g}", ((index, at_nm / (4 * index)),))
+
+
+def v_coat(
+    n_before: float,
+    n_after: float,
+    at_nm: float = DESIGN_NM,
+    outer: float | None = None,
+    inner: float | None = None,
+) -> Coating:
+    """Two films without any reflection at `at_nm` and normal incidence (Macleod, section 3.2: equations of tan^2).
+
+    Args:
+        n_before, n_after: media on the scene's and on the film's side.
+        at_nm: design wavelength in vacuum.
+        outer, inner: indices of the films next to the rarer and to the denser medium; both or neither. Without them
+            magnesium fluoride over tantala (2.10), over alumina (1.63) for glass above 1.90.
+
+    Of the two solutions the thinner, which is the broader, is taken.
+
+    Raises:
+        InputError: no two films of these indices bring the reflection of these media to zero.
+    """
+    pairs = V_PAIRS if outer is None or inner is None else ((outer, inner),)
+    low, high = sorted((n_before, n_after))
+    for pair in pairs:
+        solution = _v_phases(low, high, *pair)
+        if solution is not None:
+            layers = tuple(_film(n, phase, at_nm) for n, phase in zip(pair, solution, strict=True))
+            return Coating(f"v-coat {at_nm:g}", _oriented(layers, n_before, n_after))
+    tried = " or ".join(f"{a:g} over {b:g}" for a, b in pairs)
+    raise InputError(
+        "v-coat", "media", f"({n_before:g} to {n_after:g})", f"media whose reflection films of {tried} can cancel"
+    )
+
+
+def broadband(
+    n_before: float,
+    n_after: float,
+    at_nm: float = DESIGN_NM,
+    outer: float = MAGNESIUM_FLUORIDE,
+    middle: float = TANTALA,
+    inner: float | None = None,
+) -> Coating:
+    """The classic triple layer, quarter, half and quarter wave from the rarer side (Cox, Hass and Thelen 1962).
+
+    `inner` None takes outer * sqrt(n_high / n_low), which leaves no reflection at `at_nm`; mixtures of oxides have such
+    indices (1.7 on crown glass).
+    """
+    low, high = sorted((n_before, n_after))
+    inner = outer * math.sqrt(high / low) if inner is None else inner
+    quarter = math.pi / 2
+    layers = (_film(outer, quarter, at_nm), _film(middle, 2 * quarter, at_nm), _film(inner, quarter, at_nm))
+    return Coating(f"broadband {at_nm:g}", _oriented(layers, n_before, n_after))
+
+
+def design(name: str, n_before: float, n_after: float, file: str | Path = "coating", where: str = "name") -> Coating:
+    """A coating by the name that lens files use: "bare", "quarter-wave", "v-coat 500", "broadband".
+
+    Args:
+        name: the design, and after a space its wavelength in nm where that is not 550.
+        n_before, n_after: indices (n_d) on the scene's and on the film's side of the surface.
+        file, where: for error messages.
+
+    Raises:
+        InputError: an unknown name, a wavelength that is not a positive number, a design that the media do not allow.
+    """
+    kind, _, wavelength = name.partition(" ")
+    if kind not in ("bare", "quarter-wave", "v-coat", "broadband") or (kind == "bare" and name != kind):
+        raise InputError(file, where, name, KNOWN)
+    if kind == "bare":
+        return bare()
+    at_nm = _wavelength(name, wavelength, file, where) if name != kind else DESIGN_NM
+    if n_before == n_after:
+        raise InputError(file, where, name, f"a surface between two different media (both are {n_before:g})")
+    if kind == "quarter-wave":
+        return Coating(name, quarter_wave(at_nm=at_nm).layers)
+    if kind == "broadband":
+        return Coating(name, broadband(n_before, n_after, at_nm).layers)
+    try:
+        return Coating(name, v_coat(n_before, n_after, at_nm).layers)
+    except InputError as error:
+        raise InputError(file, where, name, f"another design: {error}") from None
+
+
+def _wavelength(name: str, text: str, file: str | Path, where: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise InputError(file, where, name, KNOWN)
+    return value
+
+
+def _film(index: float, phase: float, at_nm: float) -> tuple[float, float]:
+    """(index, thickness in nm) of a film whose phase thickness is `phase` rad at `at_nm`."""
+    return index, phase * at_nm / (2 * math.pi * index)
+
+
+def _oriented(
+    from_low: tuple[tuple[float, float], ...], n_before: float, n_after: float
+) -> tuple[tuple[float, float], ...]:
+    """Layers given from the side of the lower index, as seen from the scene's side."""
+    return from_low if n_before <= n_after else from_low[::-1]
+
+
+def _v_phases(n_0: float, n_s: float, n_1: float, n_2: float) -> tuple[float, float] | None:
+    """Phase thicknesses (rad) of films n_1, n_2 that match medium n_0 to n_s > n_0, the thinner pair; None if none."""
+    across = n_1 * n_1 * n_s - n_0 * n_2 * n_2
+    below, above = n_0 * n_s - n_1 * n_1, n_2 * n_2 - n_0 * n_s
+    if across == 0 or below == 0 or not (n_s - n_0) * above / (across * below) > 0:
+        return None
+    tangent = math.sqrt((n_s - n_0) * above / (across * below)) * n_1
+    pairs = []
+    for t_1 in (tangent, -tangent):
+        t_2 = t_1 * below * n_2 / (above * n_1)
+        pairs.append((math.atan(t_1) % math.pi, math.atan(t_2) % math.pi))
+    return min(pairs, key=lambda pair: pair[0] / n_1 + pair[1] / n_2)
