@@ -22,17 +22,19 @@ BASE = {"errors", "status", "files", "tomlfile", "config", "progress", "focus", 
 # Parts of the package that each part may import, besides itself and the base.
 PARTS = {
     "optics": set(),
+    "readers": {"optics"},
     "surrogates": {"optics"},
     "cameras": set(),
     "render": {"cameras"},
-    "evaluate": {"optics", "surrogates", "cameras", "render"},
-    "commands": {"optics", "surrogates", "cameras", "render", "evaluate"},
+    "evaluate": {"optics", "readers", "surrogates", "cameras", "render"},
+    "commands": {"optics", "readers", "surrogates", "cameras", "render", "evaluate"},
     "cli": {"commands"},
 }
 # Packages from elsewhere that each part may import; what is not listed here is not restricted.
 PACKAGES = {
     "base": {"numpy"},
     "optics": {"numpy", "torch"},
+    "readers": set(),
     "cameras": {"numpy", "onnxruntime"},
     "render": {"numpy", "OpenEXR", "PIL"},
 }

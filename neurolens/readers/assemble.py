@@ -1,0 +1,155 @@
+"""What every reader ends with: loose facts from a file become a lens that is whole and checked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from types import ModuleType
+from typing import Any
+
+from neurolens.errors import InputError
+from neurolens.optics import paraxial
+from neurolens.optics.clearance import check_clearance
+from neurolens.optics.lensfields import MAX_INDEX
+from neurolens.optics.lensrows import MAX_POWER, MAX_SURFACES
+from neurolens.optics.prescription import Configuration, Lens, Surface
+from neurolens.readers.source import warn
+
+# A diameter that the file does not give, until `finish` has found it.
+UNKNOWN = math.nan
+SAME_INDEX, SAME_ABBE = 2e-5, 0.005  # how near the catalogue printed figures are to be those of a named glass
+
+
+def finish(
+    lens: Lens,
+    *,
+    pupil_mm: float | None = None,
+    f_number: float | None = None,
+    film_given: bool = True,
+) -> Lens:
+    """A lens from the rows of a file, with what follows from them: f-number or stop, and back focus.
+
+    Args:
+        lens: rows as read; `UNKNOWN` for a diameter that is not given, NaN for an f-number that is not.
+        pupil_mm: diameter of the entrance pupil, where the file gives that; it rules over the stop's diameter.
+        f_number: from the file or the user, used for the stop where neither pupil nor stop diameter are known.
+        film_given: whether the last thickness is the file's; else it becomes the paraxial back focus.
+
+    Raises:
+        InputError: no row, too many, no stop or several, a figure out of range, a last medium that is not air, a
+            diameter that nothing gives, surfaces that overlap.
+    """
+    _check_rows(lens.surfaces, lens.path)
+    stop = lens.surfaces[lens.stop_index]
+    stated = lens.f_number if f_number is None else f_number
+    # First-order data needs an opening, whatever it is.
+    trial = lens.with_stop_radius(1.0 if math.isnan(stop.diameter_mm) else stop.semi_diameter_mm)
+    data = paraxial.first_order(trial)
+    if pupil_mm is not None:
+        trial = trial.with_stop_radius(trial.stop_radius_mm * pupil_mm / data.entrance_pupil_diameter_mm)
+        stated = abs(data.efl_mm) / pupil_mm if math.isnan(stated) else stated
+    elif math.isnan(stop.diameter_mm):
+        if math.isnan(stated):
+            raise InputError(lens.path, "stop", "(no diameter, no f-number)", "one of them: give --f-number")
+        trial = trial.with_stop_radius(trial.stop_radius_mm * data.f_number / stated)
+    if math.isnan(stated):
+        stated = paraxial.first_order(trial).f_number
+        warn(lens.path, f"no f-number is stated; f/{stated:.4g} follows from the stop's diameter")
+    rows = list(trial.surfaces)
+    if not film_given:
+        rows[-1] = replace(rows[-1], thickness_mm=data.back_focus_mm)
+        if data.back_focus_mm <= 0:
+            raise InputError(lens.path, "back focus", data.back_focus_mm, "a film behind the last surface")
+    missing = [k for k, s in enumerate(rows) if math.isnan(s.diameter_mm)]
+    if missing:
+        found = f"(not given for surface {', '.join(map(str, missing))})"
+        raise InputError(lens.path, "diameter", found, "the clear diameter of every surface")
+    whole = replace(lens, surfaces=tuple(rows), f_number=float(stated))
+    check_states(whole)
+    return whole
+
+
+def check_states(lens: Lens) -> None:
+    """Raise for rims beyond their sphere and surfaces that overlap, in the table and in every state of it."""
+    check_clearance(lens.surfaces, lens.path)
+    for c in lens.configurations:
+        check_clearance(moved(lens, c).surfaces, lens.path, f'configuration "{c.name}", ')
+
+
+def moved(lens: Lens, c: Configuration) -> Lens:
+    """The lens with the thicknesses of a state."""
+    thickness = dict(c.thickness_mm)
+    rows = (replace(s, thickness_mm=thickness.get(k, s.thickness_mm)) for k, s in enumerate(lens.surfaces))
+    return replace(lens, surfaces=tuple(rows))
+
+
+def _check_rows(rows: Sequence[Surface], file: str) -> None:
+    if not rows:
+        raise InputError(file, "surfaces", "(none)", "at least one surface between object and image")
+    if len(rows) > MAX_SURFACES:
+        raise InputError(file, "surfaces", f"({len(rows)} of them)", f"at most {MAX_SURFACES}")
+    for k, s in enumerate(rows):
+        where = f"surface {k}, "
+        if math.isnan(s.radius_mm) or s.radius_mm == 0:
+            raise InputError(file, f"{where}radius", s.radius_mm, "a number other than 0, or a plane")
+        if not math.isfinite(s.thickness_mm):
+            raise InputError(file, f"{where}thickness", s.thickness_mm, "a finite length")
+        if s.diameter_mm <= 0 or math.isinf(s.diameter_mm):
+            raise InputError(file, f"{where}diameter", s.diameter_mm, "a length above 0")
+        if not 1 <= s.n_d <= MAX_INDEX:
+            raise InputError(file, f"{where}index", s.n_d, f"a refractive index from 1 to {MAX_INDEX}")
+        if s.V_d is not None and not (s.V_d > 0 and math.isfinite(s.V_d)):
+            raise InputError(file, f"{where}Abbe number", s.V_d, "a number above 0")
+        if not math.isfinite(s.conic) or not all(math.isfinite(a) for _, a in s.asphere):
+            raise InputError(file, f"{where}asphere", (s.conic, s.asphere), "finite coefficients")
+        for power, _ in s.asphere:
+            if not 2 <= power <= MAX_POWER:
+                raise InputError(file, f"{where}asphere, power", power, f"a power from 2 to {MAX_POWER}")
+    stops = [k for k, s in enumerate(rows) if s.stop]
+    if len(stops) != 1:
+        found = f"(on surfaces {', '.join(map(str, stops))})" if stops else "(none)"
+        raise InputError(file, "stop", found, "exactly one surface that is the aperture stop")
+    if rows[-1].n_d != 1:
+        raise InputError(file, f"surface {len(rows) - 1}, index", rows[-1].n_d, "air between last surface and film")
+
+
+def catalogue_glass(name: str) -> Any | None:
+    """The glass of that name in the catalogue, or None."""
+    catalogue = _catalogue()
+    if catalogue is None:
+        return None
+    try:
+        return catalogue.find(name, "", "")
+    except InputError:
+        return None
+
+
+def named_glass(name: str, file: str, field: str) -> dict[str, Any]:
+    """Fields of a surface whose glass the file gives by name alone.
+
+    Raises:
+        InputError: a name that the catalogue does not know; the message suggests the nearest.
+    """
+    catalogue = _catalogue()
+    if catalogue is None:
+        raise InputError(file, field, name, "a glass by its index and Abbe number (there is no catalogue)")
+    known = catalogue.find(name, file, field)
+    return {"n_d": known.n_d, "V_d": known.V_d, "glass": name, "material": name}
+
+
+def same_glass(name: str | None, n_d: float, V_d: float | None) -> str | None:
+    """The catalogue's name of a glass given by name and figures, where the figures are those of the catalogue."""
+    known = None if name is None else catalogue_glass(name)
+    if known is None or V_d is None:
+        return None
+    alike = abs(known.n_d - n_d) <= SAME_INDEX and abs(known.V_d - V_d) <= SAME_ABBE * V_d
+    return name if alike else None
+
+
+def _catalogue() -> ModuleType | None:
+    try:
+        from neurolens.optics import catalogue
+    except ImportError:
+        return None
+    return catalogue

@@ -1,0 +1,139 @@
+"""Files from elsewhere, read within bounds: bytes, text in whatever encoding, numbers, each mistake named by line."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from neurolens.errors import InputError, NeurolensWarning
+from neurolens.tomlfile import suggestion
+
+MAX_BYTES = 4_000_000  # the longest real lens files, with tolerances and merit function, stay below 1 MB
+MAX_LINES = 100_000
+MAX_LINE = 10_000
+
+# What one unit of length is in mm.
+UNITS_MM = {"mm": 1.0, "cm": 10.0, "in": 25.4, "m": 1000.0}
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a text file: where it stands, and its words."""
+
+    file: str
+    number: int
+    text: str
+
+    @property
+    def words(self) -> list[str]:
+        return self.text.split()
+
+    def error(self, keyword: str, value: object, expected: str) -> InputError:
+        """The error for something on this line."""
+        return InputError(self.file, f"line {self.number}, {keyword}", value, expected)
+
+    def unknown(self, keyword: str, known: Sequence[str]) -> InputError:
+        """The error for a keyword that the reader does not know."""
+        expected = f"one of the keywords read: {', '.join(known)}{suggestion(keyword, known)}"
+        return self.error(keyword, "(unknown keyword)", expected)
+
+    def number_of(self, keyword: str, word: str, expected: str = "a finite number") -> float:
+        """A finite number from one word of this line."""
+        try:
+            value = float(word) if "_" not in word else math.nan
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise self.error(keyword, word, expected)
+        return value
+
+    def numbers(self, keyword: str, words: Sequence[str], least: int = 1) -> list[float]:
+        """Finite numbers from words of this line, at least so many."""
+        if len(words) < least:
+            found = " ".join(words) or "(nothing)"
+            raise self.error(keyword, found, f"{least} number{'s' if least > 1 else ''} after it")
+        return [self.number_of(keyword, word) for word in words]
+
+
+def read_bytes(path: str | Path, max_bytes: int = MAX_BYTES) -> bytes:
+    """The content of a regular file of bounded size.
+
+    Raises:
+        InputError: no such file, not a regular one, unreadable, empty, or larger than `max_bytes`.
+    """
+    path = Path(path)
+    if not path.is_file():
+        found = "(not a regular file)" if path.exists() else "(missing)"
+        raise InputError(path, "file", found, "a lens file")
+    try:
+        with path.open("rb") as file:
+            raw = file.read(max_bytes + 1)
+    except OSError as error:
+        raise InputError(path, "file", f"({error.strerror})", "a readable lens file") from None
+    if len(raw) > max_bytes:
+        raise InputError(path, "file", f"(more than {max_bytes} bytes)", f"at most {max_bytes} bytes")
+    if not raw.strip():
+        raise InputError(path, "file", "(empty)", "a lens file with content")
+    return raw
+
+
+def decode(raw: bytes, path: str | Path) -> str:
+    """Text of a file: UTF-16 by its byte-order mark (or by its zero bytes), else UTF-8, else Latin-1.
+
+    Raises:
+        InputError: bytes that are no text.
+    """
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        codes = ["utf-16"]
+    elif raw[1:2] == b"\0" and raw[:1] != b"\0":
+        codes = ["utf-16-le"]
+    else:
+        codes = ["utf-8-sig", "latin-1"]
+    for code in codes:
+        try:
+            text = raw.decode(code)
+        except UnicodeDecodeError:
+            continue
+        control = next((c for c in text if ord(c) < 32 and c not in "\t\n\r\f\x1a"), None)
+        if control is None:
+            return text.replace("\x1a", "")  # the end mark of old DOS files
+        break
+    raise InputError(path, "file", "(bytes that are not text)", "a text file in UTF-8, UTF-16 or Latin-1")
+
+
+def read_lines(path: str | Path) -> list[Line]:
+    """The lines of a text file, those without content left out.
+
+    Raises:
+        InputError: see `read_bytes` and `decode`; too many lines, or one too long.
+    """
+    file = str(path)
+    rows = decode(read_bytes(path), path).splitlines()
+    if len(rows) > MAX_LINES:
+        raise InputError(file, "file", f"({len(rows)} lines)", f"at most {MAX_LINES} lines")
+    lines = [Line(file, k, row.rstrip()) for k, row in enumerate(rows, start=1) if row.strip()]
+    for line in lines:
+        if len(line.text) > MAX_LINE:
+            raise line.error("length", f"({len(line.text)} characters)", f"at most {MAX_LINE} characters in a line")
+    if not lines:
+        raise InputError(file, "file", "(empty)", "a lens file with content")
+    return lines
+
+
+def unit_mm(unit: str, file: str, field: str = "--units") -> float:
+    """Length of a unit in mm.
+
+    Raises:
+        InputError: an unknown unit.
+    """
+    if unit not in UNITS_MM:
+        raise InputError(file, field, unit, f"one of {', '.join(UNITS_MM)}")
+    return UNITS_MM[unit]
+
+
+def warn(file: str, message: str) -> None:
+    """Tell the user something about a file that was read all the same."""
+    warnings.warn(f"{file}: {message}", NeurolensWarning, stacklevel=3)
