@@ -28,7 +28,7 @@ Layers = Sequence[tuple[Any, Any]]
 # Below this square of the phase in a layer, sine and cosine are summed as series, whose derivatives keep their digits.
 SMALL_PHASE2 = 1e-2
 
-# Below this (n cos)^2 behind the stack light counts as totally reflected: products of such cosines underflow in float32.
+# Below this (n cos)^2 behind the stack, light counts as totally reflected: float32 products of such cosines underflow.
 FLOOR = 1e-30
 
 
