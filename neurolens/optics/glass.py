@@ -1,13 +1,33 @@
-"""Refractive index against wavelength: Cauchy A + B / lambda^2 through n_d and the Abbe number V_d."""
+"""The medium after a surface: its index by catalogue name, or by (n_d, V_d), and its absorption.
+
+Without a catalogue glass the dispersion is Cauchy's, A + B / lambda^2 through n_d and the Abbe number V_d.
+"""
 
 from __future__ import annotations
 
+import warnings
+from pathlib import Path
 from typing import Any
 
-# Fraunhofer lines, nm (helium d; hydrogen F and C).
-LINE_D_NM = 587.5618
-LINE_F_NM = 486.1327
-LINE_C_NM = 656.2725
+from neurolens.errors import NeurolensWarning
+from neurolens.optics import catalogue
+from neurolens.optics.dispersion import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
+from neurolens.optics.prescription import Surface
+
+__all__ = [
+    *("LINE_C_NM", "LINE_D_NM", "LINE_F_NM", "absorption_of", "cauchy_coefficients", "check_against_table"),
+    *("glass_of", "index_at", "index_of", "inverse_square_um"),
+]
+
+# How far a stated n_d or V_d may be from the catalogue's: rounding to three decimals and one, and other melts.
+TOLERANCE_N_D = 5e-4
+TOLERANCE_V_D = 0.5
+
+# The visible: where a formula that is extrapolated is worth a warning.
+VISIBLE_NM = (400.0, 700.0)
+
+# Glasses that surfaces have named. A plain dictionary, because torch.compile sees through it to the coefficients.
+_FOUND: dict[str, Glass] = {}
 
 
 def inverse_square_um(wavelength_nm: Any) -> Any:
@@ -30,3 +50,73 @@ def index_at(n_d: Any, V_d: float | None, wavelength_nm: Any) -> Any:
     """Refractive index at a wavelength in nm (number, or tensor [N]); the constant n_d where V_d is unknown."""
     a, b = cauchy_coefficients(n_d, V_d)
     return a if V_d is None else a + b * inverse_square_um(wavelength_nm)
+
+
+def glass_of(name: str) -> Glass:
+    """`catalogue.find`, remembered. To use a glass under torch.compile, ask for it once before.
+
+    Raises:
+        InputError: a glass that the catalogue does not have.
+    """
+    found = _FOUND.get(name)
+    if found is None:
+        found = _FOUND[name] = catalogue.find(name)
+    return found
+
+
+def index_of(surface: Surface, wavelength_nm: Any) -> Any:
+    """Refractive index of the medium after a surface at a wavelength in nm (number, or tensor of any shape).
+
+    The catalogue's where the surface names a glass; else by its n_d and V_d, constant where V_d is unknown.
+
+    Raises:
+        InputError: a glass that the catalogue does not have.
+    """
+    if surface.glass is not None:
+        return glass_of(surface.glass).index(wavelength_nm)
+    return index_at(surface.n_d, surface.V_d, wavelength_nm)
+
+
+def absorption_of(surface: Surface, wavelength_nm: Any) -> Any:
+    """Napierian absorption in 1/mm of the medium after a surface: the glass's and the surface's own; None for none.
+
+    Beer-Lambert: t mm of it transmit exp(-absorption t).
+
+    Raises:
+        InputError: a glass that the catalogue does not have.
+    """
+    own = surface.absorption_per_mm or None
+    glass = None if surface.glass is None else glass_of(surface.glass).absorption_per_mm(wavelength_nm)
+    if glass is None or own is None:
+        return own if glass is None else glass
+    return glass + own
+
+
+def check_against_table(surface: Surface, file: str | Path, where: str) -> None:
+    """Look a surface's glass up when a lens is read; nothing to do for a surface without one.
+
+    Args:
+        file, where: the place to name, for example "surface 3, ".
+
+    Warns:
+        NeurolensWarning: the stated n_d or V_d (n_d = 1 and None count as not stated) is not the catalogue's within
+            5e-4 and 0.5, or the catalogue's formula does not reach over 400-700 nm and is extrapolated.
+
+    Raises:
+        InputError: a glass that the catalogue does not have.
+    """
+    if surface.glass is None:
+        return
+    glass = _FOUND[surface.glass] = catalogue.find(surface.glass, file, f"{where}glass")
+    n_d = float(surface.n_d)
+    if n_d != 1 and abs(glass.n_d - n_d) > TOLERANCE_N_D:
+        _warn(file, where, f"n_d = {n_d:.6g} is stated, but {glass} has {glass.n_d:.6g}, which is used")
+    if surface.V_d is not None and abs(glass.V_d - surface.V_d) > TOLERANCE_V_D:
+        _warn(file, where, f"V_d = {surface.V_d:.4g} is stated, but {glass} has {glass.V_d:.4g}, which is used")
+    if not all(glass.covers(nm) for nm in VISIBLE_NM):
+        low, high = (round(1000 * v) for v in glass.range_um)
+        _warn(file, where, f"the index of {glass} is stated for {low}-{high} nm and extrapolated outside")
+
+
+def _warn(file: str | Path, where: str, text: str) -> None:
+    warnings.warn(f"{file}: {where}{text}", NeurolensWarning, stacklevel=3)

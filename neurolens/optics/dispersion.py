@@ -1,0 +1,103 @@
+"""One glass of a catalogue: its refractive index and its absorption against wavelength."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+# Fraunhofer lines, nm (helium d; hydrogen F and C).
+LINE_D_NM = 587.5618
+LINE_F_NM = 486.1327
+LINE_C_NM = 656.2725
+
+
+@dataclass(frozen=True)
+class Glass:
+    """Dispersion and absorption of one optical material.
+
+    Attributes:
+        maker, name: as in the catalogue.
+        form: "sellmeier", n^2 = 1 + sum of B L^2 / (L^2 - C), or "power", n^2 = sum of a_p L^p; L in um.
+        coefficients: B, C (um^2), B, C, ... of Sellmeier's form; a_4, a_2, a_0, a_-2, a_-4, ... of the other.
+        range_um: wavelengths from and to which the source states the formula for.
+        absorption: (wavelength in nm, Napierian absorption in 1/mm) at increasing wavelengths; empty where unknown.
+    """
+
+    maker: str
+    name: str
+    form: str
+    coefficients: tuple[float, ...]
+    range_um: tuple[float, float]
+    absorption: tuple[tuple[float, float], ...] = ()
+
+    def __str__(self) -> str:
+        return f"{self.maker}:{self.name}"
+
+    def index(self, wavelength_nm: Any) -> Any:
+        """Refractive index relative to air at a wavelength in nm (number, or tensor of any shape, of its dtype).
+
+        Outside `range_um` the formula is extrapolated; it is finite for 380-780 nm in every glass of the catalogue.
+        """
+        square = (wavelength_nm * 1e-3) ** 2
+        c = self.coefficients
+        if self.form == "sellmeier":
+            terms = [c[k] * square / (square - c[k + 1]) for k in range(0, len(c), 2)]
+            return (sum(terms[1:], terms[0]) + 1.0) ** 0.5
+        # Horner's scheme in 1 / L^2 for the negative powers; the catalogues have none above the fourth.
+        inverse = 1.0 / square
+        total = inverse * c[-1]
+        for a in c[-2:2:-1]:
+            total = (total + a) * inverse
+        return (total + c[2] + square * (c[1] + square * c[0])) ** 0.5
+
+    def absorption_per_mm(self, wavelength_nm: Any) -> Any:
+        """Napierian absorption, 4 pi k / wavelength, in 1/mm, at a wavelength in nm; None where the source has none.
+
+        Internal transmittance of t mm is exp(-absorption t). Linear between the source's wavelengths, and constant
+        outside them (350-1060 nm at the most): there, on the ultraviolet side, glass is darker than this says.
+        """
+        if not self.absorption:
+            return None
+        if not isinstance(wavelength_nm, Tensor):
+            value = np.interp(wavelength_nm, *np.transpose(self.absorption))
+            return float(value) if np.ndim(value) == 0 else value
+        # Inside torch.compile they are constants of the graph; its tracer does not see through a cache.
+        samples = _samples if torch.compiler.is_compiling() else _kept_samples
+        grid, values, slopes = samples(self.absorption, wavelength_nm.dtype, wavelength_nm.device)
+        place = wavelength_nm.clamp(min=grid[0], max=grid[-1])
+        left = torch.searchsorted(grid, place.detach().contiguous(), right=True).clamp(1, len(self.absorption) - 1) - 1
+        return values[left] + slopes[left] * (place - grid[left])
+
+    @property
+    def n_d(self) -> float:
+        """Index at the helium line, 587.5618 nm."""
+        return self.index(LINE_D_NM)
+
+    @property
+    def V_d(self) -> float:
+        """Abbe number (n_d - 1) / (n_F - n_C)."""
+        return (self.n_d - 1.0) / (self.index(LINE_F_NM) - self.index(LINE_C_NM))
+
+    def covers(self, wavelength_nm: float) -> bool:
+        """Whether the source states the formula for this wavelength."""
+        return self.range_um[0] <= wavelength_nm * 1e-3 <= self.range_um[1]
+
+
+def _samples(
+    absorption: tuple[tuple[float, float], ...], dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Wavelengths, absorption there, and its slope to the next one."""
+    pairs = list(zip(absorption[:-1], absorption[1:], strict=True))
+    slopes = [(b - a) / (right - left) for (left, a), (right, b) in pairs]
+    columns = ([nm for nm, _ in absorption], [a for _, a in absorption], slopes)
+    grid, values, steps = (torch.tensor(c, dtype=dtype, device=device) for c in columns)
+    return grid, values, steps
+
+
+# Kept, because every copy to a GPU makes the host wait.
+_kept_samples = lru_cache(maxsize=1024)(_samples)
