@@ -10,12 +10,12 @@ from contextlib import contextmanager
 from typing import Any
 
 from neurolens import __version__
-from neurolens.commands import evaluate, lens, render, train
+from neurolens.commands import bench, evaluate, lens, render, train
 from neurolens.commands.arguments import Parser
 from neurolens.errors import NeurolensError, NeurolensWarning
 
 # Packages of the extra that a base install lacks.
-_TRAIN_PACKAGES = {"torch", "sklearn", "onnx", "matplotlib", "flip_evaluator"}
+_TRAIN_PACKAGES = {"torch", "sklearn", "onnx", "matplotlib", "flip_evaluator", "mpmath"}
 _INTERRUPTED, _BROKEN_PIPE = 130, 141  # 128 plus the signal's number, as shells report it
 
 _DESCRIPTION = "Any lens prescription as a fast camera model with a measured error."
@@ -35,7 +35,7 @@ def build_parser() -> Parser:
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    for command in (lens, train, evaluate, render):
+    for command in (lens, train, evaluate, render, bench):
         command.add_parser(subparsers)
     return parser
 

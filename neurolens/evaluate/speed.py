@@ -30,6 +30,7 @@ POOL = (
 BATCHES = (4096, 8192, 16384)
 _SAMPLE_S = 0.001  # a sample lasts at least this long; short ones fall between the interruptions of a busy machine
 _SAMPLES = 5  # the best of so many is the time of a round
+_PREPARING = 0.7  # share of a race's time that compiling takes, about
 
 Call = Callable[[], object]
 
@@ -104,8 +105,20 @@ class Race:
         return {"name": name, "available": True, "ns_per_ray": self.timing(name)}
 
 
-def race(candidates: Sequence[Candidate], domain: Domain, *, threads: int = 1, rounds: int = 20, seed: int = 3) -> Race:
+def race(
+    candidates: Sequence[Candidate],
+    domain: Domain | FilmRays,
+    *,
+    threads: int = 1,
+    rounds: int = 20,
+    seed: int = 3,
+    report: Callable[[float], None] = lambda share: None,
+) -> Race:
     """Time candidates in turn on the same rays of a domain, or each on those of its own.
+
+    Args:
+        domain: whose rays all do that have none of their own; or those rays, `POOL` of them.
+        report: hears the share that is done, now and then.
 
     Each call runs on one thread; with more threads, that many workers share out the batches, as a renderer does
     (torch and onnxruntime gain nothing from threads within an operator at batches that fit the caches).
@@ -121,11 +134,12 @@ def race(candidates: Sequence[Candidate], domain: Domain, *, threads: int = 1, r
     before = _load()
     with _workers(threads) as team, pinned_threads(1), torch.no_grad():
         torch._dynamo.reset()  # torch compiles one function only so often before it gives up; a race starts afresh
-        for c in candidates:
+        for i, c in enumerate(candidates):
             try:
                 passes[c.name] = _best_batch(c, _pool(c.domain or domain, seed), team)
             except Unavailable as reason:
                 unavailable[c.name] = str(reason)
+            report(_PREPARING * (i + 1) / len(candidates))
         inner = {name: _calls_for_a_sample(each.sample_ns(1)) for name, each in passes.items()}
         ns: dict[str, list[float]] = {name: [] for name in passes}
         for i in range(rounds):
@@ -133,11 +147,14 @@ def race(candidates: Sequence[Candidate], domain: Domain, *, threads: int = 1, r
             for name in order:
                 passes[name].sample_ns(1)  # warms the caches for this candidate
                 ns[name].append(min(passes[name].sample_ns(inner[name]) for _ in range(_SAMPLES)) / POOL)
+            report(_PREPARING + (1 - _PREPARING) * (i + 1) / rounds)
     return Race(ns, {n: p.batch for n, p in passes.items()}, threads, rounds, unavailable, before, _load())
 
 
-def _pool(domain: Domain, seed: int) -> FilmRays:
+def _pool(domain: Domain | FilmRays, seed: int) -> FilmRays:
     """The rays of one pass: `POOL` of them, from the domain's film plane nearest to the lens."""
+    if isinstance(domain, FilmRays):
+        return domain
     rays = sample_domain(domain, POOL, seed)
     return replace(rays, film_z=torch.full_like(rays.film_z, domain.film_z_mm[0]))
 

@@ -1,0 +1,136 @@
+"""`neurolens bench WHAT`: speed and numerics of the exact tracer, measured here and written as tables."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from neurolens.commands.arguments import Parser, whole
+
+_DESCRIPTION = """\
+Measure the exact tracer on this machine and write the tables of experiments/results/.
+Needs the extra "train" (torch)."""
+_TRACE = """\
+Rays per second of the exact tracer: eager and compiled, float32 and float64, by number of
+surfaces and threads, with two aspheres, and the memory that it takes. Candidates run in turn,
+so that ratios are fair on a busy machine; absolute figures want a quiet one.
+Writes trace_speed.md and trace_speed.json."""
+_EXTREMES = """\
+Errors of float32 from float64, and of float64 from 50 digits, at the ends of what optics allows:
+f/0.6 to f/45, 220 degrees, radii from the semi-diameter to a plane, grazing rays, the critical
+angle, cemented equal indices, near and far objects, every lens file, both ways.
+Exit code 1 where a number is not finite or a status differs away from any edge.
+Writes extremes.md and extremes.json."""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser("bench", help="speed and numerics of the exact tracer", description=_DESCRIPTION)
+    kinds = parser.add_subparsers(metavar="WHAT", required=True, parser_class=Parser)
+    _add_trace(kinds)
+    _add_extremes(kinds)
+
+
+def _add_trace(kinds: Any) -> None:
+    parser = kinds.add_parser("trace", help="rays per second and memory", description=_TRACE)
+    parser.add_argument("--quick", action="store_true", help="12 refractions on one thread, few rounds (a minute)")
+    parser.add_argument("--only", metavar="TEXT", default="", help="lens files whose name holds this text")
+    parser.add_argument(
+        "--threads", metavar="N", type=whole(1), nargs="+", default=[1, 2], help="thread counts (default: 1 2)"
+    )
+    parser.add_argument("--rounds", metavar="N", type=whole(1), help="rounds (default 20; quick 5)")
+    _add_out(parser)
+    parser.set_defaults(run=run_trace, kept="lenses that were finished are in the table")
+
+
+def _add_extremes(kinds: Any) -> None:
+    parser = kinds.add_parser("extremes", help="errors and statuses at the ends", description=_EXTREMES)
+    parser.add_argument("--rays", metavar="N", type=whole(100), default=20000, help="rays a case (default 20000)")
+    _add_out(parser)
+    parser.set_defaults(run=run_extremes, kept="nothing is written")
+
+
+def _add_out(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", metavar="DIR", type=Path, help="folder for the tables (default: experiments/results)")
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+
+
+def run_trace(args: argparse.Namespace) -> int:
+    """Time the tracer, lens by lens; the table is written after each."""
+    from neurolens.evaluate.project import project_root
+    from neurolens.evaluate.trace_memory import SIZES, Unmeasured, memory_of
+    from neurolens.evaluate.trace_speed import MAIN, chosen_lenses, selected, time_lens, with_aspheres
+    from neurolens.evaluate.trace_speed_page import Found, page, write
+    from neurolens.progress import Progress
+
+    _quiet_glasses()
+    root = project_root()
+    out = args.out or root / "experiments" / "results"
+    lenses, missing = chosen_lenses(root / "lenses")
+    lenses = selected({MAIN: lenses[MAIN]} if args.quick else lenses, args.only)
+    rounds = args.rounds or (5 if args.quick else 20)
+    found = Found(rounds, missing=[] if args.quick or args.only else missing)
+    races = [(n, t) for t in (args.threads[:1] if args.quick else args.threads) for n in lenses]
+    plan = {_stage(n, t): (4.0 if n == MAIN else 2.0) * (5 + n) for n, t in races} | {"memory": 10.0}
+    progress = Progress(plan, quiet=args.quiet)
+    for n, threads in races:
+        aspheric = with_aspheres(lenses[n]) if n == MAIN else None
+        with progress.stage(_stage(n, threads)) as report:
+            found.rows += time_lens(lenses[n], threads, rounds, aspheric=aspheric, report=report)
+        write(found, out)
+    if MAIN in lenses:
+        with progress.stage("memory") as report:
+            try:
+                for i, size in enumerate(SIZES[: 2 if args.quick else 3]):
+                    found.memory.append(memory_of(root / "lenses" / Path(lenses[MAIN].path).name, size))
+                    report((i + 1) / len(SIZES))
+            except Unmeasured as reason:
+                found.missing.append(str(reason))
+        write(found, out)
+    print(page(found))
+    return 0
+
+
+def _quiet_glasses() -> None:
+    """No word on glasses of unknown dispersion: it changes nothing here."""
+    import warnings
+
+    from neurolens.errors import NeurolensWarning
+
+    warnings.simplefilter("ignore", NeurolensWarning)
+
+
+def _stage(refractions: int, threads: int) -> str:
+    return f"{refractions} refractions, {threads} thread{'s' * (threads > 1)}"
+
+
+def run_extremes(args: argparse.Namespace) -> int:
+    """Measure every case; 1 where something happened that never may."""
+    import json
+
+    from neurolens.evaluate import extremes
+    from neurolens.evaluate.extreme_cases import all_cases
+    from neurolens.evaluate.project import project_root
+    from neurolens.files import atomic_write_text
+    from neurolens.progress import Progress
+
+    _quiet_glasses()
+    root = project_root()
+    out = args.out or root / "experiments" / "results"
+    with Progress(quiet=args.quiet).stage("extremes") as report:
+        cases = list(all_cases(root / "lenses", args.rays))
+        done = []
+        for case in cases:
+            done.append(extremes.measure(case))
+            report(len(done) / len(cases))
+    bad = extremes.failures(done)
+    text = extremes.page(done, bad)
+    out.mkdir(parents=True, exist_ok=True)
+    atomic_write_text(out / "extremes.md", text)
+    atomic_write_text(out / "extremes.json", json.dumps(extremes.to_json(done), indent=1, allow_nan=False) + "\n")
+    print(text)
+    for line in bad:
+        print(f"neurolens: {line}", file=sys.stderr)
+    return 1 if bad else 0
