@@ -40,7 +40,9 @@ __all__ = [
     "v_coat",
 ]
 
+# Where a design is best over the visible if nobody says otherwise: the triple layer falls off faster towards violet.
 DESIGN_NM = 550.0
+BROADBAND_NM = 510.0
 MAGNESIUM_FLUORIDE = 1.38
 ALUMINA = 1.63
 TANTALA = 2.10  # zirconia is close
@@ -48,7 +50,9 @@ TANTALA = 2.10  # zirconia is close
 # Pairs of (outer, inner) films in the order tried: the second where the glass is too dense for the first.
 V_PAIRS = ((MAGNESIUM_FLUORIDE, TANTALA), (MAGNESIUM_FLUORIDE, ALUMINA))
 
-KNOWN = '"bare", "quarter-wave", "v-coat" or "broadband", the last three with a wavelength in nm if not 550'
+KNOWN = (
+    '"bare", "quarter-wave", "v-coat" or "broadband", the last three with a wavelength in nm where wanted (550; 510)'
+)
 
 
 def bare() -> Coating:
@@ -97,7 +101,7 @@ def v_coat(
 def broadband(
     n_before: float,
     n_after: float,
-    at_nm: float = DESIGN_NM,
+    at_nm: float = BROADBAND_NM,
     outer: float = MAGNESIUM_FLUORIDE,
     middle: float = TANTALA,
     inner: float | None = None,
@@ -118,7 +122,7 @@ def design(name: str, n_before: float, n_after: float, file: str | Path = "coati
     """A coating by the name that lens files use: "bare", "quarter-wave", "v-coat 500", "broadband".
 
     Args:
-        name: the design, and after a space its wavelength in nm where that is not 550.
+        name: the design, and after a space its wavelength in nm where that is not 550 (broadband: 510).
         n_before, n_after: indices (n_d) on the scene's and on the film's side of the surface.
         file, where: for error messages.
 
@@ -130,7 +134,8 @@ def design(name: str, n_before: float, n_after: float, file: str | Path = "coati
         raise InputError(file, where, name, KNOWN)
     if kind == "bare":
         return bare()
-    at_nm = _wavelength(name, wavelength, file, where) if name != kind else DESIGN_NM
+    usual_nm = BROADBAND_NM if kind == "broadband" else DESIGN_NM
+    at_nm = _wavelength(name, wavelength, file, where) if name != kind else usual_nm
     if n_before == n_after:
         raise InputError(file, where, name, f"a surface between two different media (both are {n_before:g})")
     if kind == "quarter-wave":

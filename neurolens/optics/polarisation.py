@@ -67,28 +67,34 @@ def polarised_transmittance(steps: Sequence[Step], wavelength_nm: Any) -> Tensor
 
     Differentiable; finite at normal incidence. 0 beyond a critical angle. Rays that carry NaN give NaN.
     """
-    field = _through(steps, _two_inputs(_stacked(steps[0].before)), wavelength_nm)
-    return 0.5 * (field * field).sum((0, 1, 2))
+    return power(_through(steps, wavelength_nm)[1])
 
 
 def polarised_fields(steps: Sequence[Step], wavelength_nm: Any) -> Fields:
     """The fields that two orthogonal inputs leave with; arguments as for `polarised_transmittance`."""
-    inputs = _two_inputs(_stacked(steps[0].before))
-    field = _through(steps, inputs, wavelength_nm)
-    return Fields(inputs, torch.complex(field[0], field[1]))
+    entering, leaving = _through(steps, wavelength_nm)
+    return Fields(entering[0], torch.complex(leaving[0], leaving[1]))
 
 
-def _through(steps: Sequence[Step], inputs: Tensor, wavelength_nm: Any) -> Tensor:
-    """[2, 2, 3, N]: real and imaginary part of the fields of the inputs [2, 3, N] after all steps."""
-    field = torch.stack([inputs, torch.zeros_like(inputs)])
-    for step in steps:
-        if step.layers or step.reflected or step.n_before is not step.n_after:
-            field = _pass(step, field, wavelength_nm)
-    return field
+def unpolarised(direction: Vector) -> Tensor:
+    """Two orthogonal fields of unit power across unit directions (x, y, z each [N]), for `pass_surface` and `power`.
+
+    Returns [2, 2, 3, N]: real and imaginary part of the two fields, x, y, z. Pairs of reals compile, complex numbers do
+    not.
+    """
+    k = _stacked(direction)
+    s = _across(k, k)
+    fields = torch.stack([s, _cross(k, s)])
+    return torch.stack([fields, torch.zeros_like(fields)])
 
 
-def _pass(step: Step, field: Tensor, wavelength_nm: Any) -> Tensor:
-    """Resolve the field along s and p, let the surface act on each, and add them up across the new direction."""
+def pass_surface(field: Tensor, step: Step, wavelength_nm: Any) -> Tensor:
+    """What becomes of fields [2, 2, 3, N] (see `unpolarised`) at one surface.
+
+    They are resolved along s and p, the surface acts on each, and they are added up across the new direction.
+    """
+    if not step.layers and not step.reflected and step.n_before is step.n_after:
+        return field
     normal, before, after = _stacked(step.normal), _stacked(step.before), _stacked(step.after)
     cos_i = (normal * before).sum(0).abs()
     media = step.n_before, step.n_after
@@ -98,16 +104,23 @@ def _pass(step: Step, field: Tensor, wavelength_nm: Any) -> Tensor:
     return _times(along_s, *s_part) * s + _times(along_p, *p_part) * _cross(after, s)
 
 
+def power(field: Tensor) -> Tensor:
+    """Mean power [N] of the two fields of `unpolarised`, which is that of unpolarised light."""
+    return 0.5 * (field * field).sum((0, 1, 2))
+
+
+def _through(steps: Sequence[Step], wavelength_nm: Any) -> tuple[Tensor, Tensor]:
+    """Fields [2, 2, 3, N] before and after all steps."""
+    entering = leaving = unpolarised(steps[0].before)
+    for step in steps:
+        leaving = pass_surface(leaving, step, wavelength_nm)
+    return entering, leaving
+
+
 def _times(along: Tensor, real: Tensor, imaginary: Tensor) -> Tensor:
     """Complex product of components [2, 2, N] and an amplitude, as [2, 2, 1, N]."""
     re, im = along
     return torch.stack([re * real - im * imaginary, re * imaginary + im * real]).unsqueeze(2)
-
-
-def _two_inputs(direction: Tensor) -> Tensor:
-    """[2, 3, N]: two orthogonal unit vectors across directions [3, N]."""
-    s = _across(direction, direction)
-    return torch.stack([s, _cross(direction, s)])
 
 
 def _across(direction: Tensor, normal: Tensor) -> Tensor:
