@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from neurolens.cameras.lens_film import PupilTable
+from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.errors import InputError, ModelError
 
 

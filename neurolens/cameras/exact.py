@@ -11,7 +11,8 @@ import numpy as np
 import torch
 
 from neurolens.cameras.contract import CameraRays, FloatArray
-from neurolens.cameras.lens_film import LensFilm, PupilTable, SceneRays
+from neurolens.cameras.lens_film import LensFilm, SceneRays
+from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.sampling import check_film, positive
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order
@@ -58,13 +59,12 @@ class ExactCamera:
         used = wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
         film_z = self.lens.film_z_mm
         assert film_z is not None  # `at` places the film
-        stopped = bounds is not None and self.lens.stop_radius_mm < 0.99 * lens.stop_radius_mm
         if bounds is None:
             corner = math.hypot(*self.film_mm) / 2
             bounds = pupil_bounds(self.lens, 1.0001 * corner, (film_z, film_z), used)
         self._pupil_z_mm = bounds.pupil_z_mm
         self._dtype = torch.float32 if dtype == "float32" else torch.float64
-        self.film = LensFilm(PupilTable.of(asdict(bounds)), float(film_z), used, self._scene, stopped)
+        self.film = LensFilm(PupilTable.of(asdict(bounds)), float(film_z), used, self._scene)
         data = first_order(self.lens)
         self.settings: dict[str, Any] = {
             "camera": "exact",

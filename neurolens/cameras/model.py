@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from neurolens.cameras.contract import CameraRays, FloatArray
-from neurolens.cameras.lens_film import LensFilm, PupilTable, SceneRays
+from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
+from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.sampling import check_film, positive
 from neurolens.errors import InputError
 from neurolens.focus import film_z_mm
@@ -48,8 +49,7 @@ class OnnxCamera:
         self.wavelength_nm = (low, high) if lens["dispersive"] else None
         film_z = _film_z(model, self.focus_m)
         stop = _stop_radius(model, f_number)
-        stopped = stop < 0.99 * float(domain["stop_radius_mm"])
-        self.film = LensFilm(PupilTable.of(domain["bounds"]), film_z, (low, high), _Scene(model, film_z, stop), stopped)
+        self.film = LensFilm(PupilTable.of(domain["bounds"]), film_z, (low, high), _Scene(model, film_z, stop))
         self.settings: dict[str, Any] = {
             "camera": "model",
             "model": str(model.path),

@@ -1,0 +1,133 @@
+"""Boxes on the pupil plane that hold the rays that pass a lens, by film radius: what a model's card carries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.cameras.contract import FloatArray
+from neurolens.cameras.pupil_outline import turned
+from neurolens.errors import InputError
+
+# Lattice on a row's box when the bounds are tightened; along and across (one half).
+_LATTICE = (96, 48)
+
+# Whether light of a wavelength in nm passes from film points [2, N] through pupil points [2, N], both mm: bool [N].
+Passes = Callable[[FloatArray, FloatArray, float], NDArray[np.bool_]]
+
+
+@dataclass(frozen=True)
+class PupilTable:
+    """Boxes on the pupil plane that hold the passing rays of film points at equally spaced radii.
+
+    For a film point at radius r along +x, passing rays lie within low <= u <= high along +x and |v| <= half across.
+
+    Attributes:
+        pupil_z_mm: the plane.
+        film_radius_mm: radius of the last row; the first row is the axis.
+        rows: [3, R]: low, high, half; low > high where nothing passes.
+    """
+
+    pupil_z_mm: float
+    film_radius_mm: float
+    rows: FloatArray
+
+    @staticmethod
+    def of(bounds: Mapping[str, Any]) -> PupilTable:
+        """From the fields of `optics.pupils.PupilBounds`, as a model's card holds them."""
+        rows = np.array([bounds["low_mm"], bounds["high_mm"], bounds["half_mm"]], dtype=np.float32)
+        if rows.ndim != 2 or rows.shape[1] < 2 or not np.isfinite(rows).all():
+            raise InputError("pupil bounds", "low_mm, high_mm, half_mm", rows.shape, "three lists of finite numbers")
+        return PupilTable(float(bounds["pupil_z_mm"]), float(bounds["film_radius_mm"]), rows)
+
+    def sample(self, film_mm: FloatArray, square: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Uniform points in the boxes of film points.
+
+        Args:
+            film_mm: [2, N].
+            square: [2, N] in [0, 1).
+
+        Returns the points [2, N] in mm and the areas [N] of their boxes in mm^2, 0 where nothing passes.
+        """
+        count = self.rows.shape[1]
+        radius = np.sqrt(np.einsum("in,in->n", film_mm, film_mm))
+        # Beyond the last row, and for NaN, the place is that of the dark row at the end.
+        place = np.fmin(radius * np.float32((count - 1) / self.film_radius_mm), np.float32(count - 1))
+        row = place.astype(np.intp)
+        step = place - row
+        low, low_step, width, width_step, half, half_step = self._between.take(row, axis=1)
+        width += width_step * step
+        half += half_step * step
+        along = low + low_step * step + width * square[0]
+        across = half * (square[1] * np.float32(2) - np.float32(1))
+        return turned(along, across, film_mm, radius), width * half * np.float32(2)
+
+    @cached_property
+    def _between(self) -> FloatArray:
+        """[6, R] low, width and half width at each row, each with its step to the next; a dark row at the end.
+
+        Rows hold the boxes of their neighbours, so what passes between two rows lies in the mean of their boxes.
+        """
+        low, high, half = self.rows
+        lit = np.append((low <= high)[:-1] & (low <= high)[1:], False)
+        columns = np.stack([low, high - low, half])
+        steps = np.diff(columns, axis=1, append=columns[:, -1:])
+        return np.where(lit, np.stack([columns, steps], axis=1).reshape(6, -1), np.float32(0))
+
+
+def tightened(table: PupilTable, passes: Passes, wavelength_nm: Sequence[float]) -> PupilTable:
+    """The same rows with boxes cut to what passes now at any of the wavelengths, for example through a closed stop.
+
+    Bounds move on a lattice of the table's own boxes, one step wider than what passes: the boundary lies between two
+    points.
+    """
+    count = table.rows.shape[1]
+    u, v = np.linspace(0, 1, _LATTICE[0], dtype=np.float32), np.linspace(0, 1, _LATTICE[1], dtype=np.float32)
+    fu, fv = (a.ravel() for a in np.meshgrid(u, v, indexing="ij"))
+    boxes = np.empty((3, count), np.float32)
+    for k in range(count):
+        low, high, half = table.rows[:, k]
+        boxes[:, k] = (1, -1, 0)
+        if low > high:
+            continue
+        radius = np.float32(table.film_radius_mm * min(k / (count - 1), 1 - 1e-6))
+        film = np.stack([np.full_like(fu, radius), np.zeros_like(fu)])
+        pupil = np.stack([low + (high - low) * fu, half * fv])
+        passed = passes_any(passes, film, pupil, wavelength_nm).reshape(_LATTICE)
+        if passed.any():
+            along, across = np.flatnonzero(passed.any(1)), np.flatnonzero(passed.any(0))
+            first, last = max(along[0] - 1, 0), min(along[-1] + 1, len(u) - 1)
+            boxes[:, k] = (
+                low + (high - low) * u[first],
+                low + (high - low) * u[last],
+                half * v[min(across[-1] + 1, len(v) - 1)],
+            )
+    return replace(table, rows=_with_neighbours(boxes))
+
+
+def passes_any(
+    passes: Passes, film: FloatArray, pupil: FloatArray, wavelength_nm: Sequence[float]
+) -> NDArray[np.bool_]:
+    """Whether rays of film points [2, N] through pupil points [2, N] pass at any of the wavelengths."""
+    passed = np.zeros(film.shape[1], bool)
+    for wavelength in wavelength_nm:
+        left = np.flatnonzero(~passed)
+        passed[left] = passes(film[:, left], pupil[:, left], wavelength)
+    return passed
+
+
+def _with_neighbours(boxes: FloatArray) -> FloatArray:
+    """Every box joined with the boxes of the film radii next to it."""
+    low = np.where(boxes[0] <= boxes[1], boxes[0], np.inf)
+    high = np.where(boxes[0] <= boxes[1], boxes[1], -np.inf)
+    padded = [np.pad(a, 1, constant_values=c) for a, c in ((low, np.inf), (high, -np.inf), (boxes[2], 0.0))]
+    low, high, half = (
+        f([a[:-2], a[1:-1], a[2:]], axis=0) for f, a in zip((np.min, np.max, np.max), padded, strict=True)
+    )
+    empty = low > high
+    return np.stack([np.where(empty, 1, low), np.where(empty, -1, high), half]).astype(np.float32)

@@ -1,0 +1,229 @@
+"""Finding the outline of what passes a lens on its pupil plane, from nothing but whether rays pass.
+
+The exact tracer and an exported model answer that question alike, so one search serves both, at any focus and stop.
+All rows of the outline are searched at once, ray by ray from a centre outwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.cameras.pupil_boxes import Passes, PupilTable, passes_any, tightened
+from neurolens.cameras.pupil_outline import PupilOutline
+
+ROWS, SEGMENTS = 97, 40
+
+# Halvings that place the end of the light; lattice on a box, along and across (one half), that looks for light.
+_END_HALVINGS = 10
+_LATTICE = (40, 20)
+# Directions in which the first outline is sought; steps outwards, and halvings of the step that crosses the boundary.
+_DIRECTIONS, _STEPS, _COARSE, _FINE = 33, 24, 5, 12
+# Where between rows, along an edge and between the two wavelengths the interpolated outline is checked; from where to
+# where, as a share of it; and how far vertices are pushed beyond what was found: a hair, against rounding.
+_BETWEEN_ROWS, _ALONG_EDGE, _BETWEEN_WAVELENGTHS = (0.0, 0.25, 0.5, 0.75), (0.0, 0.25, 0.5, 0.75), (0.0, 0.5, 1.0)
+_CHECK_FROM, _CHECK_TO, _CHECK_STEPS, _CHECK_HALVINGS = 0.97, 1.15, 9, 7
+_HAIR = 2e-5
+
+Float64Array = NDArray[np.float64]
+# Whether rays pass from film points (radius, 0) through points [2, ...]; the radius broadcasts with the points.
+Ask = Callable[[Float64Array, Float64Array], NDArray[np.bool_]]
+
+
+def outline_of(
+    table: PupilTable,
+    passes: Passes,
+    wavelength_nm: tuple[float, float],
+    *,
+    rows: int = ROWS,
+    segments: int = SEGMENTS,
+) -> PupilOutline | None:
+    """The outline of what passes, or None where nothing does.
+
+    Args:
+        table: boxes that hold what passes, wider is slower but no harm.
+        passes: the lens at one focus and stop.
+        wavelength_nm: shortest and longest wavelength; equal ones give an outline for one.
+        rows: film radii. segments: edges of the upper half of a polygon.
+
+    The polygons hold every point found to pass at the rows, between them and between vertices, even where the region
+    is not convex or the outline bends: their vertices are pushed out until they do.
+    """
+    used = tuple(sorted(set(wavelength_nm)))
+    ask = _asking(passes, used)
+    tight = tightened(table, passes, used)
+    end = _end_of_light(tight, ask)
+    if end is None:
+        return None
+    empty = np.zeros((len(used), rows, 1), np.float32)
+    outline = PupilOutline(table.pupil_z_mm, end, used, empty[0, :, 0], empty, empty)
+    frame = _frame_of(tight, outline.radii(np.arange(rows, dtype=np.float64)), ask)
+    angles = np.repeat(np.linspace(0, np.pi, _DIRECTIONS)[None], rows, axis=0)
+    angles = _equal_areas(angles, _boundary(ask, frame, angles, _COARSE), segments)
+    fine = np.stack([_boundary(_asking(passes, (w,)), frame, angles, _FINE) for w in used])
+    x, y = (fine * a[:, None] * f(angles) for a, f in zip(frame.stretch, (np.cos, np.sin), strict=True))
+    y[..., [0, -1]] = 0
+    centre, x, y = (a.astype(np.float32) for a in (frame.centre, x, y))
+    return _pushed_out(replace(outline, centre=centre, x=x, y=y), passes)
+
+
+class _Frame(NamedTuple):
+    """For each row [R]: film radius, centre of the polygon, half widths along and across [2, R], and farthest reach.
+
+    Directions and the reach are those of a frame in which the region is about as wide as it is high.
+    """
+
+    radius: Float64Array
+    centre: Float64Array
+    stretch: Float64Array
+    reach: Float64Array
+
+
+def _asking(passes: Passes, wavelength_nm: Sequence[float]) -> Ask:
+    def ask(radius: Float64Array, points: Float64Array) -> NDArray[np.bool_]:
+        film = np.zeros(points.shape, np.float32)
+        film[0] = radius
+        flat = film.reshape(2, -1), points.astype(np.float32).reshape(2, -1)
+        return passes_any(passes, *flat, wavelength_nm).reshape(points.shape[1:])
+
+    return ask
+
+
+def _end_of_light(table: PupilTable, ask: Ask) -> float | None:
+    """The largest film radius, within those of the table, from which a ray is found to pass."""
+    last = table.rows.shape[1] - 1
+    places = np.minimum(np.flatnonzero(table.rows[0] <= table.rows[1]), last * (1 - 1e-6))
+    lit, dark = None, None
+    for place in places[::-1]:
+        # The rows of the table hold their neighbours, so the last of them may be dark.
+        if _lattice(table, place[None], ask)[0].any():
+            lit = place
+            break
+        dark = place
+    if lit is None:
+        return None
+    for _ in range(_END_HALVINGS if dark is not None else 0):
+        middle = (lit + dark) / 2
+        if _lattice(table, middle[None], ask)[0].any():
+            lit = middle
+        else:
+            dark = middle
+    return float(table.film_radius_mm * lit / last) if lit > 0 else None
+
+
+def _boxes(table: PupilTable, place: Float64Array) -> Float64Array:
+    """[3, M] low, high and half width that hold what passes at fractional rows of the table."""
+    low, high, half = table.rows.astype(np.float64)
+    empty = low > high
+    low, high = np.where(empty, np.inf, low), np.where(empty, -np.inf, high)
+    a = np.minimum(place.astype(np.intp), low.size - 1)
+    b = np.minimum(a + 1, low.size - 1)
+    return np.stack([np.minimum(low[a], low[b]), np.maximum(high[a], high[b]), np.maximum(half[a], half[b])])
+
+
+def _lattice(table: PupilTable, place: Float64Array, ask: Ask) -> tuple[NDArray[np.bool_], Float64Array]:
+    """Which points of a lattice on the box of each fractional row [M] pass, [M, A, B], and the points, [2, M, A, B]."""
+    low, high, half = _boxes(table, place)
+    u, v = ((np.arange(n) + 0.5) / n for n in _LATTICE)
+    points = np.empty((2, place.size, *_LATTICE))
+    points[0] = low[:, None, None] + (high - low)[:, None, None] * u[:, None]
+    points[1] = half[:, None, None] * v
+    radius = table.film_radius_mm * place / (table.rows.shape[1] - 1)
+    return ask(radius[:, None, None], points), points
+
+
+def _frame_of(table: PupilTable, radius: Float64Array, ask: Ask) -> _Frame:
+    """Centroid and extent of what passes at each film radius, from a lattice."""
+    place = radius / table.film_radius_mm * (table.rows.shape[1] - 1)
+    passed, (x, y) = _lattice(table, place, ask)
+    low, high, half = _boxes(table, place)
+    count = passed.sum((1, 2))
+    centre = np.where(passed, x, 0).sum((1, 2)) / np.maximum(count, 1)
+    low = np.where(passed, x, np.inf).min((1, 2)) - (high - low) / _LATTICE[0]
+    high = np.where(passed, x, -np.inf).max((1, 2)) + (high - low) / _LATTICE[0]
+    half = np.where(passed, y, 0).max((1, 2)) + half / _LATTICE[1]
+    # A row whose lattice misses a small region takes what its neighbours have.
+    rows, found = np.arange(radius.size), count > 0
+    centre, low, high, half = (np.interp(rows, rows[found], a[found]) for a in (centre, low, high, half))
+    stretch = np.stack([(high - low) / 2, half])
+    off_centre = np.abs(centre - (low + high) / 2) / stretch[0]
+    return _Frame(radius, centre, stretch, 1.05 * np.hypot(1 + off_centre, 1))
+
+
+def _boundary(ask: Ask, frame: _Frame, angles: Float64Array, halvings: int) -> Float64Array:
+    """Distance [R, D] from the centre to the last passing point in each direction, in the stretched frame."""
+    direction = np.stack([np.cos(angles), np.sin(angles)]) * frame.stretch[:, :, None]
+    origin = np.stack([frame.centre, np.zeros_like(frame.centre)])[:, :, None]
+    return _farthest(ask, frame.radius[:, None], origin, direction, (0.0, frame.reach[:, None]), _STEPS, halvings)
+
+
+def _farthest(
+    ask: Ask,
+    radius: Float64Array,
+    origin: Float64Array,
+    direction: Float64Array,
+    span: tuple[float, float | Float64Array],
+    steps: int,
+    halvings: int,
+) -> Float64Array:
+    """The largest t of a span, up to the last halving, at which origin + t direction passes.
+
+    Steps along the whole span find the last passing one, so that a region with a dent is held whole.
+    """
+    near, far = span
+    last = np.full(direction.shape[1:], near)
+    width = (far - near) / steps
+    for i in range(1, steps + 1):
+        t = near + i * width
+        last = np.where(ask(radius, origin + t * direction), t, last)
+    for _ in range(halvings):
+        width = width / 2
+        last = np.where(ask(radius, origin + (last + width) * direction), last + width, last)
+    return last + width
+
+
+def _equal_areas(angles: Float64Array, distance: Float64Array, segments: int) -> Float64Array:
+    """Angles [R, segments + 1] between which the outline given by its distance at `angles` encloses equal areas."""
+    wedges = distance[:, 1:] * distance[:, :-1] + 1e-9
+    area = np.concatenate([np.zeros((len(angles), 1)), np.cumsum(wedges, axis=1)], axis=1)
+    wanted = np.linspace(0, 1, segments + 1)
+    return np.stack([np.interp(wanted * a[-1], a, t) for a, t in zip(area, angles, strict=True)])
+
+
+def _pushed_out(outline: PupilOutline, passes: Passes) -> PupilOutline:
+    """The outline with its vertices moved outwards until it holds what passes between them, in all three ways."""
+    needed = np.ones(outline.x.shape)
+    both = len(outline.wavelength_nm) > 1
+    for share in _BETWEEN_WAVELENGTHS if both else (0.0,):
+        ask = _asking(passes, (outline.wavelength(share),))
+        ends = {0.0: slice(0, 1), 1.0: slice(-1, None)}.get(share, slice(None))
+        x, y = ((1 - share) * c[0].astype(np.float64) + share * c[-1] for c in (outline.x, outline.y))
+        for step in _BETWEEN_ROWS:
+            for t in _ALONG_EDGE:
+                found = _excess(outline, (x, y), step, t, ask)
+                count = len(found)
+                for row in (slice(0, count), slice(1, 1 + count)) if step else (slice(0, count),):
+                    for edge in (slice(0, -1), slice(1, None)):
+                        needed[ends, row, edge] = np.maximum(needed[ends, row, edge], found)
+    scale = (needed + _HAIR).astype(np.float32)
+    return replace(outline, x=outline.x * scale, y=outline.y * scale)
+
+
+def _excess(
+    outline: PupilOutline, vertices: tuple[Float64Array, Float64Array], step: float, t: float, ask: Ask
+) -> Float64Array:
+    """How far what passes reaches, as a share of the outline, at a fraction of the steps between rows and vertices."""
+
+    def between(c: Float64Array) -> Float64Array:
+        return (1 - step) * c[:-1] + step * c[1:] if step else c
+
+    radius = outline.radii(between(np.arange(outline.centre.size, dtype=np.float64)))
+    centre = between(outline.centre.astype(np.float64))
+    point = np.stack([(1 - t) * c[:, :-1] + t * c[:, 1:] for c in map(between, vertices)])
+    origin = np.stack([centre, np.zeros_like(centre)])[:, :, None]
+    span = (_CHECK_FROM, _CHECK_TO)
+    return _farthest(ask, radius[:, None], origin, point, span, _CHECK_STEPS, _CHECK_HALVINGS)
