@@ -29,7 +29,7 @@ KINDS = ("invariants", "raw", "network", "thick", "fisheye")
 
 @cache
 def lens(name: str = "laikin_double_gauss_50") -> Lens:
-    return read_lens(LENSES / f"{name}.toml").at(efl_mm=14.0 if "muller" in name else None)
+    return read_lens(LENSES / f"{name}.toml").at(focal_length_mm=14.0 if "muller" in name else None)
 
 
 @cache

@@ -315,7 +315,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
     from neurolens.surrogates.pairs import PairSettings, make_pairs
 
-    lens = read_lens(SINGLET).at(f_number=8, efl_mm=50)
+    lens = read_lens(SINGLET).at(f_number=8, focal_length_mm=50)
     domain = domain_of(lens, film_radius_mm=21.0, focus_m=(math.inf, 1.0))
     pairs = make_pairs(lens, domain, PairSettings(train=4000, held_out=4000, rim=2000))
     fitted = fit_model(prepare(pairs), ModelSettings(method="ols", terms=12))

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 MODULES = sorted((ROOT / "neurolens").rglob("*.py"))
 MAX_LINES = 300
 
-BASE = {"errors", "status", "files", "tomlfile", "config", "progress", "focus", "modelfile"}
+BASE = {"errors", "status", "files", "tomlfile", "config", "progress", "focus", "modelfile", "apertures"}
 # Parts of the package that each part may import, besides itself and the base.
 PARTS = {
     "optics": set(),

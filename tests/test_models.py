@@ -44,7 +44,7 @@ def model(file: str) -> OnnxLens:
 
 @cache
 def exact(lens_file: str, configuration: str | None, efl_mm: float | None) -> Lens:
-    return read_lens(ROOT / lens_file).at(configuration=configuration, efl_mm=efl_mm)
+    return read_lens(ROOT / lens_file).at(zoom=configuration, focal_length_mm=efl_mm)
 
 
 @cache

@@ -81,7 +81,7 @@ def _exact(path: Path, shot: Shot) -> Camera:
     from neurolens.optics.lensfile import read_lens
     from neurolens.optics.paraxial import first_order
 
-    lens = read_lens(path).at(efl_mm=shot.efl_mm, configuration=shot.configuration)
+    lens = read_lens(path).at(focal_length_mm=shot.efl_mm, zoom=shot.configuration)
     f_number = shot.f_number_for(first_order(lens).f_number)
     return ExactCamera(
         lens, film_mm=shot.film_mm, focus_m=shot.focus_m, f_number=f_number, wavelength_nm=shot.wavelength_nm

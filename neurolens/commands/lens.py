@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NeurolensWarning)  # `describe_lens` says the same among its warnings
         tabled = read_lens(args.file)
-    lens = tabled.at(configuration=args.configuration, efl_mm=args.efl, f_number=args.f_number, focus_m=args.focus)
+    lens = tabled.at(zoom=args.configuration, focal_length_mm=args.efl, f_number=args.f_number, focus_m=args.focus)
     focus = math.inf if args.focus is None else args.focus
     domain = domain_of(lens, focus_m=(focus, focus))
     configurations = [{"name": c.name, "efl_mm": c.efl_mm} for c in tabled.configurations]

@@ -88,7 +88,7 @@ def bench_models(root: Path, folder: Path, only: str, threads: int, rounds: int,
     for (lens_file, configuration, efl_mm), rows in groups.items():
         state = " ".join([Path(lens_file).stem, *([str(configuration)] if configuration else [])])
         _say(f"{state}: compiling and timing, {len(rows)} models ...")
-        lens = read_lens(root / lens_file).at(configuration=configuration, efl_mm=efl_mm)
+        lens = read_lens(root / lens_file).at(zoom=configuration, focal_length_mm=efl_mm)
         models = {row["file"]: load_model(folder / row["file"], lens.sha256) for row in rows}
         domain = Domain.from_dict(next(iter(models.values())).card["domain"])
         lens = lens.with_stop_radius(domain.stop_radius_mm)

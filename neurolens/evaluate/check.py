@@ -143,10 +143,10 @@ def _find(lens_id: str, model_file: Path) -> Path:
 def _states(tabled: Lens, efl_mm: float) -> Iterator[Lens]:
     """The lens in every zoom state, as tabled and at the focal length of the card."""
     for configuration in (None, *(c.name for c in tabled.configurations)):
-        lens = tabled.at(configuration=configuration)
+        lens = tabled.at(zoom=configuration)
         yield lens
         # The card has the focal length that came out; the one asked for, whose bits count, had fewer digits.
         for digits in (9, 12, 15):
             asked = float(f"{efl_mm:.{digits}g}")
             if abs(first_order(lens).efl_mm / asked - 1) > 1e-12:
-                yield tabled.at(configuration=configuration, efl_mm=asked)
+                yield tabled.at(zoom=configuration, focal_length_mm=asked)

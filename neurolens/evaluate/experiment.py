@@ -49,7 +49,7 @@ class LensChoice:
     def read(self) -> Lens:
         """The lens at infinity focus."""
         return read_lens(self.file).at(
-            efl_mm=self.efl_mm, configuration=self.configuration, f_number=self.f_number, focus_m=None
+            focal_length_mm=self.efl_mm, zoom=self.configuration, f_number=self.f_number, focus_m=None
         )
 
 

@@ -165,7 +165,7 @@ def library(lenses: Path, count: int) -> Iterator[Case]:
     for path in sorted(lenses.glob("*.toml")):
         table = read_lens(path)
         for name in (None, *(c.name for c in table.configurations)):
-            lens = table.at(configuration=name)
+            lens = table.at(zoom=name)
             title = path.stem + ("" if name is None else f" {name}")
             rays = from_film(lens, count, generator())
             yield _case("library", f"{title}, to the scene", lens, rays, "scene")

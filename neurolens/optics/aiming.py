@@ -44,7 +44,7 @@ class Bundle(NamedTuple):
 
 def without_rims(lens: Lens) -> Lens:
     """The lens with every surface, the stop too, open as far as it goes."""
-    return replace(lens, surfaces=tuple(replace(s, diameter_mm=math.inf) for s in lens.surfaces))
+    return replace(lens, aperture=None, surfaces=tuple(replace(s, diameter_mm=math.inf) for s in lens.surfaces))
 
 
 def aim_at_stop(

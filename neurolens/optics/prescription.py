@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from neurolens.errors import InputError
+from neurolens.apertures import Aperture
+
+Focus = Literal["film", "best", "internal"]
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,12 @@ class Surface:
         """1 / radius in 1/mm, 0 for a plane."""
         return 1.0 / self.radius_mm
 
+    def vertex_curvature(self, meridian: str) -> Any:
+        """Curvature at the vertex along "x" or "y" in 1/mm: 1 / radius + 2 A_2, and 0 where a cylinder is straight."""
+        if self.cylinder not in (None, meridian):
+            return 0.0
+        return self.curvature + sum(2 * a for p, a in self.asphere if p == 2)
+
     @property
     def semi_diameter_mm(self) -> float:
         return self.diameter_mm / 2
@@ -105,8 +113,11 @@ class Lens:
         image_radius_mm: radius of the image circle, None where only the field is known.
         half_field_deg: half field of view, None where unknown.
         film_z_mm: film plane in the lens frame; None until `at` has focused the lens: the table's thickness rules.
-        configurations: zoom states of the source.
+        configurations: zoom and focus states of the source.
         path: the file it was read from, for error messages.
+        aperture: shape of the stop's opening inside its rim, None where round.
+        derived: in words, what of this state does not stand in the source (a zoom between its states).
+        infinity_mm: thicknesses at infinity focus, by surface index, of the groups that `at` has moved to focus.
     """
 
     name: str
@@ -123,6 +134,9 @@ class Lens:
     path: str = "lens"
     stated_efl_mm: float | None = None
     stated_efl_x_mm: float | None = None
+    aperture: Aperture | None = None
+    derived: str = ""
+    infinity_mm: tuple[tuple[int, Any], ...] = ()
 
     @property
     def vertices_mm(self) -> list[Any]:
@@ -161,37 +175,35 @@ class Lens:
     def at(
         self,
         *,
-        configuration: str | None = None,
-        efl_mm: float | None = None,
-        f_number: float | None = None,
         focus_m: float | None = None,
+        f_number: float | None = None,
+        focal_length_mm: float | None = None,
+        field_deg: float | None = None,
+        zoom: str | float | None = None,
+        focus: Focus = "film",
     ) -> Lens:
-        """The same lens in another state.
+        """The same lens in another state; `neurolens.optics.states` does the work.
 
         Args:
-            configuration: name of a zoom state of the file.
-            efl_mm: rescale the whole lens so that its focal length at infinity focus is this.
-            f_number: EFL / paraxial entrance-pupil diameter at infinity focus; None keeps the tabled stop.
-            focus_m: distance from object to film in metres, `inf` allowed; None focuses at infinity.
+            focus_m: distance from object to film in metres, `inf` allowed; None focuses at infinity (a focus state
+                chosen by its name: at the object of the source).
+            f_number: EFL / paraxial entrance-pupil diameter at infinity focus, of a bladed stop by the circle round it.
+                None keeps the stop. A stop wider than the rims let light through is allowed: they then vignette.
+            focal_length_mm: rescale the whole lens so that its focal length at infinity focus is this.
+            field_deg: full field of view at infinity focus that the image circle shall see: the lens is rescaled, the
+                image circle stays (by the traced chief ray, along x; distortion included).
+            zoom: name of a state of the file, or a focal length in mm between those of its states
+                (`neurolens.optics.zoom`; marked in `derived`).
+            focus: "film" moves the film as the paraxial image does; "best" to the least RMS spot of the axial point at
+                the d line; "internal" moves the groups as the file's focus states do, film fixed.
 
         Raises:
-            InputError: an unknown configuration, a value that is not positive, focus nearer than four focal lengths,
-                or `efl_mm` for a lens that diverges.
+            InputError: an unknown state, a focal length beyond the zoom's range, a value that is not positive, a focus
+                nearer than the lens allows, a field that it does not see, or a size asked of a lens that diverges.
         """
-        from neurolens.optics import paraxial  # paraxial needs this module's types
+        from neurolens.optics import states  # states need this module's types
 
-        lens = self if configuration is None else self._configured(configuration)
-        for field, value in (("efl_mm", efl_mm), ("f_number", f_number), ("focus_m", focus_m)):
-            if value is not None and not value > 0:
-                raise InputError(self.path, field, value, "a positive number")
-        if efl_mm is not None:
-            now_mm = paraxial.first_order(lens).efl_mm
-            if now_mm < 0:
-                raise InputError(self.path, "efl_mm", efl_mm, f"none: this lens diverges (EFL {now_mm:.4g} mm)")
-            lens = lens.scaled(efl_mm / now_mm)
-        if f_number is not None:
-            lens = lens.with_stop_radius(paraxial.stop_radius_mm(lens, f_number))
-        return replace(lens, film_z_mm=paraxial.film_z_mm(lens, math.inf if focus_m is None else focus_m))
+        return states.at(self, focus_m, f_number, focal_length_mm, field_deg, zoom, focus)
 
     def scaled(self, factor: float) -> Lens:
         """All lengths times `factor`; angles, indices and f-number stay."""
@@ -220,10 +232,12 @@ class Lens:
             )
             for c in self.configurations
         )
+        infinity_mm = tuple((k, t * factor) for k, t in self.infinity_mm)
         return replace(
             self,
             surfaces=surfaces,
             configurations=configurations,
+            infinity_mm=infinity_mm,
             image_radius_mm=scale(self.image_radius_mm),
             film_z_mm=scale(self.film_z_mm),
             stated_efl_mm=scale(self.stated_efl_mm),
@@ -236,15 +250,14 @@ class Lens:
         stop = replace(self.surfaces[k], diameter_mm=2 * radius_mm)
         return replace(self, surfaces=(*self.surfaces[:k], stop, *self.surfaces[k + 1 :]))
 
-    def _configured(self, name: str) -> Lens:
-        for c in self.configurations:
-            if c.name == name:
-                thickness = dict(c.thickness_mm)
-                rows = (replace(s, thickness_mm=thickness.get(k, s.thickness_mm)) for k, s in enumerate(self.surfaces))
-                field = self.half_field_deg if c.half_field_deg is None else c.half_field_deg
-                return replace(self, surfaces=tuple(rows), half_field_deg=field)
-        known = ", ".join(c.name for c in self.configurations) or "none in this file"
-        raise InputError(self.path, "configuration", name, f"one of: {known}")
+    def with_gaps(self, gaps_mm: Mapping[int, Any]) -> Lens:
+        """The same lens with other thicknesses, by surface index."""
+        rows = (replace(s, thickness_mm=gaps_mm.get(k, s.thickness_mm)) for k, s in enumerate(self.surfaces))
+        return replace(self, surfaces=tuple(rows))
+
+    def with_aperture(self, aperture: Aperture | None) -> Lens:
+        """The same lens with blades or a mask in its stop; None is a round stop."""
+        return replace(self, aperture=aperture)
 
 
 def _figures(s: Surface) -> list[Any]:

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarni
 def lens_and_domain(
     name: str, efl_mm: float | None, focus_m: float, film_radius_mm: float | None = None
 ) -> tuple[Lens, Domain]:
-    lens = read_lens(LENSES / f"{name}.toml").at(efl_mm=efl_mm, focus_m=focus_m)
+    lens = read_lens(LENSES / f"{name}.toml").at(focal_length_mm=efl_mm, focus_m=focus_m)
     return lens, domain_of(lens, focus_m=(focus_m, focus_m), film_radius_mm=film_radius_mm)
 
 

@@ -51,7 +51,7 @@ def test_tabled_film_lies_at_the_focus(name: str) -> None:
     [("72mm", 72.1, 17.0), ("135mm", 135.0, 9.15), ("194mm", 194.01, 6.0)],
 )
 def test_zoom_states(configuration: str, efl_mm: float, half_field_deg: float) -> None:
-    zoomed = lens("ogawa_zoom_70_200").at(configuration=configuration)
+    zoomed = lens("ogawa_zoom_70_200").at(zoom=configuration)
     assert first_order(zoomed).efl_mm == pytest.approx(efl_mm, rel=0.001)
     assert first_order(zoomed).f_number == pytest.approx(2.8, rel=0.001)
     assert zoomed.half_field_deg == half_field_deg
@@ -59,7 +59,7 @@ def test_zoom_states(configuration: str, efl_mm: float, half_field_deg: float) -
 
 @pytest.mark.parametrize(("name", "efl_mm"), [("brendel_tessar_100", 50), ("muller_fisheye_100", 14)])
 def test_rescaling_keeps_angles_and_f_number(name: str, efl_mm: float) -> None:
-    small = lens(name).at(efl_mm=efl_mm)
+    small = lens(name).at(focal_length_mm=efl_mm)
     assert first_order(small).efl_mm == pytest.approx(efl_mm, rel=1e-12)
     assert first_order(small).f_number == pytest.approx(first_order(lens(name)).f_number, rel=1e-12)
     assert small.half_field_deg == lens(name).half_field_deg

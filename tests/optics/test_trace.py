@@ -284,7 +284,7 @@ def test_shorter_wavelengths_bend_more() -> None:
 
 def test_focused_lens_images_its_plane() -> None:
     """A lens at 2 m: near-axis rays from the axial film point meet again at the object, 2 m from the film."""
-    near = shipped("tronnier").at(efl_mm=50, focus_m=2.0)
+    near = shipped("tronnier").at(focal_length_mm=50, focus_m=2.0)
     assert near.film_z_mm is not None
     start = rays(*((0, 0, near.film_z_mm, 0, h, -1) for h in (1e-4, 2e-4)))
     out = trace(near, start)

@@ -117,7 +117,7 @@ def test_near_objects_before_the_plane_in_focus_keep_their_place() -> None:
 
 
 def test_one_shot_needs_less_than_the_whole_lens() -> None:
-    lens = read_lens(ROOT / "brendel_tessar_100.toml").at(efl_mm=50)
+    lens = read_lens(ROOT / "brendel_tessar_100.toml").at(focal_length_mm=50)
     full = domain_of(lens, focus_m=(math.inf, 0.7))
     stopped, shot = domain_from_camera(lens, film_mm=(24.0, 16.0), focus_m=2.0, f_number=8.0, wavelength_nm=(500, 600))
     assert first_order(stopped).f_number == pytest.approx(8.0)
@@ -147,7 +147,7 @@ def test_infinity_focus_has_no_plane() -> None:
 
 
 def test_without_dispersion_there_is_one_wavelength() -> None:
-    fisheye = read_lens(ROOT / "muller_fisheye_100.toml").at(efl_mm=14, f_number=16)
+    fisheye = read_lens(ROOT / "muller_fisheye_100.toml").at(focal_length_mm=14, f_number=16)
     plain = replace(fisheye, surfaces=tuple(replace(s, V_d=None) for s in fisheye.surfaces))
     domain = domain_of(plain, film_radius_mm=5.0)
     assert domain.wavelength_nm == (LINE_D_NM, LINE_D_NM)

@@ -34,7 +34,7 @@ ROOT = Path(__file__).parents[2] / "lenses"
 @cache
 def prepared() -> tuple[RayPairs, Encoding, tuple[Gate, ...]]:
     """A Tessar at 50 mm over its whole aperture and field, focused from infinity to 1 m."""
-    lens = read_lens(ROOT / "brendel_tessar_100.toml").at(efl_mm=50)
+    lens = read_lens(ROOT / "brendel_tessar_100.toml").at(focal_length_mm=50)
     domain = domain_of(lens, focus_m=(math.inf, 1.0))
     pairs = make_pairs(lens, domain, PairSettings(train=4000, held_out=4000, rim=6000))
     gates = choose_gates(lens, pairs.rim.select(pairs.rim.status != 0))
