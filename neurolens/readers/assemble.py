@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from types import ModuleType
 from typing import Any
 
 from neurolens.errors import InputError
-from neurolens.optics import paraxial
+from neurolens.optics import catalogue, paraxial
 from neurolens.optics.clearance import check_clearance
+from neurolens.optics.dispersion import Glass
 from neurolens.optics.lensfields import MAX_INDEX
 from neurolens.optics.lensrows import MAX_POWER, MAX_SURFACES
 from neurolens.optics.prescription import Configuration, Lens, Surface
@@ -45,7 +45,7 @@ def finish(
     stated = lens.f_number if f_number is None else f_number
     # First-order data needs an opening, whatever it is.
     trial = lens.with_stop_radius(1.0 if math.isnan(stop.diameter_mm) else stop.semi_diameter_mm)
-    data = paraxial.first_order(trial)
+    data = paraxial.first_order(meridian(trial, "y"))
     if pupil_mm is not None:
         trial = trial.with_stop_radius(trial.stop_radius_mm * pupil_mm / data.entrance_pupil_diameter_mm)
         stated = abs(data.efl_mm) / pupil_mm if math.isnan(stated) else stated
@@ -54,7 +54,7 @@ def finish(
             raise InputError(lens.path, "stop", "(no diameter, no f-number)", "one of them: give --f-number")
         trial = trial.with_stop_radius(trial.stop_radius_mm * data.f_number / stated)
     if math.isnan(stated):
-        stated = paraxial.first_order(trial).f_number
+        stated = paraxial.first_order(meridian(trial, "y")).f_number
         warn(lens.path, f"no f-number is stated; f/{stated:.4g} follows from the stop's diameter")
     rows = list(trial.surfaces)
     if not film_given:
@@ -75,6 +75,20 @@ def check_states(lens: Lens) -> None:
     check_clearance(lens.surfaces, lens.path)
     for c in lens.configurations:
         check_clearance(moved(lens, c).surfaces, lens.path, f'configuration "{c.name}", ')
+
+
+def is_anamorphic(lens: Lens) -> bool:
+    """Whether a lens has cylinders."""
+    return any(s.cylinder for s in lens.surfaces)
+
+
+def meridian(lens: Lens, axis: str) -> Lens:
+    """The rotationally symmetric lens that a lens with cylinders is in the plane of `axis` ("x" or "y")."""
+    rows = (
+        replace(s, cylinder=None, radius_mm=s.radius_mm if s.cylinder in (None, axis) else math.inf)
+        for s in lens.surfaces
+    )
+    return replace(lens, surfaces=tuple(rows))
 
 
 def moved(lens: Lens, c: Configuration) -> Lens:
@@ -114,42 +128,26 @@ def _check_rows(rows: Sequence[Surface], file: str) -> None:
         raise InputError(file, f"surface {len(rows) - 1}, index", rows[-1].n_d, "air between last surface and film")
 
 
-def catalogue_glass(name: str) -> Any | None:
-    """The glass of that name in the catalogue, or None."""
-    catalogue = _catalogue()
-    if catalogue is None:
-        return None
-    try:
-        return catalogue.find(name, "", "")
-    except InputError:
-        return None
-
-
 def named_glass(name: str, file: str, field: str) -> dict[str, Any]:
     """Fields of a surface whose glass the file gives by name alone.
 
     Raises:
         InputError: a name that the catalogue does not know; the message suggests the nearest.
     """
-    catalogue = _catalogue()
-    if catalogue is None:
-        raise InputError(file, field, name, "a glass by its index and Abbe number (there is no catalogue)")
     known = catalogue.find(name, file, field)
-    return {"n_d": known.n_d, "V_d": known.V_d, "glass": name, "material": name}
+    return {"n_d": known.n_d, "V_d": known.V_d, "glass": short_name(known), "material": name}
 
 
 def same_glass(name: str | None, n_d: float, V_d: float | None) -> str | None:
-    """The catalogue's name of a glass given by name and figures, where the figures are those of the catalogue."""
-    known = None if name is None else catalogue_glass(name)
-    if known is None or V_d is None:
+    """The catalogue's glass of that name whose figures are the given ones to the digits printed, or None."""
+    if name is None or V_d is None:
         return None
-    alike = abs(known.n_d - n_d) <= SAME_INDEX and abs(known.V_d - V_d) <= SAME_ABBE * V_d
-    return name if alike else None
+    for known in catalogue.same_name(name):
+        if abs(known.n_d - n_d) <= SAME_INDEX and abs(known.V_d - V_d) <= SAME_ABBE * V_d:
+            return short_name(known)
+    return None
 
 
-def _catalogue() -> ModuleType | None:
-    try:
-        from neurolens.optics import catalogue
-    except ImportError:
-        return None
-    return catalogue
+def short_name(glass: Glass) -> str:
+    """The name that finds a glass again, with its maker only where others have one of that name."""
+    return glass.name if catalogue.find(glass.name) is glass else str(glass)

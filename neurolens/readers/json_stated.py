@@ -12,24 +12,12 @@ from typing import Any
 from neurolens.errors import InputError
 from neurolens.optics import paraxial
 from neurolens.optics.prescription import Lens
+from neurolens.readers.assemble import is_anamorphic, meridian
 from neurolens.readers.source import warn
 
 COMPUTED_KEYS = ("efl_mm", "bfd_mm", "efl_y_mm", "efl_x_mm", "bfd_y_mm", "bfd_x_mm", "f_number_from_stop")
 AGREES = 1e-4  # relative: more than rounding of the printed figures, less than any wrong digit
 _NUMBER = r"([0-9]+(?:\.[0-9]+)?)"
-
-
-def meridian(lens: Lens, axis: str) -> Lens:
-    """The rotationally symmetric lens that a lens with cylinders is in the plane of `axis` ("x" or "y")."""
-    rows = (
-        replace(s, cylinder=None, radius_mm=s.radius_mm if s.cylinder in (None, axis) else math.inf)
-        for s in lens.surfaces
-    )
-    return replace(lens, surfaces=tuple(rows))
-
-
-def is_anamorphic(lens: Lens) -> bool:
-    return any(s.cylinder for s in lens.surfaces)
 
 
 def stated_efl(lens: Lens, data: Mapping[str, Any]) -> Lens:

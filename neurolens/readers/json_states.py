@@ -11,8 +11,7 @@ from neurolens.errors import InputError
 from neurolens.optics import paraxial
 from neurolens.optics.lensfields import number, text
 from neurolens.optics.prescription import Configuration, Lens
-from neurolens.readers.assemble import check_states, moved
-from neurolens.readers.json_stated import is_anamorphic, meridian
+from neurolens.readers.assemble import check_states, meridian, moved
 from neurolens.readers.source import warn
 from neurolens.tomlfile import reject_unknown
 
@@ -71,9 +70,7 @@ def _state(lens: Lens, table: Mapping[str, Any], name: str) -> Configuration:
     efl_y, distance = given.pop("efl_y_mm"), table.get("object_distance_mm")
     efl = given.pop("efl_mm") if given["efl_mm"] is not None else (given.pop("efl_mm"), efl_y)[1]
     state = Configuration(name, efl, _thickness(lens, table, where), **given)
-    table_lens = moved(lens, state)
-    if is_anamorphic(lens):
-        table_lens = meridian(table_lens, "y")
+    table_lens = meridian(moved(lens, state), "y")
     paraxial_mm = _object_distance_mm(table_lens)
     if isinstance(distance, str):
         if not (math.isfinite(paraxial_mm) and paraxial_mm > 0):

@@ -1,0 +1,223 @@
+"""What a reader has found in a file, and how it becomes a lens: the steps that all formats share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from neurolens.errors import InputError
+from neurolens.optics import paraxial
+from neurolens.optics.lensrows import MAX_SURFACES
+from neurolens.optics.prescription import Configuration, Lens, Surface
+from neurolens.readers.assemble import check_states, finish, meridian, moved
+from neurolens.readers.source import unit_mm, warn
+
+
+@dataclass(frozen=True)
+class Given:
+    """What the user says about a file, where the file itself does not.
+
+    Attributes:
+        name, source: for the lens file; else the title in the file, and "FORMAT file NAME".
+        f_number: nominal f-number, for a file that states none.
+        units: of a file that does not tell: "mm", "cm", "in" or "m".
+        half_field_deg: edge of the field, for rims that have to be derived.
+    """
+
+    name: str | None = None
+    source: str | None = None
+    f_number: float | None = None
+    units: str | None = None
+    half_field_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One surface as the file has it, in the file's unit.
+
+    Attributes:
+        surface: its diameter may be `assemble.UNKNOWN`.
+        aperture: whether the file sets a clear aperture on it, so that even a plane in air cuts the beam.
+    """
+
+    surface: Surface
+    aperture: bool = False
+
+
+@dataclass(frozen=True)
+class State:
+    """A zoom or focus state, in the file's unit; None where it is as in the table.
+
+    Attributes:
+        thickness: by row number of the draft.
+        pupil, f_number, stop_diameter: any one of them sizes the stop.
+        object_distance: object to the first row of the draft; `inf` at infinity.
+        film_given: whether the last thickness stands; else it becomes the paraxial back focus of the state.
+    """
+
+    name: str
+    thickness: dict[int, float] = field(default_factory=dict)
+    pupil: float | None = None
+    f_number: float | None = None
+    stop_diameter: float | None = None
+    object_distance: float = math.inf
+    film_given: bool = True
+
+
+@dataclass(frozen=True)
+class Draft:
+    """Everything a reader has found. Lengths in the file's unit.
+
+    Attributes:
+        kind: name of the format, for the source line.
+        pupil, f_number: what sizes the stop, where the file says so; else its diameter.
+        unit: "mm", "cm", "in", "m", or None where the format does not tell.
+    """
+
+    file: str
+    kind: str
+    rows: tuple[Row, ...]
+    name: str = ""
+    notes: str = ""
+    states: tuple[State, ...] = ()
+    pupil: float | None = None
+    f_number: float | None = None
+    image_radius: float | None = None
+    half_field_deg: float | None = None
+    object_distance: float = math.inf
+    film_given: bool = True
+    unit: str | None = None
+    rims: str = "source"
+
+
+def lens_of(draft: Draft, given: Given | None = None) -> Lens:
+    """The lens of a draft, in mm, checked.
+
+    Raises:
+        InputError: see `assemble.finish`; a unit that contradicts the file's.
+    """
+    given = given or Given()
+    draft = _without_dummies(draft)
+    unit = given.units or draft.unit or "mm"
+    if given.units and draft.unit and given.units != draft.unit:
+        raise InputError(draft.file, "--units", given.units, f"{draft.unit!r}, as the file itself says (or no --units)")
+    factor = unit_mm(unit, draft.file)
+    if given.f_number is not None and (draft.f_number or draft.pupil) is not None:
+        warn(draft.file, f"--f-number {given.f_number:g} is not used: the file sizes the stop itself")
+    f_number = draft.f_number or given.f_number or math.nan
+    lens = Lens(
+        name=given.name or draft.name or Path(draft.file).stem,
+        source=given.source or f"{draft.kind} file {Path(draft.file).name}",
+        surfaces=tuple(row.surface for row in draft.rows),
+        f_number=f_number,
+        image_radius_mm=draft.image_radius,
+        half_field_deg=given.half_field_deg or draft.half_field_deg,
+        notes=draft.notes,
+        rims=draft.rims,
+        path=draft.file,
+    )
+    if draft.f_number is not None and draft.pupil is None and lens.surfaces:
+        # The file's f-number rules over whatever diameter it prints for the stop.
+        lens = _open_stop(lens)
+    lens = finish(lens, pupil_mm=draft.pupil, film_given=draft.film_given)
+    lens = replace(lens, configurations=tuple(_configuration(lens, draft, state) for state in _states(draft)))
+    check_states(lens)
+    return lens.scaled(factor) if factor != 1 else lens
+
+
+def _open_stop(lens: Lens) -> Lens:
+    rows = (replace(s, diameter_mm=math.nan) if s.stop else s for s in lens.surfaces)
+    return replace(lens, surfaces=tuple(rows))
+
+
+def _states(draft: Draft) -> tuple[State, ...]:
+    """The states of the file; a lone table that is focused near becomes a focus state of its own."""
+    if not draft.states and math.isfinite(draft.object_distance):
+        return (State("as filed", object_distance=draft.object_distance, film_given=draft.film_given),)
+    return draft.states
+
+
+def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
+    """A state for the lens file; its stop follows from the pupil or f-number of the state."""
+    last = len(lens.surfaces) - 1
+    thickness = dict(state.thickness)
+    if not state.film_given:
+        thickness.pop(last, None)
+    found = Configuration(state.name, None, tuple(sorted(thickness.items())))
+    there = moved(lens, found)
+    data = paraxial.first_order(meridian(there, "y"))
+    opening, f_number = state.stop_diameter, state.f_number
+    pupil = state.pupil
+    if pupil is None and f_number is not None:
+        pupil = abs(data.efl_mm) / f_number
+    if pupil is None and opening is None:
+        pupil = draft.pupil
+        if pupil is None and draft.f_number is not None:
+            pupil = abs(data.efl_mm) / draft.f_number
+    if pupil is not None and opening is None:
+        opening = 2 * there.stop_radius_mm * pupil / data.entrance_pupil_diameter_mm
+    if f_number is None and opening is not None:
+        f_number = data.f_number * 2 * there.stop_radius_mm / opening
+    distance = state.object_distance if math.isfinite(state.object_distance) else None
+    if not state.film_given:
+        focal_z = data.rear_focal_z_mm
+        if distance is not None:
+            focal_z += data.efl_mm**2 / (distance + data.front_focal_z_mm)  # Newton's x x' = -f^2
+        thickness[last] = focal_z - float(there.vertices_mm[last])
+    return replace(
+        found,
+        efl_mm=None if distance is not None else data.efl_mm,
+        thickness_mm=tuple(sorted(thickness.items())),
+        f_number=f_number,
+        stop_diameter_mm=opening,
+        object_distance_mm=distance,
+    )
+
+
+def _without_dummies(draft: Draft) -> Draft:
+    """The draft without planes between equal media that cut no beam; gaps on both sides become one."""
+    if len(draft.rows) > MAX_SURFACES:
+        raise InputError(draft.file, "surfaces", f"({len(draft.rows)} of them)", f"at most {MAX_SURFACES}")
+    rows, dropped, place = list(draft.rows), [k for k in range(len(draft.rows)) if _is_dummy(draft, k)], 0
+    if not dropped:
+        return draft
+    kept = [k for k in range(len(rows)) if k not in dropped]
+    if not kept:
+        return draft
+    # To which kept row the thickness of each row belongs; those in front of all belong to the object's distance.
+    owner: list[int] = []
+    for k in range(len(rows)):
+        place += k in kept
+        owner.append(place - 1)
+
+    def merged(thickness: dict[int, float]) -> tuple[dict[int, float], float]:
+        full = [thickness.get(k, rows[k].surface.thickness_mm) for k in range(len(rows))]
+        sums, front = dict.fromkeys(range(len(kept)), 0.0), 0.0
+        for k, t in enumerate(full):
+            if owner[k] < 0:
+                front += t
+            else:
+                sums[owner[k]] += t
+        return sums, front
+
+    table, front = merged({})
+    new = tuple(
+        replace(rows[k], surface=replace(rows[k].surface, thickness_mm=table[place])) for place, k in enumerate(kept)
+    )
+    states = []
+    for state in draft.states:
+        sums, before = merged(state.thickness)
+        touched = {owner[k] for k in state.thickness if owner[k] >= 0}
+        gaps = {place: sums[place] for place in sorted(touched)}
+        states.append(replace(state, thickness=gaps, object_distance=state.object_distance + before))
+    listed = ", ".join(map(str, dropped))
+    warn(draft.file, f"row {listed} behind the object (from 0): a plane in one medium that cuts no beam, left out")
+    return replace(draft, rows=new, states=tuple(states), object_distance=draft.object_distance + front)
+
+
+def _is_dummy(draft: Draft, k: int) -> bool:
+    s, row = draft.rows[k].surface, draft.rows[k]
+    before = draft.rows[k - 1].surface if k else Surface(math.inf, 0.0, 1.0)
+    same = (s.n_d, s.V_d, s.glass) == (before.n_d, before.V_d, before.glass)
+    return same and math.isinf(s.radius_mm) and not s.stop and not s.asphere and not row.aperture
