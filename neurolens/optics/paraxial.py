@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 from neurolens import focus
 from neurolens.errors import InputError
-from neurolens.optics.glass import LINE_D_NM, index_at
+from neurolens.optics.glass import LINE_D_NM, index_of
 from neurolens.optics.prescription import Lens
+
+Meridian = Literal["x", "y"]
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,9 @@ class FirstOrder:
     f_number: float
 
 
-def _march(lens: Lens, indices: list[Any], y: float, u: float, start: int, stop: int) -> tuple[Any, Any]:
+def _march(
+    lens: Lens, indices: list[Any], y: float, u: float, start: int, stop: int, meridian: Meridian
+) -> tuple[Any, Any]:
     """Follow a paraxial ray (height y mm, angle u rad in the medium before `start`) through surfaces start..stop-1.
 
     Returns the height at surface stop-1 and the angle after it. y-nu trace (Smith, Modern Optical Engineering, ch. 2).
@@ -47,7 +51,9 @@ def _march(lens: Lens, indices: list[Any], y: float, u: float, start: int, stop:
     for k in range(start, stop):
         if k > start:
             y = y + u * lens.surfaces[k - 1].thickness_mm
-        u = (indices[k] * u - y * lens.surfaces[k].curvature * (indices[k + 1] - indices[k])) / indices[k + 1]
+        u = (
+            indices[k] * u - y * lens.surfaces[k].vertex_curvature(meridian) * (indices[k + 1] - indices[k])
+        ) / indices[k + 1]
     return y, u
 
 
@@ -58,49 +64,55 @@ def _reversed(lens: Lens) -> Lens:
     for k in range(len(rows) - 1, -1, -1):
         glass_before = rows[k - 1] if k else None
         turned.append(
-            type(rows[k])(
+            replace(
+                rows[k],
                 radius_mm=-rows[k].radius_mm,
+                asphere=tuple((p, -a) for p, a in rows[k].asphere),
                 thickness_mm=glass_before.thickness_mm if glass_before else 0.0,
-                diameter_mm=rows[k].diameter_mm,
                 n_d=glass_before.n_d if glass_before else 1.0,
                 V_d=glass_before.V_d if glass_before else None,
-                stop=rows[k].stop,
+                glass=glass_before.glass if glass_before else None,
             )
         )
     return Lens(lens.name, lens.source, tuple(turned), lens.f_number, path=lens.path)
 
 
-def _pupil(lens: Lens, indices: list[Any]) -> tuple[Any, Any]:
+def _pupil(lens: Lens, indices: list[Any], meridian: Meridian) -> tuple[Any, Any]:
     """Distance of the stop's image behind the last vertex, and its magnification, by the surfaces after the stop."""
     k, n = lens.stop_index, len(lens.surfaces)
     if k == n - 1:
         return 0.0, 1.0
     gap = lens.surfaces[k].thickness_mm
-    y, u = _march(lens, indices, gap * 1.0, 1.0, k + 1, n)  # from the axial point of the stop
-    y1, u1 = _march(lens, indices, 1.0, 0.0, k + 1, n)  # parallel, at height 1 in the stop
+    y, u = _march(lens, indices, gap * 1.0, 1.0, k + 1, n, meridian)  # from the axial point of the stop
+    y1, u1 = _march(lens, indices, 1.0, 0.0, k + 1, n, meridian)  # parallel, at height 1 in the stop
     distance = -y / u if u != 0 else math.inf
     return distance, (y1 + u1 * distance if math.isfinite(distance) else math.inf)
 
 
-def first_order(lens: Lens, wavelength_nm: float = LINE_D_NM) -> FirstOrder:
-    """First-order data at one wavelength.
+def first_order(lens: Lens, wavelength_nm: float = LINE_D_NM, meridian: Meridian = "y") -> FirstOrder:
+    """First-order data at one wavelength; of one meridian, where a lens has cylinders.
+
+    A lens that bends nothing (a pinhole, filters before or behind it) has its film for a focal point, wherever that
+    stands, and for a focal length the distance from the hole to the film, by which it maps angles to the film.
 
     Raises:
         InputError: an afocal lens (no finite focal length).
     """
-    indices = [1.0, *(index_at(s.n_d, s.V_d, wavelength_nm) for s in lens.surfaces)]
+    indices = [1.0, *(index_of(s, wavelength_nm) for s in lens.surfaces)]
     turned = _reversed(lens)
-    back_indices = [1.0, *(index_at(s.n_d, s.V_d, wavelength_nm) for s in turned.surfaces)]
+    back_indices = [1.0, *(index_of(s, wavelength_nm) for s in turned.surfaces)]
     n = len(lens.surfaces)
     last_z = lens.vertices_mm[n - 1]
-    y, u = _march(lens, indices, 1.0, 0.0, 0, n)
+    y, u = _march(lens, indices, 1.0, 0.0, 0, n, meridian)
     if u == 0:
-        raise InputError(lens.path, "surfaces", "(an afocal system)", "a lens with a finite focal length")
-    y_back, u_back = _march(turned, back_indices, 1.0, 0.0, 0, n)
+        if not is_pinhole(lens):
+            raise InputError(lens.path, "surfaces", "(an afocal system)", "a lens with a finite focal length")
+        return _pinhole(lens, indices)
+    y_back, u_back = _march(turned, back_indices, 1.0, 0.0, 0, n, meridian)
     efl, back_focus = -1.0 / u, -y / u
     rear_focal, front_focal = last_z + back_focus, y_back / u_back
-    exit_distance, exit_magnification = _pupil(lens, indices)
-    entrance_distance, entrance_magnification = _pupil(turned, back_indices)
+    exit_distance, exit_magnification = _pupil(lens, indices, meridian)
+    entrance_distance, entrance_magnification = _pupil(turned, back_indices, meridian)
     opening = 2 * lens.stop_radius_mm
     entrance_diameter = opening * abs(entrance_magnification)
     return FirstOrder(
@@ -118,6 +130,25 @@ def first_order(lens: Lens, wavelength_nm: float = LINE_D_NM) -> FirstOrder:
     )
 
 
+def is_pinhole(lens: Lens) -> bool:
+    """Whether no surface bends light: a hole, perhaps behind plane filters."""
+    return all(s.radius_mm in (math.inf, -math.inf) and not s.asphere for s in lens.surfaces)
+
+
+def _pinhole(lens: Lens, indices: list[Any]) -> FirstOrder:
+    """The data of a hole among planes: planes shorten what lies behind them, seen from the other side, by n."""
+    k, n = lens.stop_index, len(lens.surfaces)
+    depth = [s.thickness_mm / i for s, i in zip(lens.surfaces, indices[1:], strict=True)]
+    last_z = lens.vertices_mm[n - 1]
+    film = lens.vertices_mm[n] if lens.film_z_mm is None else lens.film_z_mm
+    behind, opening = sum(depth[k : n - 1]), 2 * lens.stop_radius_mm
+    entrance, exit_, efl = sum(depth[:k]), last_z - behind, film - last_z + behind
+    f_number = efl / opening if opening else math.inf
+    return FirstOrder(
+        efl, film - last_z, film, entrance - efl, exit_, entrance, entrance, opening, exit_, opening, f_number
+    )
+
+
 def stop_radius_mm(lens: Lens, f_number: float) -> float:
     """Radius of the stop for f-number N = EFL / paraxial entrance-pupil diameter at infinity focus."""
     now = first_order(lens)
@@ -127,8 +158,20 @@ def stop_radius_mm(lens: Lens, f_number: float) -> float:
 def film_z_mm(lens: Lens, focus_m: float) -> float:
     """Film plane that focuses an object `focus_m` metres from the film (unit focusing; see `neurolens.focus`).
 
+    A pinhole's film stays where it is: it is as sharp at every distance.
+
     Raises:
         InputError: an object nearer than four focal lengths, for which no film plane exists.
     """
     data = first_order(lens)
+    if is_pinhole(lens):
+        return float(data.rear_focal_z_mm)
     return focus.film_z_mm(data.efl_mm, data.front_principal_z_mm, data.rear_principal_z_mm, focus_m, file=lens.path)
+
+
+def image_z_mm(lens: Lens, object_z_mm: float) -> float:
+    """Paraxial image of a point on the axis, lens frame, at the d line (x x' = -f^2); of a pinhole, the film."""
+    data = first_order(lens)
+    if is_pinhole(lens):
+        return float(data.rear_focal_z_mm)
+    return float(data.rear_focal_z_mm - data.efl_mm**2 / (object_z_mm - data.front_focal_z_mm))

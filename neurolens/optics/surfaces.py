@@ -1,8 +1,10 @@
-"""Where a ray meets a surface and how it bends there: pure functions on separate x, y, z tensors of shape [N].
+"""Where a ray meets a sphere or a plane and how it bends there: pure functions on separate x, y, z tensors [N].
 
-`sense` is +1 for rays travelling from the scene to the film (+z) and -1 for camera rays. Coordinates are relative to
-the surface's vertex. Formulas: Spencer and Murty 1962, "General Ray-Tracing Procedure", in the form that needs no
-division by dz and gives the cosine of incidence for free.
+Directions in here are optical direction cosines: unit vectors times the refractive index of the medium, p = n d, for
+which Snell's law needs no division (p after = p before + a multiple of the normal). `sense` is +1 for rays travelling
+from the scene to the film (+z) and -1 for camera rays. Coordinates are relative to the surface's vertex. Formulas:
+Spencer and Murty 1962, "General Ray-Tracing Procedure", in the form that needs no division by dz and gives the cosine
+of incidence for free; optical direction cosines as in Welford 1986, "Aberrations of Optical Systems", ch. 4.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from torch import Tensor
 
 
 class Rays(NamedTuple):
-    """Rays as a structure of arrays, each [N]: a point (mm) and a unit direction."""
+    """Rays as a structure of arrays, each [N]: a point (mm) and a direction (unit, or times the index in here)."""
 
     x: Tensor
     y: Tensor
@@ -24,19 +26,38 @@ class Rays(NamedTuple):
     dz: Tensor
 
 
+class Medium(NamedTuple):
+    """A refractive index with its square and the inverse of that: numbers, or tensors [N] where dispersive."""
+
+    n: Any
+    n2: Any
+    inverse_n2: Any
+
+
 class Hit(NamedTuple):
     """A meeting point, each [N].
 
-    `discriminant` is the square of the cosine of incidence: positive where the ray meets the surface, and a smooth
-    measure of how far it misses elsewhere. `met` is False where there is no meeting (NaN counts as none).
+    `q` is n times the cosine of incidence and `q2` its square: positive where the ray meets the surface, and a smooth
+    measure of how far it misses elsewhere. `met` is False where there is no meeting (NaN counts as none). `normal` is
+    the unit normal towards +z; None for a sphere of curvature c, whose normal is (-c x, -c y, 1 - c z).
     """
 
     x: Tensor
     y: Tensor
     z: Tensor
-    cos_i: Tensor
-    discriminant: Tensor
+    q: Tensor
+    q2: Tensor
     met: Tensor
+    normal: tuple[Tensor, Tensor, Tensor] | None = None
+
+
+AIR = Medium(1.0, 1.0, 1.0)
+
+
+def medium(n: Any) -> Medium:
+    """A medium of index `n` (number or tensor)."""
+    n2 = n * n
+    return Medium(n, n2, 1 / n2)
 
 
 def plus_times(a: Tensor, b: Tensor, k: Any) -> Tensor:
@@ -44,38 +65,49 @@ def plus_times(a: Tensor, b: Tensor, k: Any) -> Tensor:
     return a + b * k if isinstance(k, Tensor) else torch.add(a, b, alpha=k)
 
 
-def _root(square: Tensor, guard: bool) -> Tensor:
+def times(a: Tensor, k: Any) -> Tensor:
+    """a k, at no cost where k is the number 1."""
+    return a if not isinstance(k, Tensor) and k == 1 else a * k
+
+
+def root(square: Tensor, guard: bool) -> Tensor:
     """Square root; with `guard`, 1 instead of NaN (or of an infinite slope) where there is none."""
     return torch.sqrt(torch.where(square > 0, square, 1.0)) if guard else torch.sqrt(square)
 
 
-def intersect_sphere(r: Rays, curvature: Any, sense: int, entering: bool, guard: bool) -> Hit:
+def nearest_approach(r: Rays, inverse_n2: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """The point of a ray nearest to the vertex: its coordinates are small, which keeps float32 to micrometres."""
+    e = times(torch.addcmul(torch.addcmul(r.x * r.dx, r.y, r.dy), r.z, r.dz), inverse_n2)
+    return (
+        torch.addcmul(r.x, e, r.dx, value=-1),
+        torch.addcmul(r.y, e, r.dy, value=-1),
+        torch.addcmul(r.z, e, r.dz, value=-1),
+    )
+
+
+def intersect_sphere(r: Rays, curvature: Any, sense: int, before: Medium, entering: bool, guard: bool) -> Hit:
     """Meet a sphere of signed curvature (1/mm) at the root next to the vertex.
 
-    Starts from the point of closest approach to the vertex: its coordinates stay small, which is what keeps float32
-    to micrometres. `entering` marks the first surface met, where rays may arrive at more than 90 degrees. `guard`
-    keeps rays without a meeting finite (for gradients and for crossings that are learnt from); without it they are NaN.
+    `entering` marks the first surface met, where rays may arrive at more than 90 degrees. `guard` keeps rays without a
+    meeting finite (for gradients and for crossings that are learnt from); without it they are NaN.
     """
-    e = torch.addcmul(torch.addcmul(r.x * r.dx, r.y, r.dy), r.z, r.dz)
-    mx = torch.addcmul(r.x, e, r.dx, value=-1)
-    my = torch.addcmul(r.y, e, r.dy, value=-1)
-    mz = torch.addcmul(r.z, e, r.dz, value=-1)
+    mx, my, mz = nearest_approach(r, before.inverse_n2)
     m2 = torch.addcmul(torch.addcmul(mx * mx, my, my), mz, mz)
     f = plus_times(m2 * curvature, mz, -2.0)
-    discriminant = plus_times(r.dz * r.dz, f, -curvature)
-    cos_i = _root(discriminant, guard or entering)
-    denominator = torch.add(r.dz, cos_i, alpha=sense)
+    q2 = plus_times(r.dz * r.dz, times(f, before.n2), -curvature)
+    q = root(q2, guard or entering)
+    denominator = torch.add(r.dz, q, alpha=sense)
     if entering:
         # Beyond 90 degrees the usual form divides two vanishing numbers; the conjugate form is exact there.
-        met = discriminant > 0
+        met = q2 > 0
         backwards = r.dz * sense <= 0
-        conjugate = torch.sub(r.dz, cos_i, alpha=sense) / curvature
+        conjugate = times(torch.sub(r.dz, q, alpha=sense) / curvature, before.inverse_n2)
         t = torch.where(backwards, conjugate, f / torch.where(backwards, float(sense), denominator))
     elif guard:
-        met = (discriminant > 0) & (denominator * sense > 0)
+        met = (q2 > 0) & (denominator * sense > 0)
         t = f / torch.where(met, denominator, float(sense))
     else:
-        # One comparison: NaN from a negative discriminant fails it too.
+        # One comparison: NaN from a negative square fails it too.
         met = denominator > 0 if sense > 0 else denominator < 0
         t = f / denominator
     x = torch.addcmul(mx, t, r.dx)
@@ -84,43 +116,52 @@ def intersect_sphere(r: Rays, curvature: Any, sense: int, entering: bool, guard:
     if entering:
         # A ray from anywhere may meet the far half of the sphere, where there is no glass.
         met = met & (z * curvature <= 1)
-    return Hit(x, y, z, cos_i, discriminant, met)
+    return Hit(x, y, z, q, q2, met)
 
 
 def intersect_plane(r: Rays, sense: int) -> Hit:
     """Meet the plane z = 0; a ray that does not travel along `sense` misses it."""
-    cos_i = r.dz * sense
-    met = cos_i > 0
+    q = r.dz * sense
+    met = q > 0
     t = r.z / torch.where(met, r.dz, float(sense))
     x = torch.addcmul(r.x, t, r.dx, value=-1)
     y = torch.addcmul(r.y, t, r.dy, value=-1)
-    return Hit(x, y, torch.zeros_like(r.z), cos_i, r.dz * r.dz, met)
+    return Hit(x, y, torch.zeros_like(r.z), q, r.dz * r.dz, met)
 
 
-def refract(r: Rays, hit: Hit, curvature: Any, sense: int, mu: Any, guard: bool) -> tuple[Rays, Tensor, Tensor]:
-    """Snell's law in vector form. `mu` is n_before / n_after (number or [N]).
+def refract(
+    r: Rays, hit: Hit, curvature: Any, sense: int, before: Medium, after: Medium, guard: bool
+) -> tuple[Rays, Tensor, Tensor]:
+    """Snell's law: the tangential part of the optical direction cosines stays, the normal part follows their length.
 
-    Returns the refracted rays (vertex frame), the cosine of refraction [N], and its square before guarding, which is
-    not positive where the ray is totally reflected.
+    Returns the refracted rays (vertex frame), n' times the cosine of refraction [N], and the square of that before
+    guarding, which is not positive where the ray is totally reflected.
     """
-    mu2 = mu * mu
-    cos2_t = (
-        torch.addcmul(1 - mu2, mu2, hit.discriminant) if isinstance(mu, Tensor) else hit.discriminant * mu2 + (1 - mu2)
-    )
-    cos_t = _root(cos2_t, guard)
-    bend = cos_t - mu * hit.cos_i
-    pull = bend * (curvature * sense)
-    dx = torch.addcmul(mu * r.dx, pull, hit.x, value=-1)
-    dy = torch.addcmul(mu * r.dy, pull, hit.y, value=-1)
-    dz = torch.addcmul(torch.add(mu * r.dz, bend, alpha=sense), pull, hit.z, value=-1)
-    return Rays(hit.x, hit.y, hit.z, dx, dy, dz), cos_t, cos2_t
+    # As a product: the difference of two squares would lose the digits of nearly equal indices.
+    step = (after.n - before.n) * (after.n + before.n)
+    q2 = hit.q2 + step
+    q = root(q2, guard)
+    bend = q - hit.q
+    if hit.normal is not None:
+        direction = (torch.addcmul(p, bend, n, value=sense) for p, n in zip(r[3:], hit.normal, strict=True))
+        return Rays(hit.x, hit.y, hit.z, *direction), q, q2
+    ahead = torch.add(r.dz, bend, alpha=sense)
+    if isinstance(curvature, Tensor):
+        pull = bend * (curvature * sense)
+        return Rays(hit.x, hit.y, hit.z, r.dx - pull * hit.x, r.dy - pull * hit.y, ahead - pull * hit.z), q, q2
+    pull = -curvature * sense
+    dx = torch.addcmul(r.dx, bend, hit.x, value=pull)
+    dy = torch.addcmul(r.dy, bend, hit.y, value=pull)
+    dz = torch.addcmul(ahead, bend, hit.z, value=pull) if curvature else ahead
+    return Rays(hit.x, hit.y, hit.z, dx, dy, dz), q, q2
 
 
-def fresnel_transmittance(cos_i: Tensor, cos_t: Tensor, mu: Any) -> Tensor:
+def fresnel_transmittance(q_before: Tensor, q_after: Tensor, before: Medium, after: Medium) -> Tensor:
     """Unpolarised power transmitted by a bare surface, (Ts + Tp) / 2 in [0, 1], shape [N] (Born and Wolf, 1.5.2).
 
-    `mu` is n_before / n_after. Lossless media: T = 1 - R.
+    `q_before` and `q_after` are n cos i and n' cos t. Lossless media: T = 1 - R.
     """
-    r_s = (mu * cos_i - cos_t) / (mu * cos_i + cos_t)
-    r_p = (cos_i - mu * cos_t) / (cos_i + mu * cos_t)
+    r_s = (q_before - q_after) / (q_before + q_after)
+    p_before, p_after = times(q_before, after.n2), times(q_after, before.n2)
+    r_p = (p_before - p_after) / (p_before + p_after)
     return 1 - 0.5 * (r_s * r_s + r_p * r_p)

@@ -16,12 +16,17 @@ from torch import Tensor
 from neurolens import status as st
 from neurolens.errors import InputError
 from neurolens.optics import glass
+from neurolens.optics.media import media
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.surfaces import Hit, Rays, fresnel_transmittance, intersect_plane, intersect_sphere, refract
+from neurolens.optics.shapes import intersect_shape, is_plain
+from neurolens.optics.surfaces import Hit, Medium, Rays, intersect_plane, intersect_sphere, refract, times
+from neurolens.optics.survival import Survival, survival
+from neurolens.optics.transmission import light
 
 __all__ = ["CHUNK", "Crossing", "Rays", "Traced", "compile_trace", "trace"]
 
 Towards = Literal["scene", "film"]
+Transmittance = bool | Literal["polarised"]
 
 # Rays per chunk: long enough to hide the cost of calling an operator, short enough for a core's second-level cache.
 CHUNK = 32768
@@ -50,14 +55,25 @@ class Traced(NamedTuple):
             were totally reflected are replaced by a finite ray along the axis; rays that only a rim stops go on, so
             that their crossings can be learnt from.
         status: [N] int32, see `neurolens.status`.
-        transmittance: [N], product over surfaces of (Ts + Tp) / 2, or None when not asked for.
+        transmittance: [N], power of unpolarised light that arrives: of surfaces (by default the product of
+            (Ts + Tp) / 2) and of absorption in the glass; None when not asked for.
         crossings: surface index to `Crossing`, for the surfaces asked for.
+        path: the rays on and after every surface, in the order of travel, or empty when not asked for.
     """
 
     rays: Rays
     status: Tensor
     transmittance: Tensor | None
     crossings: dict[int, Crossing]
+    path: tuple[Rays, ...] = ()
+
+
+class _Wanted(NamedTuple):
+    """What to follow besides the rays; see `trace`."""
+
+    transmittance: Transmittance
+    record: tuple[int, ...]
+    path: bool
 
 
 def trace(
@@ -66,8 +82,9 @@ def trace(
     wavelength_nm: Tensor | float = glass.LINE_D_NM,
     *,
     towards: Towards = "scene",
-    transmittance: bool = False,
+    transmittance: Transmittance = False,
     record: Sequence[int] = (),
+    path: bool = False,
 ) -> Traced:
     """Trace rays through the whole lens.
 
@@ -76,17 +93,23 @@ def trace(
         rays: points and unit directions [N], lens frame, mm. The dtype (float32 or float64) is that of the result.
         wavelength_nm: one number, or a tensor [N]; NaN and what is not positive pass no dispersive glass.
         towards: "scene" for camera rays (-z), "film" for light from the scene (+z).
-        transmittance: whether to follow the Fresnel transmittance.
+        transmittance: whether to follow the transmittance; "polarised" follows the polarisation that each surface
+            gives to unpolarised light, where True averages it away at every surface.
         record: surfaces whose crossings are wanted.
+        path: whether the points on all surfaces and the directions after them are wanted.
 
     Raises:
         InputError: components of unequal shapes or dtypes or of another dtype, a wavelength of another shape or a
-            number that is not positive, an unknown `towards`, a surface to record that the lens does not have.
+            number that is not positive, an unknown `towards` or `transmittance`, a surface to record that the lens
+            does not have.
 
     A direction that is not a unit vector counts as a miss of the first surface.
     Differentiable with respect to rays, wavelength and prescription fields given as tensors.
     """
     _check(lens, rays, wavelength_nm, towards, record)
+    if transmittance not in (True, False, "polarised"):
+        raise InputError("trace", "transmittance", transmittance, 'True, False or "polarised"')
+    wanted = _Wanted(transmittance, tuple(record), path)
     if isinstance(wavelength_nm, Tensor):
         # In the precision of the rays, or a float64 wavelength would turn float32 rays into float64 halfway.
         wavelength_nm = torch.where(wavelength_nm > 0, wavelength_nm, math.nan).to(rays.x.dtype)
@@ -95,23 +118,18 @@ def trace(
     )
     count = rays.x.shape[0]
     if needs_grad or count <= CHUNK:
-        return _trace_chunk(lens, rays, wavelength_nm, towards, transmittance, tuple(record), needs_grad)
+        return _trace_chunk(lens, rays, wavelength_nm, towards, wanted, needs_grad)
     parts = []
     for i in range(0, count, CHUNK):
         part = slice(i, i + CHUNK)
         lam = wavelength_nm[part] if isinstance(wavelength_nm, Tensor) and wavelength_nm.ndim else wavelength_nm
         chunk = Rays(*(c[part] for c in rays))
-        parts.append(_trace_chunk(lens, chunk, lam, towards, transmittance, tuple(record), False))
-    return Traced(
-        Rays(*(torch.cat(c) for c in zip(*(p.rays for p in parts), strict=True))),
-        torch.cat([p.status for p in parts]),
-        torch.cat([p.transmittance for p in parts if p.transmittance is not None]) if transmittance else None,
-        {k: Crossing(*(torch.cat(c) for c in zip(*(p.crossings[k] for p in parts), strict=True))) for k in record},
-    )
+        parts.append(_trace_chunk(lens, chunk, lam, towards, wanted, False))
+    return _joined(parts)
 
 
 def compile_trace(
-    lens: Lens, *, towards: Towards = "scene", transmittance: bool = False, record: Sequence[int] = ()
+    lens: Lens, *, towards: Towards = "scene", transmittance: Transmittance = False, record: Sequence[int] = ()
 ) -> Callable[[Rays, Tensor], Traced]:
     """The same trace with the prescription folded in as constants, compiled by torch for chunks of one length.
 
@@ -120,13 +138,14 @@ def compile_trace(
     """
 
     def run(rays: Rays, wavelength_nm: Tensor) -> Traced:
-        return _trace_chunk(lens, rays, wavelength_nm, towards, transmittance, tuple(record), False)
+        return _trace_chunk(lens, rays, wavelength_nm, towards, _Wanted(transmittance, tuple(record), False), False)
 
     return torch.compile(run, dynamic=False)
 
 
 def _parameters(lens: Lens) -> list[Any]:
-    return [v for s in lens.surfaces for v in (s.radius_mm, s.thickness_mm, s.n_d)]
+    figures = ((s.radius_mm, s.thickness_mm, s.n_d, s.conic, *(a for _, a in s.asphere)) for s in lens.surfaces)
+    return [value for row in figures for value in row]
 
 
 def _check(lens: Lens, rays: Rays, wavelength_nm: Tensor | float, towards: str, record: Sequence[int]) -> None:
@@ -152,85 +171,96 @@ def _check(lens: Lens, rays: Rays, wavelength_nm: Tensor | float, towards: str, 
 
 
 def _trace_chunk(
-    lens: Lens,
-    rays: Rays,
-    wavelength_nm: Tensor | float,
-    towards: Towards,
-    transmittance: bool,
-    record: tuple[int, ...],
-    freeze: bool,
+    lens: Lens, rays: Rays, wavelength_nm: Tensor | float, towards: Towards, wanted: _Wanted, freeze: bool
 ) -> Traced:
     sense, order = (1, range(len(lens.surfaces))) if towards == "film" else (-1, range(len(lens.surfaces) - 1, -1, -1))
     vertices = lens.vertices_mm
-    media = _indices(lens, wavelength_nm)  # media[k] lies before surface k as light travels to the film
-    guard = freeze or bool(record)
+    glasses = media(lens, wavelength_nm)  # glasses[k] lies before surface k as light travels to the film
+    guard = freeze or bool(wanted.record)
+    r, tests = _start(rays, glasses[0 if sense > 0 else -1], sense, st.blocked(order[0], st.MISSED), freeze)
+    power = light(lens, wavelength_nm, sense, wanted.transmittance, rays)
+    crossings: dict[int, Crossing] = {}
+    path: list[Rays] = []
+    vertex = 0.0
+    for position, k in enumerate(order):
+        # Move to this surface's own frame, where float32 keeps its digits.
+        r = r._replace(z=r.z + (vertex - vertices[k]))
+        vertex = vertices[k]
+        before, after = (glasses[k], glasses[k + 1]) if sense > 0 else (glasses[k + 1], glasses[k])
+        hit = _meet(lens.surfaces[k], k, r, before, sense, position == 0, guard, tests)
+        bent, q, q2 = _bend(lens.surfaces[k], k, r, hit, before, after, sense, guard, tests)
+        if power is not None:
+            power.pass_surface(k, r, hit, bent, q, before, after)
+        if k in wanted.record:
+            crossings[k] = Crossing(hit.x, hit.y, times(hit.q2, before.inverse_n2), times(q2, after.inverse_n2))
+        # A lost ray goes on along the axis: no overflow there can reach the gradients of the others.
+        r = _along_axis(bent, tests.goes_on, sense, 0.0) if freeze else bent
+        if wanted.path:
+            path.append(_unit(r._replace(z=r.z + vertex), after))
+    r = _along_axis(_unit(r._replace(z=r.z + vertex), after), tests.goes_on, sense, vertex)
+    return Traced(r, tests.status(), None if power is None else power.arrived(tests.goes_on), crossings, tuple(path))
+
+
+def _start(rays: Rays, first: Medium, sense: int, otherwise: int, freeze: bool) -> tuple[Rays, Survival]:
+    """Rays with optical direction cosines, and the test that their directions are unit vectors."""
     length2 = torch.addcmul(torch.addcmul(rays.dx * rays.dx, rays.dy, rays.dy), rays.dz, rays.dz)
     sound = (length2 - 1).abs() < UNIT_SLACK
     if freeze:
         # Not even a NaN that comes in may reach the gradients of the others.
         sound = sound & torch.isfinite(rays.x + rays.y + rays.z)
         rays = _along_axis(rays, sound, sense, 0.0)
-    tests = _Tests(sound, st.blocked(order[0], st.MISSED))
-    power = torch.ones_like(rays.x) if transmittance else None
-    crossings: dict[int, Crossing] = {}
-    r, vertex = rays, 0.0
-    for position, k in enumerate(order):
-        # Move to this surface's own frame, where float32 keeps its digits.
-        r = r._replace(z=r.z + (vertex - vertices[k]))
-        vertex = vertices[k]
-        before, after = (media[k], media[k + 1]) if sense > 0 else (media[k + 1], media[k])
-        hit, r, cos_t, cos2_t = _pass_surface(lens, k, r, (before, after), sense, position == 0, guard, tests)
-        if power is not None and cos_t is not None:
-            power = power * fresnel_transmittance(hit.cos_i, cos_t, before / after)
-        if k in record:
-            crossings[k] = Crossing(hit.x, hit.y, hit.discriminant, cos2_t)
-        if freeze:
-            # A lost ray goes on along the axis: no overflow there can reach the gradients of the others.
-            r = _along_axis(r, tests.goes_on, sense, 0.0)
-    r = _along_axis(r._replace(z=r.z + vertex), tests.goes_on, sense, vertex)
-    if power is not None:
-        power = torch.where(tests.goes_on, power, 0.0)
-    return Traced(r, tests.status, power, crossings)
+    return Rays(*rays[:3], *(times(d, first.n) for d in rays[3:])), survival(sound, otherwise)
 
 
-def _pass_surface(
-    lens: Lens, k: int, r: Rays, media: tuple[Any, Any], sense: int, entering: bool, guard: bool, tests: _Tests
-) -> tuple[Hit, Rays, Tensor | None, Tensor]:
-    """Meet surface k, test its rim, refract.
+def _unit(r: Rays, last: Medium) -> Rays:
+    if not isinstance(last.n, Tensor) and last.n == 1:
+        return r
+    return Rays(*r[:3], *(d / last.n for d in r[3:]))
 
-    Returns the meeting point, the rays after it, their cosine of refraction (None where the medium does not change),
-    and the margin by which they are not totally reflected.
-    """
-    surface = lens.surfaces[k]
-    c = 0.0 if _is_plane(surface) else surface.curvature
-    hit = intersect_plane(r, sense) if _is_plane(surface) else intersect_sphere(r, c, sense, entering, guard)
+
+def _meet(
+    surface: Surface, k: int, r: Rays, before: Medium, sense: int, entering: bool, guard: bool, tests: Survival
+) -> Hit:
+    """Meet surface k and test its rim."""
+    plane = _is_plane(surface)
+    if plane:
+        hit = intersect_plane(r, sense)
+    elif is_plain(surface):
+        hit = intersect_sphere(r, surface.curvature, sense, before, entering, guard)
+    else:
+        hit = intersect_shape(r, surface, sense, before, entering, guard)
     tests.require(hit.met, k, st.MISSED)
     distance2 = torch.addcmul(hit.x * hit.x, hit.y, hit.y)
     tests.require(distance2 <= surface.semi_diameter_mm**2, k, st.RIM)
-    if _is_plane(surface):
+    if plane:
         # A sphere's square root turns NaN and overflow into a miss; a plane would let them go on.
         tests.goes_on = tests.goes_on & (distance2 < math.inf)
-    before, after = media
+    return hit
+
+
+def _bend(
+    surface: Surface,
+    k: int,
+    r: Rays,
+    hit: Hit,
+    before: Medium,
+    after: Medium,
+    sense: int,
+    guard: bool,
+    tests: Survival,
+) -> tuple[Rays, Tensor, Tensor]:
+    """Refract at surface k.
+
+    Returns the rays after it, n' times their cosine of refraction, and its square before guarding: the margin by which
+    they are not totally reflected.
+    """
     if before is after:
-        return hit, Rays(hit.x, hit.y, hit.z, r.dx, r.dy, r.dz), None, hit.discriminant
-    bent, cos_t, cos2_t = refract(r, hit, c, sense, before / after, guard)
-    tests.require(cos2_t > 0, k, st.TOTAL_REFLECTION)
-    return hit, bent, cos_t, cos2_t
-
-
-class _Tests:
-    """The tests at each surface (met, inside the rim, not totally reflected), in that order; first failure rules."""
-
-    def __init__(self, sound: Tensor, otherwise: int) -> None:
-        """Start with rays whose direction is `sound` [N]; the others have the status `otherwise`."""
-        self.status = (~sound).to(torch.int32) * otherwise
-        self.goes_on = sound
-
-    def require(self, passed: Tensor, surface: int, reason: int) -> None:
-        """Apply the next test. A rim alone lets a ray go on (its crossings are learnt from); the other two end it."""
-        self.status = torch.where(passed | (self.status != 0), self.status, st.blocked(surface, reason))
-        if reason != st.RIM:
-            self.goes_on = self.goes_on & passed
+        return Rays(hit.x, hit.y, hit.z, r.dx, r.dy, r.dz), hit.q, hit.q2
+    bent, q, q2 = refract(r, hit, 0.0 if _is_plane(surface) else surface.curvature, sense, before, after, guard)
+    if isinstance(before.n, Tensor) or before.n != 1:
+        # From air nothing is totally reflected.
+        tests.require(q2 > 0, k, st.TOTAL_REFLECTION)
+    return bent, q, q2
 
 
 def _along_axis(r: Rays, goes_on: Tensor, sense: int, z: Any) -> Rays:
@@ -239,18 +269,23 @@ def _along_axis(r: Rays, goes_on: Tensor, sense: int, z: Any) -> Rays:
 
 
 def _is_plane(surface: Surface) -> bool:
-    return not isinstance(surface.radius_mm, Tensor) and math.isinf(surface.radius_mm)
+    return not isinstance(surface.radius_mm, Tensor) and math.isinf(surface.radius_mm) and is_plain(surface)
 
 
-def _indices(lens: Lens, wavelength_nm: Tensor | float) -> list[Any]:
-    """Index of the media from the scene (air) to the film; the same object where the medium does not change."""
-    inverse = glass.inverse_square_um(wavelength_nm) if lens.dispersive else None
-    known: dict[tuple[Any, float | None], Any] = {(1.0, None): 1.0}
-    media: list[Any] = [known[1.0, None]]
-    for s in lens.surfaces:
-        key = (id(s.n_d) if isinstance(s.n_d, Tensor) else float(s.n_d), s.V_d)
-        if key not in known:
-            a, b = glass.cauchy_coefficients(s.n_d, s.V_d)
-            known[key] = a if s.V_d is None else a + b * inverse
-        media.append(known[key])
-    return media
+def _joined(parts: Sequence[Traced]) -> Traced:
+    """Chunks put together again."""
+
+    def cat(columns: Sequence[Any]) -> Any:
+        if columns[0] is None:
+            return None
+        if isinstance(columns[0], Tensor):
+            return torch.cat(list(columns))
+        return type(columns[0])(*(torch.cat(c) for c in zip(*columns, strict=True)))
+
+    return Traced(
+        cat([p.rays for p in parts]),
+        cat([p.status for p in parts]),
+        cat([p.transmittance for p in parts]),
+        {k: cat([p.crossings[k] for p in parts]) for k in parts[0].crossings},
+        tuple(cat([p.path[i] for p in parts]) for i in range(len(parts[0].path))),
+    )
