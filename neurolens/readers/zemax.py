@@ -1,0 +1,250 @@
+"""Zemax OpticStudio lens files (.zmx): sequential systems, UTF-16 or plain text.
+
+The format is a list of keywords: settings of the system, then one block "SURF n" a surface, the object first and the
+image last, then merit function, tolerances and configurations. Curvatures, semi-diameters, thickness to the next
+surface. What is not known here is an error that names keyword and line.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from neurolens.errors import InputError
+from neurolens.optics.lensrows import MAX_SURFACES
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.readers import zemax_words as words
+from neurolens.readers.assemble import named_glass
+from neurolens.readers.draft import Draft, Given, Row, lens_of
+from neurolens.readers.source import Line, read_lines, warn
+from neurolens.readers.zemax_shapes import TYPES, Block, shape_of, thickness
+from neurolens.readers.zemax_states import Zoom, draft_states
+
+UNITS = {"MM": "mm", "CM": "cm", "IN": "in", "INCH": "in", "METER": "m", "METERS": "m", "M": "m"}
+SYSTEM = ("MODE", "NAME", "NOTE", "UNIT", "ENPD", "FNUM", "FLOA", "OBNA", "ENVD", "FTYP", "XFLN", "YFLN", "TOL", "MNUM")
+SURFACE = (
+    *("SURF", "TYPE", "CURV", "CONI", "DISZ", "GLAS", "DIAM", "PARM", "XDAT", "STOP", "COMM", "MAZH", "TCOM", "TOLE"),
+    *("CLAP", "FLAP", "SQAP", "ELAP", "OBDC", "IGNR"),
+)
+
+
+@dataclass
+class File:
+    """A file while it is read."""
+
+    path: str
+    blocks: list[Block] = field(default_factory=list)
+    zoom: Zoom = field(default_factory=Zoom)
+    name: str = ""
+    notes: list[str] = field(default_factory=list)
+    unit: str | None = None
+    pupil: float | None = None
+    f_number: float | None = None
+    working: Line | None = None  # where the f-number is said to be the working one
+    field_type: int = 0
+    fields: int = 0
+    heights: dict[str, list[float]] = field(default_factory=dict)
+    ignored: Counter[str] = field(default_factory=Counter)
+    oddities: list[str] = field(default_factory=list)
+
+
+def read_zmx(path: str | Path, given: Given | None = None) -> Lens:
+    """The lens of a Zemax file.
+
+    Raises:
+        InputError: see the module; also tilts, mirrors, tori, obscurations and everything else that the lens model
+            cannot hold, by name and line.
+    """
+    file = File(str(path))
+    for line in read_lines(path):
+        _read(file, line)
+    if len(file.blocks) < 3:
+        raise InputError(file.path, "SURF", f"({len(file.blocks)} surfaces)", "object, at least one surface, and image")
+    return lens_of(_draft(file), given)
+
+
+def looks_like_zmx(head: str) -> bool:
+    """Whether the beginning of a text is that of a Zemax file."""
+    first = [line.split()[0] for line in head.splitlines() if line.split()]
+    return bool({"SURF", "VERS", "MODE", "UNIT"} & set(first)) and ("SURF" in first or "MODE" in first)
+
+
+def _read(file: File, line: Line) -> None:
+    word, rest = line.words[0].upper(), line.words[1:]
+    if word.startswith("!"):
+        return
+    if file.zoom.begun:
+        file.zoom.read(line, len(file.blocks))
+    elif word == "SURF":
+        _begin(file, line, rest)
+    elif word in SYSTEM:
+        _system(file, line, word, rest)
+    elif file.blocks and word in SURFACE:
+        _surface(file, file.blocks[-1], line, word, rest)
+    elif word in words.COATING and file.blocks:
+        file.ignored["coatings named but not given"] += 1
+    elif word in words.VIGNETTING:
+        file.ignored["vignetting factors (rims decide)"] += any(line.numbers(word, rest, 0))
+    elif word in words.SYSTEM or (file.blocks and word in words.SURFACE | words.MERIT):
+        pass
+    else:
+        raise line.unknown(word, (*SYSTEM, *SURFACE))
+
+
+def _begin(file: File, line: Line, rest: list[str]) -> None:
+    if not rest or rest[0] != str(len(file.blocks)):
+        raise line.error("SURF", " ".join(rest), f"surface {len(file.blocks)}, as they are numbered in order")
+    if len(file.blocks) > MAX_SURFACES + 1:
+        raise line.error("SURF", rest[0], f"at most {MAX_SURFACES} surfaces")
+    file.blocks.append(Block(line))
+
+
+def _system(file: File, line: Line, word: str, rest: list[str]) -> None:
+    match word:
+        case "MODE":
+            if rest[:1] != ["SEQ"]:
+                raise line.error(word, " ".join(rest), "SEQ: a sequential system")
+        case "NAME":
+            file.name = " ".join(rest)
+        case "NOTE":
+            file.notes.append(" ".join(rest[1:]))
+        case "UNIT":
+            if not rest or rest[0].upper() not in UNITS:
+                raise line.error(word, " ".join(rest[:1]), f"one of {', '.join(UNITS)}")
+            file.unit = UNITS[rest[0].upper()]
+        case "ENPD":
+            file.pupil = _above_0(line, word, rest)
+        case "FNUM":
+            file.f_number = _above_0(line, word, rest)
+            file.working = line if rest[1:2] == ["1"] else None
+        case "OBNA":
+            raise line.error(word, " ".join(rest), "a pupil diameter (ENPD), an f-number (FNUM) or the stop (FLOA)")
+        case "ENVD":
+            if line.numbers(word, rest, 2)[:2] != [20.0, 1.0]:
+                file.oddities.append(f"indices are those at 20 degrees and 1 atmosphere, not at {' '.join(rest[:2])}")
+        case "FTYP":
+            numbers = line.numbers(word, rest, 1)
+            file.field_type, file.fields = int(numbers[0]), int(numbers[2]) if len(numbers) > 2 else 0
+        case "XFLN" | "YFLN":
+            file.heights[word] = line.numbers(word, rest, 0)
+        case "MNUM":
+            file.zoom.begin(line)
+
+
+def _surface(file: File, block: Block, line: Line, word: str, rest: list[str]) -> None:
+    match word:
+        case "TYPE":
+            block.kind = rest[0].upper() if rest else ""
+            if block.kind not in TYPES:
+                raise line.error(word, block.kind, f"one of {', '.join(TYPES)}")
+        case "CURV":
+            block.curvature = line.numbers(word, rest[:1])[0]
+        case "CONI":
+            block.conic = line.numbers(word, rest[:1])[0]
+        case "DISZ":
+            block.thickness = thickness(line, word, rest[:1], is_object=len(file.blocks) == 1)
+        case "GLAS":
+            block.medium = _glass(line, rest)
+        case "DIAM":
+            semi = line.numbers(word, rest[:1])[0]
+            block.semi_diameter = semi if semi > 0 else math.nan
+            block.automatic = rest[1:2] == ["0"]
+        case "PARM" | "XDAT":
+            n, value = line.numbers(word, rest[:2], 2)
+            (block.parameters if word == "PARM" else block.extra)[int(n)] = (value, line)
+        case "STOP":
+            block.stop = True
+        case "COMM":
+            pass
+        case "MAZH" | "TCOM" | "TOLE":
+            block.solve = (word, line.numbers(word, rest, 1 if word == "MAZH" else 2), line)
+        case "CLAP" | "FLAP":
+            inner, outer = line.numbers(word, rest[:2], 2)
+            if inner != 0 or outer <= 0:
+                raise line.error(word, f"{inner:g} {outer:g}", "a round opening without a hole")
+            block.clear, block.aperture = outer, True
+            block.automatic = word == "FLAP" and block.automatic
+        case "SQAP" | "ELAP":
+            block.aperture = True
+            file.oddities.append(f"line {line.number}: {word}, an opening that is not round, is taken as round by DIAM")
+        case "OBDC":
+            if any(line.numbers(word, rest)):
+                raise line.error(word, " ".join(rest), "an opening that is centred on the axis")
+        case "IGNR":
+            if rest[:1] != ["0"]:
+                raise line.error(word, " ".join(rest), "0: a surface that is switched off cannot be left in")
+
+
+def _above_0(line: Line, word: str, rest: list[str]) -> float:
+    value = line.numbers(word, rest[:1])[0]
+    if value <= 0:
+        raise line.error(word, value, "a number above 0")
+    return value
+
+
+def _glass(line: Line, rest: list[str]) -> dict[str, Any]:
+    """GLAS name, type of solve (1: a model glass, 2: a pickup already carried out, 4: an offset), surface, n_d, V_d."""
+    name, kind = rest[0] if rest else "", rest[1] if len(rest) > 1 else "0"
+    if name.upper() == "MIRROR" or not name:
+        raise line.error("GLAS", name, "a glass: the lens model has no mirrors")
+    if name.upper() in ("AIR", "VACUUM"):
+        return {}
+    if kind == "1" or name == "___BLANK":
+        n_d, V_d = line.numbers("GLAS", rest[3:5], 2)
+        return {"n_d": n_d, "V_d": V_d if V_d > 0 else None}
+    if kind not in ("0", "2"):
+        raise line.error("GLAS", f"{name} with solve {kind}", "a glass of the catalogue, or n_d and V_d")
+    return named_glass(name, line.file, f"line {line.number}, GLAS")
+
+
+def _draft(file: File) -> Draft:
+    *_, image = file.blocks
+    rows = tuple(Row(_surface_of(b), b.aperture) for b in file.blocks[1:-1])
+    if image.curvature:
+        file.oddities.append("the image surface is curved; the film is taken as plane")
+    if file.f_number is not None and file.working and math.isfinite(file.blocks[0].thickness):
+        raise file.working.error("FNUM", "(the working f-number of a near object)", "ENPD, FLOA, or FNUM with flag 0")
+    for text in (*file.oddities, *(f"{text} ({count})" for text, count in file.ignored.items() if count)):
+        warn(file.path, text)
+    last = file.blocks[-2]
+    return Draft(
+        file=file.path,
+        kind="Zemax",
+        rows=rows,
+        name=file.name,
+        notes="\n".join(file.notes).strip(),
+        states=tuple(draft_states(file.zoom, file.blocks, file.f_number is not None)),
+        pupil=file.pupil,
+        f_number=file.f_number,
+        object_distance=file.blocks[0].thickness,
+        film_given=not (last.solve and last.solve[0] == "MAZH" and last.thickness == 0),
+        unit=file.unit,
+        rims="estimated" if any(b.automatic and not b.stop for b in file.blocks[1:-1]) else "source",
+        **dict(_field(file)),
+    )
+
+
+def _surface_of(block: Block) -> Surface:
+    return Surface(
+        thickness_mm=block.thickness,
+        diameter_mm=2 * (block.semi_diameter if block.clear is None else block.clear),
+        stop=block.stop,
+        **shape_of(block),
+        **block.medium,
+    )
+
+
+def _field(file: File) -> Iterator[tuple[str, float]]:
+    """Half field or image radius: the field point farthest from the axis. FTYP 0 angle, 2 and 3 image height."""
+    points = [(x, y) for x, y in zip(*(file.heights.get(k, [0.0] * 100) for k in ("XFLN", "YFLN")), strict=False)]
+    edge = max((math.hypot(x, y) for x, y in points[: file.fields or None]), default=0.0)
+    if edge > 0 and file.field_type == 0:
+        yield "half_field_deg", edge
+    elif edge > 0 and file.field_type in (2, 3):
+        yield "image_radius", edge
+    elif edge > 0:
+        warn(file.path, f"the field is given as type {file.field_type} (not an angle, not an image height): left out")
