@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -16,7 +17,7 @@ LINE_F_NM = 486.1327
 LINE_C_NM = 656.2725
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # compared as the one object that the catalogue gives
 class Glass:
     """Dispersion and absorption of one optical material.
 
@@ -41,19 +42,20 @@ class Glass:
     def index(self, wavelength_nm: Any) -> Any:
         """Refractive index relative to air at a wavelength in nm (number, or tensor of any shape, of its dtype).
 
-        Outside `range_um` the formula is extrapolated; it is finite for 380-780 nm in every glass of the catalogue.
+        Outside `range_um` the formula is extrapolated; it is finite for 380-780 nm in every glass of the catalogue,
+        and meaningless or NaN beyond the poles in the ultraviolet (below 300 nm).
         """
         square = (wavelength_nm * 1e-3) ** 2
         c = self.coefficients
         if self.form == "sellmeier":
             terms = [c[k] * square / (square - c[k + 1]) for k in range(0, len(c), 2)]
-            return (sum(terms[1:], terms[0]) + 1.0) ** 0.5
+            return _root(sum(terms[1:], terms[0]) + 1.0)
         # Horner's scheme in 1 / L^2 for the negative powers; the catalogues have none above the fourth.
         inverse = 1.0 / square
         total = inverse * c[-1]
         for a in c[-2:2:-1]:
             total = (total + a) * inverse
-        return (total + c[2] + square * (c[1] + square * c[0])) ** 0.5
+        return _root(total + c[2] + square * (c[1] + square * c[0]))
 
     def absorption_per_mm(self, wavelength_nm: Any) -> Any:
         """Napierian absorption, 4 pi k / wavelength, in 1/mm, at a wavelength in nm; None where the source has none.
@@ -85,7 +87,13 @@ class Glass:
 
     def covers(self, wavelength_nm: float) -> bool:
         """Whether the source states the formula for this wavelength."""
-        return self.range_um[0] <= wavelength_nm * 1e-3 <= self.range_um[1]
+        low, high = self.range_um
+        return low - 1e-9 <= wavelength_nm * 1e-3 <= high + 1e-9  # 700 * 1e-3 is a digit more than 0.7
+
+
+def _root(square: Any) -> Any:
+    """Square root; a negative number gives NaN as a tensor's does, where Python's own power gives a complex one."""
+    return math.nan if isinstance(square, float) and square < 0 else square**0.5
 
 
 def _samples(

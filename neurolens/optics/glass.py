@@ -108,14 +108,24 @@ def check_against_table(surface: Surface, file: str | Path, where: str) -> None:
     if surface.glass is None:
         return
     glass = _FOUND[surface.glass] = catalogue.find(surface.glass, file, f"{where}glass")
-    n_d = float(surface.n_d)
-    if n_d != 1 and abs(glass.n_d - n_d) > TOLERANCE_N_D:
-        _warn(file, where, f"n_d = {n_d:.6g} is stated, but {glass} has {glass.n_d:.6g}, which is used")
-    if surface.V_d is not None and abs(glass.V_d - surface.V_d) > TOLERANCE_V_D:
-        _warn(file, where, f"V_d = {surface.V_d:.4g} is stated, but {glass} has {glass.V_d:.4g}, which is used")
+    stated = _contradiction(surface, glass)
+    if stated:
+        others = [str(g) for g in catalogue.same_name(surface.glass) if not _contradiction(surface, g)]
+        hint = f"; {others[0]} would agree" if others else ""
+        text = f"{stated} is stated, but {glass} has n_d = {glass.n_d:.6g}, V_d = {glass.V_d:.4g}, which rules{hint}"
+        _warn(file, where, text)
     if not all(glass.covers(nm) for nm in VISIBLE_NM):
         low, high = (round(1000 * v) for v in glass.range_um)
         _warn(file, where, f"the index of {glass} is stated for {low}-{high} nm and extrapolated outside")
+
+
+def _contradiction(surface: Surface, glass: Glass) -> str:
+    """What a surface states that is not this glass's, in words; empty where it agrees."""
+    n_d, V_d = float(surface.n_d), surface.V_d
+    wrong = [f"n_d = {n_d:.6g}"] if n_d != 1 and abs(glass.n_d - n_d) > TOLERANCE_N_D else []
+    if V_d is not None and abs(glass.V_d - V_d) > TOLERANCE_V_D:
+        wrong.append(f"V_d = {V_d:.4g}")
+    return ", ".join(wrong)
 
 
 def _warn(file: str | Path, where: str, text: str) -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from neurolens.errors import InputError
+from neurolens.optics.glass import check_against_table
 from neurolens.optics.lensfields import index, number, text
 from neurolens.optics.prescription import Coating, Surface
 from neurolens.tomlfile import reject_unknown
@@ -68,6 +69,7 @@ def _surface(row: Any, place: str, file: str, n_before: float, coatings: Mapping
         **_glass(row, file, where),
         **_shape(row, file, where),
     )
+    check_against_table(surface, file, where)
     if "coating" not in row:
         return surface
     return replace(surface, coating=_coating(row, file, where, (n_before, surface.n_d), coatings))
