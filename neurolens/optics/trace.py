@@ -15,13 +15,13 @@ from torch import Tensor
 
 from neurolens import status as st
 from neurolens.errors import InputError
-from neurolens.optics import glass
+from neurolens.optics import apertures, glass
 from neurolens.optics.media import media
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.shapes import intersect_shape, is_plain
 from neurolens.optics.surfaces import Hit, Medium, Rays, intersect_plane, intersect_sphere, refract, times
 from neurolens.optics.survival import Survival, survival
-from neurolens.optics.transmission import light
+from neurolens.optics.transmission import passage
 
 __all__ = ["CHUNK", "Crossing", "Rays", "Traced", "compile_trace", "trace"]
 
@@ -140,6 +140,10 @@ def compile_trace(
     def run(rays: Rays, wavelength_nm: Tensor) -> Traced:
         return _trace_chunk(lens, rays, wavelength_nm, towards, _Wanted(transmittance, tuple(record), False), False)
 
+    for surface in lens.surfaces:
+        # Read the catalogue now: a compiler does not look into files.
+        glass.index_of(surface, glass.LINE_D_NM)
+        glass.absorption_of(surface, glass.LINE_D_NM)
     return torch.compile(run, dynamic=False)
 
 
@@ -178,7 +182,7 @@ def _trace_chunk(
     glasses = media(lens, wavelength_nm)  # glasses[k] lies before surface k as light travels to the film
     guard = freeze or bool(wanted.record)
     r, tests = _start(rays, glasses[0 if sense > 0 else -1], sense, st.blocked(order[0], st.MISSED), freeze)
-    power = light(lens, wavelength_nm, sense, wanted.transmittance, rays)
+    power = passage(lens, wavelength_nm, sense, wanted.transmittance, rays.x)
     crossings: dict[int, Crossing] = {}
     path: list[Rays] = []
     vertex = 0.0
@@ -188,6 +192,8 @@ def _trace_chunk(
         vertex = vertices[k]
         before, after = (glasses[k], glasses[k + 1]) if sense > 0 else (glasses[k + 1], glasses[k])
         hit = _meet(lens.surfaces[k], k, r, before, sense, position == 0, guard, tests)
+        if lens.aperture is not None and lens.surfaces[k].stop:
+            tests.require(apertures.inside(lens.aperture, hit.x, hit.y, lens.stop_radius_mm), k, st.RIM)
         bent, q, q2 = _bend(lens.surfaces[k], k, r, hit, before, after, sense, guard, tests)
         if power is not None:
             power.pass_surface(k, r, hit, bent, q, before, after)
