@@ -71,7 +71,7 @@ def transmittance(
     cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int = 1
 ) -> Tensor:
     """Unpolarised power transmitted, (Ts + Tp) / 2 in [0, 1], [N]. No films: Fresnel's formulas."""
-    s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond_critical=False)
+    s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond=False)
     return 0.5 * (_transmitted(s) + _transmitted(p))
 
 
@@ -79,13 +79,13 @@ def reflectance(
     cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int = 1
 ) -> Tensor:
     """Unpolarised power reflected, (Rs + Rp) / 2 in [0, 1], [N]; 1 - transmittance but for rounding."""
-    s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond_critical=False)
+    s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond=False)
     return 0.5 * (_reflected(s) + _reflected(p))
 
 
 def powers(cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int = 1) -> Powers:
     """Power transmitted and reflected for each polarisation."""
-    s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond_critical=False)
+    s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond=False)
     return Powers(_transmitted(s), _transmitted(p), _reflected(s), _reflected(p))
 
 
@@ -96,7 +96,7 @@ def amplitudes(
 
     |t|^2 is not transmitted power: that is |t|^2 times n_after cos_t / (n_before cos_i), see `powers`.
     """
-    s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond_critical=True)
+    s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond=True)
     magnetic_to_electric = n_before / n_after
     t_s, t_p = (torch.complex(*_over_plus(r, 2 * r.before * r.fade, 0.0)) for r in (s, p))
     r_s, r_p = (torch.complex(*_reflected_amplitude(r)) for r in (s, p))
@@ -116,7 +116,7 @@ def power_amplitudes(
 
     Transmission, or with `reflected` reflection. Beyond the critical angle nothing is transmitted.
     """
-    s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond_critical=reflected)
+    s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond=reflected)
     if reflected:
         return _reflected_amplitude(s), _reflected_amplitude(p)
     return _transmitted_amplitude(s), _transmitted_amplitude(p)
@@ -159,22 +159,19 @@ def _transmitted_amplitude(r: Response) -> tuple[Tensor, Tensor]:
 
 
 def _responses(
-    cos_i: Tensor,
-    n_before: Any,
-    n_after: Any,
-    layers: Layers,
-    wavelength_nm: Any,
-    sense: int,
-    phase_beyond_critical: bool,
+    cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int, phase_beyond: bool
 ) -> tuple[Response, Response]:
-    """The s and the p response of the stack. q stands for n cos of the angle in each medium (s admittance)."""
+    """The s and the p response of the stack; `phase_beyond` the critical angle is known only where asked for.
+
+    q stands for n cos of the angle in each medium (the admittance of s).
+    """
     q0 = n_before * cos_i
     q0_2 = q0 * q0
     q2 = q0_2 + (n_after - n_before) * (n_after + n_before)
     passes = q2 > FLOOR
-    size = q2.abs() if phase_beyond_critical else q2
+    size = q2.abs() if phase_beyond else q2
     q = torch.sqrt(torch.where(size > FLOOR, size, 1.0))
-    if phase_beyond_critical:
+    if phase_beyond:
         q = torch.where(size > FLOOR, q, 0.0)
     wave_number = 2 * math.pi / wavelength_nm
     s: tuple[Any, ...] = (1.0, 0.0, 0.0, 1.0)
@@ -183,16 +180,16 @@ def _responses(
     for index, thickness_nm in layers if sense > 0 else reversed(layers):
         index2 = index * index
         layer_q2 = q0_2 + (index - n_before) * (index + n_before)
-        if not phase_beyond_critical and _always_propagates(index, n_before, n_after):
+        if not phase_beyond and _always_propagates(index, n_before, n_after):
             c, e, f = _propagating(layer_q2, wave_number * thickness_nm)
         else:
             c, e, f, layer_fade = _propagating_or_evanescent(layer_q2, wave_number * thickness_nm)
             fade = fade * layer_fade
         s = _times(s, (c, e, f, c))
         p = _times(p, (c, index2 * e, f / index2, c))
-    response_s = _response(q0, q, s, passes, fade, phase_beyond_critical)
+    response_s = _response(q0, q, s, passes, fade, phase_beyond)
     q0_p, q_p = q0 / (n_before * n_before), q / (n_after * n_after)
-    return response_s, _response(q0_p, q_p, p, passes, fade, phase_beyond_critical)
+    return response_s, _response(q0_p, q_p, p, passes, fade, phase_beyond)
 
 
 def _times(m: tuple[Any, ...], k: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -206,12 +203,12 @@ def _times(m: tuple[Any, ...], k: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def _response(
-    before: Tensor, after: Tensor, m: tuple[Any, ...], passes: Tensor, fade: Any, phase_beyond_critical: bool
+    before: Tensor, after: Tensor, m: tuple[Any, ...], passes: Tensor, fade: Any, phase_beyond: bool
 ) -> Response:
     a, b, c, d = m
     x, y, z = before * a, after * d, before * after * b
     plus, minus = (x + y, -(z + c)), (x - y, c - z)
-    if phase_beyond_critical:
+    if phase_beyond:
         # The admittance behind is i times `after`.
         real, imaginary = x + z, y - c
         plus = torch.where(passes, plus[0], real), torch.where(passes, plus[1], imaginary)
