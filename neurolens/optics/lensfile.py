@@ -34,6 +34,11 @@ The format, complete; keys marked optional may be left out:
     name = "mine"
     layers = [[1.38, 99.6]]
 
+    [aperture]                  # optional: blades of the stop, whose diameter is then that of the circle round them
+    blades = 9
+    rotation_deg = 10.0         # optional: of the first corner, from x towards y
+    curvature = 0.6             # optional: of the edges, 0 straight to 1 round
+
     [[configuration]]           # zoom and focus states, optional: thicknesses that replace those above, by surface
     name = "135mm"
     efl_mm = 135.0              # may be left out in a focus state
@@ -52,6 +57,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from neurolens.apertures import Aperture
 from neurolens.errors import InputError, NeurolensWarning
 from neurolens.optics.clearance import check_clearance
 from neurolens.optics.lensfields import half_field, number, text
@@ -62,7 +68,7 @@ from neurolens.tomlfile import read_toml, reject_unknown
 SCHEMA = 1
 LENS_KEYS = (
     *("schema", "name", "designer", "source", "f_number", "efl_mm", "efl_x_mm", "image_radius_mm", "half_field_deg"),
-    *("rims", "notes", "surfaces", "coating", "configuration"),
+    *("rims", "notes", "surfaces", "coating", "configuration", "aperture"),
 )
 CONFIGURATION_KEYS = (
     *("name", "efl_mm", "half_field_deg", "thickness_mm", "f_number", "stop_diameter_mm", "object_distance_mm"),
@@ -97,6 +103,7 @@ def read_lens(path: str | Path) -> Lens:
         rims=text(data, "rims", file),
         configurations=_configurations(data, len(surfaces), file),
         path=file,
+        aperture=_aperture(data, file),
         stated_efl_mm=number(data, "efl_mm", file, above=0) if "efl_mm" in data else None,
         stated_efl_x_mm=number(data, "efl_x_mm", file, above=0) if "efl_x_mm" in data else None,
     )
@@ -112,6 +119,20 @@ def read_lens(path: str | Path) -> Lens:
         message = f"{file}: V_d is not given after surface {unknown}: the index is taken as constant"
         warnings.warn(message, NeurolensWarning, stacklevel=2)
     return lens
+
+
+def _aperture(data: Mapping[str, Any], file: str) -> Aperture | None:
+    if "aperture" not in data:
+        return None
+    table, where = data["aperture"], "aperture, "
+    if not isinstance(table, Mapping):
+        raise InputError(file, "aperture", table, "a table under [aperture]")
+    reject_unknown(file, where, table, ("blades", "rotation_deg", "curvature"))
+    more = {key: number(table, key, file, where) for key in ("rotation_deg", "curvature") if key in table}
+    try:
+        return Aperture(table.get("blades"), **more)
+    except InputError as error:
+        raise InputError(file, where + error.field, error.value, error.expected) from None
 
 
 def _configurations(data: Mapping[str, Any], n_surfaces: int, file: str) -> tuple[Configuration, ...]:

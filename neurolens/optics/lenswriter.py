@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from neurolens.errors import InputError
 from neurolens.files import atomic_write_text
 from neurolens.optics.lensfile import SCHEMA
 from neurolens.optics.prescription import Lens, Surface
@@ -21,7 +22,7 @@ UNPADDED = ("conic", "asphere", "glass", "material", "absorption_per_mm", "coati
 def write_lens(lens: Lens, path: str | Path) -> None:
     """Write a lens file that `read_lens` reads back to the same lens (but for its `path`).
 
-    A lens that was focused keeps its film plane: it becomes the last thickness.
+    A lens that was focused keeps its film plane: it becomes the last thickness. What is derived goes into the notes.
     """
     atomic_write_text(path, format_lens(lens))
 
@@ -41,11 +42,13 @@ def format_lens(lens: Lens) -> str:
         "rims": lens.rims,
     }
     lines = [f"{key} = {format_value(value)}" for key, value in head.items() if value is not None]
-    if lens.notes:
-        lines.append(f"notes = {_wrapped(lens.notes)}")
+    notes = " ".join(text for text in (lens.notes, lens.derived) if text)
+    if notes:
+        lines.append(f"notes = {_wrapped(notes)}")
     text = "\n".join(lines) + "\n\n" + ROWS_COMMENT + "surfaces = [\n" + _rows(lens) + "]\n"
     for name, layers in {s.coating.name: s.coating.layers for s in lens.surfaces if s.coating}.items():
         text += f"\n[[coating]]\nname = {format_value(name)}\nlayers = {format_value(layers)}\n"
+    text += _aperture(lens)
     for c in lens.configurations:
         text += f"\n[[configuration]]\nname = {format_value(c.name)}\n"
         for key in ("efl_mm", "half_field_deg", "f_number", "stop_diameter_mm", "object_distance_mm"):
@@ -53,6 +56,21 @@ def format_lens(lens: Lens) -> str:
             text += "" if value is None else f"{key} = {format_value(float(value))}\n"
         text += f"thickness_mm = {format_value({str(k): float(t) for k, t in c.thickness_mm})}\n"
     return text
+
+
+def _aperture(lens: Lens) -> str:
+    """The table of the stop's blades.
+
+    Raises:
+        InputError: a stop with a mask, which a lens file has no form for.
+    """
+    if lens.aperture is None:
+        return ""
+    if lens.aperture.blades is None:
+        raise InputError(lens.path, "aperture", "(a mask)", "blades, or a round stop: masks are no part of lens files")
+    values = {"blades": lens.aperture.blades, "rotation_deg": float(lens.aperture.rotation_deg)}
+    values["curvature"] = float(lens.aperture.curvature)
+    return "\n[aperture]\n" + "".join(f"{key} = {format_value(v)}\n" for key, v in values.items())
 
 
 def _rows(lens: Lens) -> str:
