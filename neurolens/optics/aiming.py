@@ -25,6 +25,7 @@ Axis = Literal["x", "y"]
 
 _WIDEST_DEG = 89.0  # of the angles tried at the stop
 _GRID = 713  # odd, so that the axis itself is among them; a step of a quarter of a degree
+_STRETCH = 1.5  # of an asphere's rim: farther out a polynomial means nothing
 _ZOOM, _ROUNDS = 17, 9  # each round narrows the bracket 16 times: to the last digit of a double
 
 
@@ -43,8 +44,9 @@ class Bundle(NamedTuple):
 
 
 def without_rims(lens: Lens) -> Lens:
-    """The lens with every surface, the stop too, open as far as it goes."""
-    return replace(lens, aperture=None, surfaces=tuple(replace(s, diameter_mm=math.inf) for s in lens.surfaces))
+    """The lens with every surface, the stop too, open as far as it goes: an asphere a little beyond its tabled rim."""
+    rows = (replace(s, diameter_mm=_STRETCH * s.diameter_mm if s.asphere else math.inf) for s in lens.surfaces)
+    return replace(lens, aperture=None, surfaces=tuple(rows))
 
 
 def aim_at_stop(

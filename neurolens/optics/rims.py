@@ -130,11 +130,16 @@ def _moved(lens: Lens, c: Configuration) -> Lens:
 
 
 def _stop_of(lens: Lens, c: Configuration) -> float:
-    """Diameter of the stop in a state; a focus state has that of the zoom state with the same tabled stop."""
+    """Diameter of the stop in a state; a focus state has that of the zoom state with the same tabled stop.
+
+    A source that gives a state neither f-number nor stop means the stop of the table.
+    """
     if c.object_distance_mm is not None:
         same = [z for z in lens.configurations if z.object_distance_mm is None]
         twin = next((z for z in same if z.stop_diameter_mm == c.stop_diameter_mm), None)
         return _stop_of(lens, twin) if twin else 2 * stop_radius_mm(lens, lens.f_number)
+    if c.f_number is None and c.stop_diameter_mm is None:
+        return 2 * stop_radius_mm(lens, lens.f_number)  # one stop for all states
     state = _moved(lens, c)
     return 2 * stop_radius_mm(state, state.f_number)
 

@@ -1,0 +1,226 @@
+"""Whether a prescription does what its source says: every stated figure computed again, with the reason of any doubt.
+
+Tables that circulate carry dropped aspheres, swapped glasses and transposed digits. Most of these show: the focal
+length or the back focus moves, the axis blurs, elements cut each other, or no light reaches the edge of the field.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from neurolens import status as st
+from neurolens.errors import InputError
+from neurolens.optics.aiming import aim_at_stop
+from neurolens.optics.clearance import surface_sag_mm
+from neurolens.optics.lightcheck import axial_beam, axial_blur_mm, corner_illumination, film_edge_mm
+from neurolens.optics.paraxial import FirstOrder, first_order
+from neurolens.optics.prescription import Configuration, Lens
+from neurolens.optics.trace import trace
+
+EFL_TOLERANCE = 0.02  # relative; what rounding and the choice of a spectral line leave in patents
+FOCUS_TOLERANCE = 0.02  # of the focal length
+F_NUMBER_TOLERANCE = 0.05
+BEAM_TOLERANCE = 0.03
+FIELD_TOLERANCE_DEG = 1.0
+BLUR_LIMIT = 0.003  # RMS radius over focal length; a good lens has 0.0001 to 0.0005
+SIMPLE = 2  # refractions up to which nobody expects a sharp image
+DARK = 0.02  # illumination of the corner, relative to the axis
+_TINY_MM = 1e-3
+
+
+@dataclass(frozen=True)
+class Check:
+    """One figure of a lens, computed and stated.
+
+    Attributes:
+        quantity: in words, with its unit.
+        computed, stated: None where there is none.
+        doubt: why the figure casts doubt on the table, a clause; empty where it does not.
+        state: zoom or focus state of the file, empty for the table as it stands.
+    """
+
+    quantity: str
+    computed: float | None
+    stated: float | None = None
+    doubt: str = ""
+    state: str = ""
+
+
+def check_lens(lens: Lens) -> list[Check]:
+    """All checks of a lens as read from its file, d line; the table first, then its states.
+
+    Quantities: focal length, back focus, f-number (of the stop, paraxial), f-number of the axial beam (real rays
+    through all rims), edge thickness, half field (of the outermost chief ray), axial blur, illumination of the corner.
+    """
+    data = first_order(lens)
+    found = [*_first_order(lens, data), _beam(lens, data), _edges(lens), *_field(lens)]
+    if data.efl_mm > 0:
+        found.append(_blur(lens, data))
+        found += _corner(lens)
+    for c in lens.configurations:
+        state = in_state(lens, c)
+        try:
+            data = first_order(state)
+        except InputError as error:
+            found.append(Check("focal length, mm", None, c.efl_mm, error.expected, c.name))
+            continue
+        checks = _focused(state, data, c) if c.object_distance_mm is not None else _first_order(state, data)
+        field = () if c.object_distance_mm is not None or c.half_field_deg is None else _field(state)
+        found += [replace(check, state=c.name) for check in (*checks, *field)]
+    return found
+
+
+def doubts(checks: list[Check]) -> list[str]:
+    """The doubts as sentences without a full stop, states in front; what holds of the table is not said again."""
+    table = {c.doubt for c in checks if not c.state}
+    return [
+        f"{c.state}: {c.doubt}" if c.state else c.doubt
+        for c in checks
+        if c.doubt and not (c.state and c.doubt in table)
+    ]
+
+
+def verdict(checks: list[Check]) -> str:
+    """Either "ok" or "doubtful"."""
+    return "doubtful" if any(c.doubt for c in checks) else "ok"
+
+
+def in_state(lens: Lens, c: Configuration) -> Lens:
+    """The table with the thicknesses, stop and stated figures of a zoom or focus state, film as tabled."""
+    moved = dict(c.thickness_mm)
+    rows = tuple(replace(s, thickness_mm=moved.get(k, s.thickness_mm)) for k, s in enumerate(lens.surfaces))
+    anamorphic = {"stated_efl_x_mm": None}  # a state names one focal length
+    same = c.efl_mm is not None and lens.stated_efl_mm is not None and c.efl_mm == lens.stated_efl_mm
+    state = replace(
+        lens,
+        surfaces=rows,
+        stated_efl_mm=c.efl_mm,
+        half_field_deg=c.half_field_deg or (None if lens.image_radius_mm else lens.half_field_deg),
+        # Where a state has no f-number its stop is that of the table, and any f-number is as good as another.
+        f_number=c.f_number or (lens.f_number if same else math.nan),
+        **anamorphic,
+    )
+    return state if c.stop_diameter_mm is None else state.with_stop_radius(c.stop_diameter_mm / 2)
+
+
+def _first_order(lens: Lens, data: FirstOrder) -> Iterator[Check]:
+    """Focal length, back focus and f-number of an object at infinity."""
+    yield _focal_length(lens, data.efl_mm, lens.stated_efl_mm)
+    if any(s.cylinder for s in lens.surfaces):
+        yield _focal_length(lens, first_order(lens, meridian="x").efl_mm, lens.stated_efl_x_mm, " (x-z plane)")
+    yield _back_focus(lens, data.back_focus_mm, data.efl_mm)
+    n, stated = data.f_number, lens.f_number
+    off = math.isfinite(stated) and abs(n / stated - 1) > F_NUMBER_TOLERANCE
+    doubt = f"the stop gives f/{n:.3g}, the source says f/{stated:.3g}" if off else ""
+    yield Check("f-number", n, stated if math.isfinite(stated) else None, doubt)
+
+
+def _focal_length(lens: Lens, efl: float, stated: float | None, plane: str = "") -> Check:
+    doubt = ""
+    if efl <= 0:
+        doubt = "the focal length is negative: a diverging lens forms no picture on a film"
+    elif stated is not None and abs(efl / stated - 1) > EFL_TOLERANCE:
+        doubt = f"the focal length{plane} is {efl:.4g} mm, the source says {stated:.4g} mm"
+    return Check(f"focal length{plane}, mm", efl, stated, doubt)
+
+
+def _back_focus(lens: Lens, computed: float, efl: float) -> Check:
+    tabled, last = float(lens.surfaces[-1].thickness_mm), float(lens.vertices_mm[-2])
+    doubt = ""
+    if efl > 0 and abs(computed - tabled) > FOCUS_TOLERANCE * efl:
+        doubt = (
+            f"the table's last thickness puts the film at z = {last + tabled:.2f} mm, "
+            f"its focus is at {last + computed:.2f} mm"
+        )
+    return Check("back focus, mm", computed, tabled, doubt)
+
+
+def _focused(lens: Lens, data: FirstOrder, c: Configuration) -> Iterator[Check]:
+    """The image of an object at the state's distance against the tabled film."""
+    distance = (c.object_distance_mm or 0.0) + data.front_principal_z_mm
+    image_z = data.rear_principal_z_mm + 1 / (1 / data.efl_mm - 1 / distance)
+    if lens.stated_efl_mm is not None:
+        yield _focal_length(lens, data.efl_mm, lens.stated_efl_mm)
+    yield _back_focus(lens, image_z - float(lens.vertices_mm[-2]), data.efl_mm)
+
+
+def _beam(lens: Lens, data: FirstOrder) -> Check:
+    """Whether the rims let the axial beam of the stop through: its f-number against that of the widest real beam."""
+    height, blocker = axial_beam(lens)
+    n = abs(data.efl_mm) / (2 * height) if height > 0 else math.inf
+    doubt = ""
+    wanted = max(data.f_number, lens.f_number)
+    if n > (1 + BEAM_TOLERANCE) * wanted and blocker is not None and blocker != lens.stop_index:
+        doubt = f"the rim of surface {blocker} limits the axial beam to f/{n:.3g}, the stop to f/{data.f_number:.3g}"
+    return Check("f-number of the axial beam", n, None, doubt)
+
+
+def _edges(lens: Lens) -> Check:
+    """The thinnest edge of an element, each surface ending flat at its own rim."""
+    edges = {
+        k: float(a.thickness_mm)
+        + surface_sag_mm(b, b.semi_diameter_mm, 0.0)
+        - surface_sag_mm(a, a.semi_diameter_mm, 0.0)
+        for k, (a, b) in enumerate(zip(lens.surfaces, lens.surfaces[1:], strict=False))
+        if a.n_d != 1 and not a.cylinder and not b.cylinder
+    }
+    thin = [str(k) for k, edge in edges.items() if edge < -_TINY_MM]
+    doubt = f"the edge of the element behind surface {', '.join(thin)} has a negative thickness" if thin else ""
+    return Check("thinnest edge, mm", min(edges.values(), default=None), None, doubt)
+
+
+def _field(lens: Lens) -> Iterator[Check]:
+    """How far from the axis chief rays pass; beyond, light may still come through the side of the pupil."""
+    stated = lens.half_field_deg
+    if stated is None:
+        return
+    low, high, blocker = 0.0, min(stated + 1, 179.0), 0
+    for _ in range(2):
+        span = torch.deg2rad(torch.linspace(low, high, 33, dtype=torch.float64))
+        reached, status = _through(lens, span, torch.zeros(len(span), 1, dtype=torch.float64))
+        passed = int((reached & (status == st.PASSED)).to(torch.int8).cumprod(0).sum())
+        if passed in (0, len(span)):
+            low = high if passed else 0.0
+            break
+        blocker = int(status[passed]) if bool(reached[passed]) else 0
+        low, high = math.degrees(float(span[passed - 1])), math.degrees(float(span[passed]))
+    doubt = ""
+    if low < stated - FIELD_TOLERANCE_DEG:
+        heights = lens.stop_radius_mm * torch.linspace(-1, 1, 41, dtype=torch.float64)[None]
+        reached, status = _through(lens, torch.tensor([math.radians(stated)], dtype=torch.float64), heights)
+        if not bool((reached & (status == st.PASSED)).any()):
+            why = st.describe(blocker) if blocker else "none beyond meets the middle of the stop"
+            doubt = f"no light comes from {stated:.4g} degrees as stated: chief rays end at {low:.1f} ({why})"
+    yield Check("half field of the last chief ray, degrees", min(low, stated), stated, doubt)
+
+
+def _through(lens: Lens, field: Tensor, heights: Tensor) -> tuple[Tensor, Tensor]:
+    """Rays of fields [F] to heights [F, H] in the stop: whether such a ray exists, and its status, [F * H]."""
+    bundle = aim_at_stop(lens, field, heights)
+    with torch.no_grad():
+        return bundle.reached.reshape(-1), trace(lens, bundle.rays, towards="film").status
+
+
+def _blur(lens: Lens, data: FirstOrder) -> Check:
+    """RMS radius of the axial spot in its best focus, all rims open as tabled, over the focal length."""
+    blur = axial_blur_mm(lens) / data.efl_mm
+    before = [1.0, *(float(s.n_d) for s in lens.surfaces)]
+    refractions = sum(a != b for a, b in zip(before, before[1:], strict=False))
+    doubt = ""
+    if blur > BLUR_LIMIT and refractions > SIMPLE:
+        doubt = f"the image on the axis is blurred to {100 * blur:.2g}% of the focal length"
+    return Check("axial blur, RMS over focal length", blur, None, doubt)
+
+
+def _corner(lens: Lens) -> Iterator[Check]:
+    edge = film_edge_mm(lens)
+    if edge is None:
+        return
+    share = corner_illumination(lens, edge)
+    doubt = f"the corner of the film gets {100 * share:.1f}% of the light of its middle" if share < DARK else ""
+    yield Check("illumination of the corner", share, None, doubt)
