@@ -1,0 +1,238 @@
+"""The exact tracer against Optiland 0.6.3 on the same lens and the same rays, in one run.
+
+Optiland (MIT licence) is no dependency of this project: it lives in an environment of its own.
+
+    python3 -m venv /tmp/optiland
+    /tmp/optiland/bin/pip install optiland==0.6.3 torch==2.13.0
+    /tmp/optiland/bin/python experiments/compare_optiland.py [--quick] [--out DIR]
+
+Writes optiland.md and optiland.json. Both trace light from the scene through the double Gauss (and the same with two
+even aspheres) with every rim and the stop, one wavelength, one thread, in float32 and float64; Optiland with constant
+indices and without records of each surface, which is its fastest way. Candidates run in turn, each with the batch that
+suits it best. Where a ray lands on the last surface is compared as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+# Before numpy and torch are loaded: they read these once.
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import numpy as np
+import optiland
+import optiland.backend as be
+import torch
+from optiland.materials import IdealMaterial
+from optiland.optic import Optic
+from optiland.rays import RealRays
+
+from neurolens.evaluate.speed import Call, Candidate, Race, race
+from neurolens.evaluate.trace_speed import film_rays, with_aspheres
+from neurolens.evaluate.trace_speed_page import machine
+from neurolens.files import atomic_write_text
+from neurolens.optics import glass
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.trace import Rays, compile_trace, trace
+from neurolens.progress import Progress
+from neurolens.surrogates.domain import FilmRays
+
+LENS = ROOT / "lenses" / "laikin_double_gauss_50.toml"
+FOCAL_MM = 50.0
+BATCHES = (4096, 16384, 65536)
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+GOAL = 5.0  # times Optiland's rays a second, eager
+
+
+def light(lens: Lens, rays: FilmRays, dtype: torch.dtype) -> Rays:
+    """Light from distant points: the direction that a film point sees, through a place of the front rim."""
+    front, rear = lens.surfaces[0].semi_diameter_mm, lens.surfaces[-1].semi_diameter_mm
+    sx, sy = rays.film_x / FOCAL_MM, rays.film_y / FOCAL_MM
+    length = torch.sqrt(1 + sx * sx + sy * sy)
+    x, y = rays.pupil_x * front / rear, rays.pupil_y * front / rear
+    columns = (x - sx, y - sy, torch.full_like(x, -1.0), sx / length, sy / length, 1 / length)
+    return Rays(*(c.to(dtype).contiguous() for c in columns))
+
+
+def optiland_lens(lens: Lens) -> Optic:
+    """The same prescription in Optiland, in its present backend and precision."""
+    optic = Optic()
+    optic.surfaces.add(index=0, radius=be.inf, thickness=be.inf)
+    for k, s in enumerate(lens.surfaces):
+        shape: dict[str, Any] = {"radius": float(s.radius_mm), "conic": float(s.conic)}
+        if s.asphere:
+            terms = dict(s.asphere)
+            shape |= {"surface_type": "even_asphere", "coefficients": [terms.get(p, 0.0) for p in range(2, 11, 2)]}
+        optic.surfaces.add(
+            index=k + 1,
+            thickness=float(s.thickness_mm),
+            material=IdealMaterial(_index(s)),
+            is_stop=s.stop,
+            aperture=s.diameter_mm,
+            **shape,
+        )
+    return optic
+
+
+def _index(s: Surface) -> float:
+    return float(glass.index_of(s, glass.LINE_D_NM))
+
+
+def theirs(lens: Lens, backend: str, dtype: str) -> tuple[Callable[[FilmRays], Call], Callable[[FilmRays], np.ndarray]]:
+    """What prepares Optiland's call, and what gives its landing points and directions, [6, N]."""
+
+    def prepare(rays: FilmRays) -> Call:
+        start, optic = _prepared(lens, backend, dtype, rays)
+
+        def call() -> RealRays:
+            be.set_backend(backend)
+            traced = RealRays(*start)
+            optic.surfaces.trace(traced, skip=1, record=False)
+            return traced
+
+        return call
+
+    def land(rays: FilmRays) -> np.ndarray:
+        found = prepare(rays)()
+        # Blocked rays go on with no intensity.
+        out = np.stack([be.to_numpy(c) for c in (found.x, found.y, found.z, found.L, found.M, found.N)])
+        return np.where(be.to_numpy(found.i) > 0, out, np.nan)
+
+    return prepare, land
+
+
+def _prepared(lens: Lens, backend: str, dtype: str, rays: FilmRays) -> tuple[list[Any], Optic]:
+    be.set_backend(backend)
+    be.set_precision(dtype)
+    columns: list[Any] = list(light(lens, rays, DTYPES[dtype]))
+    columns += [torch.ones_like(columns[0]), torch.full_like(columns[0], glass.LINE_D_NM / 1000)]
+    return ([c.numpy() for c in columns] if backend == "numpy" else columns), optiland_lens(lens)
+
+
+def ours(lens: Lens, dtype: str, compiled: bool) -> Callable[[FilmRays], Call]:
+    """What prepares our call."""
+    fast = compile_trace(lens, towards="film") if compiled else None
+
+    def prepare(rays: FilmRays) -> Call:
+        start = light(lens, rays, DTYPES[dtype])
+        wavelength = torch.tensor(glass.LINE_D_NM, dtype=DTYPES[dtype])
+        if fast is not None:
+            return lambda: fast(start, wavelength)
+        return lambda: trace(lens, start, glass.LINE_D_NM, towards="film")
+
+    return prepare
+
+
+def contest(lens: Lens, dtype: str, rounds: int, report: Callable[[float], None]) -> tuple[Race, dict[str, Any]]:
+    """Race all of them on one lens in one precision, and compare where rays land."""
+    rays = film_rays(lens)
+    backends = {name: theirs(lens, name, dtype) for name in ("numpy", "torch")}
+    field = [Candidate(f"Optiland, {name}", prepare, BATCHES) for name, (prepare, _) in backends.items()]
+    field += [Candidate("neurolens, eager", ours(lens, dtype, False), (*BATCHES[:2], 32768))]
+    field += [Candidate("neurolens, compiled", ours(lens, dtype, True), (16384,))]
+    timed = race(field, rays, rounds=rounds, report=report)
+    with torch.no_grad():
+        out = trace(lens, light(lens, rays, DTYPES[dtype]), glass.LINE_D_NM, towards="film")
+        own = np.where(out.status.numpy() == 0, torch.stack(out.rays).numpy(), np.nan)
+        found = {name: compare(own, land(rays)) for name, (_, land) in backends.items()}
+    return timed, {"passing_share": float(np.isfinite(own[0]).mean()), "against": found}
+
+
+def compare(own: np.ndarray, other: np.ndarray) -> dict[str, Any]:
+    """Largest distance of landing points (mm) and of directions (rad), and rays that only one of us passes."""
+    a, b = np.isfinite(own).all(0), np.isfinite(other).all(0)
+    offset = (own.astype(float) - other)[:, a & b]
+    return {
+        "position_mm": float(np.linalg.norm(offset[:3], axis=0).max()),
+        "angle_rad": float(np.linalg.norm(offset[3:], axis=0).max()),
+        "one_passes": int((a != b).sum()),
+    }
+
+
+def rows_of(timed: Race, dtype: str, lens: Lens, agreement: dict[str, Any]) -> list[dict[str, Any]]:
+    """Plain tables, units in the keys."""
+    rows = []
+    for name in timed.ns:
+        t = timed.timing(name)
+        assert t is not None
+        row: dict[str, Any] = {"lens": lens.name, "dtype": dtype, "name": name, **t, **agreement}
+        row["load"] = [timed.load_before, timed.load_after]
+        if name.startswith("neurolens"):
+            row["faster_than"] = {other: timed.speedup(name, other) for other in timed.ns if other.startswith("Opti")}
+        rows.append(row)
+    return rows
+
+
+def page(rows: list[dict[str, Any]], rounds: int) -> str:
+    """The result as Markdown."""
+    m, loads = machine(), [v for r in rows for v in r["load"] if v is not None]
+    lines = [
+        "# Beside Optiland",
+        "",
+        "`python experiments/compare_optiland.py`",
+        "",
+        "The same rays from the scene through the same 13 surfaces (12 refractions, every rim, the stop), one "
+        f"wavelength, one thread; {rounds} rounds in turn. Ratios: by the best times (median within rounds).",
+        "",
+        f"{m['processor']}, {m['vectors']}; Python {m['python']}, torch {m['torch']}, numpy {m['numpy']}, "
+        f"Optiland {optiland.__version__ if hasattr(optiland, '__version__') else '0.6.3'}. "
+        f"Load average meanwhile up to {max(loads, default=0.0):.1f}.",
+        "",
+        "| lens | precision | tracer | Mray/s, best (median) | batch | times Optiland numpy | times Optiland torch |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        ratios = r.get("faster_than") or {}
+        shown = [f"{v['min']:.1f} ({v['median']:.1f})" for v in ratios.values()] or ["", ""]
+        speed = f"{1000 / r['min']:.2f} ({1000 / r['median']:.2f})"
+        lines.append(f"| {r['lens']} | {r['dtype']} | {r['name']} | {speed} | {r['batch']} | {' | '.join(shown)} |")
+    lines += ["", "Where rays land on the last surface, and rays that only one of the two passes:", ""]
+    lines += ["| lens | precision | Optiland | mm | rad | rays | of |", "|---|---|---|---|---|---|---|"]
+    for lens, dtype in dict.fromkeys((r["lens"], r["dtype"]) for r in rows):
+        row = next(r for r in rows if (r["lens"], r["dtype"]) == (lens, dtype))
+        for name, a in row["against"].items():
+            figures = f"{a['position_mm']:.1e} | {a['angle_rad']:.1e} | {a['one_passes']}"
+            lines.append(f"| {lens} | {dtype} | {name} | {figures} | 65536 |")
+    eager = [v["min"] for r in rows if r["name"] == "neurolens, eager" for v in r["faster_than"].values()]
+    reached = "reached" if min(eager) >= GOAL else "missed"
+    lines += ["", f"Goal: eager at least {GOAL:g} times Optiland, numpy and torch: {reached} (least {min(eager):.1f})."]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    """Race, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="few rounds")
+    parser.add_argument("--out", type=Path, default=ROOT / "experiments" / "results", help="folder for the tables")
+    args = parser.parse_args()
+    warnings.simplefilter("ignore")
+    be.set_backend("torch")
+    be.grad_mode.disable()
+    rounds = 5 if args.quick else 20
+    lens = read_lens(LENS).at()
+    contests = [(table, dtype) for table in (lens, with_aspheres(lens)) for dtype in DTYPES]
+    progress = Progress({f"{table.name}, {dtype}": 40.0 for table, dtype in contests})
+    rows: list[dict[str, Any]] = []
+    for table, dtype in contests:
+        with progress.stage(f"{table.name}, {dtype}") as report:
+            timed, agreement = contest(table, dtype, rounds, report)
+        rows += rows_of(timed, dtype, table, agreement)
+    args.out.mkdir(parents=True, exist_ok=True)
+    atomic_write_text(args.out / "optiland.json", json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")
+    atomic_write_text(args.out / "optiland.md", page(rows, rounds))
+    print(page(rows, rounds))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
