@@ -4,6 +4,7 @@ Optiland (MIT licence) is no dependency of this project: it lives in an environm
 
     python3 -m venv /tmp/optiland
     /tmp/optiland/bin/pip install optiland==0.6.3 torch==2.13.0
+    export OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 PYTHONPATH=.
     /tmp/optiland/bin/python experiments/compare_optiland.py [--quick] [--out DIR]
 
 Writes optiland.md and optiland.json. Both trace light from the scene through the double Gauss (and the same with two
@@ -16,17 +17,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-# Before numpy and torch are loaded: they read these once.
-os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
 
 import numpy as np
 import optiland
@@ -47,6 +42,7 @@ from neurolens.optics.trace import Rays, compile_trace, trace
 from neurolens.progress import Progress
 from neurolens.surrogates.domain import FilmRays
 
+ROOT = Path(__file__).resolve().parents[1]
 LENS = ROOT / "lenses" / "laikin_double_gauss_50.toml"
 FOCAL_MM = 50.0
 BATCHES = (4096, 16384, 65536)
