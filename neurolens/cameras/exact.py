@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from neurolens.cameras.contract import CameraRays, FloatArray
 from neurolens.cameras.lens_film import LensFilm, SceneRays
@@ -17,7 +18,7 @@ from neurolens.cameras.sampling import check_film, positive
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import PupilBounds, camera_rays, pupil_bounds
+from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds
 from neurolens.optics.trace import trace
 
 
@@ -64,7 +65,7 @@ class ExactCamera:
             bounds = pupil_bounds(self.lens, 1.0001 * corner, (film_z, film_z), used)
         self._pupil_z_mm = bounds.pupil_z_mm
         self._dtype = torch.float32 if dtype == "float32" else torch.float64
-        self.film = LensFilm(PupilTable.of(asdict(bounds)), float(film_z), used, self._scene)
+        self.film = LensFilm(PupilTable.of(asdict(bounds)), float(film_z), used, self._scene, self._passes)
         data = first_order(self.lens)
         self.settings: dict[str, Any] = {
             "camera": "exact",
@@ -100,3 +101,11 @@ class ExactCamera:
         assert done.transmittance is not None
         scene = torch.stack(list(done.rays)).to(torch.float32).numpy()
         return SceneRays(scene, done.transmittance.to(torch.float32).numpy(), done.status.numpy())
+
+    def _passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
+        """Whether light passes from film points (r, 0) through pupil points; see `passes_at_any_azimuth`."""
+        r, u, v = (torch.from_numpy(np.ascontiguousarray(a)).to(self._dtype) for a in (film[0], *pupil))
+        film_z = self.lens.film_z_mm
+        assert film_z is not None
+        with torch.no_grad():
+            return passes_at_any_azimuth(self.lens, r, film_z, u, v, self._pupil_z_mm, wavelength_nm).numpy()

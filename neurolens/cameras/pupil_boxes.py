@@ -86,27 +86,25 @@ def tightened(table: PupilTable, passes: Passes, wavelength_nm: Sequence[float])
     Bounds move on a lattice of the table's own boxes, one step wider than what passes: the boundary lies between two
     points.
     """
+    low, high, half = (a[:, None] for a in table.rows)
     count = table.rows.shape[1]
     u, v = np.linspace(0, 1, _LATTICE[0], dtype=np.float32), np.linspace(0, 1, _LATTICE[1], dtype=np.float32)
-    fu, fv = (a.ravel() for a in np.meshgrid(u, v, indexing="ij"))
-    boxes = np.empty((3, count), np.float32)
-    for k in range(count):
-        low, high, half = table.rows[:, k]
-        boxes[:, k] = (1, -1, 0)
-        if low > high:
-            continue
-        radius = np.float32(table.film_radius_mm * min(k / (count - 1), 1 - 1e-6))
-        film = np.stack([np.full_like(fu, radius), np.zeros_like(fu)])
-        pupil = np.stack([low + (high - low) * fu, half * fv])
-        passed = passes_any(passes, film, pupil, wavelength_nm).reshape(_LATTICE)
-        if passed.any():
-            along, across = np.flatnonzero(passed.any(1)), np.flatnonzero(passed.any(0))
-            first, last = max(along[0] - 1, 0), min(along[-1] + 1, len(u) - 1)
-            boxes[:, k] = (
-                low + (high - low) * u[first],
-                low + (high - low) * u[last],
-                half * v[min(across[-1] + 1, len(v) - 1)],
-            )
+    radius = table.film_radius_mm * np.minimum(np.arange(count) / (count - 1), 1 - 1e-6)
+    along, across = low + (high - low) * u, half * v
+    shape = (2, count, *_LATTICE)
+    film, pupil = np.zeros(shape, np.float32), np.empty(shape, np.float32)
+    film[0] = radius[:, None, None]
+    pupil[0], pupil[1] = along[:, :, None], across[:, None, :]
+    passed = passes_any(passes, film.reshape(2, -1), pupil.reshape(2, -1), wavelength_nm).reshape(shape[1:])
+    passed &= (low <= high)[:, :, None]
+    boxes = np.tile(np.array([[1], [-1], [0]], np.float32), count)
+    for k in np.flatnonzero(passed.any((1, 2))):
+        columns, lines = np.flatnonzero(passed[k].any(1)), np.flatnonzero(passed[k].any(0))
+        boxes[:, k] = (
+            along[k, max(columns[0] - 1, 0)],
+            along[k, min(columns[-1] + 1, len(u) - 1)],
+            across[k, min(lines[-1] + 1, len(v) - 1)],
+        )
     return replace(table, rows=_with_neighbours(boxes))
 
 

@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from neurolens.cameras.pupil_boxes import Passes, PupilTable, passes_any, tightened
 from neurolens.cameras.pupil_outline import PupilOutline
 
-ROWS, SEGMENTS = 97, 40
+ROWS, SEGMENTS = 65, 32
 
 # Halvings that place the end of the light; lattice on a box, along and across (one half), that looks for light.
 _END_HALVINGS = 10
 _LATTICE = (40, 20)
 # Directions in which the first outline is sought; steps outwards, and halvings of the step that crosses the boundary.
 _DIRECTIONS, _STEPS, _COARSE, _FINE = 33, 24, 5, 12
-# Where between rows, along an edge and between the two wavelengths the interpolated outline is checked; from where to
-# where, as a share of it; and how far vertices are pushed beyond what was found: a hair, against rounding.
-_BETWEEN_ROWS, _ALONG_EDGE, _BETWEEN_WAVELENGTHS = (0.0, 0.25, 0.5, 0.75), (0.0, 0.25, 0.5, 0.75), (0.0, 0.5, 1.0)
-_CHECK_FROM, _CHECK_TO, _CHECK_STEPS, _CHECK_HALVINGS = 0.97, 1.15, 9, 7
+# Where between rows, along an edge and between the two wavelengths the interpolated outline is checked; at which
+# multiples of it; and how far vertices are pushed beyond what was found: a hair, against rounding.
+_BETWEEN_ROWS, _ALONG_EDGE, _BETWEEN_WAVELENGTHS = (0.0, 0.5), (0.0, 0.33, 0.67), (0.0, 0.5, 1.0)
+_CHECKS, _CHECK_HALVINGS = (1.0, 1.002, 1.01, 1.03, 1.07, 1.15), 5
 _HAIR = 2e-5
 
 Float64Array = NDArray[np.float64]
@@ -157,33 +157,45 @@ def _frame_of(table: PupilTable, radius: Float64Array, ask: Ask) -> _Frame:
 def _boundary(ask: Ask, frame: _Frame, angles: Float64Array, halvings: int) -> Float64Array:
     """Distance [R, D] from the centre to the last passing point in each direction, in the stretched frame."""
     direction = np.stack([np.cos(angles), np.sin(angles)]) * frame.stretch[:, :, None]
-    origin = np.stack([frame.centre, np.zeros_like(frame.centre)])[:, :, None]
-    return _farthest(ask, frame.radius[:, None], origin, direction, (0.0, frame.reach[:, None]), _STEPS, halvings)
+    steps = np.linspace(0, 1, _STEPS + 1)[:, None] * frame.reach
+    flat = _farthest(ask, *_flat(frame.radius, frame.centre, direction), np.repeat(steps, angles.shape[1], 1), halvings)
+    return flat.reshape(angles.shape)
+
+
+def _flat(
+    radius: Float64Array, centre: Float64Array, direction: Float64Array
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Film radius [M], origin [2, M] and direction [2, M] of every direction [2, R, D] from the centres of rows."""
+    count = direction.shape[2]
+    origin = np.stack([np.repeat(centre, count), np.zeros(centre.size * count)])
+    return np.repeat(radius, count), origin, direction.reshape(2, -1)
 
 
 def _farthest(
-    ask: Ask,
-    radius: Float64Array,
-    origin: Float64Array,
-    direction: Float64Array,
-    span: tuple[float, float | Float64Array],
-    steps: int,
-    halvings: int,
+    ask: Ask, radius: Float64Array, origin: Float64Array, direction: Float64Array, steps: Float64Array, halvings: int
 ) -> Float64Array:
-    """The largest t of a span, up to the last halving, at which origin + t direction passes.
+    """The largest t [M] at which origin + t direction passes, to the last halving and never less.
 
-    Steps along the whole span find the last passing one, so that a region with a dent is held whole.
+    Args:
+        ask: whether rays pass.
+        radius, origin, direction: [M], [2, M], [2, M] mm.
+        steps: [S, M] rising values of t. All are tried, so that a region with a dent is held whole. Where none
+            passes, the first is the answer.
     """
-    near, far = span
-    last = np.full(direction.shape[1:], near)
-    width = (far - near) / steps
-    for i in range(1, steps + 1):
-        t = near + i * width
-        last = np.where(ask(radius, origin + t * direction), t, last)
+    # All in one question: tracing few rays at a time costs more than tracing many.
+    passed = ask(np.broadcast_to(radius, steps.shape), origin[:, None] + steps * direction[:, None])
+    last = len(steps) - 1 - np.argmax(passed[::-1], axis=0)
+    found = np.flatnonzero(passed.any(0))
+    low, high = steps[0].copy(), steps[np.minimum(last + 1, len(steps) - 1), np.arange(radius.size)]
+    low[found] = steps[last[found], found]
+    radius, origin, direction = radius[found], origin[:, found], direction[:, found]
+    a, b = low[found], high[found]
     for _ in range(halvings):
-        width = width / 2
-        last = np.where(ask(radius, origin + (last + width) * direction), last + width, last)
-    return last + width
+        middle = (a + b) / 2
+        now = ask(radius, origin + middle * direction)
+        a, b = np.where(now, middle, a), np.where(now, b, middle)
+    low[found] = b
+    return low
 
 
 def _equal_areas(angles: Float64Array, distance: Float64Array, segments: int) -> Float64Array:
@@ -202,28 +214,35 @@ def _pushed_out(outline: PupilOutline, passes: Passes) -> PupilOutline:
         ask = _asking(passes, (outline.wavelength(share),))
         ends = {0.0: slice(0, 1), 1.0: slice(-1, None)}.get(share, slice(None))
         x, y = ((1 - share) * c[0].astype(np.float64) + share * c[-1] for c in (outline.x, outline.y))
-        for step in _BETWEEN_ROWS:
-            for t in _ALONG_EDGE:
-                found = _excess(outline, (x, y), step, t, ask)
-                count = len(found)
-                for row in (slice(0, count), slice(1, 1 + count)) if step else (slice(0, count),):
-                    for edge in (slice(0, -1), slice(1, None)):
-                        needed[ends, row, edge] = np.maximum(needed[ends, row, edge], found)
+        for step, found in _excess(outline, (x, y), ask):
+            rows = len(found)
+            for row in (slice(0, rows), slice(1, 1 + rows)) if step else (slice(0, rows),):
+                for edge in (slice(0, -1), slice(1, None)):
+                    needed[ends, row, edge] = np.maximum(needed[ends, row, edge], found)
     scale = (needed + _HAIR).astype(np.float32)
     return replace(outline, x=outline.x * scale, y=outline.y * scale)
 
 
 def _excess(
-    outline: PupilOutline, vertices: tuple[Float64Array, Float64Array], step: float, t: float, ask: Ask
-) -> Float64Array:
-    """How far what passes reaches, as a share of the outline, at a fraction of the steps between rows and vertices."""
+    outline: PupilOutline, vertices: tuple[Float64Array, Float64Array], ask: Ask
+) -> list[tuple[float, Float64Array]]:
+    """How far what passes reaches, as a share of the outline, between rows and vertices: each place's part of the
+    step between rows, and the shares [rows, edges]."""
 
-    def between(c: Float64Array) -> Float64Array:
+    def between(c: Float64Array, step: float) -> Float64Array:
         return (1 - step) * c[:-1] + step * c[1:] if step else c
 
-    radius = outline.radii(between(np.arange(outline.centre.size, dtype=np.float64)))
-    centre = between(outline.centre.astype(np.float64))
-    point = np.stack([(1 - t) * c[:, :-1] + t * c[:, 1:] for c in map(between, vertices)])
-    origin = np.stack([centre, np.zeros_like(centre)])[:, :, None]
-    span = (_CHECK_FROM, _CHECK_TO)
-    return _farthest(ask, radius[:, None], origin, point, span, _CHECK_STEPS, _CHECK_HALVINGS)
+    centres, rows = outline.centre.astype(np.float64), np.arange(outline.centre.size, dtype=np.float64)
+    parts = []
+    for step in _BETWEEN_ROWS:
+        x, y = (between(c, step) for c in vertices)
+        for t in _ALONG_EDGE:
+            point = np.stack([(1 - t) * c[:, :-1] + t * c[:, 1:] for c in (x, y)])
+            parts.append(_flat(outline.radii(between(rows, step)), between(centres, step), point))
+    radius, origin, direction = (np.concatenate(c, axis=-1) for c in zip(*parts, strict=True))
+    steps = np.repeat(np.array(_CHECKS)[:, None], radius.size, axis=1)
+    found = _farthest(ask, radius, origin, direction, steps, _CHECK_HALVINGS)
+    edges = vertices[0].shape[1] - 1
+    shares = np.split(found, np.cumsum([len(part[0]) for part in parts])[:-1])
+    steps_between = np.repeat(_BETWEEN_ROWS, len(_ALONG_EDGE))
+    return [(step, share.reshape(-1, edges)) for step, share in zip(steps_between, shares, strict=True)]

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from neurolens.errors import InputError
-from neurolens.optics.clearance import sag_mm
+from neurolens.optics.clearance import end_mm, surface_sag_mm
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
+
+# Azimuths at which lenses with cylinders are searched, 15 degrees apart. Their two planes of symmetry give the rest:
+# what passes at -a is the mirror image of what passes at a.
+AZIMUTHS = tuple(math.radians(15 * k) for k in range(-6, 7))
 
 
 def pupil_plane_z_mm(lens: Lens) -> float:
@@ -39,6 +43,39 @@ def camera_rays(
     scale = -torch.sign(z) / torch.sqrt(x * x + y * y + z * z)
     start_z = torch.as_tensor(film_z, dtype=film_x.dtype, device=film_x.device).expand_as(film_x)
     return Rays(film_x, film_y, start_z, x * scale, y * scale, (z * scale).expand_as(film_x))
+
+
+def symmetric_about_axis(lens: Lens) -> bool:
+    """Whether turning the lens about its axis changes nothing but the place of its blades: no surface is a cylinder."""
+    return all(s.cylinder is None for s in lens.surfaces)
+
+
+def passes_at_any_azimuth(
+    lens: Lens,
+    film_radius: Tensor,
+    film_z: float,
+    pupil_x: Tensor,
+    pupil_y: Tensor,
+    pupil_z: float,
+    wavelength_nm: float,
+) -> Tensor:
+    """Whether light passes from film points on +x through pupil points, bool [N], however the whole may be turned.
+
+    Blades and masks are left out: the round opening about them holds what they let through at every azimuth. Only
+    lenses with cylinders are traced at more than one azimuth, `AZIMUTHS`, for they change with it.
+
+    Args:
+        film_radius, pupil_x, pupil_y: [N] mm. film_z, pupil_z: planes, mm, lens frame.
+    """
+    lens = replace(lens, aperture=None)
+    passed = torch.zeros_like(film_radius, dtype=torch.bool)
+    for azimuth in (0.0,) if symmetric_about_axis(lens) else AZIMUTHS:
+        left = torch.nonzero(~passed).squeeze(1)
+        r, u, v = film_radius[left], pupil_x[left], pupil_y[left]
+        c, s = math.cos(azimuth), math.sin(azimuth)
+        rays = camera_rays(c * r, s * r, film_z, c * u - s * v, s * u + c * v, pupil_z)
+        passed[left] = trace(lens, rays, wavelength_nm).status == 0
+    return passed
 
 
 @dataclass(frozen=True)
@@ -121,13 +158,14 @@ def _row(
     """Box of the passing rays from one film radius, over all film planes and wavelengths given."""
     rear = lens.surfaces[-1]
     rear_z = float(lens.vertices_mm[len(lens.surfaces) - 1])
-    limit = min(rear.semi_diameter_mm, abs(float(rear.radius_mm)))
+    limit = min(rear.semi_diameter_mm, end_mm(rear))
+    depths = [surface_sag_mm(rear, limit * t, 0.0) for t in (0.0, 0.5, 0.8, 1 - 1e-12)]
     found = []
     for film_z in film_planes:
-        # Every ray that enters crosses the rear surface between the planes of its vertex and of its rim, within the
-        # rim's radius; seen from the film point, that cylinder's two ends bound it on the pupil plane.
+        # Every ray that enters crosses the rear surface between the planes that hold it, within the rim's radius; seen
+        # from the film point, that cylinder's two ends bound it on the pupil plane.
         ends = []
-        for z in (rear_z, rear_z + sag_mm(float(rear.radius_mm), limit)):
+        for z in (rear_z + min(depths), rear_z + max(depths)):
             stretch = (film_z - plane) / (film_z - z)
             centre, reach = radius * (1 - stretch), 1.02 * rear.semi_diameter_mm * abs(stretch)
             ends.append(_Box(centre - reach, centre + reach, reach, 0.0))
@@ -145,8 +183,8 @@ def _search(
     u = torch.linspace(box.low, box.high, points, dtype=torch.float64)
     v = torch.linspace(0, box.half, points // 2, dtype=torch.float64)
     pu, pv = (t.reshape(-1) for t in torch.meshgrid(u, v, indexing="ij"))
-    rays = camera_rays(torch.full_like(pu, radius), torch.zeros_like(pu), film_z, pu, pv, plane)
-    passed = torch.stack([trace(lens, rays, w).status == 0 for w in wavelengths]).any(0)
+    film = torch.full_like(pu, radius)
+    passed = torch.stack([passes_at_any_azimuth(lens, film, film_z, pu, pv, plane, w) for w in wavelengths]).any(0)
     if not passed.any():
         return None
     du, dv = float(u[1] - u[0]), float(v[1] - v[0])
