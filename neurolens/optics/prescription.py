@@ -207,42 +207,9 @@ class Lens:
 
     def scaled(self, factor: float) -> Lens:
         """All lengths times `factor`; angles, indices and f-number stay."""
+        from neurolens.optics import scaling
 
-        def scale(value: Any) -> Any:
-            return None if value is None else value * factor
-
-        surfaces = tuple(
-            replace(
-                s,
-                radius_mm=scale(s.radius_mm),
-                thickness_mm=scale(s.thickness_mm),
-                diameter_mm=s.diameter_mm * factor,
-                asphere=tuple((p, a * factor ** (1 - p)) for p, a in s.asphere),
-                absorption_per_mm=s.absorption_per_mm / factor,
-            )
-            for s in self.surfaces
-        )
-        configurations = tuple(
-            replace(
-                c,
-                efl_mm=scale(c.efl_mm),
-                thickness_mm=tuple((k, t * factor) for k, t in c.thickness_mm),
-                stop_diameter_mm=scale(c.stop_diameter_mm),
-                object_distance_mm=scale(c.object_distance_mm),
-            )
-            for c in self.configurations
-        )
-        infinity_mm = tuple((k, t * factor) for k, t in self.infinity_mm)
-        return replace(
-            self,
-            surfaces=surfaces,
-            configurations=configurations,
-            infinity_mm=infinity_mm,
-            image_radius_mm=scale(self.image_radius_mm),
-            film_z_mm=scale(self.film_z_mm),
-            stated_efl_mm=scale(self.stated_efl_mm),
-            stated_efl_x_mm=scale(self.stated_efl_x_mm),
-        )
+        return scaling.scaled(self, factor)
 
     def with_stop_radius(self, radius_mm: float) -> Lens:
         """The same lens with another opening of the stop."""
@@ -254,6 +221,25 @@ class Lens:
         """The same lens with other thicknesses, by surface index."""
         rows = (replace(s, thickness_mm=gaps_mm.get(k, s.thickness_mm)) for k, s in enumerate(self.surfaces))
         return replace(self, surfaces=tuple(rows))
+
+    @staticmethod
+    def pinhole(film_distance_mm: float, radius_mm: float, *, image_radius_mm: float | None = None) -> Lens:
+        """A lens without glass; see `neurolens.optics.accessories.pinhole`."""
+        from neurolens.optics import accessories
+
+        return accessories.pinhole(film_distance_mm, radius_mm, image_radius_mm=image_radius_mm)
+
+    def with_filter(self, thickness_mm: float = 2.0, **options: Any) -> Lens:
+        """The same lens behind a plane filter; see `neurolens.optics.accessories.with_filter`."""
+        from neurolens.optics import accessories
+
+        return accessories.with_filter(self, thickness_mm, **options)
+
+    def with_hood(self, length_mm: float, diameter_mm: float) -> Lens:
+        """The same lens in a round hood; see `neurolens.optics.accessories.with_hood`."""
+        from neurolens.optics import accessories
+
+        return accessories.with_hood(self, length_mm, diameter_mm)
 
     def with_aperture(self, aperture: Aperture | None) -> Lens:
         """The same lens with blades or a mask in its stop; None is a round stop."""

@@ -43,7 +43,8 @@ def at(
     else:
         factor = 1.0 if field_deg is None else _factor_for_field(lens, field_deg)
     image_radius = lens.image_radius_mm
-    lens, object_mm = lens.scaled(factor), None if object_mm is None else object_mm * factor
+    if factor != 1:
+        lens, object_mm = lens.scaled(factor), None if object_mm is None else object_mm * factor
     if field_deg is not None:
         lens = replace(lens, image_radius_mm=image_radius, half_field_deg=field_deg / 2)
     if f_number is not None:
