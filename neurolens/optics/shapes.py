@@ -23,7 +23,7 @@ Vector = tuple[Tensor, Tensor, Tensor]
 
 # Steps of Newton's iteration by how far the asphere departs from the conic that it starts from, in rim radii. A fixed
 # count, for a test of convergence would make an accelerator wait for its host at every surface.
-STEPS = ((1e-3, 2), (1e-2, 3), (math.inf, 6))
+STEPS = ((1e-4, 2), (3e-3, 3), (3e-2, 5), (math.inf, 7))
 # More steps that float64 takes after the one that decides convergence, so that both precisions decide alike.
 POLISH = {torch.float32: 0, torch.float64: 3}
 # Length of the deciding step, in rim radii, that counts as converged: the error left is of the order of its square.
@@ -123,8 +123,12 @@ def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], 
 @torch.compiler.assume_constant_result
 def _start(surface: Surface) -> tuple[tuple[float, float], int]:
     """The conic c h^2 + cz z^2 = 2 z nearest to an asphere inside its rim, as (c, cz), and the steps it needs."""
-    figures = (float(surface.curvature), float(surface.conic), tuple((p, float(a)) for p, a in surface.asphere))
-    return _fitted(*figures, surface.semi_diameter_mm)
+    asphere = tuple((p, _number(a)) for p, a in surface.asphere)
+    return _fitted(_number(surface.curvature), _number(surface.conic), asphere, surface.semi_diameter_mm)
+
+
+def _number(value: Any) -> float:
+    return float(value.detach() if isinstance(value, Tensor) else value)
 
 
 @lru_cache(maxsize=4096)

@@ -180,7 +180,7 @@ def _trace_chunk(
     sense, order = (1, range(len(lens.surfaces))) if towards == "film" else (-1, range(len(lens.surfaces) - 1, -1, -1))
     vertices = lens.vertices_mm
     glasses = media(lens, wavelength_nm)  # glasses[k] lies before surface k as light travels to the film
-    guard = freeze or bool(wanted.record)
+    guard = freeze or wanted.path or bool(wanted.record)
     r, tests = _start(rays, glasses[0 if sense > 0 else -1], sense, st.blocked(order[0], st.MISSED), freeze)
     power = passage(lens, wavelength_nm, sense, wanted.transmittance, rays.x)
     crossings: dict[int, Crossing] = {}
