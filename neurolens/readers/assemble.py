@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from neurolens.errors import InputError
-from neurolens.optics import catalogue, paraxial
+from neurolens.optics import catalogue, paraxial, rims
 from neurolens.optics.clearance import check_clearance
 from neurolens.optics.dispersion import Glass
 from neurolens.optics.lensfields import MAX_INDEX
@@ -30,6 +30,9 @@ def finish(
 ) -> Lens:
     """A lens from the rows of a file, with what follows from them: f-number or stop, and back focus.
 
+    Rims that the file does not give stay `UNKNOWN`; states and overlaps are for the caller (`with_rims`,
+    `check_states`).
+
     Args:
         lens: rows as read; `UNKNOWN` for a diameter that is not given, NaN for an f-number that is not.
         pupil_mm: diameter of the entrance pupil, where the file gives that; it rules over the stop's diameter.
@@ -37,8 +40,8 @@ def finish(
         film_given: whether the last thickness is the file's; else it becomes the paraxial back focus.
 
     Raises:
-        InputError: no row, too many, no stop or several, a figure out of range, a last medium that is not air, a
-            diameter that nothing gives, surfaces that overlap.
+        InputError: no row, too many, no stop or several, a figure out of range, a last medium that is not air, a stop
+            that nothing sizes, no image behind the lens.
     """
     _check_rows(lens.surfaces, lens.path)
     stop = lens.surfaces[lens.stop_index]
@@ -61,13 +64,29 @@ def finish(
         rows[-1] = replace(rows[-1], thickness_mm=data.back_focus_mm)
         if data.back_focus_mm <= 0:
             raise InputError(lens.path, "back focus", data.back_focus_mm, "a film behind the last surface")
-    missing = [k for k, s in enumerate(rows) if math.isnan(s.diameter_mm)]
-    if missing:
-        found = f"(not given for surface {', '.join(map(str, missing))})"
-        raise InputError(lens.path, "diameter", found, "the clear diameter of every surface")
-    whole = replace(lens, surfaces=tuple(rows), f_number=float(stated))
-    check_states(whole)
-    return whole
+    return replace(lens, surfaces=tuple(rows), f_number=float(stated))
+
+
+def with_rims(lens: Lens) -> Lens:
+    """The lens with the rims that its file does not give derived by rule (`neurolens.optics.rims`).
+
+    Raises:
+        InputError: no field is known to derive them for, or the lens has cylinders.
+    """
+    missing = [k for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm)]
+    if not missing:
+        return lens
+    listed = ", ".join(map(str, missing))
+    if lens.half_field_deg is None and lens.image_radius_mm is None:
+        expected = "the clear diameter of every surface, or a field to derive rims for (--half-field)"
+        raise InputError(lens.path, "diameter", f"(not given for surface {listed})", expected)
+    derived, _ = rims.derive_rims(lens)
+    warn(lens.path, f"no rim is given for surface {listed}: derived from f-number and field")
+    rows = (
+        replace(s, diameter_mm=d.diameter_mm) if math.isnan(s.diameter_mm) else s
+        for s, d in zip(lens.surfaces, derived.surfaces, strict=True)
+    )
+    return replace(lens, surfaces=tuple(rows), rims="derived")
 
 
 def check_states(lens: Lens) -> None:

@@ -10,7 +10,7 @@ from neurolens.errors import InputError
 from neurolens.optics import paraxial
 from neurolens.optics.lensrows import MAX_SURFACES
 from neurolens.optics.prescription import Configuration, Lens, Surface
-from neurolens.readers.assemble import check_states, finish, meridian, moved
+from neurolens.readers.assemble import check_states, finish, meridian, moved, with_rims
 from neurolens.readers.source import unit_mm, warn
 
 
@@ -23,6 +23,8 @@ class Given:
         f_number: nominal f-number, for a file that states none.
         units: of a file that does not tell: "mm", "cm", "in" or "m".
         half_field_deg: edge of the field, for rims that have to be derived.
+        gap_before: of a plain table: its second column is the distance from the surface before (Kolb's tables of 1995).
+        semi_diameters: of a plain table: its last column holds radii of the rims.
     """
 
     name: str | None = None
@@ -30,6 +32,8 @@ class Given:
     f_number: float | None = None
     units: str | None = None
     half_field_deg: float | None = None
+    gap_before: bool = False
+    semi_diameters: bool = False
 
 
 @dataclass(frozen=True)
@@ -122,8 +126,9 @@ def lens_of(draft: Draft, given: Given | None = None) -> Lens:
         lens = _open_stop(lens)
     lens = finish(lens, pupil_mm=draft.pupil, film_given=draft.film_given)
     lens = replace(lens, configurations=tuple(_configuration(lens, draft, state) for state in _states(draft)))
+    lens = with_rims(lens.scaled(factor) if factor != 1 else lens)
     check_states(lens)
-    return lens.scaled(factor) if factor != 1 else lens
+    return lens
 
 
 def _open_stop(lens: Lens) -> Lens:

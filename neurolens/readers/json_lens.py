@@ -10,6 +10,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from neurolens.optics.lensfields import number, text
 from neurolens.optics.lensrows import MAX_SURFACES
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.readers.assemble import UNKNOWN, finish, same_glass
+from neurolens.readers.draft import Given
 from neurolens.readers.json_stated import check_computed, image_and_field, stated_efl
 from neurolens.readers.json_states import read_states
 from neurolens.readers.source import decode, read_bytes, warn
@@ -38,11 +40,11 @@ _NOT_THE_SOURCE_S = re.compile(
 )
 
 
-def read_json_lens(path: str | Path, *, f_number: float | None = None, catalogue: bool = True) -> Lens:
+def read_json_lens(path: str | Path, given: Given | None = None, *, catalogue: bool = True) -> Lens:
     """The lens of a JSON file, unfocused.
 
     Args:
-        f_number: nominal f-number for a file that states none (else it follows from the stop's diameter).
+        given: name and source that replace those of the file; f-number and half field for a file that states none.
         catalogue: set `Surface.glass` where the named glass is in the catalogue with the same figures; without it the
             figures of the file rule over all colours.
 
@@ -53,6 +55,9 @@ def read_json_lens(path: str | Path, *, f_number: float | None = None, catalogue
         InputError: the first mistake met; it names file, surface and field.
     """
     file = str(path)
+    given = given or Given()
+    if given.units not in (None, "mm"):
+        raise InputError(file, "--units", given.units, "mm, as the keys of the file say (or no --units)")
     data = _load(path)
     reject_unknown(file, "", data, KEYS)
     rows = data.get("surfaces", "(missing)")
@@ -69,16 +74,18 @@ def read_json_lens(path: str | Path, *, f_number: float | None = None, catalogue
         estimated = True
     stated = number(data, "f_number", file, above=0) if data.get("f_number") is not None else math.nan
     lens = Lens(
-        name=text(data, "name", file),
-        source=text(data, "source", file),
+        name=given.name or text(data, "name", file),
+        source=given.source or text(data, "source", file),
         surfaces=surfaces,
-        f_number=f_number if f_number is not None and math.isnan(stated) else stated,
+        f_number=given.f_number if given.f_number is not None and math.isnan(stated) else stated,
         designer=_optional_text(data, "designer", file),
         notes=notes,
         rims="estimated" if estimated else "source",
         path=file,
         **image_and_field(data, file),
     )
+    if lens.half_field_deg is None and given.half_field_deg is not None:
+        lens = replace(lens, half_field_deg=given.half_field_deg)
     lens = finish(lens, film_given=bool(surfaces[-1].thickness_mm))
     lens = stated_efl(lens, data)
     check_computed(lens, data)

@@ -91,6 +91,8 @@ def _round(block: Block, terms: tuple[tuple[int, float], ...]) -> dict[str, Any]
 
 def _toroidal(block: Block) -> dict[str, Any]:
     turn = block.parameter(1)
+    if turn == 0 and block.curvature == 0:
+        return {"radius_mm": math.inf}
     if turn == 0:
         return {"radius_mm": _radius(block.curvature), "conic": block.conic, "cylinder": "y"}
     if block.curvature == 0:

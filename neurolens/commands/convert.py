@@ -1,0 +1,162 @@
+"""`neurolens convert FILE -o lens.toml`: a lens file of another program in the project's own format."""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens.commands.arguments import add_json, between, positive
+from neurolens.commands.output import number, print_json
+from neurolens.errors import InputError, NeurolensWarning
+from neurolens.files import atomic_path
+
+if TYPE_CHECKING:
+    from neurolens.optics.prescription import Lens
+
+_DESCRIPTION = """\
+Read a lens file of another program and write it as a lens file of neurolens (.toml).
+
+Formats: Zemax (.zmx), CODE V (.seq), OSLO (.len, the simple ones), plain tables of four
+columns as in pbrt and appleseed (.dat, .txt), and JSON prescriptions. The content decides.
+What neurolens cannot hold or does not know is an error that names the line; what was left
+out, computed or assumed is printed as a warning. Needs the extra "train" (torch)."""
+_EPILOG = """\
+examples:
+  neurolens convert double_gauss.zmx -o lenses/double_gauss.toml
+  neurolens convert wide.22mm.dat -o wide.toml --name "Wide angle 22 mm" --source "Smith p. 360"
+  neurolens convert triplet.seq -o triplet.toml --half-field 20 --json"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser(
+        "convert", help="read a lens file of another program", description=_DESCRIPTION, epilog=_EPILOG
+    )
+    parser.add_argument("file", metavar="FILE", type=Path, help="lens file of another program")
+    parser.add_argument("-o", "--output", metavar="OUT.toml", type=Path, required=True, help="lens file to write")
+    parser.add_argument("--force", action="store_true", help="replace a file that is there")
+    group = parser.add_argument_group("what the file does not say")
+    group.add_argument("--name", help="name of the lens (default: the title in the file, else its file name)")
+    group.add_argument("--source", help="where the figures come from (default: the file's name)")
+    group.add_argument(
+        "--f-number", metavar="N", type=positive("an f-number"),
+        help="nominal f-number of a file without one (default: as the stop's diameter gives it)",
+    )  # fmt: skip
+    group.add_argument("--units", choices=("mm", "cm", "in", "m"), help="unit of lengths (default: the file's own, mm)")
+    group.add_argument(
+        "--half-field", metavar="DEG", type=between(1e-3, 179.0, "degrees"),
+        help="edge of the field from the axis, for rims that the file does not give (default: the file's own)",
+    )  # fmt: skip
+    group.add_argument(
+        "--gap-before", action="store_true", help="plain table: thickness is that in front of each surface (Kolb 1995)"
+    )
+    group.add_argument("--semi-diameters", action="store_true", help="plain table: the last column holds rim radii")
+    add_json(parser)
+    parser.set_defaults(run=run, kept="nothing is written but a finished lens file")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Convert one file and say what was read."""
+    check_output(args.output, args.force)
+    from neurolens.readers.any_format import read_any
+    from neurolens.readers.draft import Given
+
+    given = Given(
+        name=args.name,
+        source=args.source,
+        f_number=args.f_number,
+        units=args.units,
+        half_field_deg=args.half_field,
+        gap_before=args.gap_before,
+        semi_diameters=args.semi_diameters,
+    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", NeurolensWarning)
+        lens = read_any(args.file, given)
+        write_checked(lens, args.output)
+    told = [str(w.message).removeprefix(f"{args.file}: ") for w in caught if issubclass(w.category, NeurolensWarning)]
+    data = summary(lens, list(dict.fromkeys(told)))
+    data = {"file": str(args.file), "output": str(args.output), **data}
+    if args.json:
+        print_json(data)
+    else:
+        print(_text(data))
+    return 0
+
+
+def check_output(path: Path, force: bool) -> None:
+    """Refuse a file that could not be written, or that is there, before any work is done for it.
+
+    Raises:
+        InputError: another suffix, no such folder, a file that is there and no --force.
+    """
+    if path.suffix.lower() != ".toml":
+        raise InputError(path, "--output", path.suffix or "(no suffix)", ".toml")
+    if not path.parent.is_dir():
+        raise InputError(path, "--output", str(path.parent), "a folder that exists")
+    if path.exists() and not force:
+        raise InputError(path, "--output", "(a file that is there)", "a new file, or --force to replace it")
+
+
+def write_checked(lens: Lens, path: Path) -> None:
+    """Write a lens file, and keep it only if it reads back to the same lens.
+
+    Raises:
+        InputError: it does not; names the file to be written and what was wrong.
+    """
+    from neurolens.optics.lensfile import read_lens
+    from neurolens.optics.lenswriter import format_lens
+
+    with atomic_path(path) as temporary:
+        temporary.write_text(format_lens(lens), encoding="utf-8")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NeurolensWarning)  # said by the reader of the other format
+            try:
+                back = read_lens(temporary)
+            except InputError as error:
+                raise InputError(path, error.field, error.value, error.expected) from None
+        if replace(back, path=lens.path) != lens:
+            raise InputError(path, "content", "(another lens when read back)", "the lens that was read")
+
+
+def summary(lens: Lens, told: list[str]) -> dict[str, Any]:
+    """What was read, for people and for --json; mm."""
+    from neurolens.optics.paraxial import first_order
+    from neurolens.readers.assemble import is_anamorphic, meridian
+
+    data = first_order(meridian(lens, "y"))
+    across = first_order(meridian(lens, "x")) if is_anamorphic(lens) else None
+    return {
+        "name": lens.name,
+        "source": lens.source,
+        "surfaces": len(lens.surfaces),
+        "stop_surface": lens.stop_index,
+        "efl_mm": data.efl_mm,
+        "efl_x_mm": across and across.efl_mm,
+        "back_focus_mm": data.back_focus_mm,
+        "film_gap_mm": float(lens.surfaces[-1].thickness_mm),
+        "f_number": data.f_number,
+        "stated_f_number": lens.f_number,
+        "rims": lens.rims,
+        "configurations": [c.name for c in lens.configurations],
+        "warnings": told,
+    }
+
+
+def _text(data: dict[str, Any]) -> str:
+    across = "" if data["efl_x_mm"] is None else f" (in y; {number(data['efl_x_mm'], 6)} mm in x)"
+    lines = [
+        data["name"],
+        data["source"],
+        f"surfaces      {data['surfaces']}, stop on {data['stop_surface']}; rims: {data['rims']}",
+        f"focal length  {number(data['efl_mm'], 6)} mm{across}",
+        f"back focus    {number(data['back_focus_mm'], 6)} mm; film tabled at {number(data['film_gap_mm'], 6)} mm",
+        f"f-number      f/{number(data['f_number'])}, stated f/{number(data['stated_f_number'])}",
+    ]
+    if data["configurations"]:
+        lines.append(f"states        {', '.join(data['configurations'])}")
+    lines += [f"warning: {text}" for text in data["warnings"]]
+    return "\n".join([*lines, f"written to {data['output']}"])

@@ -1,0 +1,77 @@
+"""One door for every lens file: the format is told by the suffix and checked against the content."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from neurolens.errors import InputError
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens
+from neurolens.readers.codev import looks_like_seq, read_seq
+from neurolens.readers.draft import Given
+from neurolens.readers.json_lens import looks_like_json, read_json_lens
+from neurolens.readers.oslo import looks_like_len, read_len
+from neurolens.readers.source import decode, read_bytes
+from neurolens.readers.tables import looks_like_table, read_table
+from neurolens.readers.zemax import looks_like_zmx, read_zmx
+
+_HEAD = 20_000  # characters from which a format is told
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format that lenses are read from."""
+
+    name: str
+    suffixes: tuple[str, ...]
+    read: Callable[[str | Path, Given], Lens]
+    looks_like: Callable[[str], bool]
+
+
+FORMATS = (
+    Format("Zemax", (".zmx",), read_zmx, looks_like_zmx),
+    Format("OSLO", (".len", ".osl"), read_len, looks_like_len),
+    Format("CODE V", (".seq",), read_seq, looks_like_seq),
+    Format("JSON", (".json",), read_json_lens, looks_like_json),
+    Format("lens table", (".dat", ".txt", ".lens"), read_table, looks_like_table),
+)
+
+
+def read_any(path: str | Path, given: Given | None = None) -> Lens:
+    """The lens of a file in any format that neurolens reads, its own TOML too.
+
+    The content decides: a suffix only helps where the content tells nothing.
+
+    Args:
+        given: what the user says where the file does not (name, source, f-number, units).
+
+    Raises:
+        InputError: a file in no known format, or the mistake in it; names file and line.
+    """
+    given = given or Given()
+    if Path(path).suffix.lower() == ".toml":
+        return read_lens(path)
+    found = format_of(path)
+    for option, said in (("--gap-before", given.gap_before), ("--semi-diameters", given.semi_diameters)):
+        if said and found.read is not read_table:
+            raise InputError(path, option, f"(a {found.name} file)", "a plain table: other formats say what they hold")
+    return found.read(path, given)
+
+
+def format_of(path: str | Path) -> Format:
+    """The format of a file, by its content, else by its suffix.
+
+    Raises:
+        InputError: neither tells.
+    """
+    head = decode(read_bytes(path), path)[:_HEAD]
+    suffix = Path(path).suffix.lower()
+    by_content = next((f for f in FORMATS if f.looks_like(head)), None)
+    by_suffix = next((f for f in FORMATS if suffix in f.suffixes), None)
+    found = by_content or by_suffix
+    if found is None:
+        known = ", ".join(f"{f.name} ({', '.join(f.suffixes)})" for f in FORMATS)
+        raise InputError(path, "format", suffix or "(no suffix)", f"one of {known}, or a lens file (.toml)")
+    return found

@@ -1,0 +1,242 @@
+"""CODE V sequence files (.seq): one lens written as commands, S lines with radius (or curvature), thickness, glass.
+
+Three letters name a command. What is not known here is an error that names command and line.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from neurolens.errors import InputError
+from neurolens.optics.lensrows import MAX_SURFACES
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.readers.assemble import UNKNOWN
+from neurolens.readers.codev_shapes import LETTERS, NONE_BUT_0, Block, shape_of
+from neurolens.readers.codev_text import Command, commands, medium, private_glass
+from neurolens.readers.codev_zoom import Zoom
+from neurolens.readers.draft import Draft, Given, Row, lens_of
+from neurolens.readers.source import read_lines, warn
+
+UNITS = {"M": "mm", "C": "cm", "I": "in"}
+INFINITE = 1e9
+FIELDS = ("XAN", "YAN", "XIM", "YIM", "XRI", "YRI", "XOB", "YOB")
+# Settings, weights, wavelengths, labels, control codes of variables, tolerances.
+IGNORED = frozenset(
+    """LEN WL REF WTW WTF WTA INI DOR TEM PRE DER UID SLB GO END CCY CCX THC GLC KC AC BC CC DC EC FC GC HC JC DLT
+    DLN DLF DLR IRR""".split()
+)
+VIGNETTING = frozenset(["VUX", "VLX", "VUY", "VLY"])
+READ = (
+    *("S", "SO", "SI", "RDM", "TIT", "DIM", "EPD", "FNO", *FIELDS, "RDY", "CUY", "RDX", "CUX", "THI", "GLA", "STO"),
+    *("SPH", "CON", "ASP", "CYL", "YTO", "XTO", "K", *LETTERS, *NONE_BUT_0, "CIR", "PIM", "PRV", "ZOO"),
+)
+
+
+@dataclass
+class File:
+    """A file while it is read."""
+
+    path: str
+    blocks: list[Block] = field(default_factory=list)
+    closed: bool = False  # whether the image has come
+    zoom: Zoom = field(default_factory=Zoom)
+    radii: bool | None = None
+    title: str = ""
+    unit: str | None = None
+    pupil: float | None = None
+    f_number: float | None = None
+    fields: dict[str, list[float]] = field(default_factory=dict)
+    private: dict[str, dict[str, Any]] = field(default_factory=dict)
+    private_nm: list[float] | None = None
+    ignored: Counter[str] = field(default_factory=Counter)
+
+
+def read_seq(path: str | Path, given: Given | None = None) -> Lens:
+    """The lens of a CODE V sequence file.
+
+    Raises:
+        InputError: see the module; also tilts, mirrors, tori and everything else that the lens model cannot hold.
+    """
+    file = File(str(path))
+    for command in commands(read_lines(path)):
+        if file.private_nm is not None:
+            _private(file, command)
+        elif command.name == "ZOO":
+            file.zoom.read(command, len(file.blocks))
+        elif command.name in IGNORED:
+            pass
+        elif command.name in VIGNETTING:
+            file.ignored["vignetting factors (rims decide)"] += any(command.numbers(least=0))
+        elif not _system(file, command):
+            _surface(file, command)
+    if not file.closed:
+        raise InputError(file.path, "SI", "(missing)", "an image surface at the end of the lens")
+    return lens_of(_draft(file), given)
+
+
+def looks_like_seq(head: str) -> bool:
+    """Whether the beginning of a text is that of a CODE V file."""
+    first = [line.replace(";", " ").split()[0].upper() for line in head.splitlines() if line.replace(";", " ").split()]
+    return bool({"RDM", "LEN"} & set(first)) and "NEW" not in head.upper().split()[:3]
+
+
+def _private(file: File, command: Command) -> None:
+    """Inside PRV: PWL gives wavelengths, each row a glass by its name; END closes."""
+    if command.name == "END":
+        file.private_nm = None
+    elif command.name == "PWL":
+        file.private_nm = command.numbers()
+    elif not file.private_nm:
+        raise command.line.error("PRV", command.name, "PWL and wavelengths before the glasses")
+    else:
+        file.private[command.word] = {**private_glass(command, file.private_nm), "material": command.word}
+        warn(file.path, f"private glass {command.word} is reduced to n_d and V_d")
+
+
+def _system(file: File, command: Command) -> bool:
+    """Carry out a command of the whole system; False where it is none."""
+    name, words, line = command.name, command.words, command.line
+    match name:
+        case "RDM":
+            file.radii = not (words and words[0].upper() in ("N", "NO"))
+        case "TIT" if words and words[0].upper().startswith("Z") and words[0][1:].isdecimal():
+            file.zoom.title(command)
+        case "TIT":
+            file.title = " ".join(words).strip("\"' ")
+        case "DIM":
+            unit = words[0].upper()[:1] if words else ""
+            if unit not in UNITS:
+                raise line.error("DIM", unit, "M (mm), C (cm) or I (inch)")
+            file.unit = UNITS[unit]
+        case "EPD" | "FNO":
+            value = command.numbers()[0]
+            if value <= 0:
+                raise line.error(name, value, "a number above 0")
+            file.pupil, file.f_number = (value, None) if name == "EPD" else (None, value)
+        case "PRV":
+            file.private_nm = []
+        case _ if name in FIELDS:
+            file.fields[name] = command.numbers()
+        case _:
+            return False
+    return True
+
+
+def _surface(file: File, command: Command) -> None:
+    name, words, line = command.name, command.words, command.line
+    if name in ("S", "SO", "SI"):
+        _new_surface(file, command)
+        return
+    if name not in READ:
+        raise line.unknown(name, READ)
+    block = file.blocks[-1] if file.blocks else None
+    if words and words[0].upper()[:1] == "S" and (words[0][1:].isdecimal() or words[0].upper() in ("SO", "SI")):
+        block, words = _named(file, command), words[1:]
+        if words and words[0].upper().startswith("Z") and name == "THI":
+            file.zoom.one_thickness(command, len(file.blocks))
+            return
+    if block is None:
+        raise line.error(name, " ".join(words), "a surface (SO or S) before it")
+    match name:
+        case "STO":
+            block.stop = True
+        case "SPH" | "CON" | "ASP" | "CYL" | "YTO" | "XTO":
+            block.kind = name
+        case "PIM":
+            block.solved = True
+        case "GLA":
+            block.medium = medium(command, words, file.private)
+        case "CIR":
+            if words[:1] and words[0].upper() == "EDG":
+                return
+            if words[:1] and words[0].upper() in ("OBS", "HOL"):
+                raise line.error("CIR", words[0], "a round opening without a hole")
+            block.semi_diameter = command.numbers(words)[0]
+        case _:
+            block.put(command, command.numbers(words)[0])
+
+
+def _named(file: File, command: Command) -> Block:
+    """The surface that the first word of a command names: Sk, SO or SI."""
+    word = command.words[0].upper()
+    place = {"SO": 0, "SI": len(file.blocks) - 1}.get(word, int(word[1:]) if word[1:].isdecimal() else -1)
+    if not 0 <= place < len(file.blocks):
+        raise command.line.error(command.name, word, f"a surface from S0 to S{len(file.blocks) - 1}")
+    return file.blocks[place]
+
+
+def _new_surface(file: File, command: Command) -> None:
+    """S, SO or SI: radius or curvature, thickness, medium."""
+    name, line = command.name, command.line
+    if (name == "SO") != (not file.blocks) or file.closed:
+        raise line.error(name, "(here)", "one object SO, then surfaces S, then one image SI")
+    if len(file.blocks) > MAX_SURFACES + 1:
+        raise line.error(name, f"({len(file.blocks)} surfaces)", f"at most {MAX_SURFACES} surfaces")
+    numbers = command.numbers(command.words[:2], 2)
+    if file.radii is None and numbers[0] != 0:
+        raise line.error(name, numbers[0], "RDM (radii) or RDM N (curvatures) before it: this may be either")
+    first = numbers[0]
+    block = Block(line, curvature=first if not (file.radii and first) else 1 / first, thickness=numbers[1])
+    if name == "SO" and block.thickness >= INFINITE:
+        block.thickness = math.inf
+    block.medium = medium(command, command.words[2:], file.private)
+    file.blocks.append(block)
+    file.closed = name == "SI"
+
+
+def _draft(file: File) -> Draft:
+    first, *middle, image = file.blocks
+    if not middle:
+        raise InputError(file.path, "S", "(no surface)", "at least one surface between object and image")
+    if image.curvature:
+        warn(file.path, "the image surface is curved; the film is taken as plane")
+    for text, count in file.ignored.items():
+        if count:
+            warn(file.path, f"{text} ({count})")
+    # The image lies off the last thickness by the thickness of SI: a defocus.
+    middle[-1].thickness += image.thickness
+    rows = []
+    for k, block in enumerate(middle):
+        diameter = UNKNOWN if math.isnan(block.semi_diameter) else 2 * block.semi_diameter
+        if block.solved and block is not middle[-1]:
+            raise block.start.error("PIM", f"(on surface {k + 1})", "the last surface")
+        surface = Surface(
+            thickness_mm=block.thickness,
+            diameter_mm=diameter,
+            stop=block.stop,
+            **shape_of(block),
+            **block.medium,
+        )
+        rows.append(Row(surface, aperture=not math.isnan(diameter)))
+    angles, heights = (_edge(file, pairs) for pairs in ((("XAN", "YAN"),), (("XIM", "YIM"), ("XRI", "YRI"))))
+    if _edge(file, (("XOB", "YOB"),)) and not angles:
+        warn(file.path, "the field is given as an object height: left out")
+    return Draft(
+        file=file.path,
+        kind="CODE V",
+        rows=tuple(rows),
+        name=file.title,
+        states=tuple(file.zoom.states(middle, first.thickness, image.thickness)),
+        pupil=file.pupil,
+        f_number=file.f_number,
+        object_distance=first.thickness,
+        film_given=not (middle[-1].solved and middle[-1].thickness == image.thickness),
+        unit=file.unit,
+        half_field_deg=angles,
+        image_radius=heights,
+    )
+
+
+def _edge(file: File, pairs: tuple[tuple[str, str], ...]) -> float | None:
+    """The field point farthest from the axis; None where the file has none of that kind."""
+    far = 0.0
+    for x, y in pairs:
+        across, up = file.fields.get(x, []), file.fields.get(y, [])
+        longest = max(len(across), len(up))
+        across, up = across + [0.0] * (longest - len(across)), up + [0.0] * (longest - len(up))
+        far = max([far, *(math.hypot(a, b) for a, b in zip(across, up, strict=True))])
+    return far or None

@@ -1,0 +1,204 @@
+"""OSLO lens files (.len): the simple ones, with a sphere or conic asphere of four terms a surface and round openings.
+
+"LEN NEW name focal-length surfaces", settings, then the surfaces, object first, each ended by NXT, the image by END.
+Radii (RD) or curvatures (CV), thickness to the next (TH), semi-diameters (AP), entrance beam radius (EBR), half field
+(ANG, degrees). What is not known here is an error that names command and line.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from neurolens.errors import InputError
+from neurolens.optics.lensrows import MAX_SURFACES
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.readers.assemble import UNKNOWN, named_glass
+from neurolens.readers.draft import Draft, Given, Row, lens_of
+from neurolens.readers.source import UNITS_MM, Line, read_lines
+
+INFINITE = 1e9
+TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}
+# Designer, wavelengths and weights, settings of the program.
+IGNORED = frozenset("DES WV WW CALLBACK GPRT".split())
+READ = (
+    *("LEN", "EBR", "ANG", "UNI", "NXT", "END", "AIR", "GLA", "RD", "CV", "TH", "AP", "AST", "CC", *TERMS, "PY"),
+    *("SNO1", "NOT"),
+)
+
+
+@dataclass
+class Block:
+    """One surface while it is read, in the file's unit."""
+
+    start: Line
+    values: dict[str, float] = field(default_factory=dict)
+    medium: dict[str, Any] = field(default_factory=dict)
+    semi_diameter: float = UNKNOWN
+    checked: bool = False
+    stop: bool = False
+    solved: bool = False
+
+
+@dataclass
+class File:
+    """A file while it is read."""
+
+    path: str
+    blocks: list[Block] = field(default_factory=list)
+    name: str = ""
+    notes: list[str] = field(default_factory=list)
+    unit: str | None = None
+    beam: float | None = None
+    angle: float | None = None
+    begun: bool = False
+    ended: bool = False
+
+
+def read_len(path: str | Path, given: Given | None = None) -> Lens:
+    """The lens of an OSLO file.
+
+    Raises:
+        InputError: see the module; also solves and pickups that are not carried out in the file.
+    """
+    file = File(str(path))
+    for line in read_lines(path):
+        for part in _parts(line.text):
+            _read(file, Line(line.file, line.number, part))
+    if not file.ended:
+        raise InputError(file.path, "END", "(missing)", "END and the number of the image surface")
+    if len(file.blocks) < 3:
+        raise InputError(file.path, "NXT", f"({len(file.blocks)} surfaces)", "object, at least one surface, and image")
+    return lens_of(_draft(file), given)
+
+
+def looks_like_len(head: str) -> bool:
+    """Whether the beginning of a text is that of an OSLO file."""
+    return re.search(r"^\s*LEN\s+NEW\b", head, re.IGNORECASE | re.MULTILINE) is not None
+
+
+def _parts(text: str) -> list[str]:
+    """The commands of a line: "//" begins a comment, ";" ends a command, both only outside quotes."""
+    bare = re.match(r'(?:[^"/]|"[^"]*"|/(?!/))*', text)
+    parts = re.findall(r'(?:[^";]|"[^"]*")+', bare[0] if bare else text)
+    return [part.strip() for part in parts if part.strip()]
+
+
+def _read(file: File, line: Line) -> None:
+    word, rest = line.words[0].upper(), line.words[1:]
+    if word == "LEN":
+        quoted = re.search('"([^"]*)"', line.text)
+        file.name, file.begun = quoted[1] if quoted else "", True
+        file.blocks.append(Block(line))
+    elif not file.begun or file.ended:
+        raise line.error(word, "(here)", "commands between LEN NEW and END: configurations and the rest are not read")
+    elif word in IGNORED:
+        pass
+    elif re.fullmatch("SNO[0-9]*|NOT[0-9]*", word):
+        file.notes.append(" ".join(rest).strip('"'))
+    elif not _system(file, line, word, rest):
+        _surface(file, line, word, rest)
+
+
+def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:
+    match word:
+        case "EBR" | "ANG":
+            value = line.numbers(word, rest[:1])[0]
+            if value < 0 or (word == "EBR" and value == 0):
+                raise line.error(word, value, "a number above 0")
+            file.beam, file.angle = (value, file.angle) if word == "EBR" else (file.beam, value)
+        case "UNI":
+            mm = line.numbers(word, rest[:1])[0]
+            file.unit = next((name for name, value in UNITS_MM.items() if value == mm), None)
+            if file.unit is None:
+                raise line.error(word, mm, "1 (mm), 10 (cm), 25.4 (inch) or 1000 (m)")
+        case "NXT":
+            if len(file.blocks) > MAX_SURFACES + 1:
+                raise line.error(word, f"({len(file.blocks)} surfaces)", f"at most {MAX_SURFACES} surfaces")
+            file.blocks.append(Block(line))
+        case "END":
+            file.ended = True
+            if rest and line.numbers(word, rest[:1])[0] != len(file.blocks) - 1:
+                raise line.error(word, rest[0], f"{len(file.blocks) - 1}, the number of the image surface")
+        case _:
+            return False
+    return True
+
+
+def _surface(file: File, line: Line, word: str, rest: list[str]) -> None:
+    block = file.blocks[-1]
+    match word:
+        case "AIR":
+            block.medium = {}
+        case "GLA":
+            block.medium = _glass(line, rest)
+        case "AP":
+            block.checked = rest[:1] == ["CHK"]
+            semi = line.numbers(word, rest[1:2] if block.checked else rest[:1])[0]
+            block.semi_diameter = semi if semi > 0 else UNKNOWN
+        case "AST":
+            block.stop = True
+        case "PY":
+            if line.numbers(word, rest[:1])[0] != 0:
+                raise line.error(word, rest[0], "0: the film in the paraxial image")
+            block.solved = True
+        case "RD" | "CV" | "TH" | "CC":
+            block.values[word] = line.numbers(word, rest[:1])[0]
+        case _ if word in TERMS:
+            block.values[word] = line.numbers(word, rest[:1])[0]
+        case _:
+            raise line.unknown(word, READ)
+
+
+def _glass(line: Line, rest: list[str]) -> dict[str, Any]:
+    """GLA name of the catalogue, or one index."""
+    if not rest:
+        raise line.error("GLA", "(nothing)", "the name of a glass, or an index")
+    if re.fullmatch(r"[0-9.]+", rest[0]):
+        indices = line.numbers("GLA", rest)
+        if len(indices) > 1:
+            raise line.error("GLA", " ".join(rest), "one index, or the name of a glass in the catalogue")
+        return {"n_d": indices[0]}
+    if rest[0].upper() in ("REFL", "RFL", "REFLECT"):
+        raise line.error("GLA", rest[0], "a glass: the lens model has no mirrors")
+    return named_glass(rest[0], line.file, f"line {line.number}, GLA")
+
+
+def _draft(file: File) -> Draft:
+    first, *middle, _ = file.blocks
+    for k, block in enumerate(middle, start=1):
+        if block.solved and block is not middle[-1]:
+            raise block.start.error("PY", f"(on surface {k})", "the last surface")
+    distance = first.values.get("TH", 0.0)
+    last = middle[-1]
+    return Draft(
+        file=file.path,
+        kind="OSLO",
+        rows=tuple(Row(_surface_of(block), aperture=block.checked) for block in middle),
+        name=file.name,
+        notes="\n".join(file.notes),
+        pupil=None if file.beam is None else 2 * file.beam,
+        half_field_deg=file.angle if file.angle and 1e-3 < file.angle < 90 else None,
+        object_distance=math.inf if distance >= INFINITE else distance,
+        film_given=not (last.solved and "TH" not in last.values),
+        unit=file.unit,
+    )
+
+
+def _surface_of(block: Block) -> Surface:
+    values = block.values
+    curvature = values.get("CV", 0.0)
+    radius = values.get("RD") or (1 / curvature if curvature else math.inf)
+    terms = {TERMS[name]: value for name, value in values.items() if name in TERMS and value}
+    return Surface(
+        radius_mm=radius,
+        thickness_mm=values.get("TH", 0.0),
+        diameter_mm=2 * block.semi_diameter,
+        stop=block.stop,
+        conic=values.get("CC", 0.0) if math.isfinite(radius) else 0.0,
+        asphere=tuple(sorted(terms.items())),
+        **block.medium,
+    )
