@@ -2,6 +2,7 @@
 
 base (errors, status, files, tomlfile, config, progress, focus, modelfile)
 base <- optics <- surrogates <- evaluate <- commands <- cli
+        optics <- analysis   <- evaluate
      <- cameras <- render    <- evaluate
 """
 
@@ -23,17 +24,19 @@ BASE = {"errors", "status", "files", "tomlfile", "config", "progress", "focus", 
 PARTS = {
     "optics": set(),
     "readers": {"optics"},
+    "analysis": {"optics"},
     "surrogates": {"optics"},
     "cameras": set(),
     "render": {"cameras"},
-    "evaluate": {"optics", "readers", "surrogates", "cameras", "render"},
-    "commands": {"optics", "readers", "surrogates", "cameras", "render", "evaluate"},
+    "evaluate": {"optics", "analysis", "readers", "surrogates", "cameras", "render"},
+    "commands": {"optics", "analysis", "readers", "surrogates", "cameras", "render", "evaluate"},
     "cli": {"commands"},
 }
 # Packages from elsewhere that each part may import; what is not listed here is not restricted.
 PACKAGES = {
     "base": {"numpy"},
     "optics": {"numpy", "torch"},
+    "analysis": {"numpy", "torch", "matplotlib"},
     "readers": set(),
     "cameras": {"numpy", "onnxruntime"},
     "render": {"numpy", "OpenEXR", "PIL"},

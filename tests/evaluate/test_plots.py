@@ -51,7 +51,7 @@ def biconvex(**changes: Any) -> dict[str, Any]:
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Every figure made, so that a test can read its axes."""
     made: list[Any] = []
-    for module in (plots.__name__, "plots_trade", "plots_lens", "plots_image"):
+    for module in (plots.__name__, "plots_trade", "plots_image", "neurolens.analysis.plot_layout"):
         name = module if module.startswith("neurolens") else f"neurolens.evaluate.{module}"
         if hasattr(__import__(name, fromlist=["x"]), "new_figure"):
             monkeypatch.setattr(

@@ -1,0 +1,179 @@
+"""Fields of view: chief rays from the scene, where they meet the film, and which field reaches its edge.
+
+A field is an angle from the axis in degrees in one meridional plane, that of the chief ray (through the middle of the
+stop) in front of the lens. The light comes from the positive side of the plane's axis, so that its image lies on the
+negative side; image heights are given with the sign turned, positive.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neurolens.analysis.results import Array
+from neurolens.errors import InputError
+from neurolens.optics.aiming import Axis, aim_at_stop, without_rims
+from neurolens.optics.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
+from neurolens.optics.paraxial import FirstOrder, first_order
+from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import image_radius_mm
+from neurolens.optics.surfaces import Rays
+from neurolens.optics.trace import trace
+
+__all__ = ["DEFAULT_NM", "WIDE_DEG", "Axis", "ChiefRays", "Scene"]
+
+DEFAULT_NM = (LINE_D_NM, LINE_F_NM, LINE_C_NM)  # the first is the reference of the others
+
+# Half field from which a lens counts as a wide one: near objects then lie on a sphere, not on a plane.
+WIDE_DEG = 60.0
+
+_FRACTIONS = (0.0, 0.5, 0.7, 0.85, 1.0)
+_SEARCH = 121  # fields tried for the edge of the film
+
+
+@dataclass(frozen=True)
+class ChiefRays:
+    """Chief rays of F fields, traced as if no rim were in the way.
+
+    Attributes:
+        start: [F] just before the front surface, travelling to the film.
+        exists: [F] bool; False where no ray of this field meets the middle of the stop.
+        height_mm: [F] image height, positive.
+        film: [F] rays on the film.
+    """
+
+    start: Rays
+    exists: Tensor
+    height_mm: Tensor
+    film: Rays
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A lens in a state, with the object it looks at.
+
+    Attributes:
+        lens: placed by `Lens.at`; where it is not, the table's last thickness places the film.
+        focus_m: distance from the film to the object, inf allowed. An object of a lens of less than 60 degrees half
+            field is a plane across the axis; of a wider one a sphere about the entrance pupil.
+        axis: transverse axis of the meridional plane; matters for anamorphic lenses only.
+    """
+
+    lens: Lens
+    focus_m: float = math.inf
+    axis: Axis = "y"
+
+    @property
+    def film_z_mm(self) -> float:
+        return float(self.lens.film_z_mm if self.lens.film_z_mm is not None else self.lens.vertices_mm[-1])
+
+    @property
+    def first_order(self) -> FirstOrder:
+        return first_order(self.lens)
+
+    @property
+    def object_z_mm(self) -> float:
+        """z of the object on the axis, mm; -inf for a distant one."""
+        return self.film_z_mm - 1000 * self.focus_m
+
+    def chief_rays(self, field_deg: Sequence[float] | Tensor | Any, wavelength_nm: float = LINE_D_NM) -> ChiefRays:
+        """Chief rays of fields in degrees, 0 to below 180."""
+        angles = torch.deg2rad(torch.as_tensor(field_deg, dtype=torch.float64).reshape(-1))
+        found = aim_at_stop(
+            self.lens, angles, torch.zeros(len(angles), 1, dtype=torch.float64), axis=self.axis,
+            wavelength_nm=wavelength_nm,
+        )  # fmt: skip
+        with torch.no_grad():
+            out = trace(without_rims(self.lens), found.rays, wavelength_nm, towards="film")
+        exists = found.reached[:, 0] & (out.status == 0)
+        film = on_plane(out.rays, self.film_z_mm)
+        height = -(film.x if self.axis == "x" else film.y)
+        return ChiefRays(found.rays, exists, torch.where(exists, height, math.nan), film)
+
+    def object_points(self, chief: Rays) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Where the chief rays leave the object, [F] each, mm; None for a distant object."""
+        if math.isinf(self.focus_m):
+            return None
+        if self.wide:
+            centre = self.first_order.entrance_pupil_z_mm
+            radius = centre - self.object_z_mm
+            # The sphere's far meeting with the ray run backwards: |p - c + t d| = radius.
+            z = chief.z - centre
+            b = chief.x * chief.dx + chief.y * chief.dy + z * chief.dz
+            t = -b - torch.sqrt(b * b - (chief.x**2 + chief.y**2 + z * z - radius * radius))
+        else:
+            t = (self.object_z_mm - chief.z) / chief.dz
+        return chief.x + t * chief.dx, chief.y + t * chief.dy, chief.z + t * chief.dz
+
+    @property
+    def wide(self) -> bool:
+        return (self.lens.half_field_deg or 0.0) >= WIDE_DEG
+
+    def edge_deg(self) -> float:
+        """The widest field: that whose chief ray meets the edge of the image circle, at most the stated half field.
+
+        Raises:
+            InputError: a lens that forms no image, or one whose chief rays do not exist off the axis.
+        """
+        return _edge_deg(self)
+
+    def default_fields(self) -> tuple[float, ...]:
+        """The axis, 50%, 70%, 85% and the edge of the field, degrees."""
+        edge = self.edge_deg()
+        return tuple(f * edge for f in _FRACTIONS)
+
+    def heights(self, to_deg: float) -> tuple[Array, Array]:
+        """Fields in degrees from the axis to `to_deg`, or to where chief rays end or turn back, and image heights."""
+        angles = np.linspace(0, to_deg, _SEARCH)
+        height = self.chief_rays(angles).height_mm.numpy()
+        sound = np.isfinite(height) & np.concatenate([[True], np.diff(height) > 0])
+        count = _SEARCH if sound.all() else int(np.argmin(sound))
+        return angles[:count], height[:count]
+
+    def fields_at(self, height_mm: Sequence[float]) -> list[float]:
+        """Fields in degrees whose chief rays meet the film at these heights; NaN for one that none reaches."""
+        angles, height = self.heights((self.lens.half_field_deg or 85.0) * 1.05)
+        if len(angles) < 2:
+            return [0.0 if h == 0 else math.nan for h in height_mm]
+        found = np.interp(height_mm, height, angles)
+        # The end of the search forgives rounding, no more.
+        return [float(f) if h <= height[-1] * 1.001 else math.nan for h, f in zip(height_mm, found, strict=True)]
+
+    @property
+    def open(self) -> Scene:
+        """The same scene with every rim but the stop's as wide as its surface goes: where rays would go."""
+        rows = self.lens.surfaces
+        wide = tuple(s if s.stop else replace(s, diameter_mm=math.inf) for s in rows)
+        return replace(self, lens=replace(self.lens, surfaces=wide))
+
+    def check(self) -> None:
+        """Raise InputError for a lens that forms no image on a film."""
+        focal = self.first_order.efl_mm
+        if focal <= 0:
+            raise InputError(self.lens.path, "efl_mm", f"{focal:.4g}", "a lens that forms an image (EFL above 0)")
+
+
+def on_plane(rays: Rays, z_mm: float) -> Rays:
+    """Rays moved along themselves to the plane at z."""
+    t = (z_mm - rays.z) / rays.dz
+    return rays._replace(x=rays.x + t * rays.dx, y=rays.y + t * rays.dy, z=torch.full_like(rays.z, z_mm))
+
+
+@lru_cache(maxsize=16)
+def _edge_deg(scene: Scene) -> float:
+    scene.check()
+    lens, stated = scene.lens, scene.lens.half_field_deg
+    angles, height = scene.heights(min(stated * 1.02 if stated else 89.0, 179.0))
+    if len(angles) < 2:
+        raise InputError(lens.path, "half_field_deg", stated, "a lens with chief rays off the axis")
+    if stated and lens.image_radius_mm is None:
+        return float(min(stated, angles[-1]))
+    edge = float(np.interp(image_radius_mm(lens)[0], height, angles))
+    return min(edge, stated) if stated else edge
