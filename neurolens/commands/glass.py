@@ -1,0 +1,79 @@
+"""`neurolens glass NAME`: what the glass catalogue knows of a name or of a six-digit code."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from typing import TYPE_CHECKING, Any
+
+from neurolens.commands.arguments import add_json
+from neurolens.commands.output import number, print_json, table
+
+if TYPE_CHECKING:
+    from neurolens.optics.dispersion import Glass
+
+_DESCRIPTION = """\
+Look glasses up in the catalogue that ships with neurolens: index, Abbe number, the
+wavelengths that the maker states the index for, and what 10 mm transmit inside (without
+reflections). A name gives the glass of every maker that has one of that name, the one that a
+lens file gets first; a six-digit code (517642) the glasses nearest to it. Needs the extra
+"train" (torch)."""
+_EPILOG = """\
+examples:
+  neurolens glass N-BK7 "F2 (CDGM)" PMMA
+  neurolens glass 517642 --json"""
+_CODE = re.compile(r"[0-9]{3}[./]?[0-9]{3}")
+_TRANSMITTED_NM = (400.0, 450.0, 550.0, 700.0)
+_PLATE_MM = 10.0
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser(
+        "glass", help="look glasses up by name or code", description=_DESCRIPTION, epilog=_EPILOG
+    )
+    parser.add_argument("name", metavar="NAME", nargs="+", help='"N-BK7", "Schott:N-BK7", or a code such as 517642')
+    add_json(parser)
+    parser.set_defaults(run=run, kept="nothing is written")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the glasses asked for."""
+    from neurolens.optics import catalogue
+
+    found: list[Glass] = []
+    for name in args.name:
+        if _CODE.fullmatch(name):
+            found += catalogue.by_code(name, 6)
+        else:
+            catalogue.find(name, "argument", "NAME")
+            found += catalogue.same_name(name)
+    rows = [_record(glass) for glass in dict.fromkeys(found)]
+    if args.json:
+        print_json({"glasses": rows})
+        return 0
+    header = ("glass", "n_d", "V_d", "nm from", "to", *(f"10 mm at {nm:.0f} nm" for nm in _TRANSMITTED_NM))
+    lines = [
+        [
+            *(row["glass"], f"{row['n_d']:.6f}", f"{row['V_d']:.2f}", *(number(v) for v in row["range_nm"])),
+            *(number(row["internal_transmittance_10mm"].get(f"{nm:.0f}")) for nm in _TRANSMITTED_NM),
+        ]
+        for row in rows
+    ]
+    print(table(header, lines))
+    return 0
+
+
+def _record(glass: Glass) -> dict[str, Any]:
+    """Figures of one glass; internal transmittance by wavelength in nm, empty where the source has none."""
+    absorption = {nm: glass.absorption_per_mm(nm) for nm in _TRANSMITTED_NM if glass.absorption}
+    return {
+        "glass": str(glass),
+        "n_d": glass.n_d,
+        "V_d": glass.V_d,
+        "range_nm": [1000 * v for v in glass.range_um],
+        "form": glass.form,
+        "coefficients": glass.coefficients,
+        "internal_transmittance_10mm": {f"{nm:.0f}": math.exp(-_PLATE_MM * a) for nm, a in absorption.items()},
+    }
