@@ -47,6 +47,7 @@ def all_cases(lenses: Path, count: int) -> Iterator[Case]:
     yield from near_equal_indices(count)
     yield from wavelengths(lenses, count)
     yield from object_distances(lenses, count)
+    yield from shapes(count)
     yield from library(lenses, count)
 
 
@@ -145,19 +146,33 @@ def wavelengths(lenses: Path, count: int) -> Iterator[Case]:
 
 
 def object_distances(lenses: Path, count: int) -> Iterator[Case]:
-    """Light from points at 1e-6 mm to 1e6 m in front of the front rim's plane, towards the whole front surface."""
+    """Light from points 1e-6 mm to 1e6 m away, along the ray, from where it enters the front surface."""
     lens = read_lens(lenses / f"{DOUBLE_GAUSS}.toml").at()
     for distance_mm in (1e-6, 1e-3, 1.0, 1e3, 1e6, 1e9):
         g = generator()
-        radius = lens.surfaces[0].semi_diameter_mm
-        x, y = disc(g, count, radius)
-        z = sag(float(lens.surfaces[0].radius_mm), (x, y))
-        field = 0.3 * distance_mm * uniform(g, count, 1.0)
-        near = min(1.0, distance_mm)  # a point that touches the glass faces one place of it
-        px, py = (x * (1 - near) + field[0], y * (1 - near) + field[1])
-        pz = z * (1 - near) - distance_mm
-        d = unit(x - px, y - py, z - pz)
-        yield _case("object", f"at {distance_mm:g} mm, double Gauss", lens, Rays(px, py, pz, *d), "film")
+        x, y = disc(g, count, lens.surfaces[0].semi_diameter_mm)
+        sx, sy = disc(g, count, 0.3)
+        surface = Rays(x, y, sag(float(lens.surfaces[0].radius_mm), (x, y)), *unit(sx, sy, torch.ones_like(sx)))
+        yield _case("object", f"at {distance_mm:g} mm, double Gauss", lens, moved(surface, -distance_mm), "film")
+
+
+def shapes(count: int) -> Iterator[Case]:
+    """Steep conics, aspheres of even and odd powers, and crossed cylinders."""
+    plano = Surface(INF, 5.0, 24.0, 1.6)
+    steep = {
+        "ellipsoid, K = -0.5": Surface(-11.0, 1.0, 20.0, conic=-0.5),
+        "paraboloid, K = -1": Surface(-8.0, 1.0, 20.0, conic=-1.0),
+        "hyperboloid, K = -50": Surface(-8.0, 1.0, 20.0, conic=-50.0),
+        "oblate, K = 2": Surface(-25.0, 1.0, 20.0, conic=2.0),
+        "even asphere": Surface(-20.0, 1.0, 20.0, asphere=((4, 2e-5), (6, -3e-7), (8, 4e-9), (10, -1e-11))),
+        "odd asphere with r^2": Surface(INF, 1.0, 20.0, asphere=((2, -0.01), (3, -4e-4), (4, 2e-5), (5, 1e-6))),
+        "asphere that turns back": Surface(-30.0, 1.0, 20.0, conic=-1.0, asphere=((4, 1e-4), (6, -8e-7))),
+        "cylinder": Surface(-11.0, 1.0, 20.0, cylinder="y"),
+        "acylinder": Surface(-20.0, 1.0, 20.0, conic=-1.0, cylinder="x", asphere=((4, 2e-5),)),
+    }
+    for name, surface in steep.items():
+        lens = _lens("singlet", plano, surface, _stop(60.0))
+        yield _case("shape", name, lens, from_scene(lens, count, generator(), slope=0.3), "film")
 
 
 def library(lenses: Path, count: int) -> Iterator[Case]:

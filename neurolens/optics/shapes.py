@@ -38,14 +38,14 @@ def is_plain(surface: Surface) -> bool:
     return not (conic or surface.asphere or surface.cylinder)
 
 
-def intersect_shape(r: Rays, surface: Surface, sense: int, before: Medium, entering: bool, guard: bool) -> Hit:
+def intersect_shape(r: Rays, surface: Surface, sense: int, before: Medium, guard: bool) -> Hit:
     """Meet a conic, cylinder or asphere at the root next to the vertex. Arguments as for a sphere."""
     w = (float(surface.cylinder != "y"), float(surface.cylinder != "x"))
     nearest = nearest_approach(r, before.inverse_n2)
     if surface.asphere:
         return _meet_asphere(r, nearest, surface, w, sense, before)
     c = surface.curvature
-    met, q2, q, t = _meet_quadric(r, nearest, (c * w[0], c * w[1], c * (1 + surface.conic)), sense, entering, guard)
+    met, q2, q, t = _meet_quadric(r, nearest, (c * w[0], c * w[1], c * (1 + surface.conic)), sense, guard)
     x, y, z = _along(nearest, t, (r.dx, r.dy, r.dz))
     nx, ny, nz = times(x, -c * w[0]), times(y, -c * w[1]), 1 - times(z, c * (1 + surface.conic))
     length2 = torch.addcmul(torch.addcmul(nx * nx, ny, ny), nz, nz)
@@ -68,7 +68,7 @@ def _along(m: Vector, t: Tensor, p: Vector) -> Vector:
 
 
 def _meet_quadric(
-    r: Rays, m: Vector, c: tuple[Any, Any, Any], sense: int, entering: bool, guard: bool
+    r: Rays, m: Vector, c: tuple[Any, Any, Any], sense: int, guard: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Meet cx x^2 + cy y^2 + cz z^2 = 2 z at the root next to the vertex.
 
@@ -84,8 +84,7 @@ def _meet_quadric(
     denominator = torch.where(backwards, a, torch.add(-b, q, alpha=sense))
     sound = denominator != 0
     t = torch.where(backwards, torch.add(-b, q, alpha=-sense), f) / torch.where(sound, denominator, 1.0)
-    met = (q2 > 0) & sound
-    return (met if entering else met & ~backwards), q2, q, t
+    return (q2 > 0) & sound, q2, q, t
 
 
 def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], sense: int, before: Medium) -> Hit:
@@ -99,7 +98,7 @@ def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], 
     with torch.no_grad():
         held = Rays(*(v.detach() for v in r))
         held_m, held_p = (m[0].detach(), m[1].detach(), m[2].detach()), (held.dx, held.dy, held.dz)
-        _, missed, _, t = _meet_quadric(held, held_m, (c * w[0], c * w[1], cz), sense, True, False)
+        _, missed, _, t = _meet_quadric(held, held_m, (c * w[0], c * w[1], cz), sense, False)
         t = torch.where(torch.isfinite(t), t, 0.0)
         polish = POLISH[t.dtype]
         for n in range(steps + polish - 1):

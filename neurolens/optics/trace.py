@@ -19,7 +19,16 @@ from neurolens.optics import apertures, glass
 from neurolens.optics.media import media
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.shapes import intersect_shape, is_plain
-from neurolens.optics.surfaces import Hit, Medium, Rays, intersect_plane, intersect_sphere, refract, times
+from neurolens.optics.surfaces import (
+    Hit,
+    Medium,
+    Rays,
+    intersect_plane,
+    intersect_sphere,
+    nearest_approach,
+    refract,
+    times,
+)
 from neurolens.optics.survival import Survival, survival
 from neurolens.optics.transmission import passage
 
@@ -215,6 +224,9 @@ def _start(rays: Rays, first: Medium, sense: int, otherwise: int, freeze: bool) 
         # Not even a NaN that comes in may reach the gradients of the others.
         sound = sound & torch.isfinite(rays.x + rays.y + rays.z)
         rays = _along_axis(rays, sound, sense, 0.0)
+    if sense > 0:
+        # Light may come from far away: the digits of float32 near the lens keep points and directions consistent.
+        rays = Rays(*nearest_approach(rays, 1.0), *rays[3:])
     return Rays(*rays[:3], *(times(d, first.n) for d in rays[3:])), survival(sound, otherwise)
 
 
@@ -234,7 +246,7 @@ def _meet(
     elif is_plain(surface):
         hit = intersect_sphere(r, surface.curvature, sense, before, entering, guard)
     else:
-        hit = intersect_shape(r, surface, sense, before, entering, guard)
+        hit = intersect_shape(r, surface, sense, before, guard)
     tests.require(hit.met, k, st.MISSED)
     distance2 = torch.addcmul(hit.x * hit.x, hit.y, hit.y)
     tests.require(distance2 <= surface.semi_diameter_mm**2, k, st.RIM)
