@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
+from neurolens.apertures import Aperture
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
@@ -26,7 +28,10 @@ class Shot:
         focus_m: distance from the film to the object in focus, inf allowed.
         f_number: None: the widest stop of a lens or model; f/4 for the thin lens, nominally f/8 for the pinhole.
         efl_mm: None: a lens file as tabled; 50 mm for thin lens and pinhole. A model has its own.
-        configuration: zoom state of a lens file.
+        zoom: state of a lens file by name, or a focal length in mm between its states.
+        field_deg: full field of view that the film's image circle shall see; sets the size of a lens file.
+        focus: how a lens file is focused: "film", "best" or "internal"; see `Lens.at`.
+        aperture: shape of the stop's opening; None is that of the lens file, else round.
         clamp_f_number: an f-number wider than the lens opens becomes its widest; else it is an error of a model, and
             opens the stop of a lens file as far as the rims let light through.
         wavelength_nm: shortest and longest wavelength of the light.
@@ -36,7 +41,10 @@ class Shot:
     focus_m: float
     f_number: float | None = None
     efl_mm: float | None = None
-    configuration: str | None = None
+    zoom: str | float | None = None
+    field_deg: float | None = None
+    focus: Literal["film", "best", "internal"] = "film"
+    aperture: Aperture | None = None
     wavelength_nm: tuple[float, float] = (400.0, 700.0)
     clamp_f_number: bool = False
 
@@ -69,10 +77,13 @@ def make_camera(spec: str | Path, shot: Shot) -> Camera:
 
 
 def _ideal(kind: str, shot: Shot) -> Camera:
-    _refuse(kind, "configuration", shot.configuration, "left out: only a lens file has zoom states")
+    _refuse(kind, "zoom", shot.zoom, "left out: only a lens file has zoom states")
+    _refuse(kind, "field_deg", shot.field_deg, "left out: set efl_mm")
+    _refuse(kind, "focus", None if shot.focus == "film" else shot.focus, "film: the others are for lens files")
     focal = _EFL_MM if shot.efl_mm is None else shot.efl_mm
     if kind == "thin":
-        return ThinLens(focal, shot.f_number or _THIN_F_NUMBER, shot.focus_m, shot.film_mm)
+        return ThinLens(focal, shot.f_number or _THIN_F_NUMBER, shot.focus_m, shot.film_mm, aperture=shot.aperture)
+    _refuse(kind, "aperture", shot.aperture and shot.aperture.settings(), "left out: this pinhole is a point")
     return Pinhole(focal, shot.film_mm, shot.f_number or _PINHOLE_F_NUMBER)
 
 
@@ -81,22 +92,36 @@ def _exact(path: Path, shot: Shot) -> Camera:
     from neurolens.optics.lensfile import read_lens
     from neurolens.optics.paraxial import first_order
 
-    lens = read_lens(path).at(focal_length_mm=shot.efl_mm, zoom=shot.configuration)
+    lens = read_lens(path).at(focal_length_mm=shot.efl_mm, field_deg=shot.field_deg, zoom=shot.zoom)
+    if shot.aperture is not None:
+        lens = lens.with_aperture(shot.aperture)
     f_number = shot.f_number_for(first_order(lens).f_number)
     return ExactCamera(
-        lens, film_mm=shot.film_mm, focus_m=shot.focus_m, f_number=f_number, wavelength_nm=shot.wavelength_nm
+        lens,
+        film_mm=shot.film_mm,
+        focus_m=shot.focus_m,
+        f_number=f_number,
+        wavelength_nm=shot.wavelength_nm,
+        focus=shot.focus,
     )
 
 
 def _model(path: Path, shot: Shot) -> Camera:
     from neurolens.cameras.model import OnnxCamera, load_model
 
-    for field, value in (("efl_mm", shot.efl_mm), ("configuration", shot.configuration)):
+    state = {"efl_mm": shot.efl_mm, "zoom": shot.zoom, "field_deg": shot.field_deg}
+    for field, value in (*state.items(), ("focus", None if shot.focus == "film" else shot.focus)):
         _refuse(str(path), field, value, "left out: a model is of one state of its lens")
     model = load_model(path)
     lens, domain = model.card["lens"], model.card["domain"]
     widest = float(lens["f_number"] * lens["stop_radius_mm"] / domain["stop_radius_mm"])
-    return OnnxCamera(model, film_mm=shot.film_mm, focus_m=shot.focus_m, f_number=shot.f_number_for(widest))
+    return OnnxCamera(
+        model,
+        film_mm=shot.film_mm,
+        focus_m=shot.focus_m,
+        f_number=shot.f_number_for(widest),
+        aperture=shot.aperture,
+    )
 
 
 def _refuse(camera: str, field: str, value: object, expected: str) -> None:

@@ -82,6 +82,7 @@ _RULES: dict[str, Rule] = {
     "errors": (_table, "a table"),
 }
 _OPTIONAL: dict[str, Rule] = {
+    "lens.stop_surface": (lambda v: isinstance(v, int) and not isinstance(v, bool) and 0 <= v < 10_000, "an integer"),
     "domain.nearest_m": (lambda v: v is None or _positive(v), "a number above 0, or null"),
     "fit.settings.rays_seed": (lambda v: v is None or (_number(v) and isinstance(v, int)), "an integer, or null"),
 }

@@ -17,7 +17,7 @@ from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.sampling import check_film, positive
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
+from neurolens.optics.prescription import Focus, Lens
 from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds
 from neurolens.optics.trace import trace
 
@@ -32,6 +32,7 @@ class ExactCamera:
         f_number: None keeps the lens's stop.
         wavelength_nm: range of the wavelengths; the d line stands in for a lens without known dispersion.
         dtype: precision of the trace.
+        focus: how the lens is focused; see `Lens.at`.
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
 
@@ -49,11 +50,12 @@ class ExactCamera:
         wavelength_nm: tuple[float, float] = (400.0, 700.0),
         dtype: Literal["float32", "float64"] = "float32",
         bounds: PupilBounds | None = None,
+        focus: Focus = "film",
     ) -> None:
         self._pid = os.getpid()
         self.film_mm = check_film(film_mm)
         self.focus_m = positive("focus_m", focus_m, infinite=True)
-        self.lens = lens.at(f_number=f_number, focus_m=self.focus_m)
+        self.lens = lens.at(f_number=f_number, focus_m=self.focus_m, focus=focus)
         self.name = lens.name
         self.dispersive = lens.dispersive
         self.wavelength_nm = wavelength_nm if self.dispersive else None
@@ -76,6 +78,7 @@ class ExactCamera:
             "film_mm": list(self.film_mm),
             "film_z_mm": float(film_z),
             "stop_radius_mm": float(self.lens.stop_radius_mm),
+            "aperture": self.lens.aperture and self.lens.aperture.settings(),
             "dtype": dtype,
         }
 

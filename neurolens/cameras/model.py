@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import math
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens import status as st
+from neurolens.apertures import Aperture
 from neurolens.cameras.contract import CameraRays, FloatArray
 from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
@@ -29,13 +34,20 @@ class OnnxCamera:
         film_mm: width and height of the film. What lies beyond the model's film radius stays dark.
         focus_m: distance from film to the object in focus; inf allowed.
         f_number: None takes the model's widest stop, and so does one up to 2% below it (an engraved f/1.8 may be 1.83).
+        aperture: shape of the stop's opening; None is round.
 
     Raises:
         InputError: a focus or stop outside the model's domain.
     """
 
     def __init__(
-        self, model: OnnxLens, *, film_mm: tuple[float, float], focus_m: float, f_number: float | None = None
+        self,
+        model: OnnxLens,
+        *,
+        film_mm: tuple[float, float],
+        focus_m: float,
+        f_number: float | None = None,
+        aperture: Aperture | None = None,
     ) -> None:
         card = model.card
         lens, domain = card["lens"], card["domain"]
@@ -49,7 +61,9 @@ class OnnxCamera:
         self.wavelength_nm = (low, high) if lens["dispersive"] else None
         film_z = _film_z(model, self.focus_m)
         stop = _stop_radius(model, f_number)
-        self.film = LensFilm(PupilTable.of(domain["bounds"]), film_z, (low, high), _Scene(model, film_z, stop))
+        round_stop = _Scene(model, film_z, stop)
+        scene = replace(round_stop, aperture=aperture)
+        self.film = LensFilm(PupilTable.of(domain["bounds"]), film_z, (low, high), scene, round_stop.passes)
         self.settings: dict[str, Any] = {
             "camera": "model",
             "model": str(model.path),
@@ -59,6 +73,7 @@ class OnnxCamera:
             "film_mm": list(self.film_mm),
             "film_z_mm": film_z,
             "stop_radius_mm": stop,
+            "aperture": aperture and aperture.settings(),
             "card": {k: v for k, v in card.items() if k not in ("reference", "units", "frame", "status_codes")},
         }
 
@@ -70,21 +85,32 @@ class OnnxCamera:
         """The same camera with a session of its own, for another process or thread."""
         other = copy(self)
         other.model, other.film = self.model.reopened(), copy(self.film)
-        other.film.scene = _Scene(other.model, self.film.film_z_mm, self.settings["stop_radius_mm"])
+        assert isinstance(self.film.scene, _Scene)
+        other.film.scene = replace(self.film.scene, model=other.model)
         return other
 
 
 @dataclass(frozen=True)
 class _Scene:
-    """A model at one focus and stop."""
+    """A model at one focus and stop. The graph knows a round stop; blades and masks are tested on its crossing."""
 
     model: OnnxLens
     film_z_mm: float
     stop_radius_mm: float
+    aperture: Aperture | None = None
 
     def __call__(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SceneRays:
         out = self.model.rays(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm)
-        return SceneRays(out.scene_ray, out.transmittance, out.status)
+        if self.aperture is None:
+            return SceneRays(out.scene_ray, out.transmittance, out.status)
+        inside = self.aperture.inside(*out.stop_xy_mm, self.stop_radius_mm)
+        stopped = np.int32(st.blocked(int(self.model.card["lens"].get("stop_surface", 0)), st.RIM))
+        status = np.where(inside | (out.status != st.PASSED), out.status, stopped)
+        return SceneRays(out.scene_ray, out.transmittance, status)
+
+    def passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
+        """Whether rays pass at one wavelength; bool [N]."""
+        return self(film, pupil, np.full(film.shape[1], wavelength_nm, np.float32)).status == st.PASSED
 
 
 def _film_z(model: OnnxLens, focus_m: float) -> float:

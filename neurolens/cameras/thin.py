@@ -7,9 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from neurolens import status as st
+from neurolens.apertures import Aperture
 from neurolens.cameras.contract import CameraRays, FloatArray
 from neurolens.cameras.sampling import check_film, concentric_disk, positive
 from neurolens.focus import film_z_mm
+
+_QUADRATURE = 256  # points a side
 
 
 class ThinLens:
@@ -20,6 +24,7 @@ class ThinLens:
         f_number: focal length over aperture diameter; it does not change with focus.
         focus_m: distance from film to the object in focus, or infinity.
         film_mm: width and height of the film.
+        aperture: shape of the opening; None is round.
 
     Raises:
         InputError: a value is not above 0, or `focus_m` is below 4 focal lengths.
@@ -30,7 +35,13 @@ class ThinLens:
     wavelength_nm: tuple[float, float] | None = None
 
     def __init__(
-        self, focal_mm: float, f_number: float, focus_m: float, film_mm: tuple[float, float] = (36.0, 24.0)
+        self,
+        focal_mm: float,
+        f_number: float,
+        focus_m: float,
+        film_mm: tuple[float, float] = (36.0, 24.0),
+        *,
+        aperture: Aperture | None = None,
     ) -> None:
         self.focal_mm = positive("focal_mm", focal_mm)
         self.f_number = positive("f_number", f_number)
@@ -44,7 +55,15 @@ class ThinLens:
             "f_number": self.f_number,
             "focus_m": None if math.isinf(self.focus_m) else self.focus_m,
             "film_mm": list(self.film_mm),
+            "aperture": aperture and aperture.settings(),
         }
+        self.aperture = aperture
+        # On-axis integral of cos over solid angle, pi R^2 / (R^2 + s'^2), and the part of it that a shape lets through.
+        self._exposure, self._part = 1.0 + (self.radius_mm / self.image_distance_mm) ** 2, 1.0
+        if aperture is not None:
+            middle = ((np.arange(_QUADRATURE) + 0.5) / _QUADRATURE).astype(np.float32)
+            square = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
+            self._part = float(self.sample(np.zeros_like(square), square, square[0]).weight.mean(dtype=np.float64))
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Rays for film points [2, N] in mm and pupil samples [2, N]; the wavelength changes nothing."""
@@ -64,8 +83,12 @@ class ThinLens:
         np.multiply(lens, np.float32(1e-3), out=origin[:2])
         origin[2] = -1e-3 * behind
 
-        # w = A cos^4 / s'^2 over the on-axis integral of cos over solid angle, pi R^2 / (R^2 + s'^2).
+        # w = A cos^4 / s'^2 over the exposure on the axis.
         tangent = (lens - film_mm) / behind
         cos2 = 1.0 / (1.0 + np.einsum("in,in->n", tangent, tangent))
-        weight = cos2 * cos2 * np.float32(1.0 + (self.radius_mm / self.image_distance_mm) ** 2)
-        return CameraRays(origin, direction, weight, np.zeros(count, np.int32))
+        weight = cos2 * cos2 * np.float32(self._exposure / self._part)
+        if self.aperture is None:
+            return CameraRays(origin, direction, weight, np.zeros(count, np.int32))
+        inside = self.aperture.inside(*lens, self.radius_mm)
+        status = np.where(inside, st.PASSED, st.blocked(0, st.RIM)).astype(np.int32)
+        return CameraRays(origin, direction, np.where(inside, weight, np.float32(0)), status)

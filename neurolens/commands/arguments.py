@@ -5,7 +5,11 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
-from typing import Any, NoReturn
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+if TYPE_CHECKING:
+    from neurolens.apertures import Aperture
 
 
 class Parser(argparse.ArgumentParser):
@@ -67,15 +71,25 @@ def whole(least: int, most: int | None = None) -> Callable[[str], int]:
 
 
 def add_lens_state(parser: argparse.ArgumentParser, defaults: dict[str, str]) -> None:
-    """Add --efl, --configuration, --f-number and --focus; `defaults` says in words what each is when left out."""
+    """Add --efl, --field, --zoom, --f-number, --focus, --focusing and the stop's shape.
+
+    `defaults` says in words what efl, f_number and focus are when left out.
+    """
     group = parser.add_argument_group("state of the lens")
-    group.add_argument(
+    size = group.add_mutually_exclusive_group()
+    size.add_argument(
         "--efl", metavar="MM", type=positive("a focal length in mm"),
         help=f"scale the whole lens to this focal length in mm (default: {defaults['efl']})",
     )  # fmt: skip
+    size.add_argument(
+        "--field", metavar="DEG", type=between(0.001, 359.0, "degrees"),
+        help="scale the whole lens so that its image circle sees this full field of view, traced, in degrees",
+    )  # fmt: skip
     group.add_argument(
-        "--configuration", metavar="NAME", help="zoom state of the lens file, by name (default: its table as it stands)"
-    )
+        "--zoom", "--configuration", metavar="STATE", dest="zoom",
+        help="state of the lens file by name, or a focal length in mm between its states (derived: its table and "
+        "interpolated gaps); default: the table as it stands",
+    )  # fmt: skip
     group.add_argument(
         "--f-number", metavar="N", type=positive("an f-number"),
         help=f"focal length over entrance-pupil diameter at infinity focus (default: {defaults['f_number']})",
@@ -84,6 +98,39 @@ def add_lens_state(parser: argparse.ArgumentParser, defaults: dict[str, str]) ->
         "--focus", metavar="M", type=positive("a distance in metres", infinite=True),
         help=f"distance from the film to the object in focus in metres, or inf (default: {defaults['focus']})",
     )  # fmt: skip
+    group.add_argument(
+        "--focusing", choices=("film", "best", "internal"), default="film",
+        help="by moving the film to the paraxial image, to the smallest spot on the axis, or by moving the groups as "
+        "the focus states of the lens file do (default: film)",
+    )  # fmt: skip
+    shape = parser.add_argument_group("shape of the stop")
+    shape.add_argument(
+        "--blades", metavar="N", type=whole(3, 100),
+        help="blades, their corners on the circle of the stop (default: the lens file's, else round)",
+    )  # fmt: skip
+    shape.add_argument(
+        "--blade-rotation", metavar="DEG", type=between(-360, 360, "degrees"),
+        help="of the first corner (or of the mask), from x towards y, seen from the film (default: 0)",
+    )  # fmt: skip
+    shape.add_argument(
+        "--blade-curvature", metavar="C", type=between(0, 1, "a number"),
+        help="of the blades' edges: 0 straight, 1 round (default: 0)",
+    )  # fmt: skip
+    shape.add_argument(
+        "--aperture-mask", metavar="PICTURE", type=Path,
+        help="opening of any shape: light passes where the picture is brighter than half; it spans the stop",
+    )  # fmt: skip
+
+
+def aperture_of(args: argparse.Namespace) -> Aperture | None:
+    """The stop's shape that the arguments of `add_lens_state` ask for; None where they say nothing.
+
+    Raises:
+        InputError: shapes that exclude each other, a picture that cannot be read.
+    """
+    from neurolens.render.masks import make_aperture
+
+    return make_aperture(args.blades, args.blade_rotation, args.blade_curvature, args.aperture_mask)
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

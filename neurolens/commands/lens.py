@@ -9,7 +9,8 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.commands.arguments import add_json, add_lens_state
+from neurolens.commands import lens_list, lens_rims
+from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between
 from neurolens.commands.output import number, print_json, table
 from neurolens.errors import InputError, NeurolensWarning
 
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 Read a lens file strictly and print what follows from it: focal length, pupils, film plane,
 image circle, how much of the light gets through and what stops the rest, and anything
-doubtful about it.
+doubtful about it. "neurolens lens list" checks a whole folder and prints a table;
+--derive-rims computes the rim diameters that a patent does not print.
 
 Lengths are in mm along the axis, z = 0 at the front vertex, light travelling to +z; angles
 are from the axis in degrees; first-order data is for the d line (587.56 nm). Needs the extra
@@ -29,7 +31,9 @@ _EPILOG = """\
 examples:
   neurolens lens lenses/laikin_double_gauss_50.toml
   neurolens lens lenses/brendel_tessar_100.toml --efl 50 --focus 1.5 --layout tessar.png
-  neurolens lens lenses/ogawa_zoom_70_200.toml --configuration 135mm --json"""
+  neurolens lens lenses/ogawa_zoom_70_200.toml --zoom 135mm --json
+  neurolens lens list --layouts lenses.png
+  neurolens lens lenses/brendel_tessar_100.toml --derive-rims -o tessar.toml"""
 _LAYOUT_SUFFIXES = (".png", ".pdf", ".svg")
 
 
@@ -38,18 +42,63 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "lens", help="first-order data, field and layout of a lens file", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument("file", metavar="FILE", type=Path, help="lens file (lenses/*.toml)")
+    parser.add_argument("file", metavar="FILE", type=Path, help='lens file (lenses/*.toml), or the word "list"')
+    parser.add_argument(
+        "folder", metavar="FOLDER", type=Path, nargs="?", help='of lens files, after "list" (default: those that ship)'
+    )
     add_lens_state(parser, {"efl": "as tabled", "f_number": "the tabled stop", "focus": "inf"})
     parser.add_argument(
         "--layout", metavar="OUT.png", type=Path,
         help="draw the lens with rays from three field points: axis, 70%% and edge of the film (.png, .pdf, .svg)",
     )  # fmt: skip
+    _add_list_and_rims(parser)
     add_json(parser)
     parser.set_defaults(run=run, kept="nothing is written but a finished --layout picture")
 
 
+def _add_list_and_rims(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--layouts", metavar="OUT.png", type=Path, help='after "list": draw all lenses in section on one sheet'
+    )
+    rims = parser.add_argument_group("rims")
+    rims.add_argument(
+        "--derive-rims", action="store_true",
+        help="compute the diameters from the f-number and the field, and print them beside those of the file",
+    )  # fmt: skip
+    rims.add_argument(
+        "--vignetting", metavar="SHARE", type=between(0.01, 1, "a share"), default=0.5,
+        help="share of the pupil's height that is kept at the edge of the field (default: 0.5)",
+    )  # fmt: skip
+    rims.add_argument(
+        "--half-field", metavar="DEG", type=between(0.01, 179, "an angle in degrees"),
+        help="edge of the field, in degrees from the axis (default: as the file states)",
+    )  # fmt: skip
+    rims.add_argument("-o", "--output", metavar="OUT.toml", type=Path, help="write the lens with its derived rims")
+
+
+def _check_mode(args: argparse.Namespace, listing: bool) -> None:
+    """Refuse an option that the chosen table would silently ignore."""
+    kinds = {
+        "--layouts": (args.layouts is not None, listing, 'with "list"'),
+        "FOLDER": (args.folder is not None, listing, 'after "list"'),
+        "-o": (args.output is not None, args.derive_rims, "with --derive-rims"),
+        "--half-field": (args.half_field is not None, args.derive_rims, "with --derive-rims"),
+        "--derive-rims": (args.derive_rims, not listing, "with one lens file"),
+        "--layout": (args.layout is not None, not listing and not args.derive_rims, "with one lens file alone"),
+    }
+    for option, (given, allowed, where) in kinds.items():
+        if given and not allowed:
+            raise InputError("neurolens lens", option, "(given)", f"this option only {where}")
+
+
 def run(args: argparse.Namespace) -> int:
-    """Print the data of a lens, and draw it where asked."""
+    """Print the data of a lens, and draw it where asked; or the table of a folder; or derived rims."""
+    listing = str(args.file) == lens_list.WORD
+    _check_mode(args, listing)
+    if listing:
+        return lens_list.run(args)
+    if args.derive_rims:
+        return lens_rims.run(args)
     if args.layout is not None:
         check_layout_path(args.layout)
     from neurolens.evaluate.describe import describe_lens, glass_table
@@ -60,14 +109,26 @@ def run(args: argparse.Namespace) -> int:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NeurolensWarning)  # `describe_lens` says the same among its warnings
         tabled = read_lens(args.file)
-    lens = tabled.at(zoom=args.configuration, focal_length_mm=args.efl, f_number=args.f_number, focus_m=args.focus)
-    focus = math.inf if args.focus is None else args.focus
-    domain = domain_of(lens, focus_m=(focus, focus))
-    configurations = [{"name": c.name, "efl_mm": c.efl_mm} for c in tabled.configurations]
+    lens = tabled.at(
+        zoom=args.zoom,
+        focal_length_mm=args.efl,
+        field_deg=args.field,
+        f_number=args.f_number,
+        focus_m=args.focus,
+        focus=args.focusing,
+    ).with_aperture(aperture_of(args) or tabled.aperture)
+    focus, film_z = math.inf if args.focus is None else args.focus, float(lens.film_z_mm or 0.0)
+    domain = domain_of(lens, focus_m=(focus, focus), film_z_mm=(film_z, film_z))
+    configurations = [
+        {"name": c.name, "efl_mm": c.efl_mm, "object_distance_mm": c.object_distance_mm} for c in tabled.configurations
+    ]
     data = {
         "file": str(args.file),
         **describe_lens(lens, domain),
-        "configuration": args.configuration,
+        "zoom": args.zoom,
+        "focusing": args.focusing,
+        "derived": lens.derived,
+        "aperture": lens.aperture and lens.aperture.settings(),
         "configurations": configurations,
         "surfaces": glass_table(lens),
         "layout": None if args.layout is None else str(args.layout),
@@ -106,12 +167,20 @@ def _text(data: dict[str, Any]) -> str:
     """The data as a page of text."""
     parts = [_head(data), _first_order(data), _light(data), _surfaces(data)]
     if data["configurations"]:
-        states = ", ".join(f"{c['name']} ({number(c['efl_mm'])} mm)" for c in data["configurations"])
-        parts.append(f"Zoom states (--configuration): {states}")
+        zoom = [f"{c['name']} ({number(c['efl_mm'])} mm)" for c in data["configurations"] if not _near(c)]
+        near = [f"{c['name']} ({number(c['object_distance_mm'])} mm)" for c in data["configurations"] if _near(c)]
+        parts += [f"Zoom states (--zoom, also mm between them): {', '.join(zoom)}"] if zoom else []
+        parts += [f"Focus states (--zoom, or --focusing internal): {', '.join(near)} to the object"] if near else []
+    if data["derived"]:
+        parts.append(f"Derived: {data['derived']}")
     parts += [f"Warning: {text}" for text in data["warnings"]]
     if data["layout"]:
         parts.append(f"Layout drawn in {data['layout']}")
     return "\n\n".join(parts)
+
+
+def _near(configuration: dict[str, Any]) -> bool:
+    return configuration["object_distance_mm"] is not None
 
 
 def _head(data: dict[str, Any]) -> str:

@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
-from neurolens.commands.arguments import add_json, add_lens_state, between, whole
+from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between, whole
 from neurolens.commands.output import print_json
 from neurolens.errors import InputError
 from neurolens.evaluate.records import plain
 from neurolens.progress import Progress, duration
 
 if TYPE_CHECKING:
+    from neurolens.apertures import Aperture
     from neurolens.cameras.build import Shot
     from neurolens.render.scene import CameraSettings
 
@@ -32,7 +33,7 @@ examples:
   neurolens render experiments/scenes/lights.toml --camera models/NAME.onnx --f-number 2.8 \\
       --half -o lights.exr
   neurolens render experiments/scenes/grid.toml --camera lenses/ogawa_zoom_70_200.toml \\
-      --configuration 135mm -o zoom.exr"""
+      --zoom 100 --blades 8 --blade-curvature 0.5 -o zoom.exr"""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -91,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
 
     scene = load_scene(args.scene)
     settings = scene.settings.camera
-    camera = make_camera(args.camera, shot_of(settings, args))
+    camera = make_camera(args.camera, shot_of(settings, args, scene.aperture))
     width, height = picture_size(settings, args.width, args.height)
     with Progress(quiet=args.quiet).stage(f"render {scene.name}, {camera.name}") as report:
         result = render(
@@ -109,8 +110,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def shot_of(settings: CameraSettings, args: argparse.Namespace) -> Shot:
-    """The scene's camera settings with the command line's on top."""
+def shot_of(settings: CameraSettings, args: argparse.Namespace, aperture: Aperture | None = None) -> Shot:
+    """The scene's camera settings (and shape of the stop) with the command line's on top."""
     from neurolens.cameras.build import Shot
 
     return Shot(
@@ -118,7 +119,10 @@ def shot_of(settings: CameraSettings, args: argparse.Namespace) -> Shot:
         focus_m=settings.focus_m if args.focus is None else args.focus,
         f_number=settings.f_number if args.f_number is None else args.f_number,
         efl_mm=args.efl,
-        configuration=args.configuration,
+        zoom=args.zoom,
+        field_deg=args.field,
+        focus=args.focusing,
+        aperture=aperture_of(args) or aperture,
         wavelength_nm=settings.wavelengths_nm,
         # A scene's f-number is for any lens; one that is asked for must be had.
         clamp_f_number=args.f_number is None,

@@ -128,7 +128,7 @@ def _aperture(data: Mapping[str, Any], file: str) -> Aperture | None:
     if not isinstance(table, Mapping):
         raise InputError(file, "aperture", table, "a table under [aperture]")
     reject_unknown(file, where, table, ("blades", "rotation_deg", "curvature"))
-    more = {key: number(table, key, file, where) for key in ("rotation_deg", "curvature") if key in table}
+    more: dict[str, Any] = {k: number(table, k, file, where) for k in ("rotation_deg", "curvature") if k in table}
     try:
         return Aperture(table.get("blades"), **more)
     except InputError as error:

@@ -192,8 +192,8 @@ class Lens:
             focal_length_mm: rescale the whole lens so that its focal length at infinity focus is this.
             field_deg: full field of view at infinity focus that the image circle shall see: the lens is rescaled, the
                 image circle stays (by the traced chief ray, along x; distortion included).
-            zoom: name of a state of the file, or a focal length in mm between those of its states
-                (`neurolens.optics.zoom`; marked in `derived`).
+            zoom: name of a state of the file, or a focal length in mm between those of its states, as a number or its
+                text (`neurolens.optics.zoom`; marked in `derived`).
             focus: "film" moves the film as the paraxial image does; "best" to the least RMS spot of the axial point at
                 the d line; "internal" moves the groups as the file's focus states do, film fixed.
 

@@ -31,6 +31,8 @@ def at(
     """The lens in another state; arguments and errors are those of `Lens.at`."""
     _check(lens, focus_m, f_number, focal_length_mm, field_deg, focus)
     lens, object_mm = at_infinity(lens), None
+    if isinstance(zoom, str) and zoom not in [c.name for c in lens.configurations]:
+        zoom = _millimetres(zoom)
     if isinstance(zoom, str):
         state = state_named(lens, zoom)
         lens, object_mm = in_state(lens, state), state.object_distance_mm
@@ -103,6 +105,14 @@ def _check(
         raise InputError(lens.path, "field_deg", field_deg, "left out beside focal_length_mm: each sets the size")
     if focus not in get_args(Focus):
         raise InputError(lens.path, "focus", focus, " or ".join(f'"{f}"' for f in get_args(Focus)))
+
+
+def _millimetres(text: str) -> float | str:
+    """A focal length that was typed, or the text itself: a name, then, that no state has."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def _factor_for_efl(lens: Lens, focal_length_mm: float) -> float:

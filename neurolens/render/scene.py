@@ -31,6 +31,8 @@ class CameraSettings:
     Attributes:
         position_m: film-plane centre. look_at_m: a point on the optical axis. up: points to the picture's top.
         focus_m: distance from film to the object in focus. f_number: None leaves it to the lens.
+        blades, blade_rotation_deg, blade_curvature, aperture_mask: shape of the stop's opening, see
+            `neurolens.apertures`; the mask is a picture beside the scene. Without them the lens's own, else round.
         film_width_mm, film_height_mm: the part of the film that is used.
         wavelengths_nm: range of light. width, height: picture in pixels. samples: a pixel.
         max_depth: number of surfaces along a path at which light is scattered.
@@ -41,6 +43,10 @@ class CameraSettings:
     focus_m: float
     up: Vector = (0.0, 1.0, 0.0)
     f_number: float | None = None
+    blades: int | None = None
+    blade_rotation_deg: float | None = None
+    blade_curvature: float | None = None
+    aperture_mask: Path | None = None
     film_width_mm: float = 36.0
     film_height_mm: float = 20.25
     wavelengths_nm: tuple[float, float] = (400.0, 700.0)

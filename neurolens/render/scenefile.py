@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from neurolens.apertures import Aperture
 from neurolens.cameras.contract import FloatArray
 from neurolens.config import from_dict
 from neurolens.errors import InputError
+from neurolens.render.masks import make_aperture
 from neurolens.render.mesh import read_obj
-from neurolens.render.scene import Material, SceneSettings, Texture
+from neurolens.render.scene import CameraSettings, Material, SceneSettings, Texture
 from neurolens.render.shapes import MeshSettings
 from neurolens.render.spectrum import srgb_to_linear
 from neurolens.tomlfile import read_toml, suggestion
@@ -39,12 +41,14 @@ class Scene:
     Attributes:
         name: the file's name without ending. settings: the tables of the file.
         images: linear RGB [H, W, 3] of each image texture. triangles: one a mesh.
+        aperture: shape of the stop's opening, None where the scene says nothing.
     """
 
     name: str
     settings: SceneSettings
     images: dict[str, FloatArray]
     triangles: tuple[TriangleSet, ...]
+    aperture: Aperture | None = None
 
 
 def load_scene(path: str | Path) -> Scene:
@@ -70,7 +74,15 @@ def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> 
         if texture.file is not None
     }
     triangles = tuple(_read_mesh(path, f"meshes[{k}]", mesh) for k, mesh in enumerate(settings.meshes))
-    return Scene(path.stem, settings, images, triangles)
+    return Scene(path.stem, settings, images, triangles, _aperture(path, settings.camera))
+
+
+def _aperture(path: Path, camera: CameraSettings) -> Aperture | None:
+    mask = None if camera.aperture_mask is None else path.parent / camera.aperture_mask
+    try:
+        return make_aperture(camera.blades, camera.blade_rotation_deg, camera.blade_curvature, mask)
+    except InputError as error:
+        raise InputError(path, f"camera, {error.file} {error.field}", error.value, error.expected) from None
 
 
 def _check_references(

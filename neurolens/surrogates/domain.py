@@ -11,8 +11,9 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from neurolens.errors import InputError
+from neurolens.optics import paraxial
 from neurolens.optics.glass import LINE_D_NM
-from neurolens.optics.paraxial import film_z_mm, first_order
+from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import PupilBounds, image_radius_mm, pupil_bounds
 
@@ -95,6 +96,7 @@ def domain_of(
     focus_m: tuple[float, float] = (math.inf, math.inf),
     wavelength_nm: tuple[float, float] = (400.0, 700.0),
     nearest_m: float | None = None,
+    film_z_mm: tuple[float, float] | None = None,
 ) -> Domain:
     """The domain of a lens at its present stop.
 
@@ -103,6 +105,7 @@ def domain_of(
         focus_m: two object distances from the film; the domain holds every film plane between theirs.
         wavelength_nm: replaced by the d line where no glass of the lens has a known dispersion.
         nearest_m: distance from the film of the nearest object in view; None takes the nearest focus.
+        film_z_mm: film planes, of a lens that was focused otherwise; None follows from `focus_m`.
 
     Raises:
         InputError: a radius or `nearest_m` that is not positive and finite, wavelengths outside 300..2500 nm or in the
@@ -117,7 +120,7 @@ def domain_of(
         raise InputError("domain", "wavelength_nm", wavelength_nm, "shortest then longest, within 300 to 2500 nm")
     if not lens.dispersive:
         low = high = LINE_D_NM
-    planes = sorted(film_z_mm(lens, f) for f in focus_m)
+    planes = sorted(film_z_mm or (paraxial.film_z_mm(lens, f) for f in focus_m))
     radius = film_radius_mm if film_radius_mm is not None else image_radius_mm(lens)[0]
     bounds = pupil_bounds(lens, radius, (planes[0], planes[1]), (low, high))
     return Domain(

@@ -1,0 +1,77 @@
+"""Focus breathing: how focal length, magnification and field of view change with the focus distance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from neurolens.errors import InputError
+from neurolens.optics import paraxial
+from neurolens.optics.prescription import Focus, Lens
+from neurolens.optics.pupils import image_radius_mm
+
+
+@dataclass(frozen=True)
+class Breath:
+    """A lens at one focus distance, to first order (distortion is left out).
+
+    Attributes:
+        focus_m: from object to film.
+        efl_mm: focal length of the groups as they stand.
+        magnification: image over object height, negative for an inverted image; 0 at infinity.
+        field_deg: full field of view across the image circle, seen from the entrance pupil.
+        film_z_mm: film plane, lens frame.
+        working_f_number: 1 / (2 tan theta') of the paraxial marginal ray.
+    """
+
+    focus_m: float
+    efl_mm: float
+    magnification: float
+    field_deg: float
+    film_z_mm: float
+    working_f_number: float
+
+
+def breathing(lens: Lens, focus_m: Sequence[float], focus: Focus = "film") -> list[Breath]:
+    """The lens at several focus distances.
+
+    With h the radius of the image circle at infinity focus (the film does not grow), x' the film's distance behind the
+    rear focal point and e that of the entrance pupil behind the front one: the magnification is -x'/f, and the chief
+    ray of the film's edge leaves at atan(h / (f + x' e / f)).
+
+    Args:
+        lens: in the zoom position wanted.
+        focus_m: distances from object to film, `inf` allowed.
+
+    Raises:
+        InputError: no distance, or one that the lens does not reach; "internal" for a lens without focus states.
+    """
+    if not focus_m:
+        raise InputError("breathing", "focus_m", "(none)", "distances in m")
+    radius, _ = image_radius_mm(lens.at())
+    found = []
+    for distance in focus_m:
+        state = lens.at(focus_m=distance, focus=focus)
+        data = paraxial.first_order(state)
+        assert state.film_z_mm is not None
+        extension = state.film_z_mm - data.rear_focal_z_mm
+        pupil = data.entrance_pupil_z_mm - data.front_focal_z_mm
+        reach = data.efl_mm + extension * pupil / data.efl_mm
+        found.append(
+            Breath(
+                focus_m=float(distance),
+                efl_mm=float(data.efl_mm),
+                magnification=float(-extension / data.efl_mm),
+                field_deg=2 * math.degrees(math.atan2(radius, reach)),
+                film_z_mm=float(state.film_z_mm),
+                working_f_number=float(abs(reach) / data.entrance_pupil_diameter_mm),
+            )
+        )
+    return found
+
+
+def field_change(breaths: Sequence[Breath]) -> float:
+    """Largest size of the picture over the smallest, less 1: 0 for a lens that does not breathe."""
+    tangents = [math.tan(math.radians(b.field_deg / 2)) for b in breaths]
+    return max(tangents) / min(tangents) - 1
