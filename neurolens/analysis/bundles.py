@@ -32,7 +32,8 @@ _DIFFERENCE = 1e-5  # step of the derivative, in entrance-pupil radii
 class Bundle:
     """Rays of F fields, W wavelengths and P pupil points; tensors are [F, W, P], or [F] for the chief ray.
 
-    Film coordinates are turned by half a turn into those of the field: `tangential_mm` grows with the field's angle.
+    Tangential coordinates, of the stop and of the film, grow towards the side on which the image lies (the negative
+    side of the scene's `axis`); sagittal ones along the other transverse axis.
 
     Attributes:
         start: before the front surface, travelling to the film.
@@ -163,7 +164,7 @@ class _Aim:
 
     def at(self, pattern: Pattern) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """u, v of the rays through the points of a pattern, whether they were found, and d(beam) / d(stop share)."""
-        goal_t, goal_s = (g.expand(self.shape).reshape(-1) for g in (pattern.tangential, pattern.sagittal))
+        goal_t, goal_s = (g.expand(self.shape).reshape(-1) for g in (-pattern.tangential, pattern.sagittal))
         zero = torch.zeros_like(goal_t)
         everything = torch.arange(len(zero))
         u, v = self._newton(zero, zero, goal_t, goal_s, everything, _DIRECT)

@@ -16,7 +16,8 @@ class Pattern(NamedTuple):
     """Pupil points, each [P].
 
     Attributes:
-        tangential, sagittal: shares of the stop's radius, in the meridional plane of the field and across it.
+        tangential, sagittal: shares of the stop's radius, in the meridional plane of the field (positive on the side
+            on which its image lies) and across it.
         weight: share of the stop's area that a point stands for; sums to 1 (0 for the points of a fan).
     """
 

@@ -58,6 +58,23 @@ def save(figure: Any, path: str | Path) -> Path:
     return Path(path)
 
 
+def heading(figure: Any, title: str, subtitle: str) -> None:
+    """Title of a figure with a lighter line below it, both to the left; they keep their room."""
+    lines = subtitle.count("\n")
+    figure.suptitle(f"{title}\n\n" + "\n" * lines, x=0.01, ha="left", fontsize=12, fontweight="bold")
+    figure.text(0.01, 1 - 0.36 / figure.get_figheight(), subtitle, ha="left", va="top", fontsize=9, color="#555b63")
+
+
+def wavelength_colour(wavelength_nm: float) -> str:
+    """A colour that recalls the wavelength and stays legible on white."""
+    limits = ((450, "#7b4fa3"), (505, "#0072b2"), (600, "#009e73"), (1e9, "#d55e00"))
+    return next(colour for limit, colour in limits if wavelength_nm < limit)
+
+
+def field_name(field_deg: float) -> str:
+    return "axis" if field_deg == 0 else f"{field_deg:.1f}°"
+
+
 def plain_log_ticks(axis: Any) -> None:
     """Log axis labelled 0.1, 1, 10 rather than by powers, and with 2 and 5 between where that leaves few ticks."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
