@@ -26,8 +26,11 @@ _DIRECTIONS, _STEPS, _COARSE, _FINE = 33, 24, 5, 12
 # Where between rows, along an edge and between the two wavelengths the interpolated outline is checked; at which
 # multiples of it; and how far vertices are pushed beyond what was found: a hair, against rounding.
 _BETWEEN_ROWS, _ALONG_EDGE, _BETWEEN_WAVELENGTHS = (0.0, 0.5), (0.0, 0.33, 0.67), (0.0, 0.5, 1.0)
-_CHECKS, _CHECK_HALVINGS = (1.0, 1.002, 1.01, 1.03, 1.07, 1.15), 5
+_CHECKS, _CHECK_HALVINGS = (1.0, 1.002, 1.01, 1.03, 1.07, 1.15, 1.35), 5
 _HAIR = 2e-5
+# Where one wavelength's region is less than this share of both together, one outline serves both. Half-planes that do
+# not hold the centroid of a convex region cut off less (Gruenbaum 1960: 1 - 1/e), so that the centre lies inside all.
+_APART = 0.65
 
 Float64Array = NDArray[np.float64]
 # Whether rays pass from film points (radius, 0) through points [2, ...]; the radius broadcasts with the points.
@@ -64,7 +67,8 @@ def outline_of(
     frame = _frame_of(tight, outline.radii(np.arange(rows, dtype=np.float64)), ask)
     angles = np.repeat(np.linspace(0, np.pi, _DIRECTIONS)[None], rows, axis=0)
     angles = _equal_areas(angles, _boundary(ask, frame, angles, _COARSE), segments)
-    fine = np.stack([_boundary(_asking(passes, (w,)), frame, angles, _FINE) for w in used])
+    looked_at = sorted({*used, outline.wavelength(0.5)})
+    fine = _together(np.stack([_boundary(_asking(passes, (w,)), frame, angles, _FINE) for w in looked_at]))
     x, y = (fine * a[:, None] * f(angles) for a, f in zip(frame.stretch, (np.cos, np.sin), strict=True))
     y[..., [0, -1]] = 0
     centre, x, y = (a.astype(np.float32) for a in (frame.centre, x, y))
@@ -204,6 +208,18 @@ def _equal_areas(angles: Float64Array, distance: Float64Array, segments: int) ->
     area = np.concatenate([np.zeros((len(angles), 1)), np.cumsum(wedges, axis=1)], axis=1)
     wanted = np.linspace(0, 1, segments + 1)
     return np.stack([np.interp(wanted * a[-1], a, t) for a, t in zip(area, angles, strict=True)])
+
+
+def _together(distance: Float64Array) -> Float64Array:
+    """Distances at the ends of the spectrum, of those [W, R, D] at wavelengths in order; joined where they part.
+
+    At the edge of the light lateral colour leaves some wavelengths dark before others.
+    """
+    joined = distance.max(0, keepdims=True)
+    area, whole = ((d[..., 1:] * d[..., :-1]).sum(2) for d in (distance, joined))
+    apart = (area < _APART * whole).any(0)
+    ends = distance if len(distance) == 1 else distance[[0, -1]]
+    return np.where(apart[:, None], joined, ends)
 
 
 def _pushed_out(outline: PupilOutline, passes: Passes) -> PupilOutline:
