@@ -6,6 +6,7 @@ import argparse
 import math
 import time
 import warnings
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,6 +53,10 @@ def add_parser(subparsers: Any) -> None:
         help="draw the lens with rays from three field points: axis, 70%% and edge of the film (.png, .pdf, .svg)",
     )  # fmt: skip
     _add_list_and_rims(parser)
+    parser.add_argument(
+        "--breathing", metavar="OUT.png", type=Path,
+        help="draw field of view, focal length and magnification against the focus distance (.png, .pdf, .svg)",
+    )  # fmt: skip
     add_json(parser)
     parser.set_defaults(run=run, kept="nothing is written but a finished --layout picture")
 
@@ -99,9 +104,10 @@ def run(args: argparse.Namespace) -> int:
         return lens_list.run(args)
     if args.derive_rims:
         return lens_rims.run(args)
-    if args.layout is not None:
-        check_layout_path(args.layout)
-    from neurolens.evaluate.describe import describe_lens, glass_table
+    for option in ("layout", "breathing"):
+        if getattr(args, option) is not None:
+            check_layout_path(getattr(args, option), f"--{option}")
+    from neurolens.evaluate.describe import describe_lens, file_doubts, glass_table
     from neurolens.optics.lensfile import read_lens
     from neurolens.surrogates.domain import domain_of
 
@@ -132,9 +138,16 @@ def run(args: argparse.Namespace) -> int:
         "configurations": configurations,
         "surfaces": glass_table(lens),
         "layout": None if args.layout is None else str(args.layout),
+        "breathing_plot": None if args.breathing is None else str(args.breathing),
     }
+    data["warnings"] += file_doubts(tabled)
     if args.layout is not None:
         draw_layout(lens, domain, args.layout)
+    if args.breathing is not None:
+        from neurolens.evaluate.plots_breathing import draw_breathing
+
+        found = draw_breathing(lens, args.breathing)
+        data["breathing"] = {name: [asdict(b) for b in breaths] for name, breaths in found.items()}
     data["seconds"] = time.perf_counter() - began
     if args.json:
         print_json(data)
@@ -143,16 +156,16 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def check_layout_path(path: Path) -> None:
+def check_layout_path(path: Path, option: str = "--layout") -> None:
     """Refuse a picture that could not be written before any work is done for it.
 
     Raises:
         InputError: another suffix, or no such folder.
     """
     if path.suffix.lower() not in _LAYOUT_SUFFIXES:
-        raise InputError(path, "--layout", path.suffix or "(no suffix)", f"one of {', '.join(_LAYOUT_SUFFIXES)}")
+        raise InputError(path, option, path.suffix or "(no suffix)", f"one of {', '.join(_LAYOUT_SUFFIXES)}")
     if not path.parent.is_dir():
-        raise InputError(path, "--layout", str(path.parent), "a folder that exists")
+        raise InputError(path, option, str(path.parent), "a folder that exists")
 
 
 def draw_layout(lens: Lens, domain: Domain, path: Path) -> None:
@@ -176,6 +189,8 @@ def _text(data: dict[str, Any]) -> str:
     parts += [f"Warning: {text}" for text in data["warnings"]]
     if data["layout"]:
         parts.append(f"Layout drawn in {data['layout']}")
+    if data["breathing_plot"]:
+        parts.append(f"Focus breathing drawn in {data['breathing_plot']}")
     return "\n\n".join(parts)
 
 

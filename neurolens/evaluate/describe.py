@@ -11,6 +11,7 @@ import torch
 from neurolens import status as st
 from neurolens.evaluate.layout import refractions
 from neurolens.optics.glass import table_notes
+from neurolens.optics.lenscheck import check_lens, doubts
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, image_radius_mm
@@ -19,7 +20,6 @@ from neurolens.surrogates.domain import Domain, sample_domain
 
 _RAYS = 65536
 _NEGLIGIBLE = 1e-4  # share of the rays below which a blocking surface is not worth a line
-_TABLE_TOLERANCE = 0.02  # film or f-number of the table against the computed one, relative to the focal length
 
 
 def describe_lens(lens: Lens, domain: Domain) -> dict[str, Any]:
@@ -55,7 +55,7 @@ def describe_lens(lens: Lens, domain: Domain) -> dict[str, Any]:
         "half_field_reached_deg": reached,
         "passing_share": passing,
         "ended": ended,
-        "warnings": warnings_of(lens, data.f_number, data.rear_focal_z_mm, reached),
+        "warnings": warnings_of(lens, data.f_number, reached),
     }
 
 
@@ -120,24 +120,23 @@ def passing_share(lens: Lens, domain: Domain, seed: int = 5) -> tuple[float, lis
     return passed, ended
 
 
-def warnings_of(lens: Lens, f_number: float, rear_focal_z_mm: float, reached_deg: float | None) -> list[str]:
-    """What a user of this lens should know, in sentences."""
+def file_doubts(tabled: Lens) -> list[str]:
+    """What is doubtful about a lens as its file has it, in sentences; a stop too wide is said by `warnings_of`."""
+    checks = check_lens(tabled)
+    return doubts([c for c in checks if c.quantity != "f-number" or (c.computed or 0.0) > (c.stated or 0.0)])
+
+
+def warnings_of(lens: Lens, f_number: float, reached_deg: float | None) -> list[str]:
+    """What a user of this lens in its state should know, in sentences; see `file_doubts` for its file."""
     found = []
-    focal_mm = first_order(lens).efl_mm
-    if focal_mm <= 0:
-        found.append("the focal length is negative: a diverging lens forms no picture on a film")
     if lens.rims == "estimated":
         found.append("rim diameters are estimated, not the source's: vignetting is a guess")
+    if lens.rims == "derived":
+        found.append("rim diameters are derived by a rule, the source has none: vignetting follows that rule")
     unknown = [str(k) for k, s in enumerate(lens.surfaces) if s.n_d != 1 and s.V_d is None]
     if unknown:
         found.append(f"V_d is unknown after surface {', '.join(unknown)}: the index there is constant")
     found += [f"surface {k}: {note}" for k, s in enumerate(lens.surfaces) for note in table_notes(s)]
-    tabled = float(lens.vertices_mm[-1])
-    if abs(tabled - rear_focal_z_mm) > _TABLE_TOLERANCE * abs(focal_mm):
-        found.append(
-            f"the table's last thickness puts the film at z = {tabled:.2f} mm, "
-            f"its focus at infinity is at {rear_focal_z_mm:.2f} mm"
-        )
     if abs(f_number / lens.f_number - 1) > 0.05 and f_number < lens.f_number:
         found.append(f"the stop gives f/{f_number:.3g}, wider than the f/{lens.f_number:.3g} of the source")
     if reached_deg is None:

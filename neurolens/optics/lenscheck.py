@@ -94,16 +94,15 @@ def in_state(lens: Lens, c: Configuration) -> Lens:
     """The table with the thicknesses, stop and stated figures of a zoom or focus state, film as tabled."""
     moved = dict(c.thickness_mm)
     rows = tuple(replace(s, thickness_mm=moved.get(k, s.thickness_mm)) for k, s in enumerate(lens.surfaces))
-    anamorphic = {"stated_efl_x_mm": None}  # a state names one focal length
     same = c.efl_mm is not None and lens.stated_efl_mm is not None and c.efl_mm == lens.stated_efl_mm
     state = replace(
         lens,
         surfaces=rows,
         stated_efl_mm=c.efl_mm,
+        stated_efl_x_mm=None,  # a state names one focal length
         half_field_deg=c.half_field_deg or (None if lens.image_radius_mm else lens.half_field_deg),
         # Where a state has no f-number its stop is that of the table, and any f-number is as good as another.
         f_number=c.f_number or (lens.f_number if same else math.nan),
-        **anamorphic,
     )
     return state if c.stop_diameter_mm is None else state.with_stop_radius(c.stop_diameter_mm / 2)
 
