@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import math
 import warnings
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from neurolens.commands.arguments import add_json, between, positive
 from neurolens.commands.output import number, print_json
@@ -124,18 +126,21 @@ def write_checked(lens: Lens, path: Path) -> None:
 
 def summary(lens: Lens, told: list[str]) -> dict[str, Any]:
     """What was read, for people and for --json; mm."""
-    from neurolens.optics.paraxial import first_order
-    from neurolens.readers.assemble import is_anamorphic, meridian
+    from neurolens.optics import paraxial
+    from neurolens.readers.assemble import first_order, is_anamorphic
 
-    data = first_order(meridian(lens, "y"))
-    across = first_order(meridian(lens, "x")) if is_anamorphic(lens) else None
+    data, efl_mm = first_order(lens), {"x": math.inf, "y": math.inf}
+    axis: Literal["x", "y"]
+    for axis in ("x", "y"):
+        with suppress(InputError):  # a cylinder has no power in one of its planes
+            efl_mm[axis] = paraxial.first_order(lens, meridian=axis).efl_mm
     return {
         "name": lens.name,
         "source": lens.source,
         "surfaces": len(lens.surfaces),
         "stop_surface": lens.stop_index,
-        "efl_mm": data.efl_mm,
-        "efl_x_mm": across and across.efl_mm,
+        "efl_mm": efl_mm["y"],
+        "efl_x_mm": efl_mm["x"] if is_anamorphic(lens) else None,
         "back_focus_mm": data.back_focus_mm,
         "film_gap_mm": float(lens.surfaces[-1].thickness_mm),
         "f_number": data.f_number,

@@ -13,6 +13,7 @@ from neurolens.optics.clearance import check_clearance
 from neurolens.optics.dispersion import Glass
 from neurolens.optics.lensfields import MAX_INDEX
 from neurolens.optics.lensrows import MAX_POWER, MAX_SURFACES
+from neurolens.optics.paraxial import FirstOrder
 from neurolens.optics.prescription import Configuration, Lens, Surface
 from neurolens.readers.source import warn
 
@@ -48,7 +49,7 @@ def finish(
     stated = lens.f_number if f_number is None else f_number
     # First-order data needs an opening, whatever it is.
     trial = lens.with_stop_radius(1.0 if math.isnan(stop.diameter_mm) else stop.semi_diameter_mm)
-    data = paraxial.first_order(meridian(trial, "y"))
+    data = first_order(trial)
     if pupil_mm is not None:
         trial = trial.with_stop_radius(trial.stop_radius_mm * pupil_mm / data.entrance_pupil_diameter_mm)
         stated = abs(data.efl_mm) / pupil_mm if math.isnan(stated) else stated
@@ -57,7 +58,7 @@ def finish(
             raise InputError(lens.path, "stop", "(no diameter, no f-number)", "one of them: give --f-number")
         trial = trial.with_stop_radius(trial.stop_radius_mm * data.f_number / stated)
     if math.isnan(stated):
-        stated = paraxial.first_order(meridian(trial, "y")).f_number
+        stated = first_order(trial).f_number
         warn(lens.path, f"no f-number is stated; f/{stated:.4g} follows from the stop's diameter")
     rows = list(trial.surfaces)
     if not film_given:
@@ -80,13 +81,31 @@ def with_rims(lens: Lens) -> Lens:
     if lens.half_field_deg is None and lens.image_radius_mm is None:
         expected = "the clear diameter of every surface, or a field to derive rims for (--half-field)"
         raise InputError(lens.path, "diameter", f"(not given for surface {listed})", expected)
-    derived, _ = rims.derive_rims(lens)
+    trial = lens
+    if any(lens.surfaces[k].asphere for k in missing):
+        # An asphere is traced inside a rim only: that of the spheres at the vertices is near enough to begin with.
+        trial = _filled(lens, rims.derive_rims(_spherical(lens))[0])
     warn(lens.path, f"no rim is given for surface {listed}: derived from f-number and field")
+    return replace(_filled(lens, rims.derive_rims(trial)[0]), rims="derived")
+
+
+def _filled(lens: Lens, other: Lens) -> Lens:
+    """The lens with the rims of another where it has none."""
     rows = (
-        replace(s, diameter_mm=d.diameter_mm) if math.isnan(s.diameter_mm) else s
-        for s, d in zip(lens.surfaces, derived.surfaces, strict=True)
+        replace(s, diameter_mm=o.diameter_mm) if math.isnan(s.diameter_mm) else s
+        for s, o in zip(lens.surfaces, other.surfaces, strict=True)
     )
-    return replace(lens, surfaces=tuple(rows), rims="derived")
+    return replace(lens, surfaces=tuple(rows))
+
+
+def _spherical(lens: Lens) -> Lens:
+    """The lens with every surface replaced by the sphere at its vertex."""
+    curvatures = [s.vertex_curvature("y") for s in lens.surfaces]
+    rows = (
+        replace(s, radius_mm=1 / c if c else math.inf, conic=0.0, asphere=())
+        for s, c in zip(lens.surfaces, curvatures, strict=True)
+    )
+    return replace(lens, surfaces=tuple(rows))
 
 
 def check_states(lens: Lens) -> None:
@@ -101,13 +120,18 @@ def is_anamorphic(lens: Lens) -> bool:
     return any(s.cylinder for s in lens.surfaces)
 
 
-def meridian(lens: Lens, axis: str) -> Lens:
-    """The rotationally symmetric lens that a lens with cylinders is in the plane of `axis` ("x" or "y")."""
-    rows = (
-        replace(s, cylinder=None, radius_mm=s.radius_mm if s.cylinder in (None, axis) else math.inf)
-        for s in lens.surfaces
-    )
-    return replace(lens, surfaces=tuple(rows))
+def first_order(lens: Lens) -> FirstOrder:
+    """First-order data in the y-z plane; of a lens without power there, in the x-z plane.
+
+    Raises:
+        InputError: a lens without power.
+    """
+    try:
+        return paraxial.first_order(lens, meridian="y")
+    except InputError:
+        if not is_anamorphic(lens):
+            raise
+        return paraxial.first_order(lens, meridian="x")
 
 
 def moved(lens: Lens, c: Configuration) -> Lens:

@@ -178,7 +178,8 @@ def _new_surface(file: File, command: Command) -> None:
         raise line.error(name, f"({len(file.blocks)} surfaces)", f"at most {MAX_SURFACES} surfaces")
     numbers = command.numbers(command.words[:2], 2)
     if file.radii is None and numbers[0] != 0:
-        raise line.error(name, numbers[0], "RDM (radii) or RDM N (curvatures) before it: this may be either")
+        file.radii = False
+        warn(file.path, f"line {line.number}: no RDM before it; surfaces have curvatures, CODE V's default, not radii")
     first = numbers[0]
     block = Block(line, curvature=first if not (file.radii and first) else 1 / first, thickness=numbers[1])
     if name == "SO" and block.thickness >= INFINITE:

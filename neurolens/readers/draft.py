@@ -7,10 +7,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from neurolens.errors import InputError
-from neurolens.optics import paraxial
 from neurolens.optics.lensrows import MAX_SURFACES
 from neurolens.optics.prescription import Configuration, Lens, Surface
-from neurolens.readers.assemble import check_states, finish, meridian, moved, with_rims
+from neurolens.readers.assemble import check_states, finish, first_order, moved, with_rims
 from neurolens.readers.source import unit_mm, warn
 
 
@@ -151,7 +150,7 @@ def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
         thickness.pop(last, None)
     found = Configuration(state.name, None, tuple(sorted(thickness.items())))
     there = moved(lens, found)
-    data = paraxial.first_order(meridian(there, "y"))
+    data = first_order(there)
     opening, f_number = state.stop_diameter, state.f_number
     pupil = state.pupil
     if pupil is None and f_number is not None:

@@ -7,12 +7,12 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 from neurolens.errors import InputError
 from neurolens.optics import paraxial
 from neurolens.optics.prescription import Lens
-from neurolens.readers.assemble import is_anamorphic, meridian
+from neurolens.readers.assemble import is_anamorphic
 from neurolens.readers.source import warn
 
 COMPUTED_KEYS = ("efl_mm", "bfd_mm", "efl_y_mm", "efl_x_mm", "bfd_y_mm", "bfd_x_mm", "f_number_from_stop")
@@ -32,8 +32,8 @@ def stated_efl(lens: Lens, data: Mapping[str, Any]) -> Lens:
     if not values or values[0] is None:
         return lens
     if is_anamorphic(lens) and len(values) == 2:
-        y = paraxial.first_order(meridian(lens, "y")).efl_mm
-        x = paraxial.first_order(meridian(lens, "x")).efl_mm
+        y = paraxial.first_order(lens, meridian="y").efl_mm
+        x = paraxial.first_order(lens, meridian="x").efl_mm
         a, b = map(float, values)
         straight = abs(math.log(a / abs(y))) + abs(math.log(b / abs(x)))
         crossed = abs(math.log(b / abs(y))) + abs(math.log(a / abs(x)))
@@ -48,8 +48,9 @@ def check_computed(lens: Lens, data: Mapping[str, Any]) -> None:
     if not isinstance(given, Mapping):
         raise InputError(lens.path, "computed_at_nd", given, "an object with efl_mm and bfd_mm")
     table = replace(lens, surfaces=tuple(replace(s, glass=None) for s in lens.surfaces))
-    for axis, suffix in (("y", ""), ("y", "_y"), ("x", "_x")):
-        found = paraxial.first_order(meridian(table, axis))
+    axes: tuple[tuple[Literal["x", "y"], str], ...] = (("y", ""), ("y", "_y"), ("x", "_x"))
+    for axis, suffix in axes:
+        found = paraxial.first_order(table, meridian=axis)
         for key, value in ((f"efl{suffix}_mm", found.efl_mm), (f"bfd{suffix}_mm", found.back_focus_mm)):
             expected = given.get(key)
             if isinstance(expected, int | float) and not abs(value - expected) <= AGREES * abs(found.efl_mm):

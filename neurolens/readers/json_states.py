@@ -8,10 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 from neurolens.errors import InputError
-from neurolens.optics import paraxial
 from neurolens.optics.lensfields import number, text
 from neurolens.optics.prescription import Configuration, Lens
-from neurolens.readers.assemble import check_states, meridian, moved
+from neurolens.readers.assemble import check_states, first_order, moved
 from neurolens.readers.source import warn
 from neurolens.tomlfile import reject_unknown
 
@@ -70,7 +69,7 @@ def _state(lens: Lens, table: Mapping[str, Any], name: str) -> Configuration:
     efl_y, distance = given.pop("efl_y_mm"), table.get("object_distance_mm")
     efl = given.pop("efl_mm") if given["efl_mm"] is not None else (given.pop("efl_mm"), efl_y)[1]
     state = Configuration(name, efl, _thickness(lens, table, where), **given)
-    table_lens = meridian(moved(lens, state), "y")
+    table_lens = moved(lens, state)
     paraxial_mm = _object_distance_mm(table_lens)
     if isinstance(distance, str):
         if not (math.isfinite(paraxial_mm) and paraxial_mm > 0):
@@ -82,12 +81,12 @@ def _state(lens: Lens, table: Mapping[str, Any], name: str) -> Configuration:
         if not abs(paraxial_mm / stated - 1) <= DOUBTFUL:
             warn(lens.path, f"{where}object_distance_mm {stated:g} is stated; the thicknesses focus {paraxial_mm:.6g}")
         return replace(state, object_distance_mm=stated)
-    return state if efl is not None else replace(state, efl_mm=paraxial.first_order(table_lens).efl_mm)
+    return state if efl is not None else replace(state, efl_mm=first_order(table_lens).efl_mm)
 
 
 def _object_distance_mm(lens: Lens) -> float:
     """Distance from the object in focus on the tabled film to the front vertex (Newton's x x' = -f^2)."""
-    data = paraxial.first_order(lens)
+    data = first_order(lens)
     beyond = float(lens.vertices_mm[-1]) - data.rear_focal_z_mm
     return data.efl_mm**2 / beyond - data.front_focal_z_mm if beyond else math.inf
 

@@ -8,7 +8,7 @@ SYSTEM = frozenset(
     GSTD NSCD COFN LUID EFFL""".split()
 )
 # Of the system, and ignored: rims and stop decide which rays pass, not the factors that a designer chose.
-VIGNETTING = frozenset("VDXN VDYN VCXN VCYN VANN".split())
+VIGNETTING = frozenset("VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN".split())
 # Of a surface: what the editor shows and hides, substrates, mechanical edges, variables, pickups carried out.
 SURFACE = frozenset("HIDE MIRR SLAB POPS FIMP MEMA OEMA VDSZ VPAR PPAR GLCZ".split())
 # Of a surface, and worth a warning: coatings are named, not given.

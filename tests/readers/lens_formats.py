@@ -11,7 +11,6 @@ from dataclasses import replace
 
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.readers.assemble import meridian
 
 
 class CannotSay(Exception):
@@ -25,7 +24,7 @@ def plain(lens: Lens) -> Lens:
 
 
 def pupil_mm(lens: Lens) -> float:
-    return first_order(meridian(lens, "y")).entrance_pupil_diameter_mm
+    return first_order(lens).entrance_pupil_diameter_mm
 
 
 def zmx(lens: Lens) -> str:
