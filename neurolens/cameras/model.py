@@ -103,7 +103,7 @@ class _Scene:
         out = self.model.rays(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm)
         if self.aperture is None:
             return SceneRays(out.scene_ray, out.transmittance, out.status)
-        inside = self.aperture.inside(*out.stop_xy_mm, self.stop_radius_mm)
+        inside = self.aperture.inside(out.stop_xy_mm[0], out.stop_xy_mm[1], self.stop_radius_mm)
         stopped = np.int32(st.blocked(int(self.model.card["lens"].get("stop_surface", 0)), st.RIM))
         status = np.where(inside | (out.status != st.PASSED), out.status, stopped)
         return SceneRays(out.scene_ray, out.transmittance, status)

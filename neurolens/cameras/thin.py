@@ -89,6 +89,6 @@ class ThinLens:
         weight = cos2 * cos2 * np.float32(self._exposure / self._part)
         if self.aperture is None:
             return CameraRays(origin, direction, weight, np.zeros(count, np.int32))
-        inside = self.aperture.inside(*lens, self.radius_mm)
+        inside = self.aperture.inside(lens[0], lens[1], self.radius_mm)
         status = np.where(inside, st.PASSED, st.blocked(0, st.RIM)).astype(np.int32)
         return CameraRays(origin, direction, np.where(inside, weight, np.float32(0)), status)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from neurolens.errors import InputError
 from neurolens.evaluate.plots_style import FIELD_COLOURS, new_figure, plain_log_ticks, save, style
-from neurolens.optics.breathing import Breath, field_change
+from neurolens.optics.breathing import Breath, breathing, field_change
+from neurolens.optics.internal import focus_states, nearest_focus_m
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Focus, Lens
 
 _DASHES = ((0, ()), (0, (5, 2)), (0, (1.5, 1.5)))
 
@@ -55,3 +59,21 @@ def breathing_plot(ways: Mapping[str, Sequence[Breath]], path: str | Path, title
         plain_log_ticks(panels[2].xaxis)
         plain_log_ticks(panels[2].yaxis)
         return save(figure, path)
+
+
+def draw_breathing(lens: Lens, path: str | Path, count: int = 48) -> dict[str, list[Breath]]:
+    """Compute and draw a lens's breathing from its nearest focus to a thousand focal lengths.
+
+    Both ways of focusing are drawn where the lens file has focus states. Returns what is drawn, infinity first.
+    """
+    data = first_order(lens.at())
+    nearest = 1.05 * (4 * abs(data.efl_mm) + data.rear_principal_z_mm - data.front_principal_z_mm) / 1000
+    ways: dict[str, Focus] = {"film moves": "film"}
+    if focus_states(lens):
+        ways["groups move"] = "internal"
+        nearest = max(nearest, 1.0001 * nearest_focus_m(lens))
+    far = max(abs(data.efl_mm), 10 * nearest)
+    distances = [nearest * (far / nearest) ** (k / (count - 1)) for k in range(count)]
+    found = {name: breathing(lens, [math.inf, *distances], way) for name, way in ways.items()}
+    breathing_plot(found, path, f"Focus breathing of {lens.name}")
+    return found

@@ -95,8 +95,15 @@ def _solved(lens: Lens, gaps: list[int], states: list[_State], efl_mm: float) ->
     """Places of the groups with this focal length and the paraxial image on the film: Gauss-Newton, least moves."""
     x = [math.log(s.efl_mm) for s in states]
     target = min(max(math.log(efl_mm), x[0]), x[-1])
-    places = np.array(monotone(x, [s.places.tolist() for s in states], target))
-    directions = _directions(np.array([s.places for s in states]))
+    known = np.array([s.places for s in states])
+    places, (moving, kept) = np.array(monotone(x, known.tolist(), target)), _movement(known)
+    if moving.sum() > 2:
+        (gap_mm,) = monotone(x, (known[:, kept : kept + 1] - known[:, kept + 1 : kept + 2]).tolist(), target)
+        if moving[kept]:
+            places[kept] = places[kept + 1] + gap_mm
+        else:
+            places[kept + 1] = places[kept] - gap_mm
+    directions = _directions(moving, kept)
 
     def wrong(places: Vector) -> Vector:
         inner = dict(zip(gaps, (places[:-1] - places[1:]).tolist(), strict=True))
@@ -116,18 +123,22 @@ def _solved(lens: Lens, gaps: list[int], states: list[_State], efl_mm: float) ->
     raise InputError(lens.path, "zoom", efl_mm, "a position between states that its groups can reach in focus")
 
 
-def _directions(places: Vector) -> Vector:
-    """The moves [D, groups] that may correct the interpolation, from the places [states, groups]."""
+def _movement(places: Vector) -> tuple[NDArray[np.bool_], int]:
+    """Which groups move, and the first gap that varies, from the places [states, groups]."""
     travel = np.ptp(places, axis=0)
-    moving = travel > MOVES * travel.max()
-    unit = np.eye(len(travel))
+    least = MOVES * travel.max()
+    varies = np.ptp(places[:, :-1] - places[:, 1:], axis=0) > least
+    return travel > least, int(np.argmax(varies))
+
+
+def _directions(moving: NDArray[np.bool_], kept: int) -> Vector:
+    """The moves [D, groups] that may correct the interpolation."""
+    unit = np.eye(len(moving))
     if moving.sum() < 2:
         return unit
     if moving.sum() == 2:
         return np.asarray(unit[moving])
     # The first varying gap is kept: what bounds it moves together, or stands still if one of the two does.
-    varies = np.ptp(places[:, :-1] - places[:, 1:], axis=0) > MOVES * travel.max()
-    kept = int(np.argmax(varies))
     together = [unit[kept] + unit[kept + 1]] if moving[kept] and moving[kept + 1] else []
     others = [unit[j] for j in np.flatnonzero(moving) if j not in (kept, kept + 1)]
     return np.array(together + others)
@@ -139,13 +150,15 @@ def _between(states: list[_State], efl_mm: float) -> tuple[_State, _State]:
 
 
 def _interpolated_texts(lens: Lens, states: list[_State], efl_mm: float) -> Lens:
-    """Stop, half field (by the image's height) and nominal f-number between those of the states, where all say."""
+    """Stop, half field (by the image's height) and nominal f-number between those of the states that say."""
     x = [math.log(s.efl_mm) for s in states]
     place = min(max(math.log(efl_mm), x[0]), x[-1])
 
     def value(known: list[float | None]) -> float | None:
-        sure = [k for k in known if k is not None]
-        return monotone(x, [[k] for k in sure], place)[0] if len(sure) == len(known) else None
+        sure = [(at, [k]) for at, k in zip(x, known, strict=True) if k is not None]
+        if not sure or not sure[0][0] <= place <= sure[-1][0]:
+            return None
+        return monotone([s[0] for s in sure], [s[1] for s in sure], place)[0]
 
     heights = [
         None if s.source.half_field_deg is None or s.source.half_field_deg >= 89
