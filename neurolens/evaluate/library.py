@@ -14,6 +14,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lightcheck import film_edge_mm
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import image_radius_mm
 
 UNREADABLE = "unreadable"
 _NO_FIELD = 0.2  # film radius over focal length at which a lens of unknown field is drawn
@@ -103,7 +104,9 @@ def sections(files: list[Path]) -> list[dict[str, Any]]:
     for path in files:
         lens = read_quietly(path).at()
         data = first_order(lens)
-        edge = film_edge_mm(lens) or _NO_FIELD * abs(data.efl_mm)
+        edge = film_edge_mm(lens)
+        if edge is None:
+            edge = _NO_FIELD * abs(data.efl_mm) if lens.half_field_deg is None else image_radius_mm(lens)[0]
         profile = layout_profile(Scene(lens, math.inf, "y"), edge)
         found.append({**profile, "title": path.stem, "subtitle": _caption(lens, data.efl_mm, data.f_number)})
     return found
