@@ -229,7 +229,7 @@ class _Aim:
 
 def _to_film(scene: Scene, start: Rays, wavelength_nm: Tensor) -> tuple[Rays, Tensor, Tensor]:
     """Rays on the film, their status, and the optical path from their start to the film."""
-    lens = scene.lens
+    lens = scene.traced
     with torch.no_grad():
         out = trace(lens, start, wavelength_nm, towards="film", path=True)
     film = on_plane(out.rays, scene.film_z_mm)

@@ -64,11 +64,13 @@ class Scene:
         focus_m: distance from the film to the object, inf allowed. An object of a lens of less than 60 degrees half
             field is a plane across the axis; of a wider one a sphere about the entrance pupil.
         axis: transverse axis of the meridional plane; matters for anamorphic lenses only.
+        rims: False opens every rim but the stop's (of aspheres a little, for they end soon after it).
     """
 
     lens: Lens
     focus_m: float = math.inf
     axis: Axis = "y"
+    rims: bool = True
 
     @property
     def film_z_mm(self) -> float:
@@ -148,10 +150,16 @@ class Scene:
 
     @property
     def open(self) -> Scene:
-        """The same scene with every rim but the stop's as wide as its surface goes: where rays would go."""
-        rows = self.lens.surfaces
-        wide = tuple(s if s.stop else replace(s, diameter_mm=math.inf) for s in rows)
-        return replace(self, lens=replace(self.lens, surfaces=wide))
+        """The same scene without rims: where rays would go if only the stop were in the way."""
+        return replace(self, rims=False)
+
+    @property
+    def traced(self) -> Lens:
+        """The lens that rays go through."""
+        if self.rims:
+            return self.lens
+        rows = zip(self.lens.surfaces, without_rims(self.lens).surfaces, strict=True)
+        return replace(self.lens, surfaces=tuple(old if old.stop else new for old, new in rows))
 
     def check(self) -> None:
         """Raise InputError for a lens that forms no image on a film."""

@@ -60,7 +60,7 @@ def illumination(
     start, area = _grid(scene, rays.chief_height_mm, film, n)
     with torch.no_grad():
         light = area[:, None] * start.dz.reshape(fields, -1) ** 4
-        whole, seen = (_sum(light, lens, start, wavelength_nm) for lens in (scene.open.lens, scene.lens))
+        whole, seen = (_sum(light, lens, start, wavelength_nm) for lens in (scene.open.traced, scene.lens))
     return Illumination(
         wavelength_nm,
         angles,

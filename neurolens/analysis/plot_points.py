@@ -34,7 +34,7 @@ def plot_spots(data: Spots, path: str | Path, title: str, subtitle: str) -> Path
                 axes.set_title(f"film {1000 * shifts[j]:+.0f} µm" if abs(shifts[j]) > 1e-12 else "film as it stands")
             if j == 0:
                 axes.set_ylabel(
-                    f"{field_name(data.field_deg[i])}, {data.height_mm[i]:.1f} mm\ntangential (µm)", size=8.5
+                    f"{field_name(float(data.field_deg[i]))}, {data.height_mm[i]:.1f} mm\ntangential (µm)", size=8.5
                 )
             if i == rows - 1:
                 axes.set_xlabel("sagittal (µm)", size=8.5)
@@ -97,7 +97,7 @@ def plot_fans(data: Fans, path: str | Path, title: str, subtitle: str) -> Path:
                 axes.set(xlim=(-1, 1), ylim=(-reach, reach))
                 if i == 0:
                     axes.set_title(name)
-            grid[i, 0].set_ylabel(f"{field_name(data.field_deg[i])}\naberration (µm)", size=8.5)
+            grid[i, 0].set_ylabel(f"{field_name(float(data.field_deg[i]))}\naberration (µm)", size=8.5)
         for axes in grid[-1]:
             axes.set_xlabel("height in the stop / its radius")
         handles, labels = grid[0, 0].get_legend_handles_labels()
@@ -122,7 +122,7 @@ def plot_psf(data: Psf, path: str | Path, title: str, subtitle: str) -> Path:
                     axes.imshow(shown, origin="lower", extent=(-half, half, -half, half), cmap="magma", vmin=0)
                 else:
                     axes.text(0, 0, "aberrations far larger\nthan diffraction", ha="center", va="center", fontsize=8)
-            grid[0, i].set_title(field_name(data.field_deg[i]))
+            grid[0, i].set_title(field_name(float(data.field_deg[i])))
             if np.isfinite(data.strehl[i]):
                 grid[1, i].set_title(f"Strehl ratio {data.strehl[i]:.3f}", fontsize=9)
             grid[1, i].set_xlabel("sagittal (µm)", size=8.5)

@@ -23,7 +23,7 @@ from neurolens.analysis.spots import working_f_number
 from neurolens.analysis.wavefront import cosines, path_to_chief_mm
 
 _BINS, _POINTS = 49, 97  # of the geometric and the diffraction image, odd: one on the centre
-_FINEST = 144  # points across the pupil that are still traced
+_FINEST = 128  # points across the pupil that are still traced
 _HELD = 0.98  # share of the geometric spot's energy that the window holds
 
 
@@ -61,7 +61,7 @@ def psf(
     """Point spread of fields; the window holds the spot and six Airy radii unless its half width is given."""
     fields = scene.default_fields() if field_deg is None else field_deg
     airy = 1.22e-3 * wavelength_nm[0] * working_f_number(scene, wavelength_nm[0])
-    rays = bundle(scene, fields, wavelength_nm, grid(72))
+    rays = bundle(scene, fields, wavelength_nm, grid(64))
     half, geometric, diffraction, needed = [], [], [], []
     for k, field in enumerate(fields):
         t, s, w = (v[k].flatten() for v in (rays.tangential_mm, rays.sagittal_mm, rays.weight))

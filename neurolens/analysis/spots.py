@@ -78,7 +78,7 @@ def spots(
         np.array(rays.field_deg), np.array(rays.wavelength_nm), rays.chief_height_mm.numpy(),
         t.numpy(), s.numpy(), st.numpy(), ss.numpy(),
         moments.rms_um(torch.zeros(1, dtype=torch.float64))[:, 0].numpy(),
-        torch.nan_to_num(away, nan=-1.0).amax((1, 2)).numpy(),
+        torch.where(rays.passed, away, -math.inf).amax((1, 2)).clamp_min(0.0).numpy(),
         _Moments(rays, by_wavelength=True).rms_um(torch.zeros(1, dtype=torch.float64))[..., 0].numpy(),
         (rays.weight.sum((1, 2)) / open_energy).numpy(),
         n, 1.22e-3 * wavelength_nm[0] * n,
