@@ -204,6 +204,11 @@ def _glass(line: Line, rest: list[str]) -> dict[str, Any]:
 def _draft(file: File) -> Draft:
     *_, image = file.blocks
     rows = tuple(Row(_surface_of(b), b.aperture) for b in file.blocks[1:-1])
+    for block in file.blocks:
+        if math.isnan(block.thickness):
+            raise block.start.error("DISZ", "(missing)", "the thickness behind every surface (is the file cut off?)")
+    if image.thickness or image.medium or image.stop:
+        raise image.start.error("SURF", "(the last in the file)", "an image surface (is the file cut off?)")
     if image.curvature:
         file.oddities.append("the image surface is curved; the film is taken as plane")
     if file.f_number is not None and file.working and math.isfinite(file.blocks[0].thickness):

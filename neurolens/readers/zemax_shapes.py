@@ -21,7 +21,7 @@ class Block:
     kind: str = "STANDARD"
     curvature: float = 0.0
     conic: float = 0.0
-    thickness: float = 0.0
+    thickness: float = math.nan  # until DISZ has been read
     semi_diameter: float = UNKNOWN
     automatic: bool = True  # whether the program sized the rim from the rays
     medium: dict[str, Any] = field(default_factory=dict)
