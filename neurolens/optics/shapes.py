@@ -2,8 +2,9 @@
 
 A conic surface of curvature c and constant K is c (x^2 + y^2 + (1 + K) z^2) - 2 z = 0; a cylinder lacks the square of
 the coordinate along which it is straight. Both are met in closed form. An asphere adds A_p h^p, h the distance from
-the axis (from the plane of symmetry, for a cylinder): Newton's iteration along the ray, started from the conic that
-fits best; started at the vertex plane it fails beyond about 55 degrees.
+the axis (from the plane of symmetry, for a cylinder): an iteration of Newton's kind along the ray, started from the
+conic that fits best; started at the vertex plane it fails beyond about 55 degrees. All steps but the last follow a parabola along
+the ray instead of a tangent, which still finds the surface where rays graze it.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ from neurolens.optics.surfaces import Hit, Medium, Rays, nearest_approach, root,
 
 Vector = tuple[Tensor, Tensor, Tensor]
 
-# Steps of Newton's iteration by how far the asphere departs from the conic that it starts from, in rim radii. A fixed
+# Steps of the iteration by how far the asphere departs from the conic that it starts from, in rim radii. A fixed
 # count, for a test of convergence would make an accelerator wait for its host at every surface.
-STEPS = ((1e-4, 2), (3e-3, 3), (3e-2, 5), (math.inf, 7))
+STEPS = ((1e-4, 2), (3e-3, 3), (3e-2, 4), (math.inf, 7))
 # More steps that float64 takes after the one that decides convergence, so that both precisions decide alike.
-POLISH = {torch.float32: 0, torch.float64: 3}
-# Length of the deciding step, in rim radii, that counts as converged: the error left is of the order of its square.
+POLISH = {torch.float32: 0, torch.float64: 2}
+# Length of the deciding step, in rim radii, that counts as converged: the error left is of the order of its cube.
 LAST_STEP = 3e-4
-# cos^2 of the slope of the steepest conic that Newton's iteration walks on.
+# cos^2 of the slope of the steepest conic that the iteration walks on.
 STEEPEST = 1e-7
 
 
@@ -88,7 +89,7 @@ def _meet_quadric(
 
 
 def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], sense: int, before: Medium) -> Hit:
-    """Newton's iteration along the rays, from the conic that fits the asphere best.
+    """Iterate along the rays, from the conic that fits the asphere best.
 
     All steps but the last are taken outside the graph: the last one alone carries the derivative of the solution
     (implicit function theorem), so that gradients cost no memory for iterations.
@@ -102,19 +103,21 @@ def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], 
         t = torch.where(torch.isfinite(t), t, 0.0)
         polish = POLISH[t.dtype]
         for n in range(steps + polish - 1):
-            step = _step(_along(held_m, t, held_p), held_p, surface, w)
+            step = _leap(_along(held_m, t, held_p), held_p, surface, w, sense)
             if n == steps - 1:
                 deciding = step
             t = t + step
     at = _along(m, t.detach(), p)
-    step = _step(at, p, surface, w)
+    step = _step(at, p, surface, w, sense)
     x, y, z = _along(at, step, p)
-    _, slope, cos2 = _sag(surface, w, x, y)
+    _, slope, _, cos2 = _sag(surface, w, x, y)
     nx, ny = (times(v * -slope, k) for v, k in zip((x, y), w, strict=True))
     scale = torch.rsqrt(1 + nx * nx + ny * ny)
     q = (nx * p[0] + ny * p[1] + p[2]) * scale * sense
     length = times((deciding if polish else step).abs(), before.n)
-    met = (length <= LAST_STEP * surface.semi_diameter_mm) & (cos2 > STEEPEST) & (q > 0)
+    met = (length <= LAST_STEP * surface.semi_diameter_mm) & (q > 0)
+    if cos2 is not None:
+        met = met & (cos2 > STEEPEST)
     q2 = torch.where(met, q * q, torch.minimum(missed, -q * q))
     return Hit(x, y, z, q, q2, met, (nx * scale, ny * scale, scale))
 
@@ -150,19 +153,32 @@ def _fitted(
     return (c, cz), next(steps for departure, steps in STEPS if worst <= departure * rim_mm)
 
 
-def _step(at: Vector, p: Vector, surface: Surface, w: tuple[float, float]) -> Tensor:
-    """Newton's step along the rays towards sag(x, y) = z."""
+def _leap(at: Vector, p: Vector, surface: Surface, w: tuple[float, float], sense: int) -> Tensor:
+    """A step like Newton's that also knows how the surface bends along the ray: sound where rays graze.
+
+    The second derivative of the sag along the ray is exact for the conic; of the polynomial it leaves out how the slope
+    over the height changes.
+    """
     x, y, z = at
-    sag, slope, _ = _sag(surface, w, x, y)
-    rate = p[2] - slope * _weighted((x, y, z), p, w)
-    return (sag - z) / torch.where(rate == 0, 1.0, rate)
+    sag, slope, turn, _ = _sag(surface, w, x, y)
+    along = _weighted((x, y, z), p, w)
+    rate = slope * along - p[2]
+    # Second derivative of the sag along the ray, but for what the polynomial adds to the change of its own slope.
+    bend = slope * _weighted(p, p, w)
+    if turn is not None:
+        bend = bend + along * along * turn
+    lack = sag - z
+    square = (rate * rate - 2 * bend * lack).clamp_min(0)
+    denominator = rate - sense * torch.sqrt(square + 1e-30)
+    return -2 * lack / denominator
 
 
-def _sag(surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth of the asphere, d sag / d h divided by h, and the conic's squared cosine, positive where it exists; [N]."""
-    c, h2 = surface.curvature, _weighted((x, y, x), (x, y, x), w)
-    cos2 = 1 - h2 * ((1 + surface.conic) * c * c)
-    cos = torch.sqrt(cos2.clamp_min(STEEPEST))
+def _sag(
+    surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+    """The asphere at points [N]: depth, slope d sag / d h divided by h, the change d slope / d h divided by h of the
+    conic alone, and the conic's squared cosine, positive where it exists; the last two None without a conic."""
+    h2 = _weighted((x, y, x), (x, y, x), w)
     powers = dict(surface.asphere)
     even = all(p % 2 == 0 for p in powers)
     # Horner's rule in h^2, or in h where odd powers occur; the root is kept from 0, where its slope is infinite.
@@ -173,4 +189,14 @@ def _sag(surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor) -> tupl
         sag, slope = sag * h, slope * h
         if k in powers:
             sag, slope = sag + powers[k], slope + k * powers[k]
-    return c * h2 / (1 + cos) + sag * h2, c / cos + slope, cos2
+    c = surface.curvature
+    if not isinstance(c, Tensor) and c == 0:
+        return sag * h2, slope, None, None
+    stretch = (1 + surface.conic) * c * c
+    cos2 = 1 - h2 * stretch
+    cos = torch.sqrt(cos2.clamp_min(STEEPEST))
+    # One division for both c h^2 / (1 + cos) and c / cos.
+    both = c / (cos + cos * cos)
+    inverse = both * (1 + cos)
+    turn = inverse * inverse * inverse * (1 + surface.conic)
+    return both * cos * h2 + sag * h2, inverse + slope, turn, cos2
