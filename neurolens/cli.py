@@ -1,4 +1,4 @@
-"""The command line: `neurolens lens | glass | train | evaluate | render`. Errors are one line and exit code 2."""
+"""The command line: `neurolens lens | analyse | glass | train | evaluate | render`. Errors are one line and exit code 2."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from neurolens import __version__
-from neurolens.commands import bench, convert, evaluate, glass, lens, render, train
+from neurolens.commands import analyse, bench, convert, evaluate, glass, lens, render, train
 from neurolens.commands.arguments import Parser
 from neurolens.errors import NeurolensError, NeurolensWarning
 
@@ -35,7 +35,7 @@ def build_parser() -> Parser:
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    for command in (lens, glass, convert, train, evaluate, render, bench):
+    for command in (lens, analyse, glass, convert, train, evaluate, render, bench):
         command.add_parser(subparsers)
     return parser
 

@@ -78,7 +78,7 @@ class Scene:
 
     @property
     def first_order(self) -> FirstOrder:
-        return first_order(self.lens)
+        return first_order(self.lens, meridian=self.axis)
 
     @property
     def object_z_mm(self) -> float:

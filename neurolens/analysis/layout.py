@@ -57,7 +57,7 @@ def layout_profile(scene: Scene, film_radius_mm: float | None = None) -> dict[st
         "film_half_height_mm": radius,
         "height": scene.axis,
         "title": lens.name,
-        "subtitle": _subtitle(scene, radius),
+        "subtitle": f"{state_text(scene)}, film radius {radius:.1f} mm",
     }
 
 
@@ -86,12 +86,13 @@ def _profile(s: Surface, vertex_mm: float, axis: str) -> list[list[float]] | Non
     return found
 
 
-def _subtitle(scene: Scene, radius: float) -> str:
+def state_text(scene: Scene) -> str:
+    """Focal length, f-number, refractions and focus of a scene, for headings."""
     data = scene.first_order
-    focus = "infinity" if math.isinf(scene.focus_m) else f"{scene.focus_m:g} m"
+    focus = "infinity" if math.isinf(scene.focus_m) else f"{scene.focus_m:.4g} m"
+    plane = f", {scene.axis}-z plane" if any(s.cylinder for s in scene.lens.surfaces) else ""
     return (
-        f"f = {data.efl_mm:.1f} mm, f/{data.f_number:.2g}, {refractions(scene.lens)} refractions, focus {focus}, "
-        f"film radius {radius:.1f} mm"
+        f"f = {data.efl_mm:.1f} mm, f/{data.f_number:.2g}, {refractions(scene.lens)} refractions, focus {focus}{plane}"
     )
 
 

@@ -17,6 +17,7 @@ from neurolens.analysis.fields import Scene
 from neurolens.analysis.results import Array, Result
 from neurolens.errors import InputError
 from neurolens.optics.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, index_of
+from neurolens.optics.paraxial import is_pinhole
 from neurolens.optics.prescription import Lens, Surface
 
 NAMES = ("S1 spherical", "S2 coma", "S3 astigmatism", "S4 Petzval", "S5 distortion", "C1 axial colour", "C2 lateral")
@@ -65,6 +66,8 @@ def seidel(scene: Scene, *, wavelength_nm: float = LINE_D_NM, image_height_mm: f
     lens = scene.lens
     if any(s.cylinder for s in lens.surfaces):
         raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
+    if is_pinhole(lens):
+        raise InputError(lens.path, "surfaces", "(a pinhole)", "a lens with power")
     if image_height_mm is None:
         image_height_mm = float(scene.chief_rays([scene.edge_deg()], wavelength_nm).height_mm[0])
     n = _indices(lens, wavelength_nm)
@@ -98,7 +101,7 @@ def _indices(lens: Lens, wavelength_nm: float) -> list[float]:
 
 def _curvature(s: Surface) -> float:
     """Curvature at the vertex: r^2 terms count."""
-    return float(s.curvature) + 2 * float(dict(s.asphere).get(2, 0.0))
+    return float(s.vertex_curvature("y"))
 
 
 def _march(lens: Lens, n: list[float], y: float, u: float) -> _Ray:
