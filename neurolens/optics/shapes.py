@@ -3,8 +3,7 @@
 A conic surface of curvature c and constant K is c (x^2 + y^2 + (1 + K) z^2) - 2 z = 0; a cylinder lacks the square of
 the coordinate along which it is straight. Both are met in closed form. An asphere adds A_p h^p, h the distance from
 the axis (from the plane of symmetry, for a cylinder): an iteration of Newton's kind along the ray, started from the
-conic that fits best; started at the vertex plane it fails beyond about 55 degrees. All steps but the last follow a parabola along
-the ray instead of a tangent, which still finds the surface where rays graze it.
+conic that fits best; started at the vertex plane it fails beyond about 55 degrees.
 """
 
 from __future__ import annotations
@@ -103,7 +102,7 @@ def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], 
         t = torch.where(torch.isfinite(t), t, 0.0)
         polish = POLISH[t.dtype]
         for n in range(steps + polish - 1):
-            step = _leap(_along(held_m, t, held_p), held_p, surface, w, sense)
+            step = _step(_along(held_m, t, held_p), held_p, surface, w, sense)
             if n == steps - 1:
                 deciding = step
             t = t + step
@@ -153,11 +152,11 @@ def _fitted(
     return (c, cz), next(steps for departure, steps in STEPS if worst <= departure * rim_mm)
 
 
-def _leap(at: Vector, p: Vector, surface: Surface, w: tuple[float, float], sense: int) -> Tensor:
-    """A step like Newton's that also knows how the surface bends along the ray: sound where rays graze.
+def _step(at: Vector, p: Vector, surface: Surface, w: tuple[float, float], sense: int) -> Tensor:
+    """Euler's step along the rays towards sag(x, y) = z: Newton's with the bend of the surface taken into account.
 
-    The second derivative of the sag along the ray is exact for the conic; of the polynomial it leaves out how the slope
-    over the height changes.
+    Newton's own step is lost where a ray all but touches the surface, for there two meetings lie close together; the
+    parabola through value, slope and bend has both, and the sign of its root is that of the one wanted.
     """
     x, y, z = at
     sag, slope, turn, _ = _sag(surface, w, x, y)

@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from neurolens.optics.survival import positive
+
 
 class Rays(NamedTuple):
     """Rays as a structure of arrays, each [N]: a point (mm) and a direction (unit, or times the index in here)."""
@@ -38,7 +40,7 @@ class Hit(NamedTuple):
     """A meeting point, each [N].
 
     `q` is n times the cosine of incidence and `q2` its square: positive where the ray meets the surface, and a smooth
-    measure of how far it misses elsewhere. `met` is False where there is no meeting (NaN counts as none). `normal` is
+    measure of how far it misses elsewhere. `met` is False (or 0) where there is no meeting (NaN is none). `normal` is
     the unit normal towards +z; None for a sphere of curvature c, whose normal is (-c x, -c y, 1 - c z).
     """
 
@@ -85,11 +87,14 @@ def nearest_approach(r: Rays, inverse_n2: Any) -> tuple[Tensor, Tensor, Tensor]:
     )
 
 
-def intersect_sphere(r: Rays, curvature: Any, sense: int, before: Medium, entering: bool, guard: bool) -> Hit:
+def intersect_sphere(
+    r: Rays, curvature: Any, sense: int, before: Medium, entering: bool, guard: bool, spend: bool
+) -> Hit:
     """Meet a sphere of signed curvature (1/mm) at the root next to the vertex.
 
     `entering` marks the first surface met, where rays may arrive at more than 90 degrees. `guard` keeps rays without a
-    meeting finite (for gradients and for crossings that are learnt from); without it they are NaN.
+    meeting finite (for gradients and for crossings that are learnt from); without it they are NaN. `spend` is as in
+    `survival.positive`.
     """
     mx, my, mz = nearest_approach(r, before.inverse_n2)
     m2 = torch.addcmul(torch.addcmul(mx * mx, my, my), mz, mz)
@@ -107,9 +112,9 @@ def intersect_sphere(r: Rays, curvature: Any, sense: int, before: Medium, enteri
         met = (q2 > 0) & (denominator * sense > 0)
         t = f / torch.where(met, denominator, float(sense))
     else:
-        # One comparison: NaN from a negative square fails it too.
-        met = denominator > 0 if sense > 0 else denominator < 0
         t = f / denominator
+        # One comparison: NaN from a negative square fails it too.
+        met = positive(denominator, sense, spend=spend)
     x = torch.addcmul(mx, t, r.dx)
     y = torch.addcmul(my, t, r.dy)
     z = torch.addcmul(mz, t, r.dz)
@@ -119,11 +124,11 @@ def intersect_sphere(r: Rays, curvature: Any, sense: int, before: Medium, enteri
     return Hit(x, y, z, q, q2, met)
 
 
-def intersect_plane(r: Rays, sense: int) -> Hit:
-    """Meet the plane z = 0; a ray that does not travel along `sense` misses it."""
+def intersect_plane(r: Rays, sense: int, guard: bool, spend: bool) -> Hit:
+    """Meet the plane z = 0; a ray that does not travel along `sense` misses it. Arguments as for a sphere."""
     q = r.dz * sense
-    met = q > 0
-    t = r.z / torch.where(met, r.dz, float(sense))
+    met = positive(q.clone() if spend else q, spend=spend)
+    t = r.z / (torch.where(met, r.dz, float(sense)) if guard else r.dz)
     x = torch.addcmul(r.x, t, r.dx, value=-1)
     y = torch.addcmul(r.y, t, r.dy, value=-1)
     return Hit(x, y, torch.zeros_like(r.z), q, r.dz * r.dz, met)

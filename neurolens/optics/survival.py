@@ -10,65 +10,98 @@ from torch import Tensor
 from neurolens import status as st
 
 
+def positive(value: Tensor, sense: int = 1, *, spend: bool = False) -> Tensor:
+    """Whether value * sense > 0, [N]; NaN is not. With `spend` as 1.0 and 0.0 in the place of `value` itself.
+
+    Comparisons that give truth values are not vectorised on CPUs and cost five times as much as those in place; only
+    for values that nobody needs afterwards, and never where gradients are wanted.
+    """
+    if not spend:
+        return value > 0 if sense > 0 else value < 0
+    return value.gt_(0) if sense > 0 else value.lt_(0)
+
+
+def at_most(value: Tensor, limit: float, *, spend: bool = False) -> Tensor:
+    """Whether value <= limit, [N]; NaN is not. `spend` as for `positive`."""
+    return value.le_(limit) if spend else value <= limit
+
+
 class Survival(Protocol):
     """The tests at each surface (met, inside the rim, not totally reflected), in the order in which they are called.
 
-    `goes_on` [N] is False for rays that missed a surface or were totally reflected. A rim alone lets a ray go on: its
-    crossings are learnt from.
+    A ray goes on until it misses a surface or is totally reflected. A rim alone lets it go on: its crossings are learnt
+    from.
     """
 
-    goes_on: Tensor
-
     def require(self, passed: Tensor, surface: int, reason: int) -> None:
-        """Apply the next test; `passed` is boolean [N]."""
+        """Apply the next test; `passed` is [N], boolean or 1.0 and 0.0."""
+
+    def end(self, sound: Tensor) -> None:
+        """End rays that are not `sound` [N] boolean, whatever their status."""
+
+    def only(self, value: Tensor, otherwise: float) -> Tensor:
+        """`value` [N] of the rays that go on, `otherwise` for the others, even where it is NaN."""
 
     def status(self) -> Tensor:
         """Status of every ray, [N] int32; see `neurolens.status`."""
 
 
-def survival(sound: Tensor, otherwise: int) -> Survival:
-    """Start with the rays that are `sound` [N]; the others have the status `otherwise`."""
-    return _Labels(sound, otherwise) if torch.compiler.is_compiling() else _Counts(sound, otherwise)
-
-
-class _Labels:
-    """A label a ray, written at its first failure: what a compiler turns into few instructions in registers."""
+class Labels:
+    """A label a ray, written at its first failure: what a compiler turns into few instructions in registers, and what
+    gradients can be taken through."""
 
     def __init__(self, sound: Tensor, otherwise: int) -> None:
+        """Start with the rays that are `sound` [N] boolean; the others have the status `otherwise`."""
         self._status = (~sound).to(torch.int32) * otherwise
-        self.goes_on = sound
+        self._goes_on = sound
 
     def require(self, passed: Tensor, surface: int, reason: int) -> None:
         self._status = torch.where(passed | (self._status != 0), self._status, st.blocked(surface, reason))
         if reason != st.RIM:
-            self.goes_on = self.goes_on & passed
+            self._goes_on = self._goes_on & passed
+
+    def end(self, sound: Tensor) -> None:
+        self._goes_on = self._goes_on & sound
+
+    def only(self, value: Tensor, otherwise: float) -> Tensor:
+        return torch.where(self._goes_on, value, otherwise)
 
     def status(self) -> Tensor:
         return self._status
 
 
-class _Counts:
-    """How many tests a ray passed before its first failure: one byte a ray to read and write, where the memory traffic
-    of every test counts."""
+class Counts:
+    """How many tests a ray passed before its first failure, in numbers throughout: truth values, selections and
+    conversions between them cost more than all the optics."""
 
     def __init__(self, sound: Tensor, otherwise: int) -> None:
-        self._alive, self.goes_on = sound.clone(), sound
+        """Start with the rays that are `sound` [N], 1.0 or 0.0; the others have the status `otherwise`."""
+        self._alive, self._goes_on = sound.clone(), sound.clone()
+        self._count = sound.clone()
         self._meanings = [otherwise]
-        self._full = sound.to(torch.uint8)  # counts up to 255, then moves to `_count`
-        self._count: Tensor | None = None
+        self._mask: Tensor | None = None
 
     def require(self, passed: Tensor, surface: int, reason: int) -> None:
-        self._alive.logical_and_(passed)
-        if reason != st.RIM:
-            self.goes_on = self.goes_on & passed  # not in place: gradients may keep it
-        if len(self._meanings) % 255 == 0:
-            self._count = self._full.int() if self._count is None else self._count + self._full
-            self._full.zero_()
-        # The same byte seen as a number: no conversion.
-        self._full.add_(self._alive.view(torch.uint8))
+        passed = passed.to(self._alive.dtype)
+        self._alive.mul_(passed)
+        self._count.add_(self._alive)
         self._meanings.append(st.blocked(surface, reason))
+        if reason != st.RIM:
+            self._goes_on.mul_(passed)
+            self._mask = None
+
+    def end(self, sound: Tensor) -> None:
+        self._goes_on.mul_(sound)
+        self._mask = None
+
+    def only(self, value: Tensor, otherwise: float) -> Tensor:
+        bits = torch.int32 if value.dtype == torch.float32 else torch.int64
+        if self._mask is None:
+            self._mask = self._goes_on.to(bits).neg_()
+        # All bits or none: the only product with 0 that a NaN does not survive.
+        kept = value.view(bits).bitwise_and(self._mask).view(value.dtype)
+        return kept if otherwise == 0 else kept.add_(1 - self._goes_on, alpha=otherwise)
 
     def status(self) -> Tensor:
-        count = self._full if self._count is None else self._count + self._full
-        meanings = torch.tensor([*self._meanings, st.PASSED], dtype=torch.int32, device=count.device)
-        return meanings.index_select(0, count.int())
+        meanings = torch.tensor([*self._meanings, st.PASSED], dtype=torch.int32, device=self._count.device)
+        return meanings.index_select(0, self._count.int())

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from neurolens import status as st
 from neurolens.errors import InputError
@@ -29,7 +30,7 @@ from neurolens.optics.surfaces import (
     refract,
     times,
 )
-from neurolens.optics.survival import Survival, survival
+from neurolens.optics.survival import Counts, Labels, Survival, at_most, positive
 from neurolens.optics.transmission import passage
 
 __all__ = ["CHUNK", "Crossing", "Rays", "Traced", "compile_trace", "trace"]
@@ -122,9 +123,7 @@ def trace(
     if isinstance(wavelength_nm, Tensor):
         # In the precision of the rays, or a float64 wavelength would turn float32 rays into float64 halfway.
         wavelength_nm = torch.where(wavelength_nm > 0, wavelength_nm, math.nan).to(rays.x.dtype)
-    needs_grad = torch.is_grad_enabled() and any(
-        isinstance(v, Tensor) and v.requires_grad for v in (*rays, wavelength_nm, *_parameters(lens))
-    )
+    needs_grad = any(_differentiated(v) for v in (*rays, wavelength_nm, *_parameters(lens)))
     count = rays.x.shape[0]
     if needs_grad or count <= CHUNK:
         return _trace_chunk(lens, rays, wavelength_nm, towards, wanted, needs_grad)
@@ -154,6 +153,13 @@ def compile_trace(
         glass.index_of(surface, glass.LINE_D_NM)
         glass.absorption_of(surface, glass.LINE_D_NM)
     return torch.compile(run, dynamic=False)
+
+
+def _differentiated(value: Any) -> bool:
+    """Whether derivatives with respect to a value are followed, backwards or forwards."""
+    if not isinstance(value, Tensor):
+        return False
+    return (value.requires_grad and torch.is_grad_enabled()) or forward_ad.unpack_dual(value).tangent is not None
 
 
 def _parameters(lens: Lens) -> list[Any]:
@@ -189,8 +195,8 @@ def _trace_chunk(
     sense, order = (1, range(len(lens.surfaces))) if towards == "film" else (-1, range(len(lens.surfaces) - 1, -1, -1))
     vertices = lens.vertices_mm
     glasses = media(lens, wavelength_nm)  # glasses[k] lies before surface k as light travels to the film
-    guard = freeze or wanted.path or bool(wanted.record)
-    r, tests = _start(rays, glasses[0 if sense > 0 else -1], sense, st.blocked(order[0], st.MISSED), freeze)
+    mode = _Mode(sense, freeze or wanted.path or bool(wanted.record), freeze)
+    r, tests = _start(rays, glasses[0 if sense > 0 else -1], mode, st.blocked(order[0], st.MISSED))
     power = passage(lens, wavelength_nm, sense, wanted.transmittance, rays.x)
     crossings: dict[int, Crossing] = {}
     path: list[Rays] = []
@@ -200,34 +206,49 @@ def _trace_chunk(
         r = r._replace(z=r.z + (vertex - vertices[k]))
         vertex = vertices[k]
         before, after = (glasses[k], glasses[k + 1]) if sense > 0 else (glasses[k + 1], glasses[k])
-        hit = _meet(lens.surfaces[k], k, r, before, sense, position == 0, guard, tests)
-        if lens.aperture is not None and lens.surfaces[k].stop:
-            tests.require(apertures.inside(lens.aperture, hit.x, hit.y, lens.stop_radius_mm), k, st.RIM)
-        bent, q, q2 = _bend(lens.surfaces[k], k, r, hit, before, after, sense, guard, tests)
+        hit = _meet(lens, k, r, before, position == 0, mode, tests)
+        bent, q, q2 = _bend(lens.surfaces[k], k, r, hit, before, after, mode, tests)
         if power is not None:
             power.pass_surface(k, r, hit, bent, q, before, after)
         if k in wanted.record:
             crossings[k] = Crossing(hit.x, hit.y, times(hit.q2, before.inverse_n2), times(q2, after.inverse_n2))
         # A lost ray goes on along the axis: no overflow there can reach the gradients of the others.
-        r = _along_axis(bent, tests.goes_on, sense, 0.0) if freeze else bent
+        r = _along_axis(bent, tests, sense, 0.0) if freeze else bent
         if wanted.path:
             path.append(_unit(r._replace(z=r.z + vertex), after))
-    r = _along_axis(_unit(r._replace(z=r.z + vertex), after), tests.goes_on, sense, vertex)
-    return Traced(r, tests.status(), None if power is None else power.arrived(tests.goes_on), crossings, tuple(path))
+    r = _along_axis(_unit(r._replace(z=r.z + vertex), after), tests, sense, vertex)
+    arrived = None if power is None else tests.only(power.arrived(), 0.0)
+    return Traced(r, tests.status(), arrived, crossings, tuple(path))
 
 
-def _start(rays: Rays, first: Medium, sense: int, otherwise: int, freeze: bool) -> tuple[Rays, Survival]:
+class _Mode(NamedTuple):
+    """How to trace: direction of travel (+1 to the film), whether lost rays stay finite on the way, whether they are
+    put on the axis at once (for gradients)."""
+
+    sense: int
+    guard: bool
+    freeze: bool
+
+    @property
+    def spend(self) -> bool:
+        """Whether tests may overwrite the numbers they test: where nobody else needs them, outside a compiler."""
+        return not self.guard and not torch.compiler.is_compiling()
+
+
+def _start(rays: Rays, first: Medium, mode: _Mode, otherwise: int) -> tuple[Rays, Survival]:
     """Rays with optical direction cosines, and the test that their directions are unit vectors."""
     length2 = torch.addcmul(torch.addcmul(rays.dx * rays.dx, rays.dy, rays.dy), rays.dz, rays.dz)
-    sound = (length2 - 1).abs() < UNIT_SLACK
-    if freeze:
+    sound = at_most((length2 - 1).abs(), UNIT_SLACK, spend=mode.spend)
+    if mode.freeze:
         # Not even a NaN that comes in may reach the gradients of the others.
         sound = sound & torch.isfinite(rays.x + rays.y + rays.z)
-        rays = _along_axis(rays, sound, sense, 0.0)
-    if sense > 0:
+    tests = Counts(sound, otherwise) if mode.spend else Labels(sound, otherwise)
+    if mode.freeze:
+        rays = _along_axis(rays, tests, mode.sense, 0.0)
+    if mode.sense > 0:
         # Light may come from far away: the digits of float32 near the lens keep points and directions consistent.
         rays = Rays(*nearest_approach(rays, 1.0), *rays[3:])
-    return Rays(*rays[:3], *(times(d, first.n) for d in rays[3:])), survival(sound, otherwise)
+    return Rays(*rays[:3], *(times(d, first.n) for d in rays[3:])), tests
 
 
 def _unit(r: Rays, last: Medium) -> Rays:
@@ -236,36 +257,29 @@ def _unit(r: Rays, last: Medium) -> Rays:
     return Rays(*r[:3], *(d / last.n for d in r[3:]))
 
 
-def _meet(
-    surface: Surface, k: int, r: Rays, before: Medium, sense: int, entering: bool, guard: bool, tests: Survival
-) -> Hit:
-    """Meet surface k and test its rim."""
+def _meet(lens: Lens, k: int, r: Rays, before: Medium, entering: bool, mode: _Mode, tests: Survival) -> Hit:
+    """Meet surface k and test its rim, or the shape of the stop."""
+    surface = lens.surfaces[k]
     plane = _is_plane(surface)
     if plane:
-        hit = intersect_plane(r, sense)
+        hit = intersect_plane(r, mode.sense, mode.guard, mode.spend)
     elif is_plain(surface):
-        hit = intersect_sphere(r, surface.curvature, sense, before, entering, guard)
+        hit = intersect_sphere(r, surface.curvature, mode.sense, before, entering, mode.guard, mode.spend)
     else:
-        hit = intersect_shape(r, surface, sense, before, guard)
+        hit = intersect_shape(r, surface, mode.sense, before, mode.guard)
     tests.require(hit.met, k, st.MISSED)
     distance2 = torch.addcmul(hit.x * hit.x, hit.y, hit.y)
-    tests.require(distance2 <= surface.semi_diameter_mm**2, k, st.RIM)
     if plane:
         # A sphere's square root turns NaN and overflow into a miss; a plane would let them go on.
-        tests.goes_on = tests.goes_on & (distance2 < math.inf)
+        tests.end(distance2 < math.inf)
+    tests.require(at_most(distance2, surface.semi_diameter_mm**2, spend=mode.spend), k, st.RIM)
+    if lens.aperture is not None and surface.stop:
+        tests.require(apertures.inside(lens.aperture, hit.x, hit.y, lens.stop_radius_mm), k, st.RIM)
     return hit
 
 
 def _bend(
-    surface: Surface,
-    k: int,
-    r: Rays,
-    hit: Hit,
-    before: Medium,
-    after: Medium,
-    sense: int,
-    guard: bool,
-    tests: Survival,
+    surface: Surface, k: int, r: Rays, hit: Hit, before: Medium, after: Medium, mode: _Mode, tests: Survival
 ) -> tuple[Rays, Tensor, Tensor]:
     """Refract at surface k.
 
@@ -274,16 +288,18 @@ def _bend(
     """
     if before is after:
         return Rays(hit.x, hit.y, hit.z, r.dx, r.dy, r.dz), hit.q, hit.q2
-    bent, q, q2 = refract(r, hit, 0.0 if _is_plane(surface) else surface.curvature, sense, before, after, guard)
+    c = 0.0 if _is_plane(surface) else surface.curvature
+    bent, q, q2 = refract(r, hit, c, mode.sense, before, after, mode.guard)
     if isinstance(before.n, Tensor) or before.n != 1:
         # From air nothing is totally reflected.
-        tests.require(q2 > 0, k, st.TOTAL_REFLECTION)
+        tests.require(positive(q2, spend=mode.spend), k, st.TOTAL_REFLECTION)
     return bent, q, q2
 
 
-def _along_axis(r: Rays, goes_on: Tensor, sense: int, z: Any) -> Rays:
+def _along_axis(r: Rays, tests: Survival, sense: int, z: Any) -> Rays:
+    """The rays that go on, and rays along the axis from z in the place of the others."""
     on_axis = (0.0, 0.0, z, 0.0, 0.0, float(sense))
-    return Rays(*(torch.where(goes_on, c, a) for a, c in zip(on_axis, r, strict=True)))
+    return Rays(*(tests.only(c, a) for a, c in zip(on_axis, r, strict=True)))
 
 
 def _is_plane(surface: Surface) -> bool:

@@ -20,8 +20,8 @@ class Passage(Protocol):
     def pass_surface(self, k: int, r: Rays, hit: Hit, bent: Rays, q: Tensor, before: Medium, after: Medium) -> None:
         """Pass surface k: rays before it (in its frame), where they meet it, rays after it, n' cos t, the media."""
 
-    def arrived(self, goes_on: Tensor) -> Tensor:
-        """Power of unpolarised light that arrives, [N]; 0 for rays that do not go on."""
+    def arrived(self) -> Tensor:
+        """Power of unpolarised light that arrives, [N]; nonsense for rays that do not."""
 
 
 def passage(
@@ -48,8 +48,8 @@ class _Absorbed:
             depth = way_mm(r, hit, before) * absorbed
             self._depth = depth if self._depth is None else self._depth + depth
 
-    def _arrived(self, power: Tensor, goes_on: Tensor) -> Tensor:
-        return torch.where(goes_on, power if self._depth is None else power * torch.exp(-self._depth), 0.0)
+    def _arrived(self, power: Tensor) -> Tensor:
+        return power if self._depth is None else power * torch.exp(-self._depth)
 
 
 class _Averaged(_Absorbed):
@@ -66,8 +66,8 @@ class _Averaged(_Absorbed):
         elif before is not after:
             self._power = self._power * fresnel_transmittance(hit.q, q, before, after)
 
-    def arrived(self, goes_on: Tensor) -> Tensor:
-        return self._arrived(self._power, goes_on)
+    def arrived(self) -> Tensor:
+        return self._arrived(self._power)
 
 
 class _Polarised(_Absorbed):
@@ -88,8 +88,8 @@ class _Polarised(_Absorbed):
         field = polarisation.unpolarised(ahead) if self._field is None else self._field
         self._field = polarisation.pass_surface(field, step, self._wavelength_nm)
 
-    def arrived(self, goes_on: Tensor) -> Tensor:
-        return self._arrived(self._power if self._field is None else polarisation.power(self._field), goes_on)
+    def arrived(self) -> Tensor:
+        return self._arrived(self._power if self._field is None else polarisation.power(self._field))
 
 
 def way_mm(r: Rays, hit: Hit, before: Medium) -> Any:
