@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from neurolens.optics import catalogue
 from neurolens.readers.assemble import named_glass
 from neurolens.readers.source import Line
 
@@ -91,7 +92,12 @@ def medium(command: Command, words: Sequence[str], private: Mapping[str, dict[st
         numbers = command.numbers(words[:2])
         return {"n_d": numbers[0], "V_d": numbers[1] if len(numbers) > 1 else None}
     name, _, maker = word.rpartition("_")
-    known = named_glass(f"{maker}:{name}" if name else word, command.line.file, f"line {command.line.number}, glass")
+    qualified = f"{maker}:{name}" if name else word
+    if name and not catalogue.same_name(qualified):
+        # Other names of a glass ("BK7") are listed without their maker.
+        alias = [g for g in catalogue.same_name(name) if g.maker.upper() == maker.upper()]
+        qualified = str(alias[0]) if alias else qualified
+    known = named_glass(qualified, command.line.file, f"line {command.line.number}, glass")
     return {**known, "material": word}
 
 

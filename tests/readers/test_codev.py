@@ -1,0 +1,205 @@
+"""CODE V sequence files in the details of their definition: media, what sizes the stop, zooms, refusals by line."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from neurolens.errors import InputError, NeurolensWarning
+from neurolens.optics import catalogue
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.readers.codev import read_seq
+from neurolens.readers.draft import Given
+
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+
+TEXT = """\
+RDM;LEN       "VERSION: 11.2 SR1       LENS VERSION: 84       Creation Date: 28-May-2019"
+TITLE 'A singlet; for a test!' ! that is a comment
+EPD   10.0
+DIM   M
+WL    656.3 587.6 &
+ 486.1
+REF   2; WTW 1 1 1
+XAN   0.0 3.0
+YAN   0.0 4.0
+VUY   0.0 0.0
+SO    0.0 0.1e14
+S     50.0 5.0 NBK7_SCHOTT
+  CIR 8
+  STO
+  CCY 0; THC 0
+S     -50.0 45.0
+  CIR 9 ; CIR EDG 9.5
+SI    0.0 0.0
+GO
+"""
+
+
+def read(text: str, tmp_path: Path, given: Given | None = None) -> Lens:
+    path = tmp_path / "lens.seq"
+    path.write_text(text)
+    return read_seq(path, given)
+
+
+def swapped(old: str, new: str, text: str = TEXT) -> str:
+    assert old in text
+    return text.replace(old, new, 1)
+
+
+@pytest.mark.parametrize("text", [TEXT, TEXT.lower(), TEXT.replace("\n", "\r\n")])
+def test_singlet_by_the_lensmakers_formula(text: str, tmp_path: Path) -> None:
+    lens = read(text, tmp_path)
+    n, R, t = catalogue.find("N-BK7").n_d, 50.0, 5.0
+    efl_mm = 1 / ((n - 1) * (2 / R - (n - 1) * t / (n * R * R)))
+    assert first_order(lens).efl_mm == pytest.approx(efl_mm, rel=1e-12)
+    assert lens.name.lower() == "a singlet; for a test!"
+    assert lens.half_field_deg == 5.0
+    assert [s.diameter_mm for s in lens.surfaces] == pytest.approx([10.0, 18.0])
+    assert lens.f_number == pytest.approx(efl_mm / 10)
+
+
+@pytest.mark.parametrize(
+    ("medium", "n_d", "V_d", "glass"),
+    [
+        ("517.642", 1.517, 64.2, None),
+        ("517642", 1.517, 64.2, None),
+        ("516800.641700", 1.5168, 64.17, None),
+        ("1.5168:64.17", 1.5168, 64.17, None),
+        ("1.5168 64.17", 1.5168, 64.17, None),
+        ("1.5168", 1.5168, None, None),
+        ("BK7_SCHOTT", None, None, "N-BK7"),
+        ("'NSK16_SCHOTT'", None, None, "N-SK16"),
+        ("SLAL8_OHARA", None, None, "S-LAL8"),
+        ("N-BK7", None, None, "N-BK7"),
+    ],
+)
+def test_media(medium: str, n_d: float | None, V_d: float | None, glass: str | None, tmp_path: Path) -> None:
+    s = read(swapped("NBK7_SCHOTT", medium), tmp_path).surfaces[0]
+    if glass is None:
+        assert (s.n_d, s.V_d, s.glass) == (pytest.approx(n_d), V_d if V_d is None else pytest.approx(V_d), None)
+    else:
+        assert s.glass is not None and catalogue.find(s.glass).name == glass
+        assert s.n_d == catalogue.find(glass).n_d
+
+
+def test_private_glass_by_its_d_f_and_c_lines(tmp_path: Path) -> None:
+    block = "PRV\n  PWL 656.3 587.6 546.1&\n 486.1\n  'MINE' 1.5143 1.5168 1.5187 1.5224\nEND\nSO "
+    text = swapped("SO ", block, swapped("NBK7_SCHOTT", "'MINE'"))
+    with pytest.warns(NeurolensWarning, match="private glass MINE is reduced"):
+        s = read(text, tmp_path).surfaces[0]
+    assert (s.n_d, s.material) == (1.5168, "MINE")
+    assert s.V_d == pytest.approx(0.5168 / 0.0081)
+    with pytest.raises(InputError, match="an index at the C line"):
+        read(swapped("656.3 587.6 546.1", "700.0 587.6 546.1", text), tmp_path)
+
+
+def test_radii_or_curvatures(tmp_path: Path) -> None:
+    expected = read(TEXT, tmp_path)
+    in_curvatures = swapped("S     -50.0", "S -0.02", swapped("S     50.0", "S 0.02", TEXT))
+    assert read(swapped("RDM;LEN", "RDM N;LEN", in_curvatures), tmp_path) == expected
+    with pytest.warns(NeurolensWarning, match="line 12: no RDM"):
+        assert read(swapped("RDM;LEN", "LEN", in_curvatures), tmp_path) == expected
+    by_name = swapped("S     50.0 5.0", "S 0 0", TEXT) + "RDY S1 50\nTHI S1 5\n"
+    assert read(by_name, tmp_path) == expected
+
+
+def test_units_and_defocus(tmp_path: Path) -> None:
+    lens = read(TEXT, tmp_path)
+    assert read(swapped("DIM   M", "DIM I"), tmp_path) == lens.scaled(25.4)
+    assert read(swapped("SI    0.0 0.0", "SI 0.0 -0.5"), tmp_path).surfaces[-1].thickness_mm == 44.5
+    focused = read(swapped("-50.0 45.0", "-50.0 0.0\n PIM"), tmp_path)
+    assert focused.surfaces[-1].thickness_mm == pytest.approx(first_order(focused).back_focus_mm)
+
+
+@pytest.mark.parametrize(
+    ("block", "shape"),
+    [
+        ("CON; K -1", (50, -1, {}, None)),
+        ("ASP; K -1.5; A 1e-5; B -2e-8; J 1e-30", (50, -1.5, {4: 1e-5, 6: -2e-8, 20: 1e-30}, None)),
+        ("ASP\n CUF 0.0\n A 0.0", (50, 0, {}, None)),
+        ("CYL", (50, 0, {}, "y")),
+        ("YTO; K -1; CUX 0", (50, -1, {}, "y")),
+        ("YTO; CUY 0; CUX 0.025", (40, 0, {}, "x")),
+        ("XTO; RDY 0; RDX 40; K -2", (40, -2, {}, "x")),
+        ("XDE 0.0; ADE 0.0", (50, 0, {}, None)),
+    ],
+)
+def test_surface_types(block: str, shape: tuple[float, float, dict[int, float], str | None], tmp_path: Path) -> None:
+    s = read(swapped("  CIR 8", f"  {block}\n  CIR 8"), tmp_path).surfaces[0]
+    assert (pytest.approx(s.radius_mm), s.conic, dict(s.asphere), s.cylinder) == shape
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("DIM   M", "DIM   F", r"line 4, DIM: got 'F', expected M \(mm\)"),
+        ("EPD   10.0", "EPD   -1", r"line 3, EPD: got -1.0"),
+        ("EPD   10.0", "NAO   0.1", r"line 3, NAO: got \(unknown keyword\)"),
+        ("EPD   10.0\n", "", r"^$"),
+        ("NBK7_SCHOTT", "NBK8_SCHOTT", r"line 12, glass: got 'SCHOTT:NBK8'.*N-BK7"),
+        ("NBK7_SCHOTT", "REFL", r"line 12, S: got 'REFL'.*no mirrors"),
+        ("NBK7_SCHOTT", "0.5:60", r"index: got 0.5"),
+        ("  STO", "  GRT", r"line 14, GRT: got \(unknown keyword\)"),
+        ("  STO", "  STO; ADE 3", r"line 14, ADE: got 3.0, expected 0"),
+        ("  STO", "  STO; SPS ODD", r"line 14, SPS"),
+        ("  STO", "  STO; CIR OBS 2", r"CIR: got 'OBS'"),
+        ("  STO", "  STO; YTO; CUX 0.1", r"torus"),
+        ("  STO", "  STO; A 1e-5", r"ASP before coefficients"),
+        ("  STO", "  STO; K -1", r"CON or ASP before a conic"),
+        ("  STO", "  STO; RDY S7 3", r"RDY: got 'S7', expected a surface from S0 to S1"),
+        ("SO    0.0 0.1e14\n", "", r"line 11, S: got \(here\), expected one object SO"),
+        ("SI    0.0 0.0\n", "", r"SI: got \(missing\)"),
+        ("S     50.0 5.0", "S     50.0", r"line 12, S: got 'NBK7_SCHOTT', expected a finite number"),
+        ("CIR 9 ;", "CIR 60 ;", r"surface 1, diameter_mm: got 120"),
+        ("GO\n", "GO &\n", r"a line that continues"),
+        ("GO\n", "ZOO THI S1 1 2\nGO\n", r"line 19, ZOO: got 'THI', expected the count"),
+        ("GO\n", "ZOO 2\nZOO RDY S1 1 2\nGO\n", r"line 20, ZOO: got 'RDY'.*other zooms are not read"),
+        ("GO\n", "ZOO 2\nZOO THI S1 1 2 3\nGO\n", r"line 20, ZOO THI: got 'S?1? ?1 2 3', expected 2 values"),
+        ("GO\n", "ZOO 2\nZOO CIR S2 1 2\nGO\n", r"line 20, ZOO CIR: got 'S2', expected the stop"),
+        ("GO\n", "ZOO 2\nTHI S1 Z3 1\nGO\n", r"line 20, THI: got 'S1 Z3'"),
+    ],
+)
+def test_refusals(old: str, new: str, message: str, tmp_path: Path) -> None:
+    text = swapped(old, new)
+    if message == "^$":  # not a mistake: then the stop's own diameter rules
+        assert read(text, tmp_path).surfaces[0].diameter_mm == 16.0
+        return
+    with pytest.raises(InputError, match=message):
+        read(text, tmp_path)
+
+
+def test_zoom_positions(tmp_path: Path) -> None:
+    zoom = """\
+ZOO 2
+ZOO TIT
+TIT Z1 'far'
+TIT Z2 'near'
+ZOO THI SO 0.1e14 &
+ 300
+ZOO THI S2
+THI S2 Z1 45.0
+THI S2 Z2 58.5
+ZOO EPD 10 8
+ZOO THC S2 100 100
+ZOO VUY F1 0.1 0.2
+"""
+    far, near = read(swapped("GO\n", zoom + "GO\n"), tmp_path).configurations
+    assert (far.name, far.object_distance_mm, far.stop_diameter_mm) == ("far", None, pytest.approx(10))
+    assert (near.name, near.object_distance_mm, near.stop_diameter_mm) == ("near", 300.0, pytest.approx(8))
+    assert dict(near.thickness_mm) == {1: 58.5}
+    assert far.efl_mm is not None and math.isfinite(far.efl_mm)
+
+
+def test_rims_that_are_not_given_are_derived(tmp_path: Path) -> None:
+    lens = read(swapped("  CIR 9 ; CIR EDG 9.5\n", ""), tmp_path)
+    assert lens.rims == "derived" and 9 < lens.surfaces[1].diameter_mm < 12
+
+
+def test_a_lens_without_field_and_rims_is_refused(tmp_path: Path) -> None:
+    text = swapped("XAN   0.0 3.0\nYAN   0.0 4.0\n", "", swapped("  CIR 9 ; CIR EDG 9.5\n", ""))
+    with pytest.raises(InputError, match="--half-field"):
+        read(text, tmp_path)

@@ -1,0 +1,183 @@
+"""JSON prescriptions: the reference set where it is there, and each thing that the form may say or get wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from neurolens.errors import InputError, NeurolensWarning
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.readers.draft import Given
+from neurolens.readers.json_lens import read_json_lens
+
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+SHARED = sorted((Path(__file__).parents[3] / "shared" / "data" / "lenses").glob("*.json"))
+
+
+def row(radius: float, thickness: float | None, n_d: float | None = None, **more: Any) -> dict[str, Any]:
+    return {"radius_mm": radius, "thickness_mm": thickness, "n_d": n_d, "diameter_mm": 16.0, **more}
+
+
+def singlet(**changes: Any) -> dict[str, Any]:
+    rows = [row(50, 5, 1.5, V_d=60, material="CROWN"), row(-50, 2.0), row(0, None, stop=True, diameter_mm=8)]
+    return {"name": "singlet", "source": "a book, p. 1", "f_number": 6, "surfaces": rows, **changes}
+
+
+def read(data: object, tmp_path: Path, given: Given | None = None, **more: Any) -> Lens:
+    path = tmp_path / "lens.json"
+    path.write_text(data if isinstance(data, str) else json.dumps(data))
+    return read_json_lens(path, given, **more)
+
+
+@pytest.mark.skipif(not SHARED, reason="../shared/data is not here")
+def test_reference_set_agrees_with_its_own_figures() -> None:
+    """EFL and back focus to the digits printed, in both meridians of the anamorphic ones."""
+    for path in SHARED:
+        data = json.loads(path.read_text())
+        lens = read_json_lens(path, catalogue=False)
+        assert len(lens.surfaces) == len(data["surfaces"])
+        for axis, suffix in (("y", ""), ("y", "_y"), ("x", "_x")):
+            computed, found = data["computed_at_nd"], first_order(lens, meridian=axis)  # type: ignore[arg-type]
+            for key, value in ((f"efl{suffix}_mm", found.efl_mm), (f"bfd{suffix}_mm", found.back_focus_mm)):
+                assert value == pytest.approx(computed.get(key, value), abs=6e-6), (path.name, key)
+        kept = [
+            c for c in (data["configurations"] or {}).get("configs", []) if not c.get("interpolated_by_transcriber")
+        ]
+        assert [c.name for c in lens.configurations] == [c["name"] for c in kept]
+
+
+def test_a_last_thickness_of_null_is_the_back_focus(tmp_path: Path) -> None:
+    lens = read(singlet(), tmp_path)
+    assert lens.surfaces[-1].thickness_mm == pytest.approx(first_order(lens).back_focus_mm)
+    assert math.isinf(lens.surfaces[-1].radius_mm)
+
+
+def test_states(tmp_path: Path) -> None:
+    states = [
+        {"name": "far", "efl_mm": None, "thickness_overrides": {"1": 2.0}},
+        {"name": "mean", "efl_mm": 60, "interpolated_by_transcriber": True, "thickness_overrides": {"1": 1.0}},
+        {"name": "near", "object_distance_mm": "0.5 m", "thickness_overrides": {"2": 55.0}, "stop_diameter_mm": 7},
+        {"name": "wrong", "object_distance_mm": 9000.0, "thickness_overrides": {"2": 55.0}},
+    ]
+    with pytest.warns(NeurolensWarning) as told:
+        lens = read(singlet(configurations={"configs": states}), tmp_path)
+    texts = " / ".join(str(w.message) for w in told)
+    assert '"mean" is left out' in texts and "'0.5 m'" in texts and "9000 is stated" in texts
+    far, near, _ = lens.configurations
+    assert far.efl_mm == pytest.approx(first_order(lens).efl_mm)
+    # Newton: x x' = -f^2, with x' the film's distance from the focal point.
+    data = first_order(lens)
+    beyond = 55.0 - data.back_focus_mm
+    assert near.object_distance_mm == pytest.approx(data.efl_mm**2 / beyond - data.front_focal_z_mm)
+    assert near.stop_diameter_mm == 7
+
+
+def test_figures_of_the_file_that_contradict_its_table_are_told(tmp_path: Path) -> None:
+    with pytest.warns(NeurolensWarning, match="efl_mm computed from the table is 50.8475; the file says 58"):
+        read(singlet(computed_at_nd={"efl_mm": 58.0}), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "image_radius_mm", "half_field_deg"),
+    [
+        ("image radius 21.6 mm", 21.6, None),
+        ("AOV 45.2 deg; image circle 43.2 mm", 21.6, 22.6),
+        ("38 deg half field", None, 38.0),
+        ("+-20 deg", None, 20.0),
+        ("180 deg full field", None, 90.0),
+        ('{"kind": "fisheye", "fullFieldDeg": 180, "imageCircleMm": 28.35}', 14.175, 90.0),
+        ("60 deg", None, None),
+        (None, None, None),
+    ],
+)
+def test_field(text: str | None, image_radius_mm: float | None, half_field_deg: float | None, tmp_path: Path) -> None:
+    lens = read(singlet(field_or_image_circle=text), tmp_path)
+    assert lens.image_radius_mm == pytest.approx(image_radius_mm)
+    assert lens.half_field_deg == pytest.approx(half_field_deg)
+
+
+def test_a_named_glass_is_that_of_the_catalogue_where_the_figures_agree(tmp_path: Path) -> None:
+    def glass(n_d: float, V_d: float, **more: Any) -> str | None:
+        rows = [row(50, 5, n_d, V_d=V_d, material="N-BK7"), *singlet()["surfaces"][1:]]
+        return read(singlet(surfaces=rows), tmp_path, **more).surfaces[0].glass
+
+    assert glass(1.5168, 64.17) == "N-BK7"
+    assert glass(1.517, 64.2) is None and glass(1.5168, 60.0) is None
+    assert glass(1.5168, 64.17, catalogue=False) is None
+
+
+def test_rims_of_doubtful_origin_are_marked(tmp_path: Path) -> None:
+    assert read(singlet(), tmp_path).rims == "source"
+    assert read(singlet(diameters_estimated=True), tmp_path).rims == "estimated"
+    assert read(singlet(notes="Clear diameters trimmed here."), tmp_path).rims == "estimated"
+
+
+def test_an_f_number_that_is_not_stated(tmp_path: Path) -> None:
+    data = first_order(read(singlet(), tmp_path))
+    assert read(singlet(f_number=None), tmp_path).f_number == pytest.approx(data.f_number)
+    assert read(singlet(f_number=None), tmp_path, Given(f_number=7.0)).f_number == 7.0
+    assert read(singlet(), tmp_path, Given(f_number=7.0)).f_number == 6.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"colour": 1}, r"colour: got \(unknown key\)"),
+        ({"name": None}, r"name: got None, expected a text"),
+        ({"f_number": -1}, r"f_number: got -1"),
+        ({"f_number": "two"}, r"f_number: got 'two'"),
+        ({"efl_mm": [1, "x"]}, r"efl_mm"),
+        ({"computed_at_nd": 3}, r"computed_at_nd: got 3"),
+        ({"diameters_estimated": "yes"}, r"diameters_estimated: got 'yes'"),
+        ({"field_or_image_circle": 3}, r"field_or_image_circle: got 3"),
+        ({"surfaces": []}, r"surfaces: got \(0 of them\)"),
+        ({"surfaces": {}}, r"surfaces: got \{\}"),
+        ({"surfaces": [3]}, r"surface 0: got 3"),
+        ({"surfaces": [row(50, 5, 1.5)]}, r"stop: got \(none\)"),
+        ({"surfaces": [row(50, 5, 1.5, stop=True)]}, r"surface 0, index: got 1.5, expected air"),
+        ({"surfaces": [row(50, 5, tilt=3)]}, r"surface 0, tilt: got \(unknown key\)"),
+        ({"surfaces": [row(50, 5, shape="torus")]}, r"surface 0, shape: got 'torus', expected one of sphere"),
+        ({"surfaces": [row(50, 5, stop=1)]}, r"surface 0, stop: got 1"),
+        ({"surfaces": [row(50, 5, material="BK7")]}, r"surface 0, n_d: got \(null\)"),
+        ({"surfaces": [row(50, 5, 1.5, diameter_mm=None)]}, r"surface 0, diameter_mm: got \(null\)"),
+        ({"surfaces": [row(50, 5, aspheric_coefficients={"1": 1e-3}, stop=True)]}, r"power: got 1"),
+        ({"surfaces": [row(50, 5, aspheric_coefficients={"x": 1e-3})]}, r"got 'x', expected powers"),
+        ({"surfaces": [row(50, 5, aspheric_coefficients=[1])]}, r"aspheric_coefficients: got \[1\]"),
+        ({"configurations": 3}, r"configurations: got 3"),
+        ({"configurations": [3]}, r"configuration 0: got 3"),
+        ({"configurations": [{"name": "a", "thickness_overrides": {"7": 1}}]}, r"got '7', expected a surface number"),
+        ({"configurations": [{"name": "a", "thickness_overrides": {"0": "x"}}]}, r"got 'x'"),
+        ({"configurations": [{"name": "a", "thickness_overrides": {"0": -3}}]}, r"thickness_mm: got -3"),
+        ({"configurations": [{"name": "a", "thickness_overrides": {}, "zoom": 1}]}, r"zoom: got \(unknown key\)"),
+        ({"configurations": [{"name": "a", "efl_mm": 1, "thickness_overrides": {}}] * 2}, r"name: got 'a'"),
+    ],
+)
+def test_refusals(change: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        read(singlet(**change), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[1, 2]", r"file: got \(a list\)"),
+        ('{"name": "a", "name": "b"}', r"name: got \(given twice\)"),
+        ('{"name": NaN}', r"got 'NaN', expected finite numbers"),
+        ('{"name": "a"', r"file: got \(Expecting"),
+        ("[" * 100_000, r"expected valid JSON"),
+        ('{"f_number": 1' + "0" * 5000 + "}", r"f_number|expected valid JSON"),
+    ],
+)
+def test_text_that_is_no_prescription(text: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        read(text, tmp_path)
+
+
+def test_units_are_millimetres(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--units"):
+        read(singlet(), tmp_path, Given(units="in"))

@@ -1,0 +1,160 @@
+"""Plain tables and OSLO files in the details of their definitions, and their refusals by line."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from neurolens.errors import InputError
+from neurolens.optics import catalogue
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.readers.draft import Given
+from neurolens.readers.oslo import read_len
+from neurolens.readers.tables import read_table
+
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+
+# A biconvex singlet of R = 50 mm, 5 mm thick, n = 1.5, behind a stop: EFL by the lensmaker's formula.
+TABLE = """\
+# Singlet behind a stop
+# radius  thickness  n  aperture
+
+0       4.0   0     10
+50      5.0   1.5   20   # the front
+-50.0   0     1     20
+"""
+EFL_MM = 1 / (0.5 * (2 / 50 - 0.5 * 5 / (1.5 * 2500)))
+
+OSLO = """\
+// OSLO 6.1 31567 0 0
+LEN NEW "A singlet; // for a test" 49.15 3
+EBR  5.0
+ANG  5.0
+DES  "OSLO"
+UNI  1.0
+SNO1 "made up"
+AIR
+TH   1.0e+20
+AP   8.7e+18
+NXT  // SRF 1
+GLA  BK7
+RD   50.0
+TH   5.0
+AP   8.0
+AST
+NXT
+AIR ; RD -50.0
+PY   0.0
+AP CHK 9.0
+NXT
+AIR
+CALLBACK 1
+WV 0.58756 0.48613 0.65627
+END  3
+"""
+
+
+def read(text: str, suffix: str, tmp_path: Path, given: Given | None = None) -> Lens:
+    path = tmp_path / f"lens{suffix}"
+    path.write_text(text)
+    return read_len(path, given) if suffix == ".len" else read_table(path, given)
+
+
+def swapped(old: str, new: str, text: str) -> str:
+    assert old in text
+    return text.replace(old, new, 1)
+
+
+@pytest.mark.parametrize("count", ["", "3\n"])
+def test_table_by_the_lensmakers_formula(count: str, tmp_path: Path) -> None:
+    lens = read(count + TABLE, ".dat", tmp_path)
+    data = first_order(lens)
+    assert data.efl_mm == pytest.approx(EFL_MM, rel=1e-12)
+    # A last thickness of 0 stands for the paraxial focus.
+    assert lens.surfaces[-1].thickness_mm == pytest.approx(EFL_MM * (1 - 0.5 * 5 / (1.5 * 50)), rel=1e-12)
+    assert (lens.name, lens.stop_index) == ("Singlet behind a stop", 0)
+    assert lens.f_number == pytest.approx(EFL_MM / data.entrance_pupil_diameter_mm)
+    assert lens.dispersive is False
+
+
+def test_the_users_word_where_a_table_says_nothing(tmp_path: Path) -> None:
+    given = Given(name="mine", source="a book", f_number=4.9, units="in")
+    lens = read(TABLE, ".dat", tmp_path, given)
+    assert (lens.name, lens.source, lens.f_number) == ("mine", "a book", 4.9)
+    assert first_order(lens).efl_mm == pytest.approx(25.4 * EFL_MM)
+    assert lens.surfaces[0].diameter_mm == pytest.approx(254)
+
+
+def test_semi_diameters_and_gaps_in_front(tmp_path: Path) -> None:
+    lens = read(TABLE, ".dat", tmp_path)
+    rows = "0 0 0 5\n50 4.0 1.5 10\n-50 5.0 1 10\n"
+    other = read(rows, ".txt", tmp_path, Given(gap_before=True, semi_diameters=True))
+    assert other.surfaces == lens.surfaces
+
+
+def test_a_plane_that_is_no_stop(tmp_path: Path) -> None:
+    text = swapped("-50.0   0  ", "0   0  ", TABLE)
+    lens = read(text, ".dat", tmp_path)
+    assert [s.stop for s in lens.surfaces] == [True, False, False] and math.isinf(lens.surfaces[2].radius_mm)
+    with pytest.raises(InputError, match=r"stop: got \(rows at line 4, 6\)"):
+        read(swapped("4.0   0 ", "4.0   1 ", text), ".dat", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("1.5   20", "1.5", r"line 5, row: got '50 5.0 1.5', expected 4 numbers"),
+        ("1.5   20", "1.5 20 7", r"line 5, row"),
+        ("1.5   20", "1.5 -20", r"line 5, diameter: got -20.0"),
+        ("1.5   20", "0.9 20", r"line 5, index: got 0.9"),
+        ("1.5   20", "9.9 20", r"index: got 9.9"),
+        ("1.5   20", "0 20", r"stop: got \(rows at line 4, 5\)"),
+        ("1.5   20", "nbk7 20", r"line 5, index: got 'nbk7'"),
+        ("1     20", "1.2   20", r"surface 2, index: got 1.2, expected air"),
+        ("0       4.0", "7\n0       4.0", r"line 4, count: got 7, expected 3"),
+        ("50      5.0", "50      -5.0", r"surface 1, thickness_mm: got -5.0"),
+        ("1.5   20", "1.5 120", r"surface 1, diameter_mm: got 120"),
+    ],
+)
+def test_table_refusals(old: str, new: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        read(swapped(old, new, TABLE), ".dat", tmp_path)
+
+
+def test_oslo_by_the_lensmakers_formula(tmp_path: Path) -> None:
+    lens = read(OSLO, ".len", tmp_path)
+    n, R, t = catalogue.find("BK7").n_d, 50.0, 5.0
+    efl_mm = 1 / ((n - 1) * (2 / R - (n - 1) * t / (n * R * R)))
+    assert first_order(lens).efl_mm == pytest.approx(efl_mm, rel=1e-12)
+    assert lens.surfaces[-1].thickness_mm == pytest.approx(efl_mm * (1 - (n - 1) * t / (n * R)))
+    assert (lens.name, lens.notes, lens.half_field_deg) == ("A singlet; // for a test", "made up", 5.0)
+    assert [s.diameter_mm for s in lens.surfaces] == pytest.approx([10.0, 18.0])
+    assert read(swapped("UNI  1.0", "UNI  25.4", OSLO), ".len", tmp_path) == lens.scaled(25.4)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("UNI  1.0", "UNI  3.0", r"line 6, UNI: got 3.0"),
+        ("EBR  5.0", "EBR  0", r"line 3, EBR"),
+        ("EBR  5.0", "NAO  0.1", r"line 3, NAO: got \(unknown keyword\)"),
+        ("GLA  BK7", "GLA  BK99", r"line 12, GLA: got 'BK99'"),
+        ("GLA  BK7", "GLA  1.5 1.6 1.7", r"line 12, GLA: got '1.5 1.6 1.7', expected one index"),
+        ("GLA  BK7", "PK GLA -2", r"line 12, PK: got \(unknown keyword\)"),
+        ("GLA  BK7", "GLA  REFL", r"no mirrors"),
+        ("TH   5.0", "PY 0.0", r"PY: got \(on surface 1\), expected the last surface"),
+        ("PY   0.0", "PU   -0.1", r"line 19, PU: got \(unknown keyword\)"),
+        ("AST\n", "AST; TLA 5\n", r"line 16, TLA: got \(unknown keyword\)"),
+        ("AST\n", "", r"stop: got \(none\)"),
+        ("END  3", "END  7", r"line 25, END: got '7', expected 3"),
+        ("END  3\n", "", r"END: got \(missing\)"),
+        ("END  3\n", "END 3\nCFG NEW\n", r"line 26, CFG: got \(here\)"),
+        ("TH   5.0", "TH   x", r"line 14, TH: got 'x'"),
+    ],
+)
+def test_oslo_refusals(old: str, new: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        read(swapped(old, new, OSLO), ".len", tmp_path)

@@ -1,0 +1,270 @@
+"""Zemax files in the details of their definition: closed forms, what sizes the stop, states, and refusals by line."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from neurolens.errors import InputError, NeurolensWarning
+from neurolens.optics import catalogue
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.readers.draft import Given
+from neurolens.readers.zemax import read_zmx
+
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+
+HEAD = """\
+VERS 140730 73 26155
+MODE SEQ
+NAME Singlet for a test
+NOTE 0 made up
+NOTE 4
+UNIT MM X W X CM MR CPMM
+ENPD 10
+ENVD 2.0E+1 1 0
+GCAT SCHOTT
+FTYP 0 0 3 1 0 0 0
+XFLN 0 0 3 9
+YFLN 0 2.5 4 9
+VDXN 0 0 0
+WAVM 1 5.875618E-1 1
+PWAV 1
+SURF 0
+  TYPE STANDARD
+  CURV 0.0 0 0 0 0 ""
+  DISZ INFINITY
+  DIAM 0 0 0 0 1 ""
+"""
+BODY = """\
+SURF 1
+  STOP
+  TYPE STANDARD
+  CURV 2.0E-2 0 0 0 0 ""
+  COAT AR
+  HIDE 0 0 0 0 0 0 0 0 0 0
+  SLAB 4
+  DISZ 5.0
+  GLAS N-BK7 0 0 1.5 4.0E+1 0 0 0 0 0 0
+  DIAM 8 1 0 0 1 ""
+SURF 2
+  TYPE STANDARD
+  CURV -2.0E-2 0 0 0 0 ""
+  DISZ 45.0
+  DIAM 9 1 0 0 1 ""
+"""
+TAIL = """\
+SURF 3
+  TYPE STANDARD
+  CURV 0.0 0 0 0 0 ""
+  DISZ 0
+  DIAM 2.5 0 0 0 1 ""
+BLNK a merit function
+EFFL 0 1 0 0 0 0 0
+TOL TOFF   0   0              0              0   0 0 0
+MNUM 1 1
+MOFF   0   1 "" 0 0 0 1 1 0 0.0 ""
+"""
+
+
+def read(text: str, tmp_path: Path, given: Given | None = None, encoding: str = "utf-8") -> Lens:
+    path = tmp_path / "lens.zmx"
+    path.write_text(text, encoding=encoding)
+    return read_zmx(path, given)
+
+
+def swapped(old: str, new: str, text: str = HEAD + BODY + TAIL) -> str:
+    assert old in text
+    return text.replace(old, new, 1)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "latin-1"])
+def test_singlet_by_the_lensmakers_formula(encoding: str, tmp_path: Path) -> None:
+    text = swapped("Singlet", "Einzellinse \u00d8 20")
+    lens = read(text, tmp_path, encoding=encoding)
+    n, R, t = catalogue.find("N-BK7").n_d, 50.0, 5.0
+    efl_mm = 1 / ((n - 1) * (2 / R - (n - 1) * t / (n * R * R)))
+    data = first_order(lens)
+    assert data.efl_mm == pytest.approx(efl_mm, rel=1e-12)
+    assert data.back_focus_mm == pytest.approx(efl_mm * (1 - (n - 1) * t / (n * R)), rel=1e-12)
+    assert (lens.name, lens.notes) == ("Einzellinse \u00d8 20 for a test", "made up")
+    assert lens.surfaces[0].glass == "N-BK7"
+    assert lens.half_field_deg == 5.0  # the third field point, not the unused fourth
+    assert lens.rims == "source"
+    # The pupil of the file rules over the diameter that it prints for the stop, which is the first surface.
+    assert lens.surfaces[0].diameter_mm == pytest.approx(10)
+    assert lens.f_number == pytest.approx(efl_mm / 10)
+
+
+@pytest.mark.parametrize(
+    ("aperture", "diameter_mm"), [("ENPD 4", 4.0), ("FNUM 5 0", None), ("FLOA", 16.0), ("FNUM 5 1", None)]
+)
+def test_what_sizes_the_stop(aperture: str, diameter_mm: float | None, tmp_path: Path) -> None:
+    lens = read(swapped("ENPD 10", aperture), tmp_path)
+    data = first_order(lens)
+    expected = data.efl_mm / 5 if diameter_mm is None else diameter_mm
+    assert lens.surfaces[0].diameter_mm == pytest.approx(expected)
+    assert lens.f_number == pytest.approx(data.f_number)
+
+
+def test_units_scale_every_length(tmp_path: Path) -> None:
+    mm = read(HEAD + BODY + TAIL, tmp_path)
+    inches = read(swapped("UNIT MM", "UNIT IN"), tmp_path)
+    assert inches == mm.scaled(25.4)
+    with pytest.raises(InputError, match="--units"):
+        read(HEAD + BODY + TAIL, tmp_path, Given(units="cm"))
+    assert read(swapped("UNIT MM X W X CM MR CPMM\n", ""), tmp_path, Given(units="in")) == inches
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("  COAT AR\n", "  COAT AR\n", "coatings named but not given"),
+        ("2.0E+1 1 0", "3.0E+1 1 0", "not at 3.0E\\+1"),
+        ("VDXN 0 0 0", "VDXN 0 0.1 0", "vignetting factors"),
+        ('  DIAM 9 1 0 0 1 ""\n', '  DIAM 9 1 0 0 1 ""\n  SQAP 4 5\n', "SQAP"),
+        ("SURF 3\n  TYPE STANDARD\n  CURV 0.0", "SURF 3\n  TYPE STANDARD\n  CURV 0.01", "image surface is curved"),
+    ],
+)
+def test_what_is_left_out_is_told(old: str, new: str, message: str, tmp_path: Path) -> None:
+    with pytest.warns(NeurolensWarning, match=message):
+        read(swapped(old, new), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("block", "shape"),
+    [
+        ("TYPE EVENASPH\n  CURV 0.02\n  CONI -1\n  PARM 1 1E-4\n  PARM 2 2E-6", (50, -1, {2: 1e-4, 4: 2e-6}, None)),
+        ("TYPE ODDASPHE\n  CURV 0.02\n  PARM 1 0\n  PARM 3 1E-5\n  PARM 8 1E-12", (50, 0, {3: 1e-5, 8: 1e-12}, None)),
+        ("TYPE TOROIDAL\n  CURV 0.02\n  PARM 1 0\n  XDAT 1 0 0 0 1\n  XDAT 2 100 0 0 1", (50, 0, {}, "y")),
+        ("TYPE TOROIDAL\n  CURV 0.0\n  PARM 1 40", (40, 0, {}, "x")),
+        ("TYPE TOROIDAL\n  CURV 0.025\n  PARM 1 40", (40, 0, {}, None)),
+        ("TYPE BICONICX\n  CURV 0.02\n  CONI -2\n  PARM 1 0\n  PARM 2 3", (50, -2, {}, "y")),
+        ("TYPE BICONICX\n  CURV 0\n  PARM 1 40\n  PARM 2 -3", (40, -3, {}, "x")),
+        ("TYPE BICONICX\n  CURV 0.025\n  CONI -1\n  PARM 1 40\n  PARM 2 -1", (40, -1, {}, None)),
+    ],
+)
+def test_surface_types(block: str, shape: tuple[float, float, dict[int, float], str | None], tmp_path: Path) -> None:
+    lens = read(swapped('TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""', block), tmp_path)
+    s = lens.surfaces[0]
+    assert (pytest.approx(s.radius_mm), s.conic, dict(s.asphere), s.cylinder) == shape
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("MODE SEQ", "MODE NSC", r"line 2, MODE: got 'NSC'"),
+        ("UNIT MM", "UNIT FURLONG", r"line 6, UNIT: got 'FURLONG', expected one of MM"),
+        ("ENPD 10", "OBNA 0.1 0", r"line 7, OBNA"),
+        ("ENPD 10", "ENPD 0", r"line 7, ENPD: got 0.0, expected a number above 0"),
+        ("GLAS N-BK7", "GLAS N-BK8", r"GLAS: got 'N-BK8', expected a glass.*N-BK7"),
+        ("GLAS N-BK7 0", "GLAS N-BK7 4", r"GLAS: got 'N-BK7 with solve 4'"),
+        ("GLAS N-BK7", "GLAS MIRROR", r"line 29, GLAS: got 'MIRROR'.*no mirrors"),
+        ("GLAS N-BK7 0 0 1.5 4.0E+1", "GLAS ___BLANK 1 0 0.5 60", r"index: got 0.5"),
+        ("SURF 2", "SURF 4", r"SURF: got '4', expected surface 2"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE COORDBRK\n  PARM 3 12\n  CURV -2", r"PARM 3 of COORDBRK: got 12.0"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE XPOLYNOM\n  CURV -2", r"line 32, TYPE: got 'XPOLYNOM'"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE TOROIDAL\n  PARM 1 33\n  CURV -2", r"torus is not read"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE TOROIDAL\n  PARM 2 1E-5\n  CURV -2", r"PARM 2 of TOROIDAL"),
+        (
+            "TYPE STANDARD\n  CURV -2",
+            "TYPE BICONICX\n  PARM 1 33\n  CURV -2",
+            r"BICONICX.*radii infinite",
+        ),
+        ("TYPE STANDARD\n  CURV -2", "TYPE ODDASPHE\n  PARM 1 1E-3\n  CURV -2", r"PARM 1 of ODDASPHE"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE STANDARD\n  PARM 1 1E-3\n  CURV -2", r"PARM 1 of STANDARD"),
+        ("  DIAM 9 1", "  OBSC 0 3 0\n  DIAM 9 1", r"line 35, OBSC: got \(unknown keyword\)"),
+        ("  DIAM 9 1", "  CLAP 2 9 0\n  DIAM 9 1", r"CLAP: got '2 9', expected a round opening without a hole"),
+        ("  DIAM 9 1", "  OBDC 0 3\n  DIAM 9 1", r"OBDC"),
+        ("  DIAM 9 1", "  IGNR 1\n  DIAM 9 1", r"IGNR"),
+        ("DIAM 9 1", "DIAM 60 1", r"surface 1, diameter_mm: got 120"),
+        ("DISZ 45.0", "DISZ INFINITY", r"DISZ: got 'INFINITY'"),
+        ("MNUM 1 1", "MNUM 1000 1", r"MNUM: got 1000"),
+    ],
+)
+def test_refusals(old: str, new: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        read(swapped(old, new), tmp_path)
+
+
+DUMMY = """\
+SURF 3
+  TYPE STANDARD
+  CURV 0
+  DISZ {gap}
+  DIAM 0.1 0 0 0 1 ""
+"""
+
+
+def test_planes_that_cut_no_beam_are_left_out(tmp_path: Path) -> None:
+    text = swapped("DISZ 45.0", "DISZ 40.0").replace(TAIL, DUMMY.format(gap=5.0) + TAIL.replace("SURF 3", "SURF 4"))
+    with pytest.warns(NeurolensWarning, match="row 2 behind the object"):
+        lens = read(text, tmp_path)
+    assert [s.thickness_mm for s in lens.surfaces] == [5.0, 45.0]
+    held = text.replace('DIAM 0.1 0 0 0 1 ""', 'DIAM 6 1 0 0 1 ""\n  CLAP 0 5 0')
+    with pytest.warns(NeurolensWarning):
+        lens = read(held, tmp_path)
+    assert [s.diameter_mm for s in lens.surfaces][1:] == [18.0, 10.0]
+
+
+ZOOM = """\
+MNUM 2 1
+LTTL 0 1 "far" 0 0 0
+LTTL 0 2 "near" 0 0 0
+THIC 0 1 1.0E+10 0 0 0
+THIC 0 2 300 0 0 0
+THIC 2 1 45 0 0 0
+THIC 2 2 58.5 0 0 0
+FVDY 1 1 0 0 0 0
+APER 0 1 10 0 0 0
+APER 0 2 8 0 0 0
+"""
+
+
+def test_configurations(tmp_path: Path) -> None:
+    text = HEAD + BODY + TAIL[: TAIL.index("MNUM")] + ZOOM
+    far, near = read(text, tmp_path).configurations
+    assert (far.name, far.object_distance_mm, far.stop_diameter_mm) == ("far", None, pytest.approx(10))
+    assert (near.name, near.object_distance_mm, near.stop_diameter_mm) == ("near", 300.0, pytest.approx(8))
+    assert dict(near.thickness_mm) == {1: 58.5}
+    for old, new, message in (
+        ("APER 0 2 8", "CRVT 1 2 0.03", r"CRVT: got \(unknown operand\)"),
+        ("APER 0 2 8", "GLSS 1 2 0", r"GLSS"),
+        ("APER 0 2 8", "SDIA 2 2 8", r"SDIA: got \(surface 2\), expected the stop"),
+        ("THIC 2 2", "THIC 9 2", r"THIC: got '9 2'"),
+        ("THIC 2 2", "THIC 2 7", r"THIC: got '2 7'"),
+        ("THIC 2 2 58.5", "THIC 2 2 nan", r"THIC: got 'nan'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read(swapped(old, new, text), tmp_path)
+
+
+@pytest.mark.parametrize("solve", ["TCOM 1 50", "TOLE 1 50"])
+def test_thickness_solves_are_carried_out_in_each_configuration(solve: str, tmp_path: Path) -> None:
+    body = swapped("DISZ 45.0\n", f"DISZ 45.0\n  {solve}\n", BODY)
+    zoom = "MNUM 2 1\nTHIC 1 1 5 0\nTHIC 1 2 7 0\n"
+    one, two = read(HEAD + body + TAIL[: TAIL.index("MNUM")] + zoom, tmp_path).configurations
+    assert dict(one.thickness_mm) == {0: 5.0, 1: 45.0} and dict(two.thickness_mm) == {0: 7.0, 1: 43.0}
+
+
+def test_a_marginal_ray_solve_puts_the_film_in_focus(tmp_path: Path) -> None:
+    lens = read(swapped("DISZ 45.0\n", "DISZ 0\n  MAZH 0 0\n"), tmp_path)
+    assert lens.surfaces[-1].thickness_mm == pytest.approx(first_order(lens).back_focus_mm)
+
+
+def test_a_near_object_becomes_a_focus_state(tmp_path: Path) -> None:
+    lens = read(swapped("DISZ INFINITY", "DISZ 500"), tmp_path)
+    assert [c.object_distance_mm for c in lens.configurations] == [500.0]
+
+
+def test_rims_that_are_not_given_are_derived_for_the_field(tmp_path: Path) -> None:
+    text = swapped('  DIAM 9 1 0 0 1 ""\n', "")
+    lens = read(text, tmp_path)
+    assert lens.rims == "derived" and 9 < lens.surfaces[1].diameter_mm < 12
+    without = swapped("YFLN 0 2.5 4 9", "YFLN 0 0 0 0", swapped("XFLN 0 0 3 9", "XFLN 0 0 0 0", text))
+    with pytest.raises(InputError, match=r"not given for surface 1.*--half-field"):
+        read(without, tmp_path)
+    assert read(without, tmp_path, Given(half_field_deg=5.0)).surfaces == lens.surfaces
+    assert math.isfinite(lens.surfaces[1].diameter_mm)
