@@ -139,6 +139,12 @@ def test_a_mistake_is_one_line(args: list[object], words: list[str], capsys: pyt
         (["--camera", "thin", "--exposure", "nan"], ["--exposure", "stops"]),
         (["--camera", "thin", "--focus", "0.1"], ["focus_m", "focal lengths"]),
         (["--camera", "thin", "--zoom", "72mm"], ["zoom", "lens file"]),
+        (["--camera", "pinhole", "--blades", "5"], ["aperture", "point"]),
+        (["--camera", "thin", "--blades", "2"], ["--blades", "from 3 to 100"]),
+        (["--camera", "thin", "--blade-rotation", "10"], ["blades", "missing"]),
+        (["--camera", "thin", "--aperture-mask", "no.png"], ["no.png", "missing"]),
+        (["--camera", "thin", "--focusing", "internal"], ["focus", "lens files"]),
+        (["--camera", "thin", "--efl", "50", "--field", "40"], ["--field", "not allowed"]),
         (["--camera", "thin", "--width", "32", "--height", "32"], ["shape of the film"]),
         (["--camera", "thin", "-o", "a.png"], ["--out", ".exr"]),
         (["--camera", "thin", "-o", "/no/such/folder/a.exr"], ["folder"]),
@@ -197,6 +203,21 @@ def test_lens_state_is_applied(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_json(capsys, "lens", GAUSS, "--efl", "35")["efl_mm"] == pytest.approx(35)
 
 
+@pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+def test_lens_zooms_between_states_focuses_inside_and_shows_its_breathing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lens = ROOT / "lenses/nikon_zoom_70_200.toml"
+    state = ("--zoom", "100", "--focus", "1.5", "--focusing", "internal", "--blades", "9")
+    data = run_json(capsys, "lens", lens, *state, "--breathing", tmp_path / "breathing.png")
+    assert (tmp_path / "breathing.png").stat().st_size > 10_000
+    assert "100 mm" in data["derived"] and data["aperture"]["blades"] == 9
+    inside = data["breathing"]["groups move"]
+    assert inside[0]["efl_mm"] == pytest.approx(100, rel=1e-6) and inside[1]["efl_mm"] < 95
+    seen = run_json(capsys, "lens", GAUSS, "--field", "40")
+    assert seen["image_radius_mm"] == 21.6 and seen["half_field_reached_deg"] == pytest.approx(20, abs=0.5)
+
+
 def test_lens_text_and_layout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = tmp_path / "layout.png"
     assert main(["lens", str(GAUSS), "--layout", str(picture)]) == 0
@@ -222,6 +243,17 @@ def test_render_writes_the_picture_with_its_settings(
     assert metadata["render"]["samples"] == 16 and metadata["camera"] == data["camera"]
     assert metadata["camera"]["f_number"] == pytest.approx(4.0)
     assert Path(data["preview"]).read_bytes().startswith(b"\x89PNG")
+
+
+def test_render_shapes_the_stop_by_the_command_line_over_the_scene(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bladed = scene.with_name("bladed.toml")
+    bladed.write_text(scene.read_text().replace("[camera]", "[camera]\nblades = 6\nblade_rotation_deg = 15.0"))
+    out = ("--camera", "thin", "-o", tmp_path / "a.exr", "--quiet", "--samples", "1")
+    assert run_json(capsys, "render", bladed, *out)["camera"]["aperture"]["blades"] == 6
+    shaped = run_json(capsys, "render", bladed, *out, "--blades", "5", "--blade-curvature", "0.5")
+    assert shaped["camera"]["aperture"] == {"blades": 5, "rotation_deg": 0.0, "curvature": 0.5}
 
 
 def test_render_repeats_with_its_seed_and_takes_one_side_of_the_picture(

@@ -10,7 +10,7 @@ import math
 from dataclasses import replace
 
 from neurolens.errors import InputError
-from neurolens.optics.clearance import check_clearance
+from neurolens.optics.clearance import check_clearance, surface_sag_mm
 from neurolens.optics.prescription import Configuration, Lens, Surface
 
 BK7_N_D, BK7_V_D = 1.5168, 64.17
@@ -65,7 +65,9 @@ def with_filter(
     beside = lens.surfaces[-1 if rear else 0]
     if diameter_mm is None:
         field = 45.0 if rear else min(lens.half_field_deg or 45.0, _WIDEST_DEG)
-        diameter_mm = beside.diameter_mm + 2 * (gap_mm + thickness_mm) * math.tan(math.radians(field))
+        sag = surface_sag_mm(beside, beside.semi_diameter_mm, 0.0)  # the rim may lie further away than the vertex
+        reach = gap_mm + thickness_mm + max(-sag if rear else sag, 0.0)
+        diameter_mm = beside.diameter_mm + 2 * reach * math.tan(math.radians(field))
     _require(lens.path, diameter_mm=diameter_mm)
     plate = Surface(
         math.inf, thickness_mm, diameter_mm, n_d, V_d, material="filter", absorption_per_mm=absorption_per_mm

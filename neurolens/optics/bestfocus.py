@@ -27,7 +27,7 @@ def best_focus_z_mm(
 
     Rays are spread evenly over the entrance pupil, those pass that the stop and the rims let through, and the plane
     follows in closed form: the spot's second moment is a parabola in z. With pure third-order spherical aberration it
-    lies two thirds of the way from the paraxial to the marginal focus.
+    lies two thirds of the way from the paraxial to the marginal focus. A pinhole's film stays where it is.
 
     Args:
         weights: (wavelength in nm, weight) pairs; the spot is that of all colours together.
@@ -38,6 +38,8 @@ def best_focus_z_mm(
     if not weights or not all(w > 0 for pair in weights for w in pair):
         raise InputError("best focus", "weights", tuple(weights), "(wavelength in nm, weight) pairs above 0")
     film_z = paraxial.film_z_mm(lens, focus_m)
+    if paraxial.is_pinhole(lens):
+        return film_z
     for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
         film_z = _least_spot_z_mm(lens, film_z - 1000 * focus_m, weights)
     return film_z

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from render_helpers import WHITE, diffuse, scene
 
+from neurolens.apertures import Aperture
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.errors import InputError
@@ -116,3 +117,22 @@ def test_textures_lie_where_they_should(tmp_path: Path) -> None:
     shown = render(made, Pinhole(200.0, (40.0, 20.0)), width=20, height=10, samples=64, max_depth=1).rgb
     assert shown[5, 2:9].mean() > 0.9 and shown[5, 11:].mean() < 0.05
     assert shown[0:2, 0:3, 0].mean() > 0.9 and shown[0:2, 0:3, 1:].mean() < 0.1
+
+
+def test_the_stop_s_shape_by_blades_or_by_a_picture_beside_the_scene(tmp_path: Path) -> None:
+    assert scene({}).aperture is None
+    assert scene({"blades": 7, "blade_rotation_deg": 10, "blade_curvature": 0.5}).aperture == Aperture(7, 10.0, 0.5)
+    Image.fromarray(np.array([[255, 0], [255, 255]], np.uint8)).save(tmp_path / "stop.png")
+    path = tmp_path / "a.toml"
+    camera = 'position_m = [0, 0, 0]\nlook_at_m = [0, 0, -1]\nfocus_m = 2.0\naperture_mask = "stop.png"'
+    path.write_text(f"[camera]\n{camera}\n[environment]\ncolour = [1, 1, 1]\n")
+    assert load_scene(path).aperture == Aperture(mask=np.array([[1, 0], [1, 1]]))
+    for change, expected in (
+        ({"blades": 2}, "blades"),
+        ({"blade_curvature": 0.5}, "blades"),
+        ({"blades": 5, "aperture_mask": "stop.png"}, "not both"),
+        ({"aperture_mask": "none.png"}, "missing"),
+    ):
+        with pytest.raises(InputError, match=expected) as caught:
+            scene(change)
+        assert str(caught.value).startswith("test.toml: camera, ")
