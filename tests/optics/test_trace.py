@@ -229,7 +229,7 @@ def test_symmetry_and_reversibility(path: Path) -> None:
     wavelength = 380 + 400 * torch.rand(3000, generator=g, dtype=torch.float64)
     out = trace(table, start, wavelength, transmittance=True)
     passed = out.status == 0
-    assert 20 < passed.sum() < 3000
+    assert passed.sum() > 20
     # An anamorphic lens has two planes of symmetry, any other all through its axis.
     anamorphic = any(s.cylinder for s in table.surfaces)
     for angle, mirror in ((math.pi, False), (0.0, True)) if anamorphic else ((1.0, False), (4.0, True)):
