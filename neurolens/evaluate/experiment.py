@@ -47,10 +47,9 @@ class LensChoice:
     f_number: float | None = None
 
     def read(self) -> Lens:
-        """The lens at infinity focus."""
-        return read_lens(self.file).at(
-            focal_length_mm=self.efl_mm, zoom=self.configuration, f_number=self.f_number, focus_m=None
-        )
+        """The lens at infinity focus, its stop round: models know no other, and cameras shape it outside them."""
+        lens = read_lens(self.file).with_aperture(None)
+        return lens.at(focal_length_mm=self.efl_mm, zoom=self.configuration, f_number=self.f_number)
 
 
 @dataclass(frozen=True)
