@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from neurolens.errors import InputError
@@ -52,7 +52,11 @@ def read_any(path: str | Path, given: Given | None = None) -> Lens:
     """
     given = given or Given()
     if Path(path).suffix.lower() == ".toml":
-        return read_lens(path)
+        lens = read_lens(path)
+        lens = replace(lens, name=given.name or lens.name, source=given.source or lens.source)
+        if given != Given(name=given.name, source=given.source):
+            raise InputError(path, "options", "(of a lens file)", "--name and --source only: it says the rest itself")
+        return lens
     found = format_of(path)
     for option, said in (("--gap-before", given.gap_before), ("--semi-diameters", given.semi_diameters)):
         if said and found.read is not read_table:

@@ -171,13 +171,18 @@ def _check_rows(rows: Sequence[Surface], file: str) -> None:
         raise InputError(file, f"surface {len(rows) - 1}, index", rows[-1].n_d, "air between last surface and film")
 
 
-def named_glass(name: str, file: str, field: str) -> dict[str, Any]:
+def named_glass(name: str, file: str, field: str, makers: Sequence[str] = ()) -> dict[str, Any]:
     """Fields of a surface whose glass the file gives by name alone.
+
+    Args:
+        makers: the makers' catalogues that the file names; the first that has the glass is meant.
 
     Raises:
         InputError: a name that the catalogue does not know; the message suggests the nearest.
     """
     known = catalogue.find(name, file, field)
+    others = {g.maker.upper(): g for g in catalogue.same_name(name)}
+    known = next((others[m] for m in makers if m in others), known)
     return {"n_d": known.n_d, "V_d": known.V_d, "glass": short_name(known), "material": name}
 
 

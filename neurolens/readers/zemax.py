@@ -8,48 +8,28 @@ surface. What is not known here is an error that names keyword and line.
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from neurolens.errors import InputError
 from neurolens.optics.lensrows import MAX_SURFACES
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.prescription import Lens
 from neurolens.readers import zemax_words as words
 from neurolens.readers.assemble import named_glass
-from neurolens.readers.draft import Draft, Given, Row, lens_of
-from neurolens.readers.source import Line, read_lines, warn
-from neurolens.readers.zemax_shapes import TYPES, Block, shape_of, thickness
-from neurolens.readers.zemax_states import Zoom, draft_states
+from neurolens.readers.draft import Given, lens_of
+from neurolens.readers.source import Line, read_lines
+from neurolens.readers.zemax_file import File, draft_of
+from neurolens.readers.zemax_shapes import TYPES, Block, thickness
 
 UNITS = {"MM": "mm", "CM": "cm", "IN": "in", "INCH": "in", "METER": "m", "METERS": "m", "M": "m"}
-SYSTEM = ("MODE", "NAME", "NOTE", "UNIT", "ENPD", "FNUM", "FLOA", "OBNA", "ENVD", "FTYP", "XFLN", "YFLN", "TOL", "MNUM")
+SYSTEM = (
+    *("MODE", "NAME", "NOTE", "UNIT", "ENPD", "FNUM", "FLOA", "OBNA", "ENVD", "GCAT", "FTYP", "XFLN", "YFLN", "TOL"),
+    "MNUM",
+)
 SURFACE = (
     *("SURF", "TYPE", "CURV", "CONI", "DISZ", "GLAS", "DIAM", "PARM", "XDAT", "STOP", "COMM", "MAZH", "TCOM", "TOLE"),
     *("CLAP", "FLAP", "SQAP", "ELAP", "OBDC", "IGNR"),
 )
-
-
-@dataclass
-class File:
-    """A file while it is read."""
-
-    path: str
-    blocks: list[Block] = field(default_factory=list)
-    zoom: Zoom = field(default_factory=Zoom)
-    name: str = ""
-    notes: list[str] = field(default_factory=list)
-    unit: str | None = None
-    pupil: float | None = None
-    f_number: float | None = None
-    working: Line | None = None  # where the f-number is said to be the working one
-    field_type: int = 0
-    fields: int = 0
-    heights: dict[str, list[float]] = field(default_factory=dict)
-    ignored: Counter[str] = field(default_factory=Counter)
-    oddities: list[str] = field(default_factory=list)
 
 
 def read_zmx(path: str | Path, given: Given | None = None) -> Lens:
@@ -64,7 +44,7 @@ def read_zmx(path: str | Path, given: Given | None = None) -> Lens:
         _read(file, line)
     if len(file.blocks) < 3:
         raise InputError(file.path, "SURF", f"({len(file.blocks)} surfaces)", "object, at least one surface, and image")
-    return lens_of(_draft(file), given)
+    return lens_of(draft_of(file), given)
 
 
 def looks_like_zmx(head: str) -> bool:
@@ -126,6 +106,8 @@ def _system(file: File, line: Line, word: str, rest: list[str]) -> None:
         case "ENVD":
             if line.numbers(word, rest, 2)[:2] != [20.0, 1.0]:
                 file.oddities.append(f"indices are those at 20 degrees and 1 atmosphere, not at {' '.join(rest[:2])}")
+        case "GCAT":
+            file.makers = [word.upper().split("_")[0] for word in rest]  # catalogues may end in a date
         case "FTYP":
             numbers = line.numbers(word, rest, 1)
             file.field_type, file.fields = int(numbers[0]), int(numbers[2]) if len(numbers) > 2 else 0
@@ -148,7 +130,7 @@ def _surface(file: File, block: Block, line: Line, word: str, rest: list[str]) -
         case "DISZ":
             block.thickness = thickness(line, word, rest[:1], is_object=len(file.blocks) == 1)
         case "GLAS":
-            block.medium = _glass(line, rest)
+            block.medium = _glass(line, rest, file.makers)
         case "DIAM":
             semi = line.numbers(word, rest[:1])[0]
             block.semi_diameter = semi if semi > 0 else math.nan
@@ -186,7 +168,7 @@ def _above_0(line: Line, word: str, rest: list[str]) -> float:
     return value
 
 
-def _glass(line: Line, rest: list[str]) -> dict[str, Any]:
+def _glass(line: Line, rest: list[str], makers: list[str]) -> dict[str, Any]:
     """GLAS name, type of solve (1: a model glass, 2: a pickup already carried out, 4: an offset), surface, n_d, V_d."""
     name, kind = rest[0] if rest else "", rest[1] if len(rest) > 1 else "0"
     if name.upper() == "MIRROR" or not name:
@@ -198,58 +180,4 @@ def _glass(line: Line, rest: list[str]) -> dict[str, Any]:
         return {"n_d": n_d, "V_d": V_d if V_d > 0 else None, "material": None if name == "___BLANK" else name}
     if kind not in ("0", "2"):
         raise line.error("GLAS", f"{name} with solve {kind}", "a glass of the catalogue, or n_d and V_d")
-    return named_glass(name, line.file, f"line {line.number}, GLAS")
-
-
-def _draft(file: File) -> Draft:
-    *_, image = file.blocks
-    rows = tuple(Row(_surface_of(b), b.aperture) for b in file.blocks[1:-1])
-    for block in file.blocks:
-        if math.isnan(block.thickness):
-            raise block.start.error("DISZ", "(missing)", "the thickness behind every surface (is the file cut off?)")
-    if image.thickness or image.medium or image.stop:
-        raise image.start.error("SURF", "(the last in the file)", "an image surface (is the file cut off?)")
-    if image.curvature:
-        file.oddities.append("the image surface is curved; the film is taken as plane")
-    if file.f_number is not None and file.working and math.isfinite(file.blocks[0].thickness):
-        raise file.working.error("FNUM", "(the working f-number of a near object)", "ENPD, FLOA, or FNUM with flag 0")
-    for text in (*file.oddities, *(f"{text} ({count})" for text, count in file.ignored.items() if count)):
-        warn(file.path, text)
-    last = file.blocks[-2]
-    return Draft(
-        file=file.path,
-        kind="Zemax",
-        rows=rows,
-        name=file.name,
-        notes="\n".join(file.notes).strip(),
-        states=tuple(draft_states(file.zoom, file.blocks, file.f_number is not None)),
-        pupil=file.pupil,
-        f_number=file.f_number,
-        object_distance=file.blocks[0].thickness,
-        film_given=not (last.solve and last.solve[0] == "MAZH" and last.thickness == 0),
-        unit=file.unit,
-        rims="estimated" if any(b.automatic and not b.stop for b in file.blocks[1:-1]) else "source",
-        **dict(_field(file)),
-    )
-
-
-def _surface_of(block: Block) -> Surface:
-    return Surface(
-        thickness_mm=block.thickness,
-        diameter_mm=2 * (block.semi_diameter if block.clear is None else block.clear),
-        stop=block.stop,
-        **shape_of(block),
-        **block.medium,
-    )
-
-
-def _field(file: File) -> Iterator[tuple[str, float]]:
-    """Half field or image radius: the field point farthest from the axis. FTYP 0 angle, 2 and 3 image height."""
-    points = [(x, y) for x, y in zip(*(file.heights.get(k, [0.0] * 100) for k in ("XFLN", "YFLN")), strict=False)]
-    edge = max((math.hypot(x, y) for x, y in points[: file.fields or None]), default=0.0)
-    if edge > 0 and file.field_type == 0:
-        yield "half_field_deg", edge
-    elif edge > 0 and file.field_type in (2, 3):
-        yield "image_radius", edge
-    elif edge > 0:
-        warn(file.path, f"the field is given as type {file.field_type} (not an angle, not an image height): left out")
+    return named_glass(name, line.file, f"line {line.number}, GLAS", makers)

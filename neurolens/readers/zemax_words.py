@@ -4,7 +4,7 @@ from __future__ import annotations
 
 # Settings of the program and of its analyses.
 SYSTEM = frozenset(
-    """VERS PFIL LANG GFAC GCAT RAIM PUSH SDMA OMMA ROPD PICB PZUP FWGN FWGT WAVL WAVN WAVM WWGT WWGN PWAV POLS GLRS
+    """VERS PFIL LANG GFAC RAIM PUSH SDMA OMMA ROPD PICB PZUP FWGN FWGT WAVL WAVN WAVM WWGT WWGN PWAV POLS GLRS
     GSTD NSCD COFN LUID EFFL""".split()
 )
 # Of the system, and ignored: rims and stop decide which rays pass, not the factors that a designer chose.

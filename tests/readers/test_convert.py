@@ -13,6 +13,7 @@ from neurolens.cli import main
 from neurolens.optics.lensfile import read_lens
 from neurolens.readers.any_format import read_any
 
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
 LENSES = sorted((Path(__file__).parents[2] / "lenses").glob("*.toml"))
 TABLE = "# Singlet\n0 4.0 0 10\n50 5.0 1.5 20\n-50.0 0 1 20\n"
 
@@ -106,7 +107,6 @@ def test_options_for_tables_alone(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "--gap-before" in failure(capsys, path, "-o", tmp_path / "lens.toml", "--gap-before")
 
 
-@pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
 @pytest.mark.parametrize("path", LENSES[::4], ids=lambda p: p.stem)
 def test_round_trip(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Other program -> lens file -> the same lens, bit for bit."""
@@ -126,3 +126,7 @@ def test_a_lens_file_of_our_own_is_read_too(tmp_path: Path, capsys: pytest.Captu
     out = tmp_path / "lens.toml"
     assert main(["convert", str(LENSES[2]), "-o", str(out)]) == 0
     assert replace(read_lens(out), path=str(LENSES[2])) == read_lens(LENSES[2])
+    capsys.readouterr()
+    assert "--name and --source only" in failure(capsys, LENSES[2], "-o", out, "--force", "--units", "in")
+    assert main(["convert", str(LENSES[2]), "-o", str(out), "--force", "--name", "mine"]) == 0
+    assert read_lens(out).name == "mine"

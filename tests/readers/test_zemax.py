@@ -209,6 +209,14 @@ def test_planes_that_cut_no_beam_are_left_out(tmp_path: Path) -> None:
     assert [s.diameter_mm for s in lens.surfaces][1:] == [18.0, 10.0]
 
 
+def test_the_catalogues_of_the_file_decide_between_makers(tmp_path: Path) -> None:
+    shared = next(g for g in catalogue.all_glasses() if len(catalogue.same_name(g.name)) > 1)
+    for known in catalogue.same_name(shared.name):
+        text = swapped("GCAT SCHOTT", f"GCAT NOBODY {known.maker.upper()}_2020")
+        s = read(swapped("GLAS N-BK7", f"GLAS {shared.name.replace(' ', '')}", text), tmp_path).surfaces[0]
+        assert s.n_d == known.n_d and s.glass is not None and catalogue.find(s.glass) is known
+
+
 ZOOM = """\
 MNUM 2 1
 LTTL 0 1 "far" 0 0 0
