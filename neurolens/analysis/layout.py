@@ -90,7 +90,7 @@ def state_text(scene: Scene) -> str:
     """Focal length, f-number, refractions and focus of a scene, for headings."""
     data = scene.first_order
     focus = "infinity" if math.isinf(scene.focus_m) else f"{scene.focus_m:.4g} m"
-    plane = f", {scene.axis}-z plane" if any(s.cylinder for s in scene.lens.surfaces) else ""
+    plane = f", {scene.axis}-z plane" if scene.lens.anamorphic else ""
     return (
         f"f = {data.efl_mm:.1f} mm, f/{data.f_number:.2g}, {refractions(scene.lens)} refractions, focus {focus}{plane}"
     )

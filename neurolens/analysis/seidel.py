@@ -64,7 +64,7 @@ def seidel(scene: Scene, *, wavelength_nm: float = LINE_D_NM, image_height_mm: f
         InputError: a lens with cylinders: these sums are those of lenses symmetric about their axis.
     """
     lens = scene.lens
-    if any(s.cylinder for s in lens.surfaces):
+    if lens.anamorphic:
         raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
     if is_pinhole(lens):
         raise InputError(lens.path, "surfaces", "(a pinhole)", "a lens with power")
@@ -89,7 +89,7 @@ def seidel(scene: Scene, *, wavelength_nm: float = LINE_D_NM, image_height_mm: f
 
 def petzval_curvature(lens: Lens, wavelength_nm: float = LINE_D_NM) -> float:
     """Curvature of the Petzval surface in 1/mm (positive: centre towards +z); NaN for a lens with cylinders."""
-    if any(s.cylinder for s in lens.surfaces):
+    if lens.anamorphic:
         return math.nan
     n = _indices(lens, wavelength_nm)
     return sum(_curvature(s) * (1 / n[k + 1] - 1 / n[k]) for k, s in enumerate(lens.surfaces))

@@ -114,6 +114,6 @@ def sections(files: list[Path]) -> list[dict[str, Any]]:
 
 def _caption(lens: Lens, efl_mm: float, f_number: float) -> str:
     text = f"{efl_mm:.4g} mm f/{f_number:.2g}"
-    if any(s.cylinder for s in lens.surfaces):
+    if lens.anamorphic:
         text = f"{efl_mm:.3g} / {first_order(lens, meridian='x').efl_mm:.3g} mm f/{f_number:.2g}"
     return text + ("" if lens.half_field_deg is None else f", {lens.half_field_deg:.3g}°") + f", rims {lens.rims}"

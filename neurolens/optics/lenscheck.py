@@ -110,7 +110,7 @@ def in_state(lens: Lens, c: Configuration) -> Lens:
 def _first_order(lens: Lens, data: FirstOrder) -> Iterator[Check]:
     """Focal length, back focus and f-number of an object at infinity."""
     yield _focal_length(lens, data.efl_mm, lens.stated_efl_mm)
-    if any(s.cylinder for s in lens.surfaces):
+    if lens.anamorphic:
         yield _focal_length(lens, first_order(lens, meridian="x").efl_mm, lens.stated_efl_x_mm, " (x-z plane)")
     yield _back_focus(lens, data.back_focus_mm, data.efl_mm)
     n, stated = data.f_number, lens.f_number

@@ -99,7 +99,7 @@ def corner_illumination(lens: Lens, radius_mm: float) -> float:
 
     The corner of an anamorphic lens lies halfway between its planes of symmetry.
     """
-    across = math.sqrt(0.5) if any(s.cylinder for s in lens.surfaces) else 0.0
+    across = math.sqrt(0.5) if lens.anamorphic else 0.0
     middle, corner = _light(lens, 0.0, 0.0), _light(lens, radius_mm * math.sqrt(1 - across**2), radius_mm * across)
     return corner / middle if middle > 0 else 0.0
 

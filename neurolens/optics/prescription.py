@@ -156,9 +156,14 @@ class Lens:
         return [s.semi_diameter_mm for s in self.surfaces]
 
     @property
+    def anamorphic(self) -> bool:
+        """Whether any surface is a cylinder: the lens is then not round about its axis."""
+        return any(s.cylinder is not None for s in self.surfaces)
+
+    @property
     def dispersive(self) -> bool:
         """Whether the index of any glass is known to change with wavelength."""
-        return any(s.V_d is not None for s in self.surfaces)
+        return any(s.V_d is not None or s.glass is not None for s in self.surfaces)
 
     @property
     def lens_id(self) -> str:

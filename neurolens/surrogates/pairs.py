@@ -114,9 +114,12 @@ def make_pairs(
     `rim` and `edge` come from the rays drawn for `train`, as many as those hold.
 
     Raises:
-        InputError: an empty split, or fewer than one ray in 10,000 of the domain passes.
+        InputError: an empty split, a lens that is not round about its axis (fits turn every ray into one plane), or
+            fewer than one ray in 10,000 of the domain passes.
     """
     settings = settings or PairSettings()
+    if lens.anamorphic or lens.aperture is not None:
+        raise InputError(lens.path, "surfaces", "(cylinders or blades)", "a lens that is round about its axis")
     for name in ("train", "held_out", "rim"):
         if getattr(settings, name) < 1:
             raise InputError("pairs", name, getattr(settings, name), "at least one ray")
