@@ -25,7 +25,7 @@ from neurolens.optics.trace import trace
 
 _DIRECT, _STRIDES, _PER_STRIDE = 5, 8, 3  # Newton steps; strides of the careful walk
 _AIMED = 1e-8  # how near to its point, in stop radii, a ray must come
-_DIFFERENCE = 1e-5  # step of the derivative, in entrance-pupil radii
+_DIFFERENCE = 3e-6  # step of the derivative, in stop radii
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class _Aim:
         lens = scene.lens
         self.front = without_rims(replace(lens, surfaces=lens.surfaces[: lens.stop_index + 1]))
         self.stop_mm = lens.stop_radius_mm
-        self.step_mm = _DIFFERENCE * scene.first_order.entrance_pupil_diameter_mm / 2
+        self.step_mm = _DIFFERENCE * lens.stop_radius_mm
         self.along_x = scene.axis == "x"
         self.shape = shape
 

@@ -81,6 +81,11 @@ class Scene:
         return first_order(self.lens, meridian=self.axis)
 
     @property
+    def image_radius_mm(self) -> float:
+        """Radius of the lit film."""
+        return _image_radius_mm(self.lens)
+
+    @property
     def object_z_mm(self) -> float:
         """z of the object on the axis, mm; -inf for a distant one."""
         return self.film_z_mm - 1000 * self.focus_m
@@ -175,6 +180,11 @@ def on_plane(rays: Rays, z_mm: float) -> Rays:
 
 
 @lru_cache(maxsize=16)
+def _image_radius_mm(lens: Lens) -> float:
+    return image_radius_mm(lens)[0]
+
+
+@lru_cache(maxsize=16)
 def _edge_deg(scene: Scene) -> float:
     scene.check()
     lens, stated = scene.lens, scene.lens.half_field_deg
@@ -183,5 +193,5 @@ def _edge_deg(scene: Scene) -> float:
         raise InputError(lens.path, "half_field_deg", stated, "a lens with chief rays off the axis")
     if stated and lens.image_radius_mm is None:
         return float(min(stated, angles[-1]))
-    edge = float(np.interp(image_radius_mm(lens)[0], height, angles))
+    edge = float(np.interp(scene.image_radius_mm, height, angles))
     return min(edge, stated) if stated else edge

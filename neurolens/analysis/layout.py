@@ -13,7 +13,6 @@ from neurolens.analysis.fields import Scene
 from neurolens.analysis.patterns import Pattern, fan
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.pupils import image_radius_mm
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
@@ -32,7 +31,7 @@ def layout_profile(scene: Scene, film_radius_mm: float | None = None) -> dict[st
         A field from which no ray of the section passes has no rays.
     """
     lens = scene.lens
-    radius = image_radius_mm(lens)[0] if film_radius_mm is None else film_radius_mm
+    radius = scene.image_radius_mm if film_radius_mm is None else film_radius_mm
     rays: list[dict[str, Any]] = []
     for number, (share, field) in enumerate(zip(FIELDS, scene.fields_at([f * radius for f in FIELDS]), strict=True)):
         if math.isnan(field):

@@ -1,0 +1,53 @@
+"""Lenses whose behaviour is known in closed form, and the library's for everything else."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+from neurolens.analysis.fields import Scene
+from neurolens.errors import NeurolensWarning
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens, Surface
+
+INF = math.inf
+ROOT = Path(__file__).parents[2]
+
+
+def library(name: str, **state: float) -> Scene:
+    """A lens of the library in a state, looking at what it is focused on."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NeurolensWarning)
+        lens = read_lens(ROOT / "lenses" / f"{name}.toml").at(**state)
+    return Scene(lens, state.get("focus_m", INF))
+
+
+def scene(rows: list[Surface], half_field_deg: float = 10.0, focus_m: float = INF) -> Scene:
+    """Surfaces as a scene in focus."""
+    return Scene(Lens("test", "", tuple(rows), 4.0, half_field_deg=half_field_deg).at(focus_m=focus_m), focus_m)
+
+
+def thin(bending: float, stop_mm: float = 5.0, n: float = 1.5, gap_mm: float = 0.0, v: float | None = 60.0) -> Scene:
+    """A thin lens of f = 100 mm and shape factor (c1 + c2) / (c1 - c2), its stop `gap_mm` behind it."""
+    total = 1 / (100 * (n - 1))
+    c1, c2 = total * (bending + 1) / 2, total * (bending - 1) / 2
+    radii = [1 / c if c else INF for c in (c1, c2)]
+    rows = [Surface(radii[0], 0.0, 60, n, v), Surface(radii[1], gap_mm, 60), Surface(INF, 80, 2 * stop_mm, stop=True)]
+    return scene(rows)
+
+
+def cartesian(stop_mm: float = 10.0, n: float = 1.5, f: float = 100.0) -> Scene:
+    """Plano-hyperbolic lens, K = -n^2: collimated light comes to a perfect focus (Descartes 1637)."""
+    rows = [
+        Surface(INF, 0.0, 2 * stop_mm, stop=True),
+        Surface(INF, 12.0, 3 * stop_mm, n),
+        Surface(-f * (n - 1), f, 3 * stop_mm, conic=-n * n),
+    ]
+    return scene(rows, half_field_deg=2.0)
+
+
+def slower(given: Scene, share: float) -> Scene:
+    """The same scene with a smaller stop."""
+    return replace(given, lens=given.lens.with_stop_radius(share * given.lens.stop_radius_mm))
