@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from neurolens.cameras.contract import CameraRays, FloatArray
 from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.pupil_boxes import PupilTable
+from neurolens.cameras.pupil_search import ROWS, SEGMENTS
 from neurolens.cameras.sampling import check_film, positive
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
-from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds
+from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds, symmetric_about_axis
 from neurolens.optics.trace import trace
 
 
@@ -62,12 +63,16 @@ class ExactCamera:
         used = wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
         film_z = self.lens.film_z_mm
         assert film_z is not None  # `at` places the film
+        # A lens with cylinders is searched at many azimuths for one outline: coarser, for it fits none of them closely.
+        round_ = symmetric_about_axis(self.lens)
+        detail = (ROWS, SEGMENTS) if round_ else (33, 16)
         if bounds is None:
             corner = math.hypot(*self.film_mm) / 2
-            bounds = pupil_bounds(self.lens, 1.0001 * corner, (film_z, film_z), used)
+            rows, points = (17, 128) if round_ else (13, 48)
+            bounds = pupil_bounds(self.lens, 1.0001 * corner, (film_z, film_z), used, rows=rows, points=points)
         self._pupil_z_mm = bounds.pupil_z_mm
         self._dtype = torch.float32 if dtype == "float32" else torch.float64
-        self.film = LensFilm(PupilTable.of(asdict(bounds)), float(film_z), used, self._scene, self._passes)
+        self.film = LensFilm(PupilTable.of(asdict(bounds)), float(film_z), used, self._scene, self._passes, detail)
         data = first_order(self.lens)
         self.settings: dict[str, Any] = {
             "camera": "exact",

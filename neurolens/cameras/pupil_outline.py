@@ -126,11 +126,6 @@ class PupilOutline:
         share *= np.float32(1 / (second - first))
         return np.clip(share, np.float32(0), np.float32(1), out=share)
 
-    def wavelength(self, share: float) -> float:
-        """The wavelength in nm at a share of the way from the first to the second: the inverse of `share`."""
-        first, second = self.wavelength_nm[0], self.wavelength_nm[-1]
-        return float((first**-2 + share * (second**-2 - first**-2)) ** -0.5)
-
     @cached_property
     def _edges(self) -> FloatArray:
         """[W, 8, R * K]: first vertex and edge at each row, their steps to the next row; second the change of all."""
@@ -144,6 +139,14 @@ class PupilOutline:
     def _centres(self) -> FloatArray:
         """[2, R]: centre at each row and its step to the next."""
         return np.stack([self.centre, np.diff(self.centre, append=self.centre[-1:])]).astype(np.float32)
+
+
+def wavelength_between(wavelength_nm: tuple[float, ...], share: float) -> float:
+    """The wavelength in nm at a share of the way from the first to the last, in 1 / wavelength^2."""
+    first, last = wavelength_nm[0], wavelength_nm[-1]
+    if share in (0, 1):  # no rounding may leave the range
+        return last if share else first
+    return first if first == last else float((first**-2 + share * (last**-2 - first**-2)) ** -0.5)
 
 
 def turned(along: FloatArray, across: FloatArray, film_mm: FloatArray, radius: FloatArray) -> FloatArray:

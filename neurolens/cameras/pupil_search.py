@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.pupil_boxes import Passes, PupilTable, passes_any, tightened
-from neurolens.cameras.pupil_outline import PupilOutline
+from neurolens.cameras.pupil_outline import PupilOutline, wavelength_between
 
 ROWS, SEGMENTS = 65, 32
 
@@ -25,12 +25,14 @@ _LATTICE = (40, 20)
 _DIRECTIONS, _STEPS, _COARSE, _FINE = 33, 24, 5, 12
 # Where between rows, along an edge and between the two wavelengths the interpolated outline is checked; at which
 # multiples of it; and how far vertices are pushed beyond what was found: a hair, against rounding.
-_BETWEEN_ROWS, _ALONG_EDGE, _BETWEEN_WAVELENGTHS = (0.0, 0.5), (0.0, 0.33, 0.67), (0.0, 0.5, 1.0)
+_BETWEEN_ROWS, _ALONG_EDGE, _BETWEEN_WAVELENGTHS = (0.0, 0.5), (0.0, 0.3, 0.5, 0.7), (0.0, 0.4, 0.75, 1.0)
 _CHECKS, _CHECK_HALVINGS = (1.0, 1.002, 1.01, 1.03, 1.07, 1.15, 1.35), 5
 _HAIR = 2e-5
 # Where one wavelength's region is less than this share of both together, one outline serves both. Half-planes that do
 # not hold the centroid of a convex region cut off less (Gruenbaum 1960: 1 - 1/e), so that the centre lies inside all.
 _APART = 0.65
+# So it does where a wavelength between reaches so many times farther than the ends of the spectrum let expect.
+_BULGE = 1.04
 
 Float64Array = NDArray[np.float64]
 # Whether rays pass from film points (radius, 0) through points [2, ...]; the radius broadcasts with the points.
@@ -56,18 +58,18 @@ def outline_of(
     The polygons hold every point found to pass at the rows, between them and between vertices, even where the region
     is not convex or the outline bends: their vertices are pushed out until they do.
     """
-    used = tuple(sorted(set(wavelength_nm)))
-    ask = _asking(passes, used)
-    tight = tightened(table, passes, used)
+    ends = tuple(sorted(set(wavelength_nm)))
+    looked_at = sorted({wavelength_between(ends, share) for share in _BETWEEN_WAVELENGTHS})
+    ask = _asking(passes, looked_at)
+    tight = tightened(table, passes, looked_at)
     end = _end_of_light(tight, ask)
     if end is None:
         return None
-    empty = np.zeros((len(used), rows, 1), np.float32)
-    outline = PupilOutline(table.pupil_z_mm, end, used, empty[0, :, 0], empty, empty)
+    empty = np.zeros((len(ends), rows, 1), np.float32)
+    outline = PupilOutline(table.pupil_z_mm, end, ends, empty[0, :, 0], empty, empty)
     frame = _frame_of(tight, outline.radii(np.arange(rows, dtype=np.float64)), ask)
     angles = np.repeat(np.linspace(0, np.pi, _DIRECTIONS)[None], rows, axis=0)
     angles = _equal_areas(angles, _boundary(ask, frame, angles, _COARSE), segments)
-    looked_at = sorted({*used, outline.wavelength(0.5)})
     fine = _together(np.stack([_boundary(_asking(passes, (w,)), frame, angles, _FINE) for w in looked_at]))
     x, y = (fine * a[:, None] * f(angles) for a, f in zip(frame.stretch, (np.cos, np.sin), strict=True))
     y[..., [0, -1]] = 0
@@ -100,23 +102,38 @@ def _asking(passes: Passes, wavelength_nm: Sequence[float]) -> Ask:
 def _end_of_light(table: PupilTable, ask: Ask) -> float | None:
     """The largest film radius, within those of the table, from which a ray is found to pass."""
     last = table.rows.shape[1] - 1
-    places = np.minimum(np.flatnonzero(table.rows[0] <= table.rows[1]), last * (1 - 1e-6))
     lit, dark = None, None
-    for place in places[::-1]:
+    for place in np.minimum(np.flatnonzero(table.rows[0] <= table.rows[1]), last * (1 - 1e-6))[::-1]:
         # The rows of the table hold their neighbours, so the last of them may be dark.
-        if _lattice(table, place[None], ask)[0].any():
+        seen = _seen(_boxes(table, place[None]), table.film_radius_mm * place / last, ask)
+        if seen is not None:
             lit = place
             break
         dark = place
-    if lit is None:
+    if lit is None or seen is None:
         return None
     for _ in range(_END_HALVINGS if dark is not None else 0):
         middle = (lit + dark) / 2
-        if _lattice(table, middle[None], ask)[0].any():
-            lit = middle
-        else:
+        # What is left of the pupil mostly lies in what was left before: a lattice there finds smaller regions.
+        radius = table.film_radius_mm * middle / last
+        left = _seen(seen, radius, ask)
+        if left is None:
+            left = _seen(_boxes(table, middle[None]), radius, ask)
+        if left is None:
             dark = middle
+        else:
+            lit, seen = middle, left
     return float(table.film_radius_mm * lit / last) if lit > 0 else None
+
+
+def _seen(box: Float64Array, radius: float, ask: Ask) -> Float64Array | None:
+    """The box [3, 1] about what passes of a lattice on a box, a step wider, or None where nothing does."""
+    passed, (x, y) = _lattice(box, np.array([radius]), ask)
+    if not passed.any():
+        return None
+    x, y, (low, high, half) = x[passed], y[passed], box[:, 0]
+    step, rise = (high - low) / _LATTICE[0], half / _LATTICE[1]
+    return np.array([[x.min() - step], [x.max() + step], [y.max() + rise]])
 
 
 def _boxes(table: PupilTable, place: Float64Array) -> Float64Array:
@@ -129,22 +146,21 @@ def _boxes(table: PupilTable, place: Float64Array) -> Float64Array:
     return np.stack([np.minimum(low[a], low[b]), np.maximum(high[a], high[b]), np.maximum(half[a], half[b])])
 
 
-def _lattice(table: PupilTable, place: Float64Array, ask: Ask) -> tuple[NDArray[np.bool_], Float64Array]:
-    """Which points of a lattice on the box of each fractional row [M] pass, [M, A, B], and the points, [2, M, A, B]."""
-    low, high, half = _boxes(table, place)
+def _lattice(boxes: Float64Array, radius: Float64Array, ask: Ask) -> tuple[NDArray[np.bool_], Float64Array]:
+    """Which points of lattices on boxes [3, M] pass from film radii [M], [M, A, B], and the points, [2, M, A, B]."""
+    low, high, half = boxes
     u, v = ((np.arange(n) + 0.5) / n for n in _LATTICE)
-    points = np.empty((2, place.size, *_LATTICE))
+    points = np.empty((2, radius.size, *_LATTICE))
     points[0] = low[:, None, None] + (high - low)[:, None, None] * u[:, None]
     points[1] = half[:, None, None] * v
-    radius = table.film_radius_mm * place / (table.rows.shape[1] - 1)
     return ask(radius[:, None, None], points), points
 
 
 def _frame_of(table: PupilTable, radius: Float64Array, ask: Ask) -> _Frame:
     """Centroid and extent of what passes at each film radius, from a lattice."""
     place = radius / table.film_radius_mm * (table.rows.shape[1] - 1)
-    passed, (x, y) = _lattice(table, place, ask)
-    low, high, half = _boxes(table, place)
+    low, high, half = boxes = _boxes(table, place)
+    passed, (x, y) = _lattice(boxes, radius, ask)
     count = passed.sum((1, 2))
     centre = np.where(passed, x, 0).sum((1, 2)) / np.maximum(count, 1)
     low = np.where(passed, x, np.inf).min((1, 2)) - (high - low) / _LATTICE[0]
@@ -211,15 +227,18 @@ def _equal_areas(angles: Float64Array, distance: Float64Array, segments: int) ->
 
 
 def _together(distance: Float64Array) -> Float64Array:
-    """Distances at the ends of the spectrum, of those [W, R, D] at wavelengths in order; joined where they part.
+    """Distances at the ends of the spectrum, of those [W, R, D] at `_BETWEEN_WAVELENGTHS`; joined where they part.
 
     At the edge of the light lateral colour leaves some wavelengths dark before others.
     """
+    if len(distance) == 1:
+        return distance
     joined = distance.max(0, keepdims=True)
     area, whole = ((d[..., 1:] * d[..., :-1]).sum(2) for d in (distance, joined))
     apart = (area < _APART * whole).any(0)
-    ends = distance if len(distance) == 1 else distance[[0, -1]]
-    return np.where(apart[:, None], joined, ends)
+    for share, found in zip(_BETWEEN_WAVELENGTHS, distance, strict=True):
+        apart |= (found > _BULGE * ((1 - share) * distance[0] + share * distance[-1])).any(1)
+    return np.where(apart[:, None], joined, distance[[0, -1]])
 
 
 def _pushed_out(outline: PupilOutline, passes: Passes) -> PupilOutline:
@@ -227,7 +246,7 @@ def _pushed_out(outline: PupilOutline, passes: Passes) -> PupilOutline:
     needed = np.ones(outline.x.shape)
     both = len(outline.wavelength_nm) > 1
     for share in _BETWEEN_WAVELENGTHS if both else (0.0,):
-        ask = _asking(passes, (outline.wavelength(share),))
+        ask = _asking(passes, (wavelength_between(outline.wavelength_nm, share),))
         ends = {0.0: slice(0, 1), 1.0: slice(-1, None)}.get(share, slice(None))
         x, y = ((1 - share) * c[0].astype(np.float64) + share * c[-1] for c in (outline.x, outline.y))
         for step, found in _excess(outline, (x, y), ask):

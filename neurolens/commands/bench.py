@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.commands.arguments import Parser, whole
+from neurolens.errors import InputError
 
 _DESCRIPTION = """\
 Measure the exact tracer on this machine and write the tables of experiments/results/.
@@ -24,6 +25,11 @@ angle, cemented equal indices, near and far objects, every lens file, both ways.
 Exit code 1 where a number is not finite or a status differs away from any edge.
 Writes extremes.md and extremes.json."""
 
+_PUPILS = """\
+What share of the rays that a pupil sends pass the lens: the pupils of the literature and the outlines
+of this project's cameras, on the lenses of the theses, beside their figures (half a minute).
+Writes passage.md, passage.json and passage.png."""
+
 
 def add_parser(subparsers: Any) -> None:
     """Add the command to the command line."""
@@ -31,6 +37,7 @@ def add_parser(subparsers: Any) -> None:
     kinds = parser.add_subparsers(metavar="WHAT", required=True, parser_class=Parser)
     _add_trace(kinds)
     _add_extremes(kinds)
+    _add_pupils(kinds)
 
 
 def _add_trace(kinds: Any) -> None:
@@ -50,6 +57,14 @@ def _add_extremes(kinds: Any) -> None:
     parser.add_argument("--rays", metavar="N", type=whole(100), default=20000, help="rays a case (default 20000)")
     _add_out(parser)
     parser.set_defaults(run=run_extremes, kept="nothing is written")
+
+
+def _add_pupils(kinds: Any) -> None:
+    parser = kinds.add_parser("pupils", help="share of rays that pass", description=_PUPILS)
+    parser.add_argument("--rays", metavar="N", type=whole(1000), default=2**17, help="rays a method (default 131072)")
+    parser.add_argument("--only", metavar="TEXT", default="", help="lens files whose name holds this text")
+    _add_out(parser)
+    parser.set_defaults(run=run_pupils, kept="nothing is written")
 
 
 def _add_out(parser: argparse.ArgumentParser) -> None:
@@ -134,3 +149,28 @@ def run_extremes(args: argparse.Namespace) -> int:
     for line in bad:
         print(f"neurolens: {line}", file=sys.stderr)
     return 1 if bad else 0
+
+
+def run_pupils(args: argparse.Namespace) -> int:
+    """Measure every case of the theses and draw three."""
+    from neurolens.evaluate import passage, passage_page
+    from neurolens.evaluate.project import project_root
+    from neurolens.progress import Progress
+
+    _quiet_glasses()
+    root = project_root()
+    cases = [case for case in passage.CASES if args.only in case.lens]
+    if not cases:
+        known = ", ".join(dict.fromkeys(case.lens for case in passage.CASES))
+        raise InputError("neurolens bench pupils", "--only", args.only, f"part of one of: {known}")
+    with Progress(quiet=args.quiet).stage("pupils") as report:
+        done = []
+        for case in cases:
+            done.append(passage.measure(case, root / "lenses", args.rays))
+            report(len(done) / (len(cases) + 1))
+        pixel = [] if args.only else list(passage.pixel_rates(root / "lenses", args.rays))
+        shown = [p for p in done if p.case in passage.DRAWN] or done[:1]
+        cameras = [passage.camera_of(p.case, root / "lenses") for p in shown]
+    out = args.out or root / "experiments" / "results"
+    print(passage_page.write(done, pixel, shown, cameras, args.rays, out))
+    return 0

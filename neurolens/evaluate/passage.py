@@ -98,6 +98,13 @@ CASES = (
     Case("laikin_double_gauss_50", 50.0, 1.8),
     Case("laikin_double_gauss_50", 50.0, 8.0),
 )
+# Those of the picture.
+DRAWN = tuple(
+    case
+    for case in CASES
+    if (case.lens, case.f_number)
+    in (("laikin_double_gauss_50", 1.8), ("muller_fisheye_100", 4.0), ("mizuguchi_fisheye_10", 8.0))
+)
 
 
 @dataclass(frozen=True)
