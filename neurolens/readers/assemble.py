@@ -26,7 +26,6 @@ def finish(
     lens: Lens,
     *,
     pupil_mm: float | None = None,
-    f_number: float | None = None,
     film_given: bool = True,
 ) -> Lens:
     """A lens from the rows of a file, with what follows from them: f-number or stop, and back focus.
@@ -35,9 +34,9 @@ def finish(
     `check_states`).
 
     Args:
-        lens: rows as read; `UNKNOWN` for a diameter that is not given, NaN for an f-number that is not.
+        lens: rows as read; `UNKNOWN` for a diameter that is not given, NaN for an f-number that is not (it sizes
+            the stop where neither pupil nor stop diameter are known).
         pupil_mm: diameter of the entrance pupil, where the file gives that; it rules over the stop's diameter.
-        f_number: from the file or the user, used for the stop where neither pupil nor stop diameter are known.
         film_given: whether the last thickness is the file's; else it becomes the paraxial back focus.
 
     Raises:
@@ -46,7 +45,7 @@ def finish(
     """
     _check_rows(lens.surfaces, lens.path)
     stop = lens.surfaces[lens.stop_index]
-    stated = lens.f_number if f_number is None else f_number
+    stated = lens.f_number
     # First-order data needs an opening, whatever it is.
     trial = lens.with_stop_radius(1.0 if math.isnan(stop.diameter_mm) else stop.semi_diameter_mm)
     data = first_order(trial)
@@ -124,14 +123,18 @@ def first_order(lens: Lens) -> FirstOrder:
     """First-order data in the y-z plane; of a lens without power there, in the x-z plane.
 
     Raises:
-        InputError: a lens without power.
+        InputError: a lens without power, or whose entrance pupil is a point or infinite.
     """
     try:
-        return paraxial.first_order(lens, meridian="y")
+        data = paraxial.first_order(lens, meridian="y")
     except InputError:
         if not is_anamorphic(lens):
             raise
-        return paraxial.first_order(lens, meridian="x")
+        data = paraxial.first_order(lens, meridian="x")
+    if not 0 < data.entrance_pupil_diameter_mm < math.inf:
+        found = f"(seen from the scene {data.entrance_pupil_diameter_mm:g} mm wide)"
+        raise InputError(lens.path, "stop", found, "a stop whose image in front of it has a size")
+    return data
 
 
 def moved(lens: Lens, c: Configuration) -> Lens:

@@ -23,15 +23,34 @@ from neurolens.readers.source import read_lines, warn
 
 UNITS = {"M": "mm", "C": "cm", "I": "in"}
 INFINITE = 1e9
+ROOM = 20  # degrees, at which the catalogues measure
 FIELDS = ("XAN", "YAN", "XIM", "YIM", "XRI", "YRI", "XOB", "YOB")
 # Settings, weights, wavelengths, labels, control codes of variables, tolerances.
 IGNORED = frozenset(
-    """LEN WL REF WTW WTF WTA INI DOR TEM PRE DER UID SLB GO END CCY CCX THC GLC KC AC BC CC DC EC FC GC HC JC DLT
+    """LEN WL REF WTW WTF WTA INI DOR PRE DER UID SLB GO END CCY CCX THC GLC KC AC BC CC DC EC FC GC HC JC DLT
     DLN DLF DLR IRR""".split()
 )
 VIGNETTING = frozenset(["VUX", "VLX", "VUY", "VLY"])
 READ = (
-    *("S", "SO", "SI", "RDM", "TIT", "DIM", "EPD", "FNO", *FIELDS, "RDY", "CUY", "RDX", "CUX", "THI", "GLA", "STO"),
+    *(
+        "S",
+        "SO",
+        "SI",
+        "RDM",
+        "TIT",
+        "DIM",
+        "EPD",
+        "FNO",
+        "TEM",
+        *FIELDS,
+        "RDY",
+        "CUY",
+        "RDX",
+        "CUX",
+        "THI",
+        "GLA",
+        "STO",
+    ),
     *("SPH", "CON", "ASP", "CYL", "YTO", "XTO", "K", *LETTERS, *NONE_BUT_0, "CIR", "PIM", "PRV", "ZOO"),
 )
 
@@ -117,6 +136,9 @@ def _system(file: File, command: Command) -> bool:
             if value <= 0:
                 raise line.error(name, value, "a number above 0")
             file.pupil, file.f_number = (value, None) if name == "EPD" else (None, value)
+        case "TEM":
+            if abs(command.numbers()[0] - ROOM) > 5:
+                warn(file.path, f"indices are those at {ROOM} degrees, not at {' '.join(words)}")
         case "PRV":
             file.private_nm = []
         case _ if name in FIELDS:

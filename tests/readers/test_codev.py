@@ -107,6 +107,17 @@ def test_radii_or_curvatures(tmp_path: Path) -> None:
     assert read(by_name, tmp_path) == expected
 
 
+def test_what_is_left_out_is_told(tmp_path: Path) -> None:
+    for old, new, message in (
+        ("WL    656.3", "TEM 60\nWL    656.3", "not at 60"),
+        ("VUY   0.0 0.0", "VUY   0.0 0.2", "vignetting factors"),
+        ("SI    0.0", "SI    0.01", "image surface is curved"),
+        ("XAN   0.0 3.0\nYAN   0.0 4.0", "YOB   0.0 4.0", "object height"),
+    ):
+        with pytest.warns(NeurolensWarning, match=message):
+            read(swapped(old, new), tmp_path)
+
+
 def test_units_and_defocus(tmp_path: Path) -> None:
     lens = read(TEXT, tmp_path)
     assert read(swapped("DIM   M", "DIM I"), tmp_path) == lens.scaled(25.4)
