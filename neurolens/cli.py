@@ -22,6 +22,7 @@ _DESCRIPTION = "Any lens prescription as a fast camera model with a measured err
 _EPILOG = """\
 examples:
   neurolens lens lenses/laikin_double_gauss_50.toml --layout layout.png
+  neurolens convert lens.zmx -o lenses/lens.toml
   neurolens train experiments/quickstart.toml
   neurolens evaluate models/NAME.onnx
   neurolens render experiments/scenes/room.toml --camera models/NAME.onnx -o room.exr
