@@ -49,7 +49,7 @@ def _spot(axes: Any, data: Spots, field: int, shift_mm: float) -> None:
     middle_t, middle_s = _middle(t), _middle(s)
     for k, nm in enumerate(data.wavelength_nm):
         axes.plot(
-            s[k] - middle_s, t[k] - middle_t, ".", ms=1.6, mew=0, color=wavelength_colour(nm), label=f"{nm:.0f} nm"
+            s[k] - middle_s, t[k] - middle_t, ".", ms=1.3, mew=0, color=wavelength_colour(nm), label=f"{nm:.0f} nm"
         )
     angle = np.linspace(0, 2 * math.pi, 65)
     axes.plot(

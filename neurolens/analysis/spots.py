@@ -15,7 +15,7 @@ from neurolens.analysis.fields import DEFAULT_NM, Scene
 from neurolens.analysis.patterns import hexapolar, points
 from neurolens.analysis.results import Array, Result
 
-_RINGS = 8
+_RINGS = 16
 _SHIFTS = 21
 
 
