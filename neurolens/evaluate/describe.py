@@ -78,13 +78,13 @@ def glass_table(lens: Lens) -> list[dict[str, Any]]:
 
 
 def working_f_number(lens: Lens, domain: Domain, film_z: float) -> float | None:
-    """1 / (2 sin theta') of the outermost ray that reaches the middle of the film; None where none does."""
+    """1 / (2 sin theta') of the outermost ray of the y-z plane to reach the middle of the film; None without one."""
     u = torch.linspace(0, domain.pupil_radius_mm, 4001, dtype=torch.float64)
     zero = torch.zeros_like(u)
-    rays = camera_rays(zero, zero, film_z, u, zero, domain.pupil_z_mm)
+    rays = camera_rays(zero, zero, film_z, zero, u, domain.pupil_z_mm)
     with torch.no_grad():
         passed = trace(lens, rays).status == st.PASSED
-    sine = float(rays.dx[passed].abs().max()) if passed.any() else 0.0
+    sine = float(rays.dy[passed].abs().max()) if passed.any() else 0.0
     return 1 / (2 * sine) if sine > 0 else None
 
 

@@ -78,6 +78,11 @@ def passes_at_any_azimuth(
     return passed
 
 
+# Where rays are looked for again: within so many paraxial exit pupils of the axis, where the box of the rear rim is so
+# many times wider than that.
+_NEAR, _FAR = 3.0, 4.0
+
+
 @dataclass(frozen=True)
 class PupilBounds:
     """Bounds of the passing rays on the pupil plane at equally spaced film radii (as pbrt: Pharr et al. 2016, 6.4.5).
@@ -119,7 +124,11 @@ def pupil_bounds(
     plane = pupil_plane_z_mm(lens)
     film_planes = sorted(set(film_z_mm))
     wavelengths = sorted(set(wavelength_nm))
-    boxes = [_row(lens, film_radius_mm * i / (rows - 1), film_planes, wavelengths, plane, points) for i in range(rows)]
+    data = first_order(lens)
+    near = _NEAR * data.exit_pupil_diameter_mm / 2 if plane == data.exit_pupil_z_mm else math.inf
+    boxes = [
+        _row(lens, film_radius_mm * i / (rows - 1), film_planes, wavelengths, plane, points, near) for i in range(rows)
+    ]
     if not any(boxes):
         raise InputError(
             lens.path, "surfaces", "(no ray passes the lens)", f"rays from a film of radius {film_radius_mm:.4g} mm"
@@ -153,9 +162,18 @@ def _union(boxes: list[_Box]) -> _Box:
 
 
 def _row(
-    lens: Lens, radius: float, film_planes: list[float], wavelengths: list[float], plane: float, points: int
+    lens: Lens,
+    radius: float,
+    film_planes: list[float],
+    wavelengths: list[float],
+    plane: float,
+    points: int,
+    near: float,
 ) -> _Box | None:
-    """Box of the passing rays from one film radius, over all film planes and wavelengths given."""
+    """Box of the passing rays from one film radius, over all film planes and wavelengths given.
+
+    `near` is how far from the axis light is looked for again where the rear rim bounds it badly, mm.
+    """
     rear = lens.surfaces[-1]
     rear_z = float(lens.vertices_mm[len(lens.surfaces) - 1])
     limit = min(rear.semi_diameter_mm, end_mm(rear))
@@ -169,10 +187,14 @@ def _row(
             stretch = (film_z - plane) / (film_z - z)
             centre, reach = radius * (1 - stretch), 1.02 * rear.semi_diameter_mm * abs(stretch)
             ends.append(_Box(centre - reach, centre + reach, reach, 0.0))
-        start = _union(ends)
-        coarse = _search(lens, radius, film_z, wavelengths, plane, start, points)
-        if coarse is not None:
-            found.append(_search(lens, radius, film_z, wavelengths, plane, coarse, points) or coarse)
+        starts = [_union(ends)]
+        if starts[0].high - starts[0].low > _FAR * near:
+            # A cover glass a millimetre from the film: the pupil is a speck that falls between the points of a grid.
+            starts.append(_Box(-near, near, near, 0.0))
+        for start in starts:
+            coarse = _search(lens, radius, film_z, wavelengths, plane, start, points)
+            if coarse is not None:
+                found.append(_search(lens, radius, film_z, wavelengths, plane, coarse, points) or coarse)
     return _union(found) if found else None
 
 
@@ -210,6 +232,11 @@ def image_radius_mm(lens: Lens) -> tuple[float, str]:
         return f * math.tan(math.radians(lens.half_field_deg)), "f tan(half field)"
     radii = torch.linspace(0, 3 * abs(f), 481, dtype=torch.float64)
     share, angle = _illumination(lens, radii)
+    if not share[0] > 0:  # a stop nearly shut lies between the points of the grid
+        share, angle = _illumination(lens, radii[:: len(radii) // 60], 384)
+        radii = radii[:: len(radii) // 60]
+    if not share[0] > 0:
+        raise InputError(lens.path, "surfaces", "(no ray passes on the axis)", "a lens that light can pass")
     lit = float(radii[share >= 0.1 * share[0]].max())
     if lens.half_field_deg is not None:
         reached = float(radii[(angle <= math.radians(lens.half_field_deg)) & (share > 0)].max())

@@ -73,13 +73,16 @@ def test_an_afocal_system_has_no_focal_length() -> None:
 
 
 def near_axis(lens: Lens, z: float, towards: str, height: float = 1e-4) -> tuple[float, float]:
-    """Where an exact ray from the axial point z crosses the axis again, and 1 / magnification of the slope."""
+    """Where an exact ray from the axial point z crosses the axis again, and 1 / magnification of the slope.
+
+    In the y-z plane, whose first-order data is that of an anamorphic lens where no meridian is named.
+    """
     sense = 1.0 if towards == "film" else -1.0
-    start = Rays(*(torch.tensor([v], dtype=torch.float64) for v in (0, 0, z, height, 0, sense)))
+    start = Rays(*(torch.tensor([v], dtype=torch.float64) for v in (0, 0, z, 0, height, sense)))
     length = math.hypot(height, 1.0)
-    start = start._replace(dx=start.dx / length, dz=start.dz / length)
+    start = start._replace(dy=start.dy / length, dz=start.dz / length)
     out = trace(lens, start, towards=towards).rays  # type: ignore[arg-type]
-    return float(out.z - out.x * out.dz / out.dx), float(out.dx / out.dz) / (height * sense)
+    return float(out.z - out.y * out.dz / out.dy), float(out.dy / out.dz) / (height * sense)
 
 
 @pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
@@ -89,8 +92,10 @@ def test_exact_rays_near_the_axis_meet_in_focus(path: Path, focus_m: float) -> N
     lens = read_lens(path).at(focus_m=focus_m)
     assert lens.film_z_mm is not None
     f = first_order(lens).efl_mm
-    # The angle at the film is small enough that spherical aberration leaves no trace.
-    found, slope = near_axis(lens, lens.film_z_mm, "scene", height=1e-5)
+    # The angle at the film is small enough that spherical aberration leaves no trace: that of an r^3 only falls with
+    # the height, not with its square.
+    cubic = any(power == 3 for s in lens.surfaces for power, _ in s.asphere)
+    found, slope = near_axis(lens, lens.film_z_mm, "scene", height=1e-9 if cubic else 1e-5)
     if math.isinf(focus_m):
         assert abs(found) > 1e5 * f
         return
@@ -108,10 +113,10 @@ def test_pupils_are_conjugates_of_the_stop(path: Path) -> None:
         sense = 1.0 if towards == "film" else -1.0
         back, slope = -sense * 500, 1e-5  # start outside the lens, on a line through the pupil's centre
         length = math.hypot(slope, 1.0)
-        row = (back * slope * sense, 0.0, z + back, slope / length, 0.0, sense / length)
+        row = (0.0, back * slope * sense, z + back, 0.0, slope / length, sense / length)
         start = Rays(*(torch.tensor([v], dtype=torch.float64) for v in row))
         out = trace(lens, start, towards=towards, record=[lens.stop_index])  # type: ignore[arg-type]
-        assert abs(float(out.crossings[lens.stop_index].x)) < 1e-8
+        assert abs(float(out.crossings[lens.stop_index].y)) < 1e-8
 
 
 @pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
