@@ -85,10 +85,10 @@ def film_light(
     rings = _rings(lens)
     glass = tuple(bare.surfaces[k] if k in rings else s for k, s in enumerate(rims))
     search = _Search(lens, radius, wavelength_nm, directions)
-    if not search.lit[0]:
-        raise InputError(lens.path, "surfaces", "(no ray passes on the axis)", "a lens that light can pass")
     alone, behind_glass, all_rims = (search.boundary(replace(bare, surfaces=s)) for s in (bare.surfaces, glass, rims))
     area = [search.area(b) for b in (alone, behind_glass, all_rims)]
+    if not area[2][0] > 0:
+        raise InputError(lens.path, "surfaces", "(no ray passes on the axis)", "a lens that light can pass")
     cos4, with_glass = search.means(lens, all_rims)
     lit = search.lit
     optical, mechanical, through = (
@@ -127,8 +127,10 @@ def disc_irradiance(radius_mm: float, distance_mm: float, height_mm: Array) -> A
     a2, z2, h2 = radius_mm**2, distance_mm**2, np.asarray(height_mm, np.float64) ** 2
     total = z2 + h2 + a2
     root = np.sqrt(total * total - 4 * a2 * h2)
-    # (total - 2 a^2) / root near 1 loses digits for a small disc: 1 - x = (1 - x^2) / (1 + x).
-    return math.pi / 2 * (4 * a2 * z2 / (root * root)) / (1 + (total - 2 * a2) / root)
+    x = (total - 2 * a2) / root
+    # 1 - x loses digits for a small disc, x near 1: there it is (1 - x^2) / (1 + x).
+    small = 4 * a2 * z2 / (root * root) / (1 + np.maximum(x, 0))
+    return math.pi / 2 * np.where(x > 0, small, 1 - x)
 
 
 def _check(lens: Lens, radius: Array) -> None:
@@ -167,7 +169,7 @@ class _Search:
         self.radius = torch.from_numpy(radius)
         angle = (torch.arange(directions, dtype=torch.float64) + 0.5) * (math.pi / directions)
         self.cos, self.sin, self.step = torch.cos(angle), torch.sin(angle), math.pi / directions
-        end = max(float(radius.max()), 1e-3 * lens.surfaces[-1].semi_diameter_mm)
+        end = max(float(radius.max()), 1e-3 * self.distance_mm)
         bounds = pupil_bounds(lens, end, (self.film_z,) * 2, (wavelength_nm,) * 2, rows=33, points=64)
         low, high, half = (np.array(v) for v in (bounds.low_mm, bounds.high_mm, bounds.half_mm))
         place = np.minimum(radius / end * 32, 32)
