@@ -56,7 +56,7 @@ def colour(
 ) -> Colour:
     """Longitudinal colour on the axis by zones, and lateral colour of chief rays up to the edge of the field."""
     spectrum = np.linspace(*_VISIBLE_NM, 41) if spectrum_nm is None else np.asarray(spectrum_nm, dtype=np.float64)
-    axial = bundle(scene, [0.0], spectrum.tolist(), points(list(_ZONES), [0.0] * 3))
+    axial = bundle(scene.round, [0.0], spectrum.tolist(), points(list(_ZONES), [0.0] * 3))
     crossing = -(axial.tangential_mm / axial.slopes[0])[0].numpy()
     angles = np.linspace(0, scene.edge_deg(), fields)
     chief = bundle(scene.open, angles.tolist(), line_nm, points([0.0], [0.0]))

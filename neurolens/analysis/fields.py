@@ -159,6 +159,11 @@ class Scene:
         return replace(self, rims=False)
 
     @property
+    def round(self) -> Scene:
+        """The same scene with a round stop: what is measured at its edge."""
+        return replace(self, lens=replace(self.lens, aperture=None))
+
+    @property
     def traced(self) -> Lens:
         """The lens that rays go through."""
         if self.rims:

@@ -121,7 +121,8 @@ def plot_psf(data: Psf, path: str | Path, title: str, subtitle: str) -> Path:
                     shown = np.sqrt(np.maximum(image, 0))
                     axes.imshow(shown, origin="lower", extent=(-half, half, -half, half), cmap="magma", vmin=0)
                 else:
-                    axes.text(0, 0, "aberrations far larger\nthan diffraction", ha="center", va="center", fontsize=8)
+                    why = "aberrations far larger\nthan diffraction" if data.pupil_points[i] else "next to no light"
+                    axes.text(0, 0, why, ha="center", va="center", fontsize=8)
             grid[0, i].set_title(field_name(float(data.field_deg[i])))
             if np.isfinite(data.strehl[i]):
                 grid[1, i].set_title(f"Strehl ratio {data.strehl[i]:.3f}", fontsize=9)

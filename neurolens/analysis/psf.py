@@ -35,9 +35,10 @@ class Psf(Result):
         half_width_um: [F], from the centre of the image to its edge.
         geometric: [F, 49, 49] share of all wavelengths' energy in each square; what lies outside is missing.
         diffraction: [F, 97, 97] at the first wavelength, 1 at the peak of the same pupil without aberrations; NaN where
-            the aberrations are too large for it: then diffraction does not matter, and `geometric` rules.
+            the aberrations are too large for it (then diffraction does not matter, and `geometric` rules) or next to
+            no light arrives.
         strehl: [F], greatest value of `diffraction`.
-        pupil_points: [F], points across the pupil that the diffraction image needs.
+        pupil_points: [F], points across the pupil that the diffraction image needs; 0 without light.
         airy_um: radius of the first dark ring on the axis.
     """
 

@@ -113,7 +113,7 @@ class _Moments:
 
 def working_f_number(scene: Scene, wavelength_nm: float) -> float:
     """1 / (2 sin theta') of the real ray through the edge of the stop to the middle of the film; NaN if blocked."""
-    edge = bundle(scene.open, [0.0], [wavelength_nm], points([1 - 1e-7], [0.0]))
+    edge = bundle(scene.open.round, [0.0], [wavelength_nm], points([1 - 1e-7], [0.0]))
     film = edge.film
     sine = float(torch.hypot(film.dx, film.dy)[0, 0, 0])
     return 1 / (2 * sine) if sine > 0 else math.nan

@@ -12,7 +12,9 @@ from analysis_lenses import INF, cartesian, library, scene, thin
 from neurolens.analysis.bundles import bundle
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.patterns import Pattern, fan, grid, hexapolar, points
+from neurolens.analysis.spots import working_f_number
 from neurolens.analysis.wavefront import wavefront
+from neurolens.apertures import Aperture
 from neurolens.errors import InputError
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Rays
@@ -130,3 +132,13 @@ def test_a_diverging_lens_forms_no_image() -> None:
     lens = Lens("d", "", (Surface(-50, 2, 20, 1.5), Surface(50, 5, 20), Surface(INF, 40, 5, stop=True)), 4.0)
     with pytest.raises(InputError, match="forms an image"):
         Scene(replace(lens, film_z_mm=50.0)).default_fields()
+
+
+def test_blades_cut_the_bundle_and_count_as_the_stop() -> None:
+    """A square stop lets 2 / pi of the circle's light through; no rim takes any of it on the axis."""
+    given = library("laikin_double_gauss_50", f_number=8.0)
+    square = replace(given, lens=given.lens.with_aperture(Aperture(blades=4)))
+    cut, whole = (bundle(s, [0.0, 10.0], [587.5618], grid(100)) for s in (square, given))
+    assert float(cut.weight[0].sum() / whole.weight[0].sum()) == pytest.approx(2 / math.pi, rel=0.01)
+    assert float(cut.weight.sum() / cut.open_weight.sum()) == pytest.approx(1, rel=2e-3)
+    assert working_f_number(square, 587.5618) == pytest.approx(working_f_number(given, 587.5618))
