@@ -6,21 +6,16 @@ All rows of the outline are searched at once, ray by ray from a centre outwards.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from neurolens.cameras.pupil_boxes import Passes, PupilTable, passes_any, tightened
+from neurolens.cameras.pupil_boxes import Passes, PupilTable, tightened
+from neurolens.cameras.pupil_lattice import Ask, Float64Array, Frame, asking, end_of_light, frame_of
 from neurolens.cameras.pupil_outline import PupilOutline, wavelength_between
 
 ROWS, SEGMENTS = 65, 32
 
-# Halvings that place the end of the light; lattice on a box, along and across (one half), that looks for light.
-_END_HALVINGS = 10
-_LATTICE = (40, 20)
 # Directions in which the first outline is sought; steps outwards, and halvings of the step that crosses the boundary.
 _DIRECTIONS, _STEPS, _COARSE, _FINE = 33, 24, 5, 12
 # Where between rows, along an edge and between the two wavelengths the interpolated outline is checked; at which
@@ -33,10 +28,6 @@ _HAIR = 2e-5
 _APART = 0.65
 # So it does where a wavelength between reaches so many times farther than the ends of the spectrum let expect.
 _BULGE = 1.04
-
-Float64Array = NDArray[np.float64]
-# Whether rays pass from film points (radius, 0) through points [2, ...]; the radius broadcasts with the points.
-Ask = Callable[[Float64Array, Float64Array], NDArray[np.bool_]]
 
 
 def outline_of(
@@ -60,121 +51,24 @@ def outline_of(
     """
     ends = tuple(sorted(set(wavelength_nm)))
     looked_at = sorted({wavelength_between(ends, share) for share in _BETWEEN_WAVELENGTHS})
-    ask = _asking(passes, looked_at)
+    ask = asking(passes, looked_at)
     tight = tightened(table, passes, looked_at)
-    end = _end_of_light(tight, ask)
+    end = end_of_light(tight, ask)
     if end is None:
         return None
     empty = np.zeros((len(ends), rows, 1), np.float32)
     outline = PupilOutline(table.pupil_z_mm, end, ends, empty[0, :, 0], empty, empty)
-    frame = _frame_of(tight, outline.radii(np.arange(rows, dtype=np.float64)), ask)
+    frame = frame_of(tight, outline.radii(np.arange(rows, dtype=np.float64)), ask)
     angles = np.repeat(np.linspace(0, np.pi, _DIRECTIONS)[None], rows, axis=0)
     angles = _equal_areas(angles, _boundary(ask, frame, angles, _COARSE), segments)
-    fine = _together(np.stack([_boundary(_asking(passes, (w,)), frame, angles, _FINE) for w in looked_at]))
+    fine = _together(np.stack([_boundary(asking(passes, (w,)), frame, angles, _FINE) for w in looked_at]))
     x, y = (fine * a[:, None] * f(angles) for a, f in zip(frame.stretch, (np.cos, np.sin), strict=True))
     y[..., [0, -1]] = 0
     centre, x, y = (a.astype(np.float32) for a in (frame.centre, x, y))
     return _pushed_out(replace(outline, centre=centre, x=x, y=y), passes)
 
 
-class _Frame(NamedTuple):
-    """For each row [R]: film radius, centre of the polygon, half widths along and across [2, R], and farthest reach.
-
-    Directions and the reach are those of a frame in which the region is about as wide as it is high.
-    """
-
-    radius: Float64Array
-    centre: Float64Array
-    stretch: Float64Array
-    reach: Float64Array
-
-
-def _asking(passes: Passes, wavelength_nm: Sequence[float]) -> Ask:
-    def ask(radius: Float64Array, points: Float64Array) -> NDArray[np.bool_]:
-        film = np.zeros(points.shape, np.float32)
-        film[0] = radius
-        flat = film.reshape(2, -1), points.astype(np.float32).reshape(2, -1)
-        return passes_any(passes, *flat, wavelength_nm).reshape(points.shape[1:])
-
-    return ask
-
-
-def _end_of_light(table: PupilTable, ask: Ask) -> float | None:
-    """The largest film radius, within those of the table, from which a ray is found to pass."""
-    last = table.rows.shape[1] - 1
-    lit, dark = None, None
-    for place in np.minimum(np.flatnonzero(table.rows[0] <= table.rows[1]), last * (1 - 1e-6))[::-1]:
-        # The rows of the table hold their neighbours, so the last of them may be dark.
-        seen = _seen(_boxes(table, place[None]), table.film_radius_mm * place / last, ask)
-        if seen is not None:
-            lit = place
-            break
-        dark = place
-    if lit is None or seen is None:
-        return None
-    for _ in range(_END_HALVINGS if dark is not None else 0):
-        middle = (lit + dark) / 2
-        # What is left of the pupil mostly lies in what was left before: a lattice there finds smaller regions.
-        radius = table.film_radius_mm * middle / last
-        left = _seen(seen, radius, ask)
-        if left is None:
-            left = _seen(_boxes(table, middle[None]), radius, ask)
-        if left is None:
-            dark = middle
-        else:
-            lit, seen = middle, left
-    return float(table.film_radius_mm * lit / last) if lit > 0 else None
-
-
-def _seen(box: Float64Array, radius: float, ask: Ask) -> Float64Array | None:
-    """The box [3, 1] about what passes of a lattice on a box, a step wider, or None where nothing does."""
-    passed, (x, y) = _lattice(box, np.array([radius]), ask)
-    if not passed.any():
-        return None
-    x, y, (low, high, half) = x[passed], y[passed], box[:, 0]
-    step, rise = (high - low) / _LATTICE[0], half / _LATTICE[1]
-    return np.array([[x.min() - step], [x.max() + step], [y.max() + rise]])
-
-
-def _boxes(table: PupilTable, place: Float64Array) -> Float64Array:
-    """[3, M] low, high and half width that hold what passes at fractional rows of the table."""
-    low, high, half = table.rows.astype(np.float64)
-    empty = low > high
-    low, high = np.where(empty, np.inf, low), np.where(empty, -np.inf, high)
-    a = np.minimum(place.astype(np.intp), low.size - 1)
-    b = np.minimum(a + 1, low.size - 1)
-    return np.stack([np.minimum(low[a], low[b]), np.maximum(high[a], high[b]), np.maximum(half[a], half[b])])
-
-
-def _lattice(boxes: Float64Array, radius: Float64Array, ask: Ask) -> tuple[NDArray[np.bool_], Float64Array]:
-    """Which points of lattices on boxes [3, M] pass from film radii [M], [M, A, B], and the points, [2, M, A, B]."""
-    low, high, half = boxes
-    u, v = ((np.arange(n) + 0.5) / n for n in _LATTICE)
-    points = np.empty((2, radius.size, *_LATTICE))
-    points[0] = low[:, None, None] + (high - low)[:, None, None] * u[:, None]
-    points[1] = half[:, None, None] * v
-    return ask(radius[:, None, None], points), points
-
-
-def _frame_of(table: PupilTable, radius: Float64Array, ask: Ask) -> _Frame:
-    """Centroid and extent of what passes at each film radius, from a lattice."""
-    place = radius / table.film_radius_mm * (table.rows.shape[1] - 1)
-    low, high, half = boxes = _boxes(table, place)
-    passed, (x, y) = _lattice(boxes, radius, ask)
-    count = passed.sum((1, 2))
-    centre = np.where(passed, x, 0).sum((1, 2)) / np.maximum(count, 1)
-    low = np.where(passed, x, np.inf).min((1, 2)) - (high - low) / _LATTICE[0]
-    high = np.where(passed, x, -np.inf).max((1, 2)) + (high - low) / _LATTICE[0]
-    half = np.where(passed, y, 0).max((1, 2)) + half / _LATTICE[1]
-    # A row whose lattice misses a small region takes what its neighbours have.
-    rows, found = np.arange(radius.size), count > 0
-    centre, low, high, half = (np.interp(rows, rows[found], a[found]) for a in (centre, low, high, half))
-    stretch = np.stack([(high - low) / 2, half])
-    off_centre = np.abs(centre - (low + high) / 2) / stretch[0]
-    return _Frame(radius, centre, stretch, 1.05 * np.hypot(1 + off_centre, 1))
-
-
-def _boundary(ask: Ask, frame: _Frame, angles: Float64Array, halvings: int) -> Float64Array:
+def _boundary(ask: Ask, frame: Frame, angles: Float64Array, halvings: int) -> Float64Array:
     """Distance [R, D] from the centre to the last passing point in each direction, in the stretched frame."""
     direction = np.stack([np.cos(angles), np.sin(angles)]) * frame.stretch[:, :, None]
     steps = np.linspace(0, 1, _STEPS + 1)[:, None] * frame.reach
@@ -246,7 +140,7 @@ def _pushed_out(outline: PupilOutline, passes: Passes) -> PupilOutline:
     needed = np.ones(outline.x.shape)
     both = len(outline.wavelength_nm) > 1
     for share in _BETWEEN_WAVELENGTHS if both else (0.0,):
-        ask = _asking(passes, (wavelength_between(outline.wavelength_nm, share),))
+        ask = asking(passes, (wavelength_between(outline.wavelength_nm, share),))
         ends = {0.0: slice(0, 1), 1.0: slice(-1, None)}.get(share, slice(None))
         x, y = ((1 - share) * c[0].astype(np.float64) + share * c[-1] for c in (outline.x, outline.y))
         for step, found in _excess(outline, (x, y), ask):

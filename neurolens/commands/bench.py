@@ -154,14 +154,15 @@ def run_extremes(args: argparse.Namespace) -> int:
 def run_pupils(args: argparse.Namespace) -> int:
     """Measure every case of the theses and draw three."""
     from neurolens.evaluate import passage, passage_page
+    from neurolens.evaluate.passage_cases import CASES, DRAWN
     from neurolens.evaluate.project import project_root
     from neurolens.progress import Progress
 
     _quiet_glasses()
     root = project_root()
-    cases = [case for case in passage.CASES if args.only in case.lens]
+    cases = [case for case in CASES if args.only in case.lens]
     if not cases:
-        known = ", ".join(dict.fromkeys(case.lens for case in passage.CASES))
+        known = ", ".join(dict.fromkeys(case.lens for case in CASES))
         raise InputError("neurolens bench pupils", "--only", args.only, f"part of one of: {known}")
     with Progress(quiet=args.quiet).stage("pupils") as report:
         done = []
@@ -169,7 +170,7 @@ def run_pupils(args: argparse.Namespace) -> int:
             done.append(passage.measure(case, root / "lenses", args.rays))
             report(len(done) / (len(cases) + 1))
         pixel = [] if args.only else list(passage.pixel_rates(root / "lenses", args.rays))
-        shown = [p for p in done if p.case in passage.DRAWN] or done[:1]
+        shown = [p for p in done if p.case in DRAWN] or done[:1]
         cameras = [passage.camera_of(p.case, root / "lenses") for p in shown]
     out = args.out or root / "experiments" / "results"
     print(passage_page.write(done, pixel, shown, cameras, args.rays, out))
