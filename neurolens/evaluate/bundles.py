@@ -9,18 +9,32 @@ import torch
 from torch import Tensor
 
 from neurolens import status as st
+from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays, trace
 
 
 def from_film(lens: Lens, count: int, g: torch.Generator, *, share: float = 1.02, film: float = 1.0) -> Rays:
-    """Camera rays from the film (`film` times its image radius, or its rear rim) to `share` of the rear rim."""
-    rear = lens.surfaces[-1].semi_diameter_mm
-    z = float(lens.film_z_mm if lens.film_z_mm is not None else lens.vertices_mm[-1])
+    """Camera rays from the film, half of them to the rear rim, half to the paraxial exit pupil, both `share` as wide.
+
+    Film points lie within `film` times the image radius, where that is unknown the rear rim's.
+    """
+    rear, z = lens.surfaces[-1].semi_diameter_mm, _film_z_mm(lens)
+    rear_z = float(lens.vertices_mm[len(lens.surfaces) - 1])
+    data = first_order(lens)
+    pupil_z, pupil = data.exit_pupil_z_mm, abs(data.exit_pupil_diameter_mm) / 2
+    if not (math.isfinite(pupil_z) and math.isfinite(pupil) and pupil_z < z - 1):
+        pupil_z, pupil = rear_z, rear
     fx, fy = disc(g, count, film * (lens.image_radius_mm or rear))
-    px, py = disc(g, count, share * rear)
-    depth = torch.full_like(fx, float(lens.vertices_mm[len(lens.surfaces) - 1]) - z)
-    return Rays(fx, fy, torch.full_like(fx, z), *unit(px - fx, py - fy, depth))
+    px, py = disc(g, count, share)
+    to_rear = torch.arange(count) % 2 == 0
+    radius = torch.where(to_rear, rear, 1.2 * pupil).double()
+    depth = torch.where(to_rear, rear_z, pupil_z).double() - z
+    return Rays(fx, fy, torch.full_like(fx, z), *unit(px * radius - fx, py * radius - fy, depth))
+
+
+def _film_z_mm(lens: Lens) -> float:
+    return float(lens.film_z_mm if lens.film_z_mm is not None else lens.vertices_mm[-1])
 
 
 def from_scene(lens: Lens, count: int, g: torch.Generator, *, slope: float, wide: float = 1.0) -> Rays:
