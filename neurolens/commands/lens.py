@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.commands import lens_list, lens_rims
-from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between
+from neurolens.commands.arguments import add_json, add_lens_state, aperture_of
 from neurolens.commands.output import number, print_json, table
 from neurolens.errors import InputError, NeurolensWarning
 
@@ -52,33 +52,14 @@ def add_parser(subparsers: Any) -> None:
         "--layout", metavar="OUT.png", type=Path,
         help="draw the lens with rays from three field points: axis, 70%% and edge of the film (.png, .pdf, .svg)",
     )  # fmt: skip
-    _add_list_and_rims(parser)
+    lens_list.add_arguments(parser)
+    lens_rims.add_arguments(parser)
     parser.add_argument(
         "--breathing", metavar="OUT.png", type=Path,
         help="draw field of view, focal length and magnification against the focus distance (.png, .pdf, .svg)",
     )  # fmt: skip
     add_json(parser)
     parser.set_defaults(run=run, kept="nothing is written but a finished --layout picture")
-
-
-def _add_list_and_rims(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--layouts", metavar="OUT.png", type=Path, help='after "list": draw all lenses in section on one sheet'
-    )
-    rims = parser.add_argument_group("rims")
-    rims.add_argument(
-        "--derive-rims", action="store_true",
-        help="compute the diameters from the f-number and the field, and print them beside those of the file",
-    )  # fmt: skip
-    rims.add_argument(
-        "--vignetting", metavar="SHARE", type=between(0.01, 1, "a share"), default=0.5,
-        help="share of the pupil's height that is kept at the edge of the field (default: 0.5)",
-    )  # fmt: skip
-    rims.add_argument(
-        "--half-field", metavar="DEG", type=between(0.01, 179, "an angle in degrees"),
-        help="edge of the field, in degrees from the axis (default: as the file states)",
-    )  # fmt: skip
-    rims.add_argument("-o", "--output", metavar="OUT.toml", type=Path, help="write the lens with its derived rims")
 
 
 def _check_mode(args: argparse.Namespace, listing: bool) -> None:

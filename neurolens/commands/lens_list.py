@@ -13,6 +13,13 @@ WORD = "list"
 HEADER = ("lens", "name", "EFL mm", "f/", "half field", "refr.", "asph.", "cyl.", "states", "rims", "verdict")
 
 
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what goes with the word "list"."""
+    parser.add_argument(
+        "--layouts", metavar="OUT.png", type=Path, help='after "list": draw all lenses in section on one sheet'
+    )
+
+
 def run(args: argparse.Namespace) -> int:
     """Print the table; draw the sheet where asked."""
     from neurolens.evaluate.library import lens_files, library, sections

@@ -4,14 +4,34 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neurolens.commands.arguments import between
 from neurolens.commands.output import print_json, table
 from neurolens.errors import InputError
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens
     from neurolens.optics.rims import Rim, RimRule
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add --derive-rims and what goes with it."""
+    rims = parser.add_argument_group("rims")
+    rims.add_argument(
+        "--derive-rims", action="store_true",
+        help="compute the diameters from the f-number and the field, and print them beside those of the file",
+    )  # fmt: skip
+    rims.add_argument(
+        "--vignetting", metavar="SHARE", type=between(0.01, 1, "a share"), default=0.5,
+        help="share of the pupil's height that is kept at the edge of the field (default: 0.5)",
+    )  # fmt: skip
+    rims.add_argument(
+        "--half-field", metavar="DEG", type=between(0.01, 179, "an angle in degrees"),
+        help="edge of the field, in degrees from the axis (default: as the file states)",
+    )  # fmt: skip
+    rims.add_argument("-o", "--output", metavar="OUT.toml", type=Path, help="write the lens with its derived rims")
 
 
 def run(args: argparse.Namespace) -> int:
