@@ -16,21 +16,11 @@ from torch.autograd import forward_ad
 
 from neurolens import status as st
 from neurolens.errors import InputError
-from neurolens.optics import apertures, glass
+from neurolens.optics import glass
 from neurolens.optics.media import media
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.shapes import intersect_shape, is_plain
-from neurolens.optics.surfaces import (
-    Hit,
-    Medium,
-    Rays,
-    intersect_plane,
-    intersect_sphere,
-    nearest_approach,
-    refract,
-    times,
-)
-from neurolens.optics.survival import Counts, Labels, Survival, at_most, positive
+from neurolens.optics.passing import Mode, along_axis, bend, meet, start, unit
+from neurolens.optics.prescription import Lens
+from neurolens.optics.surfaces import Rays, times
 from neurolens.optics.transmission import passage
 
 __all__ = ["CHUNK", "Crossing", "Rays", "Traced", "compile_trace", "trace"]
@@ -40,9 +30,6 @@ Transmittance = bool | Literal["polarised"]
 
 # Rays per chunk: long enough to hide the cost of calling an operator, short enough for a core's second-level cache.
 CHUNK = 32768
-
-# How far the squared length of a direction may be from 1; float32 rounding is a thousandth of this.
-UNIT_SLACK = 1e-3
 
 
 class Crossing(NamedTuple):
@@ -195,8 +182,8 @@ def _trace_chunk(
     sense, order = (1, range(len(lens.surfaces))) if towards == "film" else (-1, range(len(lens.surfaces) - 1, -1, -1))
     vertices = lens.vertices_mm
     glasses = media(lens, wavelength_nm)  # glasses[k] lies before surface k as light travels to the film
-    mode = _Mode(sense, freeze or wanted.path or bool(wanted.record), freeze)
-    r, tests = _start(rays, glasses[0 if sense > 0 else -1], mode, st.blocked(order[0], st.MISSED))
+    mode = Mode(sense, freeze or wanted.path or bool(wanted.record), freeze)
+    r, tests = start(rays, glasses[0 if sense > 0 else -1], mode, st.blocked(order[0], st.MISSED))
     power = passage(lens, wavelength_nm, sense, wanted.transmittance, rays.x)
     crossings: dict[int, Crossing] = {}
     path: list[Rays] = []
@@ -206,104 +193,19 @@ def _trace_chunk(
         r = r._replace(z=r.z + (vertex - vertices[k]))
         vertex = vertices[k]
         before, after = (glasses[k], glasses[k + 1]) if sense > 0 else (glasses[k + 1], glasses[k])
-        hit = _meet(lens, k, r, before, position == 0, mode, tests)
-        bent, q, q2 = _bend(lens.surfaces[k], k, r, hit, before, after, mode, tests)
+        hit = meet(lens, k, r, before, position == 0, mode, tests)
+        bent, q, q2 = bend(lens.surfaces[k], k, r, hit, before, after, mode, tests)
         if power is not None:
             power.pass_surface(k, r, hit, bent, q, before, after)
         if k in wanted.record:
             crossings[k] = Crossing(hit.x, hit.y, times(hit.q2, before.inverse_n2), times(q2, after.inverse_n2))
         # A lost ray goes on along the axis: no overflow there can reach the gradients of the others.
-        r = _along_axis(bent, tests, sense, 0.0) if freeze else bent
+        r = along_axis(bent, tests, sense, 0.0) if freeze else bent
         if wanted.path:
-            path.append(_unit(r._replace(z=r.z + vertex), after))
-    r = _along_axis(_unit(r._replace(z=r.z + vertex), after), tests, sense, vertex)
+            path.append(unit(r._replace(z=r.z + vertex), after))
+    r = along_axis(unit(r._replace(z=r.z + vertex), after), tests, sense, vertex)
     arrived = None if power is None else tests.only(power.arrived(), 0.0)
     return Traced(r, tests.status(), arrived, crossings, tuple(path))
-
-
-class _Mode(NamedTuple):
-    """How to trace: direction of travel (+1 to the film), whether lost rays stay finite on the way, whether they are
-    put on the axis at once (for gradients)."""
-
-    sense: int
-    guard: bool
-    freeze: bool
-
-    @property
-    def spend(self) -> bool:
-        """Whether tests may overwrite the numbers they test: where nobody else needs them, outside a compiler."""
-        return not self.guard and not torch.compiler.is_compiling()
-
-
-def _start(rays: Rays, first: Medium, mode: _Mode, otherwise: int) -> tuple[Rays, Survival]:
-    """Rays with optical direction cosines, and the test that their directions are unit vectors."""
-    length2 = torch.addcmul(torch.addcmul(rays.dx * rays.dx, rays.dy, rays.dy), rays.dz, rays.dz)
-    sound = at_most((length2 - 1).abs(), UNIT_SLACK, spend=mode.spend)
-    if mode.freeze:
-        # Not even a NaN that comes in may reach the gradients of the others.
-        sound = sound & torch.isfinite(rays.x + rays.y + rays.z)
-    tests = Counts(sound, otherwise) if mode.spend else Labels(sound, otherwise)
-    if mode.freeze:
-        rays = _along_axis(rays, tests, mode.sense, 0.0)
-    if mode.sense > 0:
-        # Light may come from far away: the digits of float32 near the lens keep points and directions consistent.
-        rays = Rays(*nearest_approach(rays, 1.0), *rays[3:])
-    return Rays(*rays[:3], *(times(d, first.n) for d in rays[3:])), tests
-
-
-def _unit(r: Rays, last: Medium) -> Rays:
-    if not isinstance(last.n, Tensor) and last.n == 1:
-        return r
-    return Rays(*r[:3], *(d / last.n for d in r[3:]))
-
-
-def _meet(lens: Lens, k: int, r: Rays, before: Medium, entering: bool, mode: _Mode, tests: Survival) -> Hit:
-    """Meet surface k and test its rim, or the shape of the stop."""
-    surface = lens.surfaces[k]
-    plane = _is_plane(surface)
-    if plane:
-        hit = intersect_plane(r, mode.sense, mode.guard, mode.spend)
-    elif is_plain(surface):
-        hit = intersect_sphere(r, surface.curvature, mode.sense, before, entering, mode.guard, mode.spend)
-    else:
-        hit = intersect_shape(r, surface, mode.sense, before, mode.guard)
-    tests.require(hit.met, k, st.MISSED)
-    distance2 = torch.addcmul(hit.x * hit.x, hit.y, hit.y)
-    if plane:
-        # A sphere's square root turns NaN and overflow into a miss; a plane would let them go on.
-        tests.end(distance2 < math.inf)
-    tests.require(at_most(distance2, surface.semi_diameter_mm**2, spend=mode.spend), k, st.RIM)
-    if lens.aperture is not None and surface.stop:
-        tests.require(apertures.inside(lens.aperture, hit.x, hit.y, lens.stop_radius_mm), k, st.RIM)
-    return hit
-
-
-def _bend(
-    surface: Surface, k: int, r: Rays, hit: Hit, before: Medium, after: Medium, mode: _Mode, tests: Survival
-) -> tuple[Rays, Tensor, Tensor]:
-    """Refract at surface k.
-
-    Returns the rays after it, n' times their cosine of refraction, and its square before guarding: the margin by which
-    they are not totally reflected.
-    """
-    if before is after:
-        return Rays(hit.x, hit.y, hit.z, r.dx, r.dy, r.dz), hit.q, hit.q2
-    c = 0.0 if _is_plane(surface) else surface.curvature
-    bent, q, q2 = refract(r, hit, c, mode.sense, before, after, mode.guard)
-    if isinstance(before.n, Tensor) or before.n != 1:
-        # From air nothing is totally reflected.
-        tests.require(positive(q2, spend=mode.spend), k, st.TOTAL_REFLECTION)
-    return bent, q, q2
-
-
-def _along_axis(r: Rays, tests: Survival, sense: int, z: Any) -> Rays:
-    """The rays that go on, and rays along the axis from z in the place of the others."""
-    on_axis = (0.0, 0.0, z, 0.0, 0.0, float(sense))
-    return Rays(*(tests.only(c, a) for a, c in zip(on_axis, r, strict=True)))
-
-
-def _is_plane(surface: Surface) -> bool:
-    return not isinstance(surface.radius_mm, Tensor) and math.isinf(surface.radius_mm) and is_plain(surface)
 
 
 def _joined(parts: Sequence[Traced]) -> Traced:

@@ -1,0 +1,114 @@
+"""One surface passed: met, tested, refracted; and how rays start and what becomes of those that are lost."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from neurolens import status as st
+from neurolens.optics import apertures
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.shapes import intersect_shape, is_plain
+from neurolens.optics.surfaces import (
+    Hit,
+    Medium,
+    Rays,
+    intersect_plane,
+    intersect_sphere,
+    nearest_approach,
+    refract,
+    times,
+)
+from neurolens.optics.survival import Counts, Labels, Survival, at_most, positive
+
+# How far the squared length of a direction may be from 1; float32 rounding is a thousandth of this.
+UNIT_SLACK = 1e-3
+
+
+class Mode(NamedTuple):
+    """How to trace: direction of travel (+1 to the film), whether lost rays stay finite on the way, whether they are
+    put on the axis at once (for gradients)."""
+
+    sense: int
+    guard: bool
+    freeze: bool
+
+    @property
+    def spend(self) -> bool:
+        """Whether tests may overwrite the numbers they test: where nobody else needs them, outside a compiler."""
+        return not self.guard and not torch.compiler.is_compiling()
+
+
+def start(rays: Rays, first: Medium, mode: Mode, otherwise: int) -> tuple[Rays, Survival]:
+    """Rays with optical direction cosines, and the test that their directions are unit vectors."""
+    length2 = torch.addcmul(torch.addcmul(rays.dx * rays.dx, rays.dy, rays.dy), rays.dz, rays.dz)
+    sound = at_most((length2 - 1).abs(), UNIT_SLACK, spend=mode.spend)
+    if mode.freeze:
+        # Not even a NaN that comes in may reach the gradients of the others.
+        sound = sound & torch.isfinite(rays.x + rays.y + rays.z)
+    tests = Counts(sound, otherwise) if mode.spend else Labels(sound, otherwise)
+    if mode.freeze:
+        rays = along_axis(rays, tests, mode.sense, 0.0)
+    if mode.sense > 0:
+        # Light may come from far away: the digits of float32 near the lens keep points and directions consistent.
+        rays = Rays(*nearest_approach(rays, 1.0), *rays[3:])
+    return Rays(*rays[:3], *(times(d, first.n) for d in rays[3:])), tests
+
+
+def unit(r: Rays, last: Medium) -> Rays:
+    """Rays with unit directions, from optical direction cosines in a medium."""
+    if not isinstance(last.n, Tensor) and last.n == 1:
+        return r
+    return Rays(*r[:3], *(d / last.n for d in r[3:]))
+
+
+def meet(lens: Lens, k: int, r: Rays, before: Medium, entering: bool, mode: Mode, tests: Survival) -> Hit:
+    """Meet surface k and test its rim, or the shape of the stop."""
+    surface = lens.surfaces[k]
+    plane = _is_plane(surface)
+    if plane:
+        hit = intersect_plane(r, mode.sense, mode.guard, mode.spend)
+    elif is_plain(surface):
+        hit = intersect_sphere(r, surface.curvature, mode.sense, before, entering, mode.guard, mode.spend)
+    else:
+        hit = intersect_shape(r, surface, mode.sense, before, mode.guard)
+    tests.require(hit.met, k, st.MISSED)
+    distance2 = torch.addcmul(hit.x * hit.x, hit.y, hit.y)
+    if plane:
+        # A sphere's square root turns NaN and overflow into a miss; a plane would let them go on.
+        tests.end(distance2 < math.inf)
+    tests.require(at_most(distance2, surface.semi_diameter_mm**2, spend=mode.spend), k, st.RIM)
+    if lens.aperture is not None and surface.stop:
+        tests.require(apertures.inside(lens.aperture, hit.x, hit.y, lens.stop_radius_mm), k, st.RIM)
+    return hit
+
+
+def bend(
+    surface: Surface, k: int, r: Rays, hit: Hit, before: Medium, after: Medium, mode: Mode, tests: Survival
+) -> tuple[Rays, Tensor, Tensor]:
+    """Refract at surface k.
+
+    Returns the rays after it, n' times their cosine of refraction, and its square before guarding: the margin by which
+    they are not totally reflected.
+    """
+    if before is after:
+        return Rays(hit.x, hit.y, hit.z, r.dx, r.dy, r.dz), hit.q, hit.q2
+    c = 0.0 if _is_plane(surface) else surface.curvature
+    bent, q, q2 = refract(r, hit, c, mode.sense, before, after, mode.guard)
+    if isinstance(before.n, Tensor) or before.n != 1:
+        # From air nothing is totally reflected.
+        tests.require(positive(q2, spend=mode.spend), k, st.TOTAL_REFLECTION)
+    return bent, q, q2
+
+
+def along_axis(r: Rays, tests: Survival, sense: int, z: Any) -> Rays:
+    """The rays that go on, and rays along the axis from z in the place of the others."""
+    on_axis = (0.0, 0.0, z, 0.0, 0.0, float(sense))
+    return Rays(*(tests.only(c, a) for a, c in zip(on_axis, r, strict=True)))
+
+
+def _is_plane(surface: Surface) -> bool:
+    return not isinstance(surface.radius_mm, Tensor) and math.isinf(surface.radius_mm) and is_plain(surface)
