@@ -47,7 +47,14 @@ class LensChoice:
     f_number: float | None = None
 
     def read(self) -> Lens:
-        """The lens at infinity focus, its stop round: models know no other, and cameras shape it outside them."""
+        """The lens at infinity focus, its stop round: models know no other, and cameras shape it outside them.
+
+        Raises:
+            InputError: a length or f-number that is not positive, and whatever `read_lens` and `Lens.at` refuse.
+        """
+        for field, value in (("lens.efl_mm", self.efl_mm), ("lens.f_number", self.f_number)):
+            if value is not None and not value > 0:
+                raise InputError("settings", field, value, "a positive number")
         lens = read_lens(self.file).with_aperture(None)
         return lens.at(focal_length_mm=self.efl_mm, zoom=self.configuration, f_number=self.f_number)
 
