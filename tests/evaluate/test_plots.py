@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from neurolens.analysis import plot_layout
 from neurolens.errors import InputError
-from neurolens.evaluate import plots, plots_lens, plots_style
+from neurolens.evaluate import plots, plots_style
 
 MODELS = [
     {"name": "thin lens", "family": "paraxial", "rms_um": 300.0, "ns_per_ray": {"min": 2.0, "median": 2.1}},
@@ -118,7 +119,7 @@ def test_lens_layout(profile: dict[str, Any], tmp_path: Path, figures: list[Any]
 
 @pytest.mark.parametrize(("radius", "h"), [(50.0, 12.0), (-30.0, 29.9), (math.inf, 7.0), (10.0, 10.0)])
 def test_an_arc_lies_on_its_sphere_up_to_the_rim(radius: float, h: float) -> None:
-    points = plots_lens.arc({"z_mm": 3.0, "radius_mm": radius, "semi_diameter_mm": h})
+    points = plot_layout.arc({"z_mm": 3.0, "radius_mm": radius, "semi_diameter_mm": h})
     assert points[0, 1] == pytest.approx(-h) and points[-1, 1] == pytest.approx(h)
     if math.isfinite(radius):
         assert np.hypot(points[:, 0] - 3.0 - radius, points[:, 1]) == pytest.approx(abs(radius))
@@ -129,7 +130,7 @@ def test_an_arc_lies_on_its_sphere_up_to_the_rim(radius: float, h: float) -> Non
 
 def test_an_element_reaches_out_to_its_wider_rim() -> None:
     profile = biconvex()
-    outline = plots_lens.element_outline(*profile["surfaces"][:2])
+    outline = plot_layout.element_outline(*profile["surfaces"][:2])
     assert np.abs(outline[:, 1]).max() == 12.0 and outline[:, 0].min() == 0.0 and outline[:, 0].max() == 6.0
 
 
