@@ -56,7 +56,7 @@ def intersect_shape(r: Rays, surface: Surface, sense: int, before: Medium, guard
 def _weighted(a: Vector, b: Vector, w: tuple[Any, ...]) -> Tensor:
     """Sum of the products of two vectors' components, each times its weight; a weight of 0 costs nothing."""
     terms = [times(p * q, k) for p, q, k in zip(a, b, w, strict=False) if isinstance(k, Tensor) or k != 0]
-    total = terms[0]
+    total = terms[0] if terms else torch.zeros_like(a[0])
     for term in terms[1:]:
         total = total + term
     return total
@@ -136,6 +136,8 @@ def _number(value: Any) -> float:
 def _fitted(
     curvature: float, conic: float, asphere: tuple[tuple[int, float], ...], rim_mm: float
 ) -> tuple[tuple[float, float], int]:
+    if not math.isfinite(rim_mm):
+        return (curvature, curvature * (1 + conic)), STEPS[-1][1]
     radius_mm = 1 / curvature if curvature else math.inf
     same = Surface(radius_mm, 0.0, 2 * rim_mm, conic=conic, asphere=asphere)
     points = [(h, surface_sag_mm(same, h, 0.0)) for h in (rim_mm * i / 24 for i in range(1, 25))]

@@ -161,6 +161,16 @@ def test_a_paraboloid_is_a_plane_with_a_square_on_it() -> None:
     torch.testing.assert_close(torch.stack(one.rays), torch.stack(other.rays), rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("s", [surface(math.inf, asphere=((4, 0.0),)), surface(1e15, conic=1.0, asphere=((2, 0.0),))])
+@pytest.mark.parametrize("rim", [20.0, math.inf])
+def test_an_asphere_of_nothing_is_a_plane(s: Surface, rim: float) -> None:
+    rays, _ = aimed(SHAPES["paraboloid"], 500, torch.float64, 40.0)
+    one = trace(lens_of(replace(s, diameter_mm=rim)), rays, towards="film")
+    other = trace(lens_of(surface(math.inf, rim)), rays, towards="film")
+    assert torch.equal(one.status, other.status) and (one.status == 0).sum() > 100
+    torch.testing.assert_close(torch.stack(one.rays), torch.stack(other.rays), rtol=0, atol=1e-12)
+
+
 def test_the_square_counts_in_the_focal_length() -> None:
     back = Surface(math.inf, 0.0, 20.0)
     square = first_order(lens_of(surface(50.0, asphere=((2, 0.01),)), back))
