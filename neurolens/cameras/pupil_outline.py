@@ -78,6 +78,8 @@ class PupilOutline:
         area -= y * dx
         area *= np.float32(segments)
         area *= lit
+        # Where the light ends, rows between which the outline turns leave slivers of negative area: nothing (1e-6).
+        np.maximum(area, np.float32(0), out=area)
         dx *= along
         dx += x
         dx *= size

@@ -13,8 +13,8 @@ from neurolens.errors import InputError
 def concentric_disk(square: FloatArray) -> FloatArray:
     """Map points [2, N] of the unit square to the unit disk [2, N], keeping areas and neighbours.
 
-    The ideal cameras use it for their pupil; lenses and their models sample boxes on the pupil plane instead
-    (`lens_film.PupilTable`). Source: Shirley and Chiu 1997, "A low distortion map between disk and square".
+    The ideal cameras use it for their pupil; lenses and their models map the square to the outline of what passes
+    (`pupil_outline`). Source: Shirley and Chiu 1997, "A low distortion map between disk and square".
     """
     a = square[0] * np.float32(2) - np.float32(1)
     b = square[1] * np.float32(2) - np.float32(1)

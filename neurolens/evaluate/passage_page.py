@@ -119,8 +119,8 @@ _SHOWN = (OURS, "radial ellipses", "pixel ellipse", "pixel disc", "Wu, two steps
 
 def picture(passages: Sequence[Passage], cameras: Sequence[ExactCamera]) -> Any:
     """Above: rates against the film radius of some cases; below: what passes their pupil planes, and our outlines."""
-    figure = new_figure(3.6 * len(passages), 6.6)
-    axes = figure.subplots(2, len(passages), squeeze=False)
+    figure = new_figure(3.6 * len(passages), 5.2)
+    axes = figure.subplots(2, len(passages), squeeze=False, height_ratios=(1.7, 1))
     for column, (p, camera) in enumerate(zip(passages, cameras, strict=True)):
         above, below = axes[:, column]
         for method, colour in zip(_SHOWN, (INK, *FIELD_COLOURS), strict=False):
@@ -143,7 +143,7 @@ def _draw_outlines(axes: Any, camera: ExactCamera) -> None:
     """What passes at 550 nm (dots) and our outlines, from the axis (left) to the end of the light."""
     outline = camera.film.outline
     end = outline.film_radius_mm
-    axes.set_aspect("equal", "datalim")
+    axes.set_aspect("equal", "box")
     left, ticks = 0.0, []
     square = np.stack([a.ravel() for a in np.meshgrid(*[(np.arange(36) + 0.5) / 36] * 2)]).astype(np.float32)
     wavelength = np.full(square.shape[1], 550, np.float32)
@@ -160,7 +160,7 @@ def _draw_outlines(axes: Any, camera: ExactCamera) -> None:
         ticks.append((left, f"{share * end:.1f}"))
         left += 1.25 * half
     axes.set_xticks([t for t, _ in ticks], [t for _, t in ticks])
-    axes.set_xlabel("film radius (mm); pupils side by side, same scale")
+    axes.set_xlabel("pupils at film radius (mm), one scale")
 
 
 def _around(camera: ExactCamera, film: Any, square: Any, wavelength: Any) -> tuple[Any, Any]:
