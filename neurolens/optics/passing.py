@@ -27,6 +27,9 @@ from neurolens.optics.survival import Counts, Labels, Survival, at_most, positiv
 # How far the squared length of a direction may be from 1; float32 rounding is a thousandth of this.
 UNIT_SLACK = 1e-3
 
+# Rim radius over radius of curvature from which on a sphere's rim is tested by its depth.
+DEEP = 0.25
+
 
 class Mode(NamedTuple):
     """How to trace: direction of travel (+1 to the film), whether lost rays stay finite on the way, whether they are
@@ -76,11 +79,16 @@ def meet(lens: Lens, k: int, r: Rays, before: Medium, entering: bool, mode: Mode
     else:
         hit = intersect_shape(r, surface, mode.sense, before, mode.guard)
     tests.require(hit.met, k, st.MISSED)
-    distance2 = torch.addcmul(hit.x * hit.x, hit.y, hit.y)
-    if plane:
-        # A sphere's square root turns NaN and overflow into a miss; a plane would let them go on.
-        tests.end(distance2 < math.inf)
-    tests.require(at_most(distance2, surface.semi_diameter_mm**2, spend=mode.spend), k, st.RIM)
+    if _is_deep(surface):
+        # By its depth: a point on the far half of the sphere may be near the axis, but there is no glass.
+        depth = hit.z * surface.curvature
+        tests.require(at_most(depth, 1 - math.sqrt(1 - _rim_sine(surface) ** 2), spend=mode.spend), k, st.RIM)
+    else:
+        distance2 = torch.addcmul(hit.x * hit.x, hit.y, hit.y)
+        if plane:
+            # A sphere's square root turns NaN and overflow into a miss; a plane would let them go on.
+            tests.end(distance2 < math.inf)
+        tests.require(at_most(distance2, surface.semi_diameter_mm**2, spend=mode.spend), k, st.RIM)
     if lens.aperture is not None and surface.stop:
         tests.require(apertures.inside(lens.aperture, hit.x, hit.y, lens.stop_radius_mm), k, st.RIM)
     return hit
@@ -108,6 +116,17 @@ def along_axis(r: Rays, tests: Survival, sense: int, z: Any) -> Rays:
     """The rays that go on, and rays along the axis from z in the place of the others."""
     on_axis = (0.0, 0.0, z, 0.0, 0.0, float(sense))
     return Rays(*(tests.only(c, a) for a, c in zip(on_axis, r, strict=True)))
+
+
+def _is_deep(surface: Surface) -> bool:
+    """Whether a sphere's depth at its rim tells heights as exactly as their squares do."""
+    if isinstance(surface.radius_mm, Tensor) or not is_plain(surface):
+        return False
+    return DEEP < _rim_sine(surface) <= 1
+
+
+def _rim_sine(surface: Surface) -> float:
+    return abs(surface.semi_diameter_mm * surface.curvature)
 
 
 def _is_plane(surface: Surface) -> bool:
