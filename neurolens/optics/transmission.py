@@ -84,7 +84,7 @@ class _Polarised(_Absorbed):
         if before is after and not layers:
             return
         ahead, behind = ([times(d, 1 / m.n) for d in rays[3:]] for rays, m in ((r, before), (bent, after)))
-        step = Step(_normal(surface, hit), ahead, behind, before.n, after.n, layers, self._sense)
+        step = Step(normal_at(surface, hit), ahead, behind, before.n, after.n, layers, self._sense)
         field = polarisation.unpolarised(ahead) if self._field is None else self._field
         self._field = polarisation.pass_surface(field, step, self._wavelength_nm)
 
@@ -98,7 +98,8 @@ def way_mm(r: Rays, hit: Hit, before: Medium) -> Any:
     return times(way, 1 / before.n)
 
 
-def _normal(surface: Surface, hit: Hit) -> Vector:
+def normal_at(surface: Surface, hit: Hit) -> Vector:
+    """Unit normal towards +z at a meeting point, x, y, z each [N]."""
     if hit.normal is not None:
         return hit.normal
     c = surface.curvature

@@ -1,0 +1,126 @@
+"""Light along any sequence of surfaces, reflected or refracted at each: the paths of ghosts.
+
+The same surfaces, tests and refraction as in `trace`; what is added is that light may turn round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from neurolens import status as st
+from neurolens.errors import InputError
+from neurolens.optics import glass, thinfilm
+from neurolens.optics.media import absorption_per_mm, media
+from neurolens.optics.passing import Mode, along_axis, bend, meet, start, unit
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.surfaces import Hit, Medium, Rays, fresnel_transmittance, root, times
+from neurolens.optics.transmission import normal_at, way_mm
+
+Action = Literal["T", "R"]
+Steps = Sequence[tuple[int, Action]]
+
+
+class Followed(NamedTuple):
+    """What following a sequence gives.
+
+    Attributes:
+        rays: point on the last surface and unit direction after it, lens frame, mm; along the axis for lost rays.
+        status: [N] int32 as in `trace`: the surface and the reason that ended a ray first.
+        power: [N], product over the steps of the unpolarised share that is transmitted or reflected, and absorption.
+        points: x, y, z of the meeting points of every step, lens frame, mm.
+    """
+
+    rays: Rays
+    status: Tensor
+    power: Tensor
+    points: tuple[tuple[Tensor, Tensor, Tensor], ...]
+
+
+def ghost(count: int, first: int, second: int) -> list[tuple[int, Action]]:
+    """The steps of the ghost that is reflected at surface `second`, then at `first` < `second`, of `count` surfaces.
+
+    Raises:
+        InputError: surfaces that do not exist or are in the wrong order.
+    """
+    if not 0 <= first < second < count:
+        raise InputError("ghost", "first, second", (first, second), f"0 <= first < second < {count}")
+    there: list[tuple[int, Action]] = [(k, "T") for k in range(second)]
+    back: list[tuple[int, Action]] = [(k, "T") for k in range(second - 1, first, -1)]
+    again: list[tuple[int, Action]] = [(k, "T") for k in range(first + 1, count)]
+    return [*there, (second, "R"), *back, (first, "R"), *again]
+
+
+def follow(lens: Lens, rays: Rays, steps: Steps, wavelength_nm: Tensor | float = glass.LINE_D_NM) -> Followed:
+    """Follow light from the scene along a sequence of surfaces.
+
+    Args:
+        lens: the prescription; every rim and the stop are tested at every crossing.
+        rays: points and unit directions [N] towards the film, lens frame, mm; float32 or float64.
+        steps: surfaces in the order in which they are met, "T" refracted or "R" reflected.
+        wavelength_nm: number or [N].
+
+    Raises:
+        InputError: no steps, a surface that does not exist or is not the next one in the direction of travel.
+    """
+    _check(len(lens.surfaces), steps)
+    glasses, vertices = media(lens, wavelength_nm), lens.vertices_mm
+    absorption = absorption_per_mm(lens, wavelength_nm)
+    mode = Mode(sense=1, guard=True, freeze=False)
+    r, tests = start(rays, glasses[0], mode, st.blocked(steps[0][0], st.MISSED))
+    power, vertex = torch.ones_like(r.x), 0.0
+    points = []
+    after = glasses[0]
+    for position, (k, action) in enumerate(steps):
+        r, vertex = r._replace(z=r.z + (vertex - vertices[k])), vertices[k]
+        ahead = mode.sense > 0
+        before, after = (glasses[k], glasses[k + 1]) if ahead else (glasses[k + 1], glasses[k])
+        hit = meet(lens, k, r, before, position == 0, mode, tests)
+        points.append((hit.x, hit.y, hit.z + vertex))
+        absorbed = absorption[k if ahead else k + 1]
+        if absorbed is not None:
+            power = power * torch.exp(-way_mm(r, hit, before) * absorbed)
+        power = power * _share(lens.surfaces[k], hit, before, after, mode.sense, wavelength_nm, action)
+        if action == "R":
+            r, after, mode = _reflect(lens.surfaces[k], r, hit, mode.sense), before, mode._replace(sense=-mode.sense)
+        else:
+            r, _, _ = bend(lens.surfaces[k], k, r, hit, before, after, mode, tests)
+    r = along_axis(unit(r._replace(z=r.z + vertex), after), tests, mode.sense, vertex)
+    return Followed(r, tests.status(), tests.only(power, 0.0), tuple(points))
+
+
+def _reflect(surface: Surface, r: Rays, hit: Hit, sense: int) -> Rays:
+    """The normal part of the direction turned round."""
+    turn = -2 * sense * hit.q
+    normal = normal_at(surface, hit)
+    return Rays(hit.x, hit.y, hit.z, *(torch.addcmul(p, turn, n) for p, n in zip(r[3:], normal, strict=True)))
+
+
+def _share(
+    surface: Surface, hit: Hit, before: Medium, after: Medium, sense: int, wavelength_nm: Any, action: Action
+) -> Tensor | float:
+    """Unpolarised power that goes on, [N]: transmitted or reflected at one surface."""
+    if surface.coating is not None and surface.coating.layers:
+        share = thinfilm.reflectance if action == "R" else thinfilm.transmittance
+        return share(times(hit.q, 1 / before.n), before.n, after.n, surface.coating.layers, wavelength_nm, sense)
+    if before is after:
+        return 0.0 if action == "R" else 1.0
+    q2 = hit.q2 + (after.n - before.n) * (after.n + before.n)
+    transmitted = fresnel_transmittance(hit.q, root(q2, True), before, after)
+    return transmitted if action == "T" else torch.where(q2 > 0, 1 - transmitted, 1.0)
+
+
+def _check(count: int, steps: Steps) -> None:
+    """Surfaces must follow one another as light meets them."""
+    if not steps:
+        raise InputError("sequence", "steps", "(none)", "at least one surface")
+    at, sense = steps[0][0] - 1, 1
+    for n, (k, action) in enumerate(steps):
+        if action not in ("T", "R"):
+            raise InputError("sequence", f"step {n}", action, '"T" or "R"')
+        if k != at + sense or not 0 <= k < count:
+            raise InputError("sequence", f"step {n}", k, f"surface {at + sense}, of 0 to {count - 1}")
+        at, sense = k, -sense if action == "R" else sense
