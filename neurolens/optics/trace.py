@@ -107,20 +107,21 @@ def trace(
     if transmittance not in (True, False, "polarised"):
         raise InputError("trace", "transmittance", transmittance, 'True, False or "polarised"')
     wanted = _Wanted(transmittance, tuple(record), path)
-    if isinstance(wavelength_nm, Tensor):
-        # In the precision of the rays, or a float64 wavelength would turn float32 rays into float64 halfway.
-        wavelength_nm = torch.where(wavelength_nm > 0, wavelength_nm, math.nan).to(rays.x.dtype)
     needs_grad = any(_differentiated(v) for v in (*rays, wavelength_nm, *_parameters(lens)))
     count = rays.x.shape[0]
     if needs_grad or count <= CHUNK:
-        return _trace_chunk(lens, rays, wavelength_nm, towards, wanted, needs_grad)
-    parts = []
+        return _trace_chunk(lens, rays, _sound(wavelength_nm, rays.x.dtype), towards, wanted, needs_grad)
+    whole = None
     for i in range(0, count, CHUNK):
         part = slice(i, i + CHUNK)
         lam = wavelength_nm[part] if isinstance(wavelength_nm, Tensor) and wavelength_nm.ndim else wavelength_nm
         chunk = Rays(*(c[part] for c in rays))
-        parts.append(_trace_chunk(lens, chunk, lam, towards, wanted, False))
-    return _joined(parts)
+        traced = _trace_chunk(lens, chunk, _sound(lam, rays.x.dtype), towards, wanted, False)
+        # Written where it belongs at once: chunks kept until the end would take as much memory again.
+        whole = _room(traced, count) if whole is None else whole
+        _fill(whole, traced, part)
+    assert isinstance(whole, Traced)
+    return whole
 
 
 def compile_trace(
@@ -208,20 +209,32 @@ def _trace_chunk(
     return Traced(r, tests.status(), arrived, crossings, tuple(path))
 
 
-def _joined(parts: Sequence[Traced]) -> Traced:
-    """Chunks put together again."""
+def _sound(wavelength_nm: Tensor | float, dtype: torch.dtype) -> Tensor | float:
+    """NaN for what is no wavelength; in the precision of the rays, or float64 would spread to float32 rays halfway."""
+    if not isinstance(wavelength_nm, Tensor):
+        return wavelength_nm
+    return torch.where(wavelength_nm > 0, wavelength_nm, math.nan).to(dtype)
 
-    def cat(columns: Sequence[Any]) -> Any:
-        if columns[0] is None:
-            return None
-        if isinstance(columns[0], Tensor):
-            return torch.cat(list(columns))
-        return type(columns[0])(*(torch.cat(c) for c in zip(*columns, strict=True)))
 
-    return Traced(
-        cat([p.rays for p in parts]),
-        cat([p.status for p in parts]),
-        cat([p.transmittance for p in parts]),
-        {k: cat([p.crossings[k] for p in parts]) for k in parts[0].crossings},
-        tuple(cat([p.path[i] for p in parts]) for i in range(len(parts[0].path))),
-    )
+def _room(part: Any, count: int) -> Any:
+    """The same structure with room for `count` rays."""
+    if isinstance(part, Tensor):
+        return part.new_empty(count)
+    if isinstance(part, dict):
+        return {k: _room(v, count) for k, v in part.items()}
+    if isinstance(part, tuple):
+        rooms = [_room(v, count) for v in part]
+        return type(part)(*rooms) if hasattr(part, "_fields") else tuple(rooms)
+    return part
+
+
+def _fill(whole: Any, part: Any, at: slice) -> None:
+    """Write the tensors of a part into those of the whole."""
+    if isinstance(part, Tensor):
+        whole[at] = part
+    elif isinstance(part, dict):
+        for k, v in part.items():
+            _fill(whole[k], v, at)
+    elif isinstance(part, tuple):
+        for a, b in zip(whole, part, strict=True):
+            _fill(a, b, at)
