@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Protocol
 
 import torch
@@ -103,5 +104,10 @@ class Counts:
         return kept if otherwise == 0 else kept.add_(1 - self._goes_on, alpha=otherwise)
 
     def status(self) -> Tensor:
-        meanings = torch.tensor([*self._meanings, st.PASSED], dtype=torch.int32, device=self._count.device)
-        return meanings.index_select(0, self._count.int())
+        return _table((*self._meanings, st.PASSED), self._count.device).index_select(0, self._count.int())
+
+
+@lru_cache(maxsize=256)
+def _table(meanings: tuple[int, ...], device: torch.device) -> Tensor:
+    """Kept, for sending it anew with every chunk would make the host wait for an accelerator."""
+    return torch.tensor(meanings, dtype=torch.int32, device=device)
