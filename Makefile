@@ -2,7 +2,7 @@
 #
 #   make demo     train, evaluate and render the quickstart (minutes), then print where to look
 #   make test     tests, then lint, format and types
-#   make bench    speed against accuracy; fails when a promised ratio is lost
+#   make bench    the tracer's speed, then models against it; fails when a promised ratio is lost
 #   make models   fit again every model of models/
 #   make lint     lint, format and types only
 #   make format   rewrite the code in the project's format
@@ -34,6 +34,7 @@ test: $(INSTALLED)
 	$(MAKE) --no-print-directory lint
 
 bench: $(INSTALLED)
+	$(BIN)/neurolens bench trace
 	$(BIN)/python -m neurolens.evaluate.bench
 
 models: $(INSTALLED)

@@ -2,8 +2,8 @@
 
 Races each model of models/ against the exact tracer of its lens, the thin lens and the pinhole, all in one run, writes
 the table to experiments/results/, and fails when a model is slower, relative to the compiled exact tracer, than
-models/index.json promises, or when tracer or renderer fall below their floors (`floors`). `--trace`
-times the exact tracer alone on every lens file.
+models/index.json promises, or when tracer or renderer fall below their floors (`floors`). `neurolens bench trace` times
+the exact tracer alone.
 """
 
 from __future__ import annotations
@@ -17,20 +17,16 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from neurolens.cameras.model import load_model
 from neurolens.errors import InputError, NeurolensError
 from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
 from neurolens.evaluate.floors import Floor, check_floors, floor_table
-from neurolens.evaluate.layout import refractions
 from neurolens.evaluate.project import project_root
 from neurolens.evaluate.speed import Race, race
 from neurolens.evaluate.speed_table import COMPILED, markdown, notes, table_rows
 from neurolens.files import atomic_write_text
 from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens
-from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.domain import Domain
 
 
 @dataclass
@@ -123,40 +119,6 @@ def hold_to_promises(rows: Sequence[dict[str, Any]], timed: Race, outcome: Outco
             outcome.missed.append(f"{row['file']}: {best:.3g} times the compiled exact tracer, promised {promised:g}")
 
 
-def bench_trace(
-    root: Path, only: str, rounds: int, threads: Sequence[int], dtypes: Sequence[torch.dtype], save: Save
-) -> Outcome:
-    """Race the exact tracer on every lens file: tracing alone by precision, and all that a camera needs."""
-    outcome = Outcome()
-    for path in sorted((root / "lenses").glob("*.toml")):
-        if only not in path.stem:
-            continue
-        lens = read_lens(path).at()
-        domain = domain_of(lens)
-        for count in threads:
-            _say(f"{path.stem}: compiling and timing on {count} thread{'s' * (count > 1)} ...")
-            timed = race(trace_candidates(lens, domain, dtypes), domain, threads=count, rounds=rounds)
-            outcome.rows += table_rows(f"{path.stem} ({_work(lens)})", timed)
-            save(outcome)
-    return outcome
-
-
-def trace_candidates(lens: Lens, domain: Domain, dtypes: Sequence[torch.dtype]) -> list[Any]:
-    """Rays made beforehand, no transmittance; in float32 also from film and pupil points, with transmittance."""
-    candidates = []
-    for dtype in dtypes:
-        label = "trace " + str(dtype).removeprefix("torch.")
-        candidates += exact_candidates(lens, domain, dtype=dtype, transmittance=False, build_rays=False, label=label)
-    if torch.float32 in dtypes:
-        candidates += exact_candidates(lens, domain, label="camera float32")
-    return candidates
-
-
-def _work(lens: Lens) -> str:
-    """What tracing this lens takes, in words."""
-    return f"{refractions(lens)} refractions" + ("" if lens.dispersive else ", no dispersion")
-
-
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
@@ -165,12 +127,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command: 0 where all that could be checked is kept, 1 where something is not, 2 for bad input."""
     a = _parser().parse_args(argv)
     warnings.simplefilter("ignore")
-    name, title = ("trace", "The exact tracer") if a.trace else ("bench", "Models against the exact tracer")
-    threads = "1 and 2 threads" if a.trace else f"{a.threads} thread" + "s" * (a.threads > 1)
+    threads = f"{a.threads} thread" + "s" * (a.threads > 1)
 
     def page(outcome: Outcome) -> str:
         floors = f"\n## Floors\n\n{floor_table(outcome.floors)}" if outcome.floors else ""
-        return markdown(title, notes(threads, a.rounds), outcome.rows) + floors
+        return markdown("Models against the exact tracer", notes(threads, a.rounds), outcome.rows) + floors
 
     try:
         root = project_root()
@@ -178,37 +139,29 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         def save(outcome: Outcome) -> None:
             out.mkdir(parents=True, exist_ok=True)
-            atomic_write_text(out / f"{name}.md", page(outcome))
+            atomic_write_text(out / "bench.md", page(outcome))
             data = {"rows": outcome.rows, "floors": [{**asdict(f), "verdict": f.verdict} for f in outcome.floors]}
-            atomic_write_text(out / f"{name}.json", json.dumps(data, indent=1) + "\n")
+            atomic_write_text(out / "bench.json", json.dumps(data, indent=1) + "\n")
 
-        if a.trace:
-            outcome = bench_trace(root, a.only, a.rounds, (1, 2), (torch.float32, torch.float64), save)
-        else:
-            outcome = bench_models(root, a.models or root / "models", a.only, a.threads, a.rounds, save)
-            if not a.only:
-                _say("floors of the tracer and the renderer ...")
-                outcome.floors = check_floors(root, a.rounds)
-                save(outcome)
+        outcome = bench_models(root, a.models or root / "models", a.only, a.threads, a.rounds, save)
+        if not a.only:
+            _say("floors of the tracer and the renderer ...")
+            outcome.floors = check_floors(root, a.rounds)
+            save(outcome)
     except NeurolensError as error:
         print(error, file=sys.stderr)
         return 2
     print(page(outcome))
-    return 0 if a.trace else verdict(outcome)
+    return verdict(outcome)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m neurolens.evaluate.bench", description=__doc__)
     parser.add_argument("--models", type=Path, help="folder with index.json (default: the project's models/)")
-    parser.add_argument(
-        "--only", default="", help="models (with --trace: lens files) whose names hold this text; no floors then"
-    )
+    parser.add_argument("--only", default="", help="models whose names hold this text; no floors then")
     parser.add_argument("--threads", type=int, default=1, help="workers that share out batches (default 1)")
     parser.add_argument("--rounds", type=int, default=20, help="times that each candidate is timed (default 20)")
     parser.add_argument("--out", type=Path, help="folder for the tables (default: the project's experiments/results)")
-    parser.add_argument(
-        "--trace", action="store_true", help="the exact tracer alone, 1 and 2 threads, float32 and float64"
-    )
     return parser
 
 

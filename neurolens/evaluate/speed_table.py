@@ -67,8 +67,7 @@ def notes(threads: str, rounds: int) -> str:
         f"Rays uniform over film and pupil disc of each domain, blocked ones included; {threads}, {rounds} rounds in "
         "turn, each the best of a few short samples; float32 unless told. Exact tracer and models do the same work: "
         "film and pupil points in; scene ray, transmittance and status out, with stop, rims and dispersion; "
-        "models add the crossing with the stop. Thin lens and pinhole give ray and weight. Rows named trace start from "
-        "rays made beforehand and leave out transmittance. Ratios: by the best times (median within rounds), above 1 "
-        "is faster. "
+        "models add the crossing with the stop. Thin lens and pinhole give ray and weight. Ratios: by the best times "
+        "(median within rounds), above 1 is faster. "
         f"Python {platform.python_version()}, torch {torch.__version__}, {platform.machine()}."
     )

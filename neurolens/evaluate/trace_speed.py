@@ -72,11 +72,11 @@ def chosen_lenses(folder: Path) -> tuple[dict[int, Lens], list[str]]:
 
 
 def with_aspheres(lens: Lens) -> Lens:
-    """The same lens with even terms A4 to A10 on two surfaces, of the size that designs have (microns at the rim)."""
+    """The same lens with even terms A4 to A10 on two surfaces, of a size that takes as many steps as designs do."""
     surfaces = list(lens.surfaces)
     for k in ASPHERIC_SURFACES:
         h = surfaces[k].semi_diameter_mm
-        asphere = tuple((p, a / h**p) for p, a in ((4, -0.02), (6, 0.008), (8, -0.004), (10, 0.001)))
+        asphere = tuple((p, a / h**p) for p, a in ((4, -0.2), (6, 0.08), (8, -0.04), (10, 0.01)))
         surfaces[k] = replace(surfaces[k], asphere=asphere)
     return replace(lens, surfaces=tuple(surfaces), name=f"{lens.name}, two aspheres")
 

@@ -79,7 +79,7 @@ def test_two_aspheres_change_the_rays_and_little_else() -> None:
     a, b = trace(plain, *rays), trace(aspheric, *rays)
     both = (a.status == 0) & (b.status == 0)
     assert both.sum() > 0.7 * (a.status == 0).sum() > 100
-    assert 1e-3 < (a.rays.x - b.rays.x)[both].abs().max() < 1.0
+    assert 1e-2 < (a.rays.x - b.rays.x)[both].abs().max() < 3.0
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
