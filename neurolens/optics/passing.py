@@ -77,7 +77,7 @@ def meet(lens: Lens, k: int, r: Rays, before: Medium, entering: bool, mode: Mode
     elif is_plain(surface):
         hit = intersect_sphere(r, surface.curvature, mode.sense, before, entering, mode.guard, mode.spend)
     else:
-        hit = intersect_shape(r, surface, mode.sense, before, mode.guard)
+        hit = intersect_shape(r, surface, mode.sense, before, mode.guard, mode.spend)
     tests.require(hit.met, k, st.MISSED)
     if _is_deep(surface):
         # By its depth: a point on the far half of the sphere may be near the axis, but there is no glass.

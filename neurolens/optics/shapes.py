@@ -9,6 +9,7 @@ conic that fits best; started at the vertex plane it fails beyond about 55 degre
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -18,6 +19,7 @@ from torch import Tensor
 from neurolens.optics.clearance import surface_sag_mm
 from neurolens.optics.prescription import Surface
 from neurolens.optics.surfaces import Hit, Medium, Rays, nearest_approach, root, times
+from neurolens.optics.survival import also, at_most, choose, positive
 
 Vector = tuple[Tensor, Tensor, Tensor]
 
@@ -38,19 +40,21 @@ def is_plain(surface: Surface) -> bool:
     return not (conic or surface.asphere or surface.cylinder)
 
 
-def intersect_shape(r: Rays, surface: Surface, sense: int, before: Medium, guard: bool) -> Hit:
+def intersect_shape(r: Rays, surface: Surface, sense: int, before: Medium, guard: bool, spend: bool) -> Hit:
     """Meet a conic, cylinder or asphere at the root next to the vertex. Arguments as for a sphere."""
     w = (float(surface.cylinder != "y"), float(surface.cylinder != "x"))
     nearest = nearest_approach(r, before.inverse_n2)
     if surface.asphere:
-        return _meet_asphere(r, nearest, surface, w, sense, before)
+        return _meet_asphere(r, nearest, surface, w, sense, before, spend)
     c = surface.curvature
-    met, q2, q, t = _meet_quadric(r, nearest, (c * w[0], c * w[1], c * (1 + surface.conic)), sense, guard)
+    kind = (c * w[0], c * w[1], c * (1 + surface.conic))
+    met, q2, q, t = _meet_quadric(r, nearest, kind, sense, before, guard, spend)
     x, y, z = _along(nearest, t, (r.dx, r.dy, r.dz))
-    nx, ny, nz = times(x, -c * w[0]), times(y, -c * w[1]), 1 - times(z, c * (1 + surface.conic))
+    nx, ny, nz = times(x, -kind[0]), times(y, -kind[1]), 1 - times(z, kind[2])
     length2 = torch.addcmul(torch.addcmul(nx * nx, ny, ny), nz, nz)
-    scale = torch.rsqrt(torch.where(length2 > 0, length2, 1.0))
-    return Hit(x, y, z, q * scale, q2 * scale * scale, met & (nz > 0), (nx * scale, ny * scale, nz * scale))
+    scale = torch.rsqrt(torch.where(length2 > 0, length2, 1.0) if guard else length2)
+    met = also(met, positive(nz.clone() if spend else nz, spend=spend))
+    return Hit(x, y, z, q * scale, q2 * scale * scale, met, (nx * scale, ny * scale, nz * scale))
 
 
 def _weighted(a: Vector, b: Vector, w: tuple[Any, ...]) -> Tensor:
@@ -68,26 +72,35 @@ def _along(m: Vector, t: Tensor, p: Vector) -> Vector:
 
 
 def _meet_quadric(
-    r: Rays, m: Vector, c: tuple[Any, Any, Any], sense: int, guard: bool
+    r: Rays, m: Vector, c: tuple[Any, Any, Any], sense: int, before: Medium, guard: bool, spend: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Meet cx x^2 + cy y^2 + cz z^2 = 2 z at the root next to the vertex.
 
     Returns whether there is one, the square of the derivative of the left side along the ray and its root, and the
-    parameter from the point `m` of the ray: that of the closest approach where there is none.
+    parameter from the nearest approach `m` of the ray: near it where there is none.
     """
-    p = (r.dx, r.dy, r.dz)
-    a, b, f = _weighted(p, p, c), _weighted(m, p, c) - r.dz, _weighted(m, m, c) - 2 * m[2]
-    q2 = b * b - a * f
+    p, (cx, cy, cz) = (r.dx, r.dy, r.dz), c
+    if cx is cy or (not isinstance(cx, Tensor) and cx == cy):
+        # Round about the axis: p.p = n^2 and m.p = 0 leave little to compute.
+        a = p[2] * p[2] * (cz - cx) + before.n2 * cx
+        b = p[2] * (times(m[2], cz - cx) - 1)
+        f = torch.addcmul(m[0] * m[0], m[1], m[1]) * cx + m[2] * (times(m[2], cz) - 2)
+    else:
+        a, b, f = _weighted(p, p, c), _weighted(m, p, c) - r.dz, _weighted(m, m, c) - 2 * m[2]
+    q2 = torch.addcmul(b * b, a, f, value=-1)
     q = root(q2, True) if guard else torch.sqrt(q2.clamp_min(0))
     # The two forms of the same root: each divides by what is not small.
-    backwards = b * sense >= 0
-    denominator = torch.where(backwards, a, torch.add(-b, q, alpha=sense))
-    sound = denominator != 0
-    t = torch.where(backwards, torch.add(-b, q, alpha=-sense), f) / torch.where(sound, denominator, 1.0)
-    return (q2 > 0) & sound, q2, q, t
+    backwards = at_most(b * -sense, 0.0, spend=spend)
+    denominator = choose(backwards, a, torch.add(-b, q, alpha=sense))
+    numerator = choose(backwards, torch.add(-b, q, alpha=-sense), f)
+    sound = positive(denominator * denominator, spend=spend)
+    t = numerator / (torch.where(sound, denominator, 1.0) if guard else denominator)
+    return also(positive(q2.clone() if spend else q2, spend=spend), sound), q2, q, t
 
 
-def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], sense: int, before: Medium) -> Hit:
+def _meet_asphere(
+    r: Rays, m: Vector, surface: Surface, w: tuple[float, float], sense: int, before: Medium, spend: bool
+) -> Hit:
     """Iterate along the rays, from the conic that fits the asphere best.
 
     All steps but the last are taken outside the graph: the last one alone carries the derivative of the solution
@@ -98,8 +111,9 @@ def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], 
     with torch.no_grad():
         held = Rays(*(v.detach() for v in r))
         held_m, held_p = (m[0].detach(), m[1].detach(), m[2].detach()), (held.dx, held.dy, held.dz)
-        _, missed, _, t = _meet_quadric(held, held_m, (c * w[0], c * w[1], cz), sense, False)
-        t = torch.where(torch.isfinite(t), t, 0.0)
+        medium = Medium(*(v.detach() if isinstance(v, Tensor) else v for v in before))
+        _, missed, _, t = _meet_quadric(held, held_m, (c * w[0], c * w[1], cz), sense, medium, False, spend)
+        t = torch.nan_to_num(t, 0.0, 0.0, 0.0)
         polish = POLISH[t.dtype]
         for n in range(steps + polish - 1):
             step = _step(_along(held_m, t, held_p), held_p, surface, w, sense)
@@ -109,15 +123,19 @@ def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], 
     at = _along(m, t.detach(), p)
     step = _step(at, p, surface, w, sense)
     x, y, z = _along(at, step, p)
-    _, slope, _, cos2 = _sag(surface, w, x, y)
+    slope, cos2 = _slope(surface, w, x, y)
     nx, ny = (times(v * -slope, k) for v, k in zip((x, y), w, strict=True))
-    scale = torch.rsqrt(1 + nx * nx + ny * ny)
-    q = (nx * p[0] + ny * p[1] + p[2]) * scale * sense
+    scale = torch.rsqrt(torch.addcmul(nx * nx, ny, ny) + 1)
+    q = torch.addcmul(torch.addcmul(p[2], nx, p[0]), ny, p[1]) * (scale * sense)
     length = times((deciding if polish else step).abs(), before.n)
-    met = (length <= LAST_STEP * surface.semi_diameter_mm) & (q > 0)
+    met = also(
+        at_most(length, LAST_STEP * surface.semi_diameter_mm, spend=spend),
+        positive(q.clone() if spend else q, spend=spend),
+    )
     if cos2 is not None:
-        met = met & (cos2 > STEEPEST)
-    q2 = torch.where(met, q * q, torch.minimum(missed, -q * q))
+        met = also(met, positive(cos2 - STEEPEST, spend=spend))
+    # How far a ray misses is of use only where crossings are learnt from.
+    q2 = q * q if spend else torch.where(met, q * q, torch.minimum(missed, -q * q))
     return Hit(x, y, z, q, q2, met, (nx * scale, ny * scale, scale))
 
 
@@ -161,43 +179,63 @@ def _step(at: Vector, p: Vector, surface: Surface, w: tuple[float, float], sense
     parabola through value, slope and bend has both, and the sign of its root is that of the one wanted.
     """
     x, y, z = at
-    sag, slope, turn, _ = _sag(surface, w, x, y)
+    sag, slope, turn = _sag(surface, w, x, y)
     along = _weighted((x, y, z), p, w)
     rate = slope * along - p[2]
     # Second derivative of the sag along the ray, but for what the polynomial adds to the change of its own slope.
     bend = slope * _weighted(p, p, w)
     if turn is not None:
-        bend = bend + along * along * turn
-    lack = sag - z
-    square = (rate * rate - 2 * bend * lack).clamp_min(0)
-    denominator = rate - sense * torch.sqrt(square + 1e-30)
-    return -2 * lack / denominator
+        bend = torch.addcmul(bend, along * along, turn)
+    lack = 2 * (sag - z)
+    square = torch.addcmul(rate * rate, bend, lack, value=-1)
+    denominator = torch.sub(torch.sqrt(square.clamp_min(1e-30)), rate, alpha=sense) * sense
+    return lack / denominator
 
 
-def _sag(
-    surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor
-) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
-    """The asphere at points [N]: depth, slope d sag / d h divided by h, the change d slope / d h divided by h of the
-    conic alone, and the conic's squared cosine, positive where it exists; the last two None without a conic."""
-    h2 = _weighted((x, y, x), (x, y, x), w)
-    powers = dict(surface.asphere)
-    even = all(p % 2 == 0 for p in powers)
-    # Horner's rule in h^2, or in h where odd powers occur; the root is kept from 0, where its slope is infinite.
-    h = h2 if even else torch.sqrt(h2.clamp_min(1e-30))
-    highest = max(powers)
-    sag, slope = torch.full_like(h2, 0.0) + powers[highest], torch.full_like(h2, 0.0) + highest * powers[highest]
-    for k in range(highest - (2 if even else 1), 1, -2 if even else -1):
-        sag, slope = sag * h, slope * h
-        if k in powers:
-            sag, slope = sag + powers[k], slope + k * powers[k]
+def _sag(surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    """The asphere at points [N]: depth, slope d sag / d h divided by h, and the change d slope / d h divided by h of
+    the conic alone, None without a conic."""
+    h2 = _height2(w, x, y)
+    sag, slope = _polynomials(surface, h2, (0, 1))
     c = surface.curvature
     if not isinstance(c, Tensor) and c == 0:
-        return sag * h2, slope, None, None
-    stretch = (1 + surface.conic) * c * c
-    cos2 = 1 - h2 * stretch
-    cos = torch.sqrt(cos2.clamp_min(STEEPEST))
+        return sag * h2, slope, None
+    cos = torch.sqrt((1 - h2 * ((1 + surface.conic) * c * c)).clamp_min(STEEPEST))
     # One division for both c h^2 / (1 + cos) and c / cos.
-    both = c / (cos + cos * cos)
-    inverse = both * (1 + cos)
+    both = c / torch.addcmul(cos, cos, cos)
+    inverse = torch.addcmul(both, both, cos)
     turn = inverse * inverse * inverse * (1 + surface.conic)
-    return both * cos * h2 + sag * h2, inverse + slope, turn, cos2
+    return torch.addcmul(sag, both, cos) * h2, inverse + slope, turn
+
+
+def _slope(surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor | None]:
+    """d sag / d h divided by h at points [N], and the conic's squared cosine, positive where it exists."""
+    h2 = _height2(w, x, y)
+    (slope,) = _polynomials(surface, h2, (1,))
+    c = surface.curvature
+    if not isinstance(c, Tensor) and c == 0:
+        return slope, None
+    cos2 = 1 - h2 * ((1 + surface.conic) * c * c)
+    return slope + c * torch.rsqrt(cos2.clamp_min(STEEPEST)), cos2
+
+
+def _height2(w: tuple[float, float], x: Tensor, y: Tensor) -> Tensor:
+    return torch.addcmul(x * x, y, y) if w == (1.0, 1.0) else (x * x if w[0] else y * y)
+
+
+def _polynomials(surface: Surface, h2: Tensor, orders: Sequence[int]) -> list[Tensor]:
+    """sum A_p h^(p - 2) (order 0) and sum p A_p h^(p - 2) (order 1) by Horner's rule, each [N]."""
+    powers = dict(surface.asphere)
+    even = all(p % 2 == 0 for p in powers)
+    # In h^2, or in h where odd powers occur; the root is kept from 0, where its slope is infinite.
+    h = h2 if even else torch.sqrt(h2.clamp_min(1e-30))
+    highest, down = max(powers), 2 if even else 1
+    found = []
+    for order in orders:
+        total: Any = powers[highest] * highest**order
+        for k in range(highest - down, 1, -down):
+            total = total * h
+            if k in powers:
+                total = total + powers[k] * k**order
+        found.append(total if isinstance(total, Tensor) and total.shape == h2.shape else torch.zeros_like(h2) + total)
+    return found

@@ -27,6 +27,16 @@ def at_most(value: Tensor, limit: float, *, spend: bool = False) -> Tensor:
     return value.le_(limit) if spend else value <= limit
 
 
+def also(first: Tensor, second: Tensor) -> Tensor:
+    """Both tests passed, [N]; spends `first` where tests are 1.0 and 0.0."""
+    return first.mul_(second) if first.is_floating_point() else first & second
+
+
+def choose(test: Tensor, yes: Tensor, no: Tensor) -> Tensor:
+    """`yes` where the test passed, else `no`, [N]. Of a test in numbers a mixture, for which both must be finite."""
+    return torch.lerp(no, yes, test) if test.is_floating_point() else torch.where(test, yes, no)
+
+
 class Survival(Protocol):
     """The tests at each surface (met, inside the rim, not totally reflected), in the order in which they are called.
 
