@@ -70,7 +70,9 @@ def white_card_picture(light: FilmLight, film_mm: tuple[float, float], title: st
             _profile_on(axes, light.radius_mm, values, film_mm)
         bar = figure.colorbar(shown, ax=figure.axes, shrink=0.7)
         bar.set_label("irradiance over the axis")
-        figure.suptitle(title, x=0.01, ha="left", fontweight="bold", fontsize=12)
+        figure.suptitle(f"{title}\n", x=0.01, ha="left", fontweight="bold", fontsize=12)
+        curve = "curve: irradiance along +x, 0 at the film's lower edge, 1 at its upper edge"
+        figure.text(0.01, 0.945, curve, ha="left", fontsize=9, color=FIELD_COLOURS[3])
         return save(figure, path)
 
 
