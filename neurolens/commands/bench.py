@@ -87,13 +87,13 @@ def run_trace(args: argparse.Namespace) -> int:
     lenses = selected({MAIN: lenses[MAIN]} if args.quick else lenses, args.only)
     rounds = args.rounds or (5 if args.quick else 20)
     found = Found(rounds, missing=[] if args.quick or args.only else missing)
-    races = [(n, t) for t in (args.threads[:1] if args.quick else args.threads) for n in lenses]
-    plan = {_stage(n, t): (4.0 if n == MAIN else 2.0) * (5 + n) for n, t in races} | {"memory": 10.0}
+    threads = args.threads[:1] if args.quick else args.threads
+    plan = {_stage(n): (2.0 if n == MAIN else 1.0) * (8 + n + n * len(threads)) for n in lenses} | {"memory": 10.0}
     progress = Progress(plan, quiet=args.quiet)
-    for n, threads in races:
-        aspheric = with_aspheres(lenses[n]) if n == MAIN else None
-        with progress.stage(_stage(n, threads)) as report:
-            found.rows += time_lens(lenses[n], threads, rounds, aspheric=aspheric, report=report)
+    for n, lens in lenses.items():
+        with progress.stage(_stage(n)) as report:
+            aspheric = with_aspheres(lens) if n == MAIN else None
+            found.rows += time_lens(lens, threads, rounds, aspheric=aspheric, report=report)
         write(found, out)
     if MAIN in lenses:
         with progress.stage("memory") as report:
@@ -117,8 +117,8 @@ def _quiet_glasses() -> None:
     warnings.simplefilter("ignore", NeurolensWarning)
 
 
-def _stage(refractions: int, threads: int) -> str:
-    return f"{refractions} refractions, {threads} thread{'s' * (threads > 1)}"
+def _stage(count: int) -> str:
+    return f"{count} refractions"
 
 
 def run_extremes(args: argparse.Namespace) -> int:

@@ -112,12 +112,14 @@ def race(
     threads: int = 1,
     rounds: int = 20,
     seed: int = 3,
+    fresh: bool = True,
     report: Callable[[float], None] = lambda share: None,
 ) -> Race:
     """Time candidates in turn on the same rays of a domain, or each on those of its own.
 
     Args:
         domain: whose rays all do that have none of their own; or those rays, `POOL` of them.
+        fresh: forget what torch compiled before; False keeps what an earlier race of the same candidates compiled.
         report: hears the share that is done, now and then.
 
     Each call runs on one thread; with more threads, that many workers share out the batches, as a renderer does
@@ -133,7 +135,8 @@ def race(
     passes: dict[str, _Pass] = {}
     before = _load()
     with _workers(threads) as team, pinned_threads(1), torch.no_grad():
-        torch._dynamo.reset()  # torch compiles one function only so often before it gives up; a race starts afresh
+        if fresh:
+            torch._dynamo.reset()  # torch compiles one function only so often before it gives up
         for i, c in enumerate(candidates):
             try:
                 passes[c.name] = _best_batch(c, _pool(c.domain or domain, seed), team)

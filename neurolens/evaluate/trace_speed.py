@@ -136,14 +136,16 @@ def _compiled(lens: Lens, dtype: torch.dtype) -> Callable[[FilmRays], Call]:
 
 def time_lens(
     lens: Lens,
-    threads: int,
+    threads: Sequence[int],
     rounds: int,
     *,
     aspheric: Lens | None = None,
     dtypes: Sequence[torch.dtype] = DTYPES,
     report: Callable[[float], None] = lambda share: None,
 ) -> list[dict[str, Any]]:
-    """Race the tracer on one lens, and beside it on one with aspheres; rows with units in their keys.
+    """Race the tracer on one lens, and beside it on one with aspheres, a race a thread count, compiled once.
+
+    Returns: rows with units in their keys.
 
     Raises:
         InputError: as of `race`.
@@ -152,9 +154,16 @@ def time_lens(
     field = candidates(lens, dtypes)
     if aspheric is not None:
         field += candidates(aspheric, dtypes, "aspheres, ")
-    timed = race(field, rays, threads=threads, rounds=rounds, report=report)
     share = float((trace(lens, *launched(lens, rays, torch.float32)).status == st.PASSED).double().mean())
-    return [_row(c.name, lens, timed, share) for c in field]
+    rows = []
+    for i, count in enumerate(threads):
+
+        def part(done: float, before: int = i) -> None:
+            report((before + done) / len(threads))
+
+        timed = race(field, rays, threads=count, rounds=rounds, fresh=i == 0, report=part)
+        rows += [_row(c.name, lens, timed, share) for c in field]
+    return rows
 
 
 def _row(name: str, lens: Lens, timed: Race, passing: float) -> dict[str, Any]:
