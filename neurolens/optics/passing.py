@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from neurolens import status as st
+from neurolens.errors import InputError
 from neurolens.optics import apertures
+from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.shapes import intersect_shape, is_plain
 from neurolens.optics.surfaces import (
@@ -22,7 +24,7 @@ from neurolens.optics.surfaces import (
     refract,
     times,
 )
-from neurolens.optics.survival import Counts, Labels, Survival, at_most, positive
+from neurolens.optics.survival import Counts, Labels, Survival, also, at_most, positive
 
 # How far the squared length of a direction may be from 1; float32 rounding is a thousandth of this.
 UNIT_SLACK = 1e-3
@@ -45,13 +47,56 @@ class Mode(NamedTuple):
         return not self.guard and not torch.compiler.is_compiling()
 
 
-def start(rays: Rays, first: Medium, mode: Mode, otherwise: int) -> tuple[Rays, Survival]:
-    """Rays with optical direction cosines, and the test that their directions are unit vectors."""
+def check_rays(rays: Rays, wavelength_nm: Tensor | float) -> None:
+    """Refuse rays and wavelengths that cannot be traced.
+
+    Raises:
+        InputError: components of unequal shapes or dtypes or of another dtype, a wavelength of another shape, or a
+            number that is not positive.
+    """
+    shape, dtype = rays.x.shape, rays.x.dtype
+    if dtype not in (torch.float32, torch.float64):
+        raise InputError("trace", "rays.x", f"({dtype})", "torch.float32 or torch.float64")
+    for name, c in zip(Rays._fields, rays, strict=True):
+        if c.shape != shape or c.dtype != dtype or c.ndim != 1:
+            raise InputError(
+                "trace", f"rays.{name}", f"({tuple(c.shape)}, {c.dtype})", f"[N] like x: {tuple(shape)}, {dtype}"
+            )
+    if isinstance(wavelength_nm, Tensor):
+        if wavelength_nm.ndim and wavelength_nm.shape != shape:
+            raise InputError(
+                "trace", "wavelength_nm", f"({tuple(wavelength_nm.shape)})", f"a number or a tensor {tuple(shape)}"
+            )
+    elif not 0 < wavelength_nm < math.inf:
+        raise InputError("trace", "wavelength_nm", wavelength_nm, "a positive number")
+
+
+def sound_wavelength(
+    lens: Lens, wavelength_nm: Tensor | float, dtype: torch.dtype
+) -> tuple[Tensor | float, Tensor | None]:
+    """Wavelengths in the precision of the rays, with the d line in the place of what is none, and which are sound [N].
+
+    A NaN in an index would reach the gradients of the prescription, and float64 would spread to float32 rays halfway.
+    None where all are sound or, without dispersion, where none matters.
+    """
+    if not isinstance(wavelength_nm, Tensor):
+        return wavelength_nm, None
+    sound = wavelength_nm > 0
+    return torch.where(sound, wavelength_nm, LINE_D_NM).to(dtype), sound if lens.dispersive else None
+
+
+def start(rays: Rays, first: Medium, mode: Mode, otherwise: int, lit: Tensor | None = None) -> tuple[Rays, Survival]:
+    """Rays with optical direction cosines, and the test that their directions are unit vectors.
+
+    `lit` [N] boolean ends the others before they start.
+    """
     length2 = torch.addcmul(torch.addcmul(rays.dx * rays.dx, rays.dy, rays.dy), rays.dz, rays.dz)
     sound = at_most((length2 - 1).abs(), UNIT_SLACK, spend=mode.spend)
+    if lit is not None:
+        sound = also(sound, lit)
     if mode.freeze:
         # Not even a NaN that comes in may reach the gradients of the others.
-        sound = sound & torch.isfinite(rays.x + rays.y + rays.z)
+        sound = sound & torch.isfinite(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)
     tests = Counts(sound, otherwise) if mode.spend else Labels(sound, otherwise)
     if mode.freeze:
         rays = along_axis(rays, tests, mode.sense, 0.0)

@@ -15,7 +15,7 @@ from neurolens import status as st
 from neurolens.errors import InputError
 from neurolens.optics import glass, thinfilm
 from neurolens.optics.media import absorption_per_mm, media
-from neurolens.optics.passing import Mode, along_axis, bend, meet, start, unit
+from neurolens.optics.passing import Mode, along_axis, bend, check_rays, meet, sound_wavelength, start, unit
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Hit, Medium, Rays, fresnel_transmittance, root, times
 from neurolens.optics.transmission import normal_at, way_mm
@@ -64,13 +64,16 @@ def follow(lens: Lens, rays: Rays, steps: Steps, wavelength_nm: Tensor | float =
         wavelength_nm: number or [N].
 
     Raises:
-        InputError: no steps, a surface that does not exist or is not the next one in the direction of travel.
+        InputError: as `trace` for rays and wavelengths; no steps, a surface that does not exist or is not the next one
+            in the direction of travel.
     """
+    check_rays(rays, wavelength_nm)
     _check(len(lens.surfaces), steps)
+    wavelength_nm, lit = sound_wavelength(lens, wavelength_nm, rays.x.dtype)
     glasses, vertices = media(lens, wavelength_nm), lens.vertices_mm
     absorption = absorption_per_mm(lens, wavelength_nm)
     mode = Mode(sense=1, guard=True, freeze=False)
-    r, tests = start(rays, glasses[0], mode, st.blocked(steps[0][0], st.MISSED))
+    r, tests = start(rays, glasses[0], mode, st.blocked(steps[0][0], st.MISSED), lit)
     power, vertex = torch.ones_like(r.x), 0.0
     points = []
     after = glasses[0]

@@ -106,7 +106,9 @@ def intersect_sphere(
         # Beyond 90 degrees the usual form divides two vanishing numbers; the conjugate form is exact there.
         met = q2 > 0
         backwards = r.dz * sense <= 0
-        conjugate = times(torch.sub(r.dz, q, alpha=sense) / curvature, before.inverse_n2)
+        # A plane given as a tensor: 0 / 0 is not taken, but its gradient would be.
+        bent = torch.where(curvature == 0, 1.0, curvature) if isinstance(curvature, Tensor) else curvature
+        conjugate = times(torch.sub(r.dz, q, alpha=sense) / bent, before.inverse_n2)
         t = torch.where(backwards, conjugate, f / torch.where(backwards, float(sense), denominator))
     elif guard:
         met = (q2 > 0) & (denominator * sense > 0)

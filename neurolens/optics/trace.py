@@ -6,7 +6,6 @@ arrays); float64 for truth, float32 for speed. A ray that cannot go on carries a
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -18,7 +17,7 @@ from neurolens import status as st
 from neurolens.errors import InputError
 from neurolens.optics import glass
 from neurolens.optics.media import media
-from neurolens.optics.passing import Mode, along_axis, bend, meet, start, unit
+from neurolens.optics.passing import Mode, along_axis, bend, check_rays, meet, sound_wavelength, start, unit
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays, times
 from neurolens.optics.transmission import passage
@@ -103,20 +102,24 @@ def trace(
     A direction that is not a unit vector counts as a miss of the first surface.
     Differentiable with respect to rays, wavelength and prescription fields given as tensors.
     """
-    _check(lens, rays, wavelength_nm, towards, record)
+    check_rays(rays, wavelength_nm)
+    if towards not in ("scene", "film"):
+        raise InputError("trace", "towards", towards, '"scene" or "film"')
+    if any(not 0 <= k < len(lens.surfaces) for k in record):
+        raise InputError("trace", "record", tuple(record), f"surfaces from 0 to {len(lens.surfaces) - 1}")
     if transmittance not in (True, False, "polarised"):
         raise InputError("trace", "transmittance", transmittance, 'True, False or "polarised"')
     wanted = _Wanted(transmittance, tuple(record), path)
     needs_grad = any(_differentiated(v) for v in (*rays, wavelength_nm, *_parameters(lens)))
     count = rays.x.shape[0]
     if needs_grad or count <= CHUNK:
-        return _trace_chunk(lens, rays, _sound(wavelength_nm, rays.x.dtype), towards, wanted, needs_grad)
+        return _trace_chunk(lens, rays, wavelength_nm, towards, wanted, needs_grad)
     whole = None
     for i in range(0, count, CHUNK):
         part = slice(i, i + CHUNK)
         lam = wavelength_nm[part] if isinstance(wavelength_nm, Tensor) and wavelength_nm.ndim else wavelength_nm
         chunk = Rays(*(c[part] for c in rays))
-        traced = _trace_chunk(lens, chunk, _sound(lam, rays.x.dtype), towards, wanted, False)
+        traced = _trace_chunk(lens, chunk, lam, towards, wanted, False)
         # Written where it belongs at once: chunks kept until the end would take as much memory again.
         whole = _room(traced, count) if whole is None else whole
         _fill(whole, traced, part)
@@ -155,36 +158,15 @@ def _parameters(lens: Lens) -> list[Any]:
     return [value for row in figures for value in row]
 
 
-def _check(lens: Lens, rays: Rays, wavelength_nm: Tensor | float, towards: str, record: Sequence[int]) -> None:
-    shape, dtype = rays.x.shape, rays.x.dtype
-    if dtype not in (torch.float32, torch.float64):
-        raise InputError("trace", "rays.x", f"({dtype})", "torch.float32 or torch.float64")
-    for name, c in zip(Rays._fields, rays, strict=True):
-        if c.shape != shape or c.dtype != dtype or c.ndim != 1:
-            raise InputError(
-                "trace", f"rays.{name}", f"({tuple(c.shape)}, {c.dtype})", f"[N] like x: {tuple(shape)}, {dtype}"
-            )
-    if isinstance(wavelength_nm, Tensor):
-        if wavelength_nm.ndim and wavelength_nm.shape != shape:
-            raise InputError(
-                "trace", "wavelength_nm", f"({tuple(wavelength_nm.shape)})", f"a number or a tensor {tuple(shape)}"
-            )
-    elif not 0 < wavelength_nm < math.inf:
-        raise InputError("trace", "wavelength_nm", wavelength_nm, "a positive number")
-    if towards not in ("scene", "film"):
-        raise InputError("trace", "towards", towards, '"scene" or "film"')
-    if any(not 0 <= k < len(lens.surfaces) for k in record):
-        raise InputError("trace", "record", tuple(record), f"surfaces from 0 to {len(lens.surfaces) - 1}")
-
-
 def _trace_chunk(
     lens: Lens, rays: Rays, wavelength_nm: Tensor | float, towards: Towards, wanted: _Wanted, freeze: bool
 ) -> Traced:
     sense, order = (1, range(len(lens.surfaces))) if towards == "film" else (-1, range(len(lens.surfaces) - 1, -1, -1))
     vertices = lens.vertices_mm
+    wavelength_nm, lit = sound_wavelength(lens, wavelength_nm, rays.x.dtype)
     glasses = media(lens, wavelength_nm)  # glasses[k] lies before surface k as light travels to the film
     mode = Mode(sense, freeze or wanted.path or bool(wanted.record), freeze)
-    r, tests = start(rays, glasses[0 if sense > 0 else -1], mode, st.blocked(order[0], st.MISSED))
+    r, tests = start(rays, glasses[0 if sense > 0 else -1], mode, st.blocked(order[0], st.MISSED), lit)
     power = passage(lens, wavelength_nm, sense, wanted.transmittance, rays.x)
     crossings: dict[int, Crossing] = {}
     path: list[Rays] = []
@@ -207,13 +189,6 @@ def _trace_chunk(
     r = along_axis(unit(r._replace(z=r.z + vertex), after), tests, sense, vertex)
     arrived = None if power is None else tests.only(power.arrived(), 0.0)
     return Traced(r, tests.status(), arrived, crossings, tuple(path))
-
-
-def _sound(wavelength_nm: Tensor | float, dtype: torch.dtype) -> Tensor | float:
-    """NaN for what is no wavelength; in the precision of the rays, or float64 would spread to float32 rays halfway."""
-    if not isinstance(wavelength_nm, Tensor):
-        return wavelength_nm
-    return torch.where(wavelength_nm > 0, wavelength_nm, math.nan).to(dtype)
 
 
 def _room(part: Any, count: int) -> Any:

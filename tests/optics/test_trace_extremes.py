@@ -227,3 +227,41 @@ def test_no_nan_gradient_where_most_rays_are_lost(towards: str) -> None:
     assert isinstance(total, Tensor)
     for grad in torch.autograd.grad(total, [first.radius_mm, *start]):
         assert torch.isfinite(grad).all()
+
+
+@pytest.mark.parametrize("bad", [math.nan, 0.0, -500.0])
+def test_a_bad_wavelength_spoils_no_gradient(bad: float) -> None:
+    radius = torch.tensor(40.0, dtype=torch.float64, requires_grad=True)
+    singlet = Lens("s", "", (Surface(radius, 5.0, 20.0, 1.6, 40.0), Surface(math.inf, 30.0, 20.0, stop=True)), 2.0)
+    y = torch.linspace(-8, 8, 9, dtype=torch.float64)
+    zero = torch.zeros_like(y)
+    wavelength = torch.full_like(y, 550.0)
+    gradients = []
+    for spoilt in (False, True):
+        lam = wavelength.clone()
+        if spoilt:
+            lam[4] = bad
+        out = trace(singlet, Rays(zero, y, zero - 5, zero, zero, zero + 1), lam, towards="film")
+        keep = torch.arange(9) != 4
+        assert (out.status[keep] == 0).all() and (not spoilt or int(out.status[4]) == st.blocked(0, st.MISSED))
+        gradients.append(torch.autograd.grad((out.rays.dy[keep] ** 2).sum(), radius)[0])
+    assert torch.equal(*gradients) and torch.isfinite(gradients[0])
+
+
+def test_a_plane_given_as_a_tensor_has_a_gradient() -> None:
+    radius = torch.tensor(math.inf, dtype=torch.float64, requires_grad=True)
+    plate = Lens("p", "", (Surface(radius, 5.0, 20.0, 1.6), Surface(-30.0, 30.0, 20.0, stop=True)), 2.0)
+    y = torch.linspace(-8, 8, 9, dtype=torch.float64)
+    zero = torch.zeros_like(y)
+    out = trace(plate, Rays(zero, y, zero - 5, zero, zero, zero + 1), towards="film")
+    (slope,) = torch.autograd.grad(out.rays.dy.square().sum(), radius)
+    assert (out.status == 0).all() and torch.isfinite(slope)
+
+
+def test_coordinates_that_overflow_spoil_no_gradient() -> None:
+    radius = torch.tensor(40.0, dtype=torch.float64, requires_grad=True)
+    singlet = Lens("s", "", (Surface(radius, 5.0, 20.0, 1.6), Surface(math.inf, 30.0, 20.0, stop=True)), 2.0)
+    y = torch.tensor([1.0, 2.0, 1e200], dtype=torch.float64)
+    zero = torch.zeros_like(y)
+    out = trace(singlet, Rays(zero, y, zero - 5, zero, zero, zero + 1), towards="film")
+    assert torch.isfinite(torch.autograd.grad(out.rays.dy[:2].sum(), radius)[0])
