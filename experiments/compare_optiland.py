@@ -199,9 +199,12 @@ def page(rows: list[dict[str, Any]], rounds: int) -> str:
         for name, a in row["against"].items():
             figures = f"{a['position_mm']:.1e} | {a['angle_rad']:.1e} | {a['one_passes']}"
             lines.append(f"| {lens} | {dtype} | {name} | {figures} | 65536 |")
-    eager = [v["min"] for r in rows if r["name"] == "neurolens, eager" for v in r["faster_than"].values()]
-    reached = "reached" if min(eager) >= GOAL else "missed"
-    lines += ["", f"Goal: eager at least {GOAL:g} times Optiland, numpy and torch: {reached} (least {min(eager):.1f})."]
+    lines += ["", f"Goal: eager at least {GOAL:g} times Optiland, numpy and torch, in the same precision."]
+    for dtype in DTYPES:
+        eager = [r for r in rows if r["name"] == "neurolens, eager" and r["dtype"] == dtype]
+        least = min(v["min"] for r in eager for v in r["faster_than"].values())
+        lines.append(f"{dtype}: {'reached' if least >= GOAL else 'missed'}, at least {least:.1f} times.")
+    lines.append("Optiland's numpy backend meets conics in a kernel that numba compiles; ours above is plain torch.")
     return "\n".join(lines) + "\n"
 
 
