@@ -129,7 +129,7 @@ def meet(lens: Lens, k: int, r: Rays, before: Medium, entering: bool, mode: Mode
         depth = hit.z * surface.curvature
         tests.require(at_most(depth, 1 - math.sqrt(1 - _rim_sine(surface) ** 2), spend=mode.spend), k, st.RIM)
     else:
-        distance2 = torch.addcmul(hit.x * hit.x, hit.y, hit.y)
+        distance2 = (hit.x * hit.x).addcmul_(hit.y, hit.y)
         if plane:
             # A sphere's square root turns NaN and overflow into a miss; a plane would let them go on.
             tests.end(distance2 < math.inf)

@@ -13,9 +13,9 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
-# Azimuths at which lenses with cylinders are searched, 15 degrees apart. Their two planes of symmetry give the rest:
-# what passes at -a is the mirror image of what passes at a.
-AZIMUTHS = tuple(math.radians(15 * k) for k in range(-6, 7))
+# Azimuths at which lenses with cylinders are searched, 5 degrees apart: at 15, one of them lost 7% of its corners.
+# Their two planes of symmetry give the rest: what passes at -a is the mirror image of what passes at a.
+AZIMUTHS = tuple(math.radians(5 * k) for k in range(-18, 19))
 
 
 def pupil_plane_z_mm(lens: Lens) -> float:

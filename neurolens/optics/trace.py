@@ -7,6 +7,7 @@ arrays); float64 for truth, float32 for speed. A ray that cannot go on carries a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -103,6 +104,7 @@ def trace(
     Differentiable with respect to rays, wavelength and prescription fields given as tensors.
     """
     check_rays(rays, wavelength_nm)
+    _keep_memory()
     if towards not in ("scene", "film"):
         raise InputError("trace", "towards", towards, '"scene" or "film"')
     if any(not 0 <= k < len(lens.surfaces) for k in record):
@@ -144,6 +146,16 @@ def compile_trace(
         glass.index_of(surface, glass.LINE_D_NM)
         glass.absorption_of(surface, glass.LINE_D_NM)
     return torch.compile(run, dynamic=False)
+
+
+@cache
+def _keep_memory() -> None:
+    """Make glibc keep the memory of chunks between operators, once a process.
+
+    By default it hands blocks of 128 KiB back to the system, and half the time of a trace would go into getting them
+    again. Freeing one larger block raises that limit to its size (mallopt(3), M_MMAP_THRESHOLD); it is never touched.
+    """
+    torch.empty(30 << 20, dtype=torch.uint8)
 
 
 def _differentiated(value: Any) -> bool:
