@@ -1,4 +1,7 @@
-"""The command line: `neurolens lens | analyse | glass | train | evaluate | render`. Errors are one line and exit code 2."""
+"""The command line: `neurolens lens | analyse | glass | convert | train | evaluate | render | bench`.
+
+Errors are one line and exit code 2.
+"""
 
 from __future__ import annotations
 

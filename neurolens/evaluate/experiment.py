@@ -52,9 +52,9 @@ class LensChoice:
         Raises:
             InputError: a length or f-number that is not positive, and whatever `read_lens` and `Lens.at` refuse.
         """
-        for field, value in (("lens.efl_mm", self.efl_mm), ("lens.f_number", self.f_number)):
+        for name, value in (("lens.efl_mm", self.efl_mm), ("lens.f_number", self.f_number)):
             if value is not None and not value > 0:
-                raise InputError("settings", field, value, "a positive number")
+                raise InputError("settings", name, value, "a positive number")
         lens = read_lens(self.file).with_aperture(None)
         return lens.at(focal_length_mm=self.efl_mm, zoom=self.configuration, f_number=self.f_number)
 

@@ -9,7 +9,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from neurolens.errors import NeurolensWarning
+from neurolens.errors import InputError, NeurolensWarning
 from neurolens.optics import catalogue
 from neurolens.optics.dispersion import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
 from neurolens.optics.prescription import Surface
@@ -70,9 +70,13 @@ def index_of(surface: Surface, wavelength_nm: Any) -> Any:
     The catalogue's where the surface names a glass; else by its n_d and V_d, constant where V_d is unknown.
 
     Raises:
-        InputError: a glass that the catalogue does not have.
+        InputError: a glass that the catalogue does not have, or one beside an n_d whose gradient is wanted.
     """
     if surface.glass is not None:
+        if getattr(surface.n_d, "requires_grad", False):
+            raise InputError(
+                f"glass {surface.glass}", "n_d", "(a tensor)", "no catalogue glass beside an index to learn"
+            )
         return glass_of(surface.glass).index(wavelength_nm)
     return index_at(surface.n_d, surface.V_d, wavelength_nm)
 

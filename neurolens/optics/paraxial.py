@@ -151,8 +151,8 @@ def _pinhole(lens: Lens, indices: list[Any]) -> FirstOrder:
 
 def stop_radius_mm(lens: Lens, f_number: float) -> float:
     """Radius of the stop for f-number N = EFL / paraxial entrance-pupil diameter at infinity focus."""
-    now = first_order(lens)
-    return lens.stop_radius_mm * now.f_number / f_number
+    # By an opening of 1 mm: a stop that is shut has no f-number to start from.
+    return first_order(lens.with_stop_radius(1.0)).f_number / f_number
 
 
 def film_z_mm(lens: Lens, focus_m: float) -> float:

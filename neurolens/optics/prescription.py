@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import accumulate
@@ -191,9 +192,10 @@ class Lens:
 
         Args:
             focus_m: distance from object to film in metres, `inf` allowed; None focuses at infinity (a focus state
-                chosen by its name: at the object of the source).
+                chosen by its name: at the object of the source), and leaves the focus where `f_number` alone is given.
             f_number: EFL / paraxial entrance-pupil diameter at infinity focus, of a bladed stop by the circle round it.
-                None keeps the stop. A stop wider than the rims let light through is allowed: they then vignette.
+                None keeps the stop, but for a zoom state with a stop of its own. A stop wider than the rims let light
+                through is allowed: they then vignette.
             focal_length_mm: rescale the whole lens so that its focal length at infinity focus is this.
             field_deg: full field of view at infinity focus that the image circle shall see: the lens is rescaled, the
                 image circle stays (by the traced chief ray, along x; distortion included).
@@ -253,14 +255,22 @@ class Lens:
 
 def _figures(s: Surface) -> list[Any]:
     """What a surface does to rays, for the hash; what a plain sphere of glass has not is left out."""
-    row = [float(s.radius_mm), float(s.thickness_mm), None if s.stop else s.diameter_mm, float(s.n_d), s.V_d, s.stop]
+    radius = float(s.radius_mm)
+    row = [
+        abs(radius) if math.isinf(radius) else radius,
+        float(s.thickness_mm),
+        None if s.stop else float(s.diameter_mm),
+        float(s.n_d),
+        None if s.V_d is None else float(s.V_d),
+        s.stop,
+    ]
     more = {
         "conic": float(s.conic),
         "asphere": [(p, float(a)) for p, a in s.asphere],
         "cylinder": s.cylinder,
         "glass": s.glass,
-        "absorption_per_mm": s.absorption_per_mm,
-        "coating": s.coating and s.coating.layers,
+        "absorption_per_mm": float(s.absorption_per_mm),
+        "coating": s.coating and [[float(n), float(nm)] for n, nm in s.coating.layers],
     }
     more = {key: value for key, value in more.items() if value}
     return [*row, more] if more else row

@@ -150,12 +150,9 @@ def _check(lens: Lens, radius: Array) -> None:
 
 def _rings(lens: Lens) -> set[int]:
     """Rows that bend nothing and are not the stop: hoods and other rings."""
-    before = (1.0, *(float(s.n_d) for s in lens.surfaces))
-    return {
-        k
-        for k, s in enumerate(lens.surfaces)
-        if not s.stop and float(s.n_d) == before[k] and (k == 0 or s.glass == lens.surfaces[k - 1].glass)
-    }
+    air = (1.0, None, None)
+    media = [air, *((float(s.n_d), s.V_d, s.glass) for s in lens.surfaces)]
+    return {k for k, s in enumerate(lens.surfaces) if not s.stop and media[k] == media[k + 1]}
 
 
 class _Search:

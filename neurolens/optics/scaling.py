@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
+from neurolens.errors import InputError
 from neurolens.optics.prescription import Configuration, Lens, Surface
 
 
 def scaled(lens: Lens, factor: float) -> Lens:
-    """All lengths times `factor`; angles, indices and f-number stay."""
+    """All lengths times `factor`; angles, indices and f-number stay.
+
+    A grey filter keeps its density (its absorption per mm shrinks as it grows), a catalogue glass absorbs more when it
+    is thicker, and coatings keep their layers.
+
+    Raises:
+        InputError: a factor that is not positive and finite.
+    """
+    if not 0 < factor < math.inf:
+        raise InputError(lens.path, "factor", factor, "a positive number")
 
     def scale(value: Any) -> Any:
         return None if value is None else value * factor

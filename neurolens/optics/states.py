@@ -30,6 +30,13 @@ def at(
 ) -> Lens:
     """The lens in another state; arguments and errors are those of `Lens.at`."""
     _check(lens, focus_m, f_number, focal_length_mm, field_deg, focus)
+    if (
+        f_number is not None
+        and lens.film_z_mm is not None
+        and (focus_m, focal_length_mm, field_deg, zoom) == (None,) * 4
+    ):
+        # Closing the stop leaves the focus where it is.
+        return lens.with_stop_radius(paraxial.stop_radius_mm(at_infinity(lens), f_number))
     lens, object_mm = at_infinity(lens), None
     if isinstance(zoom, str) and zoom not in [c.name for c in lens.configurations]:
         zoom = _millimetres(zoom)
@@ -78,13 +85,26 @@ def in_state(lens: Lens, state: Configuration) -> Lens:
         moved = moved.with_stop_radius(state.stop_diameter_mm / 2)
     return replace(
         moved,
-        half_field_deg=lens.half_field_deg if state.half_field_deg is None else state.half_field_deg,
-        f_number=lens.f_number if state.f_number is None else state.f_number,
+        half_field_deg=half_field_in(lens, state),
+        f_number=_f_number_in(lens, state),
         stated_efl_mm=state.efl_mm,
         stated_efl_x_mm=None,
         derived="",
         infinity_mm=tuple((k, start[k]) for k, _ in state.thickness_mm) if near else (),
     )
+
+
+def half_field_in(lens: Lens, state: Configuration) -> float | None:
+    """Half field of a state: its own, else that of the image circle where the lens has one (None), else the lens's."""
+    return state.half_field_deg or (None if lens.image_radius_mm is not None else lens.half_field_deg)
+
+
+def _f_number_in(lens: Lens, state: Configuration) -> float:
+    """Nominal f-number of a state: its own, else that of the zoom state which it focuses, else the lens's."""
+    if state.f_number is None and state.object_distance_mm is not None:
+        focused = zoom_state_of(lens, state)
+        return lens.f_number if focused is None or focused.f_number is None else focused.f_number
+    return lens.f_number if state.f_number is None else state.f_number
 
 
 def _check(

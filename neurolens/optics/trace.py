@@ -166,8 +166,12 @@ def _differentiated(value: Any) -> bool:
 
 
 def _parameters(lens: Lens) -> list[Any]:
-    figures = ((s.radius_mm, s.thickness_mm, s.n_d, s.conic, *(a for _, a in s.asphere)) for s in lens.surfaces)
-    return [value for row in figures for value in row]
+    """Every figure of the prescription that may be a tensor."""
+    found: list[Any] = []
+    for s in lens.surfaces:
+        found += (s.radius_mm, s.thickness_mm, s.n_d, s.V_d, s.conic, s.absorption_per_mm, *(a for _, a in s.asphere))
+        found += (figure for layer in (s.coating.layers if s.coating else ()) for figure in layer)
+    return found
 
 
 def _trace_chunk(

@@ -19,7 +19,7 @@ from neurolens.optics.interpolate import monotone
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.prescription import Coating, Lens, Surface
 from neurolens.optics.trace import Rays, trace
 
 pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
@@ -411,3 +411,57 @@ def test_every_shipped_lens_with_states_reaches_all_of_them() -> None:
             assert lens.at(zoom=state.name).film_z_mm is not None
         for state in focus_states(lens):
             assert nearest_focus_m(lens.at(zoom=state.name)) > 0
+
+
+def test_a_named_state_does_not_depend_on_the_way_to_it() -> None:
+    for name in ("nikon_zoom_14_24", "nikon_zoom_70_200", "ogawa_zoom_70_200", "itoh_zoom_100_146"):
+        table = tabled(name)
+        for state in table.configurations:
+            for other in table.configurations:
+                direct, round_about = table.at(zoom=state.name), table.at(zoom=other.name).at(zoom=state.name)
+                assert direct.half_field_deg == round_about.half_field_deg, (name, other.name, state.name)
+                assert direct.f_number == round_about.f_number, (name, other.name, state.name)
+                assert direct.vertices_mm == pytest.approx(round_about.vertices_mm, abs=1e-12)
+
+
+def test_closing_the_stop_leaves_the_focus() -> None:
+    lens = tabled("laikin_double_gauss_50").at(focus_m=1.0)
+    closed = lens.at(f_number=8)
+    assert closed.film_z_mm == lens.film_z_mm and first_order(closed).f_number == pytest.approx(8)
+    assert closed == tabled("laikin_double_gauss_50").at(focus_m=1.0, f_number=8)
+    zoom = tabled("nikon_zoom_70_200").at(zoom="135mm", focus_m=2.0, focus="internal")
+    assert zoom.at(f_number=8).vertices_mm == zoom.vertices_mm
+
+
+def test_a_shut_stop_opens_again() -> None:
+    shut = tabled("laikin_double_gauss_50").with_stop_radius(0.0)
+    assert first_order(shut.at(f_number=4)).f_number == pytest.approx(4)
+
+
+@pytest.mark.parametrize("factor", [0.0, -1.0, math.nan, math.inf])
+def test_sizes_that_are_none(factor: float) -> None:
+    with pytest.raises(InputError, match="factor"):
+        tabled("laikin_double_gauss_50").scaled(factor)
+
+
+def test_equal_lenses_have_one_hash() -> None:
+    lens = tabled("laikin_double_gauss_50")
+    other = [
+        replace(s, diameter_mm=int(s.diameter_mm) if s.diameter_mm == int(s.diameter_mm) else s.diameter_mm)
+        for s in lens.surfaces
+    ]
+    other[lens.stop_index] = replace(other[lens.stop_index], radius_mm=-math.inf)
+    assert replace(lens, surfaces=tuple(other)).sha256 == lens.sha256
+
+
+def test_gradients_of_coatings_and_absorption() -> None:
+    """Layers and absorption may be learnt too."""
+    nm, grey = (torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (90.0, 0.01))
+    film = Coating("c", ((1.38, nm),))  # type: ignore[arg-type]
+    front = Surface(40.0, 5.0, 20.0, 1.6, coating=film, absorption_per_mm=grey)  # type: ignore[arg-type]
+    lens = Lens("c", "", (front, Surface(math.inf, 30.0, 20.0, stop=True)), 2.0)
+    y = torch.linspace(-5, 5, 5, dtype=torch.float64)
+    out = trace(lens, Rays(0 * y, y, 0 * y - 5, 0 * y, 0 * y, 0 * y + 1), 550.0, towards="film", transmittance=True)
+    assert out.transmittance is not None
+    found = torch.autograd.grad(out.transmittance.sum(), (nm, grey))
+    assert float(found[0]) != 0 and float(found[1]) == pytest.approx(-float((out.transmittance * 5.0).sum()), rel=0.1)
