@@ -18,6 +18,8 @@ from neurolens.errors import ModelError
 from neurolens.modelfile import CARD_KEY, CARD_KIND, CARD_SCHEMA
 
 MAX_BYTES = 64 * 2**20
+INPUT_ROWS = 16  # rows of an input: more than any has
+MAX_ROWS = 20_000  # of any tensor inside; the largest polynomials known have a thousand terms
 OPERATORS = frozenset(
     "Abs Add And Cast Clip Concat Cos Div Equal Gather Gemm Greater GreaterOrEqual Identity LessOrEqual MatMul Max Min "
     "Mul Neg Reciprocal ReduceSum Relu Reshape Sin Slice Split Sqrt Sub Tanh Where".split()
@@ -92,6 +94,36 @@ def _check_graph(graph: Fields, opsets: list[str], functions: bool) -> None:
                 raise ModelError(f"operator {kind}: an attribute holds a tensor or a graph, expected numbers only")
     for tensor in map(_fields, graph.get(5, [])):
         _check_tensor(tensor)
+    _check_sizes(graph)
+
+
+def _check_sizes(graph: Fields) -> None:
+    """Refuse graphs whose tensors grow beyond reason, before any memory is taken for them.
+
+    Tensors of a lens model are [rows, rays]. No operator of the list makes more rows than its largest input has, but
+    Concat, which adds them up; a chain of those could ask for any amount from a file of a thousand bytes.
+    """
+    rows = {_text(t, 8): max(_dimensions(t), default=1) for t in map(_fields, graph.get(5, []))}
+    for node in map(_fields, graph.get(1, [])):
+        sizes = [rows.get(bytes(name).decode("utf-8"), INPUT_ROWS) for name in node.get(1, [])]
+        grown = sum(sizes) if _text(node, 4) == "Concat" else max(sizes, default=1)
+        if grown > MAX_ROWS:
+            raise ModelError(f"operator {_text(node, 4)} makes {grown} rows, expected at most {MAX_ROWS}")
+        rows.update((bytes(name).decode("utf-8"), grown) for name in node.get(2, []))
+
+
+def _dimensions(tensor: Fields) -> list[int]:
+    """dims of a TensorProto, packed or one by one."""
+    found: list[int] = []
+    for chunk in tensor.get(1, []):
+        if isinstance(chunk, int):
+            found.append(chunk)
+            continue
+        at = 0
+        while at < len(chunk):
+            size, at = _varint(chunk, at)
+            found.append(size)
+    return found
 
 
 def _check_tensor(tensor: Fields) -> None:

@@ -149,6 +149,12 @@ DAMAGE: dict[str, tuple[Callable[[ModelProto], object], str]] = {
         lambda p: p.graph.initializer.append(helper.make_tensor("s", TensorProto.STRING, [1], [b"x"])),
         "type 8",
     ),
+    "rows without end": (
+        lambda p: p.graph.node.extend(
+            helper.make_node("Concat", [f"g{k}" if k else "film_z_mm"] * 16, [f"g{k + 1}"], axis=0) for k in range(12)
+        ),
+        "rows, expected at most",
+    ),
     "broken graph": (lambda p: p.graph.node.pop(0), "cannot load"),
 }
 
