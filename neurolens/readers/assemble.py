@@ -19,6 +19,7 @@ from neurolens.readers.source import warn
 
 # A diameter that the file does not give, until `finish` has found it.
 UNKNOWN = math.nan
+NARROWER = 1e-4  # relative: by less, two figures of the stop differ by the rounding of what is printed
 SAME_INDEX, SAME_ABBE = 2e-5, 0.005  # how near the catalogue printed figures are to be those of a named glass
 
 
@@ -27,6 +28,7 @@ def finish(
     *,
     pupil_mm: float | None = None,
     film_given: bool = True,
+    stop_limit_mm: float | None = None,
 ) -> Lens:
     """A lens from the rows of a file, with what follows from them: f-number or stop, and back focus.
 
@@ -38,6 +40,8 @@ def finish(
             the stop where neither pupil nor stop diameter are known).
         pupil_mm: diameter of the entrance pupil, where the file gives that; it rules over the stop's diameter.
         film_given: whether the last thickness is the file's; else it becomes the paraxial back focus.
+        stop_limit_mm: diameter of the aperture that the file sets on the stop itself; the smaller of it and of what
+            pupil or f-number ask for is taken, with a warning.
 
     Raises:
         InputError: no row, too many, no stop or several, a figure out of range, a last medium that is not air, a stop
@@ -56,6 +60,10 @@ def finish(
         if math.isnan(stated):
             raise InputError(lens.path, "stop", "(no diameter, no f-number)", "one of them: give --f-number")
         trial = trial.with_stop_radius(trial.stop_radius_mm * data.f_number / stated)
+    asked = 2 * trial.stop_radius_mm
+    if smaller_stop(lens.path, asked, stop_limit_mm) != asked:
+        trial = trial.with_stop_radius((stop_limit_mm or asked) / 2)
+        stated = first_order(trial).f_number
     if math.isnan(stated):
         stated = first_order(trial).f_number
         warn(lens.path, f"no f-number is stated; f/{stated:.4g} follows from the stop's diameter")
@@ -65,6 +73,18 @@ def finish(
         if data.back_focus_mm <= 0:
             raise InputError(lens.path, "back focus", data.back_focus_mm, "a film behind the last surface")
     return replace(lens, surfaces=tuple(rows), f_number=float(stated))
+
+
+def smaller_stop(file: str, asked: float, limit: float | None, state: str = "") -> float:
+    """The smaller of two diameters of the stop: by pupil or f-number, and of its own aperture; warns of the latter."""
+    if limit is None or not limit < asked * (1 - NARROWER):
+        return asked
+    warn(
+        file,
+        f"{state}pupil or f-number ask for a stop {asked:.6g} wide, its own aperture is {limit:.6g} "
+        "(in the file's unit): the smaller is taken",
+    )
+    return limit
 
 
 def with_rims(lens: Lens) -> Lens:

@@ -9,7 +9,7 @@ from pathlib import Path
 from neurolens.errors import InputError
 from neurolens.optics.lensrows import MAX_SURFACES
 from neurolens.optics.prescription import Configuration, Lens, Surface
-from neurolens.readers.assemble import check_states, finish, first_order, moved, with_rims
+from neurolens.readers.assemble import check_states, finish, first_order, moved, smaller_stop, with_rims
 from neurolens.readers.source import unit_mm, warn
 
 
@@ -121,9 +121,9 @@ def lens_of(draft: Draft, given: Given | None = None) -> Lens:
         path=draft.file,
     )
     if draft.f_number is not None and draft.pupil is None and lens.surfaces:
-        # The file's f-number rules over whatever diameter it prints for the stop.
+        # The file's f-number rules over whatever diameter it prints for the stop, an aperture set on it aside.
         lens = _open_stop(lens)
-    lens = finish(lens, pupil_mm=draft.pupil, film_given=draft.film_given)
+    lens = finish(lens, pupil_mm=draft.pupil, film_given=draft.film_given, stop_limit_mm=_stop_aperture(draft))
     lens = replace(lens, configurations=tuple(_configuration(lens, draft, state) for state in _states(draft)))
     lens = with_rims(lens.scaled(factor) if factor != 1 else lens)
     check_states(lens)
@@ -133,6 +133,12 @@ def lens_of(draft: Draft, given: Given | None = None) -> Lens:
 def _open_stop(lens: Lens) -> Lens:
     rows = (replace(s, diameter_mm=math.nan) if s.stop else s for s in lens.surfaces)
     return replace(lens, surfaces=tuple(rows))
+
+
+def _stop_aperture(draft: Draft) -> float | None:
+    """Diameter of the aperture that the file sets on the stop itself, in its unit."""
+    stops = (row.surface.diameter_mm for row in draft.rows if row.surface.stop and row.aperture)
+    return next((d for d in stops if not math.isnan(d)), None)
 
 
 def _states(draft: Draft) -> tuple[State, ...]:
@@ -160,7 +166,9 @@ def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
         if pupil is None and draft.f_number is not None:
             pupil = abs(data.efl_mm) / draft.f_number
     if pupil is not None and opening is None:
-        opening = 2 * there.stop_radius_mm * pupil / data.entrance_pupil_diameter_mm
+        asked = 2 * there.stop_radius_mm * pupil / data.entrance_pupil_diameter_mm
+        opening = smaller_stop(draft.file, asked, _stop_aperture(draft), f'state "{state.name}": ')
+        f_number = f_number if opening == asked else None
     if f_number is None and opening is not None:
         f_number = data.f_number * 2 * there.stop_radius_mm / opening
     distance = state.object_distance if math.isfinite(state.object_distance) else None

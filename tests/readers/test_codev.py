@@ -214,3 +214,10 @@ def test_a_lens_without_field_and_rims_is_refused(tmp_path: Path) -> None:
     text = swapped("XAN   0.0 3.0\nYAN   0.0 4.0\n", "", swapped("  CIR 9 ; CIR EDG 9.5\n", ""))
     with pytest.raises(InputError, match="--half-field"):
         read(text, tmp_path)
+
+
+def test_the_stop_s_own_aperture_clips_what_the_pupil_asks_for(tmp_path: Path) -> None:
+    with pytest.warns(NeurolensWarning, match="ask for a stop 10 wide, its own aperture is 6 "):
+        lens = read(swapped("CIR 8", "CIR 3.0"), tmp_path)
+    assert lens.surfaces[0].diameter_mm == pytest.approx(6.0)
+    assert lens.f_number == pytest.approx(first_order(lens).f_number)

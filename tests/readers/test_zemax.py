@@ -276,3 +276,16 @@ def test_rims_that_are_not_given_are_derived_for_the_field(tmp_path: Path) -> No
         read(without, tmp_path)
     assert read(without, tmp_path, Given(half_field_deg=5.0)).surfaces == lens.surfaces
     assert math.isfinite(lens.surfaces[1].diameter_mm)
+
+
+@pytest.mark.parametrize("sized", ["ENPD 25", "FNUM 2 0"])
+def test_the_stop_s_own_aperture_clips_what_the_pupil_asks_for(sized: str, tmp_path: Path) -> None:
+    text = swapped("ENPD 10", sized, swapped("  DIAM 8 1", "  FLAP 0 6.0 0\n  DIAM 8 1"))
+    with pytest.warns(NeurolensWarning, match=r"ask for a stop 2[0-9.]+ wide, its own aperture is 12"):
+        lens = read(text, tmp_path)
+    assert lens.surfaces[0].diameter_mm == pytest.approx(12.0)
+    assert lens.f_number == pytest.approx(first_order(lens).f_number)
+    zoom = text[: text.index("MNUM")] + ZOOM.replace("APER 0 1 10", "APER 0 1 14")
+    if sized.startswith("ENPD"):
+        far, near = read(zoom, tmp_path).configurations
+        assert (far.stop_diameter_mm, near.stop_diameter_mm) == (pytest.approx(12.0), pytest.approx(8.0))
