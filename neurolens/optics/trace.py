@@ -104,7 +104,8 @@ def trace(
     Differentiable with respect to rays, wavelength and prescription fields given as tensors.
     """
     check_rays(rays, wavelength_nm)
-    _keep_memory()
+    if not torch.compiler.is_compiling():
+        _keep_memory()
     if towards not in ("scene", "film"):
         raise InputError("trace", "towards", towards, '"scene" or "film"')
     if any(not 0 <= k < len(lens.surfaces) for k in record):
