@@ -41,8 +41,9 @@ def check_clearance(surfaces: Sequence[Surface], file: str, state: str = "") -> 
     """Raise for a rim larger than its radius of curvature and for neighbours that overlap inside their rims.
 
     The gap between two spheres grows or shrinks steadily from the axis outwards, so that axis and the smaller of the
-    two rims decide; other shapes are looked at in between too. The stop's plane may lie inside an element, in front of
-    which (or behind which) it is then listed; what stands on both sides of the stop must be clear of each other.
+    two rims decide; other shapes are looked at in between too. A stop that bends nothing (one medium on both sides) may
+    lie inside an element, in front of which (or behind which) it is then listed; what stands on both sides of it must
+    be clear of each other. A stop on a glass surface is a surface like any other.
 
     Args:
         state: words in front of the surface in messages, for a zoom state of the file.
@@ -56,9 +57,8 @@ def check_clearance(surfaces: Sequence[Surface], file: str, state: str = "") -> 
             raise InputError(file, f"{state}surface {k}, diameter_mm", s.diameter_mm, limit)
     for k, after, axis_gap_mm in neighbours(surfaces):
         if axis_gap_mm < -TOUCH_MM:
-            raise InputError(
-                file, f"{state}surface {k}, thickness_mm", axis_gap_mm, "at least 0, except beside the stop"
-            )
+            expected = "at least 0, except beside a stop with the same medium before and behind it"
+            raise InputError(file, f"{state}surface {k}, thickness_mm", axis_gap_mm, expected)
         gap_mm, height_mm = _narrowest(surfaces[k], surfaces[after], axis_gap_mm)
         if gap_mm < -TOUCH_MM:
             found = f"(an overlap of {-gap_mm:.4g} mm with surface {after}, {height_mm:.4g} mm from the axis)"
@@ -82,10 +82,20 @@ def _narrowest(before: Surface, after: Surface, axis_gap_mm: float) -> tuple[flo
 
 
 def neighbours(surfaces: Sequence[Surface]) -> Iterator[tuple[int, int, float]]:
-    """Pairs of surfaces that may collide, the stop aside, with the distance of their vertices."""
+    """Pairs of surfaces that may collide, a stop that bends nothing aside, with the distance of their vertices."""
+    idle = [s.stop and _same_medium(surfaces, k) for k, s in enumerate(surfaces)]
     for k in range(len(surfaces) - 1):
-        if not surfaces[k].stop and not surfaces[k + 1].stop:
+        if not idle[k] and not idle[k + 1]:
             yield k, k + 1, surfaces[k].thickness_mm
     for k in range(1, len(surfaces) - 1):
-        if surfaces[k].stop and math.isinf(surfaces[k].radius_mm):
+        if idle[k] and math.isinf(surfaces[k].radius_mm):
             yield k - 1, k + 1, surfaces[k - 1].thickness_mm + surfaces[k].thickness_mm
+
+
+def _same_medium(surfaces: Sequence[Surface], k: int) -> bool:
+    """Whether a surface has the same medium before and behind it."""
+    after = surfaces[k]
+    if not k:
+        return after.n_d == 1
+    before = surfaces[k - 1]
+    return (before.n_d, before.V_d, before.glass) == (after.n_d, after.V_d, after.glass)

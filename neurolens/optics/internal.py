@@ -133,10 +133,16 @@ def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = 
     if not nearest > 0:
         raise InputError(lens.path, "focus", "internal", "focus states that focus nearer than infinity")
     if wanted > nearest * (1 + 1e-9):
-        limit = f"at least {1 / nearest / 1000:.4g} m, the nearest focus of the source's states"
+        limit = f"at least {_rounded_up(1 / nearest / 1000):g} m, the nearest focus of the source's states"
         raise InputError(lens.path, "focus_m", focus_m, limit)
     s = _solve(lambda s: _vergence(place(s)) - wanted, furthest) if wanted else 0.0
     return replace(place(s), infinity_mm=tuple((k, lens.surfaces[k].thickness_mm) for k in path.steps[0]))
+
+
+def _rounded_up(value: float) -> float:
+    """A positive number with four digits, never below itself: a distance printed as the limit must be allowed."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 3)
+    return math.ceil(value / step - 1e-9) * step
 
 
 def nearest_focus_m(lens: Lens) -> float:

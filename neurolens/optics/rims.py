@@ -152,7 +152,10 @@ def _beams(lens: Lens, rule: RimRule, field_deg: float) -> tuple[list[float], li
     bundle = aim_at_stop(lens, share * math.radians(field_deg), heights)
     if not bundle.reached[:, len(_HEIGHTS) // 2].all():
         widest = math.degrees(float(bundle.field_rad[-1, len(_HEIGHTS) // 2]))
-        raise InputError(lens.path, "half_field_deg", field_deg, f"at most {widest:.1f}, where the chief ray ends")
+        expected = f"at most {widest:.3g}, where the chief ray ends"
+        if not 0 < widest < field_deg:  # a chief ray that turns back on its way tells no limit
+            expected = "a field whose chief ray meets the middle of the stop: none does (a wrong radius or thickness?)"
+        raise InputError(lens.path, "half_field_deg", field_deg, expected)
     every = range(len(lens.surfaces))
     with torch.no_grad():
         traced = trace(without_rims(lens), bundle.rays, towards="film", record=every)
@@ -169,7 +172,10 @@ def _clear_of_neighbours(states: Sequence[Lens], diameters: Sequence[float]) -> 
             smaller = min(found[k], found[after])
             room = _meeting_height(state.surfaces[k], state.surfaces[after], gap, smaller / 2)
             if 2 * room < smaller:
-                for which in _which_to_trim(state.surfaces[k], state.surfaces[after], k, after, room):
+                trimmed = _which_to_trim(state.surfaces[k], state.surfaces[after], k, after, room)
+                if state.stop_index in (k, after):  # a stop on glass keeps its size
+                    trimmed = (after if k == state.stop_index else k,)
+                for which in trimmed:
                     found[which] = min(found[which], math.floor(2 * room / _STEP_MM) * _STEP_MM)
     return [round(d, 4) for d in found]
 

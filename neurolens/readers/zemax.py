@@ -125,14 +125,17 @@ def _surface(file: File, block: Block, line: Line, word: str, rest: list[str]) -
                 raise line.error(word, block.kind, f"one of {', '.join(TYPES)}")
         case "CURV":
             block.curvature = line.numbers(word, rest[:1])[0]
+            block.bends = line if block.curvature else None
         case "CONI":
             block.conic = line.numbers(word, rest[:1])[0]
         case "DISZ":
             block.thickness = thickness(line, word, rest[:1], is_object=len(file.blocks) == 1)
         case "GLAS":
-            block.medium = _glass(line, rest, file.makers)
+            block.medium, block.glass = _glass(line, rest, file.makers), line
         case "DIAM":
             semi = line.numbers(word, rest[:1])[0]
+            if semi < 0:
+                raise line.error(word, semi, "a semi-diameter above 0, or 0 where the program sizes the rim")
             block.semi_diameter = semi if semi > 0 else math.nan
             block.automatic = rest[1:2] == ["0"]
         case "PARM" | "XDAT":

@@ -43,6 +43,9 @@ def draft_of(file: File) -> Draft:
             object.
     """
     *_, image = file.blocks
+    for before, block in zip(file.blocks, file.blocks[1:], strict=False):
+        if block.kind == "COORDBRK" and block.glass is None:
+            block.medium = before.medium  # it stands in the medium of the surface before it
     rows = tuple(Row(_surface_of(b), b.aperture) for b in file.blocks[1:-1])
     for block in file.blocks:
         if math.isnan(block.thickness):

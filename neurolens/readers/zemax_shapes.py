@@ -25,6 +25,8 @@ class Block:
     semi_diameter: float = UNKNOWN
     automatic: bool = True  # whether the program sized the rim from the rays
     medium: dict[str, Any] = field(default_factory=dict)
+    bends: Line | None = None  # where a curvature other than 0 is given
+    glass: Line | None = None  # where the medium is given
     stop: bool = False
     clear: float | None = None  # semi-diameter of an aperture, which rules over the former
     aperture: bool = False
@@ -72,6 +74,9 @@ def shape_of(block: Block) -> dict[str, Any]:
             # The second extra value of a toroid is a normalisation radius, with nothing to normalise.
             if value != 0 and not (block.kind == "TOROIDAL" and name == "XDAT" and n == 2):
                 raise line.error(f"{name} {n} of {block.kind}", value, "0: the lens model has no such term")
+    for word, given in (("CURV", block.bends), ("GLAS", block.glass)):
+        if block.kind == "COORDBRK" and given is not None:
+            raise given.error(f"{word} of COORDBRK", given.text.strip(), "none: a coordinate break is no surface")
     return shape
 
 

@@ -220,6 +220,18 @@ def test_the_stop_may_lie_inside_the_next_element(tmp_path: Path) -> None:
     assert read_lens(write(tmp_path, replaced(row, row.replace("2.0", "-1.5", 1)))).surfaces[3].thickness_mm == -1.5
 
 
+def test_a_stop_on_a_glass_surface_may_not_lie_inside_its_neighbours(tmp_path: Path) -> None:
+    text = replaced(ROW_3, ROW_3.replace(", stop = true", "")).replace(
+        "diameter_mm = 18.0, n_d", "diameter_mm = 18.0, stop = true, n_d"
+    )
+    assert read_lens(write(tmp_path, text)).stop_index == 4
+    for old, new in (
+        ("thickness_mm = 3.0, d", "thickness_mm = -3.0, d"),
+        ("2.0, diameter_mm = 12.0", "-2.0, diameter_mm = 12.0"),
+    ):
+        refuses(write(tmp_path, text.replace(old, new)), ["thickness_mm", "same medium before and behind"])
+
+
 def test_elements_on_both_sides_of_the_stop_must_clear_each_other(tmp_path: Path) -> None:
     text = replaced("radius_mm = -200, thickness_mm = 2.0", "radius_mm = -40, thickness_mm = -0.4")
     text = text.replace("thickness_mm = 2.0, diameter_mm = 12.0", "thickness_mm = -0.4, diameter_mm = 12.0")

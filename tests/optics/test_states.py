@@ -371,6 +371,11 @@ def test_nearer_than_the_nearest_is_an_error_that_names_it() -> None:
     lens.at(focus_m=nearest, focus="internal")
     with pytest.raises(InputError, match=r"1\.71"):
         lens.at(focus_m=0.99 * nearest, focus="internal")
+    with pytest.raises(InputError) as caught:
+        lens.at(focus_m=nearest * (1 - 1e-6), focus="internal")
+    limit = float(caught.value.expected.split()[2])
+    assert nearest <= limit < 1.001 * nearest  # rounded up: what is printed is allowed
+    lens.at(focus_m=limit, focus="internal")
 
 
 # --- Breathing

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -221,3 +222,15 @@ def test_the_stop_s_own_aperture_clips_what_the_pupil_asks_for(tmp_path: Path) -
         lens = read(swapped("CIR 8", "CIR 3.0"), tmp_path)
     assert lens.surfaces[0].diameter_mm == pytest.approx(6.0)
     assert lens.f_number == pytest.approx(first_order(lens).f_number)
+
+
+@pytest.mark.parametrize("radius", ["1.0", "-1.0", "2.0"])
+def test_a_bad_radius_gives_no_limit_that_the_field_keeps(radius: str, tmp_path: Path) -> None:
+    text = swapped("  CIR 9 ; CIR EDG 9.5\n", "", swapped("  CIR 8\n  STO\n", ""))
+    text = swapped("-50.0 45.0", f"{radius} 40.0", swapped("SI    0.0", "S 0 5\n  STO\nSI    0.0", text))
+    text = swapped("S     50.0", f"S {radius}", text)
+    try:
+        read(text, tmp_path)
+    except InputError as error:
+        limit = re.search("at most ([-0-9.e+]+)", str(error))
+        assert limit is None or 0 < float(limit[1].rstrip(",")) < 5

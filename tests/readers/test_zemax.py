@@ -289,3 +289,24 @@ def test_the_stop_s_own_aperture_clips_what_the_pupil_asks_for(sized: str, tmp_p
     if sized.startswith("ENPD"):
         far, near = read(zoom, tmp_path).configurations
         assert (far.stop_diameter_mm, near.stop_diameter_mm) == (pytest.approx(12.0), pytest.approx(8.0))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("DIAM 9 1", "DIAM -12.7 1", r"line 35, DIAM: got -12.7, expected a semi-diameter above 0"),
+        ("DISZ 5.0", "DISZ -600", r"surface 0, thickness_mm: got -600.0, expected at least 0, except beside a stop"),
+        ("TYPE STANDARD\n  CURV 2", "TYPE COORDBRK\n  CURV 2", r"line 24, CURV of COORDBRK"),
+        ('TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""\n', "TYPE COORDBRK\n", r"line 28, GLAS of COORDBRK"),
+    ],
+)
+def test_what_no_lens_has(old: str, new: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        read(swapped(old, new), tmp_path)
+
+
+def test_a_coordinate_break_without_tilt_stands_in_its_medium(tmp_path: Path) -> None:
+    plain = read(HEAD + BODY + TAIL, tmp_path)
+    block = "SURF 2\n  TYPE COORDBRK\n  CURV 0\n  PARM 3 0\n  DISZ 2.0\n"
+    text = swapped("DISZ 5.0", "DISZ 3.0").replace("SURF 3", "SURF 4").replace("SURF 2", block + "SURF 3")
+    assert read(text, tmp_path).surfaces == plain.surfaces
