@@ -16,6 +16,7 @@ from neurolens import status as st
 from neurolens.analysis.aim import Aim
 from neurolens.analysis.fields import DEFAULT_NM, Scene, on_plane
 from neurolens.analysis.patterns import Pattern, hexapolar
+from neurolens.errors import InputError
 from neurolens.optics import apertures
 from neurolens.optics.media import media
 from neurolens.optics.surfaces import Rays
@@ -111,6 +112,21 @@ def bundle(
         status.reshape(shape), shaped(area, other=0.0), area.reshape(shape),
         shaped(aim.lead_mm(u, v) + path), chief.height_mm,
     )  # fmt: skip
+
+
+def check_light(scene: Scene, field_deg: Sequence[float] | None, wavelength_nm: float) -> None:
+    """Raise InputError for a field asked for from which no ray reaches the film, or a lens that passes none at all.
+
+    Of the default fields (None) some may be dark.
+    """
+    fields = scene.default_fields() if field_deg is None else field_deg
+    seen = bundle(scene, [0.0, *fields], [wavelength_nm], hexapolar(12)).passed.any(2).any(1).tolist()
+    if not any(seen):
+        raise InputError(scene.lens.path, "surfaces", "(no ray reaches the film)", "a lens that passes light")
+    dark = [field for field, lit in zip(field_deg or (), seen[1:], strict=False) if not lit]
+    if dark:
+        edge = f"at most {scene.edge_deg():.4g} degrees, the edge of the image"
+        raise InputError(scene.lens.path, f"field {dark[0]:g}", "(no light reaches the film)", edge)
 
 
 def _to_film(scene: Scene, start: Rays, wavelength_nm: Tensor) -> tuple[Rays, Tensor, Tensor]:

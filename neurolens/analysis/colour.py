@@ -11,6 +11,8 @@ from neurolens.analysis.bundles import bundle
 from neurolens.analysis.fields import DEFAULT_NM, Scene
 from neurolens.analysis.patterns import points
 from neurolens.analysis.results import Array, Result
+from neurolens.errors import InputError
+from neurolens.optics.paraxial import is_pinhole
 
 LINE_G_NM = 435.8343  # mercury, the usual fourth line
 
@@ -54,7 +56,13 @@ def colour(
     line_nm: Sequence[float] = (*DEFAULT_NM, LINE_G_NM),
     fields: int = 21,
 ) -> Colour:
-    """Longitudinal colour on the axis by zones, and lateral colour of chief rays up to the edge of the field."""
+    """Longitudinal colour on the axis by zones, and lateral colour of chief rays up to the edge of the field.
+
+    Raises:
+        InputError: a pinhole, which has no focus.
+    """
+    if is_pinhole(scene.lens):
+        raise InputError(scene.lens.path, "surfaces", "(a pinhole)", "a lens with power")
     spectrum = np.linspace(*_VISIBLE_NM, 41) if spectrum_nm is None else np.asarray(spectrum_nm, dtype=np.float64)
     axial = bundle(scene.round, [0.0], spectrum.tolist(), points(list(_ZONES), [0.0] * 3))
     crossing = -(axial.tangential_mm / axial.slopes[0])[0].numpy()

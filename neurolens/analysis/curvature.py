@@ -16,7 +16,9 @@ from neurolens.analysis.fields import Scene
 from neurolens.analysis.patterns import points
 from neurolens.analysis.results import Array, Result
 from neurolens.analysis.seidel import petzval_curvature
+from neurolens.errors import InputError
 from neurolens.optics.glass import LINE_D_NM
+from neurolens.optics.paraxial import is_pinhole
 
 _CLOSE = 1e-3  # stop radii; differences are central, so that the error is of the order of its square
 
@@ -49,7 +51,13 @@ class Curvature(Result):
 def curvature(
     scene: Scene, *, wavelength_nm: float = LINE_D_NM, fields: int = 31, edge_deg: float | None = None
 ) -> Curvature:
-    """Sagittal and tangential foci up to the edge of the field, rims left out of account."""
+    """Sagittal and tangential foci up to the edge of the field, rims left out of account.
+
+    Raises:
+        InputError: a pinhole, which has no focus.
+    """
+    if is_pinhole(scene.lens):
+        raise InputError(scene.lens.path, "surfaces", "(a pinhole)", "a lens with power")
     angles = np.linspace(0, scene.edge_deg() if edge_deg is None else edge_deg, fields)
     pattern = points([-_CLOSE, _CLOSE, 0.0, 0.0], [0.0, 0.0, -_CLOSE, _CLOSE])
     rays = bundle(scene.open, angles.tolist(), [wavelength_nm], pattern)

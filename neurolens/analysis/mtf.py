@@ -10,7 +10,7 @@ import torch
 
 from neurolens.analysis.bundles import bundle
 from neurolens.analysis.fields import DEFAULT_NM, Scene
-from neurolens.analysis.patterns import hexapolar
+from neurolens.analysis.patterns import grid
 from neurolens.analysis.results import Array, Result
 from neurolens.analysis.spots import working_f_number
 
@@ -45,10 +45,15 @@ def mtf(
     *,
     frequency_per_mm: Sequence[float] | None = None,
     shift_mm: float = 0.0,
-    rings: int = 16,
+    across: int = 128,
 ) -> Mtf:
-    """Modulus of the energy-weighted mean of exp(2 pi i f x) over the rays of all wavelengths."""
-    rays = bundle(scene, scene.default_fields() if field_deg is None else field_deg, wavelength_nm, hexapolar(rings))
+    """Modulus of the energy-weighted mean of exp(2 pi i f x) over the rays of all wavelengths; NaN without light.
+
+    The rays fill the stop as a square grid, `across` points wide: a fine one, since rims cut the pupil anywhere. With
+    128 points an even disc of light comes within 0.001 of its Bessel function, and fields that lose up to two thirds
+    of their light to the rims within 0.01 of a grid of 300 points, 0.0025 up to 50 cycles/mm.
+    """
+    rays = bundle(scene, scene.default_fields() if field_deg is None else field_deg, wavelength_nm, grid(across))
     f = np.linspace(0, 100, 101) if frequency_per_mm is None else np.asarray(frequency_per_mm, dtype=np.float64)
     n = working_f_number(scene, wavelength_nm[0])
     weight = (rays.weight / rays.weight.sum((1, 2), keepdim=True)).flatten(1)

@@ -126,8 +126,9 @@ def plot_mtf(data: Mtf, path: str | Path, title: str, subtitle: str) -> Path:
                     ls="--",
                     label=f"{field_name(field)}, sagittal",
                 )
-        limit = f"diffraction limit, f/{data.working_f_number:.3g}"
-        axes.plot(data.frequency_per_mm, data.diffraction_limit, color=INK, ls=":", label=limit)
+        if np.isfinite(data.diffraction_limit).all():
+            limit = f"diffraction limit, f/{data.working_f_number:.3g}"
+            axes.plot(data.frequency_per_mm, data.diffraction_limit, color=INK, ls=":", label=limit)
         axes.grid(True)
         axes.set(xlabel="frequency (cycles/mm)", ylabel="contrast", ylim=(0, 1.02))
         axes.set_xlim(0, data.frequency_per_mm[-1])

@@ -52,12 +52,19 @@ def _spot(axes: Any, data: Spots, field: int, shift_mm: float) -> None:
             s[k] - middle_s, t[k] - middle_t, ".", ms=1.3, mew=0, color=wavelength_colour(nm), label=f"{nm:.0f} nm"
         )
     angle = np.linspace(0, 2 * math.pi, 65)
-    axes.plot(
-        data.airy_um * np.cos(angle), data.airy_um * np.sin(angle), color="black", lw=0.8,
-        label=f"Airy disc, radius {data.airy_um:.1f} µm",
-    )  # fmt: skip
+    if math.isfinite(data.airy_um):
+        axes.plot(
+            data.airy_um * np.cos(angle), data.airy_um * np.sin(angle), color="black", lw=0.8,
+            label=f"Airy disc, radius {data.airy_um:.1f} µm",
+        )  # fmt: skip
     rms = float(np.interp(shift_mm, data.shift_mm, data.through_focus_um[field]))
-    axes.annotate(f"RMS {rms:.3g} µm", (0.04, 0.03), xycoords="axes fraction", fontsize=7, color="#555b63")
+    axes.annotate(
+        f"RMS {rms:.3g} µm" if math.isfinite(rms) else "no light",
+        (0.04, 0.03),
+        xycoords="axes fraction",
+        fontsize=7,
+        color="#555b63",
+    )
 
 
 def _middle(values: np.ndarray) -> float:
@@ -66,7 +73,7 @@ def _middle(values: np.ndarray) -> float:
 
 def _half_width(data: Spots) -> float:
     """Half width that holds nearly all rays at every focus shown."""
-    reach = [data.airy_um * 1.5]
+    reach = [data.airy_um * 1.5] if math.isfinite(data.airy_um) else []
     for shift in (data.shift_mm[0], 0.0, data.shift_mm[-1]):
         t = data.tangential_um + 1000 * shift * data.slope_tangential
         s = data.sagittal_um + 1000 * shift * data.slope_sagittal
@@ -74,7 +81,7 @@ def _half_width(data: Spots) -> float:
             away = np.hypot(t[i] - _middle(t[i]), s[i] - _middle(s[i]))
             if np.isfinite(away).any():
                 reach.append(float(np.nanquantile(away, 0.97)))
-    return 1.1 * max(reach)
+    return 1.1 * max(reach, default=0.0) or 1.0
 
 
 def plot_fans(data: Fans, path: str | Path, title: str, subtitle: str) -> Path:
@@ -113,7 +120,7 @@ def plot_psf(data: Psf, path: str | Path, title: str, subtitle: str) -> Path:
         heading(figure, title, f"Point spread, brightness as square root; {subtitle}")
         grid = figure.subplots(2, columns, squeeze=False)
         for i in range(columns):
-            half = float(data.half_width_um[i])
+            half = float(np.nan_to_num(data.half_width_um[i], nan=1.0))
             for axes, image in zip(grid[:, i], (data.geometric[i], data.diffraction[i]), strict=True):
                 axes.tick_params(labelsize=7.5)
                 axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")

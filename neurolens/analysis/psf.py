@@ -21,6 +21,8 @@ from neurolens.analysis.patterns import grid, hexapolar
 from neurolens.analysis.results import Array, Result
 from neurolens.analysis.spots import working_f_number
 from neurolens.analysis.wavefront import cosines, path_to_chief_mm
+from neurolens.errors import InputError
+from neurolens.optics.paraxial import is_pinhole
 
 _BINS, _POINTS = 49, 97  # of the geometric and the diffraction image, odd: one on the centre
 _FINEST = 128  # points across the pupil that are still traced
@@ -32,8 +34,9 @@ class Psf(Result):
     """Point spread of F fields; images are indexed [tangential, sagittal], centred on the spot's centroid.
 
     Attributes:
-        half_width_um: [F], from the centre of the image to its edge.
-        geometric: [F, 49, 49] share of all wavelengths' energy in each square; what lies outside is missing.
+        half_width_um: [F], from the centre of the image to its edge; NaN without light.
+        geometric: [F, 49, 49] share of all wavelengths' energy in each square; what lies outside is missing; NaN
+            without light.
         diffraction: [F, 97, 97] at the first wavelength, 1 at the peak of the same pupil without aberrations; NaN where
             the aberrations are too large for it (then diffraction does not matter, and `geometric` rules) or next to
             no light arrives.
@@ -59,7 +62,13 @@ def psf(
     *,
     half_width_um: float | None = None,
 ) -> Psf:
-    """Point spread of fields; the window holds the spot and six Airy radii unless its half width is given."""
+    """Point spread of fields; the window holds the spot and six Airy radii unless its half width is given.
+
+    Raises:
+        InputError: a pinhole, whose rays do not meet: it has no focus that waves could be summed about.
+    """
+    if is_pinhole(scene.lens):
+        raise InputError(scene.lens.path, "surfaces", "(a pinhole)", "a lens with power")
     fields = scene.default_fields() if field_deg is None else field_deg
     airy = 1.22e-3 * wavelength_nm[0] * working_f_number(scene, wavelength_nm[0])
     rays = bundle(scene, fields, wavelength_nm, grid(64))
@@ -67,7 +76,9 @@ def psf(
     for k, field in enumerate(fields):
         t, s, w = (v[k].flatten() for v in (rays.tangential_mm, rays.sagittal_mm, rays.weight))
         centre, radius = _spot(t, s, w)
-        window = half_width_um / 1000 if half_width_um else max(6e-3 * airy, 1.1 * radius)
+        window = half_width_um / 1000 if half_width_um else max(6e-3 * np.nan_to_num(airy), 1.1 * radius)
+        if not (window > 0 and w.sum() > 0):
+            window = math.nan
         geometric.append(_histogram(t - centre[0], s - centre[1], w, window))
         count = _needed(scene, field, wavelength_nm[0], window)
         diffraction.append(_diffraction(scene, field, wavelength_nm[0], count, centre, window))
@@ -91,6 +102,8 @@ def _spot(t: Tensor, s: Tensor, w: Tensor) -> tuple[tuple[float, float], float]:
 
 
 def _histogram(t: Tensor, s: Tensor, w: Tensor, half_mm: float) -> Array:
+    if math.isnan(half_mm):
+        return np.full((_BINS, _BINS), np.nan)
     keep = w > 0
     edges = np.linspace(-half_mm, half_mm, _BINS + 1)
     found, _, _ = np.histogram2d(t[keep].numpy(), s[keep].numpy(), bins=(edges, edges), weights=w[keep].numpy())
@@ -103,7 +116,7 @@ def _needed(scene: Scene, field: float, wavelength_nm: float, half_mm: float) ->
     """Points across the pupil so that the phase anywhere in the window turns by less than half a turn between two."""
     rays = bundle(scene, [field], [wavelength_nm], hexapolar(6))
     t, s = cosines(rays)
-    if not rays.passed.any():
+    if math.isnan(half_mm) or not rays.passed.any():
         return 0
     span = max(float(np.nanmax(v) - np.nanmin(v)) for v in (t.numpy(), s.numpy()))
     blur = float(torch.nan_to_num(torch.hypot(rays.tangential_mm, rays.sagittal_mm)).max())

@@ -14,9 +14,11 @@ from neurolens.analysis.bundles import Bundle, bundle
 from neurolens.analysis.fields import DEFAULT_NM, Scene
 from neurolens.analysis.patterns import hexapolar, points
 from neurolens.analysis.results import Array, Result
+from neurolens.optics.paraxial import is_pinhole
 
 _RINGS = 16
 _SHIFTS = 21
+_ZONES = 101  # heights in the stop tried for the outermost ray that passes, and again between two of them
 
 
 @dataclass(frozen=True)
@@ -28,12 +30,12 @@ class Spots(Result):
         tangential_um, sagittal_um: [F, W, P] relative to that chief ray, NaN where blocked.
         slope_tangential, slope_sagittal: [F, W, P], for spots at another focus.
         rms_um: [F] root mean square distance from the centroid, all wavelengths alike, weighted by energy.
-        geometric_um: [F] the largest distance from the centroid.
+        geometric_um: [F] the largest distance from the centroid; NaN, as all sizes, where no ray passes.
         rms_by_wavelength_um: [F, W], each from its own centroid.
         passed: [F] share of the stop's light that no rim takes.
         airy_um: radius of the first dark ring on the axis, 1.22 lambda N with the working f-number.
         shift_mm, through_focus_um: [K] and [F, K], RMS radius with the film moved.
-        best_shift_mm, best_rms_um: [F], where each field's RMS radius is least.
+        best_shift_mm, best_rms_um: [F], where each field's RMS radius is least; NaN where rays stay parallel.
     """
 
     field_deg: Array
@@ -78,7 +80,7 @@ def spots(
         np.array(rays.field_deg), np.array(rays.wavelength_nm), rays.chief_height_mm.numpy(),
         t.numpy(), s.numpy(), st.numpy(), ss.numpy(),
         moments.rms_um(torch.zeros(1, dtype=torch.float64))[:, 0].numpy(),
-        torch.where(rays.passed, away, -math.inf).amax((1, 2)).clamp_min(0.0).numpy(),
+        torch.where(rays.passed, away, -1.0).amax((1, 2)).where(rays.passed.any(2).any(1), math.nan).numpy(),
         _Moments(rays, by_wavelength=True).rms_um(torch.zeros(1, dtype=torch.float64))[..., 0].numpy(),
         (rays.weight.sum((1, 2)) / open_energy).numpy(),
         n, 1.22e-3 * wavelength_nm[0] * n,
@@ -103,7 +105,8 @@ class _Moments:
             self.steep = self.steep + (weight * (b - mean_b) ** 2).sum(along)
 
     def best_shift(self) -> Tensor:
-        return -self.mixed / self.steep
+        # Rays parallel but for rounding meet nowhere.
+        return torch.where(self.steep > 1e-20, -self.mixed / self.steep, math.nan)
 
     def rms_um(self, shift_mm: Tensor) -> Tensor:
         """RMS radius at shifts [K] (or one for each field [F, 1]), with shifts last, in um."""
@@ -112,15 +115,30 @@ class _Moments:
 
 
 def working_f_number(scene: Scene, wavelength_nm: float) -> float:
-    """1 / (2 sin theta') of the real ray through the edge of the stop to the middle of the film; NaN if blocked."""
-    edge = bundle(scene.open.round, [0.0], [wavelength_nm], points([1 - 1e-7], [0.0]))
-    film = edge.film
-    sine = float(torch.hypot(film.dx, film.dy)[0, 0, 0])
+    """1 / (2 sin theta') of the outermost real ray of the axis that passes stop and rims; NaN if none does.
+
+    Of a hole without a lens: its distance from the film over its diameter.
+    """
+    if is_pinhole(scene.lens):
+        return float(scene.first_order.f_number)
+    low, high, sine = 0.0, 1 - 1e-7, 0.0
+    for _ in range(2):
+        heights = np.linspace(low, high, _ZONES)
+        rays = bundle(scene.round, [0.0], [wavelength_nm], points(heights.tolist(), [0.0] * _ZONES))
+        passed = rays.passed[0, 0].numpy()
+        if not passed.any():
+            break
+        sines = torch.hypot(rays.film.dx, rays.film.dy)[0, 0].numpy()
+        sine = max(sine, float(sines[passed].max()))
+        last = int(np.flatnonzero(passed)[-1])
+        if last == _ZONES - 1:
+            break
+        low, high = float(heights[last]), float(heights[last + 1])
     return 1 / (2 * sine) if sine > 0 else math.nan
 
 
 def _span(best: Tensor, f_number: float, wavelength_nm: float) -> Array:
     """Shifts about the film that hold the best foci of the fields, and a few depths of focus in any case."""
-    depth = 4e-6 * wavelength_nm * f_number**2  # 2 x Rayleigh's quarter wave, +- 2 lambda N^2
+    depth = 4e-6 * wavelength_nm * f_number**2 if math.isfinite(f_number) else 0.0  # Rayleigh's, +- 2 lambda N^2
     reach = max(2 * depth, 1.5 * float(torch.nan_to_num(best).abs().median()))
-    return np.linspace(-reach, reach, _SHIFTS)
+    return np.linspace(-reach, reach, _SHIFTS) if reach > 0 else np.linspace(-0.1, 0.1, _SHIFTS)

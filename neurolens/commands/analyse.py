@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import math
 import time
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neurolens.commands import analyse_text as text
-from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between, positive
+from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between, focus_of
 from neurolens.commands.output import print_json
-from neurolens.errors import InputError, NeurolensWarning
+from neurolens.errors import InputError
 
 if TYPE_CHECKING:
     from neurolens.analysis.fields import Scene
-    from neurolens.optics.prescription import Lens
 
 WHATS = (
     *("layout", "spots", "fans", "colour", "curvature", "distortion", "vignetting", "mtf", "seidel", "psf"),
 )  # fmt: skip
+_OF_FIELDS = ("spots", "fans", "mtf", "psf")  # take --fields and --wavelengths
 _BULK = {  # left out of the JSON unless asked for: a number a ray or a pixel
     "layout": ("rays", "surfaces"),
     "spots": ("tangential_um", "sagittal_um", "slope_tangential", "slope_sagittal"),
@@ -72,8 +70,8 @@ def add_parser(subparsers: Any) -> None:
         help="fields of spots, fans, mtf and psf (default: axis, 50%%, 70%%, 85%% and edge of the field)",
     )  # fmt: skip
     parser.add_argument(
-        "--wavelengths", metavar="NM", nargs="+", type=positive("wavelengths in nm"),
-        help="of spots, fans, mtf and psf, the reference first (default: the lines d, F and C)",
+        "--wavelengths", metavar="NM", nargs="+", type=between(300, 2500, "wavelengths in nm"),
+        help="of spots, fans, mtf and psf, 300 to 2500 nm, the reference first (default: the lines d, F and C)",
     )  # fmt: skip
     parser.add_argument(
         "--axis", choices=("x", "y"), default="y", help="plane of the field, for anamorphic lenses (default: y)"
@@ -82,6 +80,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png", help="of the pictures (default: png)")
     add_json(parser)
     parser.add_argument("--full", action="store_true", help="with --json: also every ray and every pixel")
+    parser.intermixed = True
     parser.set_defaults(run=run, kept="pictures that are finished stay")
 
 
@@ -96,10 +95,12 @@ def run(args: argparse.Namespace) -> int:
         if args.output.exists() and not args.output.is_dir():
             raise InputError(args.output, "--output", str(args.output), "a folder")
         args.output.mkdir(parents=True, exist_ok=True)
+    from neurolens.commands.analyse_notes import state_notes
+
     began = time.perf_counter()
-    scene = scene_of(args)
+    scene, doubts = scene_of(args)
     scene.check()
-    found, notes, pictures = {}, [], {}
+    found, pictures, notes = {}, {}, state_notes(scene.lens)
     for what in args.what or WHATS:
         try:
             found[what], picture = _one(what, scene, args)
@@ -111,25 +112,24 @@ def run(args: argparse.Namespace) -> int:
         if picture is not None:
             pictures[what] = str(picture)
     head = {"file": str(args.file), "name": scene.lens.name, "axis": scene.axis, "focus_m": scene.focus_m}
-    more = {"pictures": pictures, "notes": notes, "seconds": time.perf_counter() - began}
+    more = {"pictures": pictures, "notes": notes, "warnings": doubts, "seconds": time.perf_counter() - began}
     if args.json:
         print_json({**head, **{w: _trimmed(w, d, args.full) for w, d in found.items()}, **more})
     else:
-        parts = [f"{scene.lens.name}\n{_subtitle(scene)}", *(_analysis(w).table(d) for w, d in found.items()), *notes]
+        parts = [f"{scene.lens.name}\n{_subtitle(scene)}", *(_analysis(w).table(d) for w, d in found.items())]
+        parts += [*(f"Note: {n}" for n in notes), *(f"Warning: {w}" for w in doubts)]
         if pictures:
             parts.append(f"{len(pictures)} pictures drawn in {args.output}")
         print("\n\n".join(parts))
     return 0
 
 
-def scene_of(args: argparse.Namespace) -> Scene:
-    """The lens in the state that the arguments of `add_lens_state` ask for, with the object it is focused on."""
-    from neurolens.analysis.fields import Scene
-    from neurolens.optics.lensfile import read_lens
+def scene_of(args: argparse.Namespace) -> tuple[Scene, list[str]]:
+    """The lens in the state that the arguments of `add_lens_state` ask for with its object, and what is doubtful."""
+    from neurolens.analysis.fields import DEFAULT_NM, Scene
+    from neurolens.commands.analyse_notes import read_told, table_warnings, wavelength_warnings
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NeurolensWarning)  # doubts about the file are what `neurolens lens` tells
-        tabled = read_lens(args.file)
+    tabled, told = read_told(args.file)
     lens = tabled.at(
         zoom=args.zoom,
         focal_length_mm=args.efl,
@@ -138,25 +138,20 @@ def scene_of(args: argparse.Namespace) -> Scene:
         focus_m=args.focus,
         focus=args.focusing,
     ).with_aperture(aperture_of(args) or tabled.aperture)
-    return Scene(lens, _focus_m(args, tabled, lens), args.axis)
-
-
-def _focus_m(args: argparse.Namespace, tabled: Lens, lens: Lens) -> float:
-    """Film to object in metres: as asked for, or that of the focus state which was named."""
-    if args.focus is not None:
-        return float(args.focus)
-    near = next((c.object_distance_mm for c in tabled.configurations if c.name == args.zoom), None)
-    if near is None:
-        return math.inf
-    scale = lens.surfaces[0].diameter_mm / tabled.surfaces[0].diameter_mm
-    return float(near * scale + (lens.film_z_mm or lens.vertices_mm[-1])) / 1000
+    told += table_warnings(tabled, lens, args.zoom) + wavelength_warnings(lens, args.wavelengths or DEFAULT_NM)
+    return Scene(lens, focus_of(args, tabled, lens), args.axis), told
 
 
 def _one(what: str, scene: Scene, args: argparse.Namespace) -> tuple[dict[str, Any], Path | None]:
     """One analysis as plain data, and its picture where a folder is given."""
+    from neurolens.analysis.bundles import check_light
+    from neurolens.analysis.fields import DEFAULT_NM
+
     analysis = _analysis(what)
     options = {"field_deg": args.fields, "wavelength_nm": args.wavelengths}
-    asked = {k: v for k, v in options.items() if v is not None} if what in ("spots", "fans", "mtf", "psf") else {}
+    asked = {k: v for k, v in options.items() if v is not None} if what in _OF_FIELDS else {}
+    if what in _OF_FIELDS:
+        check_light(scene, args.fields, (args.wavelengths or DEFAULT_NM)[0])
     result = analysis.compute(scene, **asked)
     data = result if isinstance(result, dict) else result.to_dict()
     if args.output is None:

@@ -45,7 +45,7 @@ def spots(data: dict[str, Any]) -> str:
         )
         for i in range(len(data["field_deg"]))
     ]  # fmt: skip
-    airy = f"Airy disc radius {data['airy_um']:.2f} µm at the working f/{data['working_f_number']:.3g}"
+    airy = f"Airy disc radius {number(data['airy_um'], 3)} µm at the working f/{number(data['working_f_number'], 3)}"
     return f"Spots (radius from the centroid, all wavelengths; each by itself; {airy})\n" + table(header, rows)
 
 
@@ -92,7 +92,7 @@ def distortion(data: dict[str, Any]) -> str:
         (*_place(data, i), *(_three(data["error_percent"][n][i]) for n in names)) for i in _some(len(data["field_deg"]))
     ]
     head = (
-        f"Distortion (%; {data['edge_percent']:+.2f}% at the edge against {data['reference']}; "
+        f"Distortion (%; {_fixed(data['edge_percent'], 2)}% at the edge against {data['reference']}; "
         f"closest is {data['best']}; {number(data['scale_mm'])} mm per radian on the axis)"
     )
     return f"{head}\n" + table(("field", "height mm", *(n.partition(",")[0] for n in names)), rows)
@@ -109,10 +109,10 @@ def mtf(data: dict[str, Any]) -> str:
     at = [data["frequency_per_mm"].index(f) for f in _MTF_PER_MM if f in data["frequency_per_mm"]]
     header = ("field", "height mm", *(f"{data['frequency_per_mm'][k]:g}/mm {d}" for k in at for d in "TS"))
     rows = [
-        (*_place(data, i), *(f"{data[key][i][k]:.3f}" for k in at for key in ("tangential", "sagittal")))
+        (*_place(data, i), *(_fixed(data[key][i][k]) for k in at for key in ("tangential", "sagittal")))
         for i in range(len(data["field_deg"]))
     ]
-    limit = ", ".join(f"{data['diffraction_limit'][k]:.3f}" for k in at)
+    limit = ", ".join(_fixed(data["diffraction_limit"][k]) for k in at)
     waves = ", ".join(f"{w:.0f}" for w in data["wavelength_nm"])
     return (
         f"Geometric MTF ({waves} nm; T tangential, S sagittal; without diffraction, whose limit is {limit})\n"
@@ -145,13 +145,18 @@ def psf(data: dict[str, Any]) -> str:
 
 def _place(data: dict[str, Any], i: int) -> tuple[str, str]:
     field = data["field_deg"][i]
-    return ("axis" if field == 0 else f"{field:.2f}°", f"{data['height_mm'][i] + 0.0:.2f}")
+    return ("axis" if field == 0 else f"{field:.2f}°", _fixed(data["height_mm"][i], 2))
 
 
 def _some(count: int, rows: int = _ROWS) -> list[int]:
     """About so many of the indices below `count`, evenly spread, both ends among them."""
     steps = min(rows, count) - 1
     return [round(k * (count - 1) / steps) for k in range(steps + 1)] if steps > 0 else [0] * count
+
+
+def _fixed(value: float, places: int = 3) -> str:
+    """So many places, "-" where there is no value."""
+    return "-" if math.isnan(value) else f"{value + 0.0:.{places}f}"
 
 
 def _percent(value: float) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
     from neurolens.apertures import Aperture
+    from neurolens.optics.prescription import Lens
 
 
 class Parser(argparse.ArgumentParser):
@@ -19,6 +20,20 @@ class Parser(argparse.ArgumentParser):
         options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         # An abbreviation that works today would break a script when an option is added.
         super().__init__(allow_abbrev=False, **options)
+        self.intermixed = False  # True: options may stand before and between the arguments of a list
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As argparse has it, but a command complains itself of what it does not know."""
+        if self.intermixed:
+            self.intermixed = False  # argparse comes back here for its two passes
+            try:
+                found, rest = self.parse_known_intermixed_args(args, namespace)
+            finally:
+                self.intermixed = True
+            if rest:
+                self.error(f"unrecognized arguments: {' '.join(rest)}")
+            return found, rest
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
@@ -78,7 +93,7 @@ def add_lens_state(parser: argparse.ArgumentParser, defaults: dict[str, str]) ->
     group = parser.add_argument_group("state of the lens")
     size = group.add_mutually_exclusive_group()
     size.add_argument(
-        "--efl", metavar="MM", type=positive("a focal length in mm"),
+        "--efl", metavar="MM", type=between(1e-3, 1e6, "a focal length in mm"),
         help=f"scale the whole lens to this focal length in mm (default: {defaults['efl']})",
     )  # fmt: skip
     size.add_argument(
@@ -131,6 +146,28 @@ def aperture_of(args: argparse.Namespace) -> Aperture | None:
     from neurolens.render.masks import make_aperture
 
     return make_aperture(args.blades, args.blade_rotation, args.blade_curvature, args.aperture_mask)
+
+
+def focus_of(args: argparse.Namespace, tabled: Lens, lens: Lens) -> float:
+    """Film to object in metres: as the arguments of `add_lens_state` ask, or that of the focus state they name.
+
+    `tabled` is the lens of the file, `lens` its state. inf where nothing says otherwise.
+    """
+    if args.focus is not None:
+        return float(args.focus)
+    near = next((c.object_distance_mm for c in tabled.configurations if c.name == args.zoom), None)
+    if near is None:
+        return math.inf
+    row = 1 if tabled.surfaces[0].stop else 0  # a stop's diameter follows the f-number, too
+    scale = lens.surfaces[row].diameter_mm / tabled.surfaces[row].diameter_mm
+    return float(near * scale + (lens.film_z_mm or lens.vertices_mm[-1])) / 1000
+
+
+def given_options(args: argparse.Namespace) -> list[str]:
+    """Which options of `add_lens_state` were given, for commands that have no use for them."""
+    names = ("efl", "field", "zoom", "f_number", "focus", "blades", "blade_rotation", "blade_curvature")
+    given = [f"--{n.replace('_', '-')}" for n in (*names, "aperture_mask") if getattr(args, n) is not None]
+    return given + (["--focusing"] if args.focusing != "film" else [])
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
