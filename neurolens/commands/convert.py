@@ -24,7 +24,7 @@ Read a lens file of another program and write it as a lens file of neurolens (.t
 Formats: Zemax (.zmx), CODE V (.seq), OSLO (.len, the simple ones), plain tables of four
 columns as in pbrt and appleseed (.dat, .txt), and JSON prescriptions. The content decides.
 What neurolens cannot hold or does not know is an error that names the line; what was left
-out, computed or assumed is printed as a warning. Needs the extra "train" (torch)."""
+out, computed, assumed or doubtful is printed as a warning. Needs the extra "train" (torch)."""
 _EPILOG = """\
 examples:
   neurolens convert double_gauss.zmx -o lenses/double_gauss.toml
@@ -80,13 +80,25 @@ def run(args: argparse.Namespace) -> int:
         lens = read_any(args.file, given)
         write_checked(lens, args.output)
     told = [str(w.message).removeprefix(f"{args.file}: ") for w in caught if issubclass(w.category, NeurolensWarning)]
-    data = summary(lens, list(dict.fromkeys(told)))
+    data = summary(lens, list(dict.fromkeys([*told, *_doubts(lens)])))
     data = {"file": str(args.file), "output": str(args.output), **data}
     if args.json:
         print_json(data)
     else:
         print(_text(data))
     return 0
+
+
+def _doubts(lens: Lens) -> list[str]:
+    """Where the lens read does not do what its file states, in sentences: what `neurolens lens` says too."""
+    from neurolens.optics.lenscheck import check_lens, doubts
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NeurolensWarning)
+            return doubts(check_lens(lens))
+    except InputError as error:
+        return [f"the lens cannot be checked: {error.field}: expected {error.expected}"]
 
 
 def check_output(path: Path, force: bool) -> None:

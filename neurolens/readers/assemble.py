@@ -20,6 +20,7 @@ from neurolens.readers.source import warn
 # A diameter that the file does not give, until `finish` has found it.
 UNKNOWN = math.nan
 NARROWER = 1e-4  # relative: by less, two figures of the stop differ by the rounding of what is printed
+_NAMES = frozenset(m.upper() for m in catalogue.MAKERS)
 SAME_INDEX, SAME_ABBE = 2e-5, 0.005  # how near the catalogue printed figures are to be those of a named glass
 
 
@@ -194,19 +195,42 @@ def _check_rows(rows: Sequence[Surface], file: str) -> None:
         raise InputError(file, f"surface {len(rows) - 1}, index", rows[-1].n_d, "air between last surface and film")
 
 
-def named_glass(name: str, file: str, field: str, makers: Sequence[str] = ()) -> dict[str, Any]:
-    """Fields of a surface whose glass the file gives by name alone.
+def named_glass(
+    name: str, file: str, field: str, makers: Sequence[str] = (), *, said: str | None = None
+) -> dict[str, Any]:
+    """Fields of a surface whose glass the file gives by name alone; warns wherever another could be meant.
+
+    Of a maker who no longer has the glass that with "N-" in front is taken, which replaced it.
 
     Args:
         makers: the makers' catalogues that the file names; the first that has the glass is meant.
+        said: the word of the file, where that names the maker.
 
     Raises:
         InputError: a name that the catalogue does not know; the message suggests the nearest.
     """
-    known = catalogue.find(name, file, field)
-    others = {g.maker.upper(): g for g in catalogue.same_name(name)}
-    known = next((others[m] for m in makers if m in others), known)
-    return {"n_d": known.n_d, "V_d": known.V_d, "glass": short_name(known), "material": name}
+    same = catalogue.same_name(name)
+    known = next((g for m in makers for g in same if g.maker.upper() == m), None)
+    replacing = next((g for m in makers for g in catalogue.same_name(f"{m}:N-{name}") if m in _NAMES), None)
+    taken = known or replacing or catalogue.find(name, file, field)
+    if makers and taken.maker.upper() not in makers:
+        why = f"no glass of that name in the catalogues that the file names ({', '.join(makers)})"
+    elif not makers and said is None:
+        why = "the file names no maker"
+    else:
+        why = (
+            "its maker's catalogue has none of that very name"
+            if _letters(taken.name) not in _letters(said or name)
+            else ""
+        )
+    if why:
+        warn(file, f"glass {said or name} is taken as {taken} (n_d {taken.n_d:.5f}, V_d {taken.V_d:.2f}): {why}")
+    return {"n_d": taken.n_d, "V_d": taken.V_d, "glass": short_name(taken), "material": name}
+
+
+def _letters(name: str) -> str:
+    """Letters and digits of a name, the rest of which does not count."""
+    return "".join(filter(str.isalnum, name.upper()))
 
 
 def same_glass(name: str | None, n_d: float, V_d: float | None) -> str | None:

@@ -96,8 +96,10 @@ def medium(command: Command, words: Sequence[str], private: Mapping[str, dict[st
     if name and not catalogue.same_name(qualified):
         # Other names of a glass ("BK7") are listed without their maker.
         alias = [g for g in catalogue.same_name(name) if g.maker.upper() == maker.upper()]
-        qualified = str(alias[0]) if alias else qualified
-    known = named_glass(qualified, command.line.file, f"line {command.line.number}, glass")
+        # Glasses that their makers dropped are replaced by those with "N-" in front.
+        replacing = catalogue.same_name(f"{maker}:N-{name}")
+        qualified = str((*alias, *replacing)[0]) if alias or replacing else qualified
+    known = named_glass(qualified, command.line.file, f"line {command.line.number}, glass", said=word if name else None)
     return {**known, "material": word}
 
 

@@ -234,3 +234,11 @@ def test_a_bad_radius_gives_no_limit_that_the_field_keeps(radius: str, tmp_path:
     except InputError as error:
         limit = re.search("at most ([-0-9.e+]+)", str(error))
         assert limit is None or 0 < float(limit[1].rstrip(",")) < 5
+
+
+@pytest.mark.parametrize(("word", "glass"), [("SK16_SCHOTT", "N-SK16"), ("BK7_SCHOTT", "N-BK7"), ("SK16", "SK16")])
+def test_a_glass_that_could_be_another_is_named(word: str, glass: str, tmp_path: Path) -> None:
+    with pytest.warns(NeurolensWarning, match=f"glass {word} is taken as [A-Za-z]+:{glass} "):
+        lens = read(swapped("NBK7_SCHOTT", word), tmp_path)
+    found = lens.surfaces[0].glass
+    assert found is not None and catalogue.find(found).name == glass

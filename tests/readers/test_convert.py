@@ -130,3 +130,9 @@ def test_a_lens_file_of_our_own_is_read_too(tmp_path: Path, capsys: pytest.Captu
     assert "--name and --source only" in failure(capsys, LENSES[2], "-o", out, "--force", "--units", "in")
     assert main(["convert", str(LENSES[2]), "-o", str(out), "--force", "--name", "mine"]) == 0
     assert read_lens(out).name == "mine"
+
+
+def test_doubts_about_the_lens_are_printed(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table.write_text(TABLE.replace("-50.0 0 ", "-50.0 80 "))
+    assert main(["convert", str(table), "-o", str(tmp_path / "lens.toml")]) == 0
+    assert "warning: the table's last thickness puts the film at z = 89.00 mm" in capsys.readouterr().out

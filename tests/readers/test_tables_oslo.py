@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from neurolens.errors import InputError
+from neurolens.errors import InputError, NeurolensWarning
 from neurolens.optics import catalogue
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -158,3 +158,8 @@ def test_oslo_by_the_lensmakers_formula(tmp_path: Path) -> None:
 def test_oslo_refusals(old: str, new: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
         read(swapped(old, new, OSLO), ".len", tmp_path)
+
+
+def test_a_glass_of_oslo_says_whose_it_is_taken_for(tmp_path: Path) -> None:
+    with pytest.warns(NeurolensWarning, match=r"glass BK7 is taken as Schott:N-BK7 \(n_d 1.51680"):
+        read(OSLO, ".len", tmp_path)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+import warnings
 from pathlib import Path
 
 import pytest
@@ -310,3 +312,27 @@ def test_a_coordinate_break_without_tilt_stands_in_its_medium(tmp_path: Path) ->
     block = "SURF 2\n  TYPE COORDBRK\n  CURV 0\n  PARM 3 0\n  DISZ 2.0\n"
     text = swapped("DISZ 5.0", "DISZ 3.0").replace("SURF 3", "SURF 4").replace("SURF 2", block + "SURF 3")
     assert read(text, tmp_path).surfaces == plain.surfaces
+
+
+@pytest.mark.parametrize(
+    ("makers", "name", "taken", "why"),
+    [
+        ("GCAT SCHOTT", "SK16", "Schott:N-SK16", "that very name"),
+        ("GCAT SCHOTT", "BK7", "Schott:N-BK7", "that very name"),
+        ("GCAT OHARA", "SK16", "Hikari:SK16", r"names \(OHARA\)"),
+        ("NOTE 0 none", "SK16", "Hikari:SK16", "names no maker"),
+        ("NOTE 0 none", "N-BK7", "Schott:N-BK7", "names no maker"),
+        ("GCAT SCHOTT", "N-BK7", "Schott:N-BK7", None),
+    ],
+)
+def test_a_glass_that_could_be_another_is_named(
+    makers: str, name: str, taken: str, why: str | None, tmp_path: Path
+) -> None:
+    text = swapped("GCAT SCHOTT", makers, swapped("GLAS N-BK7", f"GLAS {name}"))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = read(text, tmp_path).surfaces[0].glass
+    assert found is not None and str(catalogue.find(found)) == taken
+    told = [str(w.message) for w in caught if "is taken as" in str(w.message)]
+    assert len(told) == (why is not None)
+    assert why is None or re.search(f"glass {name} is taken as {taken} .*{why}", told[0])
