@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import number, print_json, table
+from neurolens.errors import InputError
 
 if TYPE_CHECKING:
     from neurolens.optics.dispersion import Glass
@@ -17,13 +18,14 @@ _DESCRIPTION = """\
 Look glasses up in the catalogue that ships with neurolens: index, Abbe number, the
 wavelengths that the maker states the index for, and what 10 mm transmit inside (without
 reflections). A name gives the glass of every maker that has one of that name, the one that a
-lens file gets first; a six-digit code (517642) the glasses nearest to it. Needs the extra
-"train" (torch)."""
+lens file gets first; a six-digit code (517642) the glasses nearest to it, up to 0.01 in
+n_d and 2 in V_d away. Needs the extra "train" (torch)."""
 _EPILOG = """\
 examples:
   neurolens glass N-BK7 "F2 (CDGM)" PMMA
   neurolens glass 517642 --json"""
 _CODE = re.compile(r"[0-9]{3}[./]?[0-9]{3}")
+_NEAR_N_D, _NEAR_V_D = 0.01, 2.0  # what lies farther from a code has nothing to do with it
 _TRANSMITTED_NM = (400.0, 450.0, 550.0, 700.0)
 _PLATE_MM = 10.0
 
@@ -45,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     found: list[Glass] = []
     for name in args.name:
         if _CODE.fullmatch(name):
-            found += catalogue.by_code(name, 6)
+            found += _near(name)
         else:
             catalogue.find(name, "argument", "NAME")
             found += catalogue.same_name(name)
@@ -63,6 +65,25 @@ def run(args: argparse.Namespace) -> int:
     ]
     print(table(header, lines))
     return 0
+
+
+def _near(code: str) -> list[Glass]:
+    """The glasses nearest to a code, those alone that are near it.
+
+    Raises:
+        InputError: none is.
+    """
+    from neurolens.optics import catalogue
+
+    digits = re.sub("[./]", "", code)
+    n_d, V_d = 1 + int(digits[:3]) / 1000, int(digits[3:]) / 10
+    nearest = catalogue.by_code(code, 6)
+    found = [g for g in nearest if abs(g.n_d - n_d) <= _NEAR_N_D and abs(g.V_d - V_d) <= _NEAR_V_D]
+    if not found:
+        near = f"{nearest[0]} (n_d {nearest[0].n_d:.4f}, V_d {nearest[0].V_d:.1f})"
+        expected = f"a code within {_NEAR_N_D:g} in n_d and {_NEAR_V_D:g} in V_d of a glass; the nearest is {near}"
+        raise InputError("argument", "NAME", code, expected)
+    return found
 
 
 def _record(glass: Glass) -> dict[str, Any]:

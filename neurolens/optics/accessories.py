@@ -59,9 +59,14 @@ def with_filter(
         InputError: a value out of range, no room: a plate that would touch the lens, or the film.
     """
     _require(lens.path, thickness_mm=thickness_mm)
-    if not 1 <= n_d < math.inf or not 0 <= absorption_per_mm < math.inf or not 0 <= gap_mm < math.inf:
-        shown = {"n_d": n_d, "absorption_per_mm": absorption_per_mm, "gap_mm": gap_mm}
-        raise InputError(lens.path, "filter", f"({shown})", "an index from 1, absorption and gap of at least 0")
+    for field, value, least, expected in (
+        ("n_d", n_d, 1, "a refractive index from 1"),
+        ("V_d", 1.0 if V_d is None else V_d, 1e-300, "an Abbe number above 0, or None"),
+        ("absorption_per_mm", absorption_per_mm, 0, "a number of at least 0, in 1/mm"),
+        ("gap_mm", gap_mm, 0, "a length of at least 0, in mm"),
+    ):
+        if not _is_number(value) or not least <= value < math.inf:
+            raise InputError(lens.path, f"filter, {field}", value, expected)
     beside = lens.surfaces[-1 if rear else 0]
     if diameter_mm is None:
         field = 45.0 if rear else min(lens.half_field_deg or 45.0, _WIDEST_DEG)
@@ -88,8 +93,13 @@ def with_hood(lens: Lens, length_mm: float, diameter_mm: float) -> Lens:
 
 def _require(where: str, **lengths_mm: float) -> None:
     for field, value in lengths_mm.items():
-        if not 0 < value < math.inf:
+        if not _is_number(value) or not 0 < value < math.inf:
             raise InputError(where, field, value, "a finite number above 0, in mm")
+
+
+def _is_number(value: object) -> bool:
+    """Whether a value can be compared with numbers: a number, or a tensor with one."""
+    return not isinstance(value, bool) and hasattr(value, "__float__")
 
 
 def _before(lens: Lens, *rows: Surface) -> Lens:

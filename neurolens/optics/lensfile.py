@@ -61,7 +61,7 @@ from neurolens.apertures import Aperture
 from neurolens.errors import InputError, NeurolensWarning
 from neurolens.optics.clearance import check_clearance
 from neurolens.optics.lensfields import half_field, number, text
-from neurolens.optics.lensrows import read_surfaces
+from neurolens.optics.lensrows import read_surfaces, unused_coatings
 from neurolens.optics.prescription import Configuration, Lens
 from neurolens.tomlfile import read_toml, reject_unknown
 
@@ -80,7 +80,7 @@ def read_lens(path: str | Path) -> Lens:
     """The lens of a file, unfocused (`Lens.at` places the film).
 
     Warns:
-        NeurolensWarning: glasses whose V_d is unknown; their index is taken as constant.
+        NeurolensWarning: glasses whose V_d is unknown; their index is taken as constant. A coating that no surface has.
 
     Raises:
         InputError: the first mistake met: an unknown or missing key, a wrong type, a value out of range, no stop or
@@ -91,6 +91,9 @@ def read_lens(path: str | Path) -> Lens:
     if data.get("schema") != SCHEMA or isinstance(data["schema"], bool):
         raise InputError(file, "schema", data.get("schema", "(missing)"), f"{SCHEMA}, the version of the format")
     surfaces = read_surfaces(data, file)
+    if data.get("rims", "(missing)") not in RIMS:
+        expected = 'where the diameters come from: "source", "estimated" or "derived"'
+        raise InputError(file, "rims", data.get("rims", "(missing)"), expected)
     lens = Lens(
         name=text(data, "name", file),
         source=text(data, "source", file),
@@ -107,8 +110,6 @@ def read_lens(path: str | Path) -> Lens:
         stated_efl_mm=number(data, "efl_mm", file, above=0) if "efl_mm" in data else None,
         stated_efl_x_mm=number(data, "efl_x_mm", file, above=0) if "efl_x_mm" in data else None,
     )
-    if lens.rims not in RIMS:
-        raise InputError(file, "rims", lens.rims, 'where the diameters come from: "source", "estimated" or "derived"')
     check_clearance(surfaces, file)
     for c in lens.configurations:
         moved = dict(c.thickness_mm)
@@ -118,6 +119,8 @@ def read_lens(path: str | Path) -> Lens:
     if unknown:
         message = f"{file}: V_d is not given after surface {unknown}: the index is taken as constant"
         warnings.warn(message, NeurolensWarning, stacklevel=2)
+    for name in unused_coatings(data):
+        warnings.warn(f'{file}: coating "{name}": no surface has it', NeurolensWarning, stacklevel=2)
     return lens
 
 

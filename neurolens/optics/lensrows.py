@@ -117,6 +117,9 @@ def _shape(row: Mapping[str, Any], file: str, where: str) -> dict[str, Any]:
         for key in given:
             if not (key.isascii() and key.isdecimal() and str(int(key)) == key and 2 <= int(key) <= MAX_POWER):
                 raise InputError(file, f"{where}asphere", key, f"a power from 2 to {MAX_POWER}")
+            if isinstance(given[key], Mapping) and len(given[key]) == 1:  # TOML takes 4.5 for a key in a key
+                power = f"{key}.{next(iter(given[key]))}"
+                raise InputError(file, f"{where}asphere", power, f"a whole power from 2 to {MAX_POWER}")
             terms.append((int(key), number(given, key, file, f"{where}asphere, power ")))
         shape["asphere"] = tuple(sorted(terms))
     return shape
@@ -145,6 +148,12 @@ def _coatings(data: Mapping[str, Any], file: str) -> dict[str, Coating]:
             layers.append((n_film, nm))
         found[name] = Coating(name, tuple(layers))
     return found
+
+
+def unused_coatings(data: Mapping[str, Any]) -> list[str]:
+    """Names of the coatings of a file (one that reads) that no surface has."""
+    used = {row.get("coating") for row in data["surfaces"]}
+    return [table["name"] for table in data.get("coating", []) if table["name"] not in used]
 
 
 def _coating(

@@ -126,9 +126,14 @@ def test_accessories_that_cannot_be(lens: Lens) -> None:
     for options, expected in (
         ({"thickness_mm": 0.0}, "thickness_mm"),
         ({"thickness_mm": math.nan}, "thickness_mm"),
-        ({"n_d": 0.5}, "filter"),
-        ({"gap_mm": -1.0}, "filter"),
-        ({"absorption_per_mm": math.inf}, "filter"),
+        ({"n_d": 0.5}, "filter, n_d: got 0.5, expected a refractive index"),
+        ({"gap_mm": -1.0}, "filter, gap_mm: got -1.0"),
+        ({"absorption_per_mm": math.inf}, "filter, absorption_per_mm: got inf"),
+        ({"V_d": 0.0}, "filter, V_d: got 0.0"),
+        ({"thickness_mm": "2"}, "thickness_mm: got '2'"),
+        ({"n_d": "1.5"}, "filter, n_d: got '1.5'"),
+        ({"gap_mm": None}, "filter, gap_mm: got None"),
+        ({"diameter_mm": "wide"}, "diameter_mm: got 'wide'"),
         ({"diameter_mm": -3.0}, "diameter_mm"),
         ({"gap_mm": 80.0, "rear": True}, "room"),
     ):
@@ -136,6 +141,8 @@ def test_accessories_that_cannot_be(lens: Lens) -> None:
             lens.with_filter(**options)
     with pytest.raises(InputError, match="length_mm"):
         lens.with_hood(0.0, 50.0)
+    with pytest.raises(InputError, match="diameter_mm: got 'fifty'"):
+        lens.with_hood(10.0, "fifty")  # type: ignore[arg-type]
     near = Configuration("near", None, ((0, 5.817),), object_distance_mm=4.0)
     with pytest.raises(InputError, match="object_distance_mm"):
         replace(lens, configurations=(near,)).with_hood(10.0, 90.0)

@@ -167,3 +167,8 @@ def test_six_digit_codes() -> None:
     for bad in ("51764", "n-bk7", "5176421", "-17642", "５１７６４２"):
         with pytest.raises(InputError, match="six digits"):
             catalogue.by_code(bad)
+
+
+def test_a_code_far_from_every_glass_gets_none(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["glass", "999999"]) == 2
+    assert "got '999999', expected a code within 0.01 in n_d and 2 in V_d of a glass" in capsys.readouterr().err

@@ -113,6 +113,7 @@ BAD_ROWS = [
     ("n_d = 1.6,", "n_d = 1.6, conic = nan,", ["surface 4, conic", "got nan"]),
     ("n_d = 1.6,", "n_d = 1.6, asphere = {},", ["surface 4, asphere", "{ 4 = 1e-6"]),
     ("n_d = 1.6,", "n_d = 1.6, asphere = { 1 = 1e-6 },", ["surface 4, asphere", "'1'", "from 2 to 40"]),
+    ("n_d = 1.6,", "n_d = 1.6, asphere = { 4.5 = 3 },", ["surface 4, asphere", "got '4.5'", "a whole power from 2"]),
     ("n_d = 1.6,", "n_d = 1.6, asphere = { 4 = inf },", ["surface 4, asphere, power 4", "got inf"]),
     ("n_d = 1.6,", 'n_d = 1.6, cylinder = "z",', ["surface 4, cylinder", "'z'", '"x" or "y"']),
     ("n_d = 1.6,", "n_d = 1.6, absorption_per_mm = -1,", ["surface 4, absorption_per_mm", "got -1", "at least 0"]),
@@ -146,7 +147,7 @@ BAD_HEADS = [
     ("f_number = 4.0", "f_number = 0", ["f_number", "got 0", "above 0"]),
     ("f_number = 4.0", 'f_number = "f/4"', ["f_number", "'f/4'"]),
     ('rims = "source"', 'rims = "guessed"', ["rims", "'guessed'", '"estimated"']),
-    ('rims = "source"', "", ["rims", "(missing)"]),
+    ('rims = "source"', "", ["rims", "(missing)", '"source", "estimated" or "derived"']),
     ("surfaces = [", "rows = [", ["rows", "unknown key"]),
     # zoom states
     ('name = "near"', "", ["configuration 0, name", "(missing)"]),
@@ -257,6 +258,15 @@ def test_unknown_dispersion_is_a_warning(tmp_path: Path) -> None:
     with pytest.warns(NeurolensWarning, match=r"lens\.toml.*surface 4: .*constant") as seen:
         assert read_lens(path).surfaces[4].V_d is None
     assert len(seen) == 1
+
+
+def test_a_coating_that_no_surface_has_is_a_warning(tmp_path: Path) -> None:
+    coating = '\n[[coating]]\nname = "mine"\nlayers = [[1.38, 99.6]]\n'
+    with pytest.warns(NeurolensWarning, match='lens.toml: coating "mine": no surface has it'):
+        read_lens(write(tmp_path, GOOD + coating))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_lens(write(tmp_path, replaced("n_d = 1.6,", 'n_d = 1.6, coating = "mine",') + coating))
 
 
 def test_known_dispersion_is_no_warning(tmp_path: Path) -> None:
