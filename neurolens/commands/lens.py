@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import time
 import warnings
 from dataclasses import asdict
@@ -11,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.commands import lens_list, lens_rims
-from neurolens.commands.arguments import add_json, add_lens_state, aperture_of
-from neurolens.commands.output import number, print_json, table
+from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, focus_of, given_options
+from neurolens.commands.lens_text import lens_text
+from neurolens.commands.output import print_json
 from neurolens.errors import InputError, NeurolensWarning
 
 if TYPE_CHECKING:
@@ -64,13 +64,21 @@ def add_parser(subparsers: Any) -> None:
 
 def _check_mode(args: argparse.Namespace, listing: bool) -> None:
     """Refuse an option that the chosen table would silently ignore."""
+    alone = not listing and not args.derive_rims
     kinds = {
         "--layouts": (args.layouts is not None, listing, 'with "list"'),
         "FOLDER": (args.folder is not None, listing, 'after "list"'),
+        "--vignetting": (args.vignetting is not None, args.derive_rims, "with --derive-rims"),
+        "--breathing": (args.breathing is not None, alone, "with one lens file alone"),
+        **{
+            name: (True, not listing and not args.derive_rims, "with one lens file alone")
+            for name in given_options(args)
+        },
         "-o": (args.output is not None, args.derive_rims, "with --derive-rims"),
         "--half-field": (args.half_field is not None, args.derive_rims, "with --derive-rims"),
         "--derive-rims": (args.derive_rims, not listing, "with one lens file"),
-        "--layout": (args.layout is not None, not listing and not args.derive_rims, "with one lens file alone"),
+        "--layout": (args.layout is not None, alone, "with one lens file alone"),
+        **dict.fromkeys(given_options(args), (True, alone, "with one lens file alone")),
     }
     for option, (given, allowed, where) in kinds.items():
         if given and not allowed:
@@ -104,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
         focus_m=args.focus,
         focus=args.focusing,
     ).with_aperture(aperture_of(args) or tabled.aperture)
-    focus, film_z = math.inf if args.focus is None else args.focus, float(lens.film_z_mm or 0.0)
+    focus, film_z = focus_of(args, tabled, lens), float(lens.film_z_mm or 0.0)
     domain = domain_of(lens, focus_m=(focus, focus), film_z_mm=(film_z, film_z))
     configurations = [
         {"name": c.name, "efl_mm": c.efl_mm, "object_distance_mm": c.object_distance_mm} for c in tabled.configurations
@@ -133,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(data)
     else:
-        print(_text(data))
+        print(lens_text(data))
     return 0
 
 
@@ -155,86 +163,3 @@ def draw_layout(lens: Lens, domain: Domain, path: Path) -> None:
     from neurolens.evaluate.plots import lens_layout
 
     lens_layout(layout_profile(lens, domain), path)
-
-
-def _text(data: dict[str, Any]) -> str:
-    """The data as a page of text."""
-    parts = [_head(data), _first_order(data), _light(data), _surfaces(data)]
-    if data["configurations"]:
-        zoom = [f"{c['name']} ({number(c['efl_mm'])} mm)" for c in data["configurations"] if not _near(c)]
-        near = [f"{c['name']} ({number(c['object_distance_mm'])} mm)" for c in data["configurations"] if _near(c)]
-        parts += [f"Zoom states (--zoom, also mm between them): {', '.join(zoom)}"] if zoom else []
-        parts += [f"Focus states (--zoom, or --focusing internal): {', '.join(near)} to the object"] if near else []
-    if data["derived"]:
-        parts.append(f"Derived: {data['derived']}")
-    parts += [f"Warning: {text}" for text in data["warnings"]]
-    if data["layout"]:
-        parts.append(f"Layout drawn in {data['layout']}")
-    if data["breathing_plot"]:
-        parts.append(f"Focus breathing drawn in {data['breathing_plot']}")
-    return "\n\n".join(parts)
-
-
-def _near(configuration: dict[str, Any]) -> bool:
-    return configuration["object_distance_mm"] is not None
-
-
-def _head(data: dict[str, Any]) -> str:
-    by = f", {data['designer']}" if data["designer"] else ""
-    return f"{data['name']}{by}\n{data['source']}"
-
-
-def _first_order(data: dict[str, Any]) -> str:
-    focus = "infinity" if math.isinf(data["focus_m"]) else f"{data['focus_m']:g} m"
-
-    def mm(key: str) -> str:
-        return f"{number(data[key], 6)} mm"
-
-    rows = [
-        ("focal length", mm("efl_mm"), ""),
-        ("back focus", mm("back_focus_mm"), "last vertex to rear focal point"),
-        ("f-number", f"f/{number(data['f_number'])}", "focal length over entrance pupil, infinity focus"),
-        ("working f-number", f"f/{number(data['working_f_number'])}", "of the real marginal ray at this focus"),
-        ("principal planes", f"{mm('front_principal_z_mm')}, {mm('rear_principal_z_mm')}", "front H, rear H'"),
-        ("entrance pupil", mm("entrance_pupil_z_mm"), f"diameter {mm('entrance_pupil_diameter_mm')}"),
-        ("exit pupil", mm("exit_pupil_z_mm"), f"diameter {mm('exit_pupil_diameter_mm')}"),
-        ("film plane", mm("film_z_mm"), f"focus at {focus}"),
-        ("stop", f"surface {data['stop_surface']}", f"diameter {mm('stop_diameter_mm')}"),
-        ("refractions", str(data["refractions"]), ""),
-    ]
-    return _columns(rows)
-
-
-def _light(data: dict[str, Any]) -> str:
-    reached, stated = data["half_field_reached_deg"], data["half_field_deg"]
-    rows = [
-        ("image radius", f"{number(data['image_radius_mm'])} mm", f"from {data['image_radius_from']}"),
-        (
-            "half field",
-            "-" if reached is None else f"{reached:.2f} degrees",
-            "reached at the edge of the film" + ("" if stated is None else f"; the file states {stated:g}"),
-        ),
-        (
-            "rays that pass",
-            f"{100 * data['passing_share']:.1f}%",
-            "of rays uniform over the film and over the disc of all passing rays, 5% wider",
-        ),
-        *(("", f"{100 * e['share']:.1f}%", e["text"]) for e in data["ended"]),
-    ]
-    return _columns(rows)
-
-
-def _columns(rows: list[tuple[str, str, str]]) -> str:
-    wide = max(len(value) for _, value, _ in rows)
-    return "\n".join(f"{name:18}{value:{wide}}  {note}".rstrip() for name, value, note in rows)
-
-
-def _surfaces(data: dict[str, Any]) -> str:
-    header = ("surface", "radius mm", "thickness mm", "diameter mm", "n_d", "V_d", "")
-    rows = []
-    for s in data["surfaces"]:
-        radius = "plane" if math.isinf(s["radius_mm"]) else f"{s['radius_mm']:.4f}"
-        glass = ("", "") if s["n_d"] == 1 else (f"{s['n_d']:.4f}", "-" if s["V_d"] is None else f"{s['V_d']:.2f}")
-        note = "stop" if s["stop"] else s["material"] or ""
-        rows.append((str(s["surface"]), radius, f"{s['thickness_mm']:.4f}", f"{s['diameter_mm']:.4f}", *glass, note))
-    return table(header, rows)

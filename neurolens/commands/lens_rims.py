@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="compute the diameters from the f-number and the field, and print them beside those of the file",
     )  # fmt: skip
     rims.add_argument(
-        "--vignetting", metavar="SHARE", type=between(0.01, 1, "a share"), default=0.5,
+        "--vignetting", metavar="SHARE", type=between(0.01, 1, "a share"),
         help="share of the pupil's height that is kept at the edge of the field (default: 0.5)",
     )  # fmt: skip
     rims.add_argument(
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     if args.output is not None and not args.output.parent.is_dir():
         raise InputError(args.output, "-o", str(args.output.parent), "a folder that exists")
     lens = read_quietly(args.file)
-    rule = RimRule(vignetting=args.vignetting, half_field_deg=args.half_field)
+    rule = RimRule(vignetting=0.5 if args.vignetting is None else args.vignetting, half_field_deg=args.half_field)
     derived, rims = derive_rims(lens, rule)
     field = args.half_field or half_field_deg(lens)
     if args.output is not None:

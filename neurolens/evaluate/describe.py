@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
 from neurolens import status as st
 from neurolens.evaluate.layout import refractions
-from neurolens.optics.glass import table_notes
+from neurolens.optics.glass import glass_of, table_notes
+from neurolens.optics.internal import at_infinity
 from neurolens.optics.lenscheck import check_lens, doubts
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -25,17 +26,26 @@ _NEGLIGIBLE = 1e-4  # share of the rays below which a blocking surface is not wo
 def describe_lens(lens: Lens, domain: Domain) -> dict[str, Any]:
     """Figures of a lens placed by `Lens.at`, over a domain; d line where no other wavelength is named.
 
-    Returns: name, designer, source, rims, sha256; the first-order data of `paraxial.FirstOrder`; working_f_number of
-        the real marginal ray; film_z_mm, focus_m, refractions, stop_surface, stop_diameter_mm; image_radius_mm and
+    Returns: name, designer, source, rims, sha256; the first-order data of `paraxial.FirstOrder`, of an anamorphic lens
+        in the y-z plane; efl_x_mm in its x-z plane, None of a round lens; working_f_number of the real marginal ray
+        (y-z); film_z_mm, focus_m, refractions, stop_surface, stop_diameter_mm; image_radius_mm and
         image_radius_from; half_field_deg as the file states it and half_field_reached_deg, the mean angle of the rays
-        that reach the edge of the domain's film; passing_share of rays uniform over the film and pupil discs of the
+        that reach the edge of the domain's film, along y of an anamorphic lens, whose half_field_reached_x_deg is not
+        None; passing_share of rays uniform over the film and pupil discs of the
         domain; ended: what stops the others, a list of {status, text, share}, largest share first; warnings.
     """
     data = first_order(lens)
     radius, radius_from = image_radius_mm(lens)
     film_z = float(lens.film_z_mm if lens.film_z_mm is not None else domain.film_z_mm[0])
     passing, ended = passing_share(lens, domain)
-    reached = field_reached_deg(lens, domain, film_z)
+    # A round lens sees as far along y, and the mean over its rays along x is what the project has always stated.
+    reached = field_reached_deg(lens, domain, film_z, "y" if lens.anamorphic else "x")
+    reached_x = field_reached_deg(lens, domain, film_z, "x") if lens.anamorphic else reached
+    notes = warnings_of(lens, first_order(at_infinity(lens)).f_number, reached, math.isinf(domain.focus_m[0]))
+    if reached is None or reached_x is None:
+        where = " and ".join(axis for axis, deg in (("y", reached), ("x", reached_x)) if deg is None)
+        along = f", along {where}" if lens.anamorphic else ""
+        notes.append(f"no ray reaches the edge of the film ({domain.film_radius_mm:.4g} mm from the axis{along})")
     return {
         "name": lens.name,
         "designer": lens.designer,
@@ -44,6 +54,7 @@ def describe_lens(lens: Lens, domain: Domain) -> dict[str, Any]:
         "sha256": lens.sha256,
         "refractions": refractions(lens),
         **{key: float(value) for key, value in asdict(data).items()},
+        "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if lens.anamorphic else None,
         "working_f_number": working_f_number(lens, domain, film_z),
         "film_z_mm": film_z,
         "focus_m": domain.focus_m[0],
@@ -53,14 +64,20 @@ def describe_lens(lens: Lens, domain: Domain) -> dict[str, Any]:
         "image_radius_from": radius_from,
         "half_field_deg": lens.half_field_deg,
         "half_field_reached_deg": reached,
+        "half_field_reached_x_deg": reached_x if lens.anamorphic else None,
         "passing_share": passing,
         "ended": ended,
-        "warnings": warnings_of(lens, data.f_number, reached),
+        "warnings": notes,
     }
 
 
 def glass_table(lens: Lens) -> list[dict[str, Any]]:
-    """The prescription row by row: surface, z_mm, radius_mm, thickness_mm, diameter_mm, n_d, V_d, material, stop."""
+    """The prescription row by row, every figure of it.
+
+    Returns: of each surface: surface (its index), z_mm, radius_mm, thickness_mm, diameter_mm, n_d and V_d (those of the
+        catalogue where a glass rules), material, stop, conic, asphere ({power: coefficient}), cylinder, glass,
+        absorption_per_mm, coating (None or {name, layers: [[index, thickness in nm], ...]}).
+    """
     return [
         {
             "surface": k,
@@ -68,10 +85,16 @@ def glass_table(lens: Lens) -> list[dict[str, Any]]:
             "radius_mm": float(s.radius_mm),
             "thickness_mm": float(s.thickness_mm),
             "diameter_mm": s.diameter_mm,
-            "n_d": float(s.n_d),
-            "V_d": s.V_d,
+            "n_d": float(s.n_d) if s.glass is None else float(glass_of(s.glass).n_d),
+            "V_d": s.V_d if s.glass is None else float(glass_of(s.glass).V_d),
             "material": s.material,
             "stop": s.stop,
+            "conic": float(s.conic),
+            "asphere": {str(power): float(a) for power, a in s.asphere},
+            "cylinder": s.cylinder,
+            "glass": s.glass,
+            "absorption_per_mm": s.absorption_per_mm,
+            "coating": s.coating and {"name": s.coating.name, "layers": [list(layer) for layer in s.coating.layers]},
         }
         for k, (s, z) in enumerate(zip(lens.surfaces, lens.vertices_mm[:-1], strict=True))
     ]
@@ -88,13 +111,19 @@ def working_f_number(lens: Lens, domain: Domain, film_z: float) -> float | None:
     return 1 / (2 * sine) if sine > 0 else None
 
 
-def field_reached_deg(lens: Lens, domain: Domain, film_z: float, points: int = 200) -> float | None:
-    """Mean angle to the axis (degrees) of the rays from the edge of the film to the scene; None where none passes."""
+def field_reached_deg(
+    lens: Lens, domain: Domain, film_z: float, axis: Literal["x", "y"] = "x", points: int = 200
+) -> float | None:
+    """Mean angle to the axis (degrees) of the rays from the edge of the film to the scene; None where none passes.
+
+    The edge is that on the x or the y axis of the film.
+    """
     grid = torch.linspace(-domain.pupil_radius_mm, domain.pupil_radius_mm, points, dtype=torch.float64)
     u, v = (t.reshape(-1) for t in torch.meshgrid(grid, grid[points // 2 :], indexing="ij"))  # symmetric across
-    edge = torch.full_like(u, domain.film_radius_mm)
+    edge, zero = torch.full_like(u, domain.film_radius_mm), torch.zeros_like(u)
+    film, pupil = ((edge, zero), (u, v)) if axis == "x" else ((zero, edge), (v, u))
     with torch.no_grad():
-        out = trace(lens, camera_rays(edge, torch.zeros_like(u), film_z, u, v, domain.pupil_z_mm))
+        out = trace(lens, camera_rays(*film, film_z, *pupil, domain.pupil_z_mm))
     passed = out.status == st.PASSED
     if not passed.any():
         return None
@@ -126,8 +155,14 @@ def file_doubts(tabled: Lens) -> list[str]:
     return doubts([c for c in checks if c.quantity != "f-number" or (c.computed or 0.0) > (c.stated or 0.0)])
 
 
-def warnings_of(lens: Lens, f_number: float, reached_deg: float | None) -> list[str]:
-    """What a user of this lens in its state should know, in sentences; see `file_doubts` for its file."""
+def warnings_of(lens: Lens, f_number: float, reached_deg: float | None, far: bool) -> list[str]:
+    """What a user of this lens in its state should know, in sentences; see `file_doubts` for its file.
+
+    Args:
+        f_number: of the lens focused at infinity: what the source states, whatever the lens does when focused near.
+        reached_deg: half field that reaches the edge of the film.
+        far: whether the lens is focused at infinity, where its source states the field.
+    """
     found = []
     if lens.rims == "estimated":
         found.append("rim diameters are estimated, not the source's: vignetting is a guess")
@@ -139,8 +174,6 @@ def warnings_of(lens: Lens, f_number: float, reached_deg: float | None) -> list[
     found += [f"surface {k}: {note}" for k, s in enumerate(lens.surfaces) for note in table_notes(s)]
     if abs(f_number / lens.f_number - 1) > 0.05 and f_number < lens.f_number:
         found.append(f"the stop gives f/{f_number:.3g}, wider than the f/{lens.f_number:.3g} of the source")
-    if reached_deg is None:
-        found.append("no ray reaches the edge of the film")
-    elif lens.half_field_deg is not None and reached_deg < lens.half_field_deg - 2:
+    if far and lens.half_field_deg is not None and reached_deg is not None and reached_deg < lens.half_field_deg - 2:
         found.append(f"the edge of the film sees {reached_deg:.1f} degrees, the source says {lens.half_field_deg:.1f}")
     return found

@@ -24,8 +24,10 @@ def lens_files(folder: Path) -> list[Path]:
     """The lens files of a folder, by name.
 
     Raises:
-        InputError: no such folder, or none in it.
+        InputError: no such folder, a file, or none in it.
     """
+    if folder.is_file():
+        raise InputError(folder, "lens folder", "(a file)", 'a folder of lens files; leave out "list" for one lens')
     if not folder.is_dir():
         raise InputError(folder, "lens folder", "(missing)", "a folder of lens files (*.toml)")
     files = sorted(folder.glob("*.toml"))

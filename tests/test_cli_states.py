@@ -1,0 +1,179 @@
+"""The command line on lens states, whole surface tables, doubtful lenses, and places that cannot be written."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from neurolens.cli import main
+from neurolens.errors import InputError
+from neurolens.files import atomic_path, check_writable
+from neurolens.render.exr import read_exr, write_exr
+
+LENSES = Path(__file__).parents[1] / "lenses"
+SINGLET, PHONE = LENSES / "thorlabs_lb1471_biconvex_50.toml", LENSES / "phone_lens_6.toml"
+ANAMORPHIC, NIKON = LENSES / "cooke_anamorphic_42.toml", LENSES / "nikon_zoom_70_200.toml"
+SCENE = """\
+[camera]
+position_m = [0.0, 0.0, 2.0]
+look_at_m = [0.0, 0.0, 0.0]
+focus_m = 2.0
+width = 32
+height = 18
+samples = 1
+
+[environment]
+colour = [1.0, 1.0, 1.0]
+"""
+_NOWHERE = Path("/proc/q.exr")  # nobody, root neither, makes a file there
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE)
+    return path
+
+
+def described(capsys: pytest.CaptureFixture[str], *args: object) -> dict[str, Any]:
+    assert main([*map(str, args), "--json"]) == 0
+    data: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return data
+
+
+def failure(capsys: pytest.CaptureFixture[str], *args: object) -> str:
+    """The one line on stderr of a command that exits with code 2."""
+    try:
+        code = main([*map(str, args)])
+    except SystemExit as stopped:
+        code = int(stopped.code or 0)
+    captured = capsys.readouterr()
+    assert (code, captured.out, len(captured.err.splitlines())) == (2, "", 1), captured
+    return captured.err
+
+
+def test_a_focus_state_is_focused_at_its_object(capsys: pytest.CaptureFixture[str]) -> None:
+    """1588 mm before the front vertex, and the film 245 mm behind it; farther as the lens is larger."""
+    near = described(capsys, "lens", ANAMORPHIC, "--zoom", "1.6m")
+    assert near["focus_m"] == pytest.approx((1588.0 + near["film_z_mm"]) / 1000)
+    twice = described(capsys, "lens", ANAMORPHIC, "--zoom", "1.6m", "--efl", 80)
+    assert twice["focus_m"] / near["focus_m"] == pytest.approx(twice["efl_mm"] / near["efl_mm"])
+    assert described(capsys, "lens", NIKON, "--zoom", "135mm near")["focus_m"] == pytest.approx(0.9966, abs=1e-3)
+
+
+def test_an_anamorphic_lens_is_described_in_both_planes(capsys: pytest.CaptureFixture[str]) -> None:
+    """The source: 42.47 mm, and half of it across; the edge of the circle is lit along y, the picture is wider."""
+    data = described(capsys, "lens", ANAMORPHIC)
+    assert data["efl_mm"] == pytest.approx(42.47, abs=0.05) and data["efl_x_mm"] == pytest.approx(21.47, rel=0.01)
+    assert data["half_field_reached_deg"] > 15
+    dark = [w for w in data["warnings"] if "no ray reaches" in w]
+    assert (data["half_field_reached_x_deg"] is None) == bool(dark) and all("along x" in w for w in dark)
+    assert main(["lens", str(ANAMORPHIC)]) == 0
+    text = capsys.readouterr().out
+    assert "in the x-z plane" in text and "cylinder y" in text
+    assert described(capsys, "lens", SINGLET)["efl_x_mm"] is None
+
+
+def test_breathing_is_no_other_f_number(capsys: pytest.CaptureFixture[str]) -> None:
+    state = ("--zoom", "135mm", "--focus", "2", "--focusing", "internal")
+    data = described(capsys, "lens", NIKON, *state)
+    assert data["efl_mm"] < 130  # it does breathe
+    assert not [w for w in data["warnings"] if "the stop gives" in w]
+
+
+def test_the_surface_table_hides_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "coated.toml"
+    material = 'n_d = 1.5168, V_d = 64.17, material = "N-BK7"'
+    more = 'coating = "quarter-wave", conic = -1.1, asphere = { 4 = 1e-7, 6 = 2e-10 }, absorption_per_mm = 0.01'
+    path.write_text(SINGLET.read_text().replace(material, f'glass = "N-BK7", {more}'))
+    row = described(capsys, "lens", path)["surfaces"][1]
+    assert (row["conic"], row["asphere"], row["glass"]) == (-1.1, {"4": 1e-7, "6": 2e-10}, "N-BK7")
+    assert row["n_d"] == pytest.approx(1.5168, abs=1e-4) and row["V_d"] == pytest.approx(64.17, abs=0.02)
+    (index, nanometres), *_ = row["coating"]["layers"]
+    assert index * nanometres == pytest.approx(550 / 4, rel=0.1) and row["absorption_per_mm"] == 0.01
+    assert main(["lens", str(path)]) == 0
+    assert "asphere 4-6, K -1.1, coating quarter-wave, absorbs 0.01/mm" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("args", "word"),
+    [
+        (("list", "--focus", "2", "--blades", "5", "--efl", "20"), "--efl"),
+        (("list", "--focusing", "best"), "--focusing"),
+        (("list", "--breathing", "a.png"), "--breathing"),
+        (("list", PHONE), "(a file)"),
+        ((PHONE, "--vignetting", "0.4"), "--vignetting"),
+        ((PHONE, "--derive-rims", "--f-number", "8"), "--f-number"),
+        ((PHONE, "--efl", "1e300"), "0.001 to 1e+06"),
+    ],
+)
+def test_nothing_is_ignored_in_silence(args: tuple[object, ...], word: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert word in failure(capsys, "lens", *args)
+
+
+# render
+
+
+def test_a_place_that_cannot_be_written_is_found_before_the_render(
+    scene: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("neurolens.render.renderer.render", lambda *_, **__: pytest.fail("rendered for nothing"))
+    line = failure(capsys, "render", scene, "--camera", "thin", "-o", _NOWHERE, "--quiet")
+    assert str(_NOWHERE) in line and ".tmp" not in line
+
+
+def test_errors_name_the_target_not_the_temporary_file(tmp_path: Path) -> None:
+    target = tmp_path / "gone" / "a.json"
+    with pytest.raises(OSError) as error, atomic_path(target) as temporary:
+        temporary.write_text("x")
+    assert error.value.filename == str(target)
+    with pytest.raises(OSError) as error:
+        check_writable(target)
+    assert error.value.filename == str(target)
+    with pytest.raises(IsADirectoryError):
+        check_writable(tmp_path)
+    check_writable(tmp_path / "fine.exr")
+    assert os.listdir(tmp_path) == []
+    with pytest.raises(InputError, match=str(_NOWHERE)) as refused:
+        write_exr(_NOWHERE, np.zeros((2, 2, 3)))
+    assert ".tmp" not in str(refused.value)
+
+
+def test_the_picture_keeps_the_state_of_its_lens(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a.exr"
+    state = ("--zoom", "100", "--focusing", "internal", "--focus", "2")
+    described(capsys, "render", scene, "--camera", NIKON, "-o", out, "--quiet", *state)
+    camera = read_exr(out)[1]["camera"]
+    assert (camera["zoom"], camera["focusing"], camera["rims"]) == ("100", "internal", "derived")
+    assert "100 mm" in camera["derived"]
+
+
+def test_doubts_are_said_and_kept(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A slip of the pen in the table, and a film five times as wide as the picture; a film that fits is no doubt."""
+    slip, out = tmp_path / "slip.toml", tmp_path / "a.exr"
+    slip.write_text(SINGLET.read_text().replace("radius_mm =  50.6", "radius_mm =  60.5"))
+    common = ("-o", str(out), "--quiet", "--samples", "1")
+    assert main(["render", str(scene), "--camera", str(slip), *common]) == 0
+    assert "warning: the focal length is 54" in capsys.readouterr().err
+    assert any("the focal length is 54" in note for note in read_exr(out)[1]["camera"]["notes"])
+    assert main(["render", str(scene), "--camera", str(PHONE), *common]) == 0
+    assert "times the image circle of 7 mm" in capsys.readouterr().err
+    assert main(["render", str(scene), "--camera", str(PHONE), *common, "--film", "6x3.375"]) == 0
+    assert capsys.readouterr().err == ""
+    assert read_exr(out)[1]["camera"]["film_mm"] == [6, 3.375]
+
+
+def test_the_shape_of_the_picture_is_checked_before_the_camera(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("neurolens.cameras.build.make_camera", lambda *_: pytest.fail("made for nothing"))
+    size = ("--width", "32", "--height", "32", "-o", tmp_path / "a.exr")
+    assert "shape of the film" in failure(capsys, "render", scene, "--camera", PHONE, *size)
+    assert "--film" in failure(capsys, "render", scene, "--camera", PHONE, "--film", "36", "-o", tmp_path / "a.exr")
