@@ -5,9 +5,10 @@ Only a lens file needs torch, which is imported when one is asked for.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from neurolens.apertures import Aperture
 from neurolens.cameras.contract import Camera
@@ -15,7 +16,11 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.errors import InputError
 
+if TYPE_CHECKING:
+    from neurolens.optics.prescription import Lens
+
 IDEAL = ("thin", "pinhole")
+_DARK_FILM = 1.25  # diagonal of the film over the image circle
 _EFL_MM, _THIN_F_NUMBER, _PINHOLE_F_NUMBER = 50.0, 4.0, 8.0
 
 
@@ -89,14 +94,16 @@ def _ideal(kind: str, shot: Shot) -> Camera:
 
 def _exact(path: Path, shot: Shot) -> Camera:
     from neurolens.cameras.exact import ExactCamera
+    from neurolens.optics.lenscheck import check_lens, doubts
     from neurolens.optics.lensfile import read_lens
     from neurolens.optics.paraxial import first_order
 
-    lens = read_lens(path).at(focal_length_mm=shot.efl_mm, field_deg=shot.field_deg, zoom=shot.zoom)
+    tabled = read_lens(path)
+    lens = tabled.at(focal_length_mm=shot.efl_mm, field_deg=shot.field_deg, zoom=shot.zoom)
     if shot.aperture is not None:
         lens = lens.with_aperture(shot.aperture)
     f_number = shot.f_number_for(first_order(lens).f_number)
-    return ExactCamera(
+    camera = ExactCamera(
         lens,
         film_mm=shot.film_mm,
         focus_m=shot.focus_m,
@@ -104,6 +111,23 @@ def _exact(path: Path, shot: Shot) -> Camera:
         wavelength_nm=shot.wavelength_nm,
         focus=shot.focus,
     )
+    camera.settings |= {"zoom": shot.zoom, "notes": [*doubts(check_lens(tabled)), *_dark_film(lens, shot.film_mm)]}
+    return camera
+
+
+def _dark_film(lens: Lens, film_mm: tuple[float, float]) -> list[str]:
+    """A sentence on a film that is far larger than the picture of the lens, where the size of that is known."""
+    from neurolens.optics.pupils import image_radius_mm
+
+    if lens.image_radius_mm is None and (lens.half_field_deg is None or lens.half_field_deg >= 60):
+        return []  # only a long search would tell
+    circle, diagonal = 2 * image_radius_mm(lens)[0], math.hypot(*film_mm)
+    if diagonal <= _DARK_FILM * circle:
+        return []
+    return [
+        f"the film's diagonal of {diagonal:.3g} mm is {diagonal / circle:.2g} times the image circle "
+        f"of {circle:.3g} mm: its corners may stay dark"
+    ]
 
 
 def _model(path: Path, shot: Shot) -> Camera:

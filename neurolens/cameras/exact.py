@@ -69,7 +69,9 @@ class ExactCamera:
         if bounds is None:
             corner = math.hypot(*self.film_mm) / 2
             rows, points = (17, 128) if round_ else (13, 48)
-            bounds = pupil_bounds(self.lens, 1.0001 * corner, (film_z, film_z), used, rows=rows, points=points)
+            bounds = pupil_bounds(
+                self.lens, 1.0001 * corner, (film_z, film_z), used, rows=rows, points=points, film_mm=self.film_mm
+            )
         self._pupil_z_mm = bounds.pupil_z_mm
         self._dtype = torch.float32 if dtype == "float32" else torch.float64
         self.film = LensFilm(PupilTable.of(asdict(bounds)), float(film_z), used, self._scene, self._passes, detail)
@@ -83,6 +85,9 @@ class ExactCamera:
             "film_mm": list(self.film_mm),
             "film_z_mm": float(film_z),
             "stop_radius_mm": float(self.lens.stop_radius_mm),
+            "focusing": focus,
+            "derived": self.lens.derived,
+            "rims": lens.rims,
             "aperture": self.lens.aperture and self.lens.aperture.settings(),
             "dtype": dtype,
         }
@@ -116,4 +121,6 @@ class ExactCamera:
         film_z = self.lens.film_z_mm
         assert film_z is not None
         with torch.no_grad():
-            return passes_at_any_azimuth(self.lens, r, film_z, u, v, self._pupil_z_mm, wavelength_nm).numpy()
+            return passes_at_any_azimuth(
+                self.lens, r, film_z, u, v, self._pupil_z_mm, wavelength_nm, self.film_mm
+            ).numpy()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +13,7 @@ from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, 
 from neurolens.commands.output import print_json
 from neurolens.errors import InputError
 from neurolens.evaluate.records import plain
+from neurolens.files import check_writable
 from neurolens.progress import Progress, duration
 
 if TYPE_CHECKING:
@@ -61,6 +64,9 @@ def add_parser(subparsers: Any) -> None:
         "--height", metavar="PIXELS", type=whole(1, 16384),
         help="height (default: the scene's, or from --width and the film's shape)",
     )  # fmt: skip
+    picture.add_argument(
+        "--film", metavar="WxH", type=film_size, help="width and height of the film in mm (default: the scene's)"
+    )
     picture.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the random numbers (default: 0)")
     picture.add_argument("--max-depth", metavar="N", type=whole(1, 1000), help="bounces (default: the scene's)")
     picture.add_argument("--half", action="store_true", help="16-bit floats in the EXR (default: 32-bit)")
@@ -87,13 +93,21 @@ def run(args: argparse.Namespace) -> int:
     preview = _preview_path(args.out)
     from neurolens.cameras.build import make_camera
     from neurolens.render.exr import write_exr, write_png
+    from neurolens.render.film import PixelGrid
     from neurolens.render.renderer import render
     from neurolens.render.scenefile import load_scene
 
     scene = load_scene(args.scene)
     settings = scene.settings.camera
-    camera = make_camera(args.camera, shot_of(settings, args, scene.aperture))
+    if args.film is not None:
+        settings = replace(settings, film_width_mm=args.film[0], film_height_mm=args.film[1])
+        if args.width is None and args.height is None:
+            args.width = settings.width
     width, height = picture_size(settings, args.width, args.height)
+    PixelGrid(width, height, (settings.film_width_mm, settings.film_height_mm))  # before the slow making of a camera
+    camera = make_camera(args.camera, shot_of(settings, args, scene.aperture))
+    for note in camera.settings.get("notes", ()):
+        print(f"neurolens: warning: {note}", file=sys.stderr)
     with Progress(quiet=args.quiet).stage(f"render {scene.name}, {camera.name}") as report:
         result = render(
             scene, camera, width=width, height=height, samples=args.samples, seed=args.seed,
@@ -140,17 +154,31 @@ def picture_size(settings: CameraSettings, width: int | None, height: int | None
     return (max(1, round(height * shape)) if width is None else width), height
 
 
+def film_size(text: str) -> tuple[float, float]:
+    """Type of --film: width x height in mm, as in 36x24."""
+    width, _, height = text.lower().partition("x")
+    side = between(1e-3, 1e4, "the film's width x height in mm, as in 36x24, each")
+    try:
+        return side(width), side(height)
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(f"{text!r}: {error}") from None
+
+
 def _preview_path(out: Path) -> Path:
     """The PNG beside the EXR; refuses names that cannot be written before anything is rendered.
 
     Raises:
         InputError: not .exr, or no such folder.
+        OSError: a folder that cannot be written.
     """
     if out.suffix.lower() != ".exr":
         raise InputError(out, "--out", out.suffix or "(no suffix)", "a name that ends in .exr")
     if not out.parent.is_dir():
         raise InputError(out, "--out", str(out.parent), "a folder that exists")
-    return out.with_suffix(".png")
+    preview = out.with_suffix(".png")
+    for path in (out, preview):
+        check_writable(path)
+    return preview
 
 
 def _text(stats: dict[str, Any], out: Path, preview: Path) -> str:

@@ -34,7 +34,8 @@ def write_exr(path: str | Path, rgb: ArrayLike, *, half: bool = False, metadata:
         metadata: JSON-able settings, kept as one JSON text in the attribute "neurolens".
 
     Raises:
-        InputError: another shape, no pixels, complex or text, not finite, metadata that is not JSON, no such folder.
+        InputError: another shape, no pixels, complex or text, not finite, metadata that is not JSON, no such folder,
+            a place that cannot be written.
     """
     path = Path(path)
     picture = np.asarray(rgb)
@@ -58,7 +59,11 @@ def write_exr(path: str | Path, rgb: ArrayLike, *, half: bool = False, metadata:
     channels = {name: np.ascontiguousarray(stored[..., k]) for k, name in enumerate("RGB")}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, METADATA_KEY: text}
     with atomic_path(path) as temporary:
-        OpenEXR.File([OpenEXR.Part(header, channels)]).write(str(temporary))
+        try:
+            OpenEXR.File([OpenEXR.Part(header, channels)]).write(str(temporary))
+        except RuntimeError as error:  # the library's only kind; it names the temporary file
+            said = str(error).replace(str(temporary), path.name)
+            raise InputError(path, "file", f"({said})", "a place that can be written") from None
 
 
 def read_exr(path: str | Path) -> tuple[FloatArray, dict[str, Any]]:
