@@ -52,7 +52,7 @@ def illumination(
 ) -> Illumination:
     """Relative illumination up to the edge of the field, with n by n rays from each film point.
 
-    Fields without a chief ray are NaN.
+    Fields without a chief ray are NaN, and all are where the axis gets no light.
     """
     angles = np.linspace(0, scene.edge_deg() if edge_deg is None else edge_deg, fields)
     rays = bundle(scene.open, angles.tolist(), [wavelength_nm], hexapolar(6))
@@ -61,13 +61,15 @@ def illumination(
     with torch.no_grad():
         light = area[:, None] * start.dz.reshape(fields, -1) ** 4
         whole, seen = (_sum(light, lens, start, wavelength_nm) for lens in (scene.open.traced, scene.lens))
+    with np.errstate(divide="ignore", invalid="ignore"):  # dark fields, or an axis without light: NaN
+        relative, unvignetted, passed = seen / (seen[0] or np.nan), whole / (whole[0] or np.nan), seen / whole
     return Illumination(
         wavelength_nm,
         angles,
         rays.chief_height_mm.numpy(),
-        seen / seen[0],
-        whole / whole[0],
-        seen / whole,
+        relative,
+        unvignetted,
+        passed,
         np.where(angles < 90, np.cos(np.radians(angles)), 0.0) ** 4,
     )
 

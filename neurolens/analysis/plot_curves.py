@@ -71,7 +71,7 @@ def plot_distortion(data: Distortion, path: str | Path, title: str, subtitle: st
         figure = new_figure(7.4, 4.8)
         heading(figure, title, f"Distortion, {data.wavelength_nm:.0f} nm; {subtitle}")
         axes = figure.add_subplot()
-        limit = max(2.0, 1.25 * float(np.nanmax(np.abs(data.error_percent[data.reference]))))
+        limit = max(2.0, 1.25 * float(np.nan_to_num(np.abs(data.error_percent[data.reference])).max()))
         for k, (name, error) in enumerate(data.error_percent.items()):
             chosen = name == data.reference
             label = f"against {name}{' (reference)' if chosen else ''}"
@@ -102,7 +102,7 @@ def plot_vignetting(data: Illumination, path: str | Path, title: str, subtitle: 
             axes.plot(data.height_mm, 100 * values, color=colour, ls=line, lw=width, label=label)
         axes.grid(True)
         axes.set(xlabel="image height (mm)", ylabel="share of the axis (%)")
-        axes.set_ylim(0, max(105.0, 105 * float(np.nanmax([data.relative, data.unvignetted]))))
+        axes.set_ylim(0, max(105.0, 105 * float(np.nan_to_num([data.relative, data.unvignetted]).max())))
         _degrees(axes, data.height_mm, data.field_deg, across=True)
         axes.legend(loc="lower left")
         return save(figure, path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -72,6 +73,16 @@ def test_no_light_is_one_error_or_a_gap(tmp_path: Path, capsys: pytest.CaptureFi
     plot_psf(image, tmp_path / "psf.png", "", "")
     assert "field 80: got (no light" in error_of(capsys, GAUSS, "spots", "--fields", 0, 80)
     assert "expected at most 2" in error_of(capsys, GAUSS, "mtf", "--fields", 80)
+
+
+def test_a_stop_beyond_all_glass_warns_of_no_division(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lens = LENSES / "muller_fisheye_100.toml"
+        data = run_json(capsys, lens, "vignetting", "spots", "--f-number", 0.3, "-o", tmp_path)
+    assert data["vignetting"]["relative"][0] in (None, 1.0)
+    assert data["spots"]["working_f_number"] == pytest.approx(4, rel=0.02)
+    assert any("V_d is not given" in w for w in data["warnings"])
 
 
 def test_a_pinhole_has_no_focus(pinhole: Path, capsys: pytest.CaptureFixture[str]) -> None:
