@@ -59,14 +59,14 @@ def with_filter(
         InputError: a value out of range, no room: a plate that would touch the lens, or the film.
     """
     _require(lens.path, thickness_mm=thickness_mm)
-    for field, value, least, expected in (
+    for key, value, least, expected in (
         ("n_d", n_d, 1, "a refractive index from 1"),
         ("V_d", 1.0 if V_d is None else V_d, 1e-300, "an Abbe number above 0, or None"),
         ("absorption_per_mm", absorption_per_mm, 0, "a number of at least 0, in 1/mm"),
         ("gap_mm", gap_mm, 0, "a length of at least 0, in mm"),
     ):
         if not _is_number(value) or not least <= value < math.inf:
-            raise InputError(lens.path, f"filter, {field}", value, expected)
+            raise InputError(lens.path, f"filter, {key}", value, expected)
     beside = lens.surfaces[-1 if rear else 0]
     if diameter_mm is None:
         field = 45.0 if rear else min(lens.half_field_deg or 45.0, _WIDEST_DEG)
