@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from neurolens.cameras.contract import CameraRays, FloatArray
 from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.pupil_boxes import PupilTable
-from neurolens.cameras.pupil_search import ROWS, SEGMENTS
+from neurolens.cameras.pupil_search import COARSE, FINE
 from neurolens.cameras.sampling import check_film, positive
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order
@@ -65,7 +65,7 @@ class ExactCamera:
         assert film_z is not None  # `at` places the film
         # A lens with cylinders is searched at many azimuths for one outline: coarser, for it fits none of them closely.
         round_ = symmetric_about_axis(self.lens)
-        detail = (ROWS, SEGMENTS) if round_ else (33, 16)
+        detail = FINE if round_ else COARSE._replace(tighten=bounds is not None)
         if bounds is None:
             corner = math.hypot(*self.film_mm) / 2
             rows, points = (17, 128) if round_ else (13, 48)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from neurolens import status as st
 from neurolens.cameras.contract import CameraRays, FloatArray
 from neurolens.cameras.pupil_boxes import Passes, PupilTable
-from neurolens.cameras.pupil_search import ROWS, SEGMENTS, outline_of
+from neurolens.cameras.pupil_search import FINE, Detail, outline_of
 from neurolens.errors import InputError
 
 # Points a side of the quadrature of the exposure on the axis, and wavelengths.
@@ -43,7 +43,7 @@ class LensFilm:
         scene: the lens.
         passes: whether rays pass where a simpler answer than that of `scene` should rule the outline; it must be true
             where `scene` passes.
-        detail: film radii of the outline, and edges of half a polygon.
+        detail: how closely the outline is sought.
 
     Attributes:
         outline: the pupil of every film radius, searched for when this is made (0.1 to 0.5 s).
@@ -59,11 +59,11 @@ class LensFilm:
         wavelength_nm: tuple[float, float],
         scene: SceneFunction,
         passes: Passes | None = None,
-        detail: tuple[int, int] = (ROWS, SEGMENTS),
+        detail: Detail = FINE,
     ) -> None:
         self.film_z_mm, self.scene = film_z_mm, scene
         self.distance_mm = film_z_mm - table.pupil_z_mm
-        outline = outline_of(table, passes or self._passes, wavelength_nm, rows=detail[0], segments=detail[1])
+        outline = outline_of(table, passes or self._passes, wavelength_nm, detail)
         if outline is None:
             raise InputError("camera", "f_number, focus_m", "(no ray passes)", "a lens that light can pass")
         self.outline = outline

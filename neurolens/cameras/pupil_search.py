@@ -6,7 +6,9 @@ All rows of the outline are searched at once, ray by ray from a centre outwards.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,13 +16,11 @@ from neurolens.cameras.pupil_boxes import Passes, PupilTable, tightened
 from neurolens.cameras.pupil_lattice import Ask, Float64Array, Frame, asking, end_of_light, frame_of
 from neurolens.cameras.pupil_outline import PupilOutline, wavelength_between
 
-ROWS, SEGMENTS = 65, 32
-
 # Directions in which the first outline is sought; steps outwards, and halvings of the step that crosses the boundary.
 _DIRECTIONS, _STEPS, _COARSE, _FINE = 33, 24, 5, 12
 # Where between rows, along an edge and between the two wavelengths the interpolated outline is checked; at which
 # multiples of it; and how far vertices are pushed beyond what was found: a hair, against rounding.
-_BETWEEN_ROWS, _ALONG_EDGE, _BETWEEN_WAVELENGTHS = (0.0, 0.5), (0.0, 0.3, 0.5, 0.7), (0.0, 0.4, 0.75, 1.0)
+_BETWEEN_ROWS, _ALONG_EDGE = (0.0, 0.5), (0.0, 0.3, 0.5, 0.7)
 _CHECKS, _CHECK_HALVINGS = (1.0, 1.002, 1.01, 1.03, 1.07, 1.15, 1.35), 5
 _HAIR = 2e-5
 # Where one wavelength's region is less than this share of both together, one outline serves both. Half-planes that do
@@ -30,13 +30,38 @@ _APART = 0.65
 _BULGE = 1.04
 
 
+class Detail(NamedTuple):
+    """How closely an outline is sought.
+
+    Attributes:
+        rows: film radii. segments: edges of the upper half of a polygon.
+        wavelengths: shares of the way from the shortest to the longest, in 1 / wavelength^2, the ends among them.
+        steps, coarse, fine: steps outwards, and halvings of the one that crosses the boundary, of two searches.
+        reach: how many times farther than the first search found the second looks.
+        tighten: whether the table may be much wider than what passes.
+    """
+
+    rows: int = 65
+    segments: int = 32
+    wavelengths: tuple[float, ...] = (0.0, 0.4, 0.75, 1.0)
+    steps: int = _STEPS
+    coarse: int = _COARSE
+    fine: int = _FINE
+    reach: float = math.inf
+    tighten: bool = True
+
+
+FINE = Detail()
+# For a lens with cylinders, each question about which takes tracing at many azimuths, and no outline fits all of them.
+# What is left out errs towards outlines too wide: halvings end outside what passes.
+COARSE = Detail(33, 16, (0.0, 0.5, 1.0), 12, 2, 5, 1.2, False)
+
+
 def outline_of(
     table: PupilTable,
     passes: Passes,
     wavelength_nm: tuple[float, float],
-    *,
-    rows: int = ROWS,
-    segments: int = SEGMENTS,
+    detail: Detail = FINE,
 ) -> PupilOutline | None:
     """The outline of what passes, or None where nothing does.
 
@@ -44,35 +69,49 @@ def outline_of(
         table: boxes that hold what passes, wider is slower but no harm.
         passes: the lens at one focus and stop.
         wavelength_nm: shortest and longest wavelength; equal ones give an outline for one.
-        rows: film radii. segments: edges of the upper half of a polygon.
+        detail: how closely.
 
     The polygons hold every point found to pass at the rows, between them and between vertices, even where the region
     is not convex or the outline bends: their vertices are pushed out until they do.
     """
     ends = tuple(sorted(set(wavelength_nm)))
-    looked_at = sorted({wavelength_between(ends, share) for share in _BETWEEN_WAVELENGTHS})
+    looked_at = sorted({wavelength_between(ends, share) for share in detail.wavelengths})
     ask = asking(passes, looked_at)
-    tight = tightened(table, passes, looked_at)
+    tight = tightened(table, passes, looked_at) if detail.tighten else table
     end = end_of_light(tight, ask)
     if end is None:
         return None
+    rows = detail.rows
     empty = np.zeros((len(ends), rows, 1), np.float32)
     outline = PupilOutline(table.pupil_z_mm, end, ends, empty[0, :, 0], empty, empty)
     frame = frame_of(tight, outline.radii(np.arange(rows, dtype=np.float64)), ask)
-    angles = np.repeat(np.linspace(0, np.pi, _DIRECTIONS)[None], rows, axis=0)
-    angles = _equal_areas(angles, _boundary(ask, frame, angles, _COARSE), segments)
-    fine = _together(np.stack([_boundary(asking(passes, (w,)), frame, angles, _FINE) for w in looked_at]))
+    start = np.repeat(np.linspace(0, np.pi, _DIRECTIONS)[None], rows, axis=0)
+    reach = np.repeat(frame.reach[:, None], _DIRECTIONS, axis=1)
+    rough = _boundary(ask, frame, start, reach, detail.steps, detail.coarse)
+    angles = _equal_areas(start, rough, detail.segments)
+    if detail.reach < math.inf:
+        reach = np.minimum(reach, np.maximum(detail.reach * rough, reach / detail.steps))
+    reach = np.stack([np.interp(*row) for row in zip(angles, start, reach, strict=True)])
+    fine = np.stack(
+        [_boundary(asking(passes, (w,)), frame, angles, reach, detail.steps, detail.fine) for w in looked_at]
+    )
+    fine = _together(fine, detail.wavelengths)
     x, y = (fine * a[:, None] * f(angles) for a, f in zip(frame.stretch, (np.cos, np.sin), strict=True))
     y[..., [0, -1]] = 0
     centre, x, y = (a.astype(np.float32) for a in (frame.centre, x, y))
-    return _pushed_out(replace(outline, centre=centre, x=x, y=y), passes)
+    return _pushed_out(replace(outline, centre=centre, x=x, y=y), passes, detail.wavelengths)
 
 
-def _boundary(ask: Ask, frame: Frame, angles: Float64Array, halvings: int) -> Float64Array:
-    """Distance [R, D] from the centre to the last passing point in each direction, in the stretched frame."""
+def _boundary(
+    ask: Ask, frame: Frame, angles: Float64Array, reach: Float64Array, steps: int, halvings: int
+) -> Float64Array:
+    """Distance [R, D] from the centre to the last passing point in each direction, in the stretched frame.
+
+    Looked for within `reach` [R, D], in so many steps and halvings of one.
+    """
     direction = np.stack([np.cos(angles), np.sin(angles)]) * frame.stretch[:, :, None]
-    steps = np.linspace(0, 1, _STEPS + 1)[:, None] * frame.reach
-    flat = _farthest(ask, *_flat(frame.radius, frame.centre, direction), np.repeat(steps, angles.shape[1], 1), halvings)
+    tried = np.linspace(0, 1, steps + 1)[:, None] * reach.ravel()
+    flat = _farthest(ask, *_flat(frame.radius, frame.centre, direction), tried, halvings)
     return flat.reshape(angles.shape)
 
 
@@ -120,8 +159,8 @@ def _equal_areas(angles: Float64Array, distance: Float64Array, segments: int) ->
     return np.stack([np.interp(wanted * a[-1], a, t) for a, t in zip(area, angles, strict=True)])
 
 
-def _together(distance: Float64Array) -> Float64Array:
-    """Distances at the ends of the spectrum, of those [W, R, D] at `_BETWEEN_WAVELENGTHS`; joined where they part.
+def _together(distance: Float64Array, shares: tuple[float, ...]) -> Float64Array:
+    """Distances at the ends of the spectrum, of those [W, R, D] at shares of it; joined where they part.
 
     At the edge of the light lateral colour leaves some wavelengths dark before others.
     """
@@ -130,16 +169,16 @@ def _together(distance: Float64Array) -> Float64Array:
     joined = distance.max(0, keepdims=True)
     area, whole = ((d[..., 1:] * d[..., :-1]).sum(2) for d in (distance, joined))
     apart = (area < _APART * whole).any(0)
-    for share, found in zip(_BETWEEN_WAVELENGTHS, distance, strict=True):
+    for share, found in zip(shares, distance, strict=True):
         apart |= (found > _BULGE * ((1 - share) * distance[0] + share * distance[-1])).any(1)
     return np.where(apart[:, None], joined, distance[[0, -1]])
 
 
-def _pushed_out(outline: PupilOutline, passes: Passes) -> PupilOutline:
+def _pushed_out(outline: PupilOutline, passes: Passes, shares: tuple[float, ...]) -> PupilOutline:
     """The outline with its vertices moved outwards until it holds what passes between them, in all three ways."""
     needed = np.ones(outline.x.shape)
     both = len(outline.wavelength_nm) > 1
-    for share in _BETWEEN_WAVELENGTHS if both else (0.0,):
+    for share in shares if both else (0.0,):
         ask = asking(passes, (wavelength_between(outline.wavelength_nm, share),))
         ends = {0.0: slice(0, 1), 1.0: slice(-1, None)}.get(share, slice(None))
         x, y = ((1 - share) * c[0].astype(np.float64) + share * c[-1] for c in (outline.x, outline.y))

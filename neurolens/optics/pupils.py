@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from neurolens.errors import InputError
 from neurolens.optics.clearance import end_mm, surface_sag_mm
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.optics.pupil_grid import FEW, Box, Place, search, union
 from neurolens.optics.pupil_rays import camera_rays, passes_at_any_azimuth, pupil_plane_z_mm, symmetric_about_axis
 from neurolens.optics.trace import trace
 
@@ -29,8 +30,10 @@ __all__ = [
 # Where rays are looked for again: within so many paraxial exit pupils of the axis, where the box of the rear rim is so
 # many times wider than that.
 _NEAR, _FAR = 3.0, 4.0
+_COARSE = 8  # film radii of the illumination that the search for its end leaves out at first
 
-_FEW = 40  # points of a grid, of which so few pass that it may miss the edges of what passes, or the whole of it
+# Boxes about what passes from film points, looked for over boxes.
+_Look = Callable[[Lens, list[Place], list[Box]], list[Box | None]]
 
 
 @dataclass(frozen=True)
@@ -63,27 +66,40 @@ def pupil_bounds(
     *,
     rows: int = 33,
     points: int = 128,
+    film_mm: tuple[float, float] | None = None,
 ) -> PupilBounds:
-    """Search the pupil plane for passing rays, film radius by film radius: a coarse grid, then its bounding box.
+    """Search the pupil plane for passing rays, all film radii together: coarse grids, then grids on what they find.
 
-    Each row is widened by the step of its grid and by its neighbours, so that bounds hold between rows too.
+    Each row is widened by the step of its grid and by its neighbours, so that bounds hold between rows too. `film_mm`
+    (width, height) leaves out of the search of a lens with cylinders what lies beyond a film; see
+    `passes_at_any_azimuth`.
 
     Raises:
         InputError: when no ray passes from any film point.
     """
     plane = pupil_plane_z_mm(lens)
-    film_planes = sorted(set(film_z_mm))
     wavelengths = sorted(set(wavelength_nm))
     data = first_order(lens)
     near = _NEAR * data.exit_pupil_diameter_mm / 2 if plane == data.exit_pupil_z_mm else math.inf
-    boxes = [
-        _row(lens, film_radius_mm * i / (rows - 1), film_planes, wavelengths, plane, points, near) for i in range(rows)
-    ]
+    jobs = []
+    for i in range(rows):
+        for z in sorted(set(film_z_mm)):
+            place = Place(film_radius_mm * i / (rows - 1), z)
+            jobs += [(i, place, start) for start in _starts(lens, place, plane, near)]
+
+    def look(seen: Lens, places: list[Place], starts: list[Box]) -> list[Box | None]:
+        return search(seen, places, wavelengths, plane, starts, points, film_mm)
+
+    found = _found(look, lens, [place for _, place, _ in jobs], [start for _, _, start in jobs])
+    by_row: list[list[Box]] = [[] for _ in range(rows)]
+    for (i, _, _), box in zip(jobs, found, strict=True):
+        by_row[i] += [box] if box else []
+    boxes = [union(row) if row else None for row in by_row]
     if not any(boxes):
         raise InputError(
             lens.path, "surfaces", "(no ray passes the lens)", f"rays from a film of radius {film_radius_mm:.4g} mm"
         )
-    merged = [_union([b for b in boxes[max(i - 1, 0) : i + 2] if b]) for i in range(rows)]
+    merged = [union([b for b in boxes[max(i - 1, 0) : i + 2] if b]) for i in range(rows)]
     return PupilBounds(
         plane,
         film_radius_mm,
@@ -94,34 +110,8 @@ def pupil_bounds(
     )
 
 
-class _Box(NamedTuple):
-    """Bounds of passing points for a film point on +x: along it, across it, from the axis, mm; how many were found."""
-
-    low: float
-    high: float
-    half: float
-    radius: float
-    points: int = 0
-
-
-def _union(boxes: list[_Box]) -> _Box:
-    if not boxes:
-        return _Box(1.0, -1.0, 0.0, 0.0)
-    return _Box(
-        min(b.low for b in boxes), max(b.high for b in boxes), max(b.half for b in boxes), max(b.radius for b in boxes)
-    )
-
-
-def _row(
-    lens: Lens,
-    radius: float,
-    film_planes: list[float],
-    wavelengths: list[float],
-    plane: float,
-    points: int,
-    near: float,
-) -> _Box | None:
-    """Box of the passing rays from one film radius, over all film planes and wavelengths given.
+def _starts(lens: Lens, place: Place, plane: float, near: float) -> list[Box]:
+    """Where on the pupil plane light of a film point may pass: what the rear rim bounds, and near the axis.
 
     `near` is how far from the axis light is looked for again where the rear rim bounds it badly, mm.
     """
@@ -129,50 +119,37 @@ def _row(
     rear_z = float(lens.vertices_mm[len(lens.surfaces) - 1])
     limit = min(rear.semi_diameter_mm, end_mm(rear))
     depths = [surface_sag_mm(rear, limit * t, 0.0) for t in (0.0, 0.5, 0.8, 1 - 1e-12)]
-    found = []
-    for film_z in film_planes:
-        # Every ray that enters crosses the rear surface between the planes that hold it, within the rim's radius; seen
-        # from the film point, that cylinder's two ends bound it on the pupil plane.
-        ends = []
-        for z in (rear_z + min(depths), rear_z + max(depths)):
-            stretch = (film_z - plane) / (film_z - z)
-            centre, reach = radius * (1 - stretch), 1.02 * rear.semi_diameter_mm * abs(stretch)
-            ends.append(_Box(centre - reach, centre + reach, reach, 0.0))
-        starts = [_union(ends)]
-        if starts[0].high - starts[0].low > _FAR * near:
-            # A cover glass a millimetre from the film: the pupil is a speck that falls between the points of a grid.
-            starts.append(_Box(-near, near, near, 0.0))
-        for start in starts:
-            coarse = _search(lens, radius, film_z, wavelengths, plane, start, points)
-            if coarse is None or coarse.points < _FEW:
-                # A stop far down may hide between the points of the grid: look closer where light passes an open one.
-                wide = _search(lens.with_stop_radius(math.inf), radius, film_z, wavelengths, plane, start, points)
-                coarse = wide and _search(lens, radius, film_z, wavelengths, plane, wide, points)
-            if coarse is not None:
-                found.append(_search(lens, radius, film_z, wavelengths, plane, coarse, points) or coarse)
-    return _union(found) if found else None
+    # Every ray that enters crosses the rear surface between the planes that hold it, within the rim's radius; seen
+    # from the film point, that cylinder's two ends bound it on the pupil plane.
+    ends = []
+    for z in (rear_z + min(depths), rear_z + max(depths)):
+        stretch = (place.film_z - plane) / (place.film_z - z)
+        centre, reach = place.radius * (1 - stretch), 1.02 * rear.semi_diameter_mm * abs(stretch)
+        ends.append(Box(centre - reach, centre + reach, reach, 0.0))
+    starts = [union(ends)]
+    if starts[0].high - starts[0].low > _FAR * near:
+        # A cover glass a millimetre from the film: the pupil is a speck that falls between the points of a grid.
+        starts.append(Box(-near, near, near, 0.0))
+    return starts
 
 
-def _search(
-    lens: Lens, radius: float, film_z: float, wavelengths: list[float], plane: float, box: _Box, points: int
-) -> _Box | None:
-    """Box of the passing points of a grid over `box` (upper half only: the lens is symmetric), a step wider."""
-    u = torch.linspace(box.low, box.high, points, dtype=torch.float64)
-    v = torch.linspace(0, box.half, points // 2, dtype=torch.float64)
-    pu, pv = (t.reshape(-1) for t in torch.meshgrid(u, v, indexing="ij"))
-    film = torch.full_like(pu, radius)
-    passed = torch.stack([passes_at_any_azimuth(lens, film, film_z, pu, pv, plane, w) for w in wavelengths]).any(0)
-    if not passed.any():
-        return None
-    du, dv = float(u[1] - u[0]), float(v[1] - v[0])
-    pu, pv = pu[passed], pv[passed]
-    return _Box(
-        float(pu.min()) - du,
-        float(pu.max()) + du,
-        float(pv.max()) + dv,
-        float(torch.hypot(pu, pv).max()) + math.hypot(du, dv) / 2,
-        pu.numel(),
-    )
+def _found(look: _Look, lens: Lens, places: list[Place], starts: list[Box]) -> list[Box | None]:
+    """Boxes of what passes, by a grid over each start and another over what it finds."""
+    coarse = look(lens, places, starts)
+    few = [k for k, box in enumerate(coarse) if box is None or box.points < FEW]
+    # A stop far down may hide between the points of the grid: look closer where light passes an open one.
+    wide = look(lens.with_stop_radius(math.inf), [places[k] for k in few], [starts[k] for k in few])
+    seen = [(k, box) for k, box in zip(few, wide, strict=True) if box]
+    closer = look(lens, [places[k] for k, _ in seen], [box for _, box in seen])
+    for k in few:
+        coarse[k] = None
+    for (k, _), box in zip(seen, closer, strict=True):
+        coarse[k] = box
+    some = [(k, box) for k, box in enumerate(coarse) if box]
+    fine = look(lens, [places[k] for k, _ in some], [box for _, box in some])
+    for (k, box), finer in zip(some, fine, strict=True):
+        coarse[k] = finer or box
+    return coarse
 
 
 def image_radius_mm(lens: Lens) -> tuple[float, str]:
@@ -187,15 +164,25 @@ def image_radius_mm(lens: Lens) -> tuple[float, str]:
     if lens.half_field_deg is not None and lens.half_field_deg < 60:
         return f * math.tan(math.radians(lens.half_field_deg)), "f tan(half field)"
     radii = torch.linspace(0, 3 * abs(f), 481, dtype=torch.float64)
-    share, angle = _illumination(lens, radii)
-    if not share[0] > 0:  # a stop nearly shut lies between the points of the grid
-        share, angle = _illumination(lens, radii[:: len(radii) // 60], 384)
-        radii = radii[:: len(radii) // 60]
-    if not share[0] > 0:
+    points = 48
+    if not _illumination(lens, radii[:1])[0] > 0:  # a stop nearly shut lies between the points of the grid
+        radii, points = radii[:: len(radii) // 60], 384
+    on_axis = _illumination(lens, radii[:1], points)[0]
+    if not on_axis > 0:
         raise InputError(lens.path, "surfaces", "(no ray passes on the axis)", "a lens that light can pass")
-    lit = float(radii[share >= 0.1 * share[0]].max())
+    coarse = torch.arange(0, len(radii), _COARSE)
+    known = _illumination(lens, radii[coarse], points)
+
+    def last(holds: Callable[[Tensor, Tensor], Tensor]) -> float:
+        """The last radius at which a statement about illumination and angle holds: coarse steps, then those between."""
+        from_ = int(coarse[holds(*known)].max())
+        closer = torch.arange(from_, min(from_ + _COARSE, len(radii)))
+        return float(radii[closer[holds(*_illumination(lens, radii[closer], points))]].max())
+
+    lit = last(lambda share, _: share >= 0.1 * on_axis)
     if lens.half_field_deg is not None:
-        reached = float(radii[(angle <= math.radians(lens.half_field_deg)) & (share > 0)].max())
+        edge = math.radians(lens.half_field_deg)
+        reached = last(lambda share, angle: (angle <= edge) & (share > 0))
         if reached <= lit:
             return reached, "traced to the half field"
     return lit, "relative illumination of 10%"
@@ -206,7 +193,8 @@ def _illumination(lens: Lens, radii: Tensor, points: int = 48) -> tuple[Tensor, 
     film_z = lens.film_z_mm if lens.film_z_mm is not None else float(lens.vertices_mm[-1])
     rear, rear_z = lens.surfaces[-1].semi_diameter_mm, float(lens.vertices_mm[len(lens.surfaces) - 1])
     grid = torch.linspace(-rear, rear, points, dtype=torch.float64)
-    film, px, py = (t.reshape(-1) for t in torch.meshgrid(radii, grid, grid, indexing="ij"))
+    # The half above the axis stands for both.
+    film, px, py = (t.reshape(-1) for t in torch.meshgrid(radii, grid, grid[points // 2 :], indexing="ij"))
     rays = camera_rays(film, torch.zeros_like(film), film_z, px, py, rear_z)
     traced = trace(lens, rays)
     passed = ((traced.status == 0) & (px * px + py * py <= rear * rear)).reshape(len(radii), -1)
