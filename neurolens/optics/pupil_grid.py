@@ -55,7 +55,7 @@ def search(
     a film point whose grid no ray passes.
 
     A coarse grid inside each is traced first. Where enough of it passes, only the points that may lie beyond its
-    extent by less than one of its steps follow, elsewhere all points.
+    extent by less than one of its steps follow; elsewhere all points near those found, or all.
 
     Args:
         places, boxes: film points and where to look from each.
@@ -100,11 +100,13 @@ def _extent(passed: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tenso
 
 
 def _may_widen(passed: Tensor, u: Tensor, v: Tensor, du: Tensor, dv: Tensor) -> Tensor:
-    """Points that may lie beyond the extent found, by less than a step, along, across or from the axis."""
+    """Points that may lie beyond the extent found, by less than a step, along, across or from the axis; or more."""
     least, most, across, reach = (t[:, None, None] for t in _extent(passed, u, v))
     du, dv = du[:, None, None], dv[:, None, None]
     distance = torch.hypot(u, v)
     within = (u > least - du) & (u < most + du) & (v < across + dv) & (distance < reach + torch.hypot(du, dv))
     beyond = (u < least) | (u > most) | (v > across) | (distance > reach)
-    few = passed.sum((1, 2)) < FEW
-    return few[:, None, None] | (within & beyond)
+    count = passed.sum((1, 2))[:, None, None]
+    # About few, all points are tried, two steps around; about none, the whole grid.
+    near = (u > least - 2 * du) & (u < most + 2 * du) & (v < across + 2 * dv)
+    return (within & beyond) | ((count < FEW) & near) | (count == 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import lens_models
@@ -168,3 +169,24 @@ def test_fisheye_sees_beyond_75_degrees() -> None:
 def test_focus_that_no_film_plane_reaches() -> None:
     with pytest.raises(InputError, match="focus_m"):
         ExactCamera(lens_models.lens(), film_mm=FILM, focus_m=0.1)
+
+
+@pytest.mark.parametrize("name", ["cooke_anamorphic_42", "schneider_anamorphic_31"])
+def test_anamorphic_outlines_lose_no_light_between_the_azimuths_they_are_sought_at(name: str) -> None:
+    """Rays through an outline half as wide again carry no more light than those through the outline itself."""
+    lens = lens_models.lens(name)
+    film_mm = (20.0, 15.0)
+    exact = ExactCamera(lens, film_mm=film_mm, focus_m=3.0)
+    outline, side = exact.film.outline, 96
+    wide = replace(outline, x=np.float32(1.5) * outline.x, y=np.float32(1.5) * outline.y)
+    square = stratified(side)
+    beyond = np.abs(2 * square - 1).max(0) > 1 / 1.5
+    for azimuth in (2.5, 17.0, 33.0, 36.87, 38.5, 62.5, 88.0):
+        c, s = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
+        edge = min(film_mm[0] / 2 / c, film_mm[1] / 2 / s)
+        for share in (0.3, 0.85, 0.995):
+            film = repeat((share * edge * c, share * edge * s), side * side)
+            waves = np.full(side * side, 480, np.float32)
+            points, area = wide.sample(film, square, waves)
+            light = area * (exact.film.scene(film, points, waves).status == 0)
+            assert light[beyond].sum() <= 0.005 * light.sum()
