@@ -32,6 +32,8 @@ __all__ = [
 _NEAR, _FAR = 3.0, 4.0
 _COARSE = 8  # film radii of the illumination that the search for its end leaves out at first
 
+_AT_MANY_AZIMUTHS = 64  # points of a grid, at most, where each is traced at many azimuths
+
 # Boxes about what passes from film points, looked for over boxes.
 _Look = Callable[[Lens, list[Place], list[Box]], list[Box | None]]
 
@@ -78,6 +80,8 @@ def pupil_bounds(
         InputError: when no ray passes from any film point.
     """
     plane = pupil_plane_z_mm(lens)
+    if not symmetric_about_axis(lens):
+        points = min(points, _AT_MANY_AZIMUTHS)
     wavelengths = sorted(set(wavelength_nm))
     data = first_order(lens)
     near = _NEAR * data.exit_pupil_diameter_mm / 2 if plane == data.exit_pupil_z_mm else math.inf
