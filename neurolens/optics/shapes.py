@@ -25,10 +25,10 @@ Vector = tuple[Tensor, Tensor, Tensor]
 
 # Steps of the iteration by how far the asphere departs from the conic that it starts from, in rim radii. A fixed
 # count, for a test of convergence would make an accelerator wait for its host at every surface.
-STEPS = ((1e-4, 2), (3e-3, 3), (3e-2, 4), (math.inf, 7))
+STEPS = ((3e-4, 2), (3e-3, 3), (3e-2, 4), (math.inf, 7))
 # More steps that float64 takes after the one that decides convergence, so that both precisions decide alike.
 POLISH = {torch.float32: 0, torch.float64: 2}
-# Length of the deciding step, in rim radii, that counts as converged: the error left is of the order of its cube.
+# Length of the deciding step, in rim radii, that counts as converged: the error left is of the order of its square.
 LAST_STEP = 3e-4
 # cos^2 of the slope of the steepest conic that the iteration walks on.
 STEEPEST = 1e-7
@@ -45,7 +45,7 @@ def intersect_shape(r: Rays, surface: Surface, sense: int, before: Medium, guard
     w = (float(surface.cylinder != "y"), float(surface.cylinder != "x"))
     nearest = nearest_approach(r, before.inverse_n2)
     if surface.asphere:
-        return _meet_asphere(r, nearest, surface, w, sense, before, spend)
+        return _meet_asphere(r, nearest, surface, w, sense, before, guard, spend)
     c = surface.curvature
     kind = (c * w[0], c * w[1], c * (1 + surface.conic))
     met, q2, q, t = _meet_quadric(r, nearest, kind, sense, before, guard, spend)
@@ -99,7 +99,14 @@ def _meet_quadric(
 
 
 def _meet_asphere(
-    r: Rays, m: Vector, surface: Surface, w: tuple[float, float], sense: int, before: Medium, spend: bool
+    r: Rays,
+    m: Vector,
+    surface: Surface,
+    w: tuple[float, float],
+    sense: int,
+    before: Medium,
+    guard: bool,
+    spend: bool,
 ) -> Hit:
     """Iterate along the rays, from the conic that fits the asphere best.
 
@@ -113,7 +120,7 @@ def _meet_asphere(
         held_m, held_p = (m[0].detach(), m[1].detach(), m[2].detach()), (held.dx, held.dy, held.dz)
         medium = Medium(*(v.detach() if isinstance(v, Tensor) else v for v in before))
         _, missed, _, t = _meet_quadric(held, held_m, (c * w[0], c * w[1], cz), sense, medium, False, spend)
-        t = torch.nan_to_num(t, 0.0, 0.0, 0.0)
+        t = torch.nan_to_num(t, 0.0, 0.0, 0.0) if guard else t
         polish = POLISH[t.dtype]
         for n in range(steps + polish - 1):
             step = _step(_along(held_m, t, held_p), held_p, surface, w, sense)
@@ -121,7 +128,7 @@ def _meet_asphere(
                 deciding = step
             t = t + step
     at = _along(m, t.detach(), p)
-    step = _step(at, p, surface, w, sense)
+    step = _step(at, p, surface, w, sense, last=True)
     x, y, z = _along(at, step, p)
     slope, cos2 = _slope(surface, w, x, y)
     nx, ny = (times(v * -slope, k) for v, k in zip((x, y), w, strict=True))
@@ -135,7 +142,7 @@ def _meet_asphere(
     if cos2 is not None:
         met = also(met, positive(cos2 - STEEPEST, spend=spend))
     # How far a ray misses is of use only where crossings are learnt from.
-    q2 = q * q if spend else torch.where(met, q * q, torch.minimum(missed, -q * q))
+    q2 = torch.where(met, q * q, torch.minimum(missed, -q * q)) if guard else q * q
     return Hit(x, y, z, q, q2, met, (nx * scale, ny * scale, scale))
 
 
@@ -172,16 +179,19 @@ def _fitted(
     return (c, cz), next(steps for departure, steps in STEPS if worst <= departure * rim_mm)
 
 
-def _step(at: Vector, p: Vector, surface: Surface, w: tuple[float, float], sense: int) -> Tensor:
+def _step(at: Vector, p: Vector, surface: Surface, w: tuple[float, float], sense: int, last: bool = False) -> Tensor:
     """Euler's step along the rays towards sag(x, y) = z: Newton's with the bend of the surface taken into account.
 
     Newton's own step is lost where a ray all but touches the surface, for there two meetings lie close together; the
-    parabola through value, slope and bend has both, and the sign of its root is that of the one wanted.
+    parabola through value, slope and bend has both, and the sign of its root is that of the one wanted. The `last` step
+    is Newton's: by then both are the same.
     """
     x, y, z = at
     sag, slope, turn = _sag(surface, w, x, y)
     along = _weighted((x, y, z), p, w)
     rate = slope * along - p[2]
+    if last:
+        return (z - sag) / rate
     # Second derivative of the sag along the ray, but for what the polynomial adds to the change of its own slope.
     bend = slope * _weighted(p, p, w)
     if turn is not None:
