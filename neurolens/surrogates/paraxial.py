@@ -14,11 +14,11 @@ from torch import Tensor
 
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.surrogates.boundary_fit import FitData, fit_scalars, fit_stop
 from neurolens.surrogates.cores import InvariantPolynomial
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import DIRECTION, POSITION, Gate
 from neurolens.surrogates.pairs import RayPairs
-from neurolens.surrogates.polynomial import FitData, fit_scalars, fit_stop
 from neurolens.surrogates.targets import scales_of
 
 ParaxialMethod = Literal["thin", "thick"]

@@ -7,14 +7,12 @@ infinity. The stop crossing, the transmittance and the gates are then fitted on 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens import status as st
 from neurolens.errors import InputError
 from neurolens.surrogates.bases import (
     Exponents,
@@ -26,19 +24,17 @@ from neurolens.surrogates.bases import (
     vector_columns,
     vector_gram,
 )
+from neurolens.surrogates.boundary_fit import FitData, fit_scalars, fit_stop, solve_scalars, stop_crossing
 from neurolens.surrogates.cores import Basis, InvariantPolynomial, RawPolynomial
-from neurolens.surrogates.gates import boundary_rays, gate_reach, gate_values
+from neurolens.surrogates.gates import gate_values
 from neurolens.surrogates.growth import grow
-from neurolens.surrogates.lightfield import Encoding, LightField
+from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate
-from neurolens.surrogates.pairs import PairSet, RayPairs
+from neurolens.surrogates.pairs import RayPairs
 from neurolens.surrogates.selection import Sweep, forward, matching_pursuit, replace_terms
-from neurolens.surrogates.targets import Targets, film_equivalent, targets_of
+from neurolens.surrogates.targets import film_equivalent
 
 Method = Literal["dense", "omp", "ols", "adaptive"]
-
-# Only the neighbourhood of a rim decides who passes: rows of the gate fit weigh 1 / sqrt(1 + (g / width)^2).
-GATE_WIDTH = 0.1
 
 
 @dataclass(frozen=True)
@@ -59,28 +55,6 @@ class PolynomialSettings:
     terms: int = 40
     degree: int = 7
     replacement: bool = True
-
-
-@dataclass(frozen=True)
-class FitData:
-    """What every polynomial fit of one set of ray pairs shares."""
-
-    pairs: RayPairs
-    encoding: Encoding
-    gates: tuple[Gate, ...]
-
-    @property
-    def train(self) -> Targets:
-        return targets_of(self.pairs.lens, self.encoding, self.pairs.train)
-
-    @cached_property
-    def boundary(self) -> PairSet:
-        """The rays on which gates and the stop crossing are fitted."""
-        return boundary_rays(self.pairs, self.gates)
-
-    @property
-    def boundary_field(self) -> LightField:
-        return self.encoding(self.boundary.inputs)
 
 
 def fit_polynomial(
@@ -145,39 +119,6 @@ def _squares(outputs: Tensor) -> np.ndarray:
     return (outputs.flatten(1) ** 2).sum(1).numpy()
 
 
-def fit_stop(data: FitData, exponents: Exponents) -> Tensor:
-    """[2 M]: A and B of the stop crossing (in stop radii) on the monomials given, from rays on both sides of rims."""
-    crossing, weight = _stop_crossing(data)
-    field = data.boundary_field
-    columns = vector_columns(monomials(field.invariants(), exponents), field)
-    return solve(columns, crossing.reshape(1, -1), None if weight is None else weight.repeat(2))[0]
-
-
-def _stop_crossing(data: FitData) -> tuple[Tensor, Tensor | None]:
-    """[2, N] crossings of the boundary rays in stop radii, and their weights [N]: 0 for rays lost before the stop."""
-    pairs, lens = data.boundary, data.pairs.lens
-    crossing = torch.stack([pairs.cross_x[lens.stop_index], pairs.cross_y[lens.stop_index]]) / lens.stop_radius_mm
-    arrives = gate_reach((Gate(lens.stop_index, st.RIM),), pairs)[0]
-    return crossing, None if arrives.all() else arrives.to(crossing.dtype)
-
-
-def fit_scalars(data: FitData, exponents: Exponents) -> Tensor:
-    """[1 + G, M]: transmittance and gates on the monomials of the invariants given."""
-    train = data.train
-    boundary_features = monomials(data.boundary_field.invariants(), exponents)
-    return _scalars(data, monomials(train.field.invariants(), exponents), train.transmittance, boundary_features)
-
-
-def _scalars(data: FitData, features: Tensor, transmittance: Tensor, boundary_features: Tensor) -> Tensor:
-    """Transmittance on the passing rays, each gate on the rays that get as far, most on those near its boundary."""
-    rows = [solve(features, transmittance[None])]
-    values, known = gate_values(data.pairs.lens, data.gates, data.boundary), gate_reach(data.gates, data.boundary)
-    for value, arrives in zip(values, known, strict=True):
-        weight = (1 / torch.sqrt(1 + (value / GATE_WIDTH) ** 2)).where(arrives, 0.0)
-        rows.append(solve(boundary_features, value[None], weight))
-    return torch.cat(rows)
-
-
 def _fit_raw(data: FitData, settings: PolynomialSettings) -> RawPolynomial:
     """Every component with a support of its own, as published, half of `terms` each; one more for the scalars."""
     train = data.train
@@ -201,7 +142,7 @@ def _fit_raw(data: FitData, settings: PolynomialSettings) -> RawPolynomial:
     columns = {n: [place.setdefault(tuple(map(int, e)), len(place)) for e in s] for n, s in supports.items()}
     exponents = np.array(list(place), dtype=np.int64)
     features, boundary = monomials(variables, exponents), monomials(raw_variables(data.boundary_field), exponents)
-    crossing, weight = _stop_crossing(data)
+    crossing, weight = stop_crossing(data)
     components = torch.zeros((3, 2, len(place)), dtype=torch.float64)
     for axis in (0, 1):
         for vector in (POSITION, DIRECTION):
@@ -211,7 +152,7 @@ def _fit_raw(data: FitData, settings: PolynomialSettings) -> RawPolynomial:
         components[STOP, axis, at] = solve(boundary[at], crossing[axis][None], weight)[0]
     at = columns["scalars"]
     scalars = torch.zeros((1 + len(data.gates), len(place)), dtype=torch.float64)
-    scalars[:, at] = _scalars(data, features[at], train.transmittance, boundary[at])
+    scalars[:, at] = solve_scalars(data, features[at], train.transmittance, boundary[at])
     return RawPolynomial(exponents, components, scalars)
 
 
