@@ -67,6 +67,40 @@ class InvariantPolynomial:
 
 
 @dataclass(frozen=True, eq=False)
+class MirrorPolynomial:
+    """Of a lens with two planes of symmetry: out_x = A_x p_x + B_x u_x, and y likewise.
+
+    Attributes:
+        exponents: [M, 7] int64 of `LightField.mirror_invariants`; rows are unique.
+        ab: [3, 2, 2, M]: for each vector, A and B, of x and of y.
+        scalars: [S, M].
+    """
+
+    exponents: NDArray[np.int64]
+    ab: Tensor
+    scalars: Tensor
+
+    basis: str = "mirror"
+
+    def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
+        m = monomials(field.mirror_invariants(), self.exponents)
+        a, b = (self.ab[:, i] @ m for i in (0, 1))  # [3, 2, N]
+        return a * field.p + b * field.u, self.scalars @ m
+
+    def to(self, dtype: torch.dtype) -> MirrorPolynomial:
+        return replace(self, ab=self.ab.to(dtype), scalars=self.scalars.to(dtype))
+
+    @cached_property
+    def coefficients_per_vector(self) -> int:
+        """Of one vector's two components together, the larger of position and direction."""
+        return int((self.ab[:2] != 0).sum((1, 2, 3)).max())
+
+    @cached_property
+    def coefficients(self) -> int:
+        return int((self.ab != 0).sum() + (self.scalars != 0).sum())
+
+
+@dataclass(frozen=True, eq=False)
 class RawPolynomial:
     """Every component of every vector, and every scalar, is a polynomial in p_x, p_y, u_x, u_y, w: the published form.
 

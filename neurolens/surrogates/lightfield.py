@@ -5,7 +5,10 @@ film position only moves where the ray starts. For a rotationally symmetric lens
 
     out = A(rho, sigma, tau, w) p + B(rho, sigma, tau, w) u,   rho = p.p,  sigma = p.u,  tau = u.u,
 
-which holds the symmetry and the mirror symmetry exactly and has no singular point on the axis.
+which holds the symmetry and the mirror symmetry exactly and has no singular point on the axis. A lens with cylinders
+keeps its two planes of symmetry only: then x (and y likewise) of every vector is
+
+    out_x = A_x(q) p_x + B_x(q) u_x,   q = p_x^2, p_x u_x, u_x^2, p_y^2, p_y u_y, u_y^2, w.
 """
 
 from __future__ import annotations
@@ -33,6 +36,12 @@ class LightField(NamedTuple):
         p, u = self.p, self.u
         return torch.stack([p[0] * p[0] + p[1] * p[1], p[0] * u[0] + p[1] * u[1], u[0] * u[0] + u[1] * u[1], self.w])
 
+    def mirror_invariants(self) -> Tensor:
+        """[7, N]: p_x^2, p_x u_x, u_x^2, the same of y, w."""
+        p, u = self.p, self.u
+        rows = [c for i in (0, 1) for c in (p[i] * p[i], p[i] * u[i], u[i] * u[i])]
+        return torch.stack([*rows, self.w])
+
 
 @dataclass(frozen=True)
 class Encoding:
@@ -44,6 +53,7 @@ class Encoding:
         film_scale_mm, pupil_scale_mm: largest |p| and |u - k p| of the domain's passing rays.
         w_middle, w_half: w = (1 / lambda^2 - middle) / half in 1/um^2; the index is linear in 1 / lambda^2 (Cauchy).
             half is 0 for a lens without known dispersion, and then w = 0.
+        chief_y, pupil_scale_y_mm: of y where the lens has cylinders, and then the two above are of x; None: of both.
     """
 
     film_plane_z_mm: float
@@ -53,6 +63,23 @@ class Encoding:
     pupil_scale_mm: float
     w_middle: float
     w_half: float
+    chief_y: float | None = None
+    pupil_scale_y_mm: float | None = None
+
+    @property
+    def mirror(self) -> bool:
+        """Whether the lens has two planes of symmetry instead of an axis."""
+        return self.chief_y is not None
+
+    @property
+    def chiefs(self) -> tuple[float, float]:
+        """k of x and of y."""
+        return self.chief, self.chief if self.chief_y is None else self.chief_y
+
+    @property
+    def pupil_scales_mm(self) -> tuple[float, float]:
+        """Of x and of y."""
+        return self.pupil_scale_mm, self.pupil_scale_mm if self.pupil_scale_y_mm is None else self.pupil_scale_y_mm
 
     def planes(self, rays: FilmRays) -> tuple[Tensor, Tensor]:
         """Crossings with the two planes in mm, [2, N] each."""
@@ -63,7 +90,10 @@ class Encoding:
 
     def __call__(self, rays: FilmRays) -> LightField:
         p, u = self.planes(rays)
-        u = (u - self.chief * p) / self.pupil_scale_mm
+        if self.mirror:
+            u = torch.stack([(u[i] - self.chiefs[i] * p[i]) / self.pupil_scales_mm[i] for i in (0, 1)])
+        else:
+            u = (u - self.chief * p) / self.pupil_scale_mm
         if self.w_half == 0:
             w = torch.zeros_like(rays.wavelength_nm)
         else:
@@ -71,20 +101,24 @@ class Encoding:
         return LightField(p / self.film_scale_mm, u, w)
 
 
-def fit_encoding(domain: Domain, passing: PairSet) -> Encoding:
-    """Centre and scale by the passing rays of a domain."""
+def fit_encoding(domain: Domain, passing: PairSet, *, mirror: bool = False) -> Encoding:
+    """Centre and scale by the passing rays of a domain; `mirror`: x and y by themselves, for lenses with cylinders."""
     plain = Encoding(domain.film_z_mm[0], domain.pupil_z_mm, 0.0, 1.0, 1.0, 0.0, 0.0)
     p, u = plain.planes(passing.inputs)
-    chief = float((p * u).sum() / (p * p).sum())
+    axes = [slice(0, 1), slice(1, 2)] if mirror else [slice(0, 2)]
+    chiefs = [float((p[a] * u[a]).sum() / (p[a] * p[a]).sum()) for a in axes]
+    scales = [float((u[a] - k * p[a]).norm(dim=0).max()) for a, k in zip(axes, chiefs, strict=True)]
     shortest, longest = (float(inverse_square_um(v)) for v in domain.wavelength_nm)
     return Encoding(
         film_plane_z_mm=plain.film_plane_z_mm,
         pupil_plane_z_mm=plain.pupil_plane_z_mm,
-        chief=chief,
+        chief=chiefs[0],
         film_scale_mm=float(p.norm(dim=0).max()),
-        pupil_scale_mm=float((u - chief * p).norm(dim=0).max()),
+        pupil_scale_mm=scales[0],
         w_middle=(shortest + longest) / 2,
         w_half=(shortest - longest) / 2,
+        chief_y=chiefs[1] if mirror else None,
+        pupil_scale_y_mm=scales[1] if mirror else None,
     )
 
 

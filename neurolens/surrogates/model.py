@@ -18,6 +18,7 @@ from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.domain import Domain, FilmRays
+from neurolens.surrogates.front import sag_mm
 from neurolens.surrogates.lightfield import Encoding, LightField, direction_of, direction_of_slope
 
 # Order of the vector outputs of every core.
@@ -134,9 +135,7 @@ class LensModel:
 
     def _sag(self, x: Tensor, y: Tensor) -> Tensor:
         # First-order models give the position in the plane of the front vertex.
-        c = float(self.lens.surfaces[0].curvature) if self.direction == "angle" else 0.0
-        square = (x * x + y * y) * c
-        return square / (1 + torch.sqrt((1 - c * square).clamp_min(0.0)))
+        return sag_mm(self.lens.surfaces[0], x, y) if self.direction == "angle" else 0.0 * (x + y)
 
     def _status(self, rays: FilmRays, gates: Tensor, stop_square: Tensor, stop_radius: float) -> Tensor:
         """First failure in the order of travel, then the domain; guards are written so that NaN fails them."""

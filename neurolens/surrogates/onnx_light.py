@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.onnx_cores import CoreRows, Field
 from neurolens.surrogates.onnx_graph import INT32, Graph
+from neurolens.surrogates.onnx_series import add_horner, add_sag, fit_series
 
 Array = NDArray[np.float64]
 
@@ -39,14 +39,25 @@ def add_light_field(g: Graph, model: LensModel) -> tuple[Field, str]:
     matrix = _plane_matrix(g, e)
     planes = g.op("MatMul", matrix, film_pupil)  # rows p, u, p + u, v
     squares = g.op("Mul", planes, planes)
-    # rho = p.p, tau = u.u, sigma = (|p + u|^2 - rho - tau) / 2: squares only, so that one pass makes them all.
-    pairs = np.kron(np.array([[1, 0, 0], [-0.5, -0.5, 0.5], [0, 1, 0]]), [1.0, 1.0])
-    weight, bias = np.zeros((4, 7 if e.w_half else 6)), np.zeros(4)
-    weight[:3, :6] = pairs
-    if e.w_half:
-        weight[3, 6], bias[3] = 1, -e.w_middle / e.w_half
-    p, u, *_ = g.split(planes, [2, 2, len(weight[0]) - 4])
+    weight, bias = _invariants(e)
+    p, u, *_ = g.split(planes, [2, 2, weight.shape[1] - 4])
     return Field(p, u, squares, weight, bias, e.w_half != 0), inside
+
+
+def _invariants(e: Encoding) -> tuple[Array, Array]:
+    """The invariants (with w, last) as weight @ squares + bias, of the squares of p, u, p + u and v.
+
+    rho = p.p, tau = u.u, sigma = (|p + u|^2 - rho - tau) / 2: squares only, so that one pass makes them all.
+    """
+    pairs = np.array([[1, 0, 0], [-0.5, -0.5, 0.5], [0, 1, 0]])
+    # With mirror symmetry the three of x, then of y; else both together.
+    rows = np.concatenate([np.kron(pairs, axis) for axis in (([[1.0, 0.0], [0.0, 1.0]]) if e.mirror else [[1.0, 1.0]])])
+    weight = np.zeros((len(rows) + 1, 7 if e.w_half else 6))
+    weight[:-1, :6] = rows
+    bias = np.zeros(len(weight))
+    if e.w_half:
+        weight[-1, 6], bias[-1] = 1, -e.w_middle / e.w_half
+    return weight, bias
 
 
 def _between(g: Graph, value: str, low: float, high: float) -> str:
@@ -61,9 +72,10 @@ def _plane_matrix(g: Graph, e: Encoding) -> str:
         """p = u + (film - u) along, centred and scaled; columns film_x, film_y, pupil_x, pupil_y, v."""
         film, pupil = np.array([1.0, 0.0]), np.array([0.0, 1.0])
         p = along * film + (1 - along) * pupil
-        u = (pupil - e.chief * p) / e.pupil_scale_mm
-        p = p / e.film_scale_mm
-        matrix = np.kron(np.stack([p, u, p + u]), np.eye(2))
+        matrix = np.zeros((6, 4))
+        for axis, (chief, scale) in enumerate(zip(e.chiefs, e.pupil_scales_mm, strict=True)):
+            u, scaled = (pupil - chief * p) / scale, p / e.film_scale_mm
+            matrix[axis::2, axis::2] = np.stack([scaled, u, scaled + u])
         return np.asarray(np.pad(matrix, ((0, 1), (0, 1))) if e.w_half else matrix, dtype=np.float64)
 
     base, slope = rows(0.0), rows(1.0) - rows(0.0)
@@ -91,14 +103,15 @@ def _inside(g: Graph, d: Domain, film_pupil: str) -> str:
 def add_decoder(g: Graph, model: LensModel, rows: CoreRows, series: DirectionSeries) -> str:
     """Outputs scene_ray and stop_xy_mm; returns the stop crossing's squared radius [1, N]."""
     g.op("Identity", rows.stop, out="stop_xy_mm")
-    z = _sag(g, model, _square(g, rows.position))
+    # First-order models give the position in the plane of the front vertex.
+    z = add_sag(g, model.lens.surfaces[0], rows.position) if model.direction == "angle" else _flat(g, rows.position)
     t = _square(g, rows.direction)
     if model.direction == "slope":
         # (dx, dy) = slope / sqrt(1 + slope^2), dz = -1 / sqrt(1 + slope^2).
         factor = g.op("Reciprocal", g.op("Sqrt", g.op("Add", t, g.const(1.0))))
         dz = g.op("Neg", factor)
     else:
-        factor, dz = _horner(g, t, series.sinc), _horner(g, t, series.minus_cos)
+        factor, dz = add_horner(g, t, series.sinc), add_horner(g, t, series.minus_cos)
     g.concat(rows.position, z, g.op("Mul", rows.direction, factor), dz, out="scene_ray")
     return _square(g, rows.stop)
 
@@ -108,28 +121,9 @@ def _square(g: Graph, vector: str) -> str:
     return g.op("MatMul", g.const([[1.0, 1.0]]), g.op("Mul", vector, vector))
 
 
-def _sag(g: Graph, model: LensModel, r2: str) -> str:
-    """z on the front surface at squared radius r2: a short series where it is weak, else R - sqrt(R^2 - r2)."""
-    front = model.lens.surfaces[0]
-    c = 0.0 if model.direction == "slope" else float(front.curvature)
-    reach = (1.3 * front.semi_diameter_mm) ** 2
-    if c * c * reach < 0.05:
-        series = fit_series(lambda s: c * s / (1 + np.sqrt(1 - c * c * s)), reach, 1e-6)
-        return _horner(g, r2, series)
-    radius = g.const(abs(1 / c))
-    root = g.op("Sqrt", g.op("Relu", g.op("Sub", g.const(1 / c**2), r2)))
-    return g.op("Sub", radius, root) if c > 0 else g.op("Sub", root, radius)
-
-
-def _horner(g: Graph, t: str, coefficients: Array) -> str:
-    """Polynomial in t, lowest coefficient first. A leading 1 costs nothing."""
-    *rest, lead = coefficients
-    value = t if lead == 1 else g.op("Mul", t, g.const(lead))
-    for i, c in enumerate(reversed(rest)):
-        value = g.op("Add", value, g.const(c))
-        if i < len(rest) - 1:
-            value = g.op("Mul", value, t)
-    return value
+def _flat(g: Graph, position: str) -> str:
+    """Zeros [1, N], NaN where the position is."""
+    return g.op("MatMul", g.const([[0.0, 0.0]]), position)
 
 
 def add_status(g: Graph, model: LensModel, rows: CoreRows, stop_square: str, inside: str) -> None:
@@ -171,13 +165,3 @@ class DirectionSeries:
         self.sinc = sinc / self.kappa ** (2.0 * np.arange(n + 1) + 1)
         self.sinc[n] = 1.0
         self.minus_cos = self.minus_cos / self.kappa ** (2.0 * np.arange(len(self.minus_cos)))
-
-
-def fit_series(function: Callable[[Array], Array], upper: float, tolerance: float) -> Array:
-    """Power series of the lowest degree that holds the tolerance on [0, upper] (Chebyshev interpolation)."""
-    t = np.linspace(0, upper, 400)
-    for degree in range(1, 16):
-        fit = np.polynomial.Chebyshev.interpolate(function, degree, [0, upper])
-        if np.abs(fit(t) - function(t)).max() < tolerance:
-            break
-    return np.asarray(fit.convert(kind=np.polynomial.Polynomial).coef, dtype=np.float64)
