@@ -6,7 +6,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Literal, cast
+from typing import Literal, cast, get_args
 
 from neurolens import status as st
 from neurolens.errors import InputError, NeurolensWarning
@@ -14,6 +14,7 @@ from neurolens.surrogates.cores import Basis, Network
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.gates import choose_gates, explained
 from neurolens.surrogates.lightfield import Encoding, fit_encoding
+from neurolens.surrogates.mirror import fit_mirror
 from neurolens.surrogates.mlp import fit_network
 from neurolens.surrogates.model import Core, Gate, LensModel
 from neurolens.surrogates.pairs import RayPairs, trace_pairs
@@ -24,7 +25,8 @@ from neurolens.surrogates.polynomial import PolynomialSettings, fit_polynomial
 from neurolens.surrogates.targets import scales_of
 from neurolens.surrogates.threads import pinned_threads
 
-Method = Literal["thin", "thick", "dense", "omp", "ols", "adaptive", "mlp"]
+PublishedName = Literal["taylor", "hanika", "schrade", "zheng-adaptive", "neurolens2017", "rtf"]
+Method = Literal["thin", "thick", "dense", "omp", "ols", "adaptive", "mlp", PublishedName]
 POLYNOMIALS = ("dense", "omp", "ols", "adaptive")
 # Rays drawn over the domain to find what blocks anything: a share of 1e-4 is 20 of them.
 _GATE_RAYS = 200_000
@@ -38,7 +40,8 @@ class ModelSettings:
 
     Attributes:
         name: of the file and of the table's row; made from the other settings where empty.
-        method: "thin", "thick" (first order); "dense", "omp", "ols", "adaptive" (polynomials); "mlp".
+        method: "thin", "thick" (first order); "dense", "omp", "ols", "adaptive" (polynomials); "mlp"; the
+            published methods of `neurolens.surrogates.published`.
         basis, terms, degree, replacement: see `PolynomialSettings`.
         partitions: zones of the film with a fit of their own (polynomials and networks).
         units, layers: of the network. steps, seconds: its training ends by either; results repeat bit for bit where
@@ -130,7 +133,7 @@ def prepare(pairs: RayPairs) -> Prepared:
             NeurolensWarning,
             stacklevel=2,
         )
-    return Prepared(pairs, fit_encoding(pairs.domain, pairs.train), gates, lost)
+    return Prepared(pairs, fit_encoding(pairs.domain, pairs.train, mirror=pairs.lens.anamorphic), gates, lost)
 
 
 def fit_model(
@@ -142,15 +145,21 @@ def fit_model(
         InputError: an unknown method, or settings that the method refuses.
     """
     start = time.perf_counter()
+    encoding, gates = prepared.encoding, prepared.gates
     with pinned_threads():
-        core = _fit_core(prepared, settings, progress)
+        if settings.method in get_args(PublishedName):
+            from neurolens.surrogates.published import fitting  # published methods need this module's types
+
+            core, encoding, gates = fitting.fit_published(prepared, settings, progress)
+        else:
+            core = _fit_core(prepared, settings, progress)
     pairs = prepared.pairs
     return LensModel(
         lens=pairs.lens,
         domain=pairs.domain,
-        encoding=prepared.encoding,
+        encoding=encoding,
         scales=scales_of(pairs.lens),
-        gates=prepared.gates,
+        gates=gates,
         core=core,
         method=settings.label,
         settings={**asdict(settings), "rays": len(pairs.train), "rays_seed": pairs.settings.seed},
@@ -161,12 +170,14 @@ def fit_model(
 
 def _fit_core(prepared: Prepared, settings: ModelSettings, progress: Callable[[float], None] | None) -> Core:
     pairs, encoding, gates = prepared.pairs, prepared.encoding, prepared.gates
-    if settings.method == "thin" or settings.method == "thick":
+    if settings.method in ("thin", "thick") and not encoding.mirror:
         return fit_paraxial(pairs, encoding, gates, settings.method)
     if settings.method not in (*POLYNOMIALS, "mlp"):
-        raise InputError(
-            "fit", "method", settings.method, f"one of {', '.join(('thin', 'thick', *POLYNOMIALS, 'mlp'))}"
-        )
+        known = ("thin", "thick", *POLYNOMIALS, "mlp", *get_args(PublishedName))
+        raise InputError("fit", "method", settings.method, f"one of {', '.join(known)}")
+
+    if encoding.mirror:
+        return fit_mirror(pairs, encoding, gates, settings.method, settings.terms, settings.degree)
 
     def fit(zone: RayPairs) -> ZoneCore:
         if settings.method == "mlp":

@@ -1,0 +1,69 @@
+"""The published surrogates of lenses, as rows of the benchmark beside ours: who, and with which settings.
+
+Each method has its own module, whose docstring says what the paper does, what it leaves open and what was chosen.
+All are fitted on the same rays as ours (`fit_model`) and are measured by the same code; their tests of who passes are
+their own.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from neurolens.surrogates.fit import ModelSettings
+
+
+class PublishedMethod(NamedTuple):
+    """Where a method was published, and the settings of its rows; the first is the one the paper prefers."""
+
+    citation: str
+    presets: tuple[ModelSettings, ...]
+
+
+PUBLISHED: dict[str, PublishedMethod] = {
+    "taylor": PublishedMethod(
+        'Hullin, Hanika, Heidrich 2012, "Polynomial Optics: A Construction Kit for Efficient Ray-Tracing of Lens '
+        'Systems", Computer Graphics Forum 31(4)',
+        tuple(ModelSettings("taylor", f"taylor-d{degree}", "raw", degree=degree) for degree in (5, 3, 7)),
+    ),
+    "hanika": PublishedMethod(
+        'Hanika and Dachsbacher 2014, "Efficient Monte Carlo Rendering with Realistic Lenses", Computer Graphics '
+        "Forum 33(2)",
+        tuple(ModelSettings("hanika", f"hanika-d{degree}", "raw", degree=degree) for degree in (4, 5, 3)),
+    ),
+    "schrade": PublishedMethod(
+        'Schrade, Hanika, Dachsbacher 2016, "Sparse high-degree polynomials for wide-angle lenses", Computer Graphics '
+        "Forum 35(4)",
+        tuple(ModelSettings("schrade", f"schrade-{terms}", "raw", terms=terms, degree=11) for terms in (28, 16, 40)),
+    ),
+    "zheng-adaptive": PublishedMethod(
+        'Zheng and Zheng 2017, "Adaptive sparse polynomial regression for camera lens simulation", The Visual '
+        "Computer 33(6-8)",
+        tuple(
+            ModelSettings("zheng-adaptive", f"zheng-adaptive-{terms}x{zones}", "raw", terms=terms, partitions=zones)
+            for terms, zones in ((36, 4), (36, 1))
+        ),
+    ),
+    "neurolens2017": PublishedMethod(
+        'Zheng and Zheng 2017, "NeuroLens: Data-Driven Camera Lens Simulation Using Neural Networks", Computer '
+        "Graphics Forum 36(8)",
+        (
+            ModelSettings(
+                "neurolens2017",
+                "neurolens2017-128x3",
+                "raw",
+                partitions=1,
+                units=128,
+                layers=3,
+                steps=100_000,
+                seconds=60.0,
+            ),
+        ),
+    ),
+    "rtf": PublishedMethod(
+        'Goossens et al. 2022, "Ray-transfer functions for camera simulation of 3D scenes with hidden lens design", '
+        "Optics Express 30(13)",
+        tuple(ModelSettings("rtf", f"rtf-d{degree}", "raw", degree=degree) for degree in (6, 4, 8)),
+    ),
+}
+
+__all__ = ["PUBLISHED", "PublishedMethod"]

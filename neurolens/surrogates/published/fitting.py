@@ -1,0 +1,30 @@
+"""Which fit a published method asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from neurolens.errors import InputError
+from neurolens.surrogates.fit import ModelSettings, Prepared
+from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import Core, Gate
+
+Progress = Callable[[float], None] | None
+
+
+class PublishedFit(NamedTuple):
+    """A core with the coordinates that it is written in and the tests of who passes that its scalars stand for."""
+
+    core: Core
+    encoding: Encoding
+    gates: tuple[Gate, ...]
+
+
+def fit_published(prepared: Prepared, settings: ModelSettings, progress: Progress = None) -> PublishedFit:
+    """Fit one published method.
+
+    Raises:
+        InputError: an unknown method, or a lens or settings that it cannot take.
+    """
+    raise InputError("fit", "method", settings.method, "a published method that is implemented")
