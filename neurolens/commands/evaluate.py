@@ -23,8 +23,12 @@ Micrometres are film-equivalent: the distance between the exact and the predicte
 focus, taken back to the film, for rays within 60 degrees of the axis (rms_infinity_um: on the plane at
 infinity). False passes and blocks are shares of all rays that the model, or the lens, passes.
 
-Since the rays are others than the card's, a figure holds while it is at most 10% (RMS) or 15% (p99)
-above the promise, or 4 standard deviations of its count (shares); a largest error is only shown."""
+Promises are over the whole film, stopped down with the same fit ("2_stops.false_pass") and of the
+film's centre, mid and edge, its thirds by radius ("full.edge.rms_um").
+
+Since the rays are others than the card's, an error holds while it is above the promise by at most
+4 standard deviations of what so many rays can tell, at least 10% and at most 50%; a share by at most
+4 standard deviations of its count. A largest error is only shown."""
 _EPILOG = """\
 examples:
   neurolens evaluate models/NAME.onnx

@@ -9,24 +9,36 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 import neurolens
 from neurolens.cameras.model import OnnxLens
 from neurolens.errors import InputError, NeurolensWarning
+from neurolens.evaluate.fresh import STOPS, ZONED, Findings, FreshRays, fresh_rays, measure, zone_of
 from neurolens.evaluate.measure import onnx_predictor
-from neurolens.evaluate.rays import ray_errors
-from neurolens.evaluate.vignetting import vignetting_errors
+from neurolens.evaluate.rays import EachRay
+from neurolens.evaluate.vignetting import ZONES
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
-# How much worse than promised a figure may be, for the rays are others: relative for errors, and for shares so many
-# standard deviations of a count. A largest error has no such bound: more rays find larger ones.
-RMS_TOLERANCE, P99_TOLERANCE, SHARE_SIGMAS = 0.10, 0.15, 4.0
-_RMS = "rms_um rms_infinity_um rms_px direction_rms_deg position_rms_um transmittance_rms".split()
-_P99 = ["p99_um"]
-_SHARES = ["false_pass", "false_block"]
+# How much worse than promised a figure may be, for the rays are others: so many standard deviations of what a sample of
+# its size can tell, at least a tenth, at most a half. A largest error has no such bound: more rays find larger ones.
+SIGMAS, LEAST, MOST = 4.0, 0.10, 0.50
+# The errors, ray by ray, that a figure is made of.
+_RMS = {
+    "rms_um": "focus_um",
+    "rms_infinity_um": "infinity_um",
+    "rms_px": "focus_um",
+    "direction_rms_deg": "direction_deg",
+    "position_rms_um": "position_um",
+    "transmittance_rms": "transmittance",
+}
+_P99 = {"p99_um": "focus_um"}
+_SHARES = ("false_pass", "false_block")
 # Below this, float32 itself is the error: half a nanometre, a microdegree.
 _FLOOR = 5e-7
 _FRESH = 7919  # added to the seed of the fit
@@ -58,8 +70,8 @@ def check_model(
         rays: rays that the lens passes; four times as many test what passes and what is blocked.
         seed: None takes one that is not the fit's.
 
-    Returns the figures (`rays.ray_errors`, false_pass and false_block of `vignetting.vignetting_errors`, rays, seed)
-        and the promises of the card.
+    Returns the figures (those of `fresh.Findings`, flat, with stopped_down, zones, rays and seed) and the promises of
+        the card: over the whole film, stopped down ("2_stops.false_pass") and of zones ("full.edge.rms_um").
 
     Warns:
         NeurolensWarning: a seed that is the fit's own.
@@ -70,38 +82,89 @@ def check_model(
     if seed == fitted:
         warnings.warn(f"seed {seed} is that of the fit: these rays are not fresh", NeurolensWarning, stacklevel=2)
     pairs = make_pairs(lens, domain, PairSettings(train=1, held_out=rays, rim=1, seed=seed))
-    predict = onnx_predictor(model)
-    vignetting = vignetting_errors(lens, domain, predict, count=4 * rays, seed=seed)
-    # Rays that the exact lens passes, and nearly those that the model passes: what the shares are of.
-    passing = max(1.0, 4 * rays * vignetting["passing_share"])
-    figures = {
-        **ray_errors(lens, domain, pairs.held_out, predict),
-        **{key: vignetting[key] for key in (*_SHARES, "false_pass_near_rim", "false_block_near_rim")},
-        "rays": rays,
-        "seed": seed,
-    }
-    return figures, [_promise(key, value, figures, passing) for key, value in _promised(card)]
+    fresh = fresh_rays(lens, domain, pairs.held_out, count=4 * rays, seed=seed)
+    found = measure(fresh, onnx_predictor(model))
+    figures = {**found.figures, "stopped_down": found.stopped_down, "zones": found.zones, "rays": rays, "seed": seed}
+    return figures, [*_promises(card["errors"], fresh, found), *_zone_promises(card["errors"], fresh, found)]
 
 
-def _promised(card: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    """Figures of the card's errors; a figure that was not measured promises nothing."""
-    for key, value in card["errors"].items():
+def _promises(errors: Mapping[str, Any], fresh: FreshRays, found: Findings) -> Iterator[Promise]:
+    """Promises over the whole film, full aperture and stopped down."""
+    passing, promised_of = int(fresh.passes.sum()), _count(errors, "passing")
+    for key, promised in _numbers(errors):
+        measured = found.figures.get(key)
+        if key in _SHARES:
+            yield _share(key, promised, measured, passing, promised_of)
+        elif key in found.figures and key != "rays":
+            yield _error(key, promised, measured, found.each, _count(errors, "rays"))
+    for state, shares in (errors.get("stopped_down") or {}).items():
+        for key, promised in _numbers(shares) if state in found.stopped_down else ():
+            closed = 2 ** STOPS[state]  # so many times fewer rays pass
+            said = found.stopped_down[state][key]
+            yield _share(f"{state}.{key}", promised, said, passing / closed, (promised_of or passing) / closed)
+
+
+def _zone_promises(errors: Mapping[str, Any], fresh: FreshRays, found: Findings) -> Iterator[Promise]:
+    """Promises of thirds of the film."""
+    for state, zones in (errors.get("zones") or {}).items():
+        for zone, promises in zones.items():
+            if state not in ZONED or zone not in ZONES:
+                continue
+            measured, each = found.zones[state][zone], zone_of(fresh, found.each, state, zone)
+            for key, promised in _numbers(promises):
+                place, said = f"{state}.{zone}.{key}", measured.get(key)
+                if said is None:
+                    continue  # too few rays to tell
+                if key in _SHARES:
+                    yield _share(place, promised, said, measured["passing"], _count(promises, "passing"))
+                elif key in _RMS:
+                    yield _error(place, promised, said, each, _count(promises, "rays"))
+
+
+def _numbers(table: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+    """Figures; one that was not measured promises nothing."""
+    for key, value in table.items():
         if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
             yield key, float(value)
 
 
-def _promise(key: str, promised: float, figures: Mapping[str, Any], passing: float) -> Promise:
-    allowed = None
-    if key in _RMS:
-        allowed = promised * (1 + RMS_TOLERANCE) + _FLOOR
-    elif key in _P99:
-        allowed = promised * (1 + P99_TOLERANCE) + _FLOOR
-    elif key in _SHARES:
-        # Both figures are counts; no event in either still leaves room for one or two.
-        variance = max(promised * (1 - promised), 1 / passing) / passing
-        allowed = promised + SHARE_SIGMAS * math.sqrt(2 * variance)
-    value = figures.get(key)
-    return Promise(key, promised, None if value is None else float(value), allowed)
+def _count(table: Mapping[str, Any], key: str) -> int | None:
+    return dict(_numbers(table)).get(key)  # type: ignore[return-value]
+
+
+def _error(place: str, promised: float, measured: float | None, each: EachRay, promised_of: float | None) -> Promise:
+    """A promised error against fresh rays, whose own spread tells how well so many can know it."""
+    key = place.rpartition(".")[2]
+    value = math.nan if measured is None else float(measured)
+    if key not in _RMS and key not in _P99:
+        return Promise(place, promised, value, None)
+    values = getattr(each, (_RMS | _P99)[key])
+    two = math.sqrt(1 + len(values) / (promised_of or len(values)))  # both figures are samples
+    known = _rms_deviation(values) if key in _RMS else _p99_deviation(values)
+    tolerance = min(max(SIGMAS * two * known, LEAST), MOST)
+    return Promise(place, promised, value, promised * (1 + tolerance) + _FLOOR)
+
+
+def _rms_deviation(values: Tensor) -> float:
+    """Relative standard deviation of a root mean square of so many values."""
+    square = values * values
+    mean = float(square.mean()) if len(values) > 1 else 0.0
+    return float(square.std()) / (2 * mean * math.sqrt(len(values))) if mean > 0 else 0.0
+
+
+def _p99_deviation(values: Tensor) -> float:
+    """Relative standard deviation of the 99th percentile, from the quantile one deviation of its rank higher."""
+    above = torch.quantile(values, min(1.0, 0.99 + math.sqrt(0.99 * 0.01 / len(values)))) if len(values) else None
+    at = float(torch.quantile(values, 0.99)) if len(values) else 0.0
+    return (float(above) - at) / at if above is not None and at > 0 else 0.0
+
+
+def _share(place: str, promised: float, measured: float | None, rays: float, promised_of: float | None) -> Promise:
+    """A promised share against a count; no event in either still leaves room for one or two."""
+    rays, other = max(rays, 1.0), max(promised_of or rays, 1.0)
+    variance = max(promised * (1 - promised), 1 / other, 1 / rays)
+    allowed = promised + SIGMAS * math.sqrt(variance * (1 / rays + 1 / other))
+    return Promise(place, promised, None if measured is None else float(measured), allowed)
 
 
 def lens_of_card(

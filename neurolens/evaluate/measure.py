@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,8 @@ import torch
 
 from neurolens import __version__
 from neurolens.cameras.model import OnnxLens, load_model
-from neurolens.evaluate.rays import ray_errors
-from neurolens.evaluate.vignetting import vignetting_errors
+from neurolens.evaluate import fresh
+from neurolens.evaluate.fresh import FreshRays, fresh_rays
 from neurolens.files import atomic_write_text
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
@@ -28,12 +28,12 @@ from neurolens.surrogates.model import Prediction
 from neurolens.surrogates.pairs import PairSet
 
 # Keys of the ray and vignetting errors that a model's card promises and its record shows.
-_RAY_KEYS = (
-    "rms_um p99_um max_um rms_infinity_um rms_px direction_rms_deg position_rms_um transmittance_rms transmittance_max"
-).split()
+CARD_KEYS = tuple(
+    "rms_um p99_um max_um rms_infinity_um rms_px direction_rms_deg position_rms_um transmittance_rms transmittance_max "
+    "false_pass false_block false_pass_near_rim false_block_near_rim".split()
+)
 # Added to the seed of the fit's rays: the same seed would give the very rays that the rims were fitted to.
 FRESH = 104729
-_VIGNETTING_KEYS = ("false_pass", "false_block", "false_pass_near_rim", "false_block_near_rim")
 
 
 @dataclass(frozen=True)
@@ -62,22 +62,39 @@ def onnx_predictor(model: OnnxLens) -> Any:
 
 def measure_errors(
     model: OnnxLens, lens: Lens, domain: Domain, held_out: PairSet, vignetting_rays: int, seed: int
-) -> dict[str, float | None]:
-    """Errors of an exported model on held-out rays, NaN written as None; keys with units.
+) -> dict[str, Any]:
+    """Errors of an exported model on held-out rays, as a card holds them; keys with units, what is not finite as None.
 
     `seed` is of the rays that test the vignetting; it must not be that of the fit's pairs.
     """
-    predict = onnx_predictor(model)
-    rays = ray_errors(lens, domain, held_out, predict)
-    vignetting = vignetting_errors(lens, domain, predict, count=vignetting_rays, seed=seed)
-    found = {k: rays[k] for k in _RAY_KEYS} | {k: vignetting[k] for k in _VIGNETTING_KEYS}
-    return {k: None if v is None or not math.isfinite(v) else v for k, v in found.items()}
+    rays = fresh_rays(lens, domain, held_out, count=vignetting_rays, seed=seed)
+    return measure_on(rays, model)
+
+
+def shared_rays(prepared: Prepared, vignetting_rays: int) -> FreshRays:
+    """The rays on which all models of one lens and domain are measured."""
+    pairs = prepared.pairs
+    seed = pairs.settings.seed + FRESH
+    return fresh_rays(pairs.lens, pairs.domain, pairs.held_out, count=vignetting_rays, seed=seed)
+
+
+def measure_on(rays: FreshRays, model: OnnxLens) -> dict[str, Any]:
+    """The same on rays that several models share."""
+    errors = fresh.measure(rays, onnx_predictor(model)).errors(CARD_KEYS)
+    return {**errors, "rays": len(rays.held_out), "passing": int(rays.passes.sum())}
 
 
 def fit_and_measure(
-    prepared: Prepared, settings: ModelSettings, folder: Path, vignetting_rays: int, report: Report
+    prepared: Prepared,
+    settings: ModelSettings,
+    folder: Path,
+    vignetting_rays: int,
+    report: Report,
+    rays: Callable[[], FreshRays] | None = None,
 ) -> Measured:
     """Fit, export and measure one model, or take what the folder holds if it was made by the same settings and version.
+
+    `rays`, where several models share them, gives `shared_rays(prepared, vignetting_rays)`.
 
     The errors are those of the exported float32 graph, in onnxruntime: what ships is what is measured.
     """
@@ -86,11 +103,10 @@ def fit_and_measure(
     known = _known_record(note, file, fingerprint)
     if known is not None:
         return Measured(settings, file, known)
-    pairs = prepared.pairs
     model = fit_model(prepared, settings, report)
     export_onnx(model, file, errors={})
-    seed = pairs.settings.seed + FRESH
-    errors = measure_errors(load_model(file), pairs.lens, pairs.domain, pairs.held_out, vignetting_rays, seed)
+    on = rays() if rays else shared_rays(prepared, vignetting_rays)
+    errors = measure_on(on, load_model(file))
     export_onnx(model, file, errors=errors)
     start = time.perf_counter()
     load_model(file)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -69,7 +70,7 @@ def ray_errors(
     Returns, all floats:
         rms_um, p99_um, max_um: film-equivalent error on the plane in focus of each ray's film position.
         rms_infinity_um, p99_infinity_um, max_infinity_um: the same on the plane at infinity.
-        rms_px, p99_px, pixel_um: in pixels, and their pitch.
+        rms_px, p99_px, max_px, pixel_um: in pixels, and their pitch.
         rms_um_at_21_6: rms_um after scaling the lens to an image radius of 21.6 mm.
         direction_rms_deg, direction_p99_deg, direction_max_deg: angle between the exact and the predicted direction.
         position_rms_um, position_p99_um: perpendicular distance from the predicted point to the exact ray.
@@ -81,22 +82,12 @@ def ray_errors(
     Raises:
         InputError: no rays, or rays that the exact lens blocks.
     """
-    if len(held_out) == 0 or bool((held_out.status != st.PASSED).any()):
-        raise InputError(
-            "ray_errors", "held_out", f"({len(held_out)} rays)", "at least one ray, all passed by the exact lens"
-        )
-    exact, inputs = held_out.scene, held_out.inputs
-    predicted = predict(inputs)
-    rays = Rays(*(c.to(torch.float64) for c in predicted.rays))
-    direction = angles_deg(exact, rays)
-    position = 1000 * distance_to_ray(exact, rays)
-    loss = predicted.transmittance.to(torch.float64) - held_out.transmittance
-    inside = -exact.dz >= math.cos(math.radians(FIELD_LIMIT_DEG))
-    kept = inputs.select(inside)
-    pair = (Rays(*(c[inside] for c in exact)), Rays(*(c[inside] for c in rays)))
-    vergence = focused_vergence(lens, kept.film_z)
-    focus = 1000 * film_equivalent_mm(lens, domain, kept, *pair, vergence)
-    infinity = 1000 * film_equivalent_mm(lens, domain, kept, *pair, torch.zeros_like(vergence))
+    return ray_figures(lens, domain, each_ray(lens, domain, held_out, predict), pitch_um)
+
+
+def ray_figures(lens: Lens, domain: Domain, each: EachRay, pitch_um: float | None = None) -> dict[str, float]:
+    """What `ray_errors` returns, of errors ray by ray."""
+    focus, infinity, inside = each.focus_um, each.infinity_um, each.inside
     pitch = pixel_um(domain) if pitch_um is None else pitch_um
     return {
         "rms_um": _rms(focus),
@@ -107,18 +98,67 @@ def ray_errors(
         "max_infinity_um": _max(infinity),
         "rms_px": _rms(focus) / pitch,
         "p99_px": _p99(focus) / pitch,
+        "max_px": _max(focus) / pitch,
         "pixel_um": pitch,
         "rms_um_at_21_6": _rms(focus) * REFERENCE_RADIUS_MM / image_radius_mm(lens)[0],
-        "direction_rms_deg": _rms(direction),
-        "direction_p99_deg": _p99(direction),
-        "direction_max_deg": _max(direction),
-        "position_rms_um": _rms(position),
-        "position_p99_um": _p99(position),
-        "transmittance_rms": _rms(loss),
-        "transmittance_max": _max(loss.abs()),
-        "rays": float(len(held_out)),
+        "direction_rms_deg": _rms(each.direction_deg),
+        "direction_p99_deg": _p99(each.direction_deg),
+        "direction_max_deg": _max(each.direction_deg),
+        "position_rms_um": _rms(each.position_um),
+        "position_p99_um": _p99(each.position_um),
+        "transmittance_rms": _rms(each.transmittance),
+        "transmittance_max": _max(each.transmittance),
+        "rays": float(len(inside)),
         "share_beyond_60_deg": float((~inside).double().mean()),
     }
+
+
+@dataclass(frozen=True)
+class EachRay:
+    """Errors of N rays, ray by ray.
+
+    Attributes:
+        inside: [N] bool, within 60 degrees of the axis; M of them.
+        focus_um, infinity_um: [M] film-equivalent error on the plane in focus and at infinity.
+        direction_deg, position_um: [N].
+        transmittance: [N] absolute.
+    """
+
+    inside: Tensor
+    focus_um: Tensor
+    infinity_um: Tensor
+    direction_deg: Tensor
+    position_um: Tensor
+    transmittance: Tensor
+
+    def select(self, part: Tensor) -> EachRay:
+        """The rays of a mask [N]."""
+        kept = part[self.inside]
+        rest = (self.direction_deg[part], self.position_um[part], self.transmittance[part])
+        return EachRay(self.inside[part], self.focus_um[kept], self.infinity_um[kept], *rest)
+
+
+def each_ray(lens: Lens, domain: Domain, held_out: PairSet, predict: Callable[[FilmRays], Predicted]) -> EachRay:
+    """Errors of every ray; arguments and what they raise as `ray_errors`."""
+    if len(held_out) == 0 or bool((held_out.status != st.PASSED).any()):
+        raise InputError(
+            "ray_errors", "held_out", f"({len(held_out)} rays)", "at least one ray, all passed by the exact lens"
+        )
+    exact, inputs = held_out.scene, held_out.inputs
+    predicted = predict(inputs)
+    rays = Rays(*(c.to(torch.float64) for c in predicted.rays))
+    inside = -exact.dz >= math.cos(math.radians(FIELD_LIMIT_DEG))
+    kept = inputs.select(inside)
+    pair = (Rays(*(c[inside] for c in exact)), Rays(*(c[inside] for c in rays)))
+    vergence = focused_vergence(lens, kept.film_z)
+    return EachRay(
+        inside,
+        1000 * film_equivalent_mm(lens, domain, kept, *pair, vergence),
+        1000 * film_equivalent_mm(lens, domain, kept, *pair, torch.zeros_like(vergence)),
+        angles_deg(exact, rays),
+        1000 * distance_to_ray(exact, rays),
+        (predicted.transmittance.to(torch.float64) - held_out.transmittance).abs(),
+    )
 
 
 def angles_deg(a: Rays, b: Rays) -> Tensor:

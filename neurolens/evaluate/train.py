@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import platform
 import time
 import warnings
@@ -19,14 +20,14 @@ from neurolens.evaluate.experiment import Experiment, relative_to
 from neurolens.evaluate.gain import domain_facts, scene_gain
 from neurolens.evaluate.image import DEFAULT
 from neurolens.evaluate.layout import layout_profile, refractions
-from neurolens.evaluate.measure import Measured, fit_and_measure
+from neurolens.evaluate.light import illumination
+from neurolens.evaluate.measure import Measured, fit_and_measure, shared_rays
 from neurolens.evaluate.pictures import Pictures, render_all
 from neurolens.evaluate.plots import error_against_coefficients_plot, illumination_plot, lens_layout, pareto_plot
 from neurolens.evaluate.rays import pixel_um, pupil_disc_share
 from neurolens.evaluate.records import break_even_rays, write_results
 from neurolens.evaluate.report import write_report
 from neurolens.evaluate.speed import Race, race
-from neurolens.evaluate.stopping import stop_down
 from neurolens.files import atomic_write_text
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -71,20 +72,15 @@ def run_experiment(
             if experiment.save_pairs:
                 save_pairs(pairs, folder / "pairs.npz")
             prepared = prepare(pairs)
-        measured = []
+        measured, count = [], experiment.evaluation.vignetting_rays
+        fresh = functools.cache(lambda: shared_rays(prepared, count))
         for settings in experiment.model:
             with progress.stage(f"fit {settings.label}") as report:
-                measured.append(
-                    fit_and_measure(prepared, settings, models, experiment.evaluation.vignetting_rays, report)
-                )
+                measured.append(fit_and_measure(prepared, settings, models, count, report, fresh))
         timed = _race(experiment, prepared, measured, progress)
-        with progress.stage("stop down"):
-            light = stop_down(
-                [m for m in measured if m.settings.label in _shown(experiment, measured)],
-                lens,
-                domain,
-                pairs.settings.seed,
-            )
+        with progress.stage("illumination"):
+            shown = [m for m in measured if m.settings.label in _shown(experiment, measured)]
+            light = illumination(shown, lens, domain, pairs.settings.seed)
         gain = scene_gain(experiment, folder / "models", progress)
         drawn = _render(experiment, lens, domain, measured, pictures, progress)
     results = {
@@ -161,7 +157,7 @@ def _render(
 
 
 def _shown(experiment: Experiment, measured: Sequence[Measured]) -> tuple[str, ...]:
-    """Names of the models that are rendered and stopped down."""
+    """Names of the models that are rendered and whose illumination is drawn."""
     return experiment.render.models or best_models(measured)
 
 
@@ -184,7 +180,7 @@ def _error(m: Measured) -> float:
 def _draw(
     lens: Lens, domain: Domain, measured: Sequence[Measured], timed: Race, light: dict[str, Any], folder: Path
 ) -> list[dict[str, Any]]:
-    """Plots of the trade, the lens and its light; `light` as of `stop_down`."""
+    """Plots of the trade, the lens and its light; `light` as of `light.illumination`."""
     records = [m.record for m in measured]
     exact = [timed.record(n) for n in ("exact eager", "exact compiled") if n in timed.ns]
     error = "rms_um" if any(r.get("rms_um") for r in records) else "direction_rms_deg"

@@ -82,9 +82,8 @@ def test_errors_are_in_the_order_that_physics_gives(run: tuple[Path, dict]) -> N
     assert fitted["false_pass"] < 0.005 and fitted["false_block"] < 0.005
 
 
-def test_the_best_models_hold_when_stopped_down(run: tuple[Path, dict]) -> None:
-    stopped = {m["name"]: m["stopped_down"] for m in run[1]["models"] if "stopped_down" in m}
-    assert set(stopped) == {"ols-24", "mlp-8x2"}
+def test_models_hold_when_stopped_down(run: tuple[Path, dict]) -> None:
+    stopped = {m["name"]: m["stopped_down"] for m in run[1]["models"]}
     for shares in stopped["ols-24"].values():
         assert shares["false_pass"] < 0.02 and shares["false_block"] < 0.02
     assert set(stopped["mlp-8x2"]) == {"2_stops", "4_stops"}

@@ -1,0 +1,111 @@
+"""Promises of a card on fresh rays: true ones hold, whatever the seed; each one that is not true fails by itself."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from neurolens.cameras.model import load_model
+from neurolens.evaluate.check import check_model
+from neurolens.evaluate.fresh import STOPS, ZONED, fresh_rays, measure
+from neurolens.evaluate.measure import measure_errors
+from neurolens.evaluate.vignetting import ZONES, vignetting_errors
+from neurolens.surrogates.pairs import PairSettings, make_pairs
+from tests.lens_models import domain, exported, lens, model
+
+RAYS = 6000
+
+
+@pytest.fixture(scope="module")
+def errors() -> dict[str, Any]:
+    """What the exported polynomial's card would promise."""
+    pairs = make_pairs(lens(), domain(), PairSettings(train=1, held_out=RAYS, rim=1, seed=3))
+    return measure_errors(load_model(exported("invariants")), lens(), domain(), pairs.held_out, 4 * RAYS, seed=55)
+
+
+def broken(errors: dict[str, Any], seed: int | None = None) -> set[str]:
+    """Promises of a card with these errors that do not hold."""
+    known = load_model(exported("invariants"))
+    promising = SimpleNamespace(card={**known.card, "errors": errors}, rays=known.rays)
+    return {p.key for p in check_model(promising, lens(), rays=RAYS, seed=seed)[1] if not p.holds}  # type: ignore[arg-type]
+
+
+def leaves(table: dict[str, Any], place: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from leaves(value, (*place, key))
+        elif key in ("rms_um", "direction_rms_deg", "p99_um", "position_rms_um", "transmittance_rms"):
+            yield (*place, key)
+
+
+@pytest.mark.parametrize("seed", [None, 11, 12])
+def test_what_was_measured_holds_on_other_rays(errors: dict[str, Any], seed: int | None) -> None:
+    assert broken(errors, seed) == set()
+
+
+def test_a_card_has_every_zone_open_and_stopped_down(errors: dict[str, Any]) -> None:
+    assert set(errors["zones"]) == set(ZONED) and set(errors["stopped_down"]) == set(STOPS) - {"full"}
+    for zones in errors["zones"].values():
+        assert set(zones) == set(ZONES)
+    zones = errors["zones"]["full"]
+    total = sum(z["rays"] * z["rms_um"] ** 2 for z in zones.values()) / sum(z["rays"] for z in zones.values())
+    assert total == pytest.approx(errors["rms_um"] ** 2, rel=2e-3)
+
+
+def test_every_figure_that_promises_too_much_fails_and_no_other(errors: dict[str, Any]) -> None:
+    corrupted, every = copy.deepcopy(errors), list(leaves(errors))
+    for place in every:
+        table = corrupted
+        for key in place[:-1]:
+            table = table[key]
+        table[place[-1]] *= 0.5
+    assert broken(corrupted) == {".".join(p for p in place if p != "zones") for place in every}
+    alone = copy.deepcopy(errors)
+    alone["zones"]["full"]["mid"]["direction_rms_deg"] *= 0.6
+    assert broken(alone) == {"full.mid.direction_rms_deg"}
+
+
+def test_a_model_that_blocks_what_the_card_says_it_passes_fails(errors: dict[str, Any]) -> None:
+    """Its stop is 3% too small: 6% of the light is lost wherever the stop decides, the middle of the film above all."""
+    known = load_model(exported("invariants"))
+
+    def rays(film: Any, pupil: Any, wavelength: Any, film_z: Any, stop_radius_mm: float | None = None) -> Any:
+        radius = stop_radius_mm or domain().stop_radius_mm
+        return known.rays(film, pupil, wavelength, film_z, 0.97 * radius)
+
+    small = SimpleNamespace(card={**known.card, "errors": errors}, rays=rays)
+    missed = {p.key for p in check_model(small, lens(), rays=RAYS)[1] if not p.holds}  # type: ignore[arg-type]
+    assert missed >= {"false_block", "2_stops.false_block", "full.centre.false_block", "2_stops.edge.false_block"}
+    assert all(key.endswith("false_block") for key in missed)
+
+
+@pytest.mark.parametrize("state", STOPS)
+def test_one_trace_serves_every_stop(state: str) -> None:
+    """The shares of a stopped-down lens, traced by itself, are those that the crossings with the stop tell."""
+    held_out = make_pairs(lens(), domain(), PairSettings(1, 500, 1, 9)).held_out
+    fresh = fresh_rays(lens(), domain(), held_out, count=30_000, seed=21)
+    found = measure(fresh, model("invariants").predict)
+    apart = vignetting_errors(
+        lens(), domain(), model("invariants").predict, stop_radius_mm=fresh.stop_radius_mm(state), count=30_000, seed=21
+    )
+    mine = found.figures if state == "full" else found.stopped_down[state]
+    for key in ("false_pass", "false_block"):
+        assert mine[key] == apart[key]
+        if state in ZONED:
+            assert {z: found.zones[state][z][key] for z in ZONES} == {z: apart["zones"][z][key] for z in ZONES}
+
+
+def test_the_command_says_which_zone_breaks(errors: dict[str, Any], tmp_path: Path) -> None:
+    from neurolens.cli import main
+    from neurolens.surrogates.export import export_onnx
+
+    lying = copy.deepcopy(errors)
+    lying["zones"]["2_stops"]["edge"]["rms_um"] /= 2
+    for promised, code in ((errors, 0), (lying, 1)):
+        path = export_onnx(model("invariants"), tmp_path / "model.onnx", promised)
+        assert main(["evaluate", str(path), "--rays", str(RAYS), "--quiet"]) == code
