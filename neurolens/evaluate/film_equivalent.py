@@ -46,6 +46,10 @@ def film_equivalent_mm(
 ) -> Tensor:
     """[N] distance on the film (mm) that the distance between two rays on an object plane stands for."""
     dx, dy = plane_coordinates(rays, vergence) - plane_coordinates(exact, vergence)
+    if lens.anamorphic:
+        along_x, along_y = _jacobian_columns(lens, domain, inputs, vergence)
+        area = along_x[0] * along_y[1] - along_x[1] * along_y[0]
+        return torch.hypot((dx * along_y[1] - dy * along_y[0]) / area, (dy * along_x[0] - dx * along_x[1]) / area)
     radius = torch.hypot(inputs.film_x, inputs.film_y)
     centred = radius < 1e-12  # on the axis every direction is radial
     along_x = torch.where(centred, 1.0, inputs.film_x / torch.where(centred, 1.0, radius))
@@ -58,7 +62,7 @@ def local_jacobian(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tenso
     """Radial and tangential derivative [N] of `plane_coordinates` by film position, 1/mm, of the exact lens.
 
     Central differences in float64 of the ray through the middle of the passing rays (a chief-like ray; the pupil point
-    stays as the film point moves), at each ray's own film radius, film plane and wavelength. The lens is symmetric, so
+    stays as the film point moves), at each ray's own film radius, film plane and wavelength. The lens is round, so
     that the two are the whole Jacobian. Where that ray cannot be followed, the ray's own pupil point, which passes,
     stands in.
     """
@@ -73,6 +77,22 @@ def local_jacobian(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tenso
         v = torch.where(r > 0, (part.pupil_y * part.film_x - part.pupil_x * part.film_y) / safe, part.pupil_y)
         jacobian[:, lost] = _differences(lens, domain, part, r, u, v, vergence[lost])[0]
     return jacobian[0], jacobian[1]
+
+
+def _jacobian_columns(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives [2, N] of `plane_coordinates` by film_x and by film_y, 1/mm, of a lens with cylinders.
+
+    Central differences of each ray itself, which passes: no one plane holds its chief ray.
+    """
+    h = _STEP * domain.film_radius_mm
+    steps = torch.tensor([[h, -h, 0, 0], [0, 0, h, -h]], dtype=torch.float64).repeat_interleave(len(inputs), 1)
+    film_x, film_y = inputs.film_x.repeat(4) + steps[0], inputs.film_y.repeat(4) + steps[1]
+    film_z, pupil_x, pupil_y = (c.repeat(4) for c in (inputs.film_z, inputs.pupil_x, inputs.pupil_y))
+    rays = camera_rays(film_x, film_y, film_z, pupil_x, pupil_y, domain.pupil_z_mm)
+    with torch.no_grad():
+        out = trace(lens, rays, inputs.wavelength_nm.repeat(4))
+    points = plane_coordinates(out.rays, vergence.repeat(4)).reshape(2, 4, -1)
+    return (points[:, 0] - points[:, 1]) / (2 * h), (points[:, 2] - points[:, 3]) / (2 * h)
 
 
 def _differences(

@@ -114,12 +114,11 @@ def make_pairs(
     `rim` and `edge` come from the rays drawn for `train`, as many as those hold.
 
     Raises:
-        InputError: an empty split, a lens that is not round about its axis (fits turn every ray into one plane), or
-            fewer than one ray in 10,000 of the domain passes.
+        InputError: an empty split, a stop with blades or a mask (models give the crossing with it instead), or fewer than one ray in 10,000 of the domain passes.
     """
     settings = settings or PairSettings()
-    if lens.anamorphic or lens.aperture is not None:
-        raise InputError(lens.path, "surfaces", "(cylinders or blades)", "a lens that is round about its axis")
+    if lens.aperture is not None:
+        raise InputError(lens.path, "aperture", "(blades or a mask)", "a round stop: cameras shape it outside the model")
     for name in ("train", "held_out", "rim"):
         if getattr(settings, name) < 1:
             raise InputError("pairs", name, getattr(settings, name), "at least one ray")

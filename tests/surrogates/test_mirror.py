@@ -1,0 +1,104 @@
+"""Lenses with cylinders: two planes of symmetry, held exactly, in torch and in the exported graph."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neurolens import status as st
+from neurolens.cameras.model import load_model
+from neurolens.errors import InputError
+from neurolens.evaluate.measure import onnx_predictor
+from neurolens.evaluate.rays import ray_errors
+from neurolens.evaluate.vignetting import vignetting_errors
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens
+from neurolens.surrogates.domain import domain_of, sample_domain
+from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
+from neurolens.surrogates.mirror import mirror_exponents
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.pairs import PairSettings, make_pairs
+
+pytestmark = pytest.mark.slow
+LENS = Path(__file__).parents[2] / "lenses" / "cooke_anamorphic_42.toml"
+
+
+@pytest.fixture(scope="module")
+def lens() -> Lens:
+    return read_lens(LENS).at()
+
+
+@pytest.fixture(scope="module")
+def prepared(lens: Lens) -> Prepared:
+    domain = domain_of(lens, film_radius_mm=10.0, focus_m=(math.inf, math.inf))
+    return prepare(make_pairs(lens, domain, PairSettings(5000, 3000, 5000)))
+
+
+@pytest.fixture(scope="module")
+def model(prepared: Prepared) -> LensModel:
+    return fit_model(prepared, ModelSettings(terms=96, degree=4))
+
+
+def test_fits_rays_and_rims(lens: Lens, model: LensModel, prepared: Prepared) -> None:
+    errors = ray_errors(lens, model.domain, prepared.pairs.held_out, model.predict)
+    assert errors["direction_rms_deg"] < 0.002
+    assert errors["rms_um"] < 1.5
+    assert errors["position_rms_um"] < 10
+    assert errors["transmittance_rms"] < 5e-4
+    shares = vignetting_errors(lens, model.domain, model.predict, count=30_000)
+    assert shares["false_pass"] < 0.005 and shares["false_block"] < 0.005
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_mirrored_rays_have_mirrored_images(model: LensModel, axis: int) -> None:
+    rays = sample_domain(model.domain, 2000, 3)
+    names = [("film_x", "pupil_x"), ("film_y", "pupil_y")][axis]
+    mirrored = replace(rays, **{n: -getattr(rays, n) for n in names})
+    a, b = model.predict(rays), model.predict(mirrored)
+    for name in ("x", "y", "dx", "dy"):
+        sign = -1 if name.endswith("xy"[axis]) else 1
+        assert torch.equal(getattr(a.rays, name), sign * getattr(b.rays, name))
+    assert torch.equal(a.transmittance, b.transmittance) and torch.equal(a.status, b.status)
+
+
+def test_is_not_round(model: LensModel) -> None:
+    # A quarter turn of the film changes the image: an anamorphic model that were rotation-symmetric would be wrong.
+    rays = sample_domain(model.domain, 500, 3)
+    turned = replace(rays, film_x=-rays.film_y, film_y=rays.film_x, pupil_x=-rays.pupil_y, pupil_y=rays.pupil_x)
+    a, b = model.predict(rays), model.predict(turned)
+    assert float((a.rays.dx - b.rays.dy).abs().median()) > 0.01
+
+
+def test_graph_equals_model(model: LensModel, tmp_path: Path) -> None:
+    onnx = load_model(export_onnx(model, tmp_path / "anamorphic.onnx"))
+    rays = sample_domain(model.domain, 20_000, 9)
+    wanted, found = model.predict(rays), onnx_predictor(onnx)(rays)
+    assert float((wanted.status == found.status).double().mean()) > 0.999
+    passed = (wanted.status == st.PASSED) & (found.status == st.PASSED)
+    for name, limit in (("x", 2e-3), ("y", 2e-3), ("z", 2e-3), ("dx", 2e-5), ("dy", 2e-5), ("dz", 2e-5)):
+        assert float((getattr(wanted.rays, name) - getattr(found.rays, name))[passed].abs().max()) < limit
+
+
+def test_candidates_are_all_different(prepared: Prepared) -> None:
+    # The columns of one component's candidates must be independent functions: no monomial of the raw coordinates twice.
+    for axis in (0, 1):
+        seen = set()
+        for row in mirror_exponents(3, axis):
+            squares = [(2 * row[0] + row[1], 2 * row[2] + row[1]), (2 * row[3] + row[4], 2 * row[5] + row[4])]
+            for side in (0, 1):
+                own = np.array(squares[axis]) + np.eye(2, dtype=int)[side]
+                key = (*own.tolist(), *squares[1 - axis], int(row[6]))
+                assert key not in seen
+                seen.add(key)
+
+
+@pytest.mark.parametrize("method", ["mlp", "thick", "adaptive"])
+def test_other_fits_are_refused_by_name(prepared: Prepared, method: str) -> None:
+    with pytest.raises(InputError, match=rf"method.*{method}"):
+        fit_model(prepared, ModelSettings(method=method))  # type: ignore[arg-type]
