@@ -41,13 +41,17 @@ class Field:
 
 @dataclass(frozen=True)
 class CoreRows:
-    """What a core gives: vectors [2, N] each, transmittance and gates [1, N] each."""
+    """What a core gives: vectors [2, N] each, transmittance and gates [1, N] each.
+
+    `unit`: where a core gives it, the unit direction [3, N] itself, which then stands for `direction`.
+    """
 
     position: str
     direction: str
     stop: str
     transmittance: str
     gates: list[str]
+    unit: str = ""
 
 
 def add_core(g: Graph, core: Core, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
@@ -70,7 +74,9 @@ def add_core(g: Graph, core: Core, field: Field, vector_scale: Array, gate_scale
         return _network(g, core, field, vector_scale, gate_scale)
     if isinstance(core, Partitioned):
         return _partitioned(g, core, field, vector_scale, gate_scale)
-    raise TypeError(f"no ONNX form for a core of type {type(core).__name__}")
+    from neurolens.surrogates.published.graph import add_published  # published cores hold cores of this module
+
+    return add_published(g, core, field, vector_scale, gate_scale)
 
 
 def _numpy(tensor: object) -> Array:

@@ -105,6 +105,9 @@ def add_decoder(g: Graph, model: LensModel, rows: CoreRows, series: DirectionSer
     g.op("Identity", rows.stop, out="stop_xy_mm")
     # First-order models give the position in the plane of the front vertex.
     z = add_sag(g, model.lens.surfaces[0], rows.position) if model.direction == "angle" else _flat(g, rows.position)
+    if rows.unit:
+        g.concat(rows.position, z, rows.unit, out="scene_ray")
+        return _square(g, rows.stop)
     t = _square(g, rows.direction)
     if model.direction == "slope":
         # (dx, dy) = slope / sqrt(1 + slope^2), dz = -1 / sqrt(1 + slope^2).

@@ -9,6 +9,8 @@ from neurolens.errors import InputError
 from neurolens.surrogates.fit import ModelSettings, Prepared
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import Core, Gate
+from neurolens.surrogates.published.data import RawData, outer_pupil
+from neurolens.surrogates.published.polynomials import fit_dense, fit_sparse
 
 Progress = Callable[[float], None] | None
 
@@ -27,4 +29,11 @@ def fit_published(prepared: Prepared, settings: ModelSettings, progress: Progres
     Raises:
         InputError: an unknown method, or a lens or settings that it cannot take.
     """
-    raise InputError("fit", "method", settings.method, "a published method that is implemented")
+    data = RawData.of(prepared)
+    if settings.method == "hanika":
+        core, gates = outer_pupil(data, fit_dense(data, settings.degree))
+    elif settings.method == "schrade":
+        core, gates = outer_pupil(data, fit_sparse(data, settings.terms, settings.degree))
+    else:
+        raise InputError("fit", "method", settings.method, "a published method that is implemented")
+    return PublishedFit(core, data.encoding, gates)

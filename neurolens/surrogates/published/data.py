@@ -1,0 +1,137 @@
+"""What the published fits share: raw coordinates, targets on the outer pupil, and the tests of who passes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from neurolens import status as st
+from neurolens.errors import InputError
+from neurolens.surrogates.bases import raw_exponents, solve
+from neurolens.surrogates.cores import RawPolynomial, monomials
+from neurolens.surrogates.fit import Prepared
+from neurolens.surrogates.gates import gate_reach
+from neurolens.surrogates.lightfield import Encoding, LightField
+from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate
+from neurolens.surrogates.pairs import PairSet, RayPairs
+from neurolens.surrogates.published.cores import Cells, OuterPupil, to_tangents
+from neurolens.surrogates.targets import scales_of
+
+Exponents = NDArray[np.int64]
+# Outputs of the published polynomials, with the parity in x and in y that mirror symmetry gives each.
+OUTPUTS = ("position x", "position y", "tangent x", "tangent y", "stop x", "stop y", "transmittance")
+PARITY = ((1, 0), (0, 1), (1, 0), (0, 1), (1, 0), (0, 1), (0, 0))
+
+
+def slope_encoding(encoding: Encoding, passing: PairSet) -> Encoding:
+    """Raw coordinates: film position and slope, u = (pupil point - film point) / scale.
+
+    Raises:
+        InputError: a lens with cylinders.
+    """
+    if encoding.mirror:
+        raise InputError("fit", "lens", "(cylinders)", "a lens that is round about its axis, for a published method")
+    p, u = encoding.planes(passing.inputs)
+    return replace(encoding, chief=1.0, pupil_scale_mm=float((u - p).norm(dim=0).max()))
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Inputs and values [K] of one fit: variables [5, N], values [K, N], weights [N] or None for all alike."""
+
+    variables: Tensor
+    values: Tensor
+    weights: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class RawData:
+    """Ray pairs in raw coordinates."""
+
+    pairs: RayPairs
+    encoding: Encoding
+
+    @staticmethod
+    def of(prepared: Prepared) -> RawData:
+        return RawData(prepared.pairs, slope_encoding(prepared.encoding, prepared.pairs.train))
+
+    @property
+    def dispersive(self) -> bool:
+        return self.encoding.w_half != 0
+
+    @property
+    def curvature(self) -> float:
+        """Of the outer pupil, in units of 1 / position unit."""
+        return float(self.pairs.lens.surfaces[0].vertex_curvature("x")) * scales_of(self.pairs.lens).position_mm
+
+    def variables(self, rays: PairSet) -> Tensor:
+        """[5, N] x, y, slopes, w."""
+        return raw_variables(self.encoding(rays.inputs))
+
+    @cached_property
+    def outputs(self) -> tuple[Outputs, ...]:
+        """In the order of `OUTPUTS`: ray and transmittance on the training rays, the stop crossing about its rim too.
+
+        The published fits discard blocked rays; on those alone the edge of the stop would lie at the edge of the data.
+        """
+        lens, train, rim = self.pairs.lens, self.pairs.train, self.pairs.rim
+        scale, k = scales_of(lens), lens.stop_index
+        position = torch.stack([train.scene.x, train.scene.y]) / scale.position_mm
+        tangents = to_tangents(position, train.scene[3:], self.curvature)
+        inside, about = self.variables(train), self.variables(rim)
+        crossing = torch.stack([rim.cross_x[k], rim.cross_y[k]]) / scale.stop_mm
+        arrives = gate_reach((Gate(k, st.RIM),), rim)[0]
+        weights = None if arrives.all() else arrives.to(crossing.dtype)
+        rays = [Outputs(inside, row[None]) for row in (*position, *tangents)]
+        stops = [Outputs(about, row[None], weights) for row in crossing]
+        return (*rays, *stops, Outputs(inside, train.transmittance[None]))
+
+
+def parity_exponents(degree: int, odd: tuple[int, int], *, dispersive: bool) -> Exponents:
+    """Raw exponents to a total degree of the parity that an output has in (x, x slope) and in (y, y slope).
+
+    The others' coefficients vanish by the mirror symmetry of the lens.
+    """
+    rows = raw_exponents(degree, dispersive=dispersive)
+    chosen = ((rows[:, 0] + rows[:, 2]) % 2 == odd[0]) & ((rows[:, 1] + rows[:, 3]) % 2 == odd[1])
+    return np.asarray(rows[chosen])
+
+
+def solve_outputs(outputs: tuple[Outputs, ...], supports: list[Exponents]) -> RawPolynomial:
+    """Least squares of every output on a support of its own, as one polynomial on the union of the supports."""
+    place: dict[tuple[int, ...], int] = {}
+    columns = [[place.setdefault(tuple(int(e) for e in row), len(place)) for row in s] for s in supports]
+    exponents = np.array(list(place), dtype=np.int64)
+    rows = torch.zeros((len(outputs), len(place)), dtype=torch.float64)
+    for row, output, support, at in zip(rows, outputs, supports, columns, strict=True):
+        row[at] = solve(monomials(output.variables, support), output.values, output.weights)[0]
+    components = torch.zeros((3, 2, len(place)), dtype=torch.float64)
+    components[POSITION], components[DIRECTION], components[STOP] = rows[0:2], rows[2:4], rows[4:6]
+    return RawPolynomial(exponents, components, rows[6:])
+
+
+def outer_pupil(
+    data: RawData, polynomial: RawPolynomial | Cells, curvature: float | None = None
+) -> tuple[OuterPupil, tuple[Gate, ...]]:
+    """The core about a polynomial, with its tests of the inner and the outer pupil, as rays meet them."""
+    lens, e = data.pairs.lens, data.encoding
+    last = len(lens.surfaces) - 1
+    rear = float(lens.vertices_mm[last])
+    # The share of the way from the film's plane to that of the pupil points.
+    along = (rear - e.film_plane_z_mm) / (e.pupil_plane_z_mm - e.film_plane_z_mm)
+    radius = lens.surfaces[last].semi_diameter_mm
+    inner = (e.film_scale_mm / radius, along * e.pupil_scale_mm / radius) if lens.stop_index != last else None
+    outer = 1.0 if lens.stop_index != 0 else None
+    core = OuterPupil(polynomial, data.curvature if curvature is None else curvature, outer, inner)
+    gates = ([] if inner is None else [Gate(last, st.RIM)]) + ([] if outer is None else [Gate(0, st.RIM)])
+    return core, tuple(gates)
+
+
+def raw_variables(field: LightField) -> Tensor:
+    """[5, N]: x, y, slopes, w."""
+    return torch.cat([field.p, field.u, field.w[None]])

@@ -1,0 +1,88 @@
+"""The cores of the published methods as ONNX nodes; `neurolens.surrogates.onnx_cores` does all others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.surrogates.model import Core
+from neurolens.surrogates.onnx_cores import CoreRows, Field, add_core
+from neurolens.surrogates.onnx_graph import Graph
+from neurolens.surrogates.published.cores import Cells, OuterPupil
+
+Array = NDArray[np.float64]
+
+
+def add_published(g: Graph, core: Core, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
+    """Append a core of a published method; arguments as in `add_core`.
+
+    Raises:
+        TypeError: a core that has no ONNX form.
+    """
+    if isinstance(core, OuterPupil):
+        return _outer_pupil(g, core, field, vector_scale, gate_scale)
+    if isinstance(core, Cells):
+        return _cells(g, core, field, vector_scale, gate_scale)
+    raise TypeError(f"no ONNX form for a core of type {type(core).__name__}")
+
+
+def _cells(g: Graph, core: Cells, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
+    """Both halves for every ray, and a choice."""
+    k = core.variable
+    deciding = g.affine(field.weight[k : k + 1], field.squares, field.bias[k : k + 1])
+    beyond = g.op("Greater", deciding, g.const(core.threshold))
+    low, high = (add_core(g, half, field, vector_scale, gate_scale) for half in (core.low, core.high))
+
+    def choose(name: str) -> str:
+        return g.op("Where", beyond, getattr(high, name), getattr(low, name))
+
+    gates = [g.op("Where", beyond, b, a) for a, b in zip(low.gates, high.gates, strict=True)]
+    return CoreRows(*(choose(name) for name in ("position", "direction", "stop", "transmittance")), gates)
+
+
+def _outer_pupil(g: Graph, core: OuterPupil, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
+    millimetres = float(vector_scale[0])
+    rows = add_core(g, core.polynomial, field, vector_scale * np.array([1.0, 0.0, 1.0]) + [0, 1, 0], gate_scale)
+    gates = []
+    if core.inner is not None:
+        along_p, along_u = (g.op("Mul", v, g.const(k)) for v, k in zip((field.p, field.u), core.inner, strict=True))
+        gates.append(_beyond(g, g.op("Add", along_p, along_u), 1.0, gate_scale))
+    if core.outer is not None:
+        gates.append(_beyond(g, rows.position, core.outer / millimetres, gate_scale))
+    unit = _from_tangents(g, rows.position, rows.direction, core.curvature / millimetres)
+    return replace(rows, unit=unit, gates=gates)
+
+
+def _square(g: Graph, vector: str, scale: float = 1.0) -> str:
+    return g.op("MatMul", g.const([[scale, scale]]), g.op("Mul", vector, vector))
+
+
+def _beyond(g: Graph, vector: str, inverse_radius: float, gate_scale: float) -> str:
+    """gate_scale ((r / radius)^2 - 1), [1, N]."""
+    excess = g.op("Sub", _square(g, vector, inverse_radius**2), g.const(1.0))
+    return g.op("Mul", excess, g.const(gate_scale))
+
+
+def _from_tangents(g: Graph, position: str, tangents: str, curvature: float) -> str:
+    """Unit directions [3, N]; see `cores.from_tangents`."""
+    square = _square(g, tangents)
+    along = g.op("Sqrt", g.op("Relu", g.op("Sub", g.const(1.0), square)))
+    scale = g.op("Reciprocal", g.op("Sqrt", g.op("Max", square, g.const(1.0))))
+    tangents = g.op("Mul", tangents, scale)
+    if curvature == 0:
+        return g.concat(tangents, g.op("Neg", along))
+    normal = g.op("Mul", position, g.const(curvature))
+    s2 = g.op("Relu", g.op("Sub", g.const(1.0), _square(g, normal)))
+    s = g.op("Sqrt", s2)
+    (a, b), (cx, cy) = g.split(tangents, [1, 1]), g.split(normal, [1, 1])
+    length2 = g.op("Add", s2, g.op("Mul", cx, cx))
+    inverse = g.op("Reciprocal", g.op("Sqrt", g.op("Max", length2, g.const(1e-30))))
+    # a ex + b ey + along n, with ex = (s, 0, cx) / l and ey = (-cx cy, l^2, s cy) / l.
+    a, b = g.op("Mul", a, inverse), g.op("Mul", b, inverse)
+    mixed = g.op("Sub", g.op("Mul", a, s), g.op("Mul", g.op("Mul", b, cx), cy))
+    x = g.op("Add", mixed, g.op("Mul", along, cx))
+    y = g.op("Add", g.op("Mul", b, length2), g.op("Mul", along, cy))
+    turned = g.op("Add", g.op("Mul", a, cx), g.op("Mul", g.op("Mul", b, cy), s))
+    return g.concat(x, y, g.op("Sub", turned, g.op("Mul", along, s)))
