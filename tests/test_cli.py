@@ -124,7 +124,7 @@ def test_main_help_lists_the_commands_and_exit_codes(capsys: pytest.CaptureFixtu
         (["lens", GAUSS, "--foc", "1"], ["--foc"]),
         (["train"], ["EXPERIMENT.toml", "--lens"]),
         (["train", "a.toml", "--lens", GAUSS], ["both"]),
-        (["train", "--lens", GAUSS], ["--out"]),
+        (["train", "--lens", "no.toml"], ["no.toml"]),
         (["train", "no.toml"], ["no.toml", "missing"]),
         (["train", "--lens", GAUSS, "--out", GAUSS], ["--out", "folder"]),
     ],

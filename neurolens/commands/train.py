@@ -18,8 +18,10 @@ Run an experiment: trace ray pairs of the lens, fit the surrogates, export them 
 measure errors and speed against the exact tracer, render the scenes, and write one report.
 Needs the extra "train" (torch).
 
-Without an experiment file, --lens fits a polynomial and a network to that lens over its whole
-film, all wavelengths from 400 to 700 nm, focus from infinity to 14 focal lengths.
+Without an experiment file, --lens fits a polynomial and a network to that lens in its default state:
+full aperture, its whole lit film, all wavelengths from 380 to 780 nm (less where its glasses are stated
+for less; one where no dispersion is known), focus from infinity to 14 focal lengths (further where the
+lens is too long for that).
 
 A run that was interrupted goes on where it stopped: models that are there, made by the same
 settings, are kept."""
@@ -27,6 +29,7 @@ _EPILOG = """\
 examples:
   neurolens train experiments/quickstart.toml
   neurolens train experiments/quickstart.toml --out runs/try --set render.samples=4 --set pairs.seed=2
+  neurolens train --lens lenses/cooke_triplet_50.toml
   neurolens train --lens lenses/brendel_tessar_100.toml --out runs/tessar \\
       --set lens.efl_mm=50
 
@@ -40,9 +43,12 @@ def add_parser(subparsers: Any) -> None:
         "train", help="fit, measure and render the models of an experiment", description=_DESCRIPTION, epilog=_EPILOG
     )
     parser.add_argument("experiment", metavar="EXPERIMENT.toml", nargs="?", type=Path, help="experiment file")
-    parser.add_argument("--lens", metavar="FILE", type=Path, help="lens file, instead of an experiment; needs --out")
+    parser.add_argument("--lens", metavar="FILE", type=Path, help="lens file, instead of an experiment")
     parser.add_argument(
-        "--out", metavar="DIR", type=Path, help="run folder, made if needed (default: runs/NAME of the experiment file)"
+        "--out",
+        metavar="DIR",
+        type=Path,
+        help="run folder, made if needed (default: runs/NAME of the experiment or lens file)",
     )
     parser.add_argument(
         "--set", metavar="KEY=VALUE", dest="overrides", action="append", default=[],
@@ -76,14 +82,12 @@ def _run_folder(args: argparse.Namespace) -> Path:
     """The run folder of the arguments.
 
     Raises:
-        InputError: both or neither of experiment and --lens, --lens without --out, a folder that is a file.
+        InputError: both or neither of experiment and --lens, a folder that is a file.
     """
     if (args.experiment is None) == (args.lens is None):
         found = "(neither)" if args.lens is None else "(both)"
         raise InputError("neurolens train", "EXPERIMENT.toml or --lens", found, "one of them")
-    if args.lens is not None and args.out is None:
-        raise InputError("neurolens train", "--out", "(missing)", "a run folder, as --lens names none")
-    folder: Path = args.out if args.out is not None else Path("runs") / args.experiment.stem
+    folder: Path = args.out if args.out is not None else Path("runs") / (args.experiment or args.lens).stem
     if folder.exists() and not folder.is_dir():
         raise InputError("neurolens train", "--out", str(folder), "a folder, not a file")
     return folder

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from neurolens.config import from_dict, read_config
 from neurolens.errors import InputError
+from neurolens.optics.glass import glass_of
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -18,9 +19,11 @@ from neurolens.surrogates.domain import Domain, domain_of
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
 
-# Near limit where none is stated: 14 focal lengths, 0.7 m for a 50 mm lens.
-NEAR_LIMIT_FOCAL_LENGTHS = 14
-
+# Near limit where none is stated: 14 focal lengths from the film (0.7 m for a 50 mm lens), and the object 8 before the
+# front vertex, where a long lens of short focus has less room than that.
+NEAR_LIMIT_FOCAL_LENGTHS, NEAREST_OBJECT_FOCAL_LENGTHS = 14, 8
+# Wavelengths where none are stated, as far as the formulas of the lens's glasses reach.
+VISIBLE_NM = (380.0, 780.0)
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
@@ -66,13 +69,41 @@ class DomainChoice:
     Attributes:
         film_radius_mm: None takes the lit film.
         focus_m: two object distances from the film; every film position between theirs is in the domain.
-            None takes infinity and 14 focal lengths.
-        wavelength_nm: shortest and longest.
+            None takes infinity and `near_limit_m`.
+        wavelength_nm: shortest and longest; None takes `wavelengths_nm`.
     """
 
     film_radius_mm: float | None = None
     focus_m: tuple[float, float] | None = None
-    wavelength_nm: tuple[float, float] = (400.0, 700.0)
+    wavelength_nm: tuple[float, float] | None = None
+
+    def of(self, lens: Lens) -> Domain:
+        """The domain of a lens, what is not stated taken from it."""
+        return domain_of(
+            lens,
+            film_radius_mm=self.film_radius_mm,
+            focus_m=self.focus_m or (math.inf, near_limit_m(lens)),
+            wavelength_nm=self.wavelength_nm or wavelengths_nm(lens),
+        )
+
+
+def near_limit_m(lens: Lens) -> float:
+    """Distance from the film of the nearest object that a lens is asked to focus, where nobody says: see above."""
+    data = first_order(lens)
+    f, film_z = abs(data.efl_mm), data.rear_focal_z_mm
+    separation = data.rear_principal_z_mm - data.front_principal_z_mm
+    lengths = (NEAR_LIMIT_FOCAL_LENGTHS * f, film_z + NEAREST_OBJECT_FOCAL_LENGTHS * f, 6 * f + separation)
+    return max(v for v in lengths if math.isfinite(v)) / 1000
+
+
+def wavelengths_nm(lens: Lens) -> tuple[float, float]:
+    """`VISIBLE_NM`, or the part of it for which every catalogue glass of the lens is stated (400-700 nm at least)."""
+    low, high = VISIBLE_NM
+    for surface in lens.surfaces:
+        if surface.glass is not None:
+            shortest, longest = (1000 * v for v in glass_of(surface.glass).range_um)
+            low, high = max(low, min(shortest, 400.0)), min(high, max(longest, 700.0))
+    return low, high
 
 
 @dataclass(frozen=True)
@@ -146,15 +177,7 @@ class Experiment:
 
     def domain_of(self, lens: Lens) -> Domain:
         """The domain of the lens as this experiment asks for it."""
-        focus = self.domain.focus_m
-        if focus is None:
-            focus = (math.inf, NEAR_LIMIT_FOCAL_LENGTHS * abs(first_order(lens).efl_mm) / 1000)
-        return domain_of(
-            lens,
-            film_radius_mm=self.domain.film_radius_mm,
-            focus_m=focus,
-            wavelength_nm=self.domain.wavelength_nm,
-        )
+        return self.domain.of(lens)
 
 
 def read_experiment(path: str | Path, overrides: Sequence[str] = ()) -> Experiment:
@@ -202,6 +225,6 @@ def default_experiment(lens_file: str | Path, overrides: Sequence[str] = ()) -> 
     tables = {
         "title": f"Models of {Path(lens_file).stem}",
         "lens": {"file": str(lens_file)},
-        "model": [{"method": "ols", "terms": 60}, {"method": "mlp", "units": 16, "layers": 2}],
+        "model": [{"method": "ols", "terms": 64}, {"method": "mlp", "units": 32, "layers": 2}],
     }
     return from_dict(Experiment, apply_overrides(tables, overrides), "--set")

@@ -58,15 +58,15 @@ def run_experiment(
     folder, started, clock = Path(out), datetime.now(UTC), time.perf_counter()
     progress = progress or Progress(quiet=True)
     models, pictures = folder / "models", folder / "pictures"
-    for each in (models, pictures):
-        each.mkdir(parents=True, exist_ok=True)
     resolved = relative_to(experiment, folder)
-    atomic_write_text(folder / "config.toml", to_toml(resolved))
     progress.plan(_plan(experiment))
     with warnings.catch_warnings(record=True) as heard, pinned_threads():
         warnings.simplefilter("always")
         lens = experiment.lens.read()
         domain = experiment.domain_of(lens)
+        for each in (models, pictures):  # only now: a lens that cannot be leaves no folder behind
+            each.mkdir(parents=True, exist_ok=True)
+        atomic_write_text(folder / "config.toml", to_toml(resolved))
         with progress.stage("trace ray pairs") as report:
             pairs = make_pairs(lens, domain, experiment.pairs, report)
             if experiment.save_pairs:

@@ -21,6 +21,8 @@ title = "small"
 [lens]
 file = "ROOT/lenses/brendel_tessar_100.toml"
 efl_mm = 50
+[domain]
+wavelength_nm = [400, 700]
 [pairs]
 train = 3000
 held_out = 2000
@@ -143,5 +145,5 @@ def test_bad_settings_name_the_field(tmp_path: Path, override: str, field: str) 
 
 def test_a_lens_file_alone_makes_an_experiment() -> None:
     experiment = default_experiment(ROOT / "lenses/brendel_tessar_100.toml", ["pairs.train=5000"])
-    assert [m.label for m in experiment.model] == ["ols-60", "mlp-16x2"]
+    assert [m.label for m in experiment.model] == ["ols-64", "mlp-32x2"]
     assert experiment.pairs.train == 5000
