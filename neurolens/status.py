@@ -4,6 +4,7 @@ One integer a ray, the same code for the exact tracer and for exported models:
 
     0                 passed
     1                 outside the domain of a model (exact tracing never returns it)
+    2                 no ray found that is as asked for (inverse maps of models only)
     4 (k + 1) + r     ended at surface k (0-based, counted from the scene), for reason r:
                       1 missed the surface, 2 blocked by its rim (or by the stop), 3 total reflection
 
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 PASSED = 0
 OUTSIDE_DOMAIN = 1
+NO_SOLUTION = 2
 MISSED, RIM, TOTAL_REFLECTION = 1, 2, 3
 _REASONS = {
     MISSED: "missed surface",
@@ -43,4 +45,6 @@ def describe(status: int) -> str:
         return "passed"
     if status == OUTSIDE_DOMAIN:
         return "outside the model's domain"
+    if status == NO_SOLUTION:
+        return "no ray found that is as asked for"
     return f"{_REASONS[status % 4]} {status // 4 - 1}"

@@ -19,7 +19,20 @@ ROOT = Path(__file__).parents[1]
 MODULES = sorted((ROOT / "neurolens").rglob("*.py"))
 MAX_LINES = 300
 
-BASE = {"errors", "status", "files", "tomlfile", "config", "progress", "focus", "modelfile", "apertures"}
+BASE = {
+    "errors",
+    "status",
+    "files",
+    "tomlfile",
+    "config",
+    "progress",
+    "focus",
+    "modelfile",
+    "apertures",
+    "frontsurface",
+    "axes",
+    "statetable",
+}
 # Parts of the package that each part may import, besides itself and the base.
 PARTS = {
     "optics": set(),
