@@ -11,6 +11,7 @@ from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import Core, Gate
 from neurolens.surrogates.published.data import RawData, outer_pupil
 from neurolens.surrogates.published.polynomials import fit_dense, fit_sparse
+from neurolens.surrogates.published.taylor import fit_taylor
 
 Progress = Callable[[float], None] | None
 
@@ -30,7 +31,9 @@ def fit_published(prepared: Prepared, settings: ModelSettings, progress: Progres
         InputError: an unknown method, or a lens or settings that it cannot take.
     """
     data = RawData.of(prepared)
-    if settings.method == "hanika":
+    if settings.method == "taylor":
+        core, gates = outer_pupil(data, fit_taylor(prepared.pairs.lens, data.encoding, settings.degree), 0.0)
+    elif settings.method == "hanika":
         core, gates = outer_pupil(data, fit_dense(data, settings.degree))
     elif settings.method == "schrade":
         core, gates = outer_pupil(data, fit_sparse(data, settings.terms, settings.degree))

@@ -35,11 +35,16 @@ def _cells(g: Graph, core: Cells, field: Field, vector_scale: Array, gate_scale:
     beyond = g.op("Greater", deciding, g.const(core.threshold))
     low, high = (add_core(g, half, field, vector_scale, gate_scale) for half in (core.low, core.high))
 
-    def choose(name: str) -> str:
-        return g.op("Where", beyond, getattr(high, name), getattr(low, name))
+    def choose(low: str, high: str) -> str:
+        return g.op("Where", beyond, high, low)
 
-    gates = [g.op("Where", beyond, b, a) for a, b in zip(low.gates, high.gates, strict=True)]
-    return CoreRows(*(choose(name) for name in ("position", "direction", "stop", "transmittance")), gates)
+    return CoreRows(
+        choose(low.position, high.position),
+        choose(low.direction, high.direction),
+        choose(low.stop, high.stop),
+        choose(low.transmittance, high.transmittance),
+        [choose(a, b) for a, b in zip(low.gates, high.gates, strict=True)],
+    )
 
 
 def _outer_pupil(g: Graph, core: OuterPupil, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
