@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from neurolens.cameras.pupil_boxes import PupilTable
+from neurolens.cameras.states import check_states
 from neurolens.errors import InputError, ModelError
 
 
@@ -98,7 +99,19 @@ def check_card(file: Any, card: Mapping[str, Any]) -> None:
     Raises:
         ModelError: the first place that is missing or holds something else, and what belongs there.
     """
-    for place, (holds, expected) in {**_RULES, **_OPTIONAL}.items():
+    _check_places(file, card, {**_RULES, **_OPTIONAL})
+    if card.get("states") is None:
+        return
+    node_rules = {k: rule for k, rule in _RULES.items() if k.split(".")[0] in ("lens", "domain")}
+    node_rules["lens.infinity_film_z_mm"] = node_rules["lens.film_z_mm"] = NUMBER
+    try:
+        check_states(card, lambda node: _check_places(f"{file}: card: states.nodes", node, node_rules))
+    except (InputError, KeyError, TypeError, ValueError, ArithmeticError) as error:
+        raise ModelError(f"{file}: card: states: {type(error).__name__}: {error}") from error
+
+
+def _check_places(file: Any, card: Mapping[str, Any], rules: Mapping[str, Rule]) -> None:
+    for place, (holds, expected) in rules.items():
         value: Any = card
         for key in place.split("."):
             value = value.get(key, _MISSING)

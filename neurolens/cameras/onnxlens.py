@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +15,7 @@ from neurolens import status as st
 from neurolens.cameras.cardcheck import check_card
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.onnxfile import read_checked
+from neurolens.cameras.states import STATE, axes_of, card_at, default_state
 from neurolens.errors import InputError, ModelError
 
 INPUTS = {"rays": ("tensor(float)", 5, None), "film_z_mm": ("tensor(float)", 1), "stop_radius_mm": ("tensor(float)", 1)}
@@ -44,18 +47,45 @@ class OnnxLens:
     """An exported model, loaded and checked. Make it with `load_model`.
 
     Attributes:
-        card: see `neurolens.surrogates.card`.
+        card: see `neurolens.surrogates.card`; its lens and domain are those of `state`.
         path: of the file.
+        axes: what the model's state is made of (zoom in mm, focus in 1/m); none for a model of one state.
+        state: a number for every axis.
     """
 
     def __init__(self, path: Path, data: bytes, card: dict[str, Any], threads: int) -> None:
         self.path, self.card, self.threads = path, card, threads
+        self.axes, self.state = axes_of(card), default_state(card)
         self._data = data
-        self._session = _session(path, data, threads)
+        self._session = _session(path, data, threads, len(self.axes))
+
+    def at(self, *state: float) -> OnnxLens:
+        """The same model in another state, its card with the lens and the domain there; one session serves all.
+
+        Raises:
+            InputError: another number of values than axes, or one out of range.
+        """
+        other = copy(self)
+        if self.axes or state:
+            other.card, other.state = card_at(self.card, self.axes, state), tuple(float(v) for v in state)
+        return other
+
+    @property
+    def pupil_z_mm(self) -> float:
+        """Plane of the pupil points at this state."""
+        return float(self.card["domain"]["pupil_z_mm"])
+
+    @property
+    def film_z_mm(self) -> tuple[float, float]:
+        """Film planes at this state, of the farthest focus first."""
+        near, far = self.card["domain"]["film_z_mm"]
+        return float(near), float(far)
 
     def reopened(self) -> OnnxLens:
         """The same model with a session of its own, for another process or thread."""
-        return OnnxLens(self.path, self._data, self.card, self.threads)
+        other = OnnxLens(self.path, self._data, self.card, self.threads)
+        other.state = self.state
+        return other
 
     def rays(
         self,
@@ -64,6 +94,7 @@ class OnnxLens:
         wavelength_nm: ArrayLike,
         film_z_mm: float | ArrayLike | None = None,
         stop_radius_mm: float | None = None,
+        state: float | Sequence[float] | None = None,
     ) -> LensRays:
         """Scene-side rays of camera rays.
 
@@ -73,10 +104,14 @@ class OnnxLens:
             film_z_mm: film plane; None takes the domain's nearest to the lens (its farthest focus). An array [N] costs
                 a call for each distinct value.
             stop_radius_mm: None takes the widest stop.
+            state: of a model of many states, a number for every axis; None takes `self.state`, at first the first end
+                of every axis. Out of range, every ray is outside the domain.
 
         Raises:
-            InputError: arrays of other shapes. Rays outside the domain are no error: their status says so.
+            InputError: arrays of other shapes, or another number of states than axes. Rays outside the domain are no error: their status says so.
         """
+        if state is not None:
+            return self._in_state(state).rays(film_xy_mm, pupil_xy_mm, wavelength_nm, film_z_mm, stop_radius_mm)
         film, pupil, wavelength = _columns(film_xy_mm, pupil_xy_mm, wavelength_nm)
         domain = self.card["domain"]
         stop = np.array([domain["stop_radius_mm"] if stop_radius_mm is None else stop_radius_mm], np.float32)
@@ -95,6 +130,21 @@ class OnnxLens:
             for whole, piece in zip(out, done, strict=True):
                 whole[..., part] = piece
         return out
+
+    def _in_state(self, state: float | Sequence[float]) -> OnnxLens:
+        """`at`, for any numbers: out of range, where there is no domain, rays are sent with that of this state."""
+        try:
+            values = tuple(float(v) for v in np.atleast_1d(np.asarray(state, np.float64)))
+        except (TypeError, ValueError):
+            values = ()
+        if not self.axes or len(values) != len(self.axes):
+            expected = f"{len(self.axes)} numbers ({', '.join(a.name for a in self.axes) or 'a model of one state'})"
+            raise InputError("OnnxLens.rays", "state", state, expected)
+        if all(a.limits[0] <= v <= a.limits[1] for a, v in zip(self.axes, values, strict=True)):
+            return self.at(*values)
+        other = copy(self)
+        other.state = values
+        return other
 
     def _by_plane(
         self, film: FloatArray, pupil: FloatArray, wavelength: FloatArray, plane: FloatArray, stop: FloatArray
@@ -116,8 +166,11 @@ class OnnxLens:
         rays = np.empty((5, width), np.float32)
         rays[:2, :count], rays[2:4, :count], rays[4, :count] = film, pupil, wavelength
         rays[:, count:] = 0
+        feeds = {"rays": rays, "film_z_mm": plane, "stop_radius_mm": stop}
+        if self.axes:
+            feeds[STATE] = np.array(self.state, np.float32)
         try:
-            out = self._session.run(list(OUTPUTS), {"rays": rays, "film_z_mm": plane, "stop_radius_mm": stop})
+            out = self._session.run(list(OUTPUTS), feeds)
         except Exception as error:  # onnxruntime raises types of its own, without a common base
             raise ModelError(f"{self.path}: onnxruntime cannot run it ({_first_line(error)})") from error
         return LensRays(*(a[..., :count] for a in out))
@@ -178,7 +231,7 @@ def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
-def _session(path: Path, data: bytes, threads: int) -> Any:
+def _session(path: Path, data: bytes, threads: int, axes: int) -> Any:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
@@ -188,7 +241,7 @@ def _session(path: Path, data: bytes, threads: int) -> Any:
     except Exception as error:  # onnxruntime raises types of its own, without a common base
         raise ModelError(f"{path}: onnxruntime cannot load it ({_first_line(error)})") from error
     for what, expected, found in (
-        ("input", INPUTS, session.get_inputs()),
+        ("input", {**INPUTS, STATE: ("tensor(float)", axes)} if axes else INPUTS, session.get_inputs()),
         ("output", OUTPUTS, session.get_outputs()),
     ):
         shapes = {v.name: (v.type, *(None if isinstance(d, str) else d for d in v.shape)) for v in found}
@@ -198,9 +251,14 @@ def _session(path: Path, data: bytes, threads: int) -> Any:
 
 
 def _check_reference(model: OnnxLens) -> None:
-    """Recompute the card's reference rays: what is loaded here is what was exported."""
+    """Recompute the card's reference rays, at every state that has some: what is loaded here is what was exported."""
+    _check_rays(model, model.card.get("reference"))
+    for reference in model.card["states"]["reference"] if model.axes else ():
+        _check_rays(model.at(*reference["state"]), reference)
+
+
+def _check_rays(model: OnnxLens, reference: Any) -> None:
     try:
-        reference = model.card["reference"]
         rays = np.asarray(reference["rays"], np.float32)
         wanted = [np.asarray(reference[k], np.float64) for k in ("scene_ray", "transmittance", "stop_xy_mm", "status")]
         found = model.rays(rays[:2], rays[2:4], rays[4], float(reference["film_z_mm"][0]), reference["stop_radius_mm"])

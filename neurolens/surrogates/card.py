@@ -44,7 +44,7 @@ def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
     return {
         "kind": CARD_KIND,
         "schema": CARD_SCHEMA,
-        "lens": _lens(model.lens, model.domain.film_z_mm[0]),
+        "lens": lens_facts(model.lens, model.domain.film_z_mm[0]),
         "units": UNITS,
         "frame": FRAME.format(place="the front surface" if model.direction == "angle" else "the plane z = 0"),
         "domain": model.domain.to_dict(),
@@ -98,7 +98,7 @@ def _culprit(value: Any, place: str) -> tuple[str, Any]:
     return place, value
 
 
-def _lens(lens: Lens, nearest_film_z_mm: float) -> dict[str, Any]:
+def lens_facts(lens: Lens, nearest_film_z_mm: float) -> dict[str, Any]:
     data = first_order(lens)
     curvature = float(lens.surfaces[0].curvature)
     return {

@@ -16,13 +16,23 @@ import torch
 from neurolens import status as st
 from neurolens.errors import InputError
 from neurolens.files import atomic_path
-from neurolens.modelfile import CARD_KEY
+from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.surrogates.card import card_of, card_to_json
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.onnx_cores import add_core
 from neurolens.surrogates.onnx_graph import FLOAT, INT32, Graph
 from neurolens.surrogates.onnx_light import TEST_SCALE, DirectionSeries, add_decoder, add_light_field, add_status
+from neurolens.surrogates.stored import model_to_text, storable
+
+# Names and shapes; "N" stands for the number of rays.
+INPUTS: list[tuple[str, list[int | str]]] = [("rays", [5, "N"]), ("film_z_mm", [1]), ("stop_radius_mm", [1])]
+OUTPUTS: list[tuple[str, int, list[int | str]]] = [
+    ("scene_ray", FLOAT, [6, "N"]),
+    ("transmittance", FLOAT, ["N"]),
+    ("stop_xy_mm", FLOAT, [2, "N"]),
+    ("status", INT32, ["N"]),
+]
 
 
 def export_onnx(model: LensModel, path: str | Path, errors: dict[str, Any] | None = None) -> Path:
@@ -40,32 +50,42 @@ def export_onnx(model: LensModel, path: str | Path, errors: dict[str, Any] | Non
     Raises:
         InputError: weights or errors that are not finite; two gates for one reason on one surface, or one on the stop.
     """
+    check_gates(model)
+    g = Graph()
+    add_model(g, model, DirectionSeries(largest_angle(model)))
+    proto = g.model(INPUTS, OUTPUTS, {CARD_KEY: card_to_json(card_of(model, errors or {}))})
+    target = Path(path)
+    with atomic_path(target) as temporary:
+        temporary.write_bytes(proto.SerializeToString())
+    return target
+
+
+def check_gates(model: LensModel) -> None:
+    """Refuse gates whose codes could not be told apart.
+
+    Raises:
+        InputError: two gates for one reason on one surface, or one on the stop.
+    """
     codes = [gate.status for gate in model.gates]
     if len({*codes, st.blocked(model.lens.stop_index, st.RIM)}) <= len(codes):
         raise InputError("export", "gates", codes, "one gate a surface and reason, and none on the rim of the stop")
-    g = Graph()
+
+
+def add_model(g: Graph, model: LensModel, series: DirectionSeries) -> None:
+    """Append a whole model, from `INPUTS` to `OUTPUTS`."""
     field, inside = add_light_field(g, model)
-    series = DirectionSeries(largest_angle(model))
     kappa = series.kappa if model.direction == "angle" else 1.0
     scale = np.array([model.scales.position_mm, kappa, model.scales.stop_mm])
     rows = add_core(g, model.core, field, scale, TEST_SCALE)
     stop_square = add_decoder(g, model, rows, series)
     add_status(g, model, rows, stop_square, inside)
     g.reshape(rows.transmittance, [-1], out="transmittance")
-    proto = g.model(
-        [("rays", [5, "N"]), ("film_z_mm", [1]), ("stop_radius_mm", [1])],
-        [
-            ("scene_ray", FLOAT, [6, "N"]),
-            ("transmittance", FLOAT, ["N"]),
-            ("stop_xy_mm", FLOAT, [2, "N"]),
-            ("status", INT32, ["N"]),
-        ],
-        {CARD_KEY: card_to_json(card_of(model, errors or {}))},
-    )
-    target = Path(path)
-    with atomic_path(target) as temporary:
-        temporary.write_bytes(proto.SerializeToString())
-    return target
+
+
+def _metadata(model: LensModel, errors: dict[str, Any]) -> dict[str, str]:
+    """The card, and the coefficients where their core has a form for files."""
+    card = {CARD_KEY: card_to_json(card_of(model, errors))}
+    return {**card, MODEL_KEY: model_to_text(model)} if storable(model.core) else card
 
 
 def largest_angle(model: LensModel, count: int = 32768) -> float:

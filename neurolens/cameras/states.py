@@ -1,0 +1,107 @@
+"""Cards of models of many states: the axes, and the card at any state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from neurolens.axes import Axis, product, weights
+from neurolens.errors import InputError
+from neurolens.statetable import mix_domain, mix_lens
+
+STATE = "state"
+
+
+def axes_of(card: Mapping[str, Any]) -> tuple[Axis, ...]:
+    """State axes of a card that `cardcheck` passed; none for a model of one state."""
+    states = card.get("states")
+    return tuple(Axis.from_dict(a) for a in states["axes"]) if states else ()
+
+
+def default_state(card: Mapping[str, Any]) -> tuple[float, ...]:
+    """The state whose lens and domain stand in the card itself."""
+    states = card.get("states")
+    return tuple(float(v) for v in states["default"]) if states else ()
+
+
+def card_at(card: Mapping[str, Any], axes: Sequence[Axis], state: Sequence[float]) -> dict[str, Any]:
+    """The card with lens and domain at a state.
+
+    Raises:
+        InputError: another number of values than axes, or one out of range.
+    """
+    nodes, w = card["states"]["nodes"], weights(axes, state)
+    lens = mix_lens([n["lens"] for n in nodes], w)
+    return {**card, "lens": lens, "domain": mix_domain([n["domain"] for n in nodes], w)}
+
+
+def state_for(path: Any, card: Mapping[str, Any], zoom: str | float | None, focus_m: float | None) -> tuple[float, ...]:
+    """The state that a photographer asks for.
+
+    Args:
+        path: what an error names.
+        zoom: name of a state of the source, or a focal length in mm; None takes the default.
+        focus_m: distance from the film to the object; None leaves it to the film's place.
+
+    Raises:
+        InputError: a zoom position or an internal focus that the model does not have.
+    """
+    axes = axes_of(card)
+    values = dict(zip((a.name for a in axes), default_state(card), strict=True))
+    for axis in axes:
+        if axis.name == "zoom" and zoom is not None:
+            values["zoom"] = _zoom(path, axis, zoom)
+        elif axis.name == "focus" and focus_m is not None:
+            values["focus"] = min(max(1 / focus_m, axis.range[0]), axis.limits[1])
+            if 1 / focus_m > axis.limits[1]:
+                raise InputError(
+                    path, "focus_m", focus_m, f"at least {1 / axis.range[1]:.4g} m, the model's near limit"
+                )
+    if zoom is not None and "zoom" not in values:
+        raise InputError(path, "zoom", zoom, "left out: the model is of one zoom position")
+    return tuple(values.values())
+
+
+def _zoom(path: Any, axis: Axis, zoom: str | float) -> float:
+    """Focal length in mm of a zoom position: its name in the source, or a number within the range."""
+    low, high = axis.range
+    named = dict(axis.stated)
+    try:
+        value = named[zoom] if isinstance(zoom, str) and zoom in named else float(zoom)
+    except ValueError:
+        value = float("nan")
+    # The source's own figures for its ends are rounded.
+    if not low * (1 - _ROUNDED) <= value <= high * (1 + _ROUNDED):
+        expected = f"a focal length from {low:.5g} to {high:.5g} mm, or one of: {', '.join(named)}"
+        raise InputError(path, "zoom", zoom, expected)
+    return min(max(value, low), high)
+
+
+_ROUNDED = 0.01
+
+
+def check_states(card: Mapping[str, Any], check_node: Any) -> None:
+    """Check the table of states of a card.
+
+    Args:
+        check_node: called with the table of every node; raises what is wrong with its lens and domain.
+
+    Raises:
+        InputError, KeyError, TypeError, ValueError: what does not belong there.
+    """
+    states = card["states"]
+    axes = axes_of(card)
+    names = [a.name for a in axes]
+    if not axes or len(set(names)) < len(names) or not set(names) <= {"zoom", "focus"}:
+        raise InputError("card", "states.axes", names, "zoom, focus, or both")
+    nodes = states["nodes"]
+    count = len(product(axes))
+    if not isinstance(nodes, list) or len(nodes) != count:
+        raise InputError("card", "states.nodes", f"({len(nodes)})", f"a list of {count}")
+    for node in nodes:
+        check_node(node)
+    weights(axes, [float(v) for v in states["default"]])
+    for reference in states["reference"]:
+        weights(axes, [float(v) for v in reference["state"]])
+    mix_lens([n["lens"] for n in nodes], weights(axes, default_state(card)))
+    mix_domain([n["domain"] for n in nodes], weights(axes, default_state(card)))

@@ -1,0 +1,133 @@
+"""Which states a model is of: the axes of a lens file, and its lens and domain at every state."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from neurolens.axes import Axis
+from neurolens.errors import InputError
+from neurolens.optics.internal import infinity_states, nearest_focus_m
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import image_radius_mm
+from neurolens.surrogates.domain import Domain, domain_of
+
+# Degree of the polynomials between stated positions. Focal lengths that differ by less than this share are one.
+ZOOM_DEGREE, FOCUS_DEGREE = 4, 4
+_SAME = 1e-3
+# Zoom positions at which the common near limit of internal focus is sought.
+_LIMITS = 9
+
+
+@dataclass(frozen=True)
+class StateSpace:
+    """The states of a lens that one model is of.
+
+    Attributes:
+        lens: the lens as its file gives it, or scaled.
+        axes: zoom, internal focus, or both in this order.
+        zoom: state of the file where zoom is no axis.
+        f_number: None is the widest stop of each state.
+        film_radius_mm: None takes the lit film of each state.
+        focus_m: object distances (far, near) that moving the film reaches in every state; a number of focal lengths
+            stands for infinity to so many of them. Without effect where internal focus is an axis.
+        wavelength_nm: shortest and longest.
+    """
+
+    lens: Lens
+    axes: tuple[Axis, ...]
+    zoom: str | float | None = None
+    f_number: float | None = None
+    film_radius_mm: float | None = None
+    focus_m: tuple[float, float] | float = (math.inf, math.inf)
+    wavelength_nm: tuple[float, float] = (400.0, 700.0)
+
+    def _values(self, state: Sequence[float]) -> dict[str, float]:
+        return dict(zip((a.name for a in self.axes), state, strict=True))
+
+    def lens_at(self, state: Sequence[float]) -> Lens:
+        """The exact lens at a state; with internal focus, focused there, else at infinity focus."""
+        values = self._values(state)
+        zoom = values.get("zoom", self.zoom)
+        if "focus" not in values:
+            return self.lens.at(zoom=zoom, f_number=self.f_number)
+        focus_m = 1 / values["focus"] if values["focus"] > 0 else math.inf
+        return self.lens.at(
+            zoom=zoom, f_number=self.f_number, focus="internal", focus_m=None if math.isinf(focus_m) else focus_m
+        )
+
+    def domain_at(self, state: Sequence[float]) -> Domain:
+        """The domain of a state: the full lit film, and the film positions that focusing by the film needs."""
+        values, lens = self._values(state), self.lens_at(state)
+        if "focus" not in values:
+            focus = self.focus_m
+            if not isinstance(focus, tuple):
+                focus = (math.inf, focus * abs(first_order(lens).efl_mm) / 1000)
+            return domain_of(lens, film_radius_mm=self.film_radius_mm, focus_m=focus, wavelength_nm=self.wavelength_nm)
+        # The picture's size is that of the lens at infinity focus: it breathes, the film does not.
+        radius = self.film_radius_mm
+        if radius is None:
+            radius = image_radius_mm(self.lens_at([0.0 if k == "focus" else v for k, v in values.items()]))[0]
+        assert lens.film_z_mm is not None
+        distance = 1 / values["focus"] if values["focus"] > 0 else math.inf
+        return domain_of(
+            lens,
+            film_radius_mm=radius,
+            focus_m=(distance, distance),
+            wavelength_nm=self.wavelength_nm,
+            film_z_mm=(lens.film_z_mm, lens.film_z_mm),
+        )
+
+
+def zoom_axis(lens: Lens, degree: int = ZOOM_DEGREE) -> Axis:
+    """The whole range of a zoom: focal length in mm, smooth between the states of the file.
+
+    Raises:
+        InputError: a file with fewer than two zoom states.
+    """
+    found: list[tuple[float, str]] = []
+    for state in infinity_states(lens):
+        found.append((float(first_order(lens.at(zoom=state.name)).efl_mm), state.name))
+    found.sort()
+    knots: list[float] = []
+    for efl, _ in found:
+        if not knots or efl > knots[-1] * (1 + _SAME):
+            knots.append(efl)
+    if len(knots) < 2:
+        raise InputError(lens.path, "zoom", "range", "a lens file with two zoom states or more")
+    # Ray slopes go as 1 / f: in that coordinate they are straight.
+    return Axis("zoom", "mm", tuple(knots), degree, reciprocal=True, stated=tuple((n, e) for e, n in found))
+
+
+def focus_axis(lens: Lens, zoom: Sequence[str | float | None] = (None,), degree: int = FOCUS_DEGREE) -> Axis:
+    """Internal focus from infinity to the near limit that all the zoom positions given reach: vergence in 1/m.
+
+    Raises:
+        InputError: a file without focus states.
+    """
+    nearest = max(nearest_focus_m(lens.at(zoom=z)) for z in zoom)
+    return Axis("focus", "1/m", (0.0, (1 - 1e-9) / nearest), degree)
+
+
+def axes_of(lens: Lens, *, zoom: bool, internal: bool, state: str | float | None = None) -> tuple[Axis, ...]:
+    """The axes asked for: the zoom's whole range, internal focus, or both.
+
+    Args:
+        state: the zoom position where `zoom` is False.
+
+    Raises:
+        InputError: neither, or what the file has no states for.
+    """
+    if not (zoom or internal):
+        raise InputError(lens.path, "states", "(none)", "the zoom's range, internal focus, or both")
+    if not zoom:
+        return (focus_axis(lens, (state,)),)
+    first = zoom_axis(lens)
+    if not internal:
+        return (first,)
+    low, high = first.range
+    places = [1 / (1 / high + (1 / low - 1 / high) * k / (_LIMITS - 1)) for k in range(_LIMITS)]
+    inner = [v for v in places if low < v < high]
+    return first, focus_axis(lens, [*(n for n, _ in first.stated), *inner])

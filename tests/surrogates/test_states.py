@@ -1,0 +1,223 @@
+"""Models of many states: nodes, what lies between them, the graph's state input, and states out of range."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import lens_models
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from neurolens import status as st
+from neurolens.axes import Axis, product, weights
+from neurolens.cameras.onnxlens import OnnxLens, load_model
+from neurolens.errors import InputError, ModelError
+from neurolens.evaluate.rays import ray_errors
+from neurolens.evaluate.vignetting import vignetting_errors
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.paraxial import first_order
+from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.onnx_state import export_states
+from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.state_fit import StateSettings, fit_states
+from neurolens.surrogates.state_model import StateModel, mix
+from neurolens.surrogates.state_space import StateSpace, focus_axis, zoom_axis
+
+ZOOM = Axis("zoom", "mm", (70.0, 135.0, 200.0), 3, reciprocal=True, stated=(("70mm", 70.0),))
+FOCUS = Axis("focus", "1/m", (0.0, 1.0), 4)
+
+
+@cache
+def space() -> StateSpace:
+    lens = read_lens(lens_models.LENSES / "nikon_zoom_80_200.toml")
+    return StateSpace(lens, (zoom_axis(lens, 4),), focus_m=(math.inf, 4.0))
+
+
+@cache
+def model() -> StateModel:
+    return fit_states(space(), StateSettings(terms=40, degree=5, rays=4000))
+
+
+@cache
+def exported() -> Path:
+    return export_states(model(), Path(lens_models._folder().name) / "states.onnx", {"rms_um": 1.0})
+
+
+@cache
+def loaded() -> OnnxLens:
+    return load_model(exported())
+
+
+def rays_of(part: LensModel, count: int = 20_000, seed: int = 3) -> tuple[FilmRays, float]:
+    """Rays of a domain from one film plane, as float32 holds them."""
+    rays = sample_domain(part.domain, count, seed)
+    z = float(np.float32(np.mean(part.domain.film_z_mm)))
+    columns = [c.float().double() for c in rays.columns()]
+    columns[2] = torch.full_like(columns[2], z)
+    return FilmRays(*columns), z
+
+
+def run(lens: OnnxLens, rays: FilmRays, z: float, **more: object) -> object:
+    fx, fy, _, px, py, wavelength = (c.float().numpy() for c in rays.columns())
+    return lens.rays(np.stack([fx, fy]), np.stack([px, py]), wavelength, z, **more)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("axis", [ZOOM, FOCUS, replace(ZOOM, reciprocal=False, degree=1)])
+def test_interpolation_is_exact_at_nodes_and_for_piecewise_polynomials(axis: Axis) -> None:
+    low, high = axis.range
+    assert axis.nodes[0] == low and axis.nodes[-1] == high and set(axis.knots) <= set(axis.nodes)
+    assert len(axis.nodes) == (len(axis.knots) - 1) * axis.degree + 1
+    assert np.array_equal([axis.weights(v) for v in axis.nodes], np.eye(len(axis.nodes)))
+
+    def kinked(value: float) -> float:
+        x = 1 / value if axis.reciprocal else value
+        knot = 1 / axis.knots[1] if axis.reciprocal else axis.knots[1]
+        return 3 - 2 * x + abs(x - knot) * (len(axis.knots) > 2) + 5 * x**axis.degree
+
+    values = np.array([kinked(v) for v in axis.nodes])
+    for value in np.linspace(low, high, 101):
+        assert axis.weights(float(value)) @ values == pytest.approx(kinked(value), rel=1e-12)
+        assert axis.weights(float(value)).sum() == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("value", [69.9, 200.1, math.nan, math.inf, -math.inf, 0.0])
+def test_weights_refuse_states_out_of_range(value: float) -> None:
+    with pytest.raises(InputError, match="zoom"):
+        ZOOM.weights(value)
+
+
+def test_two_axes_are_a_product() -> None:
+    states = product((ZOOM, FOCUS))
+    assert len(states) == len(ZOOM.nodes) * len(FOCUS.nodes)
+    values = np.array([1 / z * (1 + f) for z, f in states])
+    assert weights((ZOOM, FOCUS), (100.0, 0.3)) @ values == pytest.approx(1.3 / 100)
+    with pytest.raises(InputError, match="2 numbers"):
+        weights((ZOOM, FOCUS), (100.0,))
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [({"knots": (1.0,)}, "knots"), ({"knots": (2.0, 1.0)}, "knots"), ({"knots": (0.0, 1.0)}, "knots"),
+     ({"knots": (1.0, math.inf)}, "knots"), ({"degree": 0}, "degree"), ({"degree": 40}, "degree")],
+)  # fmt: skip
+def test_axes_that_make_no_sense(change: dict[str, object], field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        replace(ZOOM, **change)  # type: ignore[arg-type]
+
+
+def test_axes_of_lens_files() -> None:
+    zoom = read_lens(lens_models.LENSES / "nikon_zoom_70_200.toml")
+    axis = zoom_axis(zoom)
+    for (name, value), knot in zip(axis.stated, axis.knots, strict=True):
+        assert value == knot == first_order(zoom.at(zoom=name)).efl_mm
+    focus = focus_axis(zoom, ("71mm",))
+    near = zoom.at(zoom="71mm near")
+    assert near.film_z_mm is not None
+    # The source gives the distance, and gaps to a thousandth of a millimetre.
+    assert 1 / focus.range[1] == pytest.approx((753.2 + near.film_z_mm) / 1000, rel=2e-3)
+    assert focus.range[0] == 0
+    with pytest.raises(InputError, match="zoom"):
+        zoom_axis(lens_models.lens())
+    with pytest.raises(InputError, match="focus"):
+        focus_axis(lens_models.lens())
+
+
+def test_structures_that_differ_are_no_state_model() -> None:
+    core = lens_models.model("invariants").core
+    other = replace(core, exponents=core.exponents + 1)  # type: ignore[attr-defined]
+    with pytest.raises(InputError, match="the same at every node"):
+        mix([core, other], np.array([0.5, 0.5]))
+    with pytest.raises(InputError, match="5, as many"):
+        replace(model(), nodes=model().nodes[:-1])
+
+
+def test_a_node_is_its_own_model() -> None:
+    m = model()
+    for state, node in zip(m.axes[0].nodes, m.nodes, strict=True):
+        here = m.at(state)
+        rays, _ = rays_of(node, 2000)
+        assert here.domain.film_z_mm == node.domain.film_z_mm and here.domain.bounds == node.domain.bounds
+        a, b = here.predict(rays), node.predict(rays)
+        assert torch.equal(a.status, b.status)
+        for x, y in zip((*a.rays, a.stop_x), (*b.rays, b.stop_x), strict=True):
+            assert torch.allclose(x, y, rtol=1e-12, atol=1e-11)
+
+
+@pytest.mark.parametrize("state", [91.7, 112.3, 187.0])
+def test_errors_between_nodes(state: float) -> None:
+    """No worse than twice the nodes and a micrometre, on the exact lens at states that no node has."""
+    part = model().at(state)
+    assert part.lens.at(zoom=state).film_z_mm == pytest.approx(part.domain.film_z_mm[0], abs=1e-4)
+    pairs = make_pairs(part.lens, part.domain, PairSettings(train=1, held_out=4000, rim=1, seed=9))
+    errors = ray_errors(part.lens, part.domain, pairs.held_out, part.predict)
+    assert errors["rms_um"] < 1.5 and errors["transmittance_rms"] < 1e-4
+    shares = vignetting_errors(part.lens, part.domain, part.predict, count=30_000)
+    assert shares["false_pass"] < 0.003 and shares["false_block"] < 0.003
+
+
+@pytest.mark.parametrize("state", [None, 80.5, 97.31, 123.456, 199.99])
+def test_graph_agrees_with_the_model(state: float | None) -> None:
+    m, lens = model(), loaded()
+    value = m.first_state[0] if state is None else float(np.float32(state))
+    part = m.at(value)
+    rays, z = rays_of(part)
+    said, expected = run(lens if state is None else lens.at(value), rays, z), part.predict(rays)
+    assert (said.status != expected.status.numpy()).mean() < 1e-3  # type: ignore[attr-defined]
+    passed = (said.status == st.PASSED) & (expected.status.numpy() == st.PASSED)  # type: ignore[attr-defined]
+    assert 0.2 < passed.mean() < 0.95
+    off = np.abs(said.scene_ray - torch.stack(list(expected.rays)).numpy())[:, passed]  # type: ignore[attr-defined]
+    assert off[:3].max() < 1e-4 and off[3:].max() < 5e-7
+    again = run(lens, rays, z, state=value)
+    assert np.array_equal(again.scene_ray, said.scene_ray)  # type: ignore[attr-defined]
+    assert lens.at(value).pupil_z_mm == pytest.approx(part.domain.pupil_z_mm, abs=1e-9)
+    assert lens.at(value).film_z_mm == pytest.approx(part.domain.film_z_mm, abs=1e-9)
+    assert lens.at(value).card["lens"]["efl_mm"] == pytest.approx(value, rel=1e-12)
+
+
+@pytest.mark.parametrize("bad", [80.0, 79.0, 201.0, math.nan, math.inf, -math.inf, 0.0, -0.0, -100.0, 1e38, 1e-42])
+def test_states_out_of_range_are_outside_the_domain(bad: float) -> None:
+    rays, z = rays_of(model().at(100.0), 2000)
+    said = run(loaded(), rays, z, state=bad)
+    assert (said.status == st.OUTSIDE_DOMAIN).all()  # type: ignore[attr-defined]
+    with pytest.raises(InputError):
+        loaded().at(bad)
+
+
+def test_wrong_numbers_of_states_are_refused() -> None:
+    rays, z = rays_of(model().at(100.0), 10)
+    for wrong in ((100.0, 1.0), (), "wide"):
+        with pytest.raises(InputError, match="state"):
+            run(loaded(), rays, z, state=wrong)
+    plain = load_model(lens_models.exported("invariants"))
+    with pytest.raises(InputError, match="one state"):
+        run(plain, rays, z, state=1.0)
+    assert plain.at().card == plain.card
+
+
+@pytest.mark.parametrize("damage", ["axes", "nodes", "node", "default", "reference"])
+def test_damaged_tables_of_states_are_refused(damage: str, tmp_path: Path) -> None:
+    proto = onnx.load(str(exported()))
+    card = json.loads(proto.metadata_props[0].value)
+    states = copy.deepcopy(card["states"])
+    if damage == "axes":
+        states["axes"][0]["knots"] = [1.0, "x"]
+    elif damage == "nodes":
+        states["nodes"].pop()
+    elif damage == "node":
+        states["nodes"][2]["domain"]["pupil_z_mm"] = None
+    elif damage == "default":
+        states["default"] = [1.0]
+    else:
+        states["reference"][1]["scene_ray"][0][0] += 0.1
+    proto.metadata_props[0].value = json.dumps({**card, "states": states})
+    onnx.save(proto, str(tmp_path / "bad.onnx"))
+    with pytest.raises(ModelError):
+        load_model(tmp_path / "bad.onnx")
