@@ -162,5 +162,5 @@ def weights(axes: Sequence[Axis], state: Sequence[float]) -> Array:
         raise InputError("state", "state", tuple(state), f"{len(axes)} numbers: {', '.join(a.name for a in axes)}")
     found: Array = np.ones(1)
     for axis, value in zip(axes, state, strict=True):
-        found = np.kron(found, axis.weights(value))
+        found = np.asarray(np.kron(found, axis.weights(value)), dtype=np.float64)
     return found

@@ -108,7 +108,8 @@ class OnnxLens:
                 of every axis. Out of range, every ray is outside the domain.
 
         Raises:
-            InputError: arrays of other shapes, or another number of states than axes. Rays outside the domain are no error: their status says so.
+            InputError: arrays of other shapes, or another number of states than axes. Rays outside the domain are no
+                error: their status says so.
         """
         if state is not None:
             return self._in_state(state).rays(film_xy_mm, pupil_xy_mm, wavelength_nm, film_z_mm, stop_radius_mm)

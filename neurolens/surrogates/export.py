@@ -53,11 +53,17 @@ def export_onnx(model: LensModel, path: str | Path, errors: dict[str, Any] | Non
     check_gates(model)
     g = Graph()
     add_model(g, model, DirectionSeries(largest_angle(model)))
-    proto = g.model(INPUTS, OUTPUTS, {CARD_KEY: card_to_json(card_of(model, errors or {}))})
+    proto = g.model(INPUTS, OUTPUTS, model_metadata(model, errors or {}))
     target = Path(path)
     with atomic_path(target) as temporary:
         temporary.write_bytes(proto.SerializeToString())
     return target
+
+
+def model_metadata(model: LensModel, errors: dict[str, Any]) -> dict[str, str]:
+    """The card, and the coefficients where their core has a form for files."""
+    card = {CARD_KEY: card_to_json(card_of(model, errors))}
+    return {**card, MODEL_KEY: model_to_text(model)} if storable(model.core) else card
 
 
 def check_gates(model: LensModel) -> None:

@@ -112,7 +112,7 @@ def merged(graphs: Sequence[_Recorder], axes: Sequence[Axis]) -> Graph:
     g = Graph()
     transform: NDArray[np.float64] = np.ones((1, 1))
     for axis in axes:
-        transform = np.kron(transform, axis.to_features)
+        transform = np.asarray(np.kron(transform, axis.to_features), dtype=np.float64)
     names: dict[str, str] = {}
     stacks: dict[bytes, tuple[NDArray[Any], tuple[int, ...], str]] = {}
     for i, values in enumerate(zip(*(g.values for g in graphs), strict=True)):
