@@ -6,5 +6,8 @@ from __future__ import annotations
 CARD_KEY = "neurolens"
 CARD_KIND, CARD_SCHEMA = "neurolens.lens_model", 1
 
+# The entry that holds the coefficients from which the graph was made (`surrogates.stored`).
+MODEL_KEY = "neurolens.coefficients"
+
 # Relative slack of a domain's bounds: the rounding of float32 inputs, and no more.
 DOMAIN_SLACK = 1.00001

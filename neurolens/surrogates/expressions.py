@@ -1,0 +1,191 @@
+"""Arithmetic on rays as a list of single assignments, from which C, GLSL and a numpy check are written.
+
+Every step is one operation on floats, without branches. A literal holds one number for each coefficient table of the
+program (one table, unless several wavelengths are fixed), so that all tables share their operations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from neurolens.errors import InputError
+
+# select(a, b, x, y) is x where a <= b, else y; so NaN in a or b gives y.
+KINDS = {"neg": 1, "add": 2, "sub": 2, "mul": 2, "div": 2, "sqrt": 1, "max": 2, "min": 2, "fma": 3, "select": 4}
+
+Literal = tuple[float, ...]
+Argument = int | Literal  # the number of an earlier step, or a literal
+
+
+@dataclass(frozen=True)
+class Step:
+    """One assignment: an operation of `KINDS`, or "input" with its name in `name`."""
+
+    kind: str
+    arguments: tuple[Argument, ...]
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Expr:
+    """A value of a program, for arithmetic in Python's own notation."""
+
+    program: Program
+    argument: Argument
+
+    @property
+    def literal(self) -> Literal | None:
+        return self.argument if isinstance(self.argument, tuple) else None
+
+    def is_literal(self, value: float) -> bool:
+        """Whether this is that number in every table."""
+        return self.literal is not None and all(v == value for v in self.literal)
+
+    def __add__(self, other: Number) -> Expr:
+        return self.program.op("add", self, other)
+
+    def __sub__(self, other: Number) -> Expr:
+        return self.program.op("sub", self, other)
+
+    def __mul__(self, other: Number) -> Expr:
+        return self.program.op("mul", self, other)
+
+    def __truediv__(self, other: Number) -> Expr:
+        return self.program.op("div", self, other)
+
+    def __neg__(self) -> Expr:
+        return self.program.op("neg", self)
+
+
+Number = Expr | float | ArrayLike
+_FOLDED: dict[str, Callable[..., Any]] = {
+    "neg": lambda a: -a,
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: a / b,
+    "sqrt": np.sqrt,
+    "max": np.maximum,
+    "min": np.minimum,
+    "fma": lambda a, b, c: a * b + c,
+    "select": lambda a, b, x, y: np.where(a <= b, x, y),
+}
+
+
+@dataclass
+class Program:
+    """Steps in order, and the named results.
+
+    Attributes:
+        tables: coefficient tables, the length of every literal.
+    """
+
+    tables: int = 1
+    steps: list[Step] = field(default_factory=list)
+    outputs: dict[str, Expr] = field(default_factory=dict)
+    _known: dict[Step, int] = field(default_factory=dict)
+
+    def input(self, name: str) -> Expr:
+        return self._append(Step("input", (), name))
+
+    def literal(self, value: ArrayLike) -> Expr:
+        """A number, or one for each table.
+
+        Raises:
+            InputError: a number that float32 cannot hold.
+        """
+        array = np.broadcast_to(np.asarray(value, dtype=np.float64), (self.tables,))
+        with np.errstate(over="ignore"):
+            if not np.isfinite(array.astype(np.float32)).all():
+                raise InputError("export", "weights", "(NaN or infinity)", "finite numbers, in float32 too")
+        return Expr(self, tuple(float(v) for v in array))
+
+    def expr(self, value: Number) -> Expr:
+        return value if isinstance(value, Expr) else self.literal(value)
+
+    def op(self, kind: str, *values: Number) -> Expr:
+        """Append an operation, or what it comes to: equal steps are shared, and literals folded in float64."""
+        given = [self.expr(v) for v in values]
+        simple = self._simplified(kind, given)
+        return simple if simple is not None else self._append(Step(kind, tuple(e.argument for e in given)))
+
+    def fma(self, a: Number, b: Number, c: Number) -> Expr:
+        """a b + c."""
+        return self.op("fma", a, b, c)
+
+    def select(self, a: Number, b: Number, then: Number, otherwise: Number) -> Expr:
+        """`then` where a <= b, else `otherwise`, which NaN chooses too."""
+        return self.op("select", a, b, then, otherwise)
+
+    def horner(self, t: Expr, coefficients: Sequence[Number]) -> Expr:
+        """Polynomial in t, lowest coefficient first."""
+        value = self.expr(coefficients[-1])
+        for c in reversed(coefficients[:-1]):
+            value = self.fma(value, t, c)
+        return value
+
+    def _append(self, step: Step) -> Expr:
+        if step not in self._known:
+            self._known[step] = len(self.steps)
+            self.steps.append(step)
+        return Expr(self, self._known[step])
+
+    def _simplified(self, kind: str, given: list[Expr]) -> Expr | None:
+        if all(e.literal is not None for e in given):
+            return self.literal(_FOLDED[kind](*(np.array(e.literal) for e in given)))
+        if kind == "fma":
+            a, b, c = given
+            if c.is_literal(0):
+                return self.op("mul", a, b)
+            if a.is_literal(0) or b.is_literal(0):
+                return c
+            if a.is_literal(1) or b.is_literal(1):
+                return self.op("add", b if a.is_literal(1) else a, c)
+        elif kind == "mul":
+            for one, other in (given, reversed(given)):
+                if one.is_literal(0):
+                    return one
+                if one.is_literal(1):
+                    return other
+        elif kind in ("add", "sub") and given[1].is_literal(0):
+            return given[0]
+        elif kind == "add" and given[0].is_literal(0):
+            return given[1]
+        return None
+
+    def live(self) -> list[int]:
+        """Numbers of the steps that any output needs, in order."""
+        wanted = {e.argument for e in self.outputs.values() if isinstance(e.argument, int)}
+        for k in range(len(self.steps) - 1, -1, -1):
+            if k in wanted:
+                wanted.update(a for a in self.steps[k].arguments if isinstance(a, int))
+        return sorted(wanted)
+
+    def count(self) -> dict[str, int]:
+        """Operations by kind: the floor of the work."""
+        kinds = [self.steps[k].kind for k in self.live()]
+        return {kind: kinds.count(kind) for kind in sorted(set(kinds) - {"input"})}
+
+    def evaluate(self, inputs: Mapping[str, ArrayLike], table: int = 0) -> dict[str, NDArray[np.float32]]:
+        """Results in float32, step by step as the written sources have them (fma rounds once)."""
+        found: dict[int, NDArray[np.float32]] = {}
+
+        def value(argument: Argument) -> NDArray[np.float32]:
+            return np.asarray(np.float32(argument[table])) if isinstance(argument, tuple) else found[argument]
+
+        with np.errstate(all="ignore"):
+            for k in self.live():
+                step = self.steps[k]
+                if step.kind == "input":
+                    found[k] = np.asarray(inputs[step.name], dtype=np.float32)
+                    continue
+                given = [value(a) for a in step.arguments]
+                if step.kind == "fma":  # the product is exact in float64
+                    given = [g.astype(np.float64) for g in given]
+                found[k] = np.asarray(_FOLDED[step.kind](*given), dtype=np.float32)
+        return {name: value(e.argument) for name, e in self.outputs.items()}

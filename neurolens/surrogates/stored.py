@@ -1,0 +1,252 @@
+"""A fitted model inside its exported file: coefficients, encoding, gates and prescription as compact JSON.
+
+The graph of an exported model is made to run. What it was made from stands beside it in the file's metadata, so that
+other forms (source, one wavelength) can be written from the file alone. Coefficients are kept in float32, exactly;
+floats of the prescription and the encoding in float64, exactly. Nothing is executed, sizes are bounded.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import math
+import zlib
+from dataclasses import MISSING, asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neurolens.errors import InputError, ModelError
+from neurolens.modelfile import CARD_KEY, MODEL_KEY
+from neurolens.optics.prescription import Coating, Lens, Surface
+from neurolens.surrogates.cores import InvariantPolynomial, MirrorPolynomial, Network, Partitioned, RawPolynomial
+from neurolens.surrogates.domain import Domain, FilmRays
+from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import Core, Gate, LensModel, Scales
+
+SCHEMA = 1
+# Cores by the name that files carry. Their fields are tensors, integer arrays, numbers, tuples and other cores.
+CORES: dict[str, type] = {
+    "invariants": InvariantPolynomial,
+    "mirror": MirrorPolynomial,
+    "raw": RawPolynomial,
+    "network": Network,
+    "partitioned": Partitioned,
+}
+_NAMES = {kind: name for name, kind in CORES.items()}
+_MAX_FILE = 64 * 2**20
+_MAX_TEXT = 16 * 2**20  # of the JSON; the largest models known take 100 kB
+_MAX_DEPTH = 8
+_LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "designer", "rims", "film_z_mm", "path")
+
+
+def storable(core: Core) -> bool:
+    """Whether a core, and every core in it, has a name in `CORES`."""
+    return type(core) in _NAMES and all(storable(part) for part in getattr(core, "parts", ()))
+
+
+def model_to_text(model: LensModel) -> str:
+    """The metadata entry of a model: deflated JSON in base64.
+
+    Raises:
+        InputError: a core that is not `storable`.
+    """
+    if not storable(model.core):
+        raise InputError("export", "core", type(model.core).__name__, f"one of {', '.join(CORES)}")
+    data = {
+        "schema": SCHEMA,
+        "lens": _packed_lens(model.lens),
+        "encoding": asdict(model.encoding),
+        "scales": asdict(model.scales),
+        "gates": [[g.surface, g.reason] for g in model.gates],
+        "direction": model.direction,
+        "core": _pack(model.core),
+    }
+    text = json.dumps(data, separators=(",", ":")).encode()
+    return base64.b64encode(zlib.compress(text, 9)).decode()
+
+
+def load_fitted(path: str | Path) -> LensModel:
+    """The model that an exported file was made from, coefficients rounded to float32.
+
+    Its settings and fit time are the card's, and its errors are there (`card_in`).
+
+    Raises:
+        ModelError: a file that is missing, too large, no exported model, made without its coefficients, damaged, or
+            whose coefficients do not give the card's reference rays.
+    """
+    file = Path(path)
+    metadata = _metadata(file)
+    card = card_in(file, metadata)
+    if MODEL_KEY not in metadata:
+        raise ModelError(f"{file}: it holds no coefficients beside its graph; export it again with this version")
+    try:
+        data = json.loads(_inflated(metadata[MODEL_KEY]))
+        if data["schema"] != SCHEMA:
+            raise ModelError(f"{file}: coefficients: schema: got {data['schema']!r}, expected {SCHEMA}")
+        model = LensModel(
+            lens=_lens(data["lens"]),
+            domain=Domain.from_dict(_finite_focus(card["domain"])),
+            encoding=_numbers(Encoding, data["encoding"]),
+            scales=_numbers(Scales, data["scales"]),
+            gates=tuple(Gate(int(k), int(r)) for k, r in data["gates"]),
+            core=_core(data["core"]),
+            method=str(card["fit"]["method"]),
+            settings=dict(card["fit"]["settings"]),
+            fit_s=float(card["fit"]["seconds"]),
+            direction="slope" if data["direction"] == "slope" else "angle",
+        )
+        _check(file, model, card)
+    except (ValueError, TypeError, KeyError, IndexError, RuntimeError, RecursionError, AttributeError) as error:
+        if isinstance(error, ModelError):
+            raise
+        raise ModelError(f"{file}: its coefficients are damaged ({type(error).__name__}: {error})") from error
+    return model
+
+
+def card_in(path: str | Path, metadata: dict[str, str] | None = None) -> dict[str, Any]:
+    """The card of an exported file.
+
+    Raises:
+        ModelError: as of `load_fitted`.
+    """
+    found = _metadata(Path(path)) if metadata is None else metadata
+    try:
+        card = json.loads(found[CARD_KEY])
+    except (KeyError, ValueError, RecursionError) as error:
+        raise ModelError(f"{path}: no card, or a damaged one: no model made by neurolens") from error
+    if not isinstance(card, dict):
+        raise ModelError(f"{path}: card: got {type(card).__name__}, expected a table")
+    return card
+
+
+def _metadata(file: Path) -> dict[str, str]:
+    from onnx import ModelProto  # heavy, and not needed to store
+
+    if not file.is_file():
+        raise ModelError(f"{file}: no such file, expected an exported lens model (.onnx)")
+    if file.stat().st_size > _MAX_FILE:
+        raise ModelError(f"{file}: {file.stat().st_size} bytes, expected at most {_MAX_FILE}")
+    proto = ModelProto()
+    try:
+        proto.ParseFromString(file.read_bytes())
+    except Exception as error:  # protobuf raises types of its own
+        raise ModelError(f"{file}: truncated, or not an ONNX model") from error
+    return {entry.key: entry.value for entry in proto.metadata_props}
+
+
+def _inflated(text: str) -> bytes:
+    unpacker = zlib.decompressobj()
+    try:
+        found = unpacker.decompress(base64.b64decode(text, validate=True), _MAX_TEXT)
+    except (binascii.Error, zlib.error) as error:
+        raise ValueError(str(error)) from error
+    if unpacker.unconsumed_tail or not unpacker.eof:
+        raise ValueError(f"more than {_MAX_TEXT} bytes, or cut short")
+    return found
+
+
+def _pack(value: Any) -> Any:
+    if isinstance(value, Tensor):
+        array = value.detach().cpu().numpy().astype("<f4")
+        return {"f4": base64.b64encode(array.tobytes()).decode(), "shape": list(array.shape)}
+    if isinstance(value, np.ndarray):
+        if value.size and not (0 <= value.min() and value.max() < 256):
+            raise InputError("export", "exponents", "(beyond 255)", "integers from 0 to 255")
+        return {"u1": base64.b64encode(value.astype("u1").tobytes()).decode(), "shape": list(value.shape)}
+    if isinstance(value, tuple):
+        return [_pack(v) for v in value]
+    if type(value) in _NAMES:
+        return {"kind": _NAMES[type(value)], **{f.name: _pack(getattr(value, f.name)) for f in fields(value)}}
+    return value
+
+
+def _core(packed: Any, depth: int = 0) -> Any:
+    """What `_pack` packed."""
+    if depth > _MAX_DEPTH:
+        raise ValueError("cores nested too deep")
+    if isinstance(packed, list):
+        return tuple(_core(v, depth + 1) for v in packed)
+    if not isinstance(packed, dict):
+        return packed
+    if "kind" in packed:
+        kind = CORES[packed["kind"]]
+        return kind(**{f.name: _core(packed[f.name], depth + 1) for f in fields(kind) if f.name in packed})
+    form = "f4" if "f4" in packed else "u1"
+    array = np.frombuffer(base64.b64decode(packed[form], validate=True), f"<{form}").reshape(packed["shape"])
+    if form == "u1":
+        return array.astype(np.int64)
+    if not np.isfinite(array).all():
+        raise ValueError("coefficients that are NaN or infinite")
+    return torch.from_numpy(array.astype(np.float64))
+
+
+def _numbers(kind: Any, packed: dict[str, Any]) -> Any:
+    """A dataclass of numbers, some of them None."""
+    return kind(**{key: None if value is None else float(value) for key, value in packed.items()})
+
+
+def _packed_lens(lens: Lens) -> dict[str, Any]:
+    """What stands in a prescription but for its other states and notes; numbers as they are, infinity as a word."""
+    rows = []
+    for surface in lens.surfaces:
+        row = {}
+        for f in fields(surface):
+            value = getattr(surface, f.name)
+            if f.default is MISSING or value != f.default:
+                row[f.name] = _plain(value)
+        rows.append(row)
+    return {**{k: _plain(getattr(lens, k)) for k in _LENS}, "path": Path(lens.path).name, "surfaces": rows}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Coating):
+        return [value.name, [list(layer) for layer in value.layers]]
+    if isinstance(value, tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, Tensor):
+        value = float(value)
+    if isinstance(value, float) and math.isinf(value):
+        return "inf" if value > 0 else "-inf"
+    return value
+
+
+def _lens(packed: dict[str, Any]) -> Lens:
+    surfaces = []
+    for row in packed["surfaces"]:
+        known = {f.name: row[f.name] for f in fields(Surface) if f.name in row}
+        for key in ("radius_mm", "thickness_mm", "diameter_mm"):
+            known[key] = float(known[key])  # "inf" too
+        if "asphere" in known:
+            known["asphere"] = tuple((int(p), float(a)) for p, a in known["asphere"])
+        if known.get("coating"):
+            name, layers = known["coating"]
+            known["coating"] = Coating(str(name), tuple((float(n), float(nm)) for n, nm in layers))
+        surfaces.append(Surface(**known))
+    return Lens(surfaces=tuple(surfaces), **{k: packed[k] for k in _LENS})
+
+
+def _finite_focus(domain: dict[str, Any]) -> dict[str, Any]:
+    return {**domain, "focus_m": [float(f) for f in domain["focus_m"]]}
+
+
+def _check(file: Path, model: LensModel, card: dict[str, Any]) -> None:
+    """The lens is the card's, and the card's reference rays come out: a changed coefficient shows."""
+    if model.lens.sha256 != card["lens"]["sha256"]:
+        raise ModelError(f"{file}: its prescription is not that of its card")
+    reference = card["reference"]
+    columns = torch.tensor(reference["rays"], dtype=torch.float64)
+    film_z = torch.tensor(reference["film_z_mm"], dtype=torch.float64)
+    with torch.no_grad():
+        out = model.predict(FilmRays(columns[0], columns[1], film_z, *columns[2:]), reference["stop_radius_mm"])
+    wanted = torch.tensor(reference["scene_ray"], dtype=torch.float64)
+    passed = torch.tensor(reference["status"]) == 0
+    off = (torch.stack(list(out.rays)) - wanted).abs()[:, passed]
+    limit = torch.full((6, 1), 1e-5, dtype=torch.float64)
+    limit[:3] *= max(1.0, abs(float(card["lens"]["efl_mm"])))
+    if out.status.tolist() != reference["status"] or not bool((off <= limit).all()):
+        raise ModelError(f"{file}: its coefficients do not give the reference rays of its card: they are damaged")
