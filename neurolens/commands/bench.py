@@ -1,4 +1,4 @@
-"""`neurolens bench WHAT`: speed and numerics of the exact tracer, measured here and written as tables."""
+"""`neurolens bench WHAT`: speed and numerics of the exact tracer, and surrogates against it, written as tables."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from neurolens.commands import bench_surrogates
 from neurolens.commands.arguments import Parser, whole
 from neurolens.errors import InputError
 
 _DESCRIPTION = """\
-Measure the exact tracer on this machine and write the tables of experiments/results/.
+Measure the exact tracer and surrogates on this machine and write tables.
 Needs the extra "train" (torch)."""
 _TRACE = """\
 Rays per second of the exact tracer: eager and compiled, float32 and float64, by number of
@@ -33,11 +34,14 @@ Writes passage.md, passage.json and passage.png."""
 
 def add_parser(subparsers: Any) -> None:
     """Add the command to the command line."""
-    parser = subparsers.add_parser("bench", help="speed and numerics of the exact tracer", description=_DESCRIPTION)
+    parser = subparsers.add_parser(
+        "bench", help="speed and numerics of the exact tracer; surrogates", description=_DESCRIPTION
+    )
     kinds = parser.add_subparsers(metavar="WHAT", required=True, parser_class=Parser)
     _add_trace(kinds)
     _add_extremes(kinds)
     _add_pupils(kinds)
+    bench_surrogates.add_parser(kinds)
 
 
 def _add_trace(kinds: Any) -> None:

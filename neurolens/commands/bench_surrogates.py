@@ -1,0 +1,166 @@
+"""`neurolens bench surrogates`: every method on the same rays of every lens, as records, tables and plots."""
+
+from __future__ import annotations
+
+import argparse
+import platform
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens.commands.arguments import whole
+from neurolens.errors import InputError
+
+if TYPE_CHECKING:
+    from neurolens.evaluate.surrogate_bench import BenchSettings
+
+# A standard lens, a long zoom, one that is hard for its aperture, a fisheye, and one of steep aspheres.
+DEFAULT_LENSES = (
+    "laikin_double_gauss_50", "ogawa_zoom_70_200", "schaefter_primoplan_100", "horimoto_fisheye_16", "phone_lens_6"
+)  # fmt: skip
+_DESCRIPTION = """\
+Fit every method for every lens on the same rays, measure errors, size and time against the exact
+tracer, and write one JSON record a lens and method, one table and plot a lens, and a summary over
+the lenses with the median and the worst.
+
+A record that is there, made by the same settings and version, is not made again: a run that was
+interrupted goes on where it stopped. A method that fails on a lens is a row with the reason."""
+_EPILOG = """\
+examples:
+  neurolens bench surrogates
+  neurolens bench surrogates laikin_double_gauss_50 my_lens.toml --methods ours schrade
+  neurolens bench surrogates --library --out runs/library
+
+DIR holds summary.md, LENS.md and LENS.png, records/, models/ (ONNX) and config.json."""
+
+
+def add_parser(kinds: Any) -> None:
+    """Add the command to those of `neurolens bench`."""
+    parser = kinds.add_parser(
+        "surrogates", help="all methods on all axes of the trade", description=_DESCRIPTION, epilog=_EPILOG
+    )
+    parser.add_argument(
+        "lenses", metavar="LENS", nargs="*",
+        help=f"lens files, or names of lenses/ (default: {', '.join(DEFAULT_LENSES)})",
+    )  # fmt: skip
+    parser.add_argument("--library", action="store_true", help="every lens file of lenses/")
+    parser.add_argument(
+        "--methods", metavar="METHOD", nargs="+", default=[],
+        help="rows by name, or groups: paraxial, published, ours, ablations (default: the first three)",
+    )  # fmt: skip
+    parser.add_argument("--near", action="store_true", help="focus from infinity to the near limit, not infinity alone")
+    parser.add_argument("--quick", action="store_true", help="6000 rays, 3 rounds, no compiled tracer: a rough look")
+    parser.add_argument("--rays", metavar="N", type=whole(1000, 10**6), help="rays of fits and errors (default 30000)")
+    parser.add_argument("--seed", metavar="N", type=whole(0), default=1, help="of the rays (default 1)")
+    parser.add_argument("--rounds", metavar="N", type=whole(0), help="of the race, 0 for none (default 10)")
+    parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=1, help="of the race (default 1)")
+    parser.add_argument("--again", action="store_true", help="make the chosen records again")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, default=Path("runs/surrogates"), help="folder (default: runs/surrogates)"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    parser.set_defaults(run=run, kept="finished records are kept; the same command goes on")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make what is missing, and write the pages after every lens."""
+    import json
+
+    from neurolens.evaluate.experiment import LensChoice
+    from neurolens.evaluate.records import plain
+    from neurolens.evaluate.surrogate_bench import Bench, run_bench
+    from neurolens.evaluate.surrogate_methods import chosen_rows
+    from neurolens.evaluate.surrogate_page import NOTES, summary_page, write_lens
+    from neurolens.evaluate.train import versions
+    from neurolens.files import atomic_write_text
+    from neurolens.progress import Progress
+
+    rows, settings, out = chosen_rows(args.methods), _settings(args), args.out
+    files = _lens_files(args)
+    if out.exists() and not out.is_dir():
+        raise InputError("neurolens bench surrogates", "--out", str(out), "a folder, not a file")
+    benches = [Bench(LensChoice(file), settings, out) for file in files]
+    out.mkdir(parents=True, exist_ok=True)
+    config = {
+        "lenses": [str(file) for file in files],
+        "methods": [row.name for row in rows],
+        "settings": settings,
+        "seed": args.seed,
+        "versions": versions(),
+        "machine": {"processor": platform.processor() or platform.machine(), "system": platform.platform()},
+    }
+    atomic_write_text(out / "config.json", json.dumps(plain(config | {"settings": _plain(settings)}), indent=1) + "\n")
+    facts = f"{_conditions(args, settings)} {NOTES}"
+    found: dict[str, Any] = {}
+
+    def done(bench: Bench, records: list[dict[str, Any]]) -> None:
+        found[bench.name] = records
+        write_lens(bench.name, records, facts, out)
+        atomic_write_text(out / "summary.md", summary_page(found, facts))
+
+    run_bench(benches, rows, again=args.again, progress=Progress(quiet=args.quiet), done=done)
+    print(f"{summary_page(found, facts)}\nLook at\n  {out / 'summary.md'}\n  {out / (benches[0].name + '.md')}, ...")
+    return 0
+
+
+def _plain(settings: BenchSettings) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    return asdict(settings)
+
+
+def _settings(args: argparse.Namespace) -> BenchSettings:
+    import math
+
+    from neurolens.evaluate.experiment import DomainChoice
+    from neurolens.evaluate.surrogate_bench import BenchSettings
+    from neurolens.surrogates.pairs import PairSettings
+
+    rays = args.rays or (6000 if args.quick else 30000)
+    rounds = args.rounds if args.rounds is not None else (3 if args.quick else 10)
+    return BenchSettings(
+        # The goals are stated for 400-700 nm.
+        domain=DomainChoice(focus_m=None if args.near else (math.inf, math.inf), wavelength_nm=(400.0, 700.0)),
+        pairs=PairSettings(rays, rays, rays, args.seed),
+        vignetting_rays=50_000 if args.quick else 200_000,
+        rounds=rounds,
+        threads=args.threads,
+        compile_exact=not args.quick,
+    )
+
+
+def _lens_files(args: argparse.Namespace) -> list[Path]:
+    """Files of the arguments: paths, or names in lenses/ of the working folder or the project.
+
+    Raises:
+        InputError: no such file, or two of one name, whose records would be the same file.
+    """
+    from neurolens.evaluate.library import lens_files
+    from neurolens.evaluate.project import project_root
+
+    folder = project_root() / "lenses"
+    if args.library:
+        if args.lenses:
+            raise InputError("neurolens bench surrogates", "LENS", args.lenses, "none beside --library")
+        return lens_files(folder)
+    files = []
+    for name in args.lenses or DEFAULT_LENSES:
+        path = Path(name)
+        if not path.is_file():
+            path = folder / f"{name}.toml"
+        if not path.is_file():
+            raise InputError("neurolens bench surrogates", "LENS", name, f"a lens file, or a name in {folder}")
+        files.append(path)
+    twice = sorted({f.stem for f in files if sum(g.stem == f.stem for g in files) > 1})
+    if twice:
+        raise InputError("neurolens bench surrogates", "LENS", twice, "files whose names differ")
+    return files
+
+
+def _conditions(args: argparse.Namespace, settings: BenchSettings) -> str:
+    focus = "focus from infinity to the near limit" if args.near else "focus at infinity"
+    pairs = settings.pairs
+    return (
+        f"Full aperture and lit film, 400-700 nm (one wavelength where no dispersion is known), {focus}; {pairs.train} "
+        f"rays to fit, {pairs.held_out} to measure, {settings.vignetting_rays} for the vignetting, seed {pairs.seed}; "
+        f"{settings.threads} thread{'s' * (settings.threads > 1)}, {settings.rounds} rounds."
+    )

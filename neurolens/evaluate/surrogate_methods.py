@@ -1,0 +1,80 @@
+"""The rows of the benchmark of surrogates: first order, published methods, ours, and ablations of ours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+from neurolens.errors import InputError
+from neurolens.surrogates.fit import ModelSettings
+from neurolens.surrogates.published import PUBLISHED
+
+GROUPS = {
+    "paraxial": "what renderers use today",
+    "published": "published methods, as their papers have them",
+    "ours": "this project's",
+    "ablations": "ours with one thing changed",
+}
+DEFAULT_GROUPS = ("paraxial", "published", "ours")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method with its settings.
+
+    Attributes:
+        name: of the table's row and of files.
+        group: of `GROUPS`.
+        settings: of the fit.
+        source: the paper, or what an ablation changes.
+    """
+
+    name: str
+    group: str
+    settings: ModelSettings
+    source: str = ""
+
+
+def _ours() -> tuple[ModelSettings, ...]:
+    polynomials = tuple(ModelSettings("ols", terms=terms) for terms in (20, 40, 64, 100))
+    return *polynomials, *(ModelSettings("mlp", units=units, layers=2) for units in (8, 16, 32))
+
+
+@cache
+def all_rows() -> tuple[Row, ...]:
+    """Every row that this version can fit, group by group."""
+    rows = [Row(name, "paraxial", ModelSettings(name)) for name in ("thin", "thick")]
+    for method in PUBLISHED.values():
+        rows += [Row(s.label, "published", s, method.citation) for s in method.presets]
+    rows += [Row(s.label, "ours", s) for s in (*_ours(), *_extra("residual", "RESIDUALS"))]
+    for name, settings in dict(_extra("ablations", "ABLATIONS")).items():
+        rows.append(Row(name, "ablations", settings))
+    return tuple(rows)
+
+
+def _extra(module: str, name: str) -> Any:
+    """Rows of a module of the fits that a version may lack."""
+    try:
+        return getattr(import_module(f"neurolens.surrogates.{module}"), name)
+    except (ImportError, AttributeError):
+        return ()
+
+
+def chosen_rows(names: Sequence[str]) -> tuple[Row, ...]:
+    """Rows by name, by group, or by the name of a published method; none named: all but the ablations.
+
+    Raises:
+        InputError: a name that is none of these.
+    """
+    rows, wanted = all_rows(), names or DEFAULT_GROUPS
+    picked: dict[str, Row] = {}
+    for name in wanted:
+        found = [r for r in rows if name in (r.name, r.group, r.settings.method)]
+        if not found and name not in GROUPS:
+            known = ", ".join((*GROUPS, *(r.name for r in rows)))
+            raise InputError("neurolens bench surrogates", "--methods", name, f"one of: {known}")
+        picked |= {r.name: r for r in found}
+    return tuple(picked.values())

@@ -1,0 +1,193 @@
+"""The benchmark of surrogates: records that are made once, failures that are rows, pages that say what was measured."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from neurolens.cli import main
+from neurolens.errors import InputError
+from neurolens.evaluate import surrogate_bench
+from neurolens.evaluate.experiment import DomainChoice, LensChoice
+from neurolens.evaluate.surrogate_bench import Bench, BenchSettings, run_bench
+from neurolens.evaluate.surrogate_methods import Row, all_rows, chosen_rows
+from neurolens.evaluate.surrogate_page import lens_page, summary_page, write_lens
+from neurolens.progress import Progress
+from neurolens.surrogates.fit import ModelSettings
+from neurolens.surrogates.pairs import PairSettings
+from tests.lens_models import LENSES
+
+SETTINGS = BenchSettings(
+    DomainChoice(focus_m=(math.inf, math.inf), wavelength_nm=(400.0, 700.0)),
+    PairSettings(2000, 1000, 2000),
+    vignetting_rays=20_000,
+    rounds=1,
+    compile_exact=False,
+)
+ROWS = (
+    Row("thick", "paraxial", ModelSettings("thick")),
+    Row("ols-12", "ours", ModelSettings("ols", terms=12, degree=4)),
+    Row("ols-24", "ours", ModelSettings("ols", terms=24, degree=5)),
+    Row("refused", "published", ModelSettings("dense", degree=9, basis="raw"), "a paper"),
+)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str, Any]]]:
+    folder = tmp_path_factory.mktemp("bench")
+    with pytest.MonkeyPatch.context() as patch:
+        real = surrogate_bench.fit_model
+
+        def fit(prepared: Any, settings: ModelSettings, report: Any) -> Any:
+            if settings.method == "dense":
+                raise InputError("fit", "degree", 9, "less | fewer")
+            return real(prepared, settings, report)
+
+        patch.setattr(surrogate_bench, "fit_model", fit)
+        return folder, run(folder, ROWS)
+
+
+def run(
+    folder: Path, rows: tuple[Row, ...], settings: BenchSettings = SETTINGS, **options: Any
+) -> list[dict[str, Any]]:
+    bench = Bench(LensChoice(LENSES / "cooke_triplet_50.toml"), settings, folder)
+    return run_bench([bench], rows, progress=Progress(quiet=True), **options)["cooke_triplet_50"]
+
+
+def by_method(records: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    return {r["method"]: r for r in records}
+
+
+def test_one_record_a_method_with_every_figure(made: tuple[Path, list[dict[str, Any]]]) -> None:
+    folder, records = made
+    found = by_method(records)
+    assert found["thick"]["rms_um"] > 2 * found["ols-12"]["rms_um"] > 4 * found["ols-24"]["rms_um"] > 0
+    for name in ("ols-12", "ols-24"):
+        one = found[name]
+        assert one == json.loads((folder / "records" / "cooke_triplet_50" / f"{name}.json").read_text())
+        assert one["rms_um_at_21_6"] / one["rms_um"] == pytest.approx(21.6 / 18.2, rel=0.01)
+        assert one["max_um"] >= one["p99_um"] >= one["rms_um"] and one["bytes"] > 1000
+        assert one["ns_per_ray"]["min"] > 0 and one["speedup"] > 0 and one["exact"][0]["name"] == "exact eager"
+        if one["speedup"] > 1:
+            gain = one["exact"][0]["ns_per_ray"]["min"] - one["ns_per_ray"]["min"]
+            assert one["break_even_rays"] * gain * 1e-9 == pytest.approx(one["fit_s"] + one["load_s"])
+        else:
+            assert one["break_even_rays"] == "never"
+
+
+def test_a_method_that_fails_is_a_row_with_the_reason(made: tuple[Path, list[dict[str, Any]]]) -> None:
+    refused = by_method(made[1])["refused"]
+    assert "less | fewer" in refused["failed"] and refused["fingerprint"]
+    page = lens_page("a", made[1], "")
+    assert "| refused | failed: fit: degree: got 9, expected less / fewer |" in page
+    rows = [line for line in page.splitlines() if line.startswith("|")]
+    assert len({line.count("|") for line in rows}) == 1  # one table, no cell that breaks it
+
+
+def test_a_second_run_makes_nothing_again(made: tuple[Path, list[dict[str, Any]]]) -> None:
+    folder, records = made
+    files = sorted(f for f in folder.rglob("*") if f.is_file())
+    before = [f.stat().st_mtime_ns for f in files]
+    assert by_method(run(folder, ROWS)) == by_method(records)  # the refused one, too: its settings are the same
+    assert [f.stat().st_mtime_ns for f in files] == before
+
+
+def test_other_settings_and_lost_files_are_made_again(
+    made: tuple[Path, list[dict[str, Any]]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fitted: list[str] = []
+    real = surrogate_bench.fit_model
+
+    def fit(prepared: Any, settings: ModelSettings, report: Any) -> Any:
+        fitted.append(settings.label)
+        if settings.degree == 3:
+            raise ZeroDivisionError("by accident")
+        return real(prepared, settings, report)
+
+    monkeypatch.setattr(surrogate_bench, "fit_model", fit)
+    one = ROWS[1]
+    untimed = replace(SETTINGS, rounds=0, pairs=PairSettings(500, 300, 500), vignetting_rays=2000)
+    run(tmp_path, (one,), untimed)
+    run(tmp_path, (one,), untimed)
+    assert fitted == ["ols-12"]
+    (tmp_path / "models" / "cooke_triplet_50" / "ols-12.onnx").unlink()
+    run(tmp_path, (one,), untimed)
+    run(tmp_path, (one,), untimed, again=True)
+    (tmp_path / "records" / "cooke_triplet_50" / "ols-12.json").write_text("{")
+    run(tmp_path, (one,), untimed)
+    assert len(fitted) == 4
+    accident = replace(one, settings=replace(one.settings, degree=3))
+    assert run(tmp_path, (accident,), untimed)[0]["failed"] == "ZeroDivisionError: by accident"
+    run(tmp_path, (accident,), untimed)
+    assert len(fitted) == 6  # tried again
+
+
+def test_a_lens_that_cannot_be_is_rows_too(tmp_path: Path) -> None:
+    bench = Bench(LensChoice(tmp_path / "missing.toml"), SETTINGS, tmp_path)
+    records = run_bench([bench], ROWS, progress=Progress(quiet=True))["missing"]
+    assert all("missing.toml" in r["failed"] for r in records)
+    assert "0 of 1" in summary_page({"missing": records}, "")
+    write_lens("missing", records, "", tmp_path)
+    assert not (tmp_path / "missing.png").exists()
+
+
+def test_pages_tell_median_and_worst(made: tuple[Path, list[dict[str, Any]]], tmp_path: Path) -> None:
+    name, records = "ols-12", made[1]
+    worse = [{**r, "lens": "other", "direction_rms_deg": 3.0, "speedup": 0.25} for r in records if not r["failed"]]
+    page = summary_page({"cooke": records, "other": worse}, "facts")
+    row = next(line for line in page.splitlines() if line.startswith(f"| {name} |"))
+    better = by_method(records)[name]["direction_rms_deg"]
+    assert f"{(better + 3) / 2:.3g}, 3" in row and row.rstrip(" |").endswith("–") and ", 0.25" in row
+    assert f"- {name}: other 3" in page and "- refused: a paper" in page
+    write_lens("cooke", records, "facts", tmp_path)
+    assert (tmp_path / "cooke.png").stat().st_size > 10_000 and "cooke.png" in (tmp_path / "cooke.md").read_text()
+
+
+def test_rows_by_name_group_and_method() -> None:
+    names = [r.name for r in all_rows()]
+    assert len(set(names)) == len(names)
+    assert {"thin", "ols-64", "mlp-32x2"} <= set(names)
+    assert {r.group for r in chosen_rows([])} == {"paraxial", "published", "ours"}
+    assert [r.name for r in chosen_rows(["ols-64", "thin", "ols-64"])] == ["ols-64", "thin"]
+    assert {r.settings.method for r in chosen_rows(["schrade"])} == {"schrade"}
+    with pytest.raises(InputError, match="ols-64"):
+        chosen_rows(["nonsense"])
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["nonsense"], ["LENS", "nonsense"]),
+        (["--methods", "nonsense"], ["--methods", "nonsense"]),
+        (["cooke_triplet_50", "--library"], ["--library"]),
+        (["cooke_triplet_50", str(LENSES / "cooke_triplet_50.toml")], ["names differ"]),
+    ],
+)
+def test_bad_arguments_are_one_line(
+    args: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", "surrogates", *args, "--out", str(tmp_path / "out")]) == 2
+    line = capsys.readouterr().err
+    assert all(word in line for word in words) and line.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_leaves_tables_plots_and_its_configuration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["bench", "surrogates", "cooke_triplet_50", "--methods", "thin", "ols-20", "--quick", "--rays", "2000"]
+    assert main([*command, "--rounds", "0", "--out", str(tmp_path), "--quiet"]) == 0
+    assert "| ols-20 | 1 |" in capsys.readouterr().out
+    config = json.loads((tmp_path / "config.json").read_text())
+    assert config["seed"] == 1 and config["settings"]["pairs"]["train"] == 2000 and config["versions"]["torch"]
+    assert {f.name for f in tmp_path.glob("*.*")} == {
+        "config.json",
+        "summary.md",
+        "cooke_triplet_50.md",
+        "cooke_triplet_50.png",
+    }
