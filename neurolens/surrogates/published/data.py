@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neurolens import status as st
 from neurolens.errors import InputError
-from neurolens.surrogates.bases import raw_exponents, solve
+from neurolens.surrogates.bases import raw_exponents
 from neurolens.surrogates.cores import RawPolynomial, monomials
 from neurolens.surrogates.fit import Prepared
 from neurolens.surrogates.gates import gate_reach
@@ -23,19 +23,15 @@ from neurolens.surrogates.published.cores import Cells, OuterPupil, to_tangents
 from neurolens.surrogates.targets import scales_of
 
 Exponents = NDArray[np.int64]
+# Relative to the largest, for columns of unit length.
+_RCOND = 1e-7
 # Outputs of the published polynomials, with the parity in x and in y that mirror symmetry gives each.
 OUTPUTS = ("position x", "position y", "tangent x", "tangent y", "stop x", "stop y", "transmittance")
 PARITY = ((1, 0), (0, 1), (1, 0), (0, 1), (1, 0), (0, 1), (0, 0))
 
 
 def slope_encoding(encoding: Encoding, passing: PairSet) -> Encoding:
-    """Raw coordinates: film position and slope, u = (pupil point - film point) / scale.
-
-    Raises:
-        InputError: a lens with cylinders.
-    """
-    if encoding.mirror:
-        raise InputError("fit", "lens", "(cylinders)", "a lens that is round about its axis, for a published method")
+    """Raw coordinates: film position and slope, u = (pupil point - film point) / scale."""
     p, u = encoding.planes(passing.inputs)
     return replace(encoding, chief=1.0, pupil_scale_mm=float((u - p).norm(dim=0).max()))
 
@@ -57,8 +53,19 @@ class RawData:
     encoding: Encoding
 
     @staticmethod
-    def of(prepared: Prepared) -> RawData:
-        return RawData(prepared.pairs, slope_encoding(prepared.encoding, prepared.pairs.train))
+    def of(prepared: Prepared, centred: bool = False) -> RawData:
+        """Position and slope; `centred`: the slope less its chief-ray part, which float32 evaluates with less rounding.
+
+        Polynomials of all terms to a total degree are the same functions of both.
+
+        Raises:
+            InputError: a lens with cylinders.
+        """
+        encoding = prepared.encoding
+        if encoding.mirror:
+            expected = "a lens that is round about its axis, for a published method"
+            raise InputError("fit", "lens", "(cylinders)", expected)
+        return RawData(prepared.pairs, encoding if centred else slope_encoding(encoding, prepared.pairs.train))
 
     @property
     def dispersive(self) -> bool:
@@ -109,10 +116,24 @@ def solve_outputs(outputs: tuple[Outputs, ...], supports: list[Exponents]) -> Ra
     exponents = np.array(list(place), dtype=np.int64)
     rows = torch.zeros((len(outputs), len(place)), dtype=torch.float64)
     for row, output, support, at in zip(rows, outputs, supports, columns, strict=True):
-        row[at] = solve(monomials(output.variables, support), output.values, output.weights)[0]
+        row[at] = stable_solve(monomials(output.variables, support), output.values, output.weights)[0]
     components = torch.zeros((3, 2, len(place)), dtype=torch.float64)
     components[POSITION], components[DIRECTION], components[STOP] = rows[0:2], rows[2:4], rows[4:6]
     return RawPolynomial(exponents, components, rows[6:])
+
+
+def stable_solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Least squares as `bases.solve`, with singular values cut where float32 could not evaluate what they add.
+
+    Raw coordinates of a wide angle are nearly dependent (the slope follows the position), and plain least squares then
+    gives large terms that cancel.
+    """
+    if weights is not None:
+        columns, outputs = columns * weights, outputs * weights
+    norms = columns.norm(dim=1).clamp_min(1e-300)
+    q, r = torch.linalg.qr((columns / norms[:, None]).T)
+    found = torch.linalg.lstsq(r, q.T @ outputs.T, rcond=_RCOND, driver="gelsd").solution
+    return (found / norms[:, None]).T
 
 
 def outer_pupil(
@@ -125,7 +146,8 @@ def outer_pupil(
     # The share of the way from the film's plane to that of the pupil points.
     along = (rear - e.film_plane_z_mm) / (e.pupil_plane_z_mm - e.film_plane_z_mm)
     radius = lens.surfaces[last].semi_diameter_mm
-    inner = (e.film_scale_mm / radius, along * e.pupil_scale_mm / radius) if lens.stop_index != last else None
+    by_p = e.film_scale_mm * (1 + along * (e.chief - 1))
+    inner = (by_p / radius, along * e.pupil_scale_mm / radius) if lens.stop_index != last else None
     outer = 1.0 if lens.stop_index != 0 else None
     core = OuterPupil(polynomial, data.curvature if curvature is None else curvature, outer, inner)
     gates = ([] if inner is None else [Gate(last, st.RIM)]) + ([] if outer is None else [Gate(0, st.RIM)])

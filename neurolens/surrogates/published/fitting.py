@@ -11,6 +11,7 @@ from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import Core, Gate
 from neurolens.surrogates.published.data import RawData, outer_pupil
 from neurolens.surrogates.published.polynomials import fit_dense, fit_sparse
+from neurolens.surrogates.published.rtf import fit_rtf
 from neurolens.surrogates.published.taylor import fit_taylor
 
 Progress = Callable[[float], None] | None
@@ -30,13 +31,39 @@ def fit_published(prepared: Prepared, settings: ModelSettings, progress: Progres
     Raises:
         InputError: an unknown method, or a lens or settings that it cannot take.
     """
-    data = RawData.of(prepared)
-    if settings.method == "taylor":
-        core, gates = outer_pupil(data, fit_taylor(prepared.pairs.lens, data.encoding, settings.degree), 0.0)
-    elif settings.method == "hanika":
-        core, gates = outer_pupil(data, fit_dense(data, settings.degree))
-    elif settings.method == "schrade":
-        core, gates = outer_pupil(data, fit_sparse(data, settings.terms, settings.degree))
-    else:
-        raise InputError("fit", "method", settings.method, "a published method that is implemented")
+    fit = _FITS.get(settings.method)
+    if fit is None:
+        raise InputError("fit", "method", settings.method, f"one of {', '.join(_FITS)}")
+    return fit(prepared, settings, progress)
+
+
+def _taylor(prepared: Prepared, settings: ModelSettings, progress: Progress) -> PublishedFit:
+    data = RawData.of(prepared, centred=True)
+    core, gates = outer_pupil(data, fit_taylor(prepared.pairs.lens, data.encoding, settings.degree), 0.0)
     return PublishedFit(core, data.encoding, gates)
+
+
+def _hanika(prepared: Prepared, settings: ModelSettings, progress: Progress) -> PublishedFit:
+    data = RawData.of(prepared, centred=True)
+    core, gates = outer_pupil(data, fit_dense(data, settings.degree))
+    return PublishedFit(core, data.encoding, gates)
+
+
+def _schrade(prepared: Prepared, settings: ModelSettings, progress: Progress) -> PublishedFit:
+    data = RawData.of(prepared)
+    core, gates = outer_pupil(data, fit_sparse(data, settings.terms, settings.degree))
+    return PublishedFit(core, data.encoding, gates)
+
+
+def _rtf(prepared: Prepared, settings: ModelSettings, progress: Progress) -> PublishedFit:
+    data = RawData.of(prepared)
+    core, gates = fit_rtf(data, settings.degree)
+    return PublishedFit(core, data.encoding, gates)
+
+
+_FITS: dict[str, Callable[[Prepared, ModelSettings, Progress], PublishedFit]] = {
+    "taylor": _taylor,
+    "hanika": _hanika,
+    "schrade": _schrade,
+    "rtf": _rtf,
+}

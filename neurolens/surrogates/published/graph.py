@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from neurolens.surrogates.model import Core
 from neurolens.surrogates.onnx_cores import CoreRows, Field, add_core
 from neurolens.surrogates.onnx_graph import Graph
+from neurolens.surrogates.onnx_monomials import add_polynomial, without_constants
 from neurolens.surrogates.published.cores import Cells, OuterPupil
+from neurolens.surrogates.published.rtf import Meridian
 
 Array = NDArray[np.float64]
 
@@ -25,6 +27,8 @@ def add_published(g: Graph, core: Core, field: Field, vector_scale: Array, gate_
         return _outer_pupil(g, core, field, vector_scale, gate_scale)
     if isinstance(core, Cells):
         return _cells(g, core, field, vector_scale, gate_scale)
+    if isinstance(core, Meridian):
+        return _meridian(g, core, field, vector_scale, gate_scale)
     raise TypeError(f"no ONNX form for a core of type {type(core).__name__}")
 
 
@@ -91,3 +95,53 @@ def _from_tangents(g: Graph, position: str, tangents: str, curvature: float) -> 
     y = g.op("Add", g.op("Mul", b, length2), g.op("Mul", along, cy))
     turned = g.op("Add", g.op("Mul", a, cx), g.op("Mul", g.op("Mul", b, cy), s))
     return g.concat(x, y, g.op("Sub", turned, g.op("Mul", along, s)))
+
+
+def _meridian(g: Graph, core: Meridian, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
+    """A ray-transfer function: turned into its meridian, mapped, turned back; see `rtf.Meridian`."""
+    rho = _square(g, field.p)
+    off = g.op("Greater", rho, g.const(0.0))
+    radius = g.op("Sqrt", rho)
+    y = g.split(g.op("Div", field.p, g.op("Where", off, radius, g.const(1.0))), [1, 1])
+    y[1] = g.op("Where", off, y[1], g.const(1.0))  # on the axis: the y axis itself
+    slope = g.op("Mul", field.u, g.const(core.slope))
+    length = g.op("Reciprocal", g.op("Sqrt", g.op("Add", _square(g, slope), g.const(1.0))))
+    first = [radius, g.op("Mul", g.concat(*_turn(g, slope, y)), length)]
+    if field.dispersive:
+        first.append(g.affine(field.weight[-1:], field.squares, field.bias[-1:]))
+    weight = core.outputs.numpy().astype(np.float64).copy()
+    weight[:2] *= vector_scale[0]
+    exponents, weight = without_constants(core.exponents, weight, list(range(3 + field.dispersive)))
+    position, direction, transmittance = g.split(add_polynomial(g, g.concat(*first), exponents, weight), [2, 3, 1])
+    square = g.op("MatMul", g.const([[1.0, 1.0, 1.0]]), g.op("Mul", direction, direction))
+    unit = g.op("Mul", direction, g.op("Reciprocal", g.op("Sqrt", square)))
+    turned, dz = g.split(unit, [2, 1])
+    unit = g.concat(_turn_back(g, turned, y), g.op("Neg", dz))
+    crossing = g.op("Add", g.op("Mul", field.p, g.const(core.film)), g.op("Mul", field.u, g.const(core.pupil)))
+    gate = _ellipse(g, core, radius, _turn(g, crossing, y), gate_scale)
+    position = _turn_back(g, position, y)
+    nothing = g.op("Mul", position, g.const(0.0))
+    return CoreRows(position, position, nothing, transmittance, [gate], unit)
+
+
+def _turn(g: Graph, v: str, y: list[str]) -> tuple[str, str]:
+    a, b = g.split(v, [1, 1])
+    across = g.op("Sub", g.op("Mul", a, y[1]), g.op("Mul", b, y[0]))
+    return across, g.op("Add", g.op("Mul", a, y[0]), g.op("Mul", b, y[1]))
+
+
+def _turn_back(g: Graph, v: str, y: list[str]) -> str:
+    a, b = g.split(v, [1, 1])
+    first = g.op("Add", g.op("Mul", a, y[1]), g.op("Mul", b, y[0]))
+    return g.concat(first, g.op("Sub", g.op("Mul", b, y[1]), g.op("Mul", a, y[0])))
+
+
+def _ellipse(g: Graph, core: Meridian, radius: str, crossing: tuple[str, str], gate_scale: float) -> str:
+    """gate_scale times the test of the elliptic pass function, [1, N]."""
+    base, bends = (t.numpy().astype(np.float64) for t in core.hinges())
+    knots = core.knots[:-1].numpy().astype(np.float64)
+    hinges = g.op("Relu", g.affine(np.ones((len(knots), 1)), radius, -knots))
+    across, along, centre = g.split(g.affine(bends, hinges, base), [1, 1, 1])
+    a, b = g.op("Div", crossing[0], across), g.op("Div", g.op("Sub", crossing[1], centre), along)
+    square = g.op("Add", g.op("Mul", a, a), g.op("Mul", b, b))
+    return g.op("Mul", g.op("Sub", square, g.const(1.0)), g.const(gate_scale))

@@ -5,7 +5,7 @@ surface are expanded about the axis in these four to a total degree, and a lens 
 polynomial arithmetic. Every element takes the axis to itself, so that evaluating its formulas on the polynomials of the
 rays so far is that composition, and nothing below the degree is lost. No ray is traced and nothing is fitted. Variables
 are the film position and the slope of the ray: a linear change of the paper's two-plane coordinates (film point and
-pupil point), which changes no polynomial of a total degree.
+pupil point), which changes no polynomial of a total degree; nor does taking the chief ray's part off the slope.
 
 Rays pass where they cross the stop and the outer and inner pupil (the front and the rear surface) within their radii.
 
@@ -54,7 +54,7 @@ class Expanded(NamedTuple):
 
 
 def expand(lens: Lens, encoding: Encoding, wavelength_nm: float, degree: int) -> Expanded:
-    """Camera rays through a lens as series in the four coordinates p, u of a light field with chief 1.
+    """Camera rays through a lens as series in the four coordinates p, u of a light field.
 
     Raises:
         InputError: a surface that has no power series at its vertex.
@@ -62,7 +62,8 @@ def expand(lens: Lens, encoding: Encoding, wavelength_nm: float, degree: int) ->
     t = truncated(4, degree)
     distance = encoding.film_plane_z_mm - encoding.pupil_plane_z_mm
     x, y = t.variable(0, encoding.film_scale_mm), t.variable(1, encoding.film_scale_mm)
-    slope_x, slope_y = (t.variable(k, encoding.pupil_scale_mm / distance) for k in (2, 3))
+    pupil_x, pupil_y = (t.variable(k, encoding.pupil_scale_mm) for k in (2, 3))
+    slope_x, slope_y = ((pupil + (encoding.chief - 1) * c) / distance for pupil, c in ((pupil_x, x), (pupil_y, y)))
     along = t.power(t.constant(1.0) + _square(t, slope_x, slope_y), -0.5)
     ray = RaySeries(x, y, t.times(slope_x, along), t.times(slope_y, along))
     vertices, plane, stop = lens.vertices_mm, encoding.film_plane_z_mm, ray
@@ -131,7 +132,7 @@ def _sag(t: Truncated, surface: Surface, r2: Series) -> tuple[Series, Series]:
 
 
 def fit_taylor(lens: Lens, encoding: Encoding, degree: int) -> RawPolynomial:
-    """The Taylor polynomial of a lens in raw coordinates (`data.slope_encoding`); tangents are dx and dy themselves.
+    """The Taylor polynomial of a lens in the coordinates of an encoding; tangents are dx and dy themselves.
 
     Raises:
         InputError: a surface that has no power series at its vertex.

@@ -1,0 +1,183 @@
+"""Ray-transfer functions (Goossens et al. 2022): rays turned into a meridian, dense polynomials, an elliptic pupil.
+
+Every ray is turned about the axis until its point in the input plane lies on the y axis; one dense polynomial per
+output maps (y, dx, dy), of a unit direction, to the position on the output surface and to the direction (dx, dy, dz,
+normalised), which is then turned back. A ray passes where it crosses the pupil plane within an ellipse whose centre
+and radii depend on y: that of least area about the exact passing rays at a number of y, linear between them.
+
+The pass function belongs to one stop: the model knows no stop crossing (its stop output is 0), and a smaller stop
+would need a new fit. Left open by the paper and chosen here: the input plane is the film's at infinity focus, the
+output surface the front surface; the paper has one fit a wavelength, here the coefficients are parabolas in
+1 / lambda^2 fitted on all rays at once, and one ellipse serves all wavelengths; the transmittance, which they leave
+out, is one polynomial more of the same terms.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from neurolens import status as st
+from neurolens.errors import InputError
+from neurolens.surrogates.cores import monomials
+from neurolens.surrogates.domain import Domain, FilmRays
+from neurolens.surrogates.lightfield import LightField, angle_vector
+from neurolens.surrogates.model import Gate
+from neurolens.surrogates.pairs import trace_pairs
+from neurolens.surrogates.published.data import RawData, stable_solve
+from neurolens.surrogates.published.ellipse import least_ellipse
+from neurolens.surrogates.targets import scales_of
+
+# Positions of the input plane at which the ellipse is fitted, and rays of each.
+POSITIONS = 33
+_RAYS = 6000
+
+
+@dataclass(frozen=True, eq=False)
+class Meridian:
+    """The core: polynomials in the meridian of the ray, and the elliptic pass function.
+
+    Attributes:
+        exponents: [M, 4] int64 of y, dx, dy, w.
+        outputs: [6, M]: across and along the meridian of the position (scaled), the same of the direction, its part
+            against z, transmittance.
+        slope: slope of the ray per unit of u.
+        pupil: u in mm on the pupil plane, so that the crossing is film p + pupil u.
+        film: p in mm.
+        knots: [K] y (in units of p) at which the ellipse was fitted.
+        ellipse: [K, 3]: radius across, radius along, centre along the meridian (mm).
+    """
+
+    exponents: NDArray[np.int64]
+    outputs: Tensor
+    slope: float
+    pupil: float
+    film: float
+    knots: Tensor
+    ellipse: Tensor
+
+    basis: str = "raw"
+
+    def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
+        variables, y = meridian_variables(field, self.slope)
+        across, along, *direction, transmittance = self.outputs @ monomials(variables, self.exponents)
+        inverse = torch.rsqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
+        dx, dy, dz = (d * inverse for d in direction)
+        position = turn_back(torch.stack([across, along]), y)
+        turned = turn_back(torch.stack([dx, dy]), y)
+        vector = angle_vector(turned[0], turned[1], -dz)
+        scalars = torch.stack([transmittance, self._pass(field, y)])
+        return torch.stack([position, vector, torch.zeros_like(position)]), scalars
+
+    def _pass(self, field: LightField, y: Tensor) -> Tensor:
+        """Positive outside the ellipse."""
+        radius = torch.hypot(field.p[0], field.p[1])
+        crossing = turn(self.film * field.p + self.pupil * field.u, y)
+        base, bends = self.hinges()
+        across, along, centre = base[:, None] + bends @ torch.relu(radius - self.knots[:-1, None])
+        return (crossing[0] / across) ** 2 + ((crossing[1] - centre) / along) ** 2 - 1
+
+    def hinges(self) -> tuple[Tensor, Tensor]:
+        """The piecewise linear ellipse as base [3] + bends [3, K - 1] @ relu(y - knots)."""
+        slopes = (self.ellipse[1:] - self.ellipse[:-1]) / (self.knots[1:] - self.knots[:-1])[:, None]
+        return self.ellipse[0], torch.cat([slopes[:1], slopes[1:] - slopes[:-1]]).T
+
+    def to(self, dtype: torch.dtype) -> Meridian:
+        return replace(self, outputs=self.outputs.to(dtype), knots=self.knots.to(dtype), ellipse=self.ellipse.to(dtype))
+
+    @property
+    def coefficients_per_vector(self) -> int:
+        """Of the direction, which has three outputs."""
+        return int((self.outputs[2:5] != 0).sum())
+
+    @property
+    def coefficients(self) -> int:
+        return int((self.outputs != 0).sum()) + self.ellipse.numel()
+
+
+def _meridian(p: Tensor) -> Tensor:
+    """[2, N] unit vectors along p; along y on the axis."""
+    radius = torch.hypot(p[0], p[1])
+    off = radius > 0
+    safe = torch.where(off, radius, 1.0)
+    return torch.stack([torch.where(off, p[0] / safe, 0.0), torch.where(off, p[1] / safe, 1.0)])
+
+
+def turn(v: Tensor, y: Tensor) -> Tensor:
+    """Components of v [2, N] across and along the meridian y [2, N]: y is turned into the y axis."""
+    return torch.stack([v[0] * y[1] - v[1] * y[0], v[0] * y[0] + v[1] * y[1]])
+
+
+def turn_back(v: Tensor, y: Tensor) -> Tensor:
+    """The inverse of `turn`."""
+    return torch.stack([v[0] * y[1] + v[1] * y[0], v[1] * y[1] - v[0] * y[0]])
+
+
+def meridian_variables(field: LightField, slope: float) -> tuple[Tensor, Tensor]:
+    """[4, N] y, dx, dy, w of turned rays, and the meridians [2, N]."""
+    y = _meridian(field.p)
+    rise = turn(slope * field.u, y)
+    unit = rise * torch.rsqrt(1 + rise[0] * rise[0] + rise[1] * rise[1])
+    return torch.stack([torch.hypot(field.p[0], field.p[1]), *unit, field.w]), y
+
+
+def meridian_exponents(degree: int, *, dispersive: bool) -> NDArray[np.int64]:
+    """[M, 4] all exponents of y, dx, dy to a total degree, each with w^0, w^1 and w^2."""
+    rows = [e for e in itertools.product(range(degree + 1), repeat=3) if sum(e) <= degree]
+    return np.array([(*e, w) for w in range(3 if dispersive else 1) for e in rows], dtype=np.int64)
+
+
+def fit_rtf(data: RawData, degree: int) -> tuple[Meridian, tuple[Gate, ...]]:
+    """Fit the polynomials on the training rays, and the ellipses on rays traced for them."""
+    e, train, lens = data.encoding, data.pairs.train, data.pairs.lens
+    slope = e.pupil_scale_mm / (e.film_plane_z_mm - e.pupil_plane_z_mm)
+    field = e(train.inputs)
+    variables, y = meridian_variables(field, slope)
+    scene = train.scene
+    position = turn(torch.stack([scene.x, scene.y]) / scales_of(lens).position_mm, y)
+    direction = turn(torch.stack([scene.dx, scene.dy]), y)
+    values = torch.stack([*position, *direction, -scene.dz, train.transmittance])
+    exponents = meridian_exponents(degree, dispersive=data.dispersive)
+    if len(train) <= len(exponents):
+        raise InputError("fit", "train", len(train), f"more training rays than the {len(exponents)} terms")
+    outputs = stable_solve(monomials(variables, exponents), values)
+    knots, ellipse = fit_ellipses(data)
+    core = Meridian(exponents, outputs, slope, e.pupil_scale_mm, e.film_scale_mm, knots, ellipse)
+    return core, (Gate(0 if lens.stop_index else len(lens.surfaces) - 1, st.RIM),)
+
+
+def fit_ellipses(data: RawData, positions: int = POSITIONS, count: int = _RAYS) -> tuple[Tensor, Tensor]:
+    """Knots [K] (in units of p) and ellipses [K, 3] (radius across and along, centre along; mm on the pupil plane).
+
+    Positions where no three rays pass take the ellipse of their neighbour towards the axis.
+    """
+    domain, e = data.pairs.domain, data.encoding
+    knots = torch.linspace(0, 1, positions, dtype=torch.float64)
+    rows: list[tuple[float, float, float]] = []
+    for knot in knots:
+        crossings = _passing(data, domain, float(knot) * e.film_scale_mm, count)
+        if len(crossings) >= 3:
+            rows.append(least_ellipse(crossings))
+        elif rows:
+            rows.append(rows[-1])
+    while len(rows) < positions:
+        rows.insert(0, rows[0] if rows else (1e-9, 1e-9, 0.0))
+    return knots, torch.tensor(rows, dtype=torch.float64)
+
+
+def _passing(data: RawData, domain: Domain, y_mm: float, count: int) -> NDArray[np.float64]:
+    """[K, 2] where passing rays from height y in the input plane cross the pupil plane, across and along."""
+    points = torch.quasirandom.SobolEngine(3, scramble=True, seed=17).draw(count, dtype=torch.float64).T
+    radius, angle = domain.pupil_radius_mm * torch.sqrt(points[0]), 2 * torch.pi * points[1]
+    low, high = domain.wavelength_nm
+    zero = torch.zeros_like(radius)
+    plane = zero + data.encoding.film_plane_z_mm
+    crossing = torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)])
+    rays = FilmRays(zero, zero + y_mm, plane, crossing[0], crossing[1], low + (high - low) * points[2])
+    passed = trace_pairs(data.pairs.lens, rays, domain.pupil_z_mm).status == st.PASSED
+    return np.asarray(crossing[:, passed].T.numpy(), dtype=np.float64)

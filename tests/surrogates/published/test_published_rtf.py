@@ -1,0 +1,119 @@
+"""Ray-transfer functions: turning, ellipses, their pass function against traced rays, their graph."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import lens_models
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as some
+
+from neurolens import status as st
+from neurolens.cameras.model import load_model
+from neurolens.evaluate.measure import onnx_predictor
+from neurolens.evaluate.rays import ray_errors
+from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.fit import ModelSettings, fit_model
+from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.pairs import trace_pairs
+from neurolens.surrogates.published.ellipse import least_ellipse
+from neurolens.surrogates.published.rtf import meridian_exponents, meridian_variables, turn, turn_back
+
+
+@cache
+def fitted(degree: int = 4, name: str = "laikin_double_gauss_50") -> LensModel:
+    return fit_model(lens_models.prepared(name), ModelSettings("rtf", basis="raw", degree=degree))
+
+
+def test_degree_six_has_84_terms_as_published() -> None:
+    assert len(meridian_exponents(6, dispersive=False)) == 84
+    assert len(meridian_exponents(6, dispersive=True)) == 3 * 84
+
+
+def test_turning_is_a_rotation_onto_the_y_axis() -> None:
+    generator = torch.Generator().manual_seed(0)
+    p, u, w = (torch.randn(shape, generator=generator, dtype=torch.float64) for shape in ((2, 50), (2, 50), (50,)))
+    p[:, 0] = 0  # on the axis
+    variables, y = meridian_variables(LightField(p, u, w), 0.3)
+    assert torch.allclose(turn(p, y), torch.stack([torch.zeros(50).double(), p.norm(dim=0)]), atol=1e-14)
+    assert torch.allclose(turn_back(turn(u, y), y), u)
+    assert torch.allclose(turn(u, y).norm(dim=0), u.norm(dim=0))
+    slopes = variables[1:3] / torch.sqrt(1 - variables[1] ** 2 - variables[2] ** 2)
+    assert torch.allclose(slopes.norm(dim=0), 0.3 * u.norm(dim=0))
+
+
+@given(some.floats(-3, 3), some.floats(0.2, 5), some.floats(0.2, 5), some.integers(0, 1000))
+def test_least_ellipse_about_an_ellipse_is_that_ellipse(centre: float, rx: float, ry: float, seed: int) -> None:
+    angle = np.linspace(0, 2 * math.pi, 60, endpoint=False) + seed
+    inner = np.random.default_rng(seed).uniform(-0.5, 0.5, (20, 2)) * [rx, ry] + [0, centre]
+    points = np.concatenate([np.stack([rx * np.cos(angle), centre + ry * np.sin(angle)], axis=1), inner])
+    found = least_ellipse(points)
+    assert found[0] == pytest.approx(rx, rel=0.01)
+    assert found[1] == pytest.approx(ry, rel=0.01)
+    assert found[2] == pytest.approx(centre, abs=0.01 * ry)
+
+
+def test_least_ellipse_holds_all_points_and_no_smaller_one_near_by_does() -> None:
+    points = np.random.default_rng(5).normal(size=(300, 2)) * [1.0, 2.0] + [0.0, 4.0]
+    rx, ry, centre = least_ellipse(points)
+
+    def reach(ratio: float, middle: float) -> float:
+        """Area of the least ellipse of that ratio of radii and that centre."""
+        return ratio * float(((points[:, 0] / ratio) ** 2 + (points[:, 1] - middle) ** 2).max())
+
+    assert ((points[:, 0] / rx) ** 2 + ((points[:, 1] - centre) / ry) ** 2).max() <= 1 + 1e-9
+    area = rx * ry
+    for ratio in np.linspace(0.8, 1.25, 21) * rx / ry:
+        for middle in centre + np.linspace(-0.3, 0.3, 21):
+            assert reach(ratio, middle) > area * (1 - 2e-3)
+
+
+def test_least_ellipse_of_few_points_is_finite() -> None:
+    for points in ([[0.0, 1.0]], [[0.0, 1.0], [0.0, 3.0]], [[1.0, 2.0]], [[1.0, 0.0], [0.5, 0.0]]):
+        assert all(math.isfinite(v) for v in least_ellipse(np.array(points)))
+
+
+def test_fit_is_close_and_symmetric_by_construction() -> None:
+    model, pairs = fitted(6), lens_models.prepared().pairs
+    errors = ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict)
+    assert errors["direction_rms_deg"] < 0.002
+    rays = pairs.held_out.inputs
+    turned = FilmRays(-rays.film_y, rays.film_x, rays.film_z, -rays.pupil_y, rays.pupil_x, rays.wavelength_nm)
+    a, b = model.predict(rays).rays, model.predict(turned).rays
+    assert torch.allclose(b.x, -a.y, atol=1e-10)
+    assert torch.allclose(b.dx, -a.dy, atol=1e-12)
+    assert torch.allclose(b.dz, a.dz, atol=1e-12)
+
+
+def test_pass_function_holds_every_passing_ray_and_blocks_most_others() -> None:
+    """The ellipse bounds the passing rays: hardly any of them is blocked; what it lets through is its known price."""
+    model, pairs = fitted(), lens_models.prepared().pairs
+    rays = trace_pairs(pairs.lens, sample_domain(pairs.domain, 20000, 3), pairs.domain.pupil_z_mm)
+    passes, said = rays.status == st.PASSED, model.predict(rays.inputs).status == st.PASSED
+    false_block = float((passes & ~said).sum() / passes.sum())
+    false_pass = float((said & ~passes).sum() / said.sum())
+    assert false_block < 0.01
+    assert false_pass < 0.08
+
+
+@pytest.mark.parametrize("name", ("laikin_double_gauss_50", "muller_fisheye_100"))
+def test_graph_gives_what_the_model_gives(name: str, tmp_path: Path) -> None:
+    model = fitted(4, name)
+    predict = onnx_predictor(load_model(export_onnx(model, tmp_path / "model.onnx", {})))
+    drawn = sample_domain(model.domain, 4000, 5)
+    rays = replace(drawn, film_z=torch.full_like(drawn.film_z, model.domain.film_z_mm[0]))
+    rays.film_x[:3], rays.film_y[:3] = 0.0, 0.0
+    exact, graph = model.predict(rays), predict(rays)
+    passed = (exact.status == st.PASSED) & (graph.status == st.PASSED)
+    assert int((exact.status != graph.status).sum()) <= 4
+    assert int(passed.sum()) > 1500
+    for a, b in zip(exact.rays, graph.rays, strict=True):
+        assert float((a - b)[passed].abs().max()) < 5e-5 * max(1.0, float(a[passed].abs().max()))
