@@ -1,23 +1,39 @@
-"""What every polynomial fits on the terms that are there anyway: stop crossing, transmittance and gates."""
+"""What every polynomial fits after position and direction: stop crossing, transmittance and gates.
+
+They use the terms that are there anyway, and more where those do not tell the boundaries well.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.surrogates.bases import Exponents, monomials, solve, vector_columns
-from neurolens.surrogates.gates import boundary_rays, gate_reach, gate_values
+from neurolens.surrogates.bases import (
+    Exponents,
+    invariant_exponents,
+    monomials,
+    solve,
+    vector_columns,
+    vector_gram,
+)
+from neurolens.surrogates.gate_fit import GateFit
+from neurolens.surrogates.gates import boundary_rays, boundary_weights, gate_reach, gate_values
 from neurolens.surrogates.lightfield import Encoding, LightField
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import PairSet, RayPairs
+from neurolens.surrogates.selection import Sweep
 from neurolens.surrogates.targets import Targets, targets_of
 
-# Only the neighbourhood of a rim decides who passes: rows of the gate fit weigh 1 / sqrt(1 + (g / width)^2).
-GATE_WIDTH = 0.1
+# Terms are added for boundaries until each is met to this RMS: of a gate (twice the relative radius of a rim), and of
+# the stop crossing in stop radii.
+GATE_ERROR, STOP_ERROR = 2e-3, 1e-3
+MOST_BOUNDARY_TERMS = 64
+_DEGREE = 7  # of the terms among which those for boundaries are found
+_RAYS = 12_000  # on which they are found
 
 
 @dataclass(frozen=True)
@@ -41,35 +57,112 @@ class FitData:
     def boundary_field(self) -> LightField:
         return self.encoding(self.boundary.inputs)
 
+    @cached_property
+    def boundary_weights(self) -> tuple[Tensor, Tensor]:
+        """Of the gates [G, N] and of the stop crossing [N]."""
+        return boundary_weights(self.pairs.lens, self.gates, self.boundary)
+
 
 def fit_stop(data: FitData, exponents: Exponents) -> Tensor:
     """[2 M]: A and B of the stop crossing (in stop radii) on the monomials given, from rays on both sides of rims."""
     crossing, weight = stop_crossing(data)
     field = data.boundary_field
     columns = vector_columns(monomials(field.invariants(), exponents), field)
-    return solve(columns, crossing.reshape(1, -1), None if weight is None else weight.repeat(2))[0]
+    return solve(columns, crossing.reshape(1, -1), weight.repeat(2))[0]
 
 
-def stop_crossing(data: FitData) -> tuple[Tensor, Tensor | None]:
-    """[2, N] crossings of the boundary rays in stop radii, and their weights [N]: 0 for rays lost before the stop."""
+def stop_crossing(data: FitData) -> tuple[Tensor, Tensor]:
+    """[2, N] crossings of the boundary rays in stop radii, and their weights [N]."""
     pairs, lens = data.boundary, data.pairs.lens
     crossing = torch.stack([pairs.cross_x[lens.stop_index], pairs.cross_y[lens.stop_index]]) / lens.stop_radius_mm
-    arrives = gate_reach((Gate(lens.stop_index, st.RIM),), pairs)[0]
-    return crossing, None if arrives.all() else arrives.to(crossing.dtype)
+    return crossing, data.boundary_weights[1]
 
 
 def fit_scalars(data: FitData, exponents: Exponents) -> Tensor:
     """[1 + G, M]: transmittance and gates on the monomials of the invariants given."""
-    train = data.train
-    boundary_features = monomials(data.boundary_field.invariants(), exponents)
-    return solve_scalars(data, monomials(train.field.invariants(), exponents), train.transmittance, boundary_features)
+
+    def features(rays: PairSet) -> Tensor:
+        return monomials(data.encoding(rays.inputs).invariants(), exponents)
+
+    train, near, far = (features(r) for r in (data.pairs.train, data.boundary, data.pairs.far))
+    return solve_scalars(data, train, data.pairs.train.transmittance, near, far)
 
 
-def solve_scalars(data: FitData, features: Tensor, transmittance: Tensor, boundary_features: Tensor) -> Tensor:
-    """Transmittance on the passing rays, each gate on the rays that get as far, most on those near its boundary."""
-    rows = [solve(features, transmittance[None])]
-    values, known = gate_values(data.pairs.lens, data.gates, data.boundary), gate_reach(data.gates, data.boundary)
-    for value, arrives in zip(values, known, strict=True):
-        weight = (1 / torch.sqrt(1 + (value / GATE_WIDTH) ** 2)).where(arrives, 0.0)
-        rows.append(solve(boundary_features, value[None], weight))
-    return torch.cat(rows)
+def solve_scalars(
+    data: FitData, features: Tensor, transmittance: Tensor, boundary_features: Tensor, far_features: Tensor
+) -> Tensor:
+    """Transmittance on the passing rays, each gate on the rays that get as far, most on those that it decides.
+
+    Features are those of `pairs.train`, of `boundary` and of `pairs.far`.
+    """
+    fit = GateFit(boundary_features, gate_values(data.pairs.lens, data.gates, data.boundary), data.boundary_weights[0])
+    values = gate_values(data.pairs.lens, data.gates, data.pairs.far)
+    fit.block(far_features, values, gate_reach(data.gates, data.pairs.far))
+    return torch.cat([solve(features, transmittance[None]), fit.coefficients()])
+
+
+def boundary_terms(data: FitData, exponents: Exponents, most: int = MOST_BOUNDARY_TERMS) -> Exponents:
+    """[K, 4] further exponents, where those given [M, 4] meet the stop crossing or a gate badly; often none.
+
+    Forward selection by the gain of all those boundaries together, in squares of the error that each may have.
+    """
+    every = invariant_exponents(_DEGREE, dispersive=data.encoding.w_half != 0)
+    known = {tuple(e) for e in exponents.tolist()}
+    added = np.array([e for e in every.tolist() if tuple(e) not in known], dtype=np.int64).reshape(-1, 4)
+    candidates = np.concatenate([exponents, added])
+    field = LightField(*(c[..., :_RAYS] for c in data.boundary_field))
+    features = monomials(field.invariants(), candidates)
+    fits = [f for f in _boundary_fits(data, field, features, len(exponents)) if f.error > 1]
+    chosen: list[int] = []
+    while fits and len(chosen) < min(most, len(added)):
+        scores = np.sum([f.scores() for f in fits], axis=0)
+        best = int(np.argmax(scores))
+        if not scores[best] > 0:
+            break
+        chosen.append(best)
+        for f in fits:
+            f.add(best)
+        fits = [f for f in fits if f.error > 1]
+    return candidates[chosen]
+
+
+class _BoundaryFit:
+    """One boundary's normal equations: `blocks` columns a term (A and B of a vector, or one)."""
+
+    def __init__(self, sweep: Sweep, terms: int, scale: float) -> None:
+        self.sweep, self.terms, self.scale, self.blocks = sweep, terms, scale, sweep.count // terms
+
+    @property
+    def error(self) -> float:
+        """Mean squared error over the square of the one allowed."""
+        return self.sweep.residual * self.scale
+
+    def add(self, term: int) -> None:
+        for column in range(term, self.sweep.count, self.terms):
+            if self.sweep.scores("ols")[column] > 0:
+                self.sweep.add(column)
+
+    def scores(self) -> np.ndarray:
+        return self.scale * np.maximum(self.sweep.scores("ols"), 0.0).reshape(self.blocks, self.terms).sum(0)
+
+
+def _boundary_fits(data: FitData, field: LightField, features: Tensor, start: int) -> list[_BoundaryFit]:
+    """The fits of the stop crossing and of every gate with the first `start` terms in."""
+    crossing, weight = stop_crossing(data)
+    rays, terms = features.shape[1], len(features)
+    w = weight[:rays]
+    weighed = LightField(field.p * w, field.u * w, field.w)  # only p.p, p.u and u.u of it are used
+    outputs = (crossing[:, :rays] * w)[None]
+    tables = [(*vector_gram(features, weighed, outputs), outputs, STOP_ERROR, w)]
+    values = gate_values(data.pairs.lens, data.gates, data.boundary)[:, :rays]
+    for value, weights in zip(values, data.boundary_weights[0][:, :rays], strict=True):
+        rows, output = features * weights, (value * weights)[None]
+        tables.append(((rows @ rows.T).numpy(), (rows @ output.T).numpy(), output, GATE_ERROR, weights))
+    fits = []
+    for gram, moments, outputs, allowed, w in tables:
+        squares = (outputs.flatten(1) ** 2).sum(1).numpy()
+        fit = _BoundaryFit(Sweep(gram, moments, squares), terms, 1 / (allowed**2 * max(float((w * w).sum()), 1e-300)))
+        for term in range(start):
+            fit.add(term)
+        fits.append(fit)
+    return fits

@@ -21,6 +21,10 @@ from neurolens.surrogates.pairs import PairSet, RayPairs, join_pairs, reached
 _MIXING_SEED = 1
 _MOST_GATES = 10
 
+# Only the neighbourhood of a boundary decides who passes: weights fall off beyond this distance from it, in units of
+# the gate (half as much of a rim's radius).
+BOUNDARY_WIDTH = 0.03
+
 
 def has_edges(gates: tuple[Gate, ...]) -> bool:
     """Whether any gate is a discriminant."""
@@ -47,6 +51,28 @@ def gate_values(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
     if not rows:
         return torch.empty((0, len(pairs)), dtype=pairs.transmittance.dtype)
     return torch.where(gate_reach(gates, pairs), torch.stack(rows), 0.0)
+
+
+def boundary_weights(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> tuple[Tensor, Tensor]:
+    """What rays of `boundary_rays` count in the fits of the gates [G, N] and of the stop crossing [N].
+
+    A gate decides where its value is near 0 and no other boundary stops the ray; the stop crossing counts wherever the
+    ray passes, for the stop may be closed. Rays lost before a boundary say nothing of it and weigh 0.
+    """
+    every = (*gates, Gate(lens.stop_index, st.RIM))
+    values, known = gate_values(lens, every, pairs), gate_reach(every, pairs)
+    beyond = values.where(known, 0.0).clamp_min(0.0)
+    rows = []
+    for i, value in enumerate(values):
+        others = torch.cat([beyond[:i], beyond[i + 1 :]])
+        stopped = others.amax(0) if len(others) else torch.zeros_like(value)
+        distance = value if i < len(gates) else beyond[i]
+        rows.append((_near(distance) * _near(stopped)).where(known[i], 0.0))
+    return torch.stack(rows[:-1]) if gates else values[:0], rows[-1]
+
+
+def _near(distance: Tensor) -> Tensor:
+    return 1 / torch.sqrt(1 + (distance / BOUNDARY_WIDTH) ** 2)
 
 
 def boundary_rays(pairs: RayPairs, gates: tuple[Gate, ...]) -> PairSet:

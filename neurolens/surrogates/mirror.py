@@ -105,8 +105,10 @@ def fit_mirror(
         for (i, of_u), column in zip(support, found.T, strict=True):
             ab[:2, int(of_u), axis, i] = column
     ab[STOP] = _fit_stop(data, exponents)
-    boundary = monomials(data.boundary_field.mirror_invariants(), exponents)
-    return MirrorPolynomial(exponents, ab, solve_scalars(data, features, train.transmittance, boundary))
+    boundary, far = (
+        monomials(encoding(rays.inputs).mirror_invariants(), exponents) for rays in (data.boundary, pairs.far)
+    )
+    return MirrorPolynomial(exponents, ab, solve_scalars(data, features, train.transmittance, boundary, far))
 
 
 def _scalar_terms(*, dispersive: bool) -> list[tuple[int, ...]]:

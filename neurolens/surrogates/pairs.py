@@ -20,8 +20,8 @@ from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import Rays, trace
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
 
-SCHEMA = 2
-SPLITS = ("train", "held_out", "rim", "edge")
+SCHEMA = 3
+SPLITS = ("train", "held_out", "rim", "edge", "far")
 # Rays beyond this many rim radii are too far from any boundary to teach a model where it lies.
 RIM_REACH = 1.25
 _BATCH = 65536
@@ -81,7 +81,8 @@ class RayPairs:
         train, held_out: rays that pass; no ray is in both.
         rim: rays that reach the scene but for a rim or the stop, up to a quarter of a radius beyond it.
         edge: rays that miss a surface or are totally reflected, and are no further from the rims before that than the
-            rays of `rim`; at most as many as asked for of `rim`. What they never reached is 0. Empty for most lenses.
+            rays of `rim`; at most half as many as asked for of `rim`. What they never reached is 0.
+        far: other rays that do not pass, so that models know those too; at most as many. What they never reached is 0.
         tested: rays drawn until `train` was full, so that len(train) / tested is the share of the disc that passes.
     """
 
@@ -92,6 +93,7 @@ class RayPairs:
     held_out: PairSet
     rim: PairSet
     edge: PairSet
+    far: PairSet
     tested: int
 
 
@@ -111,14 +113,17 @@ def make_pairs(
 ) -> RayPairs:
     """Sample a domain and trace it in float64 until `train` and `held_out` are full.
 
-    `rim` and `edge` come from the rays drawn for `train`, as many as those hold.
+    `rim`, `edge` and `far` come from the rays drawn for `train`, as many as those hold.
 
     Raises:
-        InputError: an empty split, a stop with blades or a mask (models give the crossing with it instead), or fewer than one ray in 10,000 of the domain passes.
+        InputError: an empty split, a stop with blades or a mask (models give the crossing with it instead), or fewer
+            than one ray in 10,000 of the domain passes.
     """
     settings = settings or PairSettings()
     if lens.aperture is not None:
-        raise InputError(lens.path, "aperture", "(blades or a mask)", "a round stop: cameras shape it outside the model")
+        raise InputError(
+            lens.path, "aperture", "(blades or a mask)", "a round stop: cameras shape it outside the model"
+        )
     for name in ("train", "held_out", "rim"):
         if getattr(settings, name) < 1:
             raise InputError("pairs", name, getattr(settings, name), "at least one ray")
@@ -135,8 +140,10 @@ def make_pairs(
             needed = wanted["train"] - counts["train"]
             order = torch.nonzero(passed)[:, 0]
             tested += int(order[needed - 1]) + 1 if len(order) >= needed else len(batch)
-            for name, near in (("rim", _teaches_rims(lens, batch)), ("edge", _teaches_edges(lens, batch))):
-                found[name].append(batch.select(near).select(slice(0, settings.rim - counts[name])))
+            rim, edge = _teaches_rims(lens, batch), _teaches_edges(lens, batch)
+            for name, near in (("rim", rim), ("edge", edge), ("far", ~(rim | edge | passed))):
+                most = settings.rim if name == "rim" else (settings.rim + 1) // 2
+                found[name].append(batch.select(near).select(slice(0, most - counts[name])))
                 counts[name] += len(found[name][-1])
         found[split].append(batch.select(passed).select(slice(0, wanted[split] - counts[split])))
         counts[split] += len(found[split][-1])
@@ -151,7 +158,7 @@ def make_pairs(
         if progress:
             progress((counts["train"] + counts["held_out"]) / total)
     joined = {name: join_pairs(sets) for name, sets in found.items()}
-    joined["edge"] = _without_the_rest(joined["edge"])
+    joined |= {name: _without_the_rest(joined[name]) for name in ("edge", "far")}
     return RayPairs(lens, domain, settings, **joined, tested=tested)
 
 

@@ -22,7 +22,7 @@ ZoneCore = InvariantPolynomial | RawPolynomial | Network
 # A zone's fit sees this share of rho beyond its edges, so that neighbours meet.
 OVERLAP = 0.03
 _FEWEST_RAYS = 200
-_FITTED = ("train", "rim", "edge")  # the splits that fits see
+_FITTED = ("train", "rim", "edge", "far")  # the splits that fits see
 
 
 def fit_partitioned(
@@ -70,4 +70,4 @@ def _zone(pairs: RayPairs, rhos: dict[str, Tensor], low: float, high: float) -> 
         chosen: PairSet = rays.select((rho > low - OVERLAP) & (rho <= high + OVERLAP))
         return chosen
 
-    return replace(pairs, train=within("train"), rim=within("rim"), edge=within("edge"))
+    return replace(pairs, train=within("train"), rim=within("rim"), edge=within("edge"), far=within("far"))

@@ -24,7 +24,14 @@ from neurolens.surrogates.bases import (
     vector_columns,
     vector_gram,
 )
-from neurolens.surrogates.boundary_fit import FitData, fit_scalars, fit_stop, solve_scalars, stop_crossing
+from neurolens.surrogates.boundary_fit import (
+    FitData,
+    boundary_terms,
+    fit_scalars,
+    fit_stop,
+    solve_scalars,
+    stop_crossing,
+)
 from neurolens.surrogates.cores import Basis, InvariantPolynomial, RawPolynomial
 from neurolens.surrogates.gates import gate_values
 from neurolens.surrogates.growth import grow
@@ -100,8 +107,9 @@ def _fit_invariant(data: FitData, settings: PolynomialSettings) -> InvariantPoly
     # The chosen columns only; position and direction share them.
     columns = [place[k % count] + (k >= count) * len(kept) for k in chosen]
     coefficients = solve(vector_columns(features, train.field)[columns], train.vectors[:2].flatten(1))
-    ab = torch.zeros((3, 2 * len(kept)), dtype=torch.float64)
-    ab[:2, columns] = coefficients
+    exponents = np.concatenate([exponents, boundary_terms(data, exponents)])
+    ab = torch.zeros((3, 2 * len(exponents)), dtype=torch.float64)
+    ab[:2, [c if c < len(kept) else c - len(kept) + len(exponents) for c in columns]] = coefficients
     ab[STOP] = fit_stop(data, exponents)
     return InvariantPolynomial(exponents, ab.reshape(3, 2, -1), fit_scalars(data, exponents))
 
@@ -142,6 +150,7 @@ def _fit_raw(data: FitData, settings: PolynomialSettings) -> RawPolynomial:
     columns = {n: [place.setdefault(tuple(map(int, e)), len(place)) for e in s] for n, s in supports.items()}
     exponents = np.array(list(place), dtype=np.int64)
     features, boundary = monomials(variables, exponents), monomials(raw_variables(data.boundary_field), exponents)
+    far = monomials(raw_variables(data.encoding(data.pairs.far.inputs)), exponents)
     crossing, weight = stop_crossing(data)
     components = torch.zeros((3, 2, len(place)), dtype=torch.float64)
     for axis in (0, 1):
@@ -152,7 +161,7 @@ def _fit_raw(data: FitData, settings: PolynomialSettings) -> RawPolynomial:
         components[STOP, axis, at] = solve(boundary[at], crossing[axis][None], weight)[0]
     at = columns["scalars"]
     scalars = torch.zeros((1 + len(data.gates), len(place)), dtype=torch.float64)
-    scalars[:, at] = solve_scalars(data, features[at], train.transmittance, boundary[at])
+    scalars[:, at] = solve_scalars(data, features[at], train.transmittance, boundary[at], far[at])
     return RawPolynomial(exponents, components, scalars)
 
 
