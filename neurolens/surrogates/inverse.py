@@ -7,7 +7,6 @@ both directions agree. Hanika and Dachsbacher 2014 introduced the iteration on t
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -15,24 +14,20 @@ import torch
 from torch import Tensor
 
 from neurolens import status as st
-from neurolens.errors import InputError
 from neurolens.frontsurface import meet_front
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.derivatives import direction_slopes, field_slopes, slopes_of
 from neurolens.surrogates.domain import FilmRays
-from neurolens.surrogates.inverse_guess import Guess, fit_guess
+from neurolens.surrogates.inverse_guess import Guess
 from neurolens.surrogates.lightfield import LightField, angle_vector
 from neurolens.surrogates.model import DIRECTION, POSITION, STOP, LensModel, Prediction
 from neurolens.surrogates.newton import Solved, determinant, limited_newton
-from neurolens.surrogates.pairs import RayPairs
 
 STEPS = 3
 # A solution counts where its residual is below this: of the stop's radius; of the front's radius and in radians.
 TOLERANCE = 1e-4
 # Longest Newton step: of the radius of the pupil (and of the film).
 _LIMIT = 0.35
-# Rays beyond the rims teach the guess how the map goes on; those that pass count more.
-_BEYOND_WEIGHT = 0.3
 
 
 class StopRays(NamedTuple):
@@ -71,7 +66,7 @@ class FilmSide(NamedTuple):
 
 @dataclass(frozen=True)
 class InverseModel:
-    """Both inverse maps of one model; see `fit_inverse`.
+    """Both inverse maps of one model; see `inverse_fit.fit_inverse`.
 
     Attributes:
         stop: from the film point (in film radii) and the stop point (in stop radii) to the pupil point, centred and
@@ -232,39 +227,3 @@ def _judged(model: LensModel, rays: FilmRays, residual: Tensor, stop_radius_mm: 
     found = model.predict(rays, stop_radius_mm)
     status = torch.where(residual < TOLERANCE, found.status, st.NO_SOLUTION)
     return found._replace(status=status.to(torch.int32))
-
-
-def fit_inverse(model: LensModel, pairs: RayPairs, *, terms: int = 40, degree: int = 5) -> InverseModel:
-    """Fit the first guesses of both inverse maps on rays that pass and on rays a little beyond the rims.
-
-    Args:
-        pairs: of the model's lens and domain. terms, degree: see `fit_guess`.
-
-    Raises:
-        InputError: pairs of another lens.
-    """
-    if pairs.lens.sha256 != model.lens.sha256:
-        raise InputError("fit_inverse", "pairs", pairs.lens.name, f"ray pairs of {model.lens.name}")
-    start = time.perf_counter()
-    size = min(len(pairs.train), len(pairs.rim))
-    inputs = [pairs.train.inputs.select(slice(0, 2 * size)), pairs.rim.inputs.select(slice(0, size))]
-    rays = FilmRays(*(torch.cat(c) for c in zip(*(i.columns() for i in inputs), strict=True)))
-    order = torch.randperm(len(rays), generator=torch.Generator().manual_seed(0))
-    weight = torch.ones(len(rays), dtype=torch.float64)
-    weight[len(inputs[0]) :] = _BEYOND_WEIGHT
-    rays, weight = rays.select(order), weight[order]
-    # What is inverted is the model, not the lens.
-    light = model.encoding(rays)
-    vectors, _ = model.core(light)
-    x, y = vectors[STOP] * model.scales.stop_mm
-    system = StopSystem(model, rays.film_x, rays.film_y, rays.film_z, x, y, rays.wavelength_nm)
-    pupil = torch.stack([rays.pupil_x, rays.pupil_y])
-    u = (pupil - system.chief * system.film) / system.scale
-    mirror = model.encoding.mirror
-    known: dict[str, Any] = {"mirror": mirror, "terms": terms, "degree": degree}
-    stop = fit_guess(system.guess_field, system.guess_z, u[None], weight, **known)
-    scene_field = LightField(vectors[POSITION], vectors[DIRECTION], light.w)
-    both = torch.stack([light.u, light.p])
-    scene = fit_guess(scene_field, torch.zeros_like(weight), both, weight, **known)
-    report = {"terms": terms, "degree": degree, "rays": len(rays), "seconds": time.perf_counter() - start}
-    return InverseModel(model, stop, scene, report)

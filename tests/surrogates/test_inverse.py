@@ -18,7 +18,8 @@ from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.derivatives import differentiate
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
-from neurolens.surrogates.inverse import InverseModel, StopRays, fit_inverse
+from neurolens.surrogates.inverse import InverseModel, StopRays
+from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 from neurolens.surrogates.newton import determinant, solve_small
 from neurolens.surrogates.pairs import PairSet
 
@@ -200,3 +201,12 @@ def test_other_cores_have_inverses_too(kind: str) -> None:
     scene = inv.from_scene(forward.rays, rays.film_z, rays.wavelength_nm)
     assert float((scene.residual < 1e-4).double().mean()) >= 0.999
     assert np.isfinite(inv.report["seconds"])
+
+
+def test_the_report_says_how_often_it_converges() -> None:
+    inv = inverse()
+    for name in ("stop", "scene"):
+        assert inv.report[name]["converged"] >= 0.9999
+        assert inv.report[name]["other"] == 0
+    rays = sample_domain(inv.model.domain, 3000, seed=12)
+    assert convergence(inv, rays, steps=0)["stop"]["converged"] < 0.99  # the guess alone is not enough
