@@ -1,4 +1,4 @@
-"""The command line: `neurolens lens | analyse | glass | convert | train | evaluate | render | bench`.
+"""The command line: `neurolens lens | analyse | glass | convert | train | evaluate | export | render | bench`.
 
 Errors are one line and exit code 2.
 """
@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from neurolens import __version__
-from neurolens.commands import analyse, bench, convert, evaluate, glass, lens, render, train
+from neurolens.commands import analyse, bench, convert, evaluate, export, glass, lens, render, train
 from neurolens.commands.arguments import Parser
 from neurolens.errors import NeurolensError, NeurolensWarning
 
@@ -28,6 +28,7 @@ examples:
   neurolens convert lens.zmx -o lenses/lens.toml
   neurolens train experiments/quickstart.toml
   neurolens evaluate models/NAME.onnx
+  neurolens export models/NAME.onnx --to c -o lens.h
   neurolens render experiments/scenes/room.toml --camera models/NAME.onnx -o room.exr
 
 exit codes: 0 done, 1 a promise of a model does not hold, 2 bad input, 130 interrupted.
@@ -39,7 +40,7 @@ def build_parser() -> Parser:
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    for command in (lens, analyse, glass, convert, train, evaluate, render, bench):
+    for command in (lens, analyse, glass, convert, train, evaluate, export, render, bench):
         command.add_parser(subparsers)
     return parser
 

@@ -1,12 +1,13 @@
-"""Models that fix what a scene fixes: one wavelength folds every power of w into the coefficients.
+"""Models that fix what a scene fixes: wavelengths, the film's position, the stop.
 
-For pictures in one colour of light (a laser line, a filter, a measurement at the d line), or one model a channel where
-dispersion within a channel does not count. Pictures in white light take the whole model.
+One wavelength folds every power of w into the coefficients: for pictures in one colour of light (a laser line, a
+filter, a measurement at the d line), or one model a channel where dispersion within a channel does not count. Pictures
+in white light take the whole model. A film position and a stop narrow the domain; rims that then block nothing go.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,102 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.errors import InputError
+from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.optics.glass import inverse_square_um
-from neurolens.surrogates.cores import InvariantPolynomial, Network, Partitioned, RawPolynomial
-from neurolens.surrogates.model import Core, LensModel
+from neurolens.surrogates.cores import InvariantPolynomial, MirrorPolynomial, Network, Partitioned, RawPolynomial
+from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.model import STOP, Core, LensModel
+
+# A gate goes where at most this share of the domain's rays is blocked by it and by nothing else.
+IDLE_SHARE = 1e-5
+_IDLE_RAYS = 200_000
+_MOST_WAVELENGTHS = 64
+
+
+@dataclass(frozen=True)
+class Fix:
+    """What a scene fixes; what is None or empty stays free. Film plane and stop in mm, lens frame."""
+
+    wavelengths_nm: tuple[float, ...] = ()
+    film_z_mm: float | None = None
+    stop_radius_mm: float | None = None
+
+
+def fixed_models(model: LensModel, fix: Fix) -> tuple[LensModel, ...]:
+    """The model for what is fixed: one for each wavelength, of one structure, or one where the wavelength stays free.
+
+    Raises:
+        InputError: a wavelength, film position or stop outside the model's domain; too many wavelengths, or one twice.
+    """
+    wanted = fix.wavelengths_nm
+    if len(wanted) > _MOST_WAVELENGTHS or len(set(wanted)) < len(wanted):
+        raise InputError("fix", "wavelengths", list(wanted), f"up to {_MOST_WAVELENGTHS} that differ")
+    narrow = _narrowed(model, fix)
+    models = tuple(at_wavelength(narrow, w) for w in wanted) or (narrow,)
+    return without_idle_gates(models) if fix != Fix() else models
+
+
+def _narrowed(model: LensModel, fix: Fix) -> LensModel:
+    """The same model over one film position, with one stop as its widest."""
+    domain, lens, settings = model.domain, model.lens, dict(model.settings)
+    (near, far), widest = domain.film_z_mm, domain.stop_radius_mm
+    z, stop = fix.film_z_mm, fix.stop_radius_mm
+    if z is not None:
+        if not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
+            raise InputError("fix", "film_z", z, f"{near:.6g} to {far:.6g} mm, the film positions of the fit")
+        domain = replace(domain, film_z_mm=(z, z))
+        settings["film_z_mm"] = z
+    if stop is not None:
+        if not 0 < stop <= widest * DOMAIN_SLACK:
+            raise InputError("fix", "stop", stop, f"above 0, up to {widest:.6g} mm, the widest stop of the fit")
+        domain, lens = replace(domain, stop_radius_mm=stop), lens.with_stop_radius(stop)
+        settings["stop_radius_mm"] = stop
+    return replace(model, domain=domain, lens=lens, settings=settings)
+
+
+def without_idle_gates(models: tuple[LensModel, ...]) -> tuple[LensModel, ...]:
+    """The models without the gates that block (next to) nothing that the others and the stop let through.
+
+    Which surface a status names may change with that: the first of those left.
+    """
+    left = list(range(len(models[0].gates)))
+    sole = [_blocked(m) for m in models]  # [1 + G, N] of each, the stop first
+    while left:
+        others = [[b[[0, *(1 + k for k in left if k != g)]].any(0) for b in sole] for g in left]
+        counts = [
+            sum(int((b[1 + g] & ~rest).sum()) for b, rest in zip(sole, each, strict=True))
+            for g, each in zip(left, others, strict=True)
+        ]
+        least = min(range(len(left)), key=lambda i: counts[i])
+        if counts[least] > IDLE_SHARE * sum(b.shape[1] for b in sole):
+            break
+        del left[least]
+    if len(left) == len(models[0].gates):
+        return models
+    return tuple(
+        replace(m, gates=tuple(m.gates[k] for k in left), core=_keep(m.core, [0, *(1 + k for k in left)]))
+        for m in models
+    )
+
+
+def _blocked(model: LensModel) -> Tensor:
+    """[1 + G, N] bool: which of the stop and the gates block each ray of the domain."""
+    with torch.no_grad():
+        vectors, scalars = model.core(model.encoding(sample_domain(model.domain, _IDLE_RAYS, seed=17)))
+    stop = ((vectors[STOP] * model.scales.stop_mm) ** 2).sum(0) > model.domain.stop_radius_mm**2
+    return torch.cat([stop[None], scalars[1:] > 0])
+
+
+def _keep(core: Core, scalars: list[int]) -> Any:
+    """A core with these of its scalars only."""
+    if isinstance(core, (InvariantPolynomial, MirrorPolynomial, RawPolynomial)):
+        return replace(core, scalars=core.scalars[scalars])
+    if isinstance(core, Network):
+        rows = [*range(6), *(6 + k for k in scalars)]
+        return replace(core, output=(core.output[0][rows], core.output[1][rows]))
+    if isinstance(core, Partitioned):
+        return replace(core, parts=tuple(_keep(part, scalars) for part in core.parts))
+    raise TypeError(f"no part of a core of type {type(core).__name__}")
 
 
 def at_wavelength(model: LensModel, wavelength_nm: float) -> LensModel:
@@ -42,7 +136,7 @@ def at_wavelength(model: LensModel, wavelength_nm: float) -> LensModel:
 
 
 def _fixed(core: Core, w: float) -> Any:
-    if isinstance(core, InvariantPolynomial):
+    if isinstance(core, (InvariantPolynomial, MirrorPolynomial)):
         exponents, merge = _merge(core.exponents, w)
         return replace(core, exponents=exponents, ab=core.ab @ merge, scalars=core.scalars @ merge)
     if isinstance(core, RawPolynomial):

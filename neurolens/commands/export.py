@@ -1,0 +1,165 @@
+"""`neurolens export MODEL`: source code of an exported model, or the same model for what a scene fixes."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens.errors import InputError
+
+if TYPE_CHECKING:
+    from neurolens.surrogates.model import LensModel
+    from neurolens.surrogates.specialise import Fix
+
+_DESCRIPTION = """\
+Write an exported model in another form: a self-contained C99 header (one function for a ray, one for
+arrays that compilers vectorise), a GLSL function, or an ONNX file. Domain guard, stop, rims,
+transmittance and status codes are those of the model; the card stands on top as a comment.
+Needs the extra "train" (torch)."""
+_EPILOG = """\
+what a scene fixes is folded into fewer operations (--fix, as often as needed):
+  wavelengths=450,550,650   one coefficient table a wavelength, chosen by the argument band (one: no argument;
+                            an ONNX file takes one)
+  film_z=59.2 | focus=2.0   film plane z in mm, or the object distance from the film in m that it focuses
+  stop=4.5 | f_number=5.6   stop radius in mm, or the f-number it gives
+
+examples:
+  neurolens export models/laikin_double_gauss_50.ols-60.onnx --to c -o gauss.h
+  neurolens export models/NAME.onnx --to glsl -o lens.glsl --fix wavelengths=450,550,650 --fix focus=2
+  neurolens export runs/quickstart --to c -o ray.h --only ray
+  neurolens export models/NAME.onnx --to onnx -o laser.onnx --fix wavelengths=633"""
+_PARTS = ("ray", "transmittance", "stop", "vignetting")
+_FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
+# Rays that measure the errors of an ONNX file for what is fixed.
+_HELD_OUT, _VIGNETTING = 20_000, 100_000
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser(
+        "export", help="source code (C, GLSL) of a model; fix what a scene fixes", description=_DESCRIPTION,
+        epilog=_EPILOG,
+    )  # fmt: skip
+    parser.add_argument(
+        "model", metavar="MODEL", type=Path, help="exported model (.onnx), or a run folder with one model"
+    )
+    parser.add_argument("--to", choices=("c", "glsl", "onnx"), required=True, help="form to write")
+    parser.add_argument("-o", "--out", metavar="FILE", type=Path, required=True, help="file to write")
+    parser.add_argument(
+        "--fix", metavar="KEY=VALUE", action="append", default=[], help="what the scene fixes (see below)"
+    )
+    parser.add_argument(
+        "--only", metavar="PARTS", default=",".join(_PARTS),
+        help=f"comma-separated: {', '.join(_PARTS)} (default: all; the domain guard is always there)",
+    )  # fmt: skip
+    parser.add_argument("--name", metavar="WORD", help="of the function (default: the lens's id)")
+    parser.set_defaults(run=run, kept="nothing is written")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Load, fix, write."""
+    file = model_file(args.model)
+    parts = _parts(args.only)
+    given = _given(args.fix)
+    if args.to == "onnx" and (args.name is not None or set(parts) != set(_PARTS)):
+        raise InputError("neurolens export", "--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")
+    from neurolens.cameras.model import load_model
+    from neurolens.surrogates.fused import Fixed, Parts
+    from neurolens.surrogates.source import export_source
+    from neurolens.surrogates.specialise import fixed_models
+    from neurolens.surrogates.stored import load_fitted
+
+    card = load_model(file).card
+    model = load_fitted(file)
+    fix = _fix(given, model)
+    models = fixed_models(model, fix)
+    if args.to == "onnx":
+        _write_onnx(models, args.out, card if not given else None)
+    else:
+        asked = Parts(*(name in parts for name in _PARTS[1:]))
+        fixed = Fixed(fix.film_z_mm, fix.stop_radius_mm)
+        export_source(models, args.out, args.to, card, parts=asked, fixed=fixed, name=args.name)
+    print(args.out)
+    return 0
+
+
+def model_file(path: Path) -> Path:
+    """The model that a path names: a file, or the one model of a run folder.
+
+    Raises:
+        InputError: a folder that holds none, or several.
+    """
+    if not path.is_dir():
+        return path
+    found = sorted(p for folder in (path, path / "models") for p in folder.glob("*.onnx"))
+    if len(found) != 1:
+        names = ", ".join(str(p) for p in found) or "(none)"
+        raise InputError("neurolens export", str(path), f"({names})", "one exported model: name its file")
+    return found[0]
+
+
+def _parts(text: str) -> list[str]:
+    parts = [word.strip() for word in text.split(",")]
+    unknown = [p for p in parts if p not in _PARTS]
+    if unknown or "ray" not in parts:
+        raise InputError("neurolens export", "--only", text, f"ray, and of {', '.join(_PARTS[1:])} what is wanted")
+    return parts
+
+
+def _given(texts: list[str]) -> dict[str, list[float]]:
+    """--fix as numbers by key."""
+    found: dict[str, list[float]] = {}
+    for text in texts:
+        key, _, value = text.partition("=")
+        try:
+            numbers = [float(v) for v in value.split(",")]
+        except ValueError:
+            numbers = []
+        infinite = key == "focus"
+        good = bool(numbers) and all(v > 0 and (infinite or math.isfinite(v)) for v in numbers)
+        if key not in _FIXED or key in found or not good or (key != "wavelengths" and len(numbers) > 1):
+            expected = f"KEY=NUMBER with KEY of {', '.join(_FIXED)} (wavelengths: a list), each once, above 0"
+            raise InputError("neurolens export", "--fix", text, expected)
+        found[key] = numbers
+    for pair in (("film_z", "focus"), ("stop", "f_number")):
+        if all(key in found for key in pair):
+            raise InputError("neurolens export", "--fix", f"(both {' and '.join(pair)})", "one of them")
+    return found
+
+
+def _fix(given: dict[str, list[float]], model: LensModel) -> Fix:
+    from neurolens.optics.paraxial import film_z_mm
+    from neurolens.surrogates.specialise import Fix
+
+    film_z = given.get("film_z", [None])[0]
+    stop = given.get("stop", [None])[0]
+    if "focus" in given:
+        film_z = film_z_mm(model.lens, given["focus"][0])
+    if "f_number" in given:
+        stop = model.lens.at(f_number=given["f_number"][0]).stop_radius_mm
+    return Fix(tuple(given.get("wavelengths", ())), film_z, stop)
+
+
+def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] | None) -> None:
+    """The graph with its card: the errors of the card given, or measured anew for what was fixed."""
+    from neurolens.cameras.model import load_model
+    from neurolens.evaluate.measure import FRESH, measure_errors
+    from neurolens.surrogates.export import export_onnx
+    from neurolens.surrogates.pairs import PairSettings, make_pairs
+
+    if len(models) > 1:
+        wavelengths = [m.domain.wavelength_nm[0] for m in models]
+        raise InputError("neurolens export", "--fix wavelengths", wavelengths, "one wavelength for an ONNX file")
+    model = models[0]
+    if card is not None:
+        export_onnx(model, out, card["errors"])
+        return
+    seed = int(model.settings.get("rays_seed") or 0) + FRESH
+    held_out = make_pairs(
+        model.lens, model.domain, PairSettings(train=1, held_out=_HELD_OUT, rim=1, seed=seed)
+    ).held_out
+    export_onnx(model, out, {})
+    errors = measure_errors(load_model(out), model.lens, model.domain, held_out, _VIGNETTING, seed + 1)
+    export_onnx(model, out, errors)

@@ -1,0 +1,94 @@
+"""`neurolens export` from outside: C, GLSL and ONNX of a model file, what a scene fixes, bad input in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import lens_models
+import numpy as np
+import pytest
+
+from neurolens.cameras.model import load_model
+from neurolens.cli import main
+from neurolens.modelfile import MODEL_KEY
+
+
+@pytest.fixture(scope="module")
+def file() -> Path:
+    return lens_models.exported("invariants")
+
+
+def failure(capsys: pytest.CaptureFixture[str], *args: object) -> str:
+    try:
+        code = main([*map(str, args)])
+    except SystemExit as stopped:
+        code = int(stopped.code or 0)
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    assert (code, captured.out, len(lines)) == (2, "", 1), captured
+    return lines[0]
+
+
+def test_c_and_glsl(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "run" / "models"
+    run.mkdir(parents=True)
+    (run / "one.onnx").write_bytes(file.read_bytes())
+    header, shader = tmp_path / "a.h", tmp_path / "a.glsl"
+    assert (
+        main(["export", str(tmp_path / "run"), "--to", "c", "-o", str(header), "--only", "ray", "--name", "gauss"]) == 0
+    )
+    assert capsys.readouterr().out.strip() == str(header)
+    text = header.read_text()
+    assert "gauss_rays(" in text and "stop_radius_mm" not in text[text.index("#ifndef") :]
+    fixes = ["--fix", "wavelengths=450,550", "--fix", "focus=1.5", "--fix", "f_number=4"]
+    assert main(["export", str(file), "--to", "glsl", "-o", str(shader), *fixes]) == 0
+    text = shader.read_text()
+    assert "in int band" in text and "film_z_mm" not in text and "Fixed: film plane" in text
+
+
+@pytest.mark.slow
+def test_onnx_for_one_wavelength_promises_what_it_keeps(file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "laser.onnx"
+    fixes = ["--fix", "wavelengths=550", "--fix", "focus=inf", "--fix", "stop=4"]
+    assert main(["export", str(file), "--to", "onnx", "-o", str(out), *fixes]) == 0
+    whole, fixed = load_model(file), load_model(out)
+    assert fixed.card["domain"]["stop_radius_mm"] == 4.0
+    assert 0 < fixed.card["errors"]["rms_um"] < 1000
+    film, pupil = np.zeros((2, 3)), np.array([[0.0, 2.0, -3.0], [0.0, 1.0, 2.0]])
+    a, b = (m.rays(film, pupil, 550.0, stop_radius_mm=4.0) for m in (whole, fixed))
+    assert np.abs(a.scene_ray[3:] - b.scene_ray[3:]).max() < 2e-6
+    assert np.all(fixed.rays(film, pupil, 500.0).status == 1)
+    again = tmp_path / "again.onnx"
+    assert main(["export", str(out), "--to", "onnx", "-o", str(again)]) == 0
+    assert load_model(again).card["errors"] == fixed.card["errors"]
+
+
+def test_bad_input_is_one_line(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "a.h"
+    old = tmp_path / "old.onnx"
+    old.write_bytes(file.read_bytes().replace(MODEL_KEY.encode(), b"x" * len(MODEL_KEY)))
+    base = ["export", file, "--to", "c", "-o", out]
+    cases: list[tuple[list[object], list[str]]] = [
+        ([*base, "--fix", "wavelengths=300"], ["400 to 700"]),
+        ([*base, "--fix", "focus=0.1"], ["focus"]),
+        ([*base, "--fix", "film_z=1"], ["film_z"]),
+        ([*base, "--fix", "stop=50"], ["stop"]),
+        ([*base, "--fix", "stop=nan"], ["--fix", "stop=nan"]),
+        ([*base, "--fix", "colour=1"], ["--fix", "wavelengths"]),
+        ([*base, "--fix", "stop=3", "--fix", "f_number=4"], ["both"]),
+        ([*base, "--only", "stop"], ["--only", "ray"]),
+        ([*base, "--name", "1 2"], ["name"]),
+        (["export", file, "--to", "onnx", "-o", out, "--only", "ray"], ["--only"]),
+        (["export", file, "--to", "onnx", "-o", out, "--fix", "wavelengths=450,550"], ["one wavelength"]),
+        (["export", tmp_path / "no.onnx", "--to", "c", "-o", out], ["no.onnx", "no such file"]),
+        (["export", old, "--to", "c", "-o", out], ["old.onnx", "export it again"]),
+        (["export", tmp_path / "empty", "--to", "c", "-o", out], ["empty", "name its file"]),
+        (["export", file, "--to", "c", "-o", tmp_path / "no" / "a.h"], ["a.h"]),
+        (["export", file, "--to", "fortran", "-o", out], ["fortran"]),
+        (["export", file, "--to", "c"], ["-o"]),
+    ]
+    (tmp_path / "empty").mkdir()
+    for args, words in cases:
+        line = failure(capsys, *args)
+        assert all(word in line for word in words), (args, line)
+    assert not out.exists()
