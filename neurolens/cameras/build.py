@@ -33,7 +33,7 @@ class Shot:
         focus_m: distance from the film to the object in focus, inf allowed.
         f_number: None: the widest stop of a lens or model; f/4 for the thin lens, nominally f/8 for the pinhole.
         efl_mm: None: a lens file as tabled; 50 mm for thin lens and pinhole. A model has its own.
-        zoom: state of a lens file by name, or a focal length in mm between its states.
+        zoom: state of a lens file by name, or a focal length in mm between its states; also of a model of a whole zoom.
         field_deg: full field of view that the film's image circle shall see; sets the size of a lens file.
         focus: how a lens file is focused: "film", "best" or "internal"; see `Lens.at`.
         aperture: shape of the stop's opening; None is that of the lens file, else round.
@@ -132,11 +132,18 @@ def _dark_film(lens: Lens, film_mm: tuple[float, float]) -> list[str]:
 
 def _model(path: Path, shot: Shot) -> Camera:
     from neurolens.cameras.model import OnnxCamera, load_model
+    from neurolens.cameras.states import state_for
 
-    state = {"efl_mm": shot.efl_mm, "zoom": shot.zoom, "field_deg": shot.field_deg}
-    for field, value in (*state.items(), ("focus", None if shot.focus == "film" else shot.focus)):
-        _refuse(str(path), field, value, "left out: a model is of one state of its lens")
+    for field, value in {"efl_mm": shot.efl_mm, "field_deg": shot.field_deg}.items():
+        _refuse(str(path), field, value, "left out: a model is of one size of its lens")
     model = load_model(path)
+    axes = [a.name for a in model.axes]
+    if "zoom" not in axes:
+        _refuse(str(path), "zoom", shot.zoom, "left out: the model is of one zoom position")
+    if shot.focus not in ("film", "internal" if "focus" in axes else "film"):
+        _refuse(str(path), "focus", shot.focus, "left out: a model focuses as it was fitted")
+    if model.axes:
+        model = model.at(*state_for(path, model.axes, model.state, shot.zoom, shot.focus_m))
     lens, domain = model.card["lens"], model.card["domain"]
     widest = float(lens["f_number"] * lens["stop_radius_mm"] / domain["stop_radius_mm"])
     return OnnxCamera(

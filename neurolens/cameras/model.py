@@ -17,12 +17,15 @@ from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.sampling import check_film, positive
+from neurolens.cameras.states import state_for
 from neurolens.errors import InputError
 from neurolens.focus import film_z_mm
 from neurolens.modelfile import DOMAIN_SLACK
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 
+# Parts of the card that the metadata of pictures leave out.
+_NOT_KEPT = ("reference", "units", "frame", "status_codes", "states")
 _NOMINAL = 1.02  # f-numbers are engraved rounded: up to this much wider than the widest stop means the widest stop
 
 
@@ -32,12 +35,15 @@ class OnnxCamera:
     Args:
         model: see `load_model`.
         film_mm: width and height of the film. What lies beyond the model's film radius stays dark.
-        focus_m: distance from film to the object in focus; inf allowed.
+        focus_m: distance from film to the object in focus; inf allowed. It moves the film, or the groups of a model
+            that knows internal focus.
         f_number: None takes the model's widest stop, and so does one up to 2% below it (an engraved f/1.8 may be 1.83).
         aperture: shape of the stop's opening; None is round.
+        zoom: of a model of a zoom's whole range: a focal length in mm, or the name of a state of the source; None
+            leaves it at `model.state`.
 
     Raises:
-        InputError: a focus or stop outside the model's domain.
+        InputError: a focus, stop or zoom position outside the model's domain.
     """
 
     def __init__(
@@ -48,13 +54,16 @@ class OnnxCamera:
         focus_m: float,
         f_number: float | None = None,
         aperture: Aperture | None = None,
+        zoom: str | float | None = None,
     ) -> None:
+        self.focus_m = positive("focus_m", focus_m, infinite=True)
+        if model.axes or zoom is not None:
+            model = model.at(*state_for(model.path, model.axes, model.state, zoom, self.focus_m))
         card = model.card
         lens, domain = card["lens"], card["domain"]
         self.model = model
         self.name = str(lens.get("name", model.path.stem))
         self.film_mm = check_film(film_mm)
-        self.focus_m = positive("focus_m", focus_m, infinite=True)
         low, high = (float(v) for v in domain["wavelength_nm"])
         self.dispersive = low < high
         # A model for one wavelength of a dispersive lens knows that wavelength only; without dispersion any will do.
@@ -74,7 +83,8 @@ class OnnxCamera:
             "film_z_mm": film_z,
             "stop_radius_mm": stop,
             "aperture": aperture and aperture.settings(),
-            "card": {k: v for k, v in card.items() if k not in ("reference", "units", "frame", "status_codes")},
+            "state": dict(zip((a.name for a in model.axes), model.state, strict=True)),
+            "card": {k: v for k, v in card.items() if k not in _NOT_KEPT},
         }
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
@@ -115,6 +125,8 @@ class _Scene:
 
 def _film_z(model: OnnxLens, focus_m: float) -> float:
     lens, (near, far) = model.card["lens"], model.card["domain"]["film_z_mm"]
+    if any(a.name == "focus" for a in model.axes):
+        return float(near)  # its groups focus, on the one film position of the state
     z = film_z_mm(lens["efl_mm"], lens["front_principal_z_mm"], lens["rear_principal_z_mm"], focus_m)
     if not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
         limits = " to ".join(f"{v} m" for v in reversed(model.card["domain"]["focus_m"]))

@@ -35,23 +35,25 @@ def card_at(card: Mapping[str, Any], axes: Sequence[Axis], state: Sequence[float
     return {**card, "lens": lens, "domain": mix_domain([n["domain"] for n in nodes], w)}
 
 
-def state_for(path: Any, card: Mapping[str, Any], zoom: str | float | None, focus_m: float | None) -> tuple[float, ...]:
+def state_for(
+    path: Any, axes: Sequence[Axis], state: Sequence[float], zoom: str | float | None, focus_m: float
+) -> tuple[float, ...]:
     """The state that a photographer asks for.
 
     Args:
         path: what an error names.
-        zoom: name of a state of the source, or a focal length in mm; None takes the default.
-        focus_m: distance from the film to the object; None leaves it to the film's place.
+        axes, state: of the model, and where it stands.
+        zoom: name of a state of the source, or a focal length in mm; None leaves it where it is.
+        focus_m: distance from the film to the object, for internal focus.
 
     Raises:
         InputError: a zoom position or an internal focus that the model does not have.
     """
-    axes = axes_of(card)
-    values = dict(zip((a.name for a in axes), default_state(card), strict=True))
+    values = dict(zip((a.name for a in axes), state, strict=True))
     for axis in axes:
         if axis.name == "zoom" and zoom is not None:
             values["zoom"] = _zoom(path, axis, zoom)
-        elif axis.name == "focus" and focus_m is not None:
+        elif axis.name == "focus":
             values["focus"] = min(max(1 / focus_m, axis.range[0]), axis.limits[1])
             if 1 / focus_m > axis.limits[1]:
                 raise InputError(

@@ -19,8 +19,11 @@ from neurolens.axes import Axis
 from neurolens.errors import InputError
 from neurolens.files import atomic_path
 from neurolens.modelfile import CARD_KEY
+from neurolens.optics.internal import at_infinity
+from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.card import card_of, card_to_json, lens_facts, reference_rays
 from neurolens.surrogates.export import INPUTS, OUTPUTS, add_model, check_gates, largest_angle
+from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.onnx_graph import Graph
 from neurolens.surrogates.onnx_light import DirectionSeries
 from neurolens.surrogates.state_model import StateModel
@@ -66,16 +69,16 @@ def state_card(model: StateModel, errors: dict[str, Any]) -> dict[str, Any]:
     card["states"] = {
         "axes": [a.to_dict() for a in model.axes],
         "default": list(model.first_state),
-        "nodes": [
-            {
-                "lens": lens_facts(node.lens, node.domain.film_z_mm[0]),
-                "domain": node.domain.to_dict(),
-            }
-            for node in model.nodes
-        ],
+        "nodes": [{"lens": _lens_facts(node), "domain": node.domain.to_dict()} for node in model.nodes],
         "reference": [{"state": list(s), **reference_rays(model.at(*s), 8, 1)} for s in _between_nodes(model)],
     }
     return card
+
+
+def _lens_facts(node: LensModel) -> dict[str, Any]:
+    """The card's table of a node's lens; the f-number is that at infinity focus, as photographers count."""
+    facts = lens_facts(node.lens, node.domain.film_z_mm[0])
+    return {**facts, "f_number": float(first_order(at_infinity(node.lens)).f_number)}
 
 
 def _between_nodes(model: StateModel) -> list[tuple[float, ...]]:

@@ -1,15 +1,14 @@
 """Fitting models of many states: one support for all nodes, the same gates, coefficients of each node on its own rays.
 
 The nodes' coefficients need not vary smoothly themselves, for a core is linear in them: what is mixed between nodes is
-the functions. Those must hold wherever rays of a state between pass, so every node is fitted on a little more than
-its own passing rays: on those that its neighbours pass, too.
+the functions. Measured on three zooms: between nodes the error is that at the nodes, and at most doubles.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
@@ -19,9 +18,10 @@ from neurolens.errors import InputError
 from neurolens.surrogates.bases import Exponents, invariant_exponents, monomials, solve, vector_columns, vector_gram
 from neurolens.surrogates.boundary_fit import FitData, fit_scalars, fit_stop
 from neurolens.surrogates.cores import InvariantPolynomial
-from neurolens.surrogates.fit import Prepared, prepare
+from neurolens.surrogates.fit import prepare
+from neurolens.surrogates.lightfield import fit_encoding
 from neurolens.surrogates.model import STOP, Gate, LensModel, Scales
-from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.pairs import PairSettings, RayPairs, make_pairs
 from neurolens.surrogates.selection import Sweep
 from neurolens.surrogates.state_model import State, StateModel
 from neurolens.surrogates.state_space import StateSpace
@@ -29,7 +29,7 @@ from neurolens.surrogates.targets import film_equivalent, scales_of
 from neurolens.surrogates.threads import pinned_threads
 
 # Nodes that choose the support and the gates; the others only fit coefficients.
-_CHOOSERS = 9
+_CHOOSERS = 7
 _PASSES = 2  # of replacement
 
 
@@ -60,32 +60,38 @@ def fit_states(
         InputError: what `pairs.make_pairs` refuses at a node; fewer than two terms.
     """
     settings, start = settings or StateSettings(), time.perf_counter()
+    if space.lens.anamorphic:
+        raise InputError(space.lens.path, "surfaces", "(cylinders)", "a lens that is round about its axis, for states")
     if not 2 <= settings.terms < settings.rays:
         raise InputError("fit", "terms", settings.terms, f"from 2 to fewer than the {settings.rays} rays of a node")
     states = ax.product(space.axes)
     with pinned_threads():
         choosers = sorted({round(float(k)) for k in np.linspace(0, len(states) - 1, _CHOOSERS)})
-        known: dict[int, Prepared] = {}
+        known: dict[int, FitData] = {}
         for done, k in enumerate(choosers):
-            known[k] = _prepared(space, states[k], settings)
+            prepared = prepare(_pairs(space, states[k], settings))
+            known[k] = FitData(prepared.pairs, prepared.encoding, prepared.gates)
             if progress:
                 progress(0.3 * (done + 1) / len(choosers))
         gates = _all_gates([p.gates for p in known.values()])
-        stop_mm = max(p.pairs.lens.stop_radius_mm for p in known.values())
-        exponents, columns = choose_jointly([FitData(p.pairs, p.encoding, gates) for p in known.values()], settings)
+        stop_mm = max(d.pairs.lens.stop_radius_mm for d in known.values())
+        exponents, columns = choose_jointly(list(known.values()), settings)
         nodes = []
         for k, state in enumerate(states):
-            prepared = known.pop(k) if k in known else _prepared(space, state, settings)
-            nodes.append(_fit_node(prepared, gates, exponents, columns, stop_mm, settings))
+            if k in known:
+                data = replace(known.pop(k), gates=gates)
+            else:
+                pairs = _pairs(space, state, settings)
+                data = FitData(pairs, fit_encoding(pairs.domain, pairs.train), gates)
+            nodes.append(_fit_node(data, exponents, columns, stop_mm, settings))
             if progress:
                 progress(0.4 + 0.6 * (k + 1) / len(states))
     return StateModel(space.axes, tuple(nodes), space.lens_at, time.perf_counter() - start)
 
 
-def _prepared(space: StateSpace, state: State, settings: StateSettings) -> Prepared:
+def _pairs(space: StateSpace, state: State, settings: StateSettings) -> RayPairs:
     lens, domain = space.lens_at(state), space.domain_at(state)
-    pairs = make_pairs(lens, domain, PairSettings(settings.rays, 1, settings.rays, settings.seed))
-    return prepare(pairs)
+    return make_pairs(lens, domain, PairSettings(settings.rays, 1, settings.rays, settings.seed))
 
 
 def _all_gates(found: Sequence[tuple[Gate, ...]]) -> tuple[Gate, ...]:
@@ -149,17 +155,10 @@ def _forward(sweeps: Sequence[Sweep], terms: int) -> list[int]:
 
 
 def _fit_node(
-    prepared: Prepared,
-    gates: tuple[Gate, ...],
-    exponents: Exponents,
-    columns: list[int],
-    stop_mm: float,
-    settings: StateSettings,
+    data: FitData, exponents: Exponents, columns: list[int], stop_mm: float, settings: StateSettings
 ) -> LensModel:
     """The model of one node; its stop crossing is in units of `stop_mm`, the same at every node."""
-    pairs, encoding = prepared.pairs, prepared.encoding
-    data = FitData(pairs, encoding, gates)
-    train, count = data.train, len(exponents)
+    pairs, train, count = data.pairs, data.train, len(exponents)
     ab = torch.zeros((3, 2 * count), dtype=torch.float64)
     vectors = vector_columns(monomials(train.field.invariants(), exponents), train.field)[columns]
     ab[:STOP, columns] = solve(vectors, train.vectors[:STOP].flatten(1))
@@ -169,9 +168,9 @@ def _fit_node(
     return LensModel(
         lens=pairs.lens,
         domain=pairs.domain,
-        encoding=encoding,
+        encoding=data.encoding,
         scales=Scales(scales.position_mm, stop_mm),
-        gates=gates,
+        gates=data.gates,
         core=core,
         method=settings.label,
         settings={"method": "ols", **asdict(settings), "rays_seed": settings.seed},
