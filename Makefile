@@ -38,7 +38,7 @@ bench: $(INSTALLED)
 	$(BIN)/python -m neurolens.evaluate.bench
 
 models: $(INSTALLED)
-	$(BIN)/python -m neurolens.evaluate.make_models
+	$(BIN)/neurolens bench models
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

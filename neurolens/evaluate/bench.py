@@ -1,9 +1,9 @@
 """Speed against the promises: `python -m neurolens.evaluate.bench` (`make bench`).
 
-Races each model of models/ against the exact tracer of its lens, the thin lens and the pinhole, all in one run, writes
-the table to experiments/results/, and fails when a model is slower, relative to the compiled exact tracer, than
-models/index.json promises, or when tracer or renderer fall below their floors (`floors`). `neurolens bench trace` times
-the exact tracer alone.
+Races each model of which models/index.json promises a speed-up against the exact tracer of its lens, the thin lens and
+the pinhole, all in one run, writes the table to experiments/results/, and fails when a model is slower, relative to the
+compiled exact tracer, than promised, or when tracer or renderer fall below their floors (`floors`). `neurolens bench
+trace` times the exact tracer alone.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def read_index(folder: Path) -> list[dict[str, Any]]:
         rows = json.loads(path.read_text(encoding="utf-8"))["models"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
-            path, "file", f"({type(error).__name__}: {error})", "the index that `make models` writes"
+            path, "file", f"({type(error).__name__}: {error})", "the index that `neurolens bench models` writes"
         ) from error
     if not isinstance(rows, list):
         raise InputError(path, "models", type(rows).__name__, "a list")
@@ -73,10 +73,13 @@ def read_index(folder: Path) -> list[dict[str, Any]]:
 
 
 def bench_models(root: Path, folder: Path, only: str, threads: int, rounds: int, save: Save) -> Outcome:
-    """Race the models of an index, lens by lens, their lens files below `root`; `save` what there is after each."""
+    """Race the models of an index, lens by lens, their lens files below `root`; `save` what there is after each.
+
+    Without `only`, those of which the index promises a speed-up.
+    """
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in read_index(folder):
-        if only in row["file"]:
+        if only in row["file"] and (only or row.get("promised_speedup") is not None):
             groups.setdefault((row["lens_file"], row.get("configuration"), row.get("efl_mm")), []).append(row)
     if not groups:
         raise InputError(folder / "index.json", "models", "(none)", f"models with {only!r} in the file's name")
@@ -158,7 +161,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m neurolens.evaluate.bench", description=__doc__)
     parser.add_argument("--models", type=Path, help="folder with index.json (default: the project's models/)")
-    parser.add_argument("--only", default="", help="models whose names hold this text; no floors then")
+    parser.add_argument("--only", default="", help="models whose names hold this text, promised or not; no floors then")
     parser.add_argument("--threads", type=int, default=1, help="workers that share out batches (default 1)")
     parser.add_argument("--rounds", type=int, default=20, help="times that each candidate is timed (default 20)")
     parser.add_argument("--out", type=Path, help="folder for the tables (default: the project's experiments/results)")

@@ -1,195 +1,201 @@
-"""Makes the models that ship: `python -m neurolens.evaluate.make_models` (`make models`).
+"""Makes the models that ship, as experiments/models.toml lists them: `neurolens bench models`, `make models`.
 
-Reads experiments/models.toml; writes models/*.onnx, models/index.json (error, time, size and the speed-up that
-`make bench` holds each model to) and models/README.md, the same as a table.
+Entry by entry: fit, check the card on fresh rays, race the exact tracer, write the files, then the index. An entry
+whose files are there as they were written by the same settings and version is not made again.
 """
 
 from __future__ import annotations
 
-import argparse
+import functools
+import hashlib
 import json
 import os
-import sys
 import tempfile
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from neurolens import __version__
 from neurolens.cameras.model import load_model
-from neurolens.config import read_config
-from neurolens.errors import InputError, NeurolensError
+from neurolens.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.evaluate.bench import read_index
 from neurolens.evaluate.candidates import exact_candidates, model_candidate
-from neurolens.evaluate.experiment import DomainChoice, Experiment, LensChoice, check_names
-from neurolens.evaluate.measure import Measured, fit_and_measure
+from neurolens.evaluate.check import check_model
+from neurolens.evaluate.measure import Measured, fit_and_measure, shared_rays
+from neurolens.evaluate.models_index import write_index
+from neurolens.evaluate.models_list import Entry, Library
 from neurolens.evaluate.project import project_root
+from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
 from neurolens.evaluate.speed import race
-from neurolens.evaluate.train import versions
-from neurolens.files import atomic_path, atomic_write_text
+from neurolens.files import atomic_path
+from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import image_radius_mm
 from neurolens.progress import Progress
-from neurolens.surrogates.fit import ModelSettings, prepare
+from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.fit import prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
-_HEAD = """# Models that ship
-
-Made by `make models` from experiments/models.toml. Errors on held-out rays at full aperture (definition:
-`neurolens.evaluate.rays`); times on one core in onnxruntime, with stop, rims and transmittance; speed-up over the
-compiled exact tracer doing the same work in the same run. Coefficients: of one vector output for polynomials, all
-weights for networks. Check one with `neurolens evaluate models/FILE`, the speed of all with `make bench`.
-
-| model | RMS um | p99 um | direction RMS deg | false pass / block % | coefficients | kB | ns per ray | speed-up |
-|---|---|---|---|---|---|---|---|---|
-"""
 # The bench fails below this share of the speed-up measured here: machines and days differ, regressions differ more.
 PROMISE = 0.8
+_VIGNETTING_RAYS = 200_000
 _KEPT = (
     "rms_um p99_um direction_rms_deg position_rms_um transmittance_rms false_pass false_block "
     "coefficients_per_vector parameters bytes fit_s"
 ).split()
 
 
-_SHOWN = (*_KEPT, "ns_per_ray", "speedup_over_compiled")  # what the table needs of a row
+def make_models(
+    library: Library, entries: Sequence[Entry], out: Path, progress: Progress, *, again: bool = False
+) -> list[str]:
+    """Make what is missing of some entries; returns in words what failed or does not hold.
+
+    The index is whole at any time: rows are replaced one entry at a time, and rows of entries that the library no
+    longer has go when all of it was asked for and is done.
+    """
+    known, left_out = _known(out)
+    todo = [e for e in entries if again or not _stands(e, library.pairs, known, out)]
+    for entry in todo:
+        progress.plan({f"{entry.state}: {m.label}": 30.0 if m.method == "mlp" else 5.0 for m in entry.models})
+        progress.plan({f"{entry.state}: race": 60.0})
+    for entry in todo:
+        mine = [row for row in known if row["entry"] == entry.state]
+        left_out.pop(entry.state, None)
+        try:
+            made = make_entry(entry, library, out, progress)
+        except NeurolensError as error:
+            left_out[entry.state] = " ".join(str(error).split())
+            made = []
+        for row in mine:
+            if row["file"] not in {r["file"] for r in made}:
+                (out / row["file"]).unlink(missing_ok=True)
+        known = [*(row for row in known if row["entry"] != entry.state), *made]
+        write_index(_ordered(known, library), left_out, out)
+    if {e.state for e in entries} == {e.state for e in library.entry}:
+        states = {e.state for e in library.entry}
+        for row in known:
+            if row["entry"] not in states:
+                (out / row["file"]).unlink(missing_ok=True)
+        known = [row for row in known if row["entry"] in states]
+        left_out = {state: reason for state, reason in left_out.items() if state in states}
+    write_index(_ordered(known, library), left_out, out)
+    broken = [f"{row['file']}: does not hold: {', '.join(row['broken'])}" for row in known if row.get("broken")]
+    return [*(f"{state}: left out: {reason}" for state, reason in left_out.items()), *broken]
 
 
-def _default_models() -> tuple[ModelSettings, ...]:
-    polynomials = tuple(ModelSettings(method="ols", terms=terms) for terms in (60, 100))
-    return *polynomials, ModelSettings(method="mlp", units=16), ModelSettings(method="mlp", units=32, steps=20)
+def _known(out: Path) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """Rows and what was left out of an index that is there; nothing of one that cannot be read, which is replaced."""
+    try:
+        rows = [row for row in read_index(out) if row.keys() >= {*_KEPT, "ns_per_ray", "speedup_over_compiled"}]
+        left_out = json.loads((out / "index.json").read_text(encoding="utf-8")).get("left_out", {})
+    except (InputError, OSError, ValueError):
+        return [], {}
+    for row in rows:  # one of before entries were named
+        row.setdefault("entry", row["file"].removesuffix(".onnx").rpartition(".")[0])
+    return rows, dict(left_out)
 
 
-@dataclass(frozen=True)
-class Entry:
-    """One lens in one state and the models made of it."""
-
-    lens: LensChoice
-    domain: DomainChoice = field(default_factory=DomainChoice)
-    models: tuple[ModelSettings, ...] = field(default_factory=_default_models)
-
-    def __post_init__(self) -> None:
-        check_names("lens", [self.state])
-        check_names("models", [m.label for m in self.models])
-
-    @property
-    def state(self) -> str:
-        """Name of the lens and its state, as model files carry it."""
-        c = self.lens
-        parts = [c.file.stem, c.configuration or "", f"{c.efl_mm:g}mm" if c.efl_mm else ""]
-        return "-".join(p for p in parts if p)
-
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Names of the model files, in the order of `models`."""
-        return tuple(f"{self.state}.{m.label}.onnx" for m in self.models)
+def _ordered(rows: Sequence[dict[str, Any]], library: Library) -> list[dict[str, Any]]:
+    """In the order of the list; what it does not name last."""
+    place = {entry.state: i for i, entry in enumerate(library.entry)}
+    return sorted(rows, key=lambda row: place.get(row["entry"], len(place)))
 
 
-@dataclass(frozen=True)
-class Library:
-    """All entries, and the ray pairs of each."""
+def fingerprint(entry: Entry, pairs: PairSettings) -> str:
+    """Of all that decides the models of an entry.
 
-    entry: tuple[Entry, ...]
-    pairs: PairSettings = field(default_factory=PairSettings)
-
-    def __post_init__(self) -> None:
-        files = [name for e in self.entry for name in e.files]
-        twice = sorted({f for f in files if files.count(f) > 1})
-        if not files or twice:
-            raise InputError("settings", "entry", twice or "(none)", "at least one model, each of a file of its own")
+    Raises:
+        InputError: a lens that cannot be read.
+    """
+    settings = [asdict(m) for m in entry.models]
+    asked = [__version__, entry.lens.read().sha256, asdict(entry.domain), settings, entry.best, asdict(pairs)]
+    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
 
 
-def make_entry(entry: Entry, pairs: PairSettings, folder: Path, out: Path, progress: Progress) -> list[dict[str, Any]]:
-    """Fit and time the models of one lens; returns rows of the index."""
-    choice = LensChoice(folder / entry.lens.file, entry.lens.efl_mm, entry.lens.configuration, entry.lens.f_number)
-    experiment = Experiment(title=entry.state, lens=choice, model=entry.models, domain=entry.domain, pairs=pairs)
-    lens = choice.read()
-    domain = experiment.domain_of(lens)
-    prepared = prepare(make_pairs(lens, domain, pairs))
-    measured: list[Measured] = []
-    with tempfile.TemporaryDirectory() as scratch:
+def _stands(entry: Entry, pairs: PairSettings, known: Sequence[dict[str, Any]], out: Path) -> bool:
+    """Whether the models of an entry are there as they were written, by the same settings and version."""
+    mine = [row for row in known if row["entry"] == entry.state]
+    try:
+        mark = fingerprint(entry, pairs)
+        return bool(mine) and all(
+            r.get("fingerprint") == mark and r["sha256"] == _sha256(out / r["file"]) for r in mine
+        )
+    except (NeurolensError, OSError):
+        return False
+
+
+def _sha256(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def make_entry(entry: Entry, library: Library, out: Path, progress: Progress) -> list[dict[str, Any]]:
+    """Fit, check and time the models of one lens; writes their files and returns their rows of the index."""
+    with warnings.catch_warnings(), tempfile.TemporaryDirectory() as scratch:
+        warnings.simplefilter("ignore", NeurolensWarning)
+        lens = entry.lens.read()
+        domain = entry.domain.of(lens)
+        prepared = prepare(make_pairs(lens, domain, library.pairs))
+        fresh = functools.cache(lambda: shared_rays(prepared, _VIGNETTING_RAYS))
+        measured: list[Measured] = []
         for settings in entry.models:
             with progress.stage(f"{entry.state}: {settings.label}") as report:
-                measured.append(fit_and_measure(prepared, settings, Path(scratch), 200_000, report))
-        candidates = exact_candidates(lens, domain)
+                made = fit_and_measure(prepared, settings, Path(scratch), _VIGNETTING_RAYS, report, fresh)
+                measured.append(made)
+        measured = best_of_each_kind(measured) if entry.best else measured
+        candidates = exact_candidates(lens, domain, compiled=library.compile_exact)
         candidates += [model_candidate(m.settings.label, load_model(m.file), domain.stop_radius_mm) for m in measured]
-        with progress.stage(f"{entry.state}: race"):
-            timed = race(candidates, domain)
+        with progress.stage(f"{entry.state}: race") as report:
+            timed = race(candidates, domain, report=report)
         rows = []
-        for name, m in zip(entry.files, measured, strict=True):
-            with atomic_path(out / name) as temporary:
-                temporary.write_bytes(m.file.read_bytes())
-            timing, speedup = timed.timing(m.settings.label), timed.speedup(m.settings.label, "exact compiled")
-            row: dict[str, Any] = {
-                "file": name,
-                "lens_file": Path(os.path.relpath(choice.file.resolve(), project_root().resolve())).as_posix(),
-                "lens": lens.name,
-                "configuration": entry.lens.configuration,
-                "efl_mm": entry.lens.efl_mm,
-                "model": m.settings.label,
-                **{k: m.record.get(k) for k in _KEPT},
-                "ns_per_ray": timing,
+        for m in measured:
+            row = {**_row(entry, lens, domain, m), "fingerprint": fingerprint(entry, library.pairs)}
+            label, speedup = m.settings.label, timed.speedup(m.settings.label, "exact compiled")
+            row |= {
+                "ns_per_ray": timed.timing(label),
                 "exact_compiled_ns_per_ray": timed.timing("exact compiled"),
                 "speedup_over_compiled": speedup["min"] if speedup else None,
-                "promised_speedup": round(PROMISE * speedup["min"], 2) if speedup else None,
+                "promised_speedup": round(PROMISE * speedup["min"], 2) if speedup and entry.promise else None,
             }
+            with atomic_path(out / row["file"]) as temporary:
+                temporary.write_bytes(m.file.read_bytes())
             rows.append(row)
     return rows
 
 
-def write_index(rows: list[dict[str, Any]], out: Path) -> None:
-    """index.json and README.md."""
-    index = {"schema": 1, "command": "make models", "versions": versions(), "models": rows}
-    atomic_write_text(out / "index.json", json.dumps(index, indent=1, allow_nan=False) + "\n")
-    lines = [
-        f"| {r['file']} | {_n(r['rms_um'])} | {_n(r['p99_um'])} | {_n(r['direction_rms_deg'])} | "
-        f"{_n(r['false_pass'], 100)} / {_n(r['false_block'], 100)} | "
-        f"{r['coefficients_per_vector'] or r['parameters']} | {r['bytes'] / 1000:.0f} | "
-        f"{_n((r['ns_per_ray'] or {}).get('min'))} | {_n(r['speedup_over_compiled'])} |"
-        for r in rows
-    ]
-    atomic_write_text(out / "README.md", _HEAD + "\n".join(lines) + "\n")
+def best_of_each_kind(measured: Sequence[Measured]) -> list[Measured]:
+    """The polynomial and the network of the smallest error."""
+    kinds: dict[bool, Measured] = {}
+    for m in sorted(measured, key=_error):
+        kinds.setdefault(m.settings.method == "mlp", m)
+    return [kinds[kind] for kind in (False, True) if kind in kinds]
 
 
-def _n(value: float | None, factor: float = 1.0) -> str:
-    return "–" if value is None else f"{value * factor:.3g}"
+def _error(m: Measured) -> float:
+    """Film-equivalent, or the angle where no ray is within 60 degrees."""
+    found = m.record.get("rms_um")
+    return float(found if found is not None else m.record.get("direction_rms_deg") or 1e9)
 
 
-def make_library(library: Library, folder: Path, out: Path, progress: Progress) -> None:
-    """Make every entry, lens files lying relative to `folder`.
-
-    The index is whole at any time: rows are replaced one entry at a time, and rows of models that the library no longer
-    names go when all is done, so that an interrupted run leaves the other models in it.
-    """
-    try:
-        rows = {row["file"]: row for row in read_index(out) if row.keys() >= set(_SHOWN)}
-    except InputError:
-        rows = {}  # none yet, or one that cannot be read and is replaced
-    for entry in library.entry:
-        rows |= {row["file"]: row for row in make_entry(entry, library.pairs, folder, out, progress)}
-        write_index(list(rows.values()), out)
-    write_index([rows[name] for entry in library.entry for name in entry.files], out)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Make every entry; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m neurolens.evaluate.make_models", description=__doc__)
-    parser.add_argument(
-        "--experiment", type=Path, help="list of models (default: the project's experiments/models.toml)"
-    )
-    parser.add_argument("--out", type=Path, help="folder for models and index (default: the project's models/)")
-    a = parser.parse_args(argv)
-    warnings.simplefilter("ignore")
-    try:
-        source = a.experiment or project_root() / "experiments" / "models.toml"
-        out = a.out or project_root() / "models"
-        library = read_config(Library, source)
-        out.mkdir(parents=True, exist_ok=True)
-        make_library(library, source.parent, out, Progress())
-    except NeurolensError as error:
-        print(error, file=sys.stderr)
-        return 2
-    print((out / "README.md").read_text(encoding="utf-8"))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def _row(entry: Entry, lens: Lens, domain: Domain, m: Measured) -> dict[str, Any]:
+    """What the index says of a model but its times; its card is checked on fresh rays."""
+    scale = REFERENCE_RADIUS_MM / image_radius_mm(lens)[0]
+    widest = lens.with_stop_radius(domain.stop_radius_mm)
+    broken = [p.key for p in check_model(load_model(m.file), widest)[1] if not p.holds]
+    scaled = {f"{k}_at_21_6": None if m.record.get(k) is None else scale * m.record[k] for k in ("rms_um", "p99_um")}
+    return {
+        "file": entry.file(m.settings),
+        "entry": entry.state,
+        "sha256": _sha256(m.file),
+        "lens_file": Path(os.path.relpath(entry.lens.file.resolve(), project_root().resolve())).as_posix(),
+        "lens": lens.name,
+        "configuration": entry.lens.configuration,
+        "efl_mm": entry.lens.efl_mm,
+        "model": m.settings.label,
+        "wavelength_nm": list(domain.wavelength_nm),
+        "focus_m": ["inf" if f == float("inf") else f for f in domain.focus_m],
+        **{k: m.record.get(k) for k in _KEPT},
+        **scaled,
+        "position_rms_um_at_21_6": scale * m.record["position_rms_um"],
+        "broken": broken,
+    }

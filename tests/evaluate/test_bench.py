@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from neurolens import cli
 from neurolens.errors import InputError
-from neurolens.evaluate import make_models
 from neurolens.evaluate.bench import Outcome, hold_to_promises, main, read_index, verdict
 from neurolens.evaluate.floors import Floor, floor_table
 from neurolens.evaluate.speed import Race
@@ -96,7 +96,7 @@ def test_away_from_the_project_one_line_says_where_to_go(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("neurolens.evaluate.project.__file__", str(tmp_path / "site-packages/neurolens/evaluate/p.py"))
-    assert main([]) == 2 and make_models.main([]) == 2
+    assert main([]) == 2 and cli.main(["bench", "models"]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2 and all("experiments/" in line for line in lines)
     assert not list(tmp_path.iterdir())
