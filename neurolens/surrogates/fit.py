@@ -61,7 +61,7 @@ class ModelSettings:
     partitions: int = 1
     units: int = 16
     layers: int = 2
-    steps: int = 60
+    steps: int = 300
     seconds: float = 60.0
     seed: int = 0
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import torch
@@ -42,13 +42,15 @@ class Problem:
         """Outputs of the network: A and B of each vector, then the scalars."""
         return 2 * len(self.vectors) + len(self.scalars)
 
-    def every(self, step: int) -> Problem:
-        """Every `step`-th ray."""
-        vectors, scalars = self.vectors[..., ::step], self.scalars[:, ::step]
-        weights = self.vector_weights[:, ::step], self.scalar_weights[:, ::step]
-        return Problem(
-            self.inputs[::step], self.p[:, ::step], self.u[:, ::step], vectors, weights[0], scalars, weights[1]
-        )
+    @property
+    def tensors(self) -> list[Tensor]:
+        """All the data, in the order of the fields."""
+        return [getattr(self, f.name) for f in fields(self)]
+
+    def every(self, step: int, first: int = 0) -> Problem:
+        """Every `step`-th ray from the `first`."""
+        inputs, *rest = self.tensors
+        return Problem(inputs[first::step], *(t[..., first::step] for t in rest))
 
     @cached_property
     def curvature(self) -> Tensor:

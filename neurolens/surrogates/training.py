@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -25,19 +26,36 @@ _DAMPING_START, _DAMPING_END = 1e-2, 1e6
 Progress = Callable[[float], None]
 
 
+@dataclass(frozen=True)
+class Stand:
+    """Where the optimiser stands; from here it goes on to the very same bits.
+
+    Attributes:
+        hidden: [units, inputs + 1] of each layer.
+        damping, growth: of the next step, and the factor on the damping if that helps nothing.
+    """
+
+    hidden: list[Tensor]
+    damping: float = _DAMPING_START
+    growth: float = 2.0
+
+    @property
+    def stuck(self) -> bool:
+        """Whether no step helps any more."""
+        return self.damping >= _DAMPING_END
+
+
 def minimise(
-    problem: Problem, hidden: list[Tensor], steps: int, deadline: float, progress: Progress | None = None
-) -> Projection:
+    problem: Problem, start: Stand, steps: int, deadline: float, progress: Progress | None = None
+) -> tuple[Projection, Stand]:
     """Levenberg-Marquardt on the hidden weights (damping after Nielsen 1999), scaled by the diagonal (Marquardt 1963).
 
     Args:
-        hidden: start, [units, inputs + 1] of each layer.
         steps: steps tried; fewer when the loss no longer falls.
         deadline: time.monotonic() after which no step starts.
         progress: called with the share of the steps done.
     """
-    best = project(problem, hidden)
-    damping, growth, taken = _DAMPING_START, 2.0, 0
+    best, damping, growth, taken = project(problem, start.hidden), start.damping, start.growth, 0
     system = None
     while taken < steps and damping < _DAMPING_END and time.monotonic() < deadline:
         if system is None:
@@ -59,7 +77,7 @@ def minimise(
             damping, growth = damping * growth, 2 * growth
         if progress:
             progress(taken / steps)
-    return best
+    return best, Stand(best.hidden, damping, growth)
 
 
 def _try(problem: Problem, hidden: list[Tensor]) -> Projection | None:

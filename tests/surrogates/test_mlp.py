@@ -8,6 +8,7 @@ import torch
 
 from neurolens.errors import InputError
 from neurolens.optics.lensfile import read_lens
+from neurolens.surrogates import checkpoint, schedule
 from neurolens.surrogates.cores import Network
 from neurolens.surrogates.domain import domain_of, sample_domain
 from neurolens.surrogates.gates import choose_gates
@@ -17,7 +18,7 @@ from neurolens.surrogates.model import DIRECTION, POSITION, STOP, LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs, trace_pairs
 from neurolens.surrogates.projection import Problem, activations, project
 from neurolens.surrogates.targets import film_equivalent_weights, scales_of, targets_of
-from neurolens.surrogates.training import minimise, normal_equations
+from neurolens.surrogates.training import Stand, minimise, normal_equations
 
 LENSES = Path(__file__).parents[2] / "lenses"
 F64 = torch.float64
@@ -193,4 +194,74 @@ def test_a_network_that_made_the_data_is_found_again():
     made = Problem(problem.inputs, problem.p, problem.u, vectors, weights[0], y[6:], weights[1])
     start = [w + 0.2 * torch.ones_like(w) for w in truth]
     assert project(made, truth).loss < 1e-10
-    assert minimise(made, start, 40, math.inf).loss < 1e-8
+    assert minimise(made, Stand(start), 40, math.inf)[0].loss < 1e-8
+
+
+class _Killed(Exception):
+    pass
+
+
+def _kill_after(calls: int):
+    count = 0
+
+    def progress(share: float) -> None:
+        nonlocal count
+        count += 1
+        if count > calls:
+            raise _Killed
+
+    return progress
+
+
+@pytest.mark.parametrize("calls", [7, 15, 44, 52])
+def test_a_training_killed_anywhere_ends_with_the_very_same_weights(singlet, tmp_path, monkeypatch, calls):
+    monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
+    monkeypatch.setattr(schedule, "FEWEST_RAYS", 500)
+    settings = {"units": 4, "steps": 60, "starts": 3, "seed": 5}
+    whole = _weights(fit_network(*singlet, **settings))
+    file, steps = tmp_path / "training.npz", []
+    with pytest.raises(_Killed):
+        fit_network(*singlet, **settings, checkpoint=file, progress=_kill_after(calls))
+    assert calls <= 10 or file.exists()
+    resumed = fit_network(*singlet, **settings, checkpoint=file, progress=steps.append)
+    assert torch.equal(whole, _weights(resumed))
+    # It went on from its last checkpoint; what is left is less than the whole by most of what was done.
+    again: list[float] = []
+    fit_network(*singlet, **settings, progress=again.append)
+    assert len(steps) <= len(again) - calls + 10
+    assert [f.name for f in tmp_path.iterdir()] == ["training.npz"]
+
+
+def test_a_training_that_ended_is_read_and_not_done_again(singlet, tmp_path):
+    file, shares = tmp_path / "training.npz", []
+    first = fit_network(*singlet, units=4, steps=12, checkpoint=file)
+    again = fit_network(*singlet, units=4, steps=12, checkpoint=file, progress=shares.append)
+    assert torch.equal(_weights(first), _weights(again))
+    assert shares == [1.0]
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda b: b"", lambda b: b[: len(b) // 2], lambda b: b"no zip at all", "other seed"]
+)
+def test_a_checkpoint_that_is_damaged_or_of_another_fit_is_replaced(singlet, tmp_path, damage):
+    file = tmp_path / "training.npz"
+    settings = {"units": 4, "steps": 6, "seed": 5}
+    fit_network(*singlet, **(settings | {"seed": 6} if damage == "other seed" else settings), checkpoint=file)
+    if damage != "other seed":
+        file.write_bytes(damage(file.read_bytes()))
+    weights = _weights(fit_network(*singlet, **settings, checkpoint=file))
+    assert torch.equal(weights, _weights(fit_network(*singlet, **settings)))
+
+
+def test_rays_are_doubled_where_few_overfit(singlet, monkeypatch):
+    monkeypatch.setattr(schedule, "FEWEST_RAYS", 125)
+    levels: list[int] = []
+    take = schedule.Training._take_rays
+
+    def noted(self):
+        levels.append(self._place.level)
+        take(self)
+
+    monkeypatch.setattr(schedule.Training, "_take_rays", noted)
+    fit_network(*singlet, units=8, steps=60, starts=1)
+    assert levels == list(range(len(levels))) and len(levels) > 1
