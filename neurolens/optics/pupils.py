@@ -69,27 +69,30 @@ def pupil_bounds(
     rows: int = 33,
     points: int = 128,
     film_mm: tuple[float, float] | None = None,
+    pupil_z_mm: float | None = None,
 ) -> PupilBounds:
     """Search the pupil plane for passing rays, all film radii together: coarse grids, then grids on what they find.
 
     Each row is widened by the step of its grid and by its neighbours, so that bounds hold between rows too. `film_mm`
     (width, height) leaves out of the search of a lens with cylinders what lies beyond a film; see
-    `passes_at_any_azimuth`.
+    `passes_at_any_azimuth`. `pupil_z_mm` is the plane; None takes `pupil_plane_z_mm`.
 
     Raises:
         InputError: when no ray passes from any film point.
     """
-    plane = pupil_plane_z_mm(lens)
+    plane = pupil_plane_z_mm(lens) if pupil_z_mm is None else pupil_z_mm
     if not symmetric_about_axis(lens):
         points = min(points, _AT_MANY_AZIMUTHS)
     wavelengths = sorted(set(wavelength_nm))
     data = first_order(lens)
-    near = _NEAR * data.exit_pupil_diameter_mm / 2 if plane == data.exit_pupil_z_mm else math.inf
+    near = math.inf
+    if pupil_plane_z_mm(lens) == data.exit_pupil_z_mm:
+        near = _NEAR * data.exit_pupil_diameter_mm / 2
     jobs = []
     for i in range(rows):
         for z in sorted(set(film_z_mm)):
             place = Place(film_radius_mm * i / (rows - 1), z)
-            jobs += [(i, place, start) for start in _starts(lens, place, plane, near)]
+            jobs += [(i, place, start) for start in _starts(lens, place, plane, near, data.exit_pupil_z_mm)]
 
     def look(seen: Lens, places: list[Place], starts: list[Box]) -> list[Box | None]:
         return search(seen, places, wavelengths, plane, starts, points, film_mm)
@@ -114,10 +117,10 @@ def pupil_bounds(
     )
 
 
-def _starts(lens: Lens, place: Place, plane: float, near: float) -> list[Box]:
-    """Where on the pupil plane light of a film point may pass: what the rear rim bounds, and near the axis.
+def _starts(lens: Lens, place: Place, plane: float, near: float, exit_z: float) -> list[Box]:
+    """Where on the pupil plane light of a film point may pass: what the rear rim bounds, and near the exit pupil.
 
-    `near` is how far from the axis light is looked for again where the rear rim bounds it badly, mm.
+    `near` is how far from the exit pupil's middle light is looked for again where the rear rim bounds it badly, mm.
     """
     rear = lens.surfaces[-1]
     rear_z = float(lens.vertices_mm[len(lens.surfaces) - 1])
@@ -131,9 +134,12 @@ def _starts(lens: Lens, place: Place, plane: float, near: float) -> list[Box]:
         centre, reach = place.radius * (1 - stretch), 1.02 * rear.semi_diameter_mm * abs(stretch)
         ends.append(Box(centre - reach, centre + reach, reach, 0.0))
     starts = [union(ends)]
-    if starts[0].high - starts[0].low > _FAR * near:
-        # A cover glass a millimetre from the film: the pupil is a speck that falls between the points of a grid.
-        starts.append(Box(-near, near, near, 0.0))
+    if math.isfinite(near):
+        stretch = (place.film_z - plane) / (place.film_z - exit_z)
+        centre, reach = place.radius * (1 - stretch), near * abs(stretch)
+        if starts[0].high - starts[0].low > _FAR * reach:
+            # A cover glass a millimetre from the film: the pupil is a speck that falls between the points of a grid.
+            starts.append(Box(centre - reach, centre + reach, reach, 0.0))
     return starts
 
 

@@ -30,9 +30,9 @@ from neurolens.surrogates.targets import Targets, targets_of
 
 # Terms are added for boundaries until each is met to this RMS: of a gate (twice the relative radius of a rim), and of
 # the stop crossing in stop radii.
-GATE_ERROR, STOP_ERROR = 2e-3, 1e-3
+GATE_ERROR, STOP_ERROR = 2e-3, 5e-4
 MOST_BOUNDARY_TERMS = 64
-_DEGREE = 7  # of the terms among which those for boundaries are found
+_DEGREE = 9  # of the terms among which those for boundaries are found
 _RAYS = 12_000  # on which they are found
 
 
@@ -111,8 +111,13 @@ def boundary_terms(data: FitData, exponents: Exponents, most: int = MOST_BOUNDAR
     added = np.array([e for e in every.tolist() if tuple(e) not in known], dtype=np.int64).reshape(-1, 4)
     candidates = np.concatenate([exponents, added])
     field = LightField(*(c[..., :_RAYS] for c in data.boundary_field))
+    bad = [
+        k for k, f in enumerate(_boundary_fits(data, field, monomials(field.invariants(), exponents))) if f.error > 1
+    ]
+    if not bad:
+        return added[:0]
     features = monomials(field.invariants(), candidates)
-    fits = [f for f in _boundary_fits(data, field, features, len(exponents)) if f.error > 1]
+    fits = _boundary_fits(data, field, features, len(exponents), bad)
     chosen: list[int] = []
     while fits and len(chosen) < min(most, len(added)):
         scores = np.sum([f.scores() for f in fits], axis=0)
@@ -146,23 +151,26 @@ class _BoundaryFit:
         return self.scale * np.maximum(self.sweep.scores("ols"), 0.0).reshape(self.blocks, self.terms).sum(0)
 
 
-def _boundary_fits(data: FitData, field: LightField, features: Tensor, start: int) -> list[_BoundaryFit]:
-    """The fits of the stop crossing and of every gate with the first `start` terms in."""
+def _boundary_fits(
+    data: FitData, field: LightField, features: Tensor, start: int | None = None, only: list[int] | None = None
+) -> list[_BoundaryFit]:
+    """The fits of the stop crossing and of every gate, or `only` some of them, with the first `start` terms in."""
     crossing, weight = stop_crossing(data)
-    rays, terms = features.shape[1], len(features)
-    w = weight[:rays]
-    weighed = LightField(field.p * w, field.u * w, field.w)  # only p.p, p.u and u.u of it are used
-    outputs = (crossing[:, :rays] * w)[None]
-    tables = [(*vector_gram(features, weighed, outputs), outputs, STOP_ERROR, w)]
-    values = gate_values(data.pairs.lens, data.gates, data.boundary)[:, :rays]
-    for value, weights in zip(values, data.boundary_weights[0][:, :rays], strict=True):
-        rows, output = features * weights, (value * weights)[None]
-        tables.append(((rows @ rows.T).numpy(), (rows @ output.T).numpy(), output, GATE_ERROR, weights))
-    fits = []
-    for gram, moments, outputs, allowed, w in tables:
+    values, weights = gate_values(data.pairs.lens, data.gates, data.boundary), data.boundary_weights[0]
+    rays, terms, fits = features.shape[1], len(features), []
+    for k in range(1 + len(values)) if only is None else only:
+        w = (weights[k - 1] if k else weight)[:rays]
+        if k:
+            rows, outputs = features * w, (values[k - 1, :rays] * w)[None]
+            gram, moments = (rows @ rows.T).numpy(), (rows @ outputs.T).numpy()
+        else:
+            weighed = LightField(field.p * w, field.u * w, field.w)  # only p.p, p.u and u.u of it are used
+            outputs = (crossing[:, :rays] * w)[None]
+            gram, moments = vector_gram(features, weighed, outputs)
         squares = (outputs.flatten(1) ** 2).sum(1).numpy()
-        fit = _BoundaryFit(Sweep(gram, moments, squares), terms, 1 / (allowed**2 * max(float((w * w).sum()), 1e-300)))
-        for term in range(start):
+        allowed = (GATE_ERROR if k else STOP_ERROR) ** 2 * max(float((w * w).sum()), 1e-300)
+        fit = _BoundaryFit(Sweep(gram, moments, squares), terms, 1 / allowed)
+        for term in range(terms if start is None else start):
             fit.add(term)
         fits.append(fit)
     return fits

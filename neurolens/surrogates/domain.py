@@ -24,6 +24,10 @@ PUPIL_MARGIN = 1.05
 # an exported model.
 FILM_PLANES = 17
 
+# Another pupil plane is taken where so many times more of the disc passes there; the planes tried are so much further
+# from the film each than the one before, out to so many focal lengths.
+_BETTER, _STEP, _REACH = 1.25, 1.02, 20
+
 
 @dataclass(frozen=True)
 class Domain:
@@ -123,6 +127,9 @@ def domain_of(
     planes = sorted(film_z_mm or (paraxial.film_z_mm(lens, f) for f in focus_m))
     radius = film_radius_mm if film_radius_mm is not None else image_radius_mm(lens)[0]
     bounds = pupil_bounds(lens, radius, (planes[0], planes[1]), (low, high))
+    plane = _best_plane_z_mm(lens, bounds, planes[0])
+    if plane != bounds.pupil_z_mm:
+        bounds = pupil_bounds(lens, radius, (planes[0], planes[1]), (low, high), pupil_z_mm=plane)
     return Domain(
         film_radius_mm=radius,
         film_z_mm=(planes[0], planes[1]),
@@ -134,6 +141,31 @@ def domain_of(
         bounds=bounds,
         nearest_m=nearest_m,
     )
+
+
+def _best_plane_z_mm(lens: Lens, bounds: PupilBounds, film_z_mm: float) -> float:
+    """The plane of `bounds`, or that on which one disc holds the passing rays of all film points most tightly.
+
+    The pupil of a fisheye or of a condenser walks as the film point moves, and that of a lens almost telecentric on
+    the film's side lies far away: then the paraxial exit pupil, or the rear vertex in its place, needs a disc that is
+    mostly dark. Rays are straight behind the lens, so that what is known on one plane is known on all.
+    """
+    here = film_z_mm - bounds.pupil_z_mm
+    rows = zip(bounds.low_mm, bounds.high_mm, bounds.half_mm, strict=True)
+    step = bounds.film_radius_mm / (len(bounds.low_mm) - 1)
+    lit = [(i * step, low, high, half) for i, (low, high, half) in enumerate(rows) if low < high]
+
+    def spread(distance: float) -> float:
+        """Radius of the disc over the distance from the film: its square goes with the disc's share of solid angle."""
+        s = distance / here
+        boxes = ((r + (low - r) * s, r + (high - r) * s, half * s) for r, low, high, half in lit)
+        return max(max(abs(a), abs(b), math.hypot((a + b) / 2, h)) for a, b, h in boxes) / distance
+
+    start = 0.25 * (film_z_mm - float(lens.vertices_mm[len(lens.surfaces) - 1]))
+    end = max(_REACH * abs(first_order(lens).efl_mm), here)
+    count = math.ceil(math.log(max(end / start, 1.0)) / math.log(_STEP)) + 1
+    best = min((start * _STEP**k for k in range(count)), key=spread)
+    return film_z_mm - best if spread(here) ** 2 > _BETTER * spread(best) ** 2 else bounds.pupil_z_mm
 
 
 def domain_from_camera(

@@ -24,6 +24,8 @@ _MOST_GATES = 10
 # Only the neighbourhood of a boundary decides who passes: weights fall off beyond this distance from it, in units of
 # the gate (half as much of a rim's radius).
 BOUNDARY_WIDTH = 0.03
+# The stop crossing is wanted to the same share of the opening down to this one, in stop radii: four stops.
+STOPPED_DOWN = 0.25
 
 
 def has_edges(gates: tuple[Gate, ...]) -> bool:
@@ -57,7 +59,8 @@ def boundary_weights(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> tup
     """What rays of `boundary_rays` count in the fits of the gates [G, N] and of the stop crossing [N].
 
     A gate decides where its value is near 0 and no other boundary stops the ray; the stop crossing counts wherever the
-    ray passes, for the stop may be closed. Rays lost before a boundary say nothing of it and weigh 0.
+    ray passes, for the stop may be closed, and the more the nearer to the middle, for an error there is to a smaller
+    opening. Rays lost before a boundary say nothing of it and weigh 0.
     """
     every = (*gates, Gate(lens.stop_index, st.RIM))
     values, known = gate_values(lens, every, pairs), gate_reach(every, pairs)
@@ -68,6 +71,8 @@ def boundary_weights(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> tup
         stopped = others.amax(0) if len(others) else torch.zeros_like(value)
         distance = value if i < len(gates) else beyond[i]
         rows.append((_near(distance) * _near(stopped)).where(known[i], 0.0))
+    opening = torch.sqrt((values[-1] + 1).clamp_min(0.0)).where(known[-1], 1.0)
+    rows[-1] *= (1 + STOPPED_DOWN) / (opening + STOPPED_DOWN)
     return torch.stack(rows[:-1]) if gates else values[:0], rows[-1]
 
 
