@@ -28,7 +28,7 @@ PUBLISHED: dict[str, PublishedMethod] = {
     "hanika": PublishedMethod(
         'Hanika and Dachsbacher 2014, "Efficient Monte Carlo Rendering with Realistic Lenses", Computer Graphics '
         "Forum 33(2)",
-        tuple(ModelSettings("hanika", f"hanika-d{degree}", "raw", degree=degree) for degree in (4, 5, 3)),
+        tuple(ModelSettings("hanika", f"hanika-d{degree}", "raw", degree=degree) for degree in (5, 4, 3)),
     ),
     "schrade": PublishedMethod(
         'Schrade, Hanika, Dachsbacher 2016, "Sparse high-degree polynomials for wide-angle lenses", Computer Graphics '
@@ -51,11 +51,11 @@ PUBLISHED: dict[str, PublishedMethod] = {
                 "neurolens2017",
                 "neurolens2017-128x3",
                 "raw",
-                partitions=1,
+                partitions=2,
                 units=128,
                 layers=3,
-                steps=100_000,
-                seconds=60.0,
+                steps=6000,
+                seconds=120.0,
             ),
         ),
     ),

@@ -9,7 +9,9 @@ from neurolens.errors import InputError
 from neurolens.surrogates.fit import ModelSettings, Prepared
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import Core, Gate
+from neurolens.surrogates.published.adaptive import fit_adaptive
 from neurolens.surrogates.published.data import RawData, outer_pupil
+from neurolens.surrogates.published.neural import NetworkSettings, fit_averaged
 from neurolens.surrogates.published.polynomials import fit_dense, fit_sparse
 from neurolens.surrogates.published.rtf import fit_rtf
 from neurolens.surrogates.published.taylor import fit_taylor
@@ -55,6 +57,19 @@ def _schrade(prepared: Prepared, settings: ModelSettings, progress: Progress) ->
     return PublishedFit(core, data.encoding, gates)
 
 
+def _zheng(prepared: Prepared, settings: ModelSettings, progress: Progress) -> PublishedFit:
+    data = RawData.of(prepared)
+    core, gates = outer_pupil(data, fit_adaptive(data, settings.terms, settings.partitions, progress))
+    return PublishedFit(core, data.encoding, gates)
+
+
+def _neurolens(prepared: Prepared, settings: ModelSettings, progress: Progress) -> PublishedFit:
+    data, s = RawData.of(prepared), settings
+    training = NetworkSettings(s.units, s.layers, s.steps, s.seconds, s.seed, s.partitions)
+    core, gates = fit_averaged(data, training, progress)
+    return PublishedFit(core, data.encoding, gates)
+
+
 def _rtf(prepared: Prepared, settings: ModelSettings, progress: Progress) -> PublishedFit:
     data = RawData.of(prepared)
     core, gates = fit_rtf(data, settings.degree)
@@ -65,5 +80,7 @@ _FITS: dict[str, Callable[[Prepared, ModelSettings, Progress], PublishedFit]] = 
     "taylor": _taylor,
     "hanika": _hanika,
     "schrade": _schrade,
+    "zheng-adaptive": _zheng,
+    "neurolens2017": _neurolens,
     "rtf": _rtf,
 }

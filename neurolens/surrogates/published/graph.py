@@ -12,6 +12,7 @@ from neurolens.surrogates.onnx_cores import CoreRows, Field, add_core
 from neurolens.surrogates.onnx_graph import Graph
 from neurolens.surrogates.onnx_monomials import add_polynomial, without_constants
 from neurolens.surrogates.published.cores import Cells, OuterPupil
+from neurolens.surrogates.published.neural import Averaged, Layers
 from neurolens.surrogates.published.rtf import Meridian
 
 Array = NDArray[np.float64]
@@ -29,6 +30,8 @@ def add_published(g: Graph, core: Core, field: Field, vector_scale: Array, gate_
         return _cells(g, core, field, vector_scale, gate_scale)
     if isinstance(core, Meridian):
         return _meridian(g, core, field, vector_scale, gate_scale)
+    if isinstance(core, Averaged):
+        return _averaged(g, core, field, vector_scale, gate_scale)
     raise TypeError(f"no ONNX form for a core of type {type(core).__name__}")
 
 
@@ -145,3 +148,35 @@ def _ellipse(g: Graph, core: Meridian, radius: str, crossing: tuple[str, str], g
     a, b = g.op("Div", crossing[0], across), g.op("Div", g.op("Sub", crossing[1], centre), along)
     square = g.op("Add", g.op("Mul", a, a), g.op("Mul", b, b))
     return g.op("Mul", g.op("Sub", square, g.const(1.0)), g.const(gate_scale))
+
+
+def _averaged(g: Graph, core: Averaged, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
+    """Every network for every ray, and a choice of the ring's mean by rho."""
+    first = [field.p, field.u]
+    if field.dispersive:
+        first.append(g.affine(field.weight[-1:], field.squares, field.bias[-1:]))
+    inputs, rho = g.concat(*first), g.affine(field.weight[:1], field.squares, field.bias[:1])
+    out = _ring(g, core.networks[0], inputs, 4 + field.dispersive)
+    for edge, ring in zip(core.edges, core.networks[1:], strict=True):
+        out = g.op("Where", g.op("Greater", rho, g.const(edge)), _ring(g, ring, inputs, 4 + field.dispersive), out)
+    position, transmittance, direction, flag = g.split(out, [2, 1, 3, 1])
+    position = g.op("Mul", position, g.const(vector_scale[0]))
+    square = g.op("MatMul", g.const([[1.0, 1.0, 1.0]]), g.op("Mul", direction, direction))
+    unit = g.op("Mul", direction, g.op("Reciprocal", g.op("Sqrt", square)))
+    gate = g.op("Mul", g.op("Sub", g.const(0.5), flag), g.const(gate_scale))
+    return CoreRows(position, position, g.op("Mul", position, g.const(0.0)), transmittance, [gate], unit)
+
+
+def _ring(g: Graph, networks: tuple[Layers, ...], inputs: str, count: int) -> str:
+    """[7, N] mean of networks on the first `count` inputs."""
+    total = ""
+    for layers in networks:
+        h = inputs
+        for k, (weight, bias) in enumerate(layers):
+            w, b = (t.detach().numpy().astype(np.float64) for t in (weight, bias))
+            if k == len(layers) - 1:
+                h = g.affine(w / len(networks), h, b / len(networks))
+            else:
+                h = g.op("Relu", g.affine(w if k else w[:, :count], h, b))
+        total = g.op("Add", total, h) if total else h
+    return total

@@ -1,0 +1,217 @@
+"""NeuroLens (Zheng and Zheng 2017, Computer Graphics Forum): averaged networks on subspaces of the input rays.
+
+A network maps a raw ray (film position, slope, wavelength) to seven numbers: three of the position, three of the
+direction, and whether the ray passes, regressed as 0 or 1. The space of input rays is divided into subspaces with
+networks of their own, and in each the mean of several networks, differing by their random start, is the answer. As in
+the public reimplementation: 5-128-128-128-7, ReLU, three networks, Adam.
+
+Left open and chosen here: subspaces are rings of the film that hold equally many rays; a ray passes where the mean flag
+is above 1/2; on a known front surface two numbers give the position, and the third channel carries the transmittance,
+which they leave out; outputs are scaled to unit spread, blocked rays count for the flag alone and come in the
+proportion in which they fall on the domain (at most two for one that passes); the rate of Adam falls to nothing along a
+half cosine. The flag belongs to one stop: the model knows no stop crossing (its stop output is 0), and a smaller stop
+would need a new training.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from neurolens import status as st
+from neurolens.errors import InputError
+from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.lightfield import LightField, angle_vector
+from neurolens.surrogates.model import Gate
+from neurolens.surrogates.pairs import PairSet, trace_pairs
+from neurolens.surrogates.published.data import RawData, raw_variables
+from neurolens.surrogates.targets import scales_of
+
+NETWORKS = 3  # whose mean is taken
+BATCH = 512
+RATE = 5e-3
+_FEWEST_RAYS = 200
+_MARGIN = 0.02  # of rho beyond a ring's edges
+_BLOCKED_RAYS = 65536
+
+Layers = tuple[tuple[Tensor, Tensor], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Averaged:
+    """The core: for each ring of the film the mean of some networks.
+
+    Attributes:
+        edges: rising values of rho between rings.
+        networks: [rings][networks] layers (weight, bias), ReLU between them; the last include the outputs' scale.
+    """
+
+    edges: tuple[float, ...]
+    networks: tuple[tuple[Layers, ...], ...]
+
+    basis: str = "raw"
+
+    def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
+        inputs, rho = raw_variables(field), field.invariants()[0]
+        out = ring_mean(self.networks[0], inputs)
+        for edge, ring in zip(self.edges, self.networks[1:], strict=True):
+            out = torch.where(rho > edge, ring_mean(ring, inputs), out)
+        direction = out[3:6] * torch.rsqrt((out[3:6] ** 2).sum(0))
+        vector = angle_vector(direction[0], direction[1], direction[2])
+        scalars = torch.stack([out[2], 0.5 - out[6]])
+        return torch.stack([out[:2], vector, torch.zeros_like(vector)]), scalars
+
+    def to(self, dtype: torch.dtype) -> Averaged:
+        cast = tuple(tuple(tuple((w.to(dtype), b.to(dtype)) for w, b in net) for net in ring) for ring in self.networks)
+        return replace(self, networks=cast)
+
+    @property
+    def coefficients_per_vector(self) -> int:
+        return self.coefficients
+
+    @property
+    def coefficients(self) -> int:
+        return sum(w.numel() + b.numel() for ring in self.networks for net in ring for w, b in net)
+
+
+def ring_mean(networks: tuple[Layers, ...], inputs: Tensor) -> Tensor:
+    """[7, N] mean over networks of inputs [5, N]."""
+    total = run(networks[0], inputs)
+    for layers in networks[1:]:
+        total = total + run(layers, inputs)
+    return total / len(networks)
+
+
+def run(layers: Layers, inputs: Tensor) -> Tensor:
+    """[7, N] of one network."""
+    h = inputs
+    for weight, bias in layers[:-1]:
+        h = torch.relu(torch.addmm(bias[:, None], weight, h))
+    return torch.addmm(layers[-1][1][:, None], layers[-1][0], h)
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """Shape and training: units a layer, hidden layers, Adam steps of each network, seconds of all, seed, rings."""
+
+    units: int
+    layers: int
+    steps: int
+    seconds: float
+    seed: int
+    rings: int
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Training rays in float32: inputs [5, N], values [7, N], and whether each passes [N] (1 or 0)."""
+
+    inputs: Tensor
+    values: Tensor
+    passes: Tensor
+
+
+def fit_averaged(
+    data: RawData, settings: NetworkSettings, progress: Callable[[float], None] | None = None
+) -> tuple[Averaged, tuple[Gate, ...]]:
+    """Train every network; the same seed gives the same weights where `steps` ends the training.
+
+    Raises:
+        InputError: more rings than the rays allow.
+    """
+    count = len(data.pairs.train)
+    if count < settings.rings * _FEWEST_RAYS:
+        most = max(1, count // _FEWEST_RAYS)
+        raise InputError("fit", "partitions", settings.rings, f"1 to {most} rings for {count} training rays")
+    rays = _training_rays(data)
+    rho = rays.inputs[0] ** 2 + rays.inputs[1] ** 2
+    shares = torch.arange(1, settings.rings) / settings.rings
+    edges = tuple(float(e) for e in torch.quantile(rho[rays.passes > 0], shares))
+    ends = (-math.inf, *edges, math.inf)
+    rings: list[tuple[Layers, ...]] = []
+    total = settings.rings * NETWORKS
+    for low, high in zip(ends, ends[1:], strict=False):
+        within = (rho > low - _MARGIN) & (rho <= high + _MARGIN)
+        ring = _Rays(rays.inputs[:, within], rays.values[:, within], rays.passes[within])
+        networks: list[Layers] = []
+        for _ in range(NETWORKS):
+            done = len(rings) * NETWORKS + len(networks)
+            networks.append(_train(ring, settings, settings.seed + done, settings.seconds / total))
+            if progress:
+                progress((done + 1) / total)
+        rings.append(tuple(networks))
+    lens = data.pairs.lens
+    gate = Gate(0 if lens.stop_index else len(lens.surfaces) - 1, st.RIM)
+    return Averaged(edges, tuple(rings)).to(torch.float64), (gate,)
+
+
+def _training_rays(data: RawData) -> _Rays:
+    """The training rays, and blocked rays drawn over the domain."""
+    pairs, scale = data.pairs, scales_of(data.pairs.lens)
+    drawn = trace_pairs(
+        pairs.lens,
+        sample_domain(pairs.domain, _BLOCKED_RAYS, pairs.settings.seed + 2_000_003),
+        pairs.domain.pupil_z_mm,
+    )
+    blocked = drawn.select(drawn.status != st.PASSED)
+    share = len(blocked) / len(drawn)
+    wanted = len(pairs.train) * min(share / max(1 - share, 1e-9), 2.0)
+    blocked = blocked.select(slice(0, int(wanted)))
+
+    def values(rays: PairSet, passes: bool) -> Tensor:
+        s = rays.scene
+        flag = torch.full_like(s.x, float(passes))
+        position = (s.x / scale.position_mm, s.y / scale.position_mm)
+        return torch.stack([*position, rays.transmittance, s.dx, s.dy, s.dz, flag])
+
+    sets = ((pairs.train, True), (blocked, False))
+    inputs = torch.cat([data.variables(rays) for rays, _ in sets], 1)
+    outputs = torch.cat([values(rays, passes) for rays, passes in sets], 1)
+    return _Rays(inputs.float(), outputs.float(), outputs[6].float())
+
+
+def _train(rays: _Rays, settings: NetworkSettings, seed: int, seconds: float) -> Layers:
+    generator = torch.Generator().manual_seed(seed)
+    widths = [5, *[settings.units] * settings.layers, 7]
+    weights: list[Tensor] = []
+    for fan_in, fan_out in zip(widths, widths[1:], strict=False):
+        weights.append(torch.randn(fan_out, fan_in, generator=generator) * math.sqrt(2 / fan_in))
+        weights.append(torch.zeros(fan_out))
+    passing = rays.values[:, rays.passes > 0]
+    mean, spread = passing.mean(1), passing.std(1).clamp_min(1e-6)
+    mean[6], spread[6] = 0.5, 0.5
+    wanted = ((rays.values - mean[:, None]) / spread[:, None]).T
+    # Blocked rays count for the flag alone.
+    counts = torch.ones_like(wanted)
+    counts[:, :6] = rays.passes[:, None]
+    inputs = rays.inputs.T.contiguous()
+    for weight in weights:
+        weight.requires_grad_(True)
+    adam = torch.optim.Adam(weights, lr=RATE)
+    start = time.perf_counter()
+    for step in range(settings.steps):
+        # The clock hastens the fall of the rate where it would end the training first, and only there, so that what the
+        # steps end repeats.
+        clock = (time.perf_counter() - start) / seconds
+        if clock >= 1:
+            break
+        spent = max(2 * clock - 1, step / settings.steps)
+        for group in adam.param_groups:
+            group["lr"] = RATE * 0.5 * (1 + math.cos(math.pi * spent))
+        batch = torch.randint(len(inputs), (BATCH,), generator=generator)
+        h = inputs[batch]
+        for k in range(0, len(weights) - 2, 2):
+            h = torch.relu(torch.addmm(weights[k + 1], h, weights[k].T))
+        out = torch.addmm(weights[-1], h, weights[-2].T)
+        loss = (((out - wanted[batch]) ** 2) * counts[batch]).mean()
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+    fitted = [w.detach() for w in weights]
+    fitted[-2], fitted[-1] = fitted[-2] * spread[:, None], fitted[-1] * spread + mean
+    return tuple((fitted[k], fitted[k + 1]) for k in range(0, len(fitted), 2))
