@@ -47,11 +47,14 @@ _HEAD = """\
 #define {macro}_FMA(a, b, c) ((a) * (b) + (c))
 #endif
 """
-# sqrtf of the library sets errno, which keeps compilers from making vectors of it.
+# sqrtf of the library sets errno, which keeps compilers from making vectors of it unless they are told not to care.
 _SQRT = """
-/* Square root by Newton's steps from the halved exponent; within an ulp. */
+/* Square root: the machine's with -fno-math-errno, else by Newton's steps from the halved exponent, within an ulp. */
 {macro}_INLINE float {name}_sqrt(float x)
 {{
+#ifdef __NO_MATH_ERRNO__
+    return __builtin_sqrtf(x);
+#else
     union {{ float f; unsigned u; }} y;
     y.f = x;
     y.u = 0x5f375a86u - (y.u >> 1);
@@ -61,6 +64,7 @@ _SQRT = """
     r = r * (1.5f - 0.5f * x * r * r);
     const float s = x * r;
     return s + 0.5f * r * (x - s * s);
+#endif
 }}
 """
 
