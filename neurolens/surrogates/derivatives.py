@@ -89,10 +89,12 @@ def polynomial_slopes(
     the polynomial, then each derivative.
     """
     place = {tuple(map(int, e)): i for i, e in enumerate(exponents)}
+    used = [int(i) for i in np.flatnonzero(weight.any(0))]
     terms: list[list[tuple[int, int, int]]] = []
     for v in variables:
         rows = []
-        for i, e in enumerate(exponents):
+        for i in used:
+            e = exponents[i]
             if e[v]:
                 lower = tuple(int(x) - (j == v) for j, x in enumerate(e))
                 rows.append((i, place.setdefault(lower, len(place)), int(e[v])))

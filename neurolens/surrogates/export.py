@@ -19,8 +19,9 @@ from neurolens.files import atomic_path
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.surrogates.card import card_of, card_to_json
 from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.model import DIRECTION, POSITION, LensModel
 from neurolens.surrogates.onnx_cores import add_core
+from neurolens.surrogates.onnx_derivatives import add_core_slopes, add_ray_derivatives, film_and_pupil
 from neurolens.surrogates.onnx_graph import FLOAT, INT32, Graph
 from neurolens.surrogates.onnx_light import TEST_SCALE, DirectionSeries, add_decoder, add_light_field, add_status
 from neurolens.surrogates.stored import model_to_text, storable
@@ -35,7 +36,16 @@ OUTPUTS: list[tuple[str, int, list[int | str]]] = [
 ]
 
 
-def export_onnx(model: LensModel, path: str | Path, errors: dict[str, Any] | None = None) -> Path:
+# Optional outputs: derivatives of the scene ray per mm of the film point's (of the pupil point's) x, then y.
+DERIVATIVES: list[tuple[str, int, list[int | str]]] = [
+    ("scene_ray_d_film", FLOAT, [2, 6, "N"]),
+    ("scene_ray_d_pupil", FLOAT, [2, 6, "N"]),
+]
+
+
+def export_onnx(
+    model: LensModel, path: str | Path, errors: dict[str, Any] | None = None, *, derivatives: bool = False
+) -> Path:
     """Write a model with its card.
 
     Inputs: rays [5, N] float32 (film_x_mm, film_y_mm, pupil_x_mm, pupil_y_mm, wavelength_nm), film_z_mm [1],
@@ -44,6 +54,7 @@ def export_onnx(model: LensModel, path: str | Path, errors: dict[str, Any] | Non
 
     Args:
         errors: held-out errors for the card, JSON-able.
+        derivatives: whether the graph gives `DERIVATIVES` too, to those who ask for them.
 
     Returns the path.
 
@@ -52,8 +63,8 @@ def export_onnx(model: LensModel, path: str | Path, errors: dict[str, Any] | Non
     """
     check_gates(model)
     g = Graph()
-    add_model(g, model, DirectionSeries(largest_angle(model)))
-    proto = g.model(INPUTS, OUTPUTS, model_metadata(model, errors or {}))
+    add_model(g, model, DirectionSeries(largest_angle(model)), derivatives)
+    proto = g.model(INPUTS, OUTPUTS + DERIVATIVES * derivatives, model_metadata(model, errors or {}))
     target = Path(path)
     with atomic_path(target) as temporary:
         temporary.write_bytes(proto.SerializeToString())
@@ -77,12 +88,17 @@ def check_gates(model: LensModel) -> None:
         raise InputError("export", "gates", codes, "one gate a surface and reason, and none on the rim of the stop")
 
 
-def add_model(g: Graph, model: LensModel, series: DirectionSeries) -> None:
-    """Append a whole model, from `INPUTS` to `OUTPUTS`."""
+def add_model(g: Graph, model: LensModel, series: DirectionSeries, derivatives: bool = False) -> None:
+    """Append a whole model, from `INPUTS` to `OUTPUTS` and, on demand, `DERIVATIVES`."""
     field, inside = add_light_field(g, model)
     kappa = series.kappa if model.direction == "angle" else 1.0
     scale = np.array([model.scales.position_mm, kappa, model.scales.stop_mm])
-    rows = add_core(g, model.core, field, scale, TEST_SCALE)
+    if derivatives:
+        chain, wanted = film_and_pupil(g, model.encoding), (POSITION, DIRECTION)
+        rows, columns = add_core_slopes(g, model.core, field, scale, TEST_SCALE, chain, wanted)
+        add_ray_derivatives(g, model, rows, columns, series)
+    else:
+        rows = add_core(g, model.core, field, scale, TEST_SCALE)
     stop_square = add_decoder(g, model, rows, series)
     add_status(g, model, rows, stop_square, inside)
     g.reshape(rows.transmittance, [-1], out="transmittance")

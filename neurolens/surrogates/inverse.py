@@ -27,7 +27,7 @@ STEPS = 3
 # A solution counts where its residual is below this: of the stop's radius; of the front's radius and in radians.
 TOLERANCE = 1e-4
 # Longest Newton step: of the radius of the pupil (and of the film).
-_LIMIT = 0.35
+LIMIT = 0.35
 
 
 class StopRays(NamedTuple):
@@ -98,7 +98,7 @@ class InverseModel:
         """
         system = StopSystem(self.model, film_x, film_y, film_z, stop_x, stop_y, wavelength_nm)
         start = self.stop.to(film_x.dtype)(system.guess_field, system.guess_z)[0]
-        return system.result(limited_newton(system, start, steps, _LIMIT), stop_radius_mm)
+        return system.result(limited_newton(system, start, steps, LIMIT), stop_radius_mm)
 
     def from_scene(
         self,
@@ -121,7 +121,7 @@ class InverseModel:
         """
         system = SceneSystem(self.model, scene, film_z, wavelength_nm)
         guess = self.scene.to(film_z.dtype)(system.target, torch.zeros_like(film_z))
-        return system.result(limited_newton(system, guess.flatten(0, 1), steps, _LIMIT), stop_radius_mm)
+        return system.result(limited_newton(system, guess.flatten(0, 1), steps, LIMIT), stop_radius_mm)
 
 
 class StopSystem:

@@ -18,6 +18,8 @@ Evaluate = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 # A step that did not help is tried again at this share of its length.
 SHORTER = 0.25
+# The unknowns stay within this, each: scaled so that passing rays fill the unit disc.
+REACH = 2.0
 
 
 class Solved(NamedTuple):
@@ -28,7 +30,7 @@ class Solved(NamedTuple):
     residual: Tensor
 
 
-def limited_newton(evaluate: Evaluate, start: Tensor, steps: int, limit: float, reach: float = 2.0) -> Solved:
+def limited_newton(evaluate: Evaluate, start: Tensor, steps: int, limit: float, reach: float = REACH) -> Solved:
     """Newton's method from `start` [K, N], `steps` steps for every column.
 
     Args:

@@ -23,12 +23,24 @@ class Graph:
         self.nodes: list[NodeProto] = []
         self.constants: dict[tuple[bytes, str, tuple[int, ...]], str] = {}
         self.tensors: list[TensorProto] = []
+        self._made: dict[tuple[str, ...], str] = {}
 
     def op(self, kind: str, *inputs: str, out: str | None = None, **attributes: Any) -> str:
         """Append a node with one output and return its name."""
         name = out or f"{kind}_{len(self.nodes)}"
         self.nodes.append(helper.make_node(kind, list(inputs), [name], name=f"n{len(self.nodes)}", **attributes))
         return name
+
+    def once(self, kind: str, *inputs: str) -> str:
+        """As `op`, but the same node of the same inputs is appended once only."""
+        key = (kind, *inputs)
+        if key not in self._made:
+            self._made[key] = self.op(kind, *inputs)
+        return self._made[key]
+
+    def several(self, kind: str, inputs: Sequence[str], outputs: Sequence[str], **attributes: Any) -> None:
+        """Append a node with several outputs."""
+        self.nodes.append(helper.make_node(kind, inputs, outputs, name=f"n{len(self.nodes)}", **attributes))
 
     def const(self, value: ArrayLike, dtype: type = np.float32) -> str:
         """A constant, float32 unless told; equal ones are stored once."""

@@ -22,10 +22,10 @@ Array = NDArray[np.float64]
 TEST_SCALE = 1e30
 
 
-def add_light_field(g: Graph, model: LensModel) -> tuple[Field, str]:
-    """The light field, and whether each ray is inside the domain, bool [1, N]."""
+def add_light_field(g: Graph, model: LensModel, rays: str = "rays") -> tuple[Field, str]:
+    """The light field of `rays` [5, N], and whether each is inside the domain, bool [1, N]."""
     e, d = model.encoding, model.domain
-    film_pupil, wavelength = g.split("rays", [4, 1])
+    film_pupil, wavelength = g.split(rays, [4, 1])
     inside = _inside(g, d, film_pupil)
     low, high = model.wavelength_limits_nm
     if e.w_half:
@@ -39,12 +39,12 @@ def add_light_field(g: Graph, model: LensModel) -> tuple[Field, str]:
     matrix = _plane_matrix(g, e)
     planes = g.op("MatMul", matrix, film_pupil)  # rows p, u, p + u, v
     squares = g.op("Mul", planes, planes)
-    weight, bias = _invariants(e)
+    weight, bias = invariant_weights(e)
     p, u, *_ = g.split(planes, [2, 2, weight.shape[1] - 4])
     return Field(p, u, squares, weight, bias, e.w_half != 0), inside
 
 
-def _invariants(e: Encoding) -> tuple[Array, Array]:
+def invariant_weights(e: Encoding) -> tuple[Array, Array]:
     """The invariants (with w, last) as weight @ squares + bias, of the squares of p, u, p + u and v.
 
     rho = p.p, tau = u.u, sigma = (|p + u|^2 - rho - tau) / 2: squares only, so that one pass makes them all.
@@ -129,8 +129,8 @@ def _flat(g: Graph, position: str) -> str:
     return g.op("MatMul", g.const([[0.0, 0.0]]), position)
 
 
-def add_status(g: Graph, model: LensModel, rows: CoreRows, stop_square: str, inside: str) -> None:
-    """Output status: the code of the first failed test along a camera ray, then the domain.
+def add_status(g: Graph, model: LensModel, rows: CoreRows, stop_square: str, inside: str, out: str = "status") -> None:
+    """Output `out`: the code of the first failed test along a camera ray, then the domain.
 
     Camera rays meet the last surface first, so the first failure is the largest code; of several tests at one surface
     it is the smallest.
@@ -149,7 +149,7 @@ def add_status(g: Graph, model: LensModel, rows: CoreRows, stop_square: str, ins
         failed[surface] = code
     code = g.op("Max", *failed.values())
     code = g.op("Where", inside, code, g.const(float(st.OUTSIDE_DOMAIN)))
-    g.reshape(g.op("Cast", code, to=INT32), [-1], out="status")
+    g.reshape(g.op("Cast", code, to=INT32), [-1], out=out)
 
 
 class DirectionSeries:
