@@ -101,6 +101,7 @@ def domain_of(
     wavelength_nm: tuple[float, float] = (400.0, 700.0),
     nearest_m: float | None = None,
     film_z_mm: tuple[float, float] | None = None,
+    pupil_z_mm: float | None = None,
 ) -> Domain:
     """The domain of a lens at its present stop.
 
@@ -110,6 +111,7 @@ def domain_of(
         wavelength_nm: replaced by the d line where no glass of the lens has a known dispersion.
         nearest_m: distance from the film of the nearest object in view; None takes the nearest focus.
         film_z_mm: film planes, of a lens that was focused otherwise; None follows from `focus_m`.
+        pupil_z_mm: plane of the pupil points; None takes the one on which the pupil is tightest.
 
     Raises:
         InputError: a radius or `nearest_m` that is not positive and finite, wavelengths outside 300..2500 nm or in the
@@ -126,8 +128,8 @@ def domain_of(
         low = high = LINE_D_NM
     planes = sorted(film_z_mm or (paraxial.film_z_mm(lens, f) for f in focus_m))
     radius = film_radius_mm if film_radius_mm is not None else image_radius_mm(lens)[0]
-    bounds = pupil_bounds(lens, radius, (planes[0], planes[1]), (low, high))
-    plane = _best_plane_z_mm(lens, bounds, planes[0])
+    bounds = pupil_bounds(lens, radius, (planes[0], planes[1]), (low, high), pupil_z_mm=pupil_z_mm)
+    plane = _best_plane_z_mm(lens, bounds, planes[0]) if pupil_z_mm is None else pupil_z_mm
     if plane != bounds.pupil_z_mm:
         bounds = pupil_bounds(lens, radius, (planes[0], planes[1]), (low, high), pupil_z_mm=plane)
     return Domain(

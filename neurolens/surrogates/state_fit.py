@@ -19,7 +19,7 @@ from neurolens.surrogates.bases import Exponents, invariant_exponents, monomials
 from neurolens.surrogates.boundary_fit import FitData, fit_scalars, fit_stop
 from neurolens.surrogates.cores import InvariantPolynomial
 from neurolens.surrogates.fit import prepare
-from neurolens.surrogates.lightfield import fit_encoding
+from neurolens.surrogates.lightfield import Encoding, fit_encoding
 from neurolens.surrogates.model import STOP, Gate, LensModel, Scales
 from neurolens.surrogates.pairs import PairSettings, RayPairs, make_pairs
 from neurolens.surrogates.selection import Sweep
@@ -74,6 +74,8 @@ def fit_states(
             if progress:
                 progress(0.3 * (done + 1) / len(choosers))
         gates = _all_gates([p.gates for p in known.values()])
+        scales = common_encoding([d.encoding for d in known.values()])
+        known = {k: replace(d, encoding=_scaled_like(scales, d.encoding)) for k, d in known.items()}
         stop_mm = max(d.pairs.lens.stop_radius_mm for d in known.values())
         exponents, columns = choose_jointly(list(known.values()), settings)
         nodes = []
@@ -82,16 +84,35 @@ def fit_states(
                 data = replace(known.pop(k), gates=gates)
             else:
                 pairs = _pairs(space, state, settings)
-                data = FitData(pairs, fit_encoding(pairs.domain, pairs.train), gates)
+                data = FitData(pairs, _scaled_like(scales, fit_encoding(pairs.domain, pairs.train)), gates)
             nodes.append(_fit_node(data, exponents, columns, stop_mm, settings))
             if progress:
                 progress(0.4 + 0.6 * (k + 1) / len(states))
-    return StateModel(space.axes, tuple(nodes), space.lens_at, time.perf_counter() - start)
+    return StateModel(space, tuple(nodes), time.perf_counter() - start)
 
 
 def _pairs(space: StateSpace, state: State, settings: StateSettings) -> RayPairs:
     lens, domain = space.lens_at(state), space.domain_at(state)
     return make_pairs(lens, domain, PairSettings(settings.rays, 1, settings.rays, settings.seed))
+
+
+def common_encoding(found: Sequence[Encoding]) -> Encoding:
+    """Scales and chief ray for all nodes: the largest scales, the mean chief ray.
+
+    Scales of each node's own would follow its domain, which need not be smooth in the state (a near limit that follows
+    one rule and then another); in such coordinates nor would be the lens.
+    """
+    return replace(
+        found[0],
+        chief=sum(e.chief for e in found) / len(found),
+        film_scale_mm=max(e.film_scale_mm for e in found),
+        pupil_scale_mm=max(e.pupil_scale_mm for e in found),
+    )
+
+
+def _scaled_like(scales: Encoding, own: Encoding) -> Encoding:
+    """The planes of a node with the scales of all."""
+    return replace(scales, film_plane_z_mm=own.film_plane_z_mm, pupil_plane_z_mm=own.pupil_plane_z_mm)
 
 
 def _all_gates(found: Sequence[tuple[Gate, ...]]) -> tuple[Gate, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from neurolens.axes import Axis
@@ -32,8 +32,8 @@ class StateSpace:
         zoom: state of the file where zoom is no axis.
         f_number: None is the widest stop of each state.
         film_radius_mm: None takes the lit film of each state.
-        focus_m: object distances (far, near) that moving the film reaches in every state; a number of focal lengths
-            stands for infinity to so many of them. Without effect where internal focus is an axis.
+        focus_m: object distances (far, near) that moving the film reaches, the same in every state or following from
+            the lens. Without effect where internal focus is an axis.
         wavelength_nm: shortest and longest.
     """
 
@@ -42,7 +42,7 @@ class StateSpace:
     zoom: str | float | None = None
     f_number: float | None = None
     film_radius_mm: float | None = None
-    focus_m: tuple[float, float] | float = (math.inf, math.inf)
+    focus_m: tuple[float, float] | Callable[[Lens], tuple[float, float]] = (math.inf, math.inf)
     wavelength_nm: tuple[float, float] = (400.0, 700.0)
 
     def _values(self, state: Sequence[float]) -> dict[str, float]:
@@ -63,9 +63,7 @@ class StateSpace:
         """The domain of a state: the full lit film, and the film positions that focusing by the film needs."""
         values, lens = self._values(state), self.lens_at(state)
         if "focus" not in values:
-            focus = self.focus_m
-            if not isinstance(focus, tuple):
-                focus = (math.inf, focus * abs(first_order(lens).efl_mm) / 1000)
+            focus = self.focus_m if isinstance(self.focus_m, tuple) else self.focus_m(lens)
             return domain_of(lens, film_radius_mm=self.film_radius_mm, focus_m=focus, wavelength_nm=self.wavelength_nm)
         # The picture's size is that of the lens at infinity focus: it breathes, the film does not.
         radius = self.film_radius_mm
