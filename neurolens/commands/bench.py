@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from neurolens.commands import bench_fused, bench_models, bench_surrogates
+from neurolens.commands import bench_fused, bench_models, bench_surrogates, bench_vignetting
 from neurolens.commands.arguments import Parser, whole
 from neurolens.errors import InputError
 
@@ -42,6 +42,7 @@ def add_parser(subparsers: Any) -> None:
     _add_extremes(kinds)
     _add_pupils(kinds)
     bench_surrogates.add_parser(kinds)
+    bench_vignetting.add_parsers(kinds)
     bench_fused.add_parser(kinds)
     bench_models.add_parser(kinds)
 
