@@ -6,6 +6,7 @@ infinity. The stop crossing, the transmittance and the gates are then fitted on 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -35,13 +36,16 @@ from neurolens.surrogates.boundary_fit import (
 from neurolens.surrogates.cores import Basis, InvariantPolynomial, RawPolynomial
 from neurolens.surrogates.gates import gate_values
 from neurolens.surrogates.growth import grow
-from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.lightfield import Encoding, LightField
 from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate
 from neurolens.surrogates.pairs import RayPairs
-from neurolens.surrogates.selection import Sweep, forward, matching_pursuit, replace_terms
+from neurolens.surrogates.selection import Sweep, backward, forward, matching_pursuit, replace_terms
 from neurolens.surrogates.targets import film_equivalent
 
 Method = Literal["dense", "omp", "ols", "adaptive"]
+
+SELECTION_RAYS = 10_000
+SURPLUS = 1.5
 
 
 @dataclass(frozen=True)
@@ -53,8 +57,11 @@ class PolynomialSettings:
             replacement), "adaptive" (terms of any degree grown from chosen terms).
         basis: "invariants" (rotational symmetry held exactly) or "raw" (p_x, p_y, u_x, u_y, w).
         terms: coefficients per vector output; ignored by "dense".
-        degree: largest total degree of the candidates; ignored by "adaptive".
+        degree: largest total degree of the candidates that a fit starts from; ignored by "adaptive".
         replacement: whether "ols" exchanges terms afterwards.
+        elimination: whether "ols" first chooses half as many terms again, and drops those that cost least.
+        growth: rounds in which "ols" in the invariants adds to the candidates what the chosen terms give, multiplied by
+            each variable: terms of higher degree where they help.
     """
 
     method: Method = "ols"
@@ -62,6 +69,8 @@ class PolynomialSettings:
     terms: int = 40
     degree: int = 7
     replacement: bool = True
+    elimination: bool = True
+    growth: int = 2
 
 
 def fit_polynomial(
@@ -92,13 +101,18 @@ def _fit_invariant(data: FitData, settings: PolynomialSettings) -> InvariantPoly
     train = data.train
     invariants, outputs = train.field.invariants(), film_equivalent(data.pairs.lens, data.pairs.domain, train.vectors)
     dispersive = data.encoding.w_half != 0
-    exponents = invariant_exponents(settings.degree, dispersive=dispersive)
     if settings.method == "adaptive":
         exponents, chosen = grow(invariants, train.field, outputs, settings.terms, dispersive=dispersive)
     else:
-        features = monomials(invariants, exponents)
-        gram, moments = vector_gram(features, train.field, outputs)
-        chosen = _choose(Sweep(gram, moments, _squares(outputs)), settings)
+        # Many rays more than candidates make a choice no better; the coefficients are fitted on all of them.
+        field, wanted = LightField(*(c[..., :SELECTION_RAYS] for c in train.field)), outputs[..., :SELECTION_RAYS]
+        exponents = invariant_exponents(settings.degree, dispersive=dispersive)
+        for _ in range(settings.growth if settings.method == "ols" else 0):
+            if 2 * len(exponents) <= settings.terms:
+                break
+            chosen = _choose(_sweep(exponents, field, wanted), replace(settings, replacement=False))
+            exponents = _grown(exponents, chosen, dispersive=dispersive)
+        chosen = _choose(_sweep(exponents, field, wanted), settings)
     count = len(exponents)
     kept = sorted({k % count for k in chosen})
     place = {k: i for i, k in enumerate(kept)}
@@ -114,10 +128,25 @@ def _fit_invariant(data: FitData, settings: PolynomialSettings) -> InvariantPoly
     return InvariantPolynomial(exponents, ab.reshape(3, 2, -1), fit_scalars(data, exponents))
 
 
+def _sweep(exponents: Exponents, field: LightField, outputs: Tensor) -> Sweep:
+    return Sweep(*vector_gram(monomials(field.invariants(), exponents), field, outputs), _squares(outputs))
+
+
+def _grown(exponents: Exponents, chosen: list[int], *, dispersive: bool) -> Exponents:
+    """The exponents [M, 4], and below them those of the chosen columns raised by one in each variable."""
+    parents = exponents[sorted({k % len(exponents) for k in chosen})]
+    children = np.concatenate([parents + step for step in np.eye(4, dtype=np.int64)[: 4 if dispersive else 3]])
+    known = {tuple(e) for e in exponents.tolist()}
+    new = [e for e in dict.fromkeys(map(tuple, children.tolist())) if e not in known]
+    return np.concatenate([exponents, np.array(new, dtype=np.int64).reshape(-1, 4)])
+
+
 def _choose(sweep: Sweep, settings: PolynomialSettings) -> list[int]:
     if settings.method == "dense":
         return list(range(sweep.count))
-    forward(sweep, settings.terms, "omp" if settings.method == "omp" else "ols")
+    surplus = SURPLUS if settings.method == "ols" and settings.elimination else 1.0
+    forward(sweep, math.ceil(surplus * settings.terms), "omp" if settings.method == "omp" else "ols")
+    backward(sweep, settings.terms)
     if settings.method == "ols" and settings.replacement:
         replace_terms(sweep)
     return sorted(sweep.chosen)

@@ -65,6 +65,12 @@ class Sweep:
         gain = correlation / np.where(usable, left, 1.0) if rule == "ols" else correlation
         return np.where(usable, gain, -1.0)
 
+    def costs(self) -> Floats:
+        """[len(chosen)] how much the residual would grow without each chosen column."""
+        t, chosen = self._table, self.chosen
+        # The pivot of a column swept in is -1 / (what is left of it beside the others).
+        return (t[chosen, self.count :] ** 2).sum(1) / np.maximum(-t[chosen, chosen], 1e-300)
+
     def _sweep(self, k: int, sign: float) -> None:
         t = self._table
         pivot, row = t[k, k], t[k].copy()
@@ -99,6 +105,16 @@ def forward(sweep: Sweep, terms: int, rule: Rule = "ols", among: list[int] | Non
         if scores[best] <= 0:
             return
         sweep.add(best)
+
+
+def backward(sweep: Sweep, terms: int) -> None:
+    """Drop the chosen term that costs least until `terms` are left.
+
+    After a forward selection of more than `terms`, this drops what later terms made superfluous (Efroymson 1960).
+    """
+    while len(sweep.chosen) > terms:
+        sweep.drop(sweep.chosen[int(sweep.costs().argmin())])
+    sweep.refresh()
 
 
 def replace_terms(sweep: Sweep, passes: int = 10, among: list[int] | None = None) -> int:
