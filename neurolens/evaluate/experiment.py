@@ -78,7 +78,15 @@ class DomainChoice:
     wavelength_nm: tuple[float, float] | None = None
 
     def of(self, lens: Lens) -> Domain:
-        """The domain of a lens, what is not stated taken from it."""
+        """The domain of a lens, what is not stated taken from it.
+
+        Raises:
+            InputError: as `domain_of`; a lens whose image is virtual, so that no film can lie there.
+        """
+        behind = first_order(lens).rear_focal_z_mm
+        if not behind > lens.vertices_mm[len(lens.surfaces) - 1]:
+            expected = "a lens whose focus at infinity lies behind its last surface"
+            raise InputError(lens.path, "surfaces", f"(focus at z = {behind:.4g} mm)", expected)
         return domain_of(
             lens,
             film_radius_mm=self.film_radius_mm,
