@@ -54,6 +54,14 @@ def add_parser(subparsers: Any) -> None:
         "--set", metavar="KEY=VALUE", dest="overrides", action="append", default=[],
         help="change a setting, for example --set pairs.train=10000; values are TOML, may be repeated",
     )  # fmt: skip
+    parser.add_argument(
+        "--zoom-range", action="store_true",
+        help="of --lens: one model of all focal lengths between the file's zoom states (input \"state\", in mm)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--internal-focus", action="store_true",
+        help="of --lens: one model of internal focus, infinity to the near limit (input \"state\", in 1/m)",
+    )  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     add_json(parser)
     parser.set_defaults(run=run, kept="models already fitted are kept in the run folder; the same command goes on")
@@ -65,7 +73,11 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.evaluate.experiment import default_experiment, read_experiment
     from neurolens.evaluate.train import run_experiment
 
+    states = ['lens.zoom="range"'] * args.zoom_range + ['lens.focusing="internal"'] * args.internal_focus
+    if states and args.lens is None:
+        raise InputError("neurolens train", "--zoom-range, --internal-focus", "(without --lens)", "--lens FILE")
     if args.lens is not None:
+        args.overrides = [*states, *args.overrides]
         experiment = default_experiment(args.lens, args.overrides)
     else:
         experiment = read_experiment(args.experiment, args.overrides)

@@ -180,7 +180,7 @@ def lens_of_card(
         InputError: no such file, or one whose prescription is not the card's in any zoom state.
     """
     wanted = card["lens"]
-    path = Path(lens_file) if lens_file is not None else _find(str(wanted["id"]), Path(model_file))
+    path = Path(lens_file) if lens_file is not None else find_lens(str(wanted["id"]), Path(model_file))
     tabled = read_lens(path)
     for lens in _states(tabled, float(wanted["efl_mm"])):
         if lens.sha256 == wanted["sha256"]:
@@ -189,7 +189,12 @@ def lens_of_card(
     raise InputError(path, "sha256", f"({tabled.name}, {tabled.sha256[:12]}...)", expected)
 
 
-def _find(lens_id: str, model_file: Path) -> Path:
+def find_lens(lens_id: str, model_file: Path) -> Path:
+    """The lens file of an id: in lenses/ of the working folder, beside the model's folder, or of this project.
+
+    Raises:
+        InputError: no such file.
+    """
     name = f"{Path(lens_id).name}.toml"
     roots = (
         Path("."),

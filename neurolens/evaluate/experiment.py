@@ -8,6 +8,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 from neurolens.config import from_dict, read_config
 from neurolens.errors import InputError
@@ -18,6 +19,7 @@ from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain, domain_of
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
+from neurolens.surrogates.state_space import StateSpace, axes_of
 
 # Near limit where none is stated: 14 focal lengths from the film (0.7 m for a 50 mm lens), and the object 8 before the
 # front vertex, where a long lens of short focus has less room than that.
@@ -42,12 +44,24 @@ def check_names(field: str, names: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class LensChoice:
-    """Which lens, in which state: rescaled to a focal length, a zoom state of its file, a stop other than its own."""
+    """Which lens, in which state: rescaled to a focal length, a zoom state of its file, a stop other than its own.
+
+    Attributes:
+        zoom: "range" asks for one model of all zoom positions between the file's states.
+        focusing: "internal" for one model of internal focus from infinity to the near limit.
+    """
 
     file: Path
     efl_mm: float | None = None
     configuration: str | None = None
     f_number: float | None = None
+    zoom: Literal["range"] | None = None
+    focusing: Literal["film", "internal"] = "film"
+
+    @property
+    def many_states(self) -> bool:
+        """Whether models are of many states of the lens."""
+        return self.zoom is not None or self.focusing == "internal"
 
     def read(self) -> Lens:
         """The lens at infinity focus, its stop round: models know no other, and cameras shape it outside them.
@@ -182,6 +196,33 @@ class Experiment:
         unknown = [n for n in self.render.models if n not in labels]
         if unknown:
             raise InputError("settings", "render.models", unknown, f"names of models: {', '.join(labels)}")
+
+    def states(self) -> StateSpace:
+        """The states that the models are of, where the lens asks for many.
+
+        Raises:
+            InputError: a rescaled lens, or states that the file does not have.
+        """
+        chosen, domain = self.lens, self.domain
+        if chosen.efl_mm is not None:
+            raise InputError("settings", "lens.efl_mm", chosen.efl_mm, "left out: many states are of the tabled size")
+        if chosen.zoom is not None and chosen.configuration is not None:
+            raise InputError("settings", "lens.configuration", chosen.configuration, 'left out beside zoom = "range"')
+        lens = read_lens(chosen.file).with_aperture(None)
+        return StateSpace(
+            lens,
+            axes_of(
+                lens,
+                zoom=chosen.zoom is not None,
+                internal=chosen.focusing == "internal",
+                state=chosen.configuration,
+            ),
+            zoom=chosen.configuration,
+            f_number=chosen.f_number,
+            film_radius_mm=domain.film_radius_mm,
+            focus_m=domain.focus_m or (lambda state: (math.inf, near_limit_m(state))),
+            wavelength_nm=domain.wavelength_nm or wavelengths_nm(lens),
+        )
 
     def domain_of(self, lens: Lens) -> Domain:
         """The domain of the lens as this experiment asks for it."""

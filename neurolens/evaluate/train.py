@@ -28,6 +28,7 @@ from neurolens.evaluate.rays import pixel_um, pupil_disc_share
 from neurolens.evaluate.records import break_even_rays, write_results
 from neurolens.evaluate.report import write_report
 from neurolens.evaluate.speed import Race, race
+from neurolens.evaluate.train_states import run_states
 from neurolens.files import atomic_write_text
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -57,6 +58,8 @@ def run_experiment(
     """
     folder, started, clock = Path(out), datetime.now(UTC), time.perf_counter()
     progress = progress or Progress(quiet=True)
+    if experiment.lens.many_states:
+        return run_states(experiment, folder, progress=progress, command=command)
     models, pictures = folder / "models", folder / "pictures"
     resolved = relative_to(experiment, folder)
     progress.plan(_plan(experiment))

@@ -69,6 +69,8 @@ def state_card(model: StateModel, errors: dict[str, Any]) -> dict[str, Any]:
     card["states"] = {
         "axes": [a.to_dict() for a in model.axes],
         "default": list(model.first_state),
+        "zoom": model.space.zoom,
+        "f_number": model.space.f_number,
         "nodes": [{"lens": _lens_facts(node), "domain": node.domain.to_dict()} for node in model.nodes],
         "reference": [{"state": list(s), **reference_rays(model.at(*s), 8, 1)} for s in _between_nodes(model)],
     }

@@ -18,11 +18,11 @@ from torch import Tensor
 
 from neurolens import axes as ax
 from neurolens.errors import InputError
-from neurolens.optics.prescription import Lens
 from neurolens.statetable import mix_domain
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.state_space import StateSpace
 
 State = tuple[float, ...]
 
@@ -32,21 +32,24 @@ class StateModel:
     """Models at the nodes of one or more state axes.
 
     Attributes:
-        axes: the state variables.
+        space: the states, and the exact lens at each.
         nodes: one model a node, in the order of `neurolens.axes.product`; of one structure: they differ in numbers.
-        lens_at: the exact lens at a state.
         fit_s: seconds that the whole fit took.
     """
 
-    axes: tuple[ax.Axis, ...]
+    space: StateSpace
     nodes: tuple[LensModel, ...]
-    lens_at: Callable[[State], Lens]
     fit_s: float = 0.0
 
     def __post_init__(self) -> None:
         count = len(ax.product(self.axes))
         if len(self.nodes) != count:
             raise InputError("state model", "nodes", f"({len(self.nodes)})", f"{count}, as many as the axes have")
+
+    @property
+    def axes(self) -> tuple[ax.Axis, ...]:
+        """The state variables."""
+        return self.space.axes
 
     @property
     def first_state(self) -> State:
@@ -63,7 +66,7 @@ class StateModel:
         first = self.nodes[0]
         return replace(
             first,
-            lens=self.lens_at(state),
+            lens=self.space.lens_at(state),
             domain=Domain.from_dict(mix_domain([n.domain.to_dict() for n in self.nodes], w)),
             encoding=mix_encodings([n.encoding for n in self.nodes], w),
             core=mix([n.core for n in self.nodes], w),

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
-from neurolens.axes import Axis
+import numpy as np
+
+from neurolens.axes import Axis, product, weights
 from neurolens.errors import InputError
 from neurolens.optics.internal import infinity_states, nearest_focus_m
 from neurolens.optics.paraxial import first_order
@@ -45,6 +48,15 @@ class StateSpace:
     focus_m: tuple[float, float] | Callable[[Lens], tuple[float, float]] = (math.inf, math.inf)
     wavelength_nm: tuple[float, float] = (400.0, 700.0)
 
+    @cached_property
+    def _planes_mm(self) -> list[float]:
+        """The tightest pupil plane at every knot of the axes."""
+        return [self._domain(state, None).pupil_z_mm for state in product(self._knots)]
+
+    @property
+    def _knots(self) -> tuple[Axis, ...]:
+        return tuple(replace(a, degree=1) for a in self.axes)
+
     def _values(self, state: Sequence[float]) -> dict[str, float]:
         return dict(zip((a.name for a in self.axes), state, strict=True))
 
@@ -60,11 +72,23 @@ class StateSpace:
         )
 
     def domain_at(self, state: Sequence[float]) -> Domain:
-        """The domain of a state: the full lit film, and the film positions that focusing by the film needs."""
+        """The domain of a state: the full lit film, and the film positions that focusing by the film needs.
+
+        Its pupil plane is straight between the knots: the tightest one of every state by itself would jump.
+        """
+        return self._domain(state, float(weights(self._knots, state) @ np.array(self._planes_mm)))
+
+    def _domain(self, state: Sequence[float], pupil_z_mm: float | None) -> Domain:
         values, lens = self._values(state), self.lens_at(state)
         if "focus" not in values:
             focus = self.focus_m if isinstance(self.focus_m, tuple) else self.focus_m(lens)
-            return domain_of(lens, film_radius_mm=self.film_radius_mm, focus_m=focus, wavelength_nm=self.wavelength_nm)
+            return domain_of(
+                lens,
+                film_radius_mm=self.film_radius_mm,
+                focus_m=focus,
+                wavelength_nm=self.wavelength_nm,
+                pupil_z_mm=pupil_z_mm,
+            )
         # The picture's size is that of the lens at infinity focus: it breathes, the film does not.
         radius = self.film_radius_mm
         if radius is None:
@@ -77,6 +101,7 @@ class StateSpace:
             focus_m=(distance, distance),
             wavelength_nm=self.wavelength_nm,
             film_z_mm=(lens.film_z_mm, lens.film_z_mm),
+            pupil_z_mm=pupil_z_mm,
         )
 
 

@@ -1,0 +1,192 @@
+"""Experiments on many states of a lens: one model of the zoom's whole range, of internal focus, or of both."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from neurolens import __version__
+from neurolens.cameras.model import load_model
+from neurolens.config import to_dict, to_toml
+from neurolens.errors import InputError
+from neurolens.evaluate.candidates import model_candidate
+from neurolens.evaluate.experiment import Experiment, relative_to
+from neurolens.evaluate.plots_states import states_plot
+from neurolens.evaluate.records import plain
+from neurolens.evaluate.speed import race
+from neurolens.evaluate.state_errors import card_errors, errors_at, random_states
+from neurolens.files import atomic_write_text
+from neurolens.progress import Progress, Report
+from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.fit import ModelSettings
+from neurolens.surrogates.onnx_state import export_states
+from neurolens.surrogates.state_fit import StateSettings, fit_states
+from neurolens.surrogates.state_space import StateSpace
+
+# States at which a model is measured for its card, and the rays of each (that pass).
+STATES, RAYS = 16, 8_000
+# Added to the seed of the fit's rays.
+_FRESH = 104729
+
+
+def state_settings(settings: ModelSettings, rays: int, seed: int) -> StateSettings:
+    """The settings of a model of one state as those of many states.
+
+    Raises:
+        InputError: another method than "ols", zones, or the raw basis.
+    """
+    if (settings.method, settings.basis, settings.partitions) != ("ols", "invariants", 1):
+        raise InputError("settings", "model", settings.label, 'method "ols" on the invariants, for many states')
+    name = settings.name or f"states-{settings.terms}"
+    return StateSettings(settings.terms, settings.degree, rays, seed, name)
+
+
+def fit_and_measure_states(
+    space: StateSpace, settings: StateSettings, folder: Path, *, states: int = STATES, report: Report | None = None
+) -> dict[str, Any]:
+    """Fit, export and measure one model, or take what the folder holds if it was made by the same settings and version.
+
+    Errors are those of the exported float32 graph, in onnxruntime, at random states: the record's own are the worst.
+    """
+    file, note = folder / f"{settings.label}.onnx", folder / f"{settings.label}.json"
+    fingerprint = _fingerprint(space, settings, states)
+    known = _known(note, file, fingerprint)
+    if known is not None:
+        return known
+    tell = report or (lambda _: None)
+    model = fit_states(space, settings, lambda done: tell(0.6 * done))
+    export_states(model, file)
+    loaded, rows = load_model(file), []
+    for state in random_states(space.axes, states, settings.seed + _FRESH):
+        rows.append(errors_at(loaded, space, state, RAYS, settings.seed + _FRESH))
+        tell(0.6 + 0.4 * len(rows) / states)
+    errors = card_errors(rows, RAYS)
+    export_states(model, file, errors)
+    start = time.perf_counter()
+    load_model(file)
+    core = model.nodes[0].core
+    record = {
+        "name": settings.label,
+        "family": "ols",
+        "variables": "invariants",
+        "file": f"{folder.name}/{file.name}",
+        **errors,
+        "nodes": len(model.nodes),
+        "coefficients_per_vector": core.coefficients_per_vector,
+        "parameters": len(model.nodes) * core.coefficients,
+        "bytes": file.stat().st_size,
+        "fit_s": model.fit_s,
+        "load_s": time.perf_counter() - start,
+    }
+    made = {"fingerprint": fingerprint, "sha256": _sha256(file), "record": record}
+    atomic_write_text(note, json.dumps(made, indent=1, allow_nan=False))
+    return record
+
+
+def run_states(experiment: Experiment, folder: Path, *, progress: Progress, command: str = "") -> dict[str, Any]:
+    """Fit and measure the polynomials of an experiment whose lens is in many states.
+
+    Writes config.toml, models/*.onnx, states.png, results.json and report.html (a page with the table and the plot).
+
+    Raises:
+        InputError: no model that can be of many states, and whatever is wrong with lens or domain.
+    """
+    started, clock = datetime.now(UTC), time.perf_counter()
+    models = folder / "models"
+    models.mkdir(parents=True, exist_ok=True)
+    resolved = relative_to(experiment, folder)
+    atomic_write_text(folder / "config.toml", to_toml(resolved))
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        space = experiment.states()
+        wanted = [m for m in experiment.model if m.method == "ols"]
+        if not wanted:
+            raise InputError("settings", "model", [m.label for m in experiment.model], 'a model of method "ols"')
+        records = []
+        for m in wanted:
+            settings = state_settings(m, experiment.pairs.train, experiment.pairs.seed)
+            with progress.stage(f"fit {settings.label}") as report:
+                records.append(fit_and_measure_states(space, settings, models, report=report))
+        left_out = [m.label for m in experiment.model if m not in wanted]
+    for record in records:
+        record["ns_per_ray"] = _time(folder / record["file"], record["name"])
+    states_plot({r["name"]: r["states"] for r in records}, space.axes[0], folder / "states.png")
+    results = {
+        "title": experiment.title,
+        "command": command,
+        "lens": {"name": space.lens.name, "file": Path(space.lens.path).name, "source": space.lens.source},
+        "axes": [a.to_dict() for a in space.axes],
+        "settings": plain(to_dict(resolved)),
+        "models": records,
+        "seed": experiment.pairs.seed,
+        "started": started.isoformat(timespec="seconds"),
+        "wall_s": time.perf_counter() - clock,
+        "warnings": sorted({str(w.message) for w in heard if issubclass(w.category, UserWarning)})
+        + [f"left out, polynomials alone can be of many states: {label}" for label in left_out],
+    }
+    atomic_write_text(folder / "results.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
+    atomic_write_text(folder / "report.html", _page(results))
+    return results
+
+
+def _time(file: Path, name: str) -> Any:
+    model = load_model(file)
+    domain = Domain.from_dict(model.card["domain"])
+    return race([model_candidate(name, model, domain.stop_radius_mm)], domain, rounds=8).timing(name)
+
+
+def _page(results: Mapping[str, Any]) -> str:
+    """A page with the table of states and the plot."""
+    from neurolens.evaluate import markup
+
+    keys = ("rms_um", "p99_um", "direction_rms_deg", "false_pass", "false_block")
+    names = [a["name"] for a in results["axes"]]
+    rows = []
+    for record in results["models"]:
+        for row in sorted(record["states"], key=lambda r: [r[n] for n in names]):
+            cells = [record["name"], *(f"{row[n]:.5g}" for n in names)]
+            rows.append([*cells, *("–" if row[k] is None else f"{row[k]:.3g}" for k in keys)])
+    head = "".join(f"<th>{markup.text(h)}</th>" for h in ("model", *names, *keys))
+    body = "".join("<tr>" + "".join(f"<td>{markup.text(c)}</td>" for c in row) + "</tr>" for row in rows)
+    title = markup.text(results["title"])
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><h1>{title}</h1>'
+        f"<p>{markup.text(results['lens']['name'])}, one model of many states, at random states; rays that no fit saw."
+        f'</p><p><img src="states.png" alt="error over the state" style="max-width:100%"></p>'
+        f"<table border=1 cellpadding=4><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></html>\n"
+    )
+
+
+def _fingerprint(space: StateSpace, settings: StateSettings, states: int) -> str:
+    first = space.domain_at(tuple(a.range[0] for a in space.axes))
+    asked: Sequence[Any] = [
+        __version__,
+        space.lens.sha256,
+        [a.to_dict() for a in space.axes],
+        space.zoom,
+        space.f_number,
+        first.to_dict(),
+        asdict(settings),
+        states,
+    ]
+    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+
+
+def _sha256(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def _known(note: Path, file: Path, fingerprint: str) -> dict[str, Any] | None:
+    try:
+        data = json.loads(note.read_text(encoding="utf-8"))
+        same = data["fingerprint"] == fingerprint and data["sha256"] == _sha256(file)
+        return data["record"] if same else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
