@@ -19,7 +19,8 @@ from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs
 
 ROOT = Path(__file__).parents[1]
-ROWS: list[dict[str, Any]] = json.loads((ROOT / "models" / "index.json").read_text(encoding="utf-8"))["models"]
+INDEX: dict[str, Any] = json.loads((ROOT / "models" / "index.json").read_text(encoding="utf-8"))
+ROWS: list[dict[str, Any]] = INDEX["models"]
 # What is promised: file, figure, limit. Coefficients count A and B terms of one vector output.
 PROMISED = [
     ("laikin_double_gauss_50.ols-28.onnx", "rms_um", 2.0),
@@ -47,13 +48,17 @@ def exact(lens_file: str, configuration: str | None, efl_mm: float | None) -> Le
     return read_lens(ROOT / lens_file).at(zoom=configuration, focal_length_mm=efl_mm)
 
 
-@cache
 def fresh_rays(file: str) -> tuple[Lens, Domain, PairSet]:
+    """Rays that no fit has seen, the same for all models of one lens and domain."""
     row = next(r for r in ROWS if r["file"] == file)
-    lens = exact(row["lens_file"], row["configuration"], row["efl_mm"])
-    domain = Domain.from_dict(model(file).card["domain"])
-    pairs = make_pairs(lens, domain, PairSettings(train=1, held_out=4000, rim=1, seed=424_243))
-    return lens, domain, pairs.held_out
+    return _fresh_rays(json.dumps(model(file).card["domain"]), row["lens_file"], row["configuration"], row["efl_mm"])
+
+
+@cache
+def _fresh_rays(domain: str, *state: Any) -> tuple[Lens, Domain, PairSet]:
+    known = Domain.from_dict(json.loads(domain))
+    lens = exact(*state).with_stop_radius(known.stop_radius_mm)
+    return lens, known, make_pairs(lens, known, PairSettings(train=1, held_out=4000, rim=1, seed=424_243)).held_out
 
 
 @pytest.mark.parametrize(("file", "figure", "limit"), PROMISED)
@@ -69,7 +74,8 @@ def test_model_keeps_its_index_on_fresh_rays(row: dict[str, Any]) -> None:
     errors = ray_errors(lens, domain, rays, onnx_predictor(model(row["file"])))
     # 4000 rays know a root mean square to a few per cent; its heavy tail to a few more.
     for figure in ("rms_um", "direction_rms_deg", "position_rms_um"):
-        assert errors[figure] <= 1.25 * row[figure], figure
+        if row[figure] is not None:  # micrometres: None where no ray is within 60 degrees of the axis
+            assert errors[figure] <= 1.25 * row[figure], figure
 
 
 @pytest.mark.parametrize("closed", [1, 2, 4])
@@ -82,8 +88,17 @@ def test_stopped_down_needs_no_new_fit(closed: int) -> None:
 
 
 def test_every_lens_ships_a_polynomial_and_a_network() -> None:
-    states: dict[tuple[str, str | None], set[bool]] = {}
+    kinds: dict[str, set[bool]] = {}
     for row in ROWS:
-        states.setdefault((row["lens_file"], row["configuration"]), set()).add(row["model"].startswith("mlp"))
-    assert len(states) == 8 and all(kinds == {True, False} for kinds in states.values())
-    assert sum(f.stat().st_size for f in (ROOT / "models").glob("*.onnx")) < 5e6
+        kinds.setdefault(Path(row["lens_file"]).stem, set()).add("mlp" in row["model"])
+    assert all(found == {True, False} for found in kinds.values())
+    if INDEX["schema"] >= 2:
+        lenses = {file.stem for file in (ROOT / "lenses").glob("*.toml")}
+        assert set(kinds) | set(INDEX["left_out"]) >= lenses and len(kinds) >= 0.9 * len(lenses)
+
+
+def test_the_folder_is_small_and_holds_what_the_index_says() -> None:
+    files = {f.name for f in (ROOT / "models").glob("*.onnx")}
+    assert files == {row["file"] for row in ROWS}
+    assert sum(f.stat().st_size for f in (ROOT / "models").iterdir()) < 5e6
+    assert not [row["file"] for row in ROWS if row.get("broken")]
