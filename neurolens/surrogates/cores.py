@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.surrogates.lightfield import LightField
+
+if TYPE_CHECKING:
+    from neurolens.surrogates.residual import Residual
 
 Basis = Literal["invariants", "raw"]
 
@@ -140,8 +143,9 @@ class Network:
     Attributes:
         hidden: weight [units, inputs] and bias [units] of each tanh layer; the first takes scaled invariants.
         output: weight [6 + S, units] and bias [6 + S]; rows 2 v and 2 v + 1 are A and B of vector v, then the scalars.
-            The bias of those rows is the constant part of A and B.
-        shift, scale: [4] each: the network sees (invariants - shift) * scale.
+            The bias of those rows is the constant part of A and B. Of a lens with cylinders 12 + S rows: A and B of x,
+            then of y, of each vector.
+        shift, scale: [4] each: the network sees (invariants - shift) * scale; [7] of a lens with cylinders.
     """
 
     hidden: tuple[tuple[Tensor, Tensor], ...]
@@ -152,12 +156,23 @@ class Network:
     basis: Basis = "invariants"
 
     def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
-        h = (field.invariants() - self.shift[:, None]) * self.scale[:, None]
+        invariants = field.mirror_invariants() if self.mirror else field.invariants()
+        h = (invariants - self.shift[:, None]) * self.scale[:, None]
         for weight, bias in self.hidden:
             h = torch.tanh(weight @ h + bias[:, None])
         out = self.output[0] @ h + self.output[1][:, None]
-        ab = out[:6].reshape(3, 2, -1)
-        return ab[:, :1] * field.p + ab[:, 1:] * field.u, out[6:]
+        ab = out[: self.ab_rows].reshape(3, -1, 2, out.shape[1])  # [3, 1 or 2, 2, N]
+        return ab[:, :, 0] * field.p + ab[:, :, 1] * field.u, out[self.ab_rows :]
+
+    @property
+    def mirror(self) -> bool:
+        """Whether it is of a lens with cylinders."""
+        return len(self.shift) == 7
+
+    @property
+    def ab_rows(self) -> int:
+        """Outputs before the scalars."""
+        return 12 if self.mirror else 6
 
     def to(self, dtype: torch.dtype) -> Network:
         return replace(
@@ -187,7 +202,7 @@ class Partitioned:
     """
 
     edges: tuple[float, ...]
-    parts: tuple[InvariantPolynomial | RawPolynomial | Network, ...]
+    parts: tuple[InvariantPolynomial | RawPolynomial | Network | Residual, ...]
 
     def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
         vectors, scalars = self.parts[0](field)

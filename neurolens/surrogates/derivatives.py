@@ -176,16 +176,20 @@ class _NetworkSlopes:
 
     def __call__(self, field: LightField) -> VectorSlopes:
         core = self.core
-        h = (field.invariants() - core.shift[:, None]) * core.scale[:, None]
-        # Derivatives by the four invariants are carried along: [4, units, N], the same columns for all rays at first.
+        invariants = field.mirror_invariants() if core.mirror else field.invariants()
+        h = (invariants - core.shift[:, None]) * core.scale[:, None]
+        # Derivatives by the invariants are carried along: [4 or 7, units, N], the same columns for all rays at first.
         d = torch.diag(core.scale)[:, :, None]
         for weight, bias in core.hidden:
             h = torch.tanh(weight @ h + bias[:, None])
             d = (weight @ d) * (1 - h * h)
-        rows = [2 * v + i for v in self.vectors for i in (0, 1)]
+        axes = core.ab_rows // 6
+        rows = [2 * (axes * v + axis) + i for v in self.vectors for i in (0, 1) for axis in range(axes)]
         weight, bias = core.output[0][rows], core.output[1][rows]
-        ab = (weight @ h + bias[:, None]).reshape(len(self.vectors), 2, 1, -1)
-        return ab_slopes(field, ab, (weight @ d).reshape(4, len(self.vectors), 2, 1, -1))
+        shape = (len(self.vectors), 2, axes, -1)
+        return ab_slopes(
+            field, (weight @ h + bias[:, None]).reshape(shape), (weight @ d).reshape(len(invariants), *shape)
+        )
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from neurolens.surrogates.pairs import RayPairs
 from neurolens.surrogates.selection import Sweep, forward, replace_terms
 from neurolens.surrogates.targets import film_equivalent
 
-METHODS = ("omp", "ols")
+METHODS = ("omp", "ols")  # and networks (`mlp`)
 # Gram matrices are made of so many rays at a time; more candidates than this would take too long to choose from.
 _CHUNK, _MOST_CANDIDATES = 4096, 2500
 
@@ -75,7 +75,7 @@ def fit_mirror(
         InputError: another method, fewer than four terms, or too few rays.
     """
     if method not in METHODS:
-        raise InputError("fit", "method", method, f"{' or '.join(METHODS)}, the fits of lenses with cylinders")
+        raise InputError("fit", "method", method, f"{', '.join(METHODS)} or mlp, the fits of lenses with cylinders")
     if terms < 4:
         raise InputError("fit", "terms", terms, "at least 4 coefficients per vector output")
     if len(pairs.train) <= terms:

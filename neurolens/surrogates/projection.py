@@ -21,8 +21,8 @@ class Problem:
 
     Attributes:
         inputs: [N, I] what the network sees.
-        p, u: [2, N].
-        vectors: [V, 2, N] and their weights vector_weights [V, N].
+        p, u: [1, 2, N]; of a lens with cylinders [V, 1, N], what stands for p and u of each component.
+        vectors: [V, 2, N] and their weights vector_weights [V, N]; [V, 1, N] of components.
         scalars: [S, N] and their weights scalar_weights [S, N].
     """
 
@@ -55,7 +55,8 @@ class Problem:
     @cached_property
     def curvature(self) -> Tensor:
         """[N, 3 V + S] second derivatives of half a ray's loss by its outputs: AA, AB, BB of a vector; each scalar."""
-        dots = torch.stack([(a * b).sum(0) for a, b in ((self.p, self.p), (self.p, self.u), (self.u, self.u))])
+        pairs = ((self.p, self.p), (self.p, self.u), (self.u, self.u))
+        dots = torch.stack([(a * b).sum(1) for a, b in pairs], 1)  # [1 or V, 3, N]
         vectors = (self.vector_weights**2)[:, None] * dots
         return torch.cat([vectors.flatten(0, 1), self.scalar_weights**2]).T.contiguous()
 

@@ -139,8 +139,8 @@ def _random_problem(rays: int = 60) -> Problem:
     normal = lambda *shape: torch.randn(shape, generator=g, dtype=F64)  # noqa: E731
     return Problem(
         normal(rays, 4),
-        normal(2, rays),
-        normal(2, rays),
+        normal(1, 2, rays),
+        normal(1, 2, rays),
         normal(3, 2, rays),
         normal(3, rays).abs(),
         normal(2, rays),
