@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -15,13 +14,13 @@ from numpy.typing import NDArray
 
 from neurolens.surrogates.cores import InvariantPolynomial, MirrorPolynomial, Network, Partitioned, RawPolynomial
 from neurolens.surrogates.expressions import Expr, Program
+from neurolens.surrogates.fused_monomials import add_polynomial
 from neurolens.surrogates.fused_tanh import add_tanh
 from neurolens.surrogates.model import Core
+from neurolens.surrogates.residual import Residual
 
 Array = NDArray[np.float64]
-Exponent = tuple[int, ...]
 Pair = tuple[Expr, Expr]
-Made = tuple[Exponent, tuple[Exponent, Exponent] | None]  # a monomial and the two that it is the product of
 
 
 @dataclass(frozen=True)
@@ -40,6 +39,9 @@ class Field:
             program.fma(ux, ux, uy * uy),
             self.w,
         ]
+
+    def mirror_invariants(self) -> list[Expr]:
+        return [*(c for p, u in zip(self.p, self.u, strict=True) for c in (p * p, p * u, u * u)), self.w]
 
 
 @dataclass(frozen=True)
@@ -115,14 +117,22 @@ def _mirror_polynomial(
     """Rows A_x, A_y, B_x, B_y of each vector, then scalars."""
     ab = _stack(cores, lambda c: c.ab) * (scale * np.array(wanted.vectors))[:, None, None, None, None]
     scalars = _stack(cores, lambda c: c.scalars) * np.array(wanted.scalars)[:, None, None]
-    variables = [c for p, u in zip(field.p, field.u, strict=True) for c in (p * p, p * u, u * u)]
     weight = np.concatenate([ab.reshape(12, *ab.shape[3:]), scalars])
-    rows = add_polynomial(program, [*variables, field.w], cores[0].exponents, weight)
-    vectors: list[Pair | None] = []
+    rows = add_polynomial(program, field.mirror_invariants(), cores[0].exponents, weight)
+    return Results(_mirror_vectors(program, field, list(rows[:12]), wanted), _asked(list(rows[12:]), wanted))
+
+
+def _mirror_vectors(program: Program, field: Field, rows: list[Expr | None], wanted: Wanted) -> list[Pair | None]:
+    """A p + B u from rows A_x, A_y, B_x, B_y of each vector asked for."""
+    found: list[Pair | None] = []
     for k, asked in enumerate(wanted.vectors):
-        x, y = (program.fma(rows[4 * k + i], field.p[i], rows[4 * k + 2 + i] * field.u[i]) for i in (0, 1))
-        vectors.append((x, y) if asked else None)
-    return Results(vectors, _asked(rows[12:], wanted))
+        ax, ay, bx, by = rows[4 * k : 4 * k + 4]
+        if not asked or ax is None or ay is None or bx is None or by is None:
+            found.append(None)
+            continue
+        (px, py), (ux, uy) = field.p, field.u
+        found.append((program.fma(ax, px, bx * ux), program.fma(ay, py, by * uy)))
+    return found
 
 
 def _raw_polynomial(
@@ -141,7 +151,8 @@ def _raw_polynomial(
 def _network(program: Program, cores: Sequence[Network], field: Field, scale: Array, wanted: Wanted) -> Results:
     """The first layer takes the invariants themselves: shift and scale are folded into it."""
     shift, spread = _stack(cores, lambda c: c.shift), _stack(cores, lambda c: c.scale)
-    values = field.invariants(program)
+    mirror, n = cores[0].mirror, cores[0].ab_rows
+    values = field.mirror_invariants() if mirror else field.invariants(program)
     for i in range(len(cores[0].hidden)):
         weight = _stack(cores, lambda c, i=i: c.hidden[i][0])  # type: ignore[misc]
         bias = _stack(cores, lambda c, i=i: c.hidden[i][1])  # type: ignore[misc]
@@ -150,12 +161,15 @@ def _network(program: Program, cores: Sequence[Network], field: Field, scale: Ar
             bias = bias - (weight * shift).sum(1)
         values = add_tanh(program, [_affine(program, w, values, b) for w, b in zip(weight, bias, strict=True)])
     weight, bias = _stack(cores, lambda c: c.output[0]), _stack(cores, lambda c: c.output[1])
-    asked = np.concatenate([np.repeat(wanted.vectors, 2), wanted.scalars])
-    factors = np.concatenate([np.repeat(scale, 2), np.ones(len(wanted.scalars))]) * asked
+    asked = np.concatenate([np.repeat(wanted.vectors, n // 3), wanted.scalars])
+    factors = np.concatenate([np.repeat(scale, n // 3), np.ones(len(wanted.scalars))]) * asked
     rows = [
         _affine(program, f * w, values, f * b) if f else None for f, w, b in zip(factors, weight, bias, strict=True)
     ]
-    return Results(_vector_rows(program, field, rows[:6], wanted), rows[6:])
+    if mirror:  # A, B of x and A, B of y of each vector; the mirror polynomial's are A of both, then B of both
+        ab = [rows[4 * k + i] for k in range(3) for i in (0, 2, 1, 3)]
+        return Results(_mirror_vectors(program, field, ab, wanted), rows[n:])
+    return Results(_vector_rows(program, field, rows[:n], wanted), rows[n:])
 
 
 def _affine(program: Program, weight: Array, values: Sequence[Expr], bias: Array) -> Expr:
@@ -189,83 +203,21 @@ def _partitioned(program: Program, cores: Sequence[Partitioned], field: Field, s
     return chosen
 
 
+def _residual(program: Program, cores: Sequence[Residual], field: Field, scale: Array, wanted: Wanted) -> Results:
+    """Polynomial and network, added."""
+    base, more = (add_core(program, [c.parts[k] for c in cores], field, scale, wanted) for k in (0, 1))
+    vectors: list[Pair | None] = []
+    for a, b in zip(base.vectors, more.vectors, strict=True):
+        vectors.append(None if a is None or b is None else (a[0] + b[0], a[1] + b[1]))
+    both = zip(base.scalars, more.scalars, strict=True)
+    return Results(vectors, [None if a is None or b is None else a + b for a, b in both])
+
+
 WRITERS: dict[type, Callable[..., Results]] = {
     InvariantPolynomial: _invariant_polynomial,
     MirrorPolynomial: _mirror_polynomial,
     RawPolynomial: _raw_polynomial,
     Network: _network,
     Partitioned: _partitioned,
+    Residual: _residual,
 }
-
-
-def add_polynomial(
-    program: Program, variables: Sequence[Expr], exponents: NDArray[np.int64], weight: Array
-) -> list[Expr]:
-    """[R] rows: weight [R, M, K] times the monomials of `variables`, for exponents [M, V].
-
-    Each monomial is made once, by one multiplication, and spent at once on every row, so that few stay in registers.
-    """
-    zero = [v.is_literal(0) for v in variables]
-    table: dict[Exponent, Array] = {}
-    for e, column in zip(exponents, np.moveaxis(weight, 1, 0), strict=True):
-        if column.any() and not any(k and z for k, z in zip(e, zero, strict=True)):
-            table[tuple(int(k) for k in e)] = column
-    constant = (0,) * len(variables)
-    rows = [program.literal(c) for c in table.pop(constant, np.zeros((len(weight), program.tables)))]
-    made = {tuple(int(i == v) for i in range(len(variables))): value for v, value in enumerate(variables)}
-    for e, factors in plan_monomials(list(table), len(variables)):
-        if factors is not None:
-            made[e] = made[factors[0]] * made[factors[1]]
-        if e in table:
-            rows = [
-                program.fma(made[e], program.literal(c), row) if c.any() else row
-                for c, row in zip(table[e], rows, strict=True)
-            ]
-    return rows
-
-
-def plan_monomials(wanted: Sequence[Exponent], variables: int) -> list[Made]:
-    """An order in which every monomial is a variable (None) or the product of two before it.
-
-    Factors that exist anyway are taken first; where none do, the one that adds least. Depth first: what a monomial is
-    made of was made just before.
-    """
-    units = [tuple(int(i == v) for i in range(variables)) for v in range(variables)]
-    factors: dict[Exponent, tuple[Exponent, Exponent]] = {}
-    known = {*units, *wanted}
-
-    def resolve(e: Exponent) -> None:
-        if sum(e) == 1 or e in factors:
-            return
-        options = []
-        for right in product(*(range(k + 1) for k in e)):
-            left = tuple(a - b for a, b in zip(e, right, strict=True))
-            if 0 < sum(right) <= sum(left):
-                options.append((sum(f not in known for f in {left, right}), sum(right), left, right))
-        _, _, left, right = min(options)
-        known.update((left, right))
-        factors[e] = (left, right)
-        resolve(left)
-        resolve(right)
-
-    for e in sorted(wanted, key=lambda e: (sum(e), e), reverse=True):
-        resolve(e)
-    return _depth_first([*units, *sorted(factors, key=lambda e: (sum(e), e))], factors, set(wanted))
-
-
-def _depth_first(
-    nodes: list[Exponent], factors: dict[Exponent, tuple[Exponent, Exponent]], wanted: set[Exponent]
-) -> list[Made]:
-    """Nodes after their factors; each is followed by those that it was the last factor of."""
-    waiting: dict[Exponent, set[Exponent]] = {e: set(pair) for e, pair in factors.items()}
-    order: list[Made] = []
-    stack = [e for e in reversed(nodes) if e not in factors]
-    while stack:
-        e = stack.pop()
-        order.append((e, factors.get(e)))
-        for child in sorted((c for c, missing in waiting.items() if e in missing), reverse=True):
-            waiting[child].discard(e)
-            if not waiting[child]:
-                del waiting[child]
-                stack.append(child)
-    return [(e, pair) for e, pair in order if pair is not None or e in wanted]

@@ -15,6 +15,7 @@ from neurolens.surrogates.cores import InvariantPolynomial, MirrorPolynomial, Ne
 from neurolens.surrogates.model import Core
 from neurolens.surrogates.onnx_graph import Graph
 from neurolens.surrogates.onnx_monomials import add_polynomial, without_constants
+from neurolens.surrogates.residual import Residual
 
 Array = NDArray[np.float64]
 
@@ -74,6 +75,10 @@ def add_core(g: Graph, core: Core, field: Field, vector_scale: Array, gate_scale
         return _network(g, core, field, vector_scale, gate_scale)
     if isinstance(core, Partitioned):
         return _partitioned(g, core, field, vector_scale, gate_scale)
+    if isinstance(core, Residual):
+        from neurolens.surrogates.onnx_residual import add_residual  # made of the functions of this module
+
+        return add_residual(g, core, field, vector_scale, gate_scale)
     from neurolens.surrogates.published.graph import add_published  # published cores hold cores of this module
 
     return add_published(g, core, field, vector_scale, gate_scale)
@@ -90,12 +95,26 @@ def _scaled_scalars(scalars: Array, gate_scale: float) -> Array:
 def _invariant_polynomial(
     g: Graph, core: InvariantPolynomial, field: Field, vector_scale: Array, gate_scale: float
 ) -> CoreRows:
+    return add_ab_rows(g, invariant_rows(g, core, field, vector_scale, gate_scale), field, 6 + len(core.scalars))
+
+
+def invariant_rows(
+    g: Graph,
+    core: InvariantPolynomial,
+    field: Field,
+    vector_scale: Array,
+    gate_scale: float,
+    constant: Array | None = None,
+) -> str:
+    """Rows A, A, A, B, B, B, transmittance, gates of a polynomial; `constant` is added to its term of degree 0."""
     ab = _numpy(core.ab) * vector_scale[:, None, None]  # [3, 2, M]
     weight = np.concatenate([ab[:, 0], ab[:, 1], _scaled_scalars(_numpy(core.scalars), gate_scale)])
+    if constant is not None:
+        weight = weight + np.outer(constant, (core.exponents == 0).all(1))
     variables = [0, 1, 2, 3] if field.dispersive else [0, 1, 2]
     exponents, weight = without_constants(core.exponents, weight, variables)
     first = g.affine(field.weight[variables], field.squares, field.bias[variables])
-    return _ab_rows(g, add_polynomial(g, first, exponents, weight), field, len(weight))
+    return add_polynomial(g, first, exponents, weight)
 
 
 def _mirror_polynomial(
@@ -107,14 +126,22 @@ def _mirror_polynomial(
     variables = list(range(7 if field.dispersive else 6))
     exponents, weight = without_constants(core.exponents, weight, variables)
     first = g.affine(field.weight[variables], field.squares, field.bias[variables])
-    rows = g.split(add_polynomial(g, first, exponents, weight), [2] * 6 + [1] * len(scalars))
-    vectors = [
-        g.op("Add", g.op("Mul", a, field.p), g.op("Mul", b, field.u)) for a, b in zip(rows[:3], rows[3:6], strict=True)
-    ]
-    return CoreRows(vectors[0], vectors[1], vectors[2], rows[6], rows[7:])
+    return add_mirror_rows(g, add_polynomial(g, first, exponents, weight), field, len(weight))
+
+
+def add_mirror_rows(g: Graph, out: str, field: Field, count: int) -> CoreRows:
+    """A p + B u for three vectors, x and y by themselves, from rows A (x, y) three times, B likewise, scalars."""
+    return _vectors(g, g.split(out, [2] * 6 + [1] * (count - 12)), field)
 
 
 def _network(g: Graph, core: Network, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
+    weight, bias = output_rows(core, vector_scale, gate_scale)
+    out = g.affine(weight, add_hidden(g, core, field), bias)
+    return (add_mirror_rows if core.mirror else add_ab_rows)(g, out, field, len(weight))
+
+
+def add_hidden(g: Graph, core: Network, field: Field) -> str:
+    """The last tanh layer, [units, N]."""
     shift, scale = _numpy(core.shift), _numpy(core.scale)
     # The first layer takes the squares themselves: the invariants never exist in the graph.
     to_input = scale[:, None] * field.weight
@@ -125,20 +152,31 @@ def _network(g: Graph, core: Network, field: Field, vector_scale: Array, gate_sc
         if i == 0:
             weight, bias = weight @ to_input, bias + weight @ input_bias
         h = g.op("Tanh", g.affine(weight, h, bias))
+    return h
+
+
+def output_rows(core: Network, vector_scale: Array, gate_scale: float) -> tuple[Array, Array]:
+    """Weight [6 + S, units] and bias [6 + S] of a network's last layer, in the order of `add_ab_rows`.
+
+    12 + S rows in the order of `add_mirror_rows` for a lens with cylinders.
+    """
     weight, bias = (np.array(_numpy(t)) for t in core.output)
-    order = [0, 2, 4, 1, 3, 5, *range(6, len(weight))]  # A of the three vectors, then B
-    factors = np.concatenate([np.tile(vector_scale, 2), [1.0], np.full(len(weight) - 7, gate_scale)])
-    weight, bias = factors[:, None] * weight[order], factors * bias[order]
-    return _ab_rows(g, g.affine(weight, h, bias), field, len(weight))
+    n, axes = core.ab_rows, core.ab_rows // 6
+    order = [*range(0, n, 2), *range(1, n, 2), *range(n, len(weight))]  # A of the three vectors, then B
+    scale = np.repeat(vector_scale, axes)
+    factors = np.concatenate([np.tile(scale, 2), [1.0], np.full(len(weight) - n - 1, gate_scale)])
+    return factors[:, None] * weight[order], factors * bias[order]
 
 
-def _ab_rows(g: Graph, out: str, field: Field, count: int) -> CoreRows:
+def add_ab_rows(g: Graph, out: str, field: Field, count: int) -> CoreRows:
     """A p + B u for three vectors, from rows A, A, A, B, B, B, transmittance, gates."""
-    rows = g.split(out, [1] * count)
-    ab = rows[:6]
+    return _vectors(g, g.split(out, [1] * count), field)
+
+
+def _vectors(g: Graph, rows: list[str], field: Field) -> CoreRows:
     # Vector by vector: products of two rows stay in the first-level cache, and nothing has to be taken apart later.
     vectors = [
-        g.op("Add", g.op("Mul", a, field.p), g.op("Mul", b, field.u)) for a, b in zip(ab[:3], ab[3:], strict=True)
+        g.op("Add", g.op("Mul", a, field.p), g.op("Mul", b, field.u)) for a, b in zip(rows[:3], rows[3:6], strict=True)
     ]
     return CoreRows(vectors[0], vectors[1], vectors[2], rows[6], rows[7:])
 

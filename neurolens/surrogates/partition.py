@@ -16,9 +16,10 @@ from neurolens.errors import InputError
 from neurolens.surrogates.cores import InvariantPolynomial, Network, Partitioned, RawPolynomial
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.pairs import PairSet, RayPairs
+from neurolens.surrogates.residual import Residual
 from neurolens.surrogates.targets import film_equivalent, targets_of
 
-ZoneCore = InvariantPolynomial | RawPolynomial | Network
+ZoneCore = InvariantPolynomial | RawPolynomial | Network | Residual
 # A zone's fit sees this share of rho beyond its edges, so that neighbours meet.
 OVERLAP = 0.03
 _FEWEST_RAYS = 200

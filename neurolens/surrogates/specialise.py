@@ -21,6 +21,7 @@ from neurolens.optics.glass import inverse_square_um
 from neurolens.surrogates.cores import InvariantPolynomial, MirrorPolynomial, Network, Partitioned, RawPolynomial
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.model import STOP, Core, LensModel
+from neurolens.surrogates.residual import Residual
 
 # A gate goes where at most this share of the domain's rays is blocked by it and by nothing else.
 IDLE_SHARE = 1e-5
@@ -107,9 +108,9 @@ def _keep(core: Core, scalars: list[int]) -> Any:
     if isinstance(core, (InvariantPolynomial, MirrorPolynomial, RawPolynomial)):
         return replace(core, scalars=core.scalars[scalars])
     if isinstance(core, Network):
-        rows = [*range(6), *(6 + k for k in scalars)]
+        rows = [*range(core.ab_rows), *(core.ab_rows + k for k in scalars)]
         return replace(core, output=(core.output[0][rows], core.output[1][rows]))
-    if isinstance(core, Partitioned):
+    if isinstance(core, (Partitioned, Residual)):
         return replace(core, parts=tuple(_keep(part, scalars) for part in core.parts))
     raise TypeError(f"no part of a core of type {type(core).__name__}")
 
@@ -144,8 +145,10 @@ def _fixed(core: Core, w: float) -> Any:
         return replace(core, exponents=exponents, components=core.components @ merge, scalars=core.scalars @ merge)
     if isinstance(core, Network):
         # With w_half = 0 the network is shown w = 0; its shift makes that the wanted one.
-        return replace(core, shift=core.shift - w * torch.tensor([0, 0, 0, 1], dtype=core.shift.dtype))
-    if isinstance(core, Partitioned):
+        shift = core.shift.clone()
+        shift[-1] -= w
+        return replace(core, shift=shift)
+    if isinstance(core, (Partitioned, Residual)):
         # Zones are split by rho, which no wavelength changes.
         return replace(core, parts=tuple(_fixed(part, w) for part in core.parts))
     raise TypeError(f"no fixed wavelength for a core of type {type(core).__name__}")

@@ -27,6 +27,7 @@ from neurolens.surrogates.cores import InvariantPolynomial, MirrorPolynomial, Ne
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import Core, Gate, LensModel, Scales
+from neurolens.surrogates.residual import Residual
 
 SCHEMA = 1
 # Cores by the name that files carry. Their fields are tensors, integer arrays, numbers, tuples and other cores.
@@ -36,6 +37,7 @@ CORES: dict[str, type] = {
     "raw": RawPolynomial,
     "network": Network,
     "partitioned": Partitioned,
+    "residual": Residual,
 }
 _NAMES = {kind: name for name, kind in CORES.items()}
 _MAX_FILE = 64 * 2**20
