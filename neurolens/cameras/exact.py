@@ -16,6 +16,7 @@ from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_search import COARSE, FINE
 from neurolens.cameras.sampling import check_film, positive
+from neurolens.optics.differentials import film_tangents, trace_differentials
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
@@ -96,6 +97,10 @@ class ExactCamera:
         """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
         return self.film.sample(film_mm, pupil, wavelength_nm)
 
+    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """As `sample`, with the differentials of the rays, carried through every surface."""
+        return self.film.sample(film_mm, pupil, wavelength_nm, self._with_differentials)
+
     def for_worker(self) -> ExactCamera:
         """This camera, in a render worker. A forked process must not enter torch's thread pool: it never returns."""
         if os.getpid() != self._pid:
@@ -114,6 +119,19 @@ class ExactCamera:
         assert done.transmittance is not None
         scene = torch.stack(list(done.rays)).to(torch.float32).numpy()
         return SceneRays(scene, done.transmittance.to(torch.float32).numpy(), done.status.numpy())
+
+    def _with_differentials(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SceneRays:
+        fx, fy, px, py, wavelength = (
+            torch.from_numpy(np.ascontiguousarray(a)).double() for a in (*film, *pupil, wavelength_nm)
+        )
+        film_z = self.lens.film_z_mm
+        assert film_z is not None
+        rays = camera_rays(fx, fy, film_z, px, py, self._pupil_z_mm)
+        gap = film_z - self._pupil_z_mm
+        distance = torch.sqrt((fx - px) ** 2 + (fy - py) ** 2 + gap * gap)
+        moves = trace_differentials(self.lens, rays, film_tangents(rays, distance), wavelength).derivatives
+        d_film = torch.stack([torch.stack(list(m)) for m in moves], 1).to(torch.float32).numpy()
+        return self._scene(film, pupil, wavelength_nm)._replace(d_film=d_film)
 
     def _passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
         """Whether light passes from film points (r, 0) through pupil points; see `passes_at_any_azimuth`."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens import status as st
-from neurolens.cameras.contract import CameraRays, FloatArray
+from neurolens.cameras.contract import CameraRays, FloatArray, RayDifferentials
 from neurolens.cameras.pupil_boxes import Passes, PupilTable
 from neurolens.cameras.pupil_search import FINE, Detail, outline_of
 from neurolens.errors import InputError
@@ -22,11 +22,15 @@ _QUADRATURE, _WAVELENGTHS = 256, 3
 
 
 class SceneRays(NamedTuple):
-    """Scene-side rays: scene_ray [6, N] (x, y, z mm, unit direction; lens frame), transmittance [N], status [N]."""
+    """Scene-side rays: scene_ray [6, N] (x, y, z mm, unit direction; lens frame), transmittance [N], status [N].
+
+    `d_film`: derivatives [6, 2, N] of scene_ray by the film point's x and y (per mm), where they were asked for.
+    """
 
     scene_ray: FloatArray
     transmittance: FloatArray
     status: NDArray[np.int32]
+    d_film: FloatArray | None = None
 
 
 # Film points [2, N] mm, pupil points [2, N] mm and wavelengths [N] nm to scene-side rays.
@@ -70,17 +74,23 @@ class LensFilm:
         self.exposure = 1.0
         self.exposure = self._exposure_on_axis(wavelength_nm)
 
-    def sample(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays for film points [2, N] in mm, random numbers [2, N] in [0, 1) and wavelengths [N] in nm."""
+    def sample(
+        self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, scene: SceneFunction | None = None
+    ) -> CameraRays:
+        """Rays for film points [2, N] in mm, random numbers [2, N] in [0, 1) and wavelengths [N] in nm.
+
+        `scene` stands in for the lens's own function, for one that gives more (`SceneRays.d_film`).
+        """
+        scene = scene or self.scene
         pupil, area = self.outline.sample(film_mm, square, wavelength_nm)
         lit = area > 0
         if lit.all():
-            return self._rays(film_mm, pupil, area, wavelength_nm)
+            return self._rays(scene, film_mm, pupil, area, wavelength_nm)
         # A film point that nothing reaches is dark: no ray is traced. A model calls it outside its domain, and so does
         # this.
         some = np.flatnonzero(lit)
         film, pupil = film_mm.take(some, axis=1), pupil.take(some, axis=1)
-        rays = self._rays(film, pupil, area.take(some), wavelength_nm.take(some))
+        rays = self._rays(scene, film, pupil, area.take(some), wavelength_nm.take(some))
         place = np.cumsum(lit)
         place *= lit
 
@@ -92,13 +102,17 @@ class LensFilm:
 
         direction = spread(rays.direction, -1)
         direction[:2] *= lit
-        return CameraRays(
-            spread(rays.origin_m, 0), direction, spread(rays.weight, 0), spread(rays.status, st.OUTSIDE_DOMAIN)
-        )
+        moves = rays.differentials
+        if moves is not None:
+            moves = RayDifferentials(spread(moves.origin_m, 0), spread(moves.direction, 0))
+        status = spread(rays.status, st.OUTSIDE_DOMAIN)
+        return CameraRays(spread(rays.origin_m, 0), direction, spread(rays.weight, 0), status, moves)
 
-    def _rays(self, film: FloatArray, pupil: FloatArray, area: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+    def _rays(
+        self, scene: SceneFunction, film: FloatArray, pupil: FloatArray, area: FloatArray, wavelength_nm: FloatArray
+    ) -> CameraRays:
         """Rays of lit film points [2, N] through pupil points [2, N] of the densities 1 / area [N]."""
-        out = self.scene(film, pupil, wavelength_nm)
+        out = scene(film, pupil, wavelength_nm)
         # w = T A cos^4 / Z^2, over the exposure on the axis.
         slope = (pupil - film) * np.float32(1 / self.distance_mm)
         cos2 = 1 / (1 + np.einsum("in,in->n", slope, slope))
@@ -107,9 +121,11 @@ class LensFilm:
         weight = np.where(out.status == st.PASSED, weight, np.float32(0))
         origin = out.scene_ray[:3] * np.float32(1e-3)
         origin[2] -= np.float32(1e-3 * self.film_z_mm)
-        return CameraRays(
-            origin, np.ascontiguousarray(out.scene_ray[3:]), weight.astype(np.float32), out.status.astype(np.int32)
-        )
+        moves = None
+        if out.d_film is not None:
+            moves = RayDifferentials(out.d_film[:3] * np.float32(1e-3), out.d_film[3:])
+        direction = np.ascontiguousarray(out.scene_ray[3:])
+        return CameraRays(origin, direction, weight.astype(np.float32), out.status.astype(np.int32), moves)
 
     def _exposure_on_axis(self, wavelength_nm: tuple[float, float]) -> float:
         """Integral of T cos over solid angle at the film's centre, mean over the wavelengths: midpoint rule."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from neurolens import status as st
 from neurolens.apertures import Aperture
 from neurolens.cameras.contract import CameraRays, FloatArray
 from neurolens.cameras.lens_film import LensFilm, SceneRays
+from neurolens.cameras.onnxderivatives import OnnxDerivatives
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.sampling import check_film, positive
@@ -62,6 +64,7 @@ class OnnxCamera:
         card = model.card
         lens, domain = card["lens"], card["domain"]
         self.model = model
+        self._derivatives: OnnxDerivatives | None = None
         self.name = str(lens.get("name", model.path.stem))
         self.film_mm = check_film(film_mm)
         low, high = (float(v) for v in domain["wavelength_nm"])
@@ -91,10 +94,22 @@ class OnnxCamera:
         """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
         return self.film.sample(film_mm, pupil, wavelength_nm)
 
+    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """As `sample`, with the differentials of the rays.
+
+        Raises:
+            InputError: a model exported without derivatives.
+        """
+        assert isinstance(self.film.scene, _Scene)
+        if self._derivatives is None:
+            self._derivatives = OnnxDerivatives(self.model)
+        whole = partial(self.film.scene.with_differentials, self._derivatives)
+        return self.film.sample(film_mm, pupil, wavelength_nm, whole)
+
     def for_worker(self) -> OnnxCamera:
         """The same camera with a session of its own, for another process or thread."""
         other = copy(self)
-        other.model, other.film = self.model.reopened(), copy(self.film)
+        other.model, other.film, other._derivatives = self.model.reopened(), copy(self.film), None
         assert isinstance(self.film.scene, _Scene)
         other.film.scene = replace(self.film.scene, model=other.model)
         return other
@@ -117,6 +132,13 @@ class _Scene:
         stopped = np.int32(st.blocked(int(self.model.card["lens"].get("stop_surface", 0)), st.RIM))
         status = np.where(inside | (out.status != st.PASSED), out.status, stopped)
         return SceneRays(out.scene_ray, out.transmittance, status)
+
+    def with_differentials(
+        self, derivatives: OnnxDerivatives, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray
+    ) -> SceneRays:
+        """As a call, with `SceneRays.d_film`."""
+        moves = derivatives(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm).d_film
+        return self(film, pupil, wavelength_nm)._replace(d_film=moves)
 
     def passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
         """Whether rays pass at one wavelength; bool [N]."""

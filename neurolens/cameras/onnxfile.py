@@ -61,6 +61,37 @@ def read_checked(path: str | Path) -> tuple[bytes, dict[str, Any]]:
     return data, _card(file, metadata)
 
 
+def without_outputs(data: bytes, names: frozenset[str]) -> bytes:
+    """The same model without some of its outputs, so that nothing is computed for them."""
+    if not any(name.encode() in data for name in names):
+        return data
+
+    def kept(number: int, value: Any) -> bool:
+        return not (number == 12 and isinstance(value, memoryview) and _text(_fields(value), 1) in names)
+
+    def message(fields: Iterator[tuple[int, Any]]) -> bytes:
+        return b"".join(_encoded(number, value) for number, value in fields)
+
+    graph = message((n, v) for n, v in _walk(memoryview(_one(_fields(memoryview(data)), 7))) if kept(n, v))
+    return message((n, graph if n == 7 else v) for n, v in _walk(memoryview(data)))
+
+
+def _encoded(number: int, value: Any) -> bytes:
+    """One field of a message: a number, or bytes."""
+    if isinstance(value, int):
+        return _as_varint(number << 3) + _as_varint(value)
+    return _as_varint(number << 3 | 2) + _as_varint(len(value)) + bytes(value)
+
+
+def _as_varint(value: int) -> bytes:
+    found = bytearray()
+    while value > 0x7F:
+        found.append(value & 0x7F | 0x80)
+        value >>= 7
+    found.append(value)
+    return bytes(found)
+
+
 def _card(file: Path, metadata: dict[str, str]) -> dict[str, Any]:
     if CARD_KEY not in metadata:
         raise ModelError(f"{file}: no card: its metadata has no {CARD_KEY!r}, so this is no model made by neurolens")
@@ -101,15 +132,30 @@ def _check_sizes(graph: Fields) -> None:
     """Refuse graphs whose tensors grow beyond reason, before any memory is taken for them.
 
     Tensors of a lens model are [rows, rays]. No operator of the list makes more rows than its largest input has, but
-    Concat, which adds them up; a chain of those could ask for any amount from a file of a thousand bytes.
+    Concat, which adds them up; a chain of those could ask for any amount from a file of a thousand bytes. Products
+    with a matrix of the file have its rows, and parts of a Split their stated ones.
     """
-    rows = {_text(t, 8): max(_dimensions(t), default=1) for t in map(_fields, graph.get(5, []))}
+    tensors = {_text(t, 8): t for t in map(_fields, graph.get(5, []))}
+    first = {name: (_dimensions(t) or [1])[0] for name, t in tensors.items()}
+    rows = {name: max(_dimensions(t), default=1) for name, t in tensors.items()}
     for node in map(_fields, graph.get(1, [])):
-        sizes = [rows.get(bytes(name).decode("utf-8"), INPUT_ROWS) for name in node.get(1, [])]
-        grown = sum(sizes) if _text(node, 4) == "Concat" else max(sizes, default=1)
+        kind = _text(node, 4)
+        inputs, outputs = ([bytes(name).decode("utf-8") for name in node.get(n, [])] for n in (1, 2))
+        sizes = [rows.get(name, INPUT_ROWS) for name in inputs]
+        grown = sum(sizes) if kind == "Concat" else max(sizes, default=1)
+        if kind in ("MatMul", "Gemm") and inputs and inputs[0] in first:
+            grown = max(first[inputs[0]], *sizes[2:], 1)
         if grown > MAX_ROWS:
-            raise ModelError(f"operator {_text(node, 4)} makes {grown} rows, expected at most {MAX_ROWS}")
-        rows.update((bytes(name).decode("utf-8"), grown) for name in node.get(2, []))
+            raise ModelError(f"operator {kind} makes {grown} rows, expected at most {MAX_ROWS}")
+        parts = _parts(tensors[inputs[1]]) if kind == "Split" and len(inputs) > 1 and inputs[1] in tensors else []
+        for i, name in enumerate(outputs):
+            rows[name] = parts[i] if len(parts) == len(outputs) and 0 < parts[i] <= grown else grown
+
+
+def _parts(tensor: Fields) -> list[int]:
+    """The numbers of an int64 tensor held as raw bytes; none for others."""
+    raw = tensor.get(9, [b""])[-1]
+    return [int(v) for v in np.frombuffer(raw, "<i8")] if not isinstance(raw, int) and len(raw) % 8 == 0 else []
 
 
 def _dimensions(tensor: Fields) -> list[int]:

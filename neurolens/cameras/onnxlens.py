@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens import status as st
 from neurolens.cameras.cardcheck import check_card
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.onnxfile import read_checked
-from neurolens.cameras.states import STATE, axes_of, card_at, default_state
+from neurolens.cameras.onnxfile import read_checked, without_outputs
+from neurolens.cameras.states import STATE, axes_of, card_at, default_state, state_numbers
 from neurolens.errors import InputError, ModelError
 
 INPUTS = {"rays": ("tensor(float)", 5, None), "film_z_mm": ("tensor(float)", 1), "stop_radius_mm": ("tensor(float)", 1)}
@@ -25,6 +25,8 @@ OUTPUTS = {
     "stop_xy_mm": ("tensor(float)", 2, None),
     "status": ("tensor(int32)", None),
 }
+# Outputs that a file may have besides; see `onnxderivatives`.
+DERIVATIVES = {name: ("tensor(float)", 2, 6, None) for name in ("scene_ray_d_film", "scene_ray_d_pupil")}
 # Rays a call of onnxruntime: enough to hide the cost of its operators, few enough for the caches.
 BATCH = 16384
 MAX_RAYS = 2**27
@@ -57,7 +59,13 @@ class OnnxLens:
         self.path, self.card, self.threads = path, card, threads
         self.axes, self.state = axes_of(card), default_state(card)
         self._data = data
-        self._session = _session(path, data, threads, len(self.axes))
+        self._session = open_session(
+            path,
+            without_outputs(data, frozenset(DERIVATIVES)),
+            threads,
+            {**INPUTS, STATE: ("tensor(float)", len(self.axes))} if self.axes else INPUTS,
+            OUTPUTS,
+        )
 
     def at(self, *state: float) -> OnnxLens:
         """The same model in another state, its card with the lens and the domain there; one session serves all.
@@ -69,6 +77,11 @@ class OnnxLens:
         if self.axes or state:
             other.card, other.state = card_at(self.card, self.axes, state), tuple(float(v) for v in state)
         return other
+
+    @property
+    def data(self) -> bytes:
+        """The file."""
+        return self._data
 
     @property
     def pupil_z_mm(self) -> float:
@@ -134,16 +147,9 @@ class OnnxLens:
 
     def _in_state(self, state: float | Sequence[float]) -> OnnxLens:
         """`at`, for any numbers: out of range, where there is no domain, rays are sent with that of this state."""
-        try:
-            values = tuple(float(v) for v in np.atleast_1d(np.asarray(state, np.float64)))
-        except (TypeError, ValueError):
-            values = ()
-        if not self.axes or len(values) != len(self.axes):
-            expected = f"{len(self.axes)} numbers ({', '.join(a.name for a in self.axes) or 'a model of one state'})"
-            raise InputError("OnnxLens.rays", "state", state, expected)
+        other, values = copy(self), state_numbers(self.axes, state)
         if all(a.limits[0] <= v <= a.limits[1] for a, v in zip(self.axes, values, strict=True)):
-            return self.at(*values)
-        other = copy(self)
+            other.card = card_at(self.card, self.axes, values)
         other.state = values
         return other
 
@@ -232,7 +238,15 @@ def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
-def _session(path: Path, data: bytes, threads: int, axes: int) -> Any:
+def open_session(
+    path: Path, data: bytes, threads: int, inputs: dict[str, tuple[Any, ...]], outputs: dict[str, tuple[Any, ...]]
+) -> Any:
+    """A session of onnxruntime on the CPU.
+
+    Raises:
+        ModelError: onnxruntime cannot load the bytes, or inputs or outputs are others than those expected: by name the
+            type, then the dimensions, None for the number of rays.
+    """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
@@ -241,10 +255,7 @@ def _session(path: Path, data: bytes, threads: int, axes: int) -> Any:
         session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises types of its own, without a common base
         raise ModelError(f"{path}: onnxruntime cannot load it ({_first_line(error)})") from error
-    for what, expected, found in (
-        ("input", {**INPUTS, STATE: ("tensor(float)", axes)} if axes else INPUTS, session.get_inputs()),
-        ("output", OUTPUTS, session.get_outputs()),
-    ):
+    for what, expected, found in (("input", inputs, session.get_inputs()), ("output", outputs, session.get_outputs())):
         shapes = {v.name: (v.type, *(None if isinstance(d, str) else d for d in v.shape)) for v in found}
         if shapes != expected:
             raise ModelError(f"{path}: {what}s: got {shapes}, expected {expected} (None: the number of rays)")
@@ -256,6 +267,17 @@ def _check_reference(model: OnnxLens) -> None:
     _check_rays(model, model.card.get("reference"))
     for reference in model.card["states"]["reference"] if model.axes else ():
         _check_rays(model.at(*reference["state"]), reference)
+
+
+def _tolerances(model: OnnxLens, rounding: dict[str, Any]) -> tuple[Any, ...]:
+    """Ten times what float32 may cost, more where the card says that it costs this model more; a changed weight shows."""
+    mm = 1e-5 * max(1.0, abs(float(model.card["lens"]["efl_mm"])))
+    least = {"position_mm": mm, "direction": 1e-5, "transmittance": 1e-5, "stop_mm": mm}
+    try:
+        position, direction, power, stop = (max(v, float(rounding.get(k, 0.0))) for k, v in least.items())
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"{model.path}: card: reference.rounding: {type(error).__name__}: {error}") from error
+    return [[position]] * 3 + [[direction]] * 3, power, stop, 0
 
 
 def _check_rays(model: OnnxLens, reference: Any) -> None:
@@ -272,9 +294,7 @@ def _check_rays(model: OnnxLens, reference: Any) -> None:
         raise ModelError(
             f"{model.path}: reference rays: got status {found.status.tolist()}, expected {wanted[3].tolist()}"
         )
-    # Ten times what float32 may cost; a changed weight shows.
-    mm = 1e-5 * max(1.0, abs(float(model.card["lens"]["efl_mm"])))
-    tolerances = ([[mm]] * 3 + [[1e-5]] * 3, 1e-5, mm, 0)
+    tolerances = _tolerances(model, reference.get("rounding") or {})
     for name, a, b, tolerance in zip(LensRays._fields, found, wanted, tolerances, strict=True):
         off = np.abs(a[..., passed] - b[..., passed])
         if not (off <= np.asarray(tolerance)).all():  # NaN fails

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from neurolens.cameras.contract import CameraRays, FloatArray
+from neurolens.cameras.contract import CameraRays, FloatArray, towards
 from neurolens.cameras.sampling import check_film, positive
 
 
@@ -52,3 +53,10 @@ class Pinhole:
         origin = np.zeros((3, count), np.float32)
         origin[2] = -1e-3 * self.focal_mm
         return CameraRays(origin, direction, (cos2 * cos2).astype(np.float32), np.zeros(count, np.int32))
+
+    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """As `sample`, with the differentials of the rays, all of which start at the hole."""
+        rays = self.sample(film_mm, pupil, wavelength_nm)
+        slope = np.zeros((3, 2, film_mm.shape[1]), np.float32)
+        slope[0, 0] = slope[1, 1] = -1 / self.focal_mm
+        return replace(rays, differentials=towards(rays.direction / -rays.direction[2], slope, rays.origin_m))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from neurolens import status as st
 from neurolens.apertures import Aperture
-from neurolens.cameras.contract import CameraRays, FloatArray
+from neurolens.cameras.contract import CameraRays, FloatArray, towards
 from neurolens.cameras.sampling import check_film, concentric_disk, positive
 from neurolens.focus import film_z_mm
 
@@ -92,3 +93,10 @@ class ThinLens:
         inside = self.aperture.inside(lens[0], lens[1], self.radius_mm)
         status = np.where(inside, st.PASSED, st.blocked(0, st.RIM)).astype(np.int32)
         return CameraRays(origin, direction, np.where(inside, weight, np.float32(0)), status)
+
+    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """As `sample`, with the differentials of the rays, which turn about their points on the lens."""
+        rays = self.sample(film_mm, pupil, wavelength_nm)
+        slope = np.zeros((3, 2, film_mm.shape[1]), np.float32)
+        slope[0, 0] = slope[1, 1] = -1 / self.image_distance_mm
+        return replace(rays, differentials=towards(rays.direction / -rays.direction[2], slope, rays.origin_m))

@@ -91,7 +91,13 @@ def test_a_core_of_another_kind_is_differentiated_all_the_same() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["laikin_double_gauss_50", "muller_fisheye_100", "canon_aspheric_50", "nikon_zoom_70_200"]
+    "name",
+    [
+        "laikin_double_gauss_50",
+        "muller_fisheye_100",
+        pytest.param("canon_aspheric_50", marks=pytest.mark.slow),
+        pytest.param("nikon_zoom_70_200", marks=pytest.mark.slow),
+    ],
 )
 def test_differentials_are_those_of_the_exact_lens_to_one_percent(name: str) -> None:
     known = prepared(name)
