@@ -17,14 +17,16 @@ from neurolens import __version__
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.evaluate import fresh
 from neurolens.evaluate.fresh import FreshRays, fresh_rays
+from neurolens.evaluate.rays import ray_errors
 from neurolens.files import atomic_write_text
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
 from neurolens.progress import Report
+from neurolens.surrogates import checkpoint
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model
-from neurolens.surrogates.model import Prediction
+from neurolens.surrogates.model import LensModel, Prediction
 from neurolens.surrogates.pairs import PairSet
 
 # Keys of the ray and vignetting errors that a model's card promises and its record shows.
@@ -103,7 +105,8 @@ def fit_and_measure(
     known = _known_record(note, file, fingerprint)
     if known is not None:
         return Measured(settings, file, known)
-    model = fit_model(prepared, settings, report)
+    training = folder / f"{settings.label}.training.npz"  # what a killed run left
+    model = fit_model(prepared, settings, report, checkpoint=training, error_um=_error_um(prepared))
     export_onnx(model, file, errors={})
     on = rays() if rays else shared_rays(prepared, vignetting_rays)
     errors = measure_on(on, load_model(file))
@@ -126,7 +129,14 @@ def fit_and_measure(
     }
     made = {"fingerprint": fingerprint, "sha256": _sha256(file), "record": record}
     atomic_write_text(note, json.dumps(made, indent=1))
+    checkpoint.clear(training)
     return Measured(settings, file, record)
+
+
+def _error_um(prepared: Prepared) -> Callable[[LensModel], float]:
+    """Film-equivalent RMS of models, as their cards will give it."""
+    pairs = prepared.pairs
+    return lambda model: ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict)["rms_um"]
 
 
 def _fingerprint(prepared: Prepared, settings: ModelSettings, vignetting_rays: int) -> str:
