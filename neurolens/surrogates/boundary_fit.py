@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neurolens.errors import InputError
 from neurolens.surrogates.bases import (
     Exponents,
     invariant_exponents,
@@ -94,7 +95,13 @@ def solve_scalars(
     """Transmittance on the passing rays, each gate on the rays that get as far, most on those that it decides.
 
     Features are those of `pairs.train`, of `boundary` and of `pairs.far`.
+
+    Raises:
+        InputError: no more rays near the boundaries than terms.
     """
+    if len(data.boundary) <= len(features):
+        expected = f"more rays near the rims than the {len(features)} terms"
+        raise InputError("fit", "rim", len(data.boundary), expected)
     fit = GateFit(boundary_features, gate_values(data.pairs.lens, data.gates, data.boundary), data.boundary_weights[0])
     values = gate_values(data.pairs.lens, data.gates, data.pairs.far)
     fit.block(far_features, values, gate_reach(data.gates, data.pairs.far))

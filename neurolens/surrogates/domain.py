@@ -163,8 +163,9 @@ def _best_plane_z_mm(lens: Lens, bounds: PupilBounds, film_z_mm: float) -> float
         boxes = ((r + (low - r) * s, r + (high - r) * s, half * s) for r, low, high, half in lit)
         return max(max(abs(a), abs(b), math.hypot((a + b) / 2, h)) for a, b, h in boxes) / distance
 
+    f = abs(first_order(lens).efl_mm)
     start = 0.25 * (film_z_mm - float(lens.vertices_mm[len(lens.surfaces) - 1]))
-    end = max(_REACH * abs(first_order(lens).efl_mm), here)
+    end = max(_REACH * f if math.isfinite(f) else 0.0, here)
     count = math.ceil(math.log(max(end / start, 1.0)) / math.log(_STEP)) + 1
     best = min((start * _STEP**k for k in range(count)), key=spread)
     return film_z_mm - best if spread(here) ** 2 > _BETTER * spread(best) ** 2 else bounds.pupil_z_mm
@@ -215,16 +216,30 @@ def sample_domain(domain: Domain, count: int, seed: int, skip: int = 0) -> FilmR
     Scrambled Sobol points (Owen scrambling, torch): the same seed gives the same rays; `skip` continues the sequence,
     so that splits never share a ray.
     """
+    s = sobol_points(count, seed, skip)
+    film_x, film_y = _disc(s[0], s[1], domain.film_radius_mm)
+    pupil_x, pupil_y = _disc(s[2], s[3], domain.pupil_radius_mm)
+    return FilmRays(film_x, film_y, film_planes(domain, s[5]), pupil_x, pupil_y, wavelengths_of(domain, s[4]))
+
+
+def sobol_points(count: int, seed: int, skip: int) -> Tensor:
+    """[6, N] scrambled Sobol points; `skip` continues a sequence."""
     engine = SobolEngine(6, scramble=True, seed=seed)
     if skip:
         engine.fast_forward(skip)
-    s = engine.draw(count, dtype=torch.float64).T
-    film_x, film_y = _disc(s[0], s[1], domain.film_radius_mm)
-    pupil_x, pupil_y = _disc(s[2], s[3], domain.pupil_radius_mm)
-    low, high = domain.wavelength_nm
+    return engine.draw(count, dtype=torch.float64).T
+
+
+def film_planes(domain: Domain, s: Tensor) -> Tensor:
+    """One of `FILM_PLANES` film planes for each number from 0 to 1."""
     near, far = domain.film_z_mm
-    step = torch.floor(s[5] * FILM_PLANES).clamp_max(FILM_PLANES - 1) / (FILM_PLANES - 1)
-    return FilmRays(film_x, film_y, near + (far - near) * step, pupil_x, pupil_y, low + (high - low) * s[4])
+    return near + (far - near) * torch.floor(s * FILM_PLANES).clamp_max(FILM_PLANES - 1) / (FILM_PLANES - 1)
+
+
+def wavelengths_of(domain: Domain, s: Tensor) -> Tensor:
+    """The domain's wavelengths, from the shortest for 0 to the longest for 1."""
+    low, high = domain.wavelength_nm
+    return low + (high - low) * s
 
 
 def _disc(a: Tensor, b: Tensor, radius: float) -> tuple[Tensor, Tensor]:

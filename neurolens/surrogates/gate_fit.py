@@ -22,8 +22,8 @@ class GateFit:
         """Fit values [G, N] with weights [G, N]."""
         # In orthogonal columns, so that normal equations keep their digits; what depends on others is left out.
         norms = features.norm(dim=1).clamp_min(1e-300)
-        left, sizes, right = torch.linalg.svd(torch.linalg.qr((features / norms[:, None]).T)[1])
-        kept = sizes > _DEPENDENT * sizes.max()
+        _, sizes, right = torch.linalg.svd(torch.linalg.qr((features / norms[:, None]).T)[1], full_matrices=False)
+        kept = sizes > _DEPENDENT * sizes[:1]  # the largest, where there is any ray
         self._turn = (right[kept] / sizes[kept, None]).T / norms[:, None] * math.sqrt(features.shape[1])  # [M, K]
         columns = features.T @ self._turn
         self._grams, self._moments = [], []

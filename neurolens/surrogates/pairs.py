@@ -19,6 +19,7 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import Rays, trace
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
+from neurolens.surrogates.lit import SPARSE, draw, lit_share
 
 SCHEMA = 3
 SPLITS = ("train", "held_out", "rim", "edge", "far")
@@ -130,24 +131,27 @@ def make_pairs(
     wanted = {"train": settings.train, "held_out": settings.held_out}
     found: dict[str, list[PairSet]] = {name: [] for name in SPLITS}
     counts = dict.fromkeys(found, 0)
-    drawn, tested = 0, 0
+    drawn, tested = 0, 0.0
+    if lit_share(domain) < SPARSE:  # then `draw` leaves out what is far
+        everywhere = trace_pairs(lens, sample_domain(domain, _BATCH, settings.seed + 1), domain.pupil_z_mm)
+        _keep(found["far"], counts, everywhere, _is_far(lens, everywhere), "far", (settings.rim + 1) // 2)
     total = sum(wanted.values())
     while counts["train"] < wanted["train"] or counts["held_out"] < wanted["held_out"]:
         split = "train" if counts["train"] < wanted["train"] else "held_out"
-        batch = trace_pairs(lens, sample_domain(domain, _BATCH, settings.seed, drawn), domain.pupil_z_mm)
+        inputs, stands_for = draw(domain, _BATCH, settings.seed, drawn)
+        batch = trace_pairs(lens, inputs, domain.pupil_z_mm)
         passed = batch.status == st.PASSED
         if split == "train":
             needed = wanted["train"] - counts["train"]
             order = torch.nonzero(passed)[:, 0]
-            tested += int(order[needed - 1]) + 1 if len(order) >= needed else len(batch)
-            rim, edge = _teaches_rims(lens, batch), _teaches_edges(lens, batch)
-            for name, near in (("rim", rim), ("edge", edge), ("far", ~(rim | edge | passed))):
+            used = int(order[needed - 1]) + 1 if len(order) >= needed else len(batch)
+            tested += stands_for * used / max(len(batch), 1)
+            for name, chosen in (("rim", _teaches_rims), ("edge", _teaches_edges), ("far", _is_far)):
                 most = settings.rim if name == "rim" else (settings.rim + 1) // 2
-                found[name].append(batch.select(near).select(slice(0, most - counts[name])))
-                counts[name] += len(found[name][-1])
+                _keep(found[name], counts, batch, chosen(lens, batch), name, most)
         found[split].append(batch.select(passed).select(slice(0, wanted[split] - counts[split])))
         counts[split] += len(found[split][-1])
-        drawn += len(batch)
+        drawn += _BATCH
         if drawn > 10000 * (counts["train"] + counts["held_out"] + 10):
             raise InputError(
                 lens.path,
@@ -159,7 +163,18 @@ def make_pairs(
             progress((counts["train"] + counts["held_out"]) / total)
     joined = {name: join_pairs(sets) for name, sets in found.items()}
     joined |= {name: _without_the_rest(joined[name]) for name in ("edge", "far")}
-    return RayPairs(lens, domain, settings, **joined, tested=tested)
+    return RayPairs(lens, domain, settings, **joined, tested=round(tested))
+
+
+def _keep(sets: list[PairSet], counts: dict[str, int], batch: PairSet, chosen: Tensor, name: str, most: int) -> None:
+    """Add the chosen rays of a batch to a split, up to `most` in all."""
+    sets.append(batch.select(chosen).select(slice(0, most - counts[name])))
+    counts[name] += len(sets[-1])
+
+
+def _is_far(lens: Lens, batch: PairSet) -> Tensor:
+    """Rays that do not pass, and of which no other split tells."""
+    return ~(_teaches_rims(lens, batch) | _teaches_edges(lens, batch) | (batch.status == st.PASSED))
 
 
 def _teaches_rims(lens: Lens, batch: PairSet) -> Tensor:

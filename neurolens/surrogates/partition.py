@@ -35,9 +35,9 @@ def fit_partitioned(
         fit: fits one core to the ray pairs of a zone.
 
     Raises:
-        InputError: fewer than one zone, or zones with fewer than 200 training rays.
+        InputError: fewer than one zone, or several with fewer than 200 training rays each.
     """
-    if zones < 1 or len(pairs.train) < zones * _FEWEST_RAYS:
+    if zones < 1 or (zones > 1 and len(pairs.train) < zones * _FEWEST_RAYS):
         most = max(1, len(pairs.train) // _FEWEST_RAYS)
         raise InputError("fit", "partitions", zones, f"1 to {most} zones for {len(pairs.train)} training rays")
     rhos = {name: encoding(getattr(pairs, name).inputs).invariants()[0] for name in _FITTED}
