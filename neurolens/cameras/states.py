@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from neurolens.axes import Axis, product, weights
 from neurolens.errors import InputError
 from neurolens.statetable import mix_domain, mix_lens
@@ -33,6 +36,22 @@ def card_at(card: Mapping[str, Any], axes: Sequence[Axis], state: Sequence[float
     nodes, w = card["states"]["nodes"], weights(axes, state)
     lens = mix_lens([n["lens"] for n in nodes], w)
     return {**card, "lens": lens, "domain": mix_domain([n["domain"] for n in nodes], w)}
+
+
+def state_numbers(axes: Sequence[Axis], state: ArrayLike) -> tuple[float, ...]:
+    """A state as given to a call, in range or not.
+
+    Raises:
+        InputError: another number of values than axes, or no numbers.
+    """
+    try:
+        values = tuple(float(v) for v in np.atleast_1d(np.asarray(state, np.float64)))
+    except (TypeError, ValueError):
+        values = ()
+    if not axes or len(values) != len(axes):
+        expected = f"{len(axes)} numbers ({', '.join(a.name for a in axes) or 'a model of one state'})"
+        raise InputError("OnnxLens.rays", "state", state, expected)
+    return values
 
 
 def state_for(

@@ -35,13 +35,14 @@ _FRESH = 7919
 
 
 def random_states(axes: Sequence[Axis], count: int, seed: int) -> list[State]:
-    """States uniform over the ranges, as float32 holds them; the last end of every axis is the first of them."""
+    """States uniform over the ranges, as float32 holds them: of every axis, one in each of `count` equal parts."""
     generator = np.random.default_rng(seed)
-    found: list[State] = [tuple(a.range[1] for a in axes)]
-    while len(found) < count:
-        values = (float(np.float32(generator.uniform(*a.range))) for a in axes)
-        found.append(tuple(min(max(v, a.range[0]), a.range[1]) for a, v in zip(axes, values, strict=True)))
-    return found
+    columns = []
+    for axis in axes:
+        low, high = axis.range
+        place = (generator.permutation(count) + generator.uniform(size=count)) / count
+        columns.append([min(max(float(np.float32(low + (high - low) * p)), low), high) for p in place])
+    return list(zip(*columns, strict=True))
 
 
 def errors_at(model: OnnxLens, space: StateSpace, state: State, rays: int, seed: int) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,7 +23,7 @@ from neurolens.evaluate.records import plain
 from neurolens.evaluate.speed import race
 from neurolens.evaluate.state_errors import card_errors, errors_at, random_states
 from neurolens.files import atomic_write_text
-from neurolens.progress import Progress, Report
+from neurolens.progress import Progress
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.onnx_state import export_states
@@ -49,7 +49,12 @@ def state_settings(settings: ModelSettings, rays: int, seed: int) -> StateSettin
 
 
 def fit_and_measure_states(
-    space: StateSpace, settings: StateSettings, folder: Path, *, states: int = STATES, report: Report | None = None
+    space: StateSpace,
+    settings: StateSettings,
+    folder: Path,
+    *,
+    states: int = STATES,
+    report: Callable[[float], None] | None = None,
 ) -> dict[str, Any]:
     """Fit, export and measure one model, or take what the folder holds if it was made by the same settings and version.
 

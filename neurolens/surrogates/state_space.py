@@ -20,6 +20,8 @@ from neurolens.surrogates.domain import Domain, domain_of
 # Degree of the polynomials between stated positions: of a zoom, by the largest ratio of two neighbours, so that
 # interpolation adds no more error than the nodes have (measured on five zooms).
 FOCUS_DEGREE, _BASE_DEGREE, _DEGREES_PER_LOG = 4, 2, 4.6
+# With both axes the nodes multiply: one degree less of each.
+_FEWER = 1
 _SAME = 1e-3  # focal lengths that differ by less than this share are one
 # Zoom positions at which the common near limit of internal focus is sought.
 _LIMITS = 9
@@ -159,4 +161,5 @@ def axes_of(lens: Lens, *, zoom: bool, internal: bool, state: str | float | None
     low, high = first.range
     places = [1 / (1 / high + (1 / low - 1 / high) * k / (_LIMITS - 1)) for k in range(_LIMITS)]
     inner = [v for v in places if low < v < high]
-    return first, focus_axis(lens, [*(n for n, _ in first.stated), *inner])
+    focus = focus_axis(lens, [*(n for n, _ in first.stated), *inner])
+    return replace(first, degree=max(1, first.degree - _FEWER)), replace(focus, degree=focus.degree - _FEWER)
