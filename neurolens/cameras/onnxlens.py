@@ -270,12 +270,14 @@ def _check_reference(model: OnnxLens) -> None:
 
 
 def _tolerances(model: OnnxLens, rounding: dict[str, Any]) -> tuple[Any, ...]:
-    """Ten times what float32 may cost, more where the card says that it costs this model more; a changed weight shows."""
+    """Ten times what float32 may cost, more where the card says that it costs this model more; changed weights show."""
     mm = 1e-5 * max(1.0, abs(float(model.card["lens"]["efl_mm"])))
     least = {"position_mm": mm, "direction": 1e-5, "transmittance": 1e-5, "stop_mm": mm}
     try:
-        position, direction, power, stop = (max(v, float(rounding.get(k, 0.0))) for k, v in least.items())
-    except (TypeError, ValueError) as error:
+        position, direction, power, stop = found = [max(v, float(rounding.get(k, 0.0))) for k, v in least.items()]
+        if not np.isfinite(found).all():
+            raise ValueError("not finite")
+    except (AttributeError, TypeError, ValueError) as error:
         raise ModelError(f"{model.path}: card: reference.rounding: {type(error).__name__}: {error}") from error
     return [[position]] * 3 + [[direction]] * 3, power, stop, 0
 

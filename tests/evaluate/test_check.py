@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from lens_models import domain, exported, lens, model
 
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.check import check_model
@@ -16,7 +17,6 @@ from neurolens.evaluate.fresh import STOPS, ZONED, fresh_rays, measure
 from neurolens.evaluate.measure import measure_errors
 from neurolens.evaluate.vignetting import ZONES, vignetting_errors
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from tests.lens_models import domain, exported, lens, model
 
 RAYS = 6000
 

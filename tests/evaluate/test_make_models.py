@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from lens_models import LENSES
 
 from neurolens.cli import main
 from neurolens.config import from_dict
@@ -18,7 +19,6 @@ from neurolens.evaluate.measure import Measured
 from neurolens.evaluate.models_list import Entry, Library, chosen, read_list
 from neurolens.progress import Progress
 from neurolens.surrogates.fit import ModelSettings
-from tests.lens_models import LENSES
 
 QUIET = Progress(quiet=True)
 

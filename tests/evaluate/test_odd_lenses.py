@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from lens_models import LENSES
 
 from neurolens.cameras.model import load_model
 from neurolens.errors import InputError
@@ -19,7 +20,6 @@ from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from tests.lens_models import LENSES
 
 AIR: dict[str, float] = {}
 BK7, SK16, F2 = {"n_d": 1.5168, "V_d": 64.17}, {"n_d": 1.62041, "V_d": 60.32}, {"n_d": 1.62004, "V_d": 36.37}

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from lens_models import LENSES
 
 from neurolens.cli import main
 from neurolens.errors import InputError
@@ -20,7 +21,6 @@ from neurolens.evaluate.surrogate_page import lens_page, summary_page, write_len
 from neurolens.progress import Progress
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
-from tests.lens_models import LENSES
 
 SETTINGS = BenchSettings(
     DomainChoice(focus_m=(math.inf, math.inf), wavelength_nm=(400.0, 700.0)),

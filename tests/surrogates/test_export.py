@@ -9,12 +9,15 @@ from pathlib import Path
 
 import lens_models
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import torch
 
 from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.cameras.model import load_model
+from neurolens.errors import InputError, ModelError
+from neurolens.modelfile import CARD_KEY
 from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.card import card_of, card_to_json
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
@@ -181,3 +184,23 @@ def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     core = replace(model.core, scalars=model.core.scalars * math.nan)  # type: ignore[type-var, attr-defined]
     with pytest.raises(InputError, match="finite"):
         export_onnx(replace(model, core=core), tmp_path / "bad.onnx", {})
+
+
+def test_the_card_says_what_float32_costs(tmp_path: Path) -> None:
+    """Within it reference rays come out; beyond it, and where it is no number, the file is refused."""
+    file = lens_models.exported("fisheye")
+    rounding = load_model(file).card["reference"]["rounding"]
+    assert set(rounding) == {"position_mm", "direction", "transmittance", "stop_mm"}
+    assert all(0 <= v < 1e-3 for v in rounding.values())
+    for changed, refused in ((1e-3, False), ("inf", True), ("much", True), (None, True)):
+        proto = onnx.load(file)
+        entry = next(p for p in proto.metadata_props if p.key == CARD_KEY)
+        card = json.loads(entry.value)
+        card["reference"]["rounding"]["stop_mm"] = changed
+        entry.value = json.dumps(card)
+        onnx.save(proto, tmp_path / "changed.onnx")
+        if refused:
+            with pytest.raises(ModelError, match="rounding"):
+                load_model(tmp_path / "changed.onnx")
+        else:
+            load_model(tmp_path / "changed.onnx")
