@@ -51,7 +51,8 @@ class ModelSettings:
         name: of the file and of the table's row; made from the other settings where empty.
         method: "thin", "thick" (first order); "dense", "omp", "ols", "adaptive" (polynomials); "mlp"; "ols+mlp" (a
             polynomial and a network on what it leaves); the published methods of `neurolens.surrogates.published`.
-        basis, terms, degree, replacement, elimination, growth: see `PolynomialSettings`.
+        basis, terms, degree, replacement, elimination, growth, position_weight, transmittance_terms: see
+            `PolynomialSettings`.
         planes: whether `PLANES_SEARCHED` methods in the invariants search the planes of the light field.
         partitions: zones of the film with a fit of their own (polynomials and networks).
         units, layers: of the network. steps, seconds: its training ends by either, or by convergence; results repeat
@@ -72,6 +73,8 @@ class ModelSettings:
     replacement: bool = True
     elimination: bool = True
     growth: int = 2
+    position_weight: float = 2.0
+    transmittance_terms: int = 16
     planes: bool = True
     partitions: int = 1
     units: int = 16
@@ -87,6 +90,7 @@ class ModelSettings:
             "terms": (1, 2000),
             "degree": (0, most_degree),
             "growth": (0, 16),
+            "transmittance_terms": (0, 200),
             "partitions": (1, 64),
             "units": (1, 512),
             "layers": (1, 8),
@@ -97,6 +101,8 @@ class ModelSettings:
                 raise InputError("settings", name, getattr(self, name), f"an integer from {least} to {most}")
         if not 0 < self.seconds:
             raise InputError("settings", "seconds", self.seconds, "a number above 0")
+        if not 0 < self.position_weight < math.inf:
+            raise InputError("settings", "position_weight", self.position_weight, "a number above 0")
         if self.target_um is not None and not 0 < self.target_um < math.inf:
             raise InputError("settings", "target_um", self.target_um, "micrometres above 0, or none")
 
@@ -207,7 +213,7 @@ def _fit_once(
             core, encoding, gates = fitting.fit_published(prepared, settings, progress)
         else:
             if settings.planes and settings.basis == "invariants" and settings.method in PLANES_SEARCHED:
-                encoding = fit_planes(prepared.pairs, encoding, settings.terms)
+                encoding = fit_planes(prepared.pairs, encoding, settings.terms, settings.position_weight)
             core = _fit_core(replace(prepared, encoding=encoding), settings, progress, checkpoint)
     pairs = prepared.pairs
     return LensModel(
@@ -266,6 +272,5 @@ def _fit_core(
 
 def _polynomial_settings(settings: ModelSettings) -> PolynomialSettings:
     method = "ols" if settings.method == "ols+mlp" else cast(PolynomialMethod, settings.method)
-    return PolynomialSettings(
-        **{f.name: getattr(settings, f.name) for f in fields(PolynomialSettings)} | {"method": method}
-    )
+    shared = {f.name: getattr(settings, f.name) for f in fields(PolynomialSettings)}
+    return PolynomialSettings(**shared | {"method": method})

@@ -19,7 +19,7 @@ from neurolens.surrogates.bases import invariant_exponents, monomials, vector_gr
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.pairs import PairSet, RayPairs
 from neurolens.surrogates.selection import Sweep, backward, forward
-from neurolens.surrogates.targets import film_equivalent, targets_of
+from neurolens.surrogates.targets import targets_of, weighed_apart
 
 # A trial fit: rays, degree of its candidates, terms before elimination over terms kept.
 _RAYS, _DEGREE, _SURPLUS = 2500, 7, 1.5
@@ -65,7 +65,7 @@ def _proper(encoding: Encoding, shift: Shift) -> bool:
     return max(map(abs, shift)) <= _FARTHEST and p_weight > least and abs(p_weight + u_weight) > least
 
 
-def fit_planes(pairs: RayPairs, encoding: Encoding, terms: int) -> Encoding:
+def fit_planes(pairs: RayPairs, encoding: Encoding, terms: int, position_weight: float) -> Encoding:
     """Search the planes for a polynomial of `terms` coefficients per vector output. Deterministic.
 
     The encoding itself is among the trials; it comes back where none does better, or where there are too few rays for
@@ -74,7 +74,7 @@ def fit_planes(pairs: RayPairs, encoding: Encoding, terms: int) -> Encoding:
     rays = pairs.train.select(slice(0, _RAYS))
     if encoding.mirror or len(rays) < 4 * _SURPLUS * terms:
         return encoding
-    trial = _trial(pairs, encoding, rays, terms)
+    trial = _trial(pairs, encoding, rays, terms, position_weight)
     known: dict[Shift, float] = {}
 
     def at(shift: Shift) -> float:
@@ -94,9 +94,11 @@ def fit_planes(pairs: RayPairs, encoding: Encoding, terms: int) -> Encoding:
     return encoding if best == (0.0, 0.0) else shifted(encoding, pairs.train, best)
 
 
-def _trial(pairs: RayPairs, encoding: Encoding, rays: PairSet, terms: int) -> Callable[[Shift], float]:
+def _trial(
+    pairs: RayPairs, encoding: Encoding, rays: PairSet, terms: int, position_weight: float
+) -> Callable[[Shift], float]:
     targets = targets_of(pairs.lens, encoding, rays)
-    outputs = film_equivalent(pairs.lens, pairs.domain, targets.vectors)
+    outputs = weighed_apart(pairs.lens, pairs.domain, targets.vectors, position_weight)
     squares = (outputs.flatten(1) ** 2).sum(1).numpy()
     exponents = invariant_exponents(_DEGREE, dispersive=encoding.w_half != 0)
 

@@ -40,7 +40,8 @@ from neurolens.surrogates.lightfield import Encoding, LightField
 from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate
 from neurolens.surrogates.pairs import RayPairs
 from neurolens.surrogates.selection import Sweep, backward, forward, matching_pursuit, replace_terms
-from neurolens.surrogates.targets import film_equivalent
+from neurolens.surrogates.targets import weighed_apart
+from neurolens.surrogates.transmittance_terms import transmittance_terms
 
 Method = Literal["dense", "omp", "ols", "adaptive"]
 
@@ -62,6 +63,8 @@ class PolynomialSettings:
         elimination: whether "ols" first chooses half as many terms again, and drops those that cost least.
         growth: rounds in which "ols" in the invariants adds to the candidates what the chosen terms give, multiplied by
             each variable: terms of higher degree where they help.
+        position_weight: how much more than to first order the position counts in the choice of terms.
+        transmittance_terms: how many more terms the transmittance may have where it needs them.
     """
 
     method: Method = "ols"
@@ -71,6 +74,8 @@ class PolynomialSettings:
     replacement: bool = True
     elimination: bool = True
     growth: int = 2
+    position_weight: float = 2.0
+    transmittance_terms: int = 16
 
 
 def fit_polynomial(
@@ -99,7 +104,8 @@ def fit_polynomial(
 
 def _fit_invariant(data: FitData, settings: PolynomialSettings) -> InvariantPolynomial:
     train = data.train
-    invariants, outputs = train.field.invariants(), film_equivalent(data.pairs.lens, data.pairs.domain, train.vectors)
+    invariants = train.field.invariants()
+    outputs = weighed_apart(data.pairs.lens, data.pairs.domain, train.vectors, settings.position_weight)
     dispersive = data.encoding.w_half != 0
     if settings.method == "adaptive":
         exponents, chosen = grow(invariants, train.field, outputs, settings.terms, dispersive=dispersive)
@@ -122,6 +128,7 @@ def _fit_invariant(data: FitData, settings: PolynomialSettings) -> InvariantPoly
     columns = [place[k % count] + (k >= count) * len(kept) for k in chosen]
     coefficients = solve(vector_columns(features, train.field)[columns], train.vectors[:2].flatten(1))
     exponents = np.concatenate([exponents, boundary_terms(data, exponents)])
+    exponents = np.concatenate([exponents, transmittance_terms(data, exponents, settings.transmittance_terms)])
     ab = torch.zeros((3, 2 * len(exponents)), dtype=torch.float64)
     ab[:2, [c if c < len(kept) else c - len(kept) + len(exponents) for c in columns]] = coefficients
     ab[STOP] = fit_stop(data, exponents)

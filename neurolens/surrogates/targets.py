@@ -66,3 +66,13 @@ def film_equivalent(lens: Lens, domain: Domain, vectors: Tensor) -> Tensor:
     position, direction = film_equivalent_weights(lens, domain)
     at_infinity = direction * vectors[DIRECTION]
     return torch.stack([at_infinity + position * vectors[POSITION], at_infinity])
+
+
+def weighed_apart(lens: Lens, domain: Domain, vectors: Tensor, position_weight: float) -> Tensor:
+    """[2, 2, N] what decides which terms a fit keeps: direction in micrometres on the film, and position.
+
+    Position counts `position_weight` times what first order makes of it (see `film_equivalent_weights`): the point on
+    the front surface matters by itself too, for objects near the lens and for what stands on the front rim.
+    """
+    position, direction = film_equivalent_weights(lens, domain)
+    return torch.stack([direction * vectors[DIRECTION], position_weight * position * vectors[POSITION]])
