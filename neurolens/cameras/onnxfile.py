@@ -21,11 +21,11 @@ MAX_BYTES = 64 * 2**20
 INPUT_ROWS = 16  # rows of an input: more than any has
 MAX_ROWS = 20_000  # of any tensor inside; the largest polynomials known have a thousand terms
 OPERATORS = frozenset(
-    "Abs Add And Cast Clip Concat Cos Div Equal Gather Gemm Greater GreaterOrEqual Identity LessOrEqual MatMul Max Min "
-    "Mul Neg Reciprocal ReduceSum Relu Reshape Sin Slice Split Sqrt Sub Tanh Where".split()
+    "Abs Add And Cast Clip Concat Cos DequantizeLinear Div Equal Gather Gemm Greater GreaterOrEqual Identity "
+    "LessOrEqual MatMul Max Min Mul Neg Reciprocal ReduceSum Relu Reshape Sin Slice Split Sqrt Sub Tanh Where".split()
 )
 # TensorProto.DataType: what models hold, and the numpy type of their raw bytes.
-_TYPES: dict[int, str] = {1: "<f4", 6: "<i4", 7: "<i8"}
+_TYPES: dict[int, str] = {1: "<f4", 3: "<i1", 6: "<i4", 7: "<i8", 10: "<f2"}
 _EXTERNAL = 1  # TensorProto.DataLocation
 
 Fields = dict[int, list[Any]]
@@ -178,10 +178,13 @@ def _check_tensor(tensor: Fields) -> None:
         raise ModelError(f"tensor {name}: its data lie in another file, expected them in the model")
     kind = int(tensor.get(2, [0])[-1])
     if kind not in _TYPES:
-        raise ModelError(f"tensor {name}: data type {kind}, expected float32, int32 or int64")
+        raise ModelError(f"tensor {name}: data type {kind}, expected float32, float16 or integers")
     raw = tensor.get(9, [b""])[-1]
-    if kind == 1:
-        values = np.frombuffer(raw, _TYPES[1]) if len(raw) else _floats(tensor.get(4, []))
+    if kind in (3, 10) and tensor.get(5):  # the other way to hold them, which no writer of models takes
+        raise ModelError(f"tensor {name}: data type {kind} as int32 numbers, expected its raw bytes")
+    if kind in (1, 10):
+        packed = len(raw) or kind == 10
+        values = np.frombuffer(raw, _TYPES[kind]) if packed else _floats(tensor.get(4, []))
         if not np.isfinite(values).all():
             raise ModelError(f"tensor {name}: {int((~np.isfinite(values)).sum())} weights are NaN or infinite")
 
