@@ -55,7 +55,7 @@ PUBLISHED: dict[str, PublishedMethod] = {
                 units=128,
                 layers=3,
                 steps=6000,
-                seconds=120.0,
+                seconds=90.0,
             ),
         ),
     ),

@@ -23,8 +23,6 @@ from neurolens.surrogates.published.cores import Cells, OuterPupil, to_tangents
 from neurolens.surrogates.targets import scales_of
 
 Exponents = NDArray[np.int64]
-# Relative to the largest, for columns of unit length.
-_RCOND = 1e-7
 # Outputs of the published polynomials, with the parity in x and in y that mirror symmetry gives each.
 OUTPUTS = ("position x", "position y", "tangent x", "tangent y", "stop x", "stop y", "transmittance")
 PARITY = ((1, 0), (0, 1), (1, 0), (0, 1), (1, 0), (0, 1), (0, 0))
@@ -122,17 +120,17 @@ def solve_outputs(outputs: tuple[Outputs, ...], supports: list[Exponents]) -> Ra
     return RawPolynomial(exponents, components, rows[6:])
 
 
-def stable_solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None) -> Tensor:
+def stable_solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None, cut: float = 1e-7) -> Tensor:
     """Least squares as `bases.solve`, with singular values cut where float32 could not evaluate what they add.
 
     Raw coordinates of a wide angle are nearly dependent (the slope follows the position), and plain least squares then
-    gives large terms that cancel.
+    gives large terms that cancel. `cut` is relative to the largest singular value of columns of unit length.
     """
     if weights is not None:
         columns, outputs = columns * weights, outputs * weights
     norms = columns.norm(dim=1).clamp_min(1e-300)
     q, r = torch.linalg.qr((columns / norms[:, None]).T)
-    found = torch.linalg.lstsq(r, q.T @ outputs.T, rcond=_RCOND, driver="gelsd").solution
+    found = torch.linalg.lstsq(r, q.T @ outputs.T, rcond=cut, driver="gelsd").solution
     return (found / norms[:, None]).T
 
 

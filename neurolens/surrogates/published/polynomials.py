@@ -7,6 +7,9 @@ Rays pass where they cross the stop, the outer and the inner pupil within their 
 Left open by the papers and chosen here: the wavelength enters as 1 / lambda^2, scaled (they take lambda in micrometres;
 the index is closer to linear so); terms that mirror symmetry forbids are no candidates; the crossing with the stop is
 fitted on rays on both sides of the rims; each scalar's error is its own sum of squares, rays uniform over the domain.
+
+The greedy choice of single terms can end among nearly dependent ones (slope and position of a ray go together), which
+no single exchange leaves: one output of a lens may be several times worse than its mirror image.
 """
 
 from __future__ import annotations

@@ -141,11 +141,13 @@ def fit_rtf(data: RawData, degree: int) -> tuple[Meridian, tuple[Gate, ...]]:
     scene = train.scene
     position = turn(torch.stack([scene.x, scene.y]) / scales_of(lens).position_mm, y)
     direction = turn(torch.stack([scene.dx, scene.dy]), y)
-    values = torch.stack([*position, *direction, -scene.dz, train.transmittance])
+    values = torch.stack([*position, *direction, -scene.dz])
     exponents = meridian_exponents(degree, dispersive=data.dispersive)
     if len(train) <= len(exponents):
         raise InputError("fit", "train", len(train), f"more training rays than the {len(exponents)} terms")
-    outputs = stable_solve(monomials(variables, exponents), values)
+    columns = monomials(variables, exponents)
+    # A coarser cut for the transmittance, which varies little: in float32 its rounding would show first.
+    outputs = torch.cat([stable_solve(columns, values), stable_solve(columns, train.transmittance[None], cut=1e-5)])
     knots, ellipse = fit_ellipses(data)
     core = Meridian(exponents, outputs, slope, e.pupil_scale_mm, e.film_scale_mm, knots, ellipse)
     return core, (Gate(0 if lens.stop_index else len(lens.surfaces) - 1, st.RIM),)
