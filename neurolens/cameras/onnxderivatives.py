@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.onnxlens import DERIVATIVES, INPUTS, OUTPUTS, LensRays, OnnxLens, open_session
+from neurolens.cameras.onnxlens import DERIVATIVES, INPUTS, OUTPUTS, LensRays, OnnxLens
+from neurolens.cameras.onnxsession import open_session
 from neurolens.errors import InputError, ModelError
 
 # Rays a call: these graphs have more rows than those without derivatives.

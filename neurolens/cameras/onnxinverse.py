@@ -14,7 +14,8 @@ from neurolens import status as st
 from neurolens.cameras.cardcheck import check_card
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.onnxfile import read_checked
-from neurolens.cameras.onnxlens import OUTPUTS, open_session
+from neurolens.cameras.onnxlens import OUTPUTS
+from neurolens.cameras.onnxsession import open_session
 from neurolens.errors import InputError, ModelError
 from neurolens.frontsurface import meet_front
 

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import onnxruntime
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens import status as st
 from neurolens.cameras.cardcheck import check_card
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.onnxfile import read_checked, without_outputs
+from neurolens.cameras.onnxsession import first_line, open_session
 from neurolens.cameras.states import STATE, axes_of, card_at, default_state, state_numbers
 from neurolens.errors import InputError, ModelError
 
@@ -179,7 +179,7 @@ class OnnxLens:
         try:
             out = self._session.run(list(OUTPUTS), feeds)
         except Exception as error:  # onnxruntime raises types of its own, without a common base
-            raise ModelError(f"{self.path}: onnxruntime cannot run it ({_first_line(error)})") from error
+            raise ModelError(f"{self.path}: onnxruntime cannot run it ({first_line(error)})") from error
         return LensRays(*(a[..., :count] for a in out))
 
 
@@ -232,34 +232,6 @@ def _empty(count: int) -> LensRays:
     shapes = ((6, count), (count,), (2, count))
     scene, power, stop = (np.empty(shape, np.float32) for shape in shapes)
     return LensRays(scene, power, stop, np.empty(count, np.int32))
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
-
-
-def open_session(
-    path: Path, data: bytes, threads: int, inputs: dict[str, tuple[Any, ...]], outputs: dict[str, tuple[Any, ...]]
-) -> Any:
-    """A session of onnxruntime on the CPU.
-
-    Raises:
-        ModelError: onnxruntime cannot load the bytes, or inputs or outputs are others than those expected: by name the
-            type, then the dimensions, None for the number of rays.
-    """
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # what goes wrong is raised, not printed
-    try:
-        session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime raises types of its own, without a common base
-        raise ModelError(f"{path}: onnxruntime cannot load it ({_first_line(error)})") from error
-    for what, expected, found in (("input", inputs, session.get_inputs()), ("output", outputs, session.get_outputs())):
-        shapes = {v.name: (v.type, *(None if isinstance(d, str) else d for d in v.shape)) for v in found}
-        if shapes != expected:
-            raise ModelError(f"{path}: {what}s: got {shapes}, expected {expected} (None: the number of rays)")
-    return session
 
 
 def _check_reference(model: OnnxLens) -> None:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from neurolens.commands import bench_fused, bench_models, bench_surrogates, bench_vignetting, bench_zoom
+from neurolens.commands import bench_fused, bench_inverse, bench_models, bench_surrogates, bench_vignetting, bench_zoom
 from neurolens.commands.arguments import Parser, whole
 from neurolens.errors import InputError
 
@@ -45,6 +45,7 @@ def add_parser(subparsers: Any) -> None:
     bench_vignetting.add_parsers(kinds)
     bench_fused.add_parser(kinds)
     bench_models.add_parser(kinds)
+    bench_inverse.add_parser(kinds)
     bench_zoom.add_parser(kinds)
 
 

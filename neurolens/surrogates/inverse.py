@@ -161,6 +161,13 @@ class StopSystem:
         vectors, slopes = self._slopes(self.model.encoding(self.rays(u)))
         return vectors[0] - self.wanted, slopes[0, :, :2] * self.by_p + slopes[0, :, 2:4] * self.by_u
 
+    def on_axis(self) -> Tensor:
+        """[2, 2, N] the Jacobian on the axis, that of the first-order map."""
+        none = torch.zeros_like(self.film_z)
+        axis = FilmRays(none, none, self.film_z, none, none, self.w_nm)
+        _, slopes = self._slopes(self.model.encoding(axis))
+        return slopes[0, :, :2] * self.by_p + slopes[0, :, 2:4] * self.by_u
+
     def result(self, solved: Solved, stop_radius_mm: float | None) -> StopRays:
         rays = self.rays(solved.x)
         density = determinant(solved.jacobian).abs() * self.model.scales.stop_mm**2 / self.scale.prod()
@@ -190,6 +197,10 @@ class SceneSystem:
         vectors, slopes = self._slopes(LightField(unknown[2:], unknown[:2], self.target.w))
         residual = torch.cat([vectors[0] - self.target.p, vectors[1] - self.target.u])
         return residual, torch.cat([slopes[:, :, 2:4], slopes[:, :, :2]], 2).flatten(0, 1)
+
+    def on_axis(self) -> Tensor:
+        """[4, 4, N] the Jacobian on the axis, that of the first-order map."""
+        return self(torch.zeros((4, *self.film_z.shape), dtype=self.film_z.dtype))[1]
 
     def rays(self, unknown: Tensor) -> FilmRays:
         """Free space from the two planes to the film."""

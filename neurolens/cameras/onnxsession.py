@@ -1,0 +1,38 @@
+"""Sessions of onnxruntime with the inputs and outputs that are expected, and no others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import onnxruntime
+
+from neurolens.errors import ModelError
+
+
+def open_session(
+    path: Path, data: bytes, threads: int, inputs: dict[str, tuple[Any, ...]], outputs: dict[str, tuple[Any, ...]]
+) -> Any:
+    """A session of onnxruntime on the CPU.
+
+    Raises:
+        ModelError: onnxruntime cannot load the bytes, or inputs or outputs are others than those expected: by name the
+            type, then the dimensions, None for the number of rays.
+    """
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 4  # what goes wrong is raised, not printed
+    try:
+        session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime raises types of its own, without a common base
+        raise ModelError(f"{path}: onnxruntime cannot load it ({first_line(error)})") from error
+    for what, expected, found in (("input", inputs, session.get_inputs()), ("output", outputs, session.get_outputs())):
+        shapes = {v.name: (v.type, *(None if isinstance(d, str) else d for d in v.shape)) for v in found}
+        if shapes != expected:
+            raise ModelError(f"{path}: {what}s: got {shapes}, expected {expected} (None: the number of rays)")
+    return session
+
+
+def first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
