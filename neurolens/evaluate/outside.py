@@ -14,7 +14,7 @@ from neurolens import status as st
 from neurolens.cameras.onnxlens import OnnxLens
 from neurolens.modelfile import DOMAIN_SLACK
 
-_BATCH = 1 << 15
+_BATCH = 1 << 12  # of one film plane and stop
 # Bounds are tested in float32, a few roundings of which may fall either side.
 _ROUNDING = 2e-6
 PASSES_OUTSIDE = "outside the domain, but of another status"
