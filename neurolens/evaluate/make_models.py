@@ -23,6 +23,7 @@ from neurolens.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.evaluate.bench import read_index
 from neurolens.evaluate.candidates import exact_candidates, model_candidate
 from neurolens.evaluate.check import check_model
+from neurolens.evaluate.make_state_models import make_state_entry
 from neurolens.evaluate.measure import Measured, fit_and_measure, shared_rays
 from neurolens.evaluate.models_index import write_index
 from neurolens.evaluate.models_list import Entry, Library
@@ -34,16 +35,16 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
 from neurolens.progress import Progress
 from neurolens.surrogates.domain import Domain
-from neurolens.surrogates.fit import prepare
+from neurolens.surrogates.fit import NETWORKS, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 # The bench fails below this share of the speed-up measured here: machines and days differ, regressions differ more.
 PROMISE = 0.8
 _VIGNETTING_RAYS = 200_000
-_KEPT = (
+_KEPT = tuple(
     "rms_um p99_um direction_rms_deg position_rms_um transmittance_rms false_pass false_block "
-    "coefficients_per_vector parameters bytes fit_s"
-).split()
+    "coefficients_per_vector parameters bytes fit_s".split()
+)
 
 
 def make_models(
@@ -57,7 +58,7 @@ def make_models(
     known, left_out = _known(out)
     todo = [e for e in entries if again or not _stands(e, library.pairs, known, out)]
     for entry in todo:
-        progress.plan({f"{entry.state}: {m.label}": 30.0 if m.method == "mlp" else 5.0 for m in entry.models})
+        progress.plan({f"{entry.state}: {m.label}": 40.0 if m.method in NETWORKS else 10.0 for m in entry.models})
         progress.plan({f"{entry.state}: race": 60.0})
     for entry in todo:
         mine = [row for row in known if row["entry"] == entry.state]
@@ -109,7 +110,9 @@ def fingerprint(entry: Entry, pairs: PairSettings) -> str:
         InputError: a lens that cannot be read.
     """
     settings = [asdict(m) for m in entry.models]
-    asked = [__version__, entry.lens.read().sha256, asdict(entry.domain), settings, entry.best, asdict(pairs)]
+    c = entry.lens
+    state = [c.read().sha256, c.efl_mm, c.configuration, c.f_number, c.zoom, c.focusing]
+    asked = [__version__, state, asdict(entry.domain), settings, entry.best, asdict(pairs)]
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
 
 
@@ -131,6 +134,18 @@ def _sha256(file: Path) -> str:
 
 def make_entry(entry: Entry, library: Library, out: Path, progress: Progress) -> list[dict[str, Any]]:
     """Fit, check and time the models of one lens; writes their files and returns their rows of the index."""
+    make = _make_of_one_state
+    if entry.lens.many_states:
+        make = functools.partial(make_state_entry, kept=_KEPT)
+    common = {
+        "entry": entry.state,
+        "fingerprint": fingerprint(entry, library.pairs),
+        "lens_file": Path(os.path.relpath(entry.lens.file.resolve(), project_root().resolve())).as_posix(),
+    }
+    return [{**row, **common} for row in make(entry, library, out, progress)]
+
+
+def _make_of_one_state(entry: Entry, library: Library, out: Path, progress: Progress) -> list[dict[str, Any]]:
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as scratch:
         warnings.simplefilter("ignore", NeurolensWarning)
         lens = entry.lens.read()
@@ -149,7 +164,7 @@ def make_entry(entry: Entry, library: Library, out: Path, progress: Progress) ->
             timed = race(candidates, domain, report=report)
         rows = []
         for m in measured:
-            row = {**_row(entry, lens, domain, m), "fingerprint": fingerprint(entry, library.pairs)}
+            row = _row(entry, lens, domain, m)
             label, speedup = m.settings.label, timed.speedup(m.settings.label, "exact compiled")
             row |= {
                 "ns_per_ray": timed.timing(label),
@@ -167,7 +182,7 @@ def best_of_each_kind(measured: Sequence[Measured]) -> list[Measured]:
     """The polynomial and the network of the smallest error."""
     kinds: dict[bool, Measured] = {}
     for m in sorted(measured, key=_error):
-        kinds.setdefault(m.settings.method == "mlp", m)
+        kinds.setdefault(m.settings.method in NETWORKS, m)
     return [kinds[kind] for kind in (False, True) if kind in kinds]
 
 
@@ -185,9 +200,7 @@ def _row(entry: Entry, lens: Lens, domain: Domain, m: Measured) -> dict[str, Any
     scaled = {f"{k}_at_21_6": None if m.record.get(k) is None else scale * m.record[k] for k in ("rms_um", "p99_um")}
     return {
         "file": entry.file(m.settings),
-        "entry": entry.state,
         "sha256": _sha256(m.file),
-        "lens_file": Path(os.path.relpath(entry.lens.file.resolve(), project_root().resolve())).as_posix(),
         "lens": lens.name,
         "configuration": entry.lens.configuration,
         "efl_mm": entry.lens.efl_mm,

@@ -25,7 +25,7 @@ from neurolens.progress import Report
 from neurolens.surrogates import checkpoint
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model
+from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model
 from neurolens.surrogates.model import LensModel, Prediction
 from neurolens.surrogates.pairs import PairSet
 
@@ -114,7 +114,7 @@ def fit_and_measure(
     start = time.perf_counter()
     load_model(file)
     load_s = time.perf_counter() - start
-    network = settings.method == "mlp"
+    network = settings.method in NETWORKS
     record: dict[str, Any] = {
         "name": settings.label,
         "family": settings.family,

@@ -43,7 +43,8 @@ class Entry:
     def state(self) -> str:
         """Name of the lens and its state, as model files carry it."""
         c = self.lens
-        parts = [c.file.stem, c.configuration or "", f"{c.efl_mm:g}mm" if c.efl_mm else ""]
+        parts = [c.file.stem, c.configuration or "", f"{c.efl_mm:g}mm" if c.efl_mm else "", c.zoom or ""]
+        parts += ["internal"] if c.focusing == "internal" else []
         return "-".join(p for p in parts if p)
 
     def file(self, settings: ModelSettings) -> str:

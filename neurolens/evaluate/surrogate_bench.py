@@ -33,7 +33,7 @@ from neurolens.optics.pupils import image_radius_mm
 from neurolens.progress import Progress, Report
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import Prepared, fit_model, prepare
+from neurolens.surrogates.fit import NETWORKS, Prepared, fit_model, prepare
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
@@ -145,7 +145,7 @@ def run_bench(
 
 
 def _expected_s(row: Row) -> float:
-    return 30.0 if row.settings.method in ("mlp", "neurolens2017") else 4.0
+    return 30.0 if row.settings.method in (*NETWORKS, "neurolens2017") else 4.0
 
 
 def _record(bench: Bench, row: Row, again: bool, report: Report) -> dict[str, Any]:
@@ -197,7 +197,7 @@ def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
         f"{key}_at_21_6": None if figures[key] is None else bench.per_reference * figures[key]  # type: ignore[operator]
         for key in ("p99_um", "max_um", "position_rms_um")
     }
-    network = row.settings.method == "mlp"
+    network = row.settings.method in NETWORKS
     return {
         **figures,
         **scaled,

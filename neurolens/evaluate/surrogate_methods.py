@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
-from importlib import import_module
-from typing import Any
 
 from neurolens.errors import InputError
+from neurolens.surrogates.ablations import POLYNOMIAL_ABLATIONS, ablated
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.published import PUBLISHED
 
@@ -40,7 +39,16 @@ class Row:
 
 def _ours() -> tuple[ModelSettings, ...]:
     polynomials = tuple(ModelSettings("ols", terms=terms) for terms in (20, 40, 64, 100))
-    return *polynomials, *(ModelSettings("mlp", units=units, layers=2) for units in (8, 16, 32))
+    networks = tuple(ModelSettings("mlp", units=units, layers=2) for units in (8, 16, 32))
+    return *polynomials, *networks, *(ModelSettings("ols+mlp", terms=n, units=u) for n, u in ((40, 8), (64, 16)))
+
+
+def _ablations() -> Iterator[Row]:
+    """Our polynomial of 64 terms with one part left out."""
+    whole = ModelSettings("ols", terms=64)
+    for text in POLYNOMIAL_ABLATIONS:
+        name = f"{whole.label}-{text.replace(' ', '-')}"
+        yield Row(name, "ablations", replace(ablated(whole, text), name=name), text)
 
 
 @cache
@@ -49,22 +57,12 @@ def all_rows() -> tuple[Row, ...]:
     rows = [Row(name, "paraxial", ModelSettings(name)) for name in ("thin", "thick")]
     for method in PUBLISHED.values():
         rows += [Row(s.label, "published", s, method.citation) for s in method.presets]
-    rows += [Row(s.label, "ours", s) for s in (*_ours(), *_extra("residual", "RESIDUALS"))]
-    for name, settings in dict(_extra("ablations", "ABLATIONS")).items():
-        rows.append(Row(name, "ablations", settings))
-    return tuple(rows)
-
-
-def _extra(module: str, name: str) -> Any:
-    """Rows of a module of the fits that a version may lack."""
-    try:
-        return getattr(import_module(f"neurolens.surrogates.{module}"), name)
-    except (ImportError, AttributeError):
-        return ()
+    rows += [Row(s.label, "ours", s) for s in _ours()]
+    return tuple([*rows, *_ablations()])
 
 
 def chosen_rows(names: Sequence[str]) -> tuple[Row, ...]:
-    """Rows by name, by group, or by the name of a published method; none named: all but the ablations.
+    """Rows by name, by group, or by method ("ols", "schrade"; without ablations); none named: all but the ablations.
 
     Raises:
         InputError: a name that is none of these.
@@ -72,7 +70,7 @@ def chosen_rows(names: Sequence[str]) -> tuple[Row, ...]:
     rows, wanted = all_rows(), names or DEFAULT_GROUPS
     picked: dict[str, Row] = {}
     for name in wanted:
-        found = [r for r in rows if name in (r.name, r.group, r.settings.method)]
+        found = [r for r in rows if name in (r.name, r.group) or (name == r.settings.method and r.group != "ablations")]
         if not found and name not in GROUPS:
             known = ", ".join((*GROUPS, *(r.name for r in rows)))
             raise InputError("neurolens bench surrogates", "--methods", name, f"one of: {known}")

@@ -34,7 +34,7 @@ from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.progress import Progress
 from neurolens.surrogates.domain import Domain
-from neurolens.surrogates.fit import Prepared, prepare
+from neurolens.surrogates.fit import NETWORKS, Prepared, prepare
 from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs
 from neurolens.surrogates.threads import pinned_threads
 
@@ -114,7 +114,7 @@ def _plan(experiment: Experiment) -> dict[str, float]:
     """Seconds that each stage may take on two cores, for the time left."""
     plan: dict[str, float] = {"trace ray pairs": 3}
     for m in experiment.model:
-        plan[f"fit {m.label}"] = m.seconds if m.method == "mlp" else 3
+        plan[f"fit {m.label}"] = m.seconds if m.method in NETWORKS else 3
     plan["race for speed"] = 45 if experiment.evaluation.compile_exact else 10
     if experiment.scene_domain is not None:
         plan["fit the scene's domain"] = 5
@@ -168,7 +168,7 @@ def best_models(measured: Sequence[Measured]) -> tuple[str, ...]:
     """Names of the polynomial and of the network with the smallest error."""
     names = []
     for networks in (False, True):
-        rows = [m for m in measured if (m.settings.method == "mlp") == networks and m.settings.family != "paraxial"]
+        rows = [m for m in measured if (m.settings.method in NETWORKS) == networks and m.settings.family != "paraxial"]
         if rows:
             names.append(min(rows, key=_error).settings.label)
     return tuple(names)
