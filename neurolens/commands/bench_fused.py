@@ -12,7 +12,8 @@ _DESCRIPTION = """\
 Fit the smallest polynomial within 1 um RMS and a small network to a few lenses, write them as C, with and
 without what a scene fixes, and race them against the exact trace: written as C by the same means, and
 compiled by torch (a minute a lens more), and against onnxruntime. One thread, float32. Needs a C compiler
-and the extra "train" (torch). Writes fused_speed.md and fused_speed.json."""
+and the extra "train" (torch). Writes fused_speed.md and fused_speed.json; lenses that are not asked for
+keep their rows."""
 
 
 def add_parser(kinds: Any) -> None:
@@ -32,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
 
     from neurolens.errors import NeurolensWarning
     from neurolens.evaluate.compiled_source import find_compiler
-    from neurolens.evaluate.fused_page import write
+    from neurolens.evaluate.fused_page import earlier, write
     from neurolens.evaluate.fused_speed import measure, selected
     from neurolens.evaluate.project import project_root
     from neurolens.progress import Progress
@@ -43,10 +44,11 @@ def run(args: argparse.Namespace) -> int:
     rounds = args.rounds or (5 if args.quick else 20)
     cases = selected(args.only)
     progress = Progress({c.file: 1.0 for c in cases}, quiet=args.quiet)
-    rows, text = [], ""
+    out = args.out or root / "experiments" / "results"
+    rows, text = earlier(out, [Path(c.file).stem for c in cases]), ""
     for case in cases:
         with progress.stage(case.file) as report:
             rows += measure(case, root / "lenses", rounds=rounds, torch_compiled=not args.quick, report=report)
-        text = write(rows, args.out or root / "experiments" / "results", rounds)
+        text = write(rows, out, rounds)
     print(text)
     return 0

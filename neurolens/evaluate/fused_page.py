@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,16 @@ def write(rows: Sequence[Row], folder: Path, rounds: int) -> str:
     atomic_write_text(folder / "fused_speed.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
     atomic_write_text(folder / "fused_speed.md", text)
     return text
+
+
+def earlier(folder: Path, names: Collection[str]) -> list[Row]:
+    """Rows of other lenses than these that stand in a folder's fused_speed.json, if it was made on this machine."""
+    try:
+        data = json.loads((folder / "fused_speed.json").read_text(encoding="utf-8"))
+        same = data["machine"] == machine() and list(data["flags"]) == list(FLAGS)
+        return [Row(**row) for row in data["rows"] if same and row["lens"] not in names]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
 
 
 def goals(rows: Sequence[Row]) -> list[dict[str, Any]]:
