@@ -61,15 +61,17 @@ def make_models(
         progress.plan({f"{entry.state}: {m.label}": 40.0 if m.method in NETWORKS else 10.0 for m in entry.models})
         progress.plan({f"{entry.state}: race": 60.0})
     for entry in todo:
-        mine = [row for row in known if row["entry"] == entry.state]
-        left_out.pop(entry.state, None)
+        made, reason = list[dict[str, Any]](), ""
         try:
             made = make_entry(entry, library, out, progress)
         except NeurolensError as error:
-            left_out[entry.state] = " ".join(str(error).split())
-            made = []
-        for row in mine:
-            if row["file"] not in {r["file"] for r in made}:
+            reason = " ".join(str(error).split())
+        known, left_out = _known(out)  # anew: another process may have made other entries meanwhile
+        left_out.pop(entry.state, None)
+        left_out |= {entry.state: reason} if reason else {}
+        written = {row["file"] for row in made}
+        for row in known:
+            if row["entry"] == entry.state and row["file"] not in written:
                 (out / row["file"]).unlink(missing_ok=True)
         known = [*(row for row in known if row["entry"] != entry.state), *made]
         write_index(_ordered(known, library), left_out, out)
