@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -17,12 +18,15 @@ import torch
 
 from neurolens import status as st
 from neurolens.axes import Axis, product, weights
+from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import OnnxLens, load_model
 from neurolens.errors import InputError, ModelError
 from neurolens.evaluate.rays import ray_errors
+from neurolens.evaluate.state_errors import check_states, random_states, space_of_card
 from neurolens.evaluate.vignetting import vignetting_errors
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.onnx_state import export_states
@@ -221,3 +225,88 @@ def test_damaged_tables_of_states_are_refused(damage: str, tmp_path: Path) -> No
     onnx.save(proto, str(tmp_path / "bad.onnx"))
     with pytest.raises(ModelError):
         load_model(tmp_path / "bad.onnx")
+
+
+class _Two(StateSpace):
+    """The zoom's lens at every state of a second axis."""
+
+    def lens_at(self, state: Sequence[float]) -> Lens:
+        return space().lens_at(state[:1])
+
+
+def test_graph_of_two_axes_agrees_with_the_model(tmp_path: Path) -> None:
+    """Nodes of the second axis are the zoom's with another core: whatever varies, the graph must follow it."""
+
+    def bent(node: LensModel) -> LensModel:
+        core = node.core
+        return replace(node, core=replace(core, ab=1.01 * core.ab, scalars=core.scalars - 0.05))  # type: ignore
+
+    zoom, focus = space().axes[0], Axis("focus", "1/m", (0.0, 0.5), 1)
+    nodes = [n for node in model().nodes for n in (node, bent(node))]
+    both = StateModel(_Two(space().lens, (zoom, focus)), tuple(nodes))
+    lens = load_model(export_states(both, tmp_path / "two.onnx"))
+    assert [a.name for a in lens.axes] == ["zoom", "focus"] and lens.state == (zoom.range[0], 0.0)
+    for state in ((100.25, 0.0), (100.25, 0.375), (zoom.range[1], 0.5)):
+        rays, z = rays_of(both.at(*state), 4000)
+        said, expected = run(lens.at(*state), rays, z), both.at(*state).predict(rays)
+        assert (said.status != expected.status.numpy()).mean() < 2e-3  # type: ignore[attr-defined]
+        passed = (said.status == st.PASSED) & (expected.status.numpy() == st.PASSED)  # type: ignore[attr-defined]
+        off = np.abs(said.scene_ray - torch.stack(list(expected.rays)).numpy())[:, passed]  # type: ignore[attr-defined]
+        assert off[:3].max() < 1e-4 and off[3:].max() < 5e-7
+    for bad in ((100.0, 0.6), (300.0, 0.2), (math.nan, 0.2), (100.0, math.nan), (100.0, -0.1)):
+        said = run(lens, rays, z, state=bad)
+        assert (said.status == st.OUTSIDE_DOMAIN).all()  # type: ignore[attr-defined]
+
+
+def test_cameras_zoom() -> None:
+    """A camera set to a zoom position sends the rays of the model there; names and rounded ends of the source count."""
+    film = (12.0, 8.0)
+    camera = OnnxCamera(loaded(), film_mm=film, focus_m=10.0, zoom=120.0)
+    assert camera.settings["state"] == {"zoom": 120.0} and camera.settings["efl_mm"] == pytest.approx(120.0)
+    assert "states" not in camera.settings["card"]
+    low, high = loaded().axes[0].range
+    assert OnnxCamera(loaded(), film_mm=film, focus_m=10.0).settings["state"] == {"zoom": low}
+    assert OnnxCamera(loaded(), film_mm=film, focus_m=10.0, zoom="200mm").settings["state"] == {"zoom": high}
+    assert OnnxCamera(loaded(), film_mm=film, focus_m=10.0, zoom=200.0).settings["state"] == {"zoom": 200.0}
+    assert OnnxCamera(loaded(), film_mm=film, focus_m=10.0, zoom=80.0).settings["state"] == {"zoom": low}
+    square = np.random.default_rng(0).random((2, 500), np.float32)
+    point = np.zeros((2, 500), np.float32)
+    wavelength = np.full(500, 550, np.float32)
+    rays, again = camera.sample(point, square, wavelength), camera.for_worker().sample(point, square, wavelength)
+    assert np.array_equal(rays.direction, again.direction) and (rays.weight > 0).mean() > 0.9
+    # Through a small stop, rays of the film's centre meet where the camera is focused: 10 m from the film.
+    rays = OnnxCamera(loaded(), film_mm=film, focus_m=10.0, zoom=120.0, f_number=11).sample(point, square, wavelength)
+    t = (-10.0 - rays.origin_m[2]) / rays.direction[2]
+    at = rays.origin_m[:2] + t * rays.direction[:2]
+    assert np.abs(at[:, rays.weight > 0]).max() < 0.001
+    for wrong in (60.0, "wide", 250.0):
+        with pytest.raises(InputError, match="zoom"):
+            OnnxCamera(loaded(), film_mm=film, focus_m=10.0, zoom=wrong)  # type: ignore[arg-type]
+
+
+def test_promises_are_checked_at_fresh_states(tmp_path: Path) -> None:
+    lens_file = lens_models.LENSES / "nikon_zoom_80_200.toml"
+    card = loaded().card
+    space_again = space_of_card(card, loaded().axes, lens_file, exported())
+    _, promises = check_states(loaded(), space_again, rays=1500, count=2)
+    assert [p.key for p in promises] == ["rms_um"] and promises[0].holds
+    too_good = load_model(export_states(model(), tmp_path / "boast.onnx", {"rms_um": 1e-3}))
+    _, promises = check_states(too_good, space_again, rays=1500, count=2)
+    assert not promises[0].holds
+    with pytest.raises(InputError, match="sha256"):
+        space_of_card(card, loaded().axes, lens_models.LENSES / "ogawa_zoom_70_200.toml", exported())
+
+
+def test_random_states_cover_the_range() -> None:
+    states = random_states((ZOOM, FOCUS), 10, seed=4)
+    assert states == random_states((ZOOM, FOCUS), 10, seed=4) != random_states((ZOOM, FOCUS), 10, seed=5)
+    for k, axis in enumerate((ZOOM, FOCUS)):
+        low, high = axis.range
+        parts = sorted(int(10 * (s[k] - low) / (high - low)) for s in states)
+        assert parts == list(range(10))
+
+
+def test_lenses_with_cylinders_are_refused() -> None:
+    lens = read_lens(lens_models.LENSES / "panavision_anamorphic_zoom_21.toml")
+    with pytest.raises(InputError, match="cylinders"):
+        fit_states(StateSpace(lens, (ZOOM,)))
