@@ -84,6 +84,8 @@ def load_fitted(path: str | Path) -> LensModel:
     file = Path(path)
     metadata = _metadata(file)
     card = card_in(file, metadata)
+    if card.get("states"):
+        raise ModelError(f"{file}: a model of many states (zoom, internal focus), expected one of one state")
     if MODEL_KEY not in metadata:
         raise ModelError(f"{file}: it holds no coefficients beside its graph; export it again with this version")
     try:
