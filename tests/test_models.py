@@ -83,7 +83,7 @@ def test_model_keeps_its_index_on_fresh_rays(row: dict[str, Any]) -> None:
 @pytest.mark.parametrize("row", [r for r in ROWS if r.get("axes")], ids=lambda r: r["file"])
 def test_a_model_of_many_states_keeps_its_card_at_others(row: dict[str, Any]) -> None:
     known = model(row["file"])
-    space = space_of_card(known.card, known.axes, ROOT / row["lens_file"])
+    space = space_of_card(known.card, known.axes, ROOT / row["lens_file"], ROOT / "models" / row["file"])
     promises = check_states(known, space, rays=4000, count=2)[1]
     assert promises and all(p.holds for p in promises)
 
