@@ -15,6 +15,8 @@ from neurolens.surrogates.lightfield import LightField
 
 Exponents = NDArray[np.int64]
 
+ROUNDING = 2.0**-24  # of float32
+
 
 def invariant_exponents(degree: int, *, dispersive: bool = True) -> Exponents:
     """[M, 4] exponents of rho, sigma, tau, w up to a total `degree` in the first three.
@@ -72,15 +74,21 @@ def vector_gram(
 def solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None) -> Tensor:
     """Least squares: coefficients [R, C] with coefficients @ columns [C, N] near outputs [R, N], rows weighted by [N].
 
-    By singular values of unit-length columns, so that dependent columns share their effect instead of blowing up.
+    A ridge stands for the rounding of float32, in which models are evaluated: each term then errs by about `ROUNDING`
+    of its own size, and the sum of these squares is part of what is minimised. So dependent columns share their effect
+    instead of blowing up, and columns that are 0 get 0.
     """
     if weights is not None:
         columns, outputs = columns * weights, outputs * weights
-    norms = columns.norm(dim=1).clamp_min(1e-300)
+    norms = columns.norm(dim=1)
+    norms = torch.where(norms > 0, norms, 1.0)
     scaled = (columns / norms[:, None]).T
     # The Gram matrix would square the condition; QR first, then the small factor by singular values.
     q, r = torch.linalg.qr(scaled)
-    found = torch.linalg.lstsq(r, q.T @ outputs.T, rcond=1e-13, driver="gelsd").solution
+    ridge = ROUNDING * torch.eye(len(columns), dtype=r.dtype)
+    rows, wanted = torch.cat([r, ridge]), q.T @ outputs.T
+    padded = torch.cat([wanted, wanted.new_zeros((len(columns), wanted.shape[1]))])
+    found = torch.linalg.lstsq(rows, padded, rcond=1e-13, driver="gelsd").solution
     return (found / norms[:, None]).T
 
 

@@ -119,6 +119,7 @@ def _fit_invariant(data: FitData, settings: PolynomialSettings) -> InvariantPoly
             chosen = _choose(_sweep(exponents, field, wanted), replace(settings, replacement=False))
             exponents = _grown(exponents, chosen, dispersive=dispersive)
         chosen = _choose(_sweep(exponents, field, wanted), settings)
+    chosen = chosen or [0]  # rays on the axis alone choose nothing
     count = len(exponents)
     kept = sorted({k % count for k in chosen})
     place = {k: i for i, k in enumerate(kept)}
