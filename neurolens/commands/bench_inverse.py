@@ -20,6 +20,7 @@ def add_parser(kinds: Any) -> None:
     parser = kinds.add_parser("inverse", help="inverse maps: how often they arrive", description=_DESCRIPTION)
     parser.add_argument("--only", metavar="TEXT", default="", help="lens files whose name holds this text")
     parser.add_argument("--rays", metavar="N", type=whole(1000), default=100_000, help="rays a lens (default: 100000)")
+    parser.add_argument("--raw", action="store_true", help="invert a model of raw monomials too (half a minute a lens)")
     parser.add_argument("--again", action="store_true", help="measure the chosen lenses again")
     parser.add_argument("--out", metavar="DIR", type=Path, help="folder for the tables (default: experiments/results)")
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
@@ -44,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     for file in missing:
         with progress.stage(file.stem):
             try:
-                records[file.stem] = measure_lens(file, BenchSettings(rays=args.rays))
+                records[file.stem] = measure_lens(file, BenchSettings(rays=args.rays, raw=args.raw))
             except InputError as error:
                 records[file.stem] = {"lens": file.stem, "refused": str(error).removeprefix(f"{root}/")}
         text = write_records(list(records.values()), out)

@@ -1,8 +1,8 @@
 """Inverse maps as ONNX graphs: the first guess, the Newton steps written out, then the model itself at the solution.
 
-Written out, the steps cost one call and no traffic between numpy and the graph; a loop in numpy over a model with
-derivatives does the same arithmetic with 2 to 4 times the time a ray, and gains from early exits only where most rays
-need none of the steps.
+Written out, the steps are one call without traffic between numpy and the graph: about 4 (stop) and 6 (scene) times the
+time of the model. A loop in numpy over a model with derivatives takes 1.6 times as long as that, its guess not counted
+(measured: 3 calls with derivatives and 3 solutions of 4 x 4 systems), and few rays could leave it early.
 """
 
 from __future__ import annotations
