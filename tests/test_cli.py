@@ -28,7 +28,7 @@ DESCRIBED = [
 GAUSS = ROOT / "lenses" / "laikin_double_gauss_50.toml"
 SINGLET = ROOT / "lenses" / "thorlabs_lb1471_biconvex_50.toml"
 ZOOM = ROOT / "lenses" / "ogawa_zoom_70_200.toml"
-COMMANDS = ("lens", "analyse", "glass", "convert", "train", "evaluate", "render")
+COMMANDS = ("lens", "analyse", "glass", "convert", "train", "evaluate", "export", "render")
 
 SCENE = """\
 [camera]

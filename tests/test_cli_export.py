@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import lens_models
@@ -40,8 +41,10 @@ def test_c_and_glsl(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert capsys.readouterr().out.strip() == str(header)
     text = header.read_text()
     assert "gauss_rays(" in text and "stop_radius_mm" not in text[text.index("#ifndef") :]
-    fixes = ["--fix", "wavelengths=450,550", "--fix", "focus=1.5", "--fix", "f_number=4"]
+    fixes = ["--fix", "wavelengths=450,550", "--fix", "focus=1.5", "--fix", "f_number=4", "--json"]
     assert main(["export", str(file), "--to", "glsl", "-o", str(shader), *fixes]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["bands_nm"] == [450.0, 550.0] and told["operations_per_ray"] > 50 and "film_z_mm" not in told["inputs"]
     text = shader.read_text()
     assert "in int band" in text and "film_z_mm" not in text and "Fixed: film plane" in text
 

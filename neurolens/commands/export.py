@@ -7,6 +7,8 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neurolens.commands.arguments import add_json
+from neurolens.commands.output import print_json
 from neurolens.errors import InputError
 
 if TYPE_CHECKING:
@@ -55,6 +57,7 @@ def add_parser(subparsers: Any) -> None:
         help=f"comma-separated: {', '.join(_PARTS)} (default: all; the domain guard is always there)",
     )  # fmt: skip
     parser.add_argument("--name", metavar="WORD", help="of the function (default: the lens's id)")
+    add_json(parser)
     parser.set_defaults(run=run, kept="nothing is written")
 
 
@@ -77,11 +80,19 @@ def run(args: argparse.Namespace) -> int:
     models = fixed_models(model, fix)
     if args.to == "onnx":
         _write_onnx(models, args.out, card if not given else None)
+        about: dict[str, Any] = {}
     else:
         asked = Parts(*(name in parts for name in _PARTS[1:]))
         fixed = Fixed(fix.film_z_mm, fix.stop_radius_mm)
-        export_source(models, args.out, args.to, card, parts=asked, fixed=fixed, name=args.name)
-    print(args.out)
+        written = export_source(models, args.out, args.to, card, parts=asked, fixed=fixed, name=args.name)
+        s = written.signature
+        bands = [m.domain.wavelength_nm[0] for m in models] if s.bands > 1 else []
+        about = {"function": s.name, "inputs": s.inputs, "outputs": [*s.outputs, "status"], "bands_nm": bands}
+        about["operations_per_ray"] = written.operations
+    if args.json:
+        print_json({"file": str(args.out), "to": args.to, "bytes": args.out.stat().st_size, **about})
+    else:
+        print(args.out)
     return 0
 
 

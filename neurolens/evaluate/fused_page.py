@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -18,9 +19,9 @@ One thread, float32, batches that fit the caches, {rounds} rounds in turn in one
 Rays uniform over film and pupil disc of the domain, blocked ones included. "ray": film and pupil point in, position on
 the front surface, direction and domain guard out. "whole": with stop, rims and transmittance.
 
-- exact C: the exact trace as C from the same writer as the models, compiled by the same flags
-  ({flags}): the tracer to beat. Every surface is bare; "ray" tests no rim. Each surface waits for the
-  one before it (a division and two roots in a row), which costs it more than its operations.
+- exact C: the exact trace as C from the same writer as the models, compiled alike
+  ({flags}): the tracer to beat. Every surface is bare; "ray" tests no rim. Each
+  surface waits for the one before it (a division and two roots in a row), which costs more than its operations.
 - exact torch: the project's own tracer compiled by torch, rims tested in both kinds of work.
 - Operations: float operations a ray, a fused multiply-add is one; in brackets, how many are divisions and square roots.
   A core with two 512-bit pipes does 32 a cycle. Bytes: what a ray reads and writes.
@@ -108,9 +109,21 @@ def page(rows: Sequence[Row], rounds: int) -> str:
     m = machine()
     parts = ["# Fused models against the exact lens", "`neurolens bench fused`"]
     parts.append(_NOTES.format(rounds=rounds, flags=" ".join(FLAGS), wavelength=WAVELENGTH_NM))
-    parts.append(f"{m['processor']}, {m['cores']} cores; Python {m['python']}, torch {m['torch']}.")
+    parts.append(f"{m['processor']}, {m['cores']} cores; Python {m['python']}, torch {m['torch']}.{_busy(rows)}")
     parts += [_goal_table(rows), _table(rows)]
     return "\n\n".join(parts) + "\n"
+
+
+def _busy(rows: Sequence[Row]) -> str:
+    """On the load, where it was more than the machine has cores for."""
+    most = max((r.load for r in rows if r.load is not None), default=0.0)
+    if most <= (os.cpu_count() or 1):
+        return ""
+    return (
+        f" Load average\nmeanwhile up to {most:.1f}: others were working too. Short passes fall between interruptions, "
+        "so their best times\nhold; passes of the tracer compiled by torch, over 5 ms for many surfaces, do not: its "
+        "times there are too long, and\nratios over it too high."
+    )
 
 
 def _goal_table(rows: Sequence[Row]) -> str:

@@ -71,6 +71,7 @@ class Row:
         operations: float operations of one ray (a fused multiply-add is one), bytes: that a ray reads and writes.
         roots: square roots and divisions among them.
         speedup: over the exact tracer in C and over the one compiled by torch at the same work, of the same race.
+        load: load average of the machine meanwhile, the larger of before and after.
     """
 
     lens: str
@@ -85,6 +86,7 @@ class Row:
     ns: dict[str, Any] | None = None
     reason: str | None = None
     speedup: dict[str, float] = field(default_factory=dict)
+    load: float | None = None
 
 
 def selected(only: str) -> list[Case]:
@@ -195,6 +197,7 @@ def _timed(row: Row, name: str, timed: Race) -> Row:
     timing = timed.timing(name)
     row.ns = None if timing is None else dict(timing)
     row.reason = timed.unavailable.get(name)
+    row.load = max((v for v in (timed.load_before, timed.load_after) if v is not None), default=None)
     for exact in ("exact C", "exact torch"):
         ratio = timed.speedup(name, f"{exact}, {row.work}")
         if ratio is not None:

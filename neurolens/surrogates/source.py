@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,21 @@ from neurolens.errors import InputError
 from neurolens.files import atomic_write_text
 from neurolens.surrogates.fused import ALL, FREE, Fixed, Parts, fused_program
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.source_c import write_c
+from neurolens.surrogates.source_c import Signature, write_c
 from neurolens.surrogates.source_glsl import write_glsl
 
 WRITERS = {"c": write_c, "glsl": write_glsl}
 _WIDTH = 110
 _ERRORS = ("rms_um", "p99_um", "max_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
+
+
+@dataclass(frozen=True)
+class Written:
+    """A file that was written: its function, and float operations of one ray (a fused multiply-add is one)."""
+
+    path: Path
+    signature: Signature
+    operations: int
 
 
 def export_source(
@@ -30,15 +40,13 @@ def export_source(
     parts: Parts = ALL,
     fixed: Fixed = FREE,
     name: str | None = None,
-) -> Path:
+) -> Written:
     """Write a model, or one for each of several fixed wavelengths, as one function.
 
     Args:
         language: "c" or "glsl".
         card: of the model, for the comment.
         name: of the function; None takes the lens's id.
-
-    Returns the path.
 
     Raises:
         InputError: another language, a name that is no identifier, numbers that float32 cannot hold.
@@ -52,7 +60,7 @@ def export_source(
     program = fused_program(models, parts, fixed)
     target = Path(path)
     atomic_write_text(target, WRITERS[language](program, own, comment_of(models, card, fixed)))
-    return target
+    return Written(target, Signature.of(program, own), sum(program.count().values()))
 
 
 def identifier(text: str) -> str:

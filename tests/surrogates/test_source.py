@@ -240,7 +240,7 @@ def test_the_card_stands_on_top(tmp_path: Path) -> None:
     model = model_of("invariants")
     card = card_of(model, {"rms_um": 1.25})
     card["lens"]["source"] = "A book */ #include <stdlib.h>\nand a second line"
-    text = export_source([model], tmp_path / "lens.h", "c", card).read_text(encoding="utf-8")
+    text = export_source([model], tmp_path / "lens.h", "c", card).path.read_text(encoding="utf-8")
     head = text[: text.index("#ifndef")]
     assert head.startswith("/*") and head.count("*/") == 1 and "\n#include" not in head
     for word in ("rms_um 1.25", "Double Gauss", "film radius", "26 blocked by the stop", "A book"):
