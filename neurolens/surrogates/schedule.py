@@ -25,8 +25,8 @@ _TRIAL_STEPS = 0.1
 _BURST = 10
 # More rays, when the RMS on rays not fitted is larger than that on the fitted ones by this factor.
 _GAP = 1.15
-# Converged, when a burst lowers the loss by less than this share.
-_LITTLE = 0.01
+# Converged, when so many bursts in a row lower the loss by less than this share each.
+_LITTLE, _IDLE = 0.01, 3
 
 
 @dataclass
@@ -39,6 +39,7 @@ class _Place:
         level: how often the rays were doubled.
         champion: the best start so far, by its loss `least`.
         previous: loss after the last burst.
+        idle: bursts in a row that gained little.
         ended: whether the training is over.
     """
 
@@ -50,6 +51,7 @@ class _Place:
     previous: float = math.inf
     damping: float = 0.0
     growth: float = 0.0
+    idle: int = 0
     ended: bool = False
 
 
@@ -134,15 +136,18 @@ class Training:
         """A burst of the best start; then more rays, or the end."""
         place = self._place
         best = self._burst(self.steps, 1.0)
-        still = best.loss > (1 - _LITTLE) * place.previous
+        little = best.loss > (1 - _LITTLE) * place.previous
+        place.idle = place.idle + 1 if little else 0
         place.previous = best.loss
-        if self._unseen is not None and (still or best.loss <= self.enough or place.taken % (2 * _BURST) == 0):
+        done = place.idle >= _IDLE or best.loss <= self.enough
+        if self._unseen is not None and (done or place.taken % (2 * _BURST) == 0):
             outputs = activations(best.hidden, self._unseen.inputs)[-1] @ best.output.T
             if self._unseen.loss(outputs) > _GAP**2 * best.loss:
-                place.level, place.previous, still = place.level + 1, math.inf, False
+                place.level, place.previous, place.idle, done = place.level + 1, math.inf, 0, False
+                self._stand = Stand(best.hidden, min(self._stand.damping, Stand.damping))
                 self._take_rays()
         over = place.taken >= self.steps or self.checkpoint.elapsed_s >= self.seconds or self._stand.stuck
-        place.ended = over or still or place.previous <= self.enough
+        place.ended = over or done
 
     def _report(self, taken: float) -> None:
         """Tell the share done; it never goes back."""
