@@ -30,6 +30,7 @@ examples:
   neurolens train experiments/quickstart.toml
   neurolens train experiments/quickstart.toml --out runs/try --set render.samples=4 --set pairs.seed=2
   neurolens train --lens lenses/cooke_triplet_50.toml
+  neurolens train --lens lenses/nikon_zoom_70_200.toml --zoom-range --out runs/zoom
   neurolens train --lens lenses/brendel_tessar_100.toml --out runs/tessar \\
       --set lens.efl_mm=50
 
