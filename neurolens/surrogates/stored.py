@@ -88,8 +88,8 @@ def load_fitted(path: str | Path) -> LensModel:
         raise ModelError(f"{file}: a model of many states (zoom, internal focus), expected one of one state")
     if MODEL_KEY not in metadata:
         raise ModelError(
-            f"{file}: it holds no coefficients beside its graph: a model of many states, a published method, or one made "
-            "by an earlier version, then export it again"
+            f"{file}: it holds no coefficients beside its graph: a model of many states, a published method, or one "
+            "made by an earlier version, then export it again"
         )
     try:
         data = json.loads(_inflated(metadata[MODEL_KEY]))
