@@ -13,6 +13,7 @@ from neurolens.surrogates.domain import Domain, FilmRays, film_planes, sample_do
 SPARSE = 0.3
 # Boxes are drawn from with this share of their half width more on every side: rays that a rim just blocks are wanted.
 _BOX_MARGIN = 0.15
+_EDGE = 0.03  # of the film radius
 
 
 def draw(domain: Domain, count: int, seed: int, skip: int = 0) -> tuple[FilmRays, float]:
@@ -23,12 +24,18 @@ def draw(domain: Domain, count: int, seed: int, skip: int = 0) -> tuple[FilmRays
 
 
 def draw_everywhere(domain: Domain, count: int, seed: int) -> FilmRays:
-    """Rays that show what blocks light: of the whole domain, and where little of it passes as many about what does."""
-    rays = sample_domain(domain, count, seed)
-    if lit_share(domain) >= SPARSE:
-        return rays
-    lit, _ = sample_lit(domain, count, seed + 1)
-    return FilmRays(*(torch.cat(c) for c in zip(rays.columns(), lit.columns(), strict=True)))
+    """Rays that show what blocks light: of the whole domain, where little of it passes as many about what does, and a
+    tenth as many from the edge of the first and the last film plane, where a rim may just begin to block.
+    """
+    rays = [sample_domain(domain, count, seed)]
+    if lit_share(domain) < SPARSE:
+        rays.append(sample_lit(domain, count, seed + 1)[0])
+    x, y, z, *rest = rays[0].select(slice(0, count // 10)).columns()
+    radius = torch.hypot(x, y).clamp_min(1e-9 * domain.film_radius_mm)
+    stretch = domain.film_radius_mm * (1 - _EDGE * (1 - radius / domain.film_radius_mm)) / radius
+    ends = torch.tensor(domain.film_z_mm, dtype=torch.float64)[torch.arange(len(z)) % 2]
+    rays.append(FilmRays(x * stretch, y * stretch, ends, *rest))
+    return FilmRays(*(torch.cat(c) for c in zip(*(r.columns() for r in rays), strict=True)))
 
 
 def sample_lit(domain: Domain, count: int, seed: int, skip: int = 0) -> tuple[FilmRays, float]:
