@@ -22,7 +22,6 @@ from neurolens.surrogates.projection import Problem, Projection, activations, ch
 
 # Damping to start from, and at which no step helps any more; both relative to the diagonal.
 _DAMPING_START, _DAMPING_END = 1e-2, 1e6
-_MATRIX_RAYS = 4000
 
 Progress = Callable[[float], None]
 
@@ -96,21 +95,19 @@ def _moved(hidden: list[Tensor], step: Tensor) -> list[Tensor]:
 def normal_equations(problem: Problem, at: Projection) -> tuple[Tensor, Tensor, Tensor]:
     """Gauss-Newton for half the summed loss, with the last layer eliminated.
 
-    The gradient is that of all rays; the matrix, which takes nearly all the time and only shapes the step, is that of
-    some `_MATRIX_RAYS` of them (subsampled Gauss-Newton; Byrd, Chin, Neveitt and Nocedal 2011).
-
     Returns the matrix [P, P] and the gradient [P] in the hidden weights, layer by layer, and the matrix's diagonal [P]
     before elimination, by which damping is scaled.
     """
-    every = max(1, len(problem) // _MATRIX_RAYS)
-    few = problem.every(every)
-    factors = at.factors if every == 1 else project(few, at.hidden).factors
     depth = len(at.hidden)
     shapes = [tuple(w.shape) for w in (*at.hidden, at.output)]
     sums: dict[tuple[int, int], Tensor] = {}
-    for part in chunks(len(few)):
-        layers = activations(at.hidden, few.inputs[part])
-        for (k, m), s in _sensitivities(few, at, part, layers).items():
+    gradient = [torch.zeros_like(w) for w in at.hidden]
+    for part in chunks(len(problem)):
+        layers = activations(at.hidden, problem.inputs[part])
+        slopes, sensitivities = _sensitivities(problem, at, part, layers)
+        for k in range(depth):
+            gradient[k] += slopes[k].T @ layers[k]
+        for (k, m), s in sensitivities.items():
             total = _symmetric(s).T @ squares(layers[k]) if k == m else s.flatten(1).T @ _products(layers[k], layers[m])
             sums[k, m] = sums[k, m] + total if (k, m) in sums else total
     blocks = {(k, m): _block(total, shapes[k], shapes[m]) for (k, m), total in sums.items()}
@@ -120,39 +117,21 @@ def normal_equations(problem: Problem, at: Projection) -> tuple[Tensor, Tensor, 
     # An input that never changes (the wavelength of a lens without dispersion) has no slope; the floor keeps it still.
     diagonal = diagonal.clamp_min(1e-12 * float(diagonal.max()) + 1e-30)
     start = 0
-    for factor in factors:
+    for factor in at.factors:
         columns = coupling[:, start : start + len(factor)]
         eliminated = torch.linalg.solve_triangular(factor, columns.T, upper=False)
         matrix -= eliminated.T @ eliminated
         start += len(factor)
-    share = len(problem) / len(few)
-    return share * matrix, _gradient(problem, at), share * diagonal
-
-
-def _gradient(problem: Problem, at: Projection) -> Tensor:
-    """[P] slope of half the summed loss by the hidden weights, by backpropagation."""
-    weights = [w[:, :-1] for w in (*at.hidden, at.output)]
-    total = [torch.zeros_like(w) for w in at.hidden]
-    vectors = len(problem.vectors)
-    for part in chunks(len(problem)):
-        layers = activations(at.hidden, problem.inputs[part])
-        curvature, outputs = problem.curvature[part], at.outputs[part]
-        aa, ab, bb = (curvature[:, i : 3 * vectors : 3] for i in range(3))
-        a, b = outputs[:, 0 : 2 * vectors : 2], outputs[:, 1 : 2 * vectors : 2]
-        heavy = torch.stack([aa * a + ab * b, ab * a + bb * b], 2).flatten(1)
-        slope = torch.cat([heavy, curvature[:, 3 * vectors :] * outputs[:, 2 * vectors :]], 1) - problem.pull[part]
-        for k in range(len(at.hidden) - 1, -1, -1):
-            slope = (slope @ weights[k + 1]) * (1 - layers[k + 1][:, :-1] ** 2)
-            total[k] += slope.T @ layers[k]
-    return torch.cat([t.reshape(-1) for t in total])
+    return matrix, torch.cat([g.reshape(-1) for g in gradient]), diagonal
 
 
 def _sensitivities(
     problem: Problem, at: Projection, part: slice, layers: list[Tensor]
-) -> dict[tuple[int, int], Tensor]:
-    """For a chunk of n rays, by the sums that enter each tanh layer: J_k^T H J_m [n, units_k, units_m], layers k <= m.
+) -> tuple[list[Tensor], dict[tuple[int, int], Tensor]]:
+    """Backpropagation for a chunk of n rays, by the sums that enter each tanh layer.
 
-    The layer after the last hidden one is the output; H is the second derivative by the outputs.
+    Returns the slopes of half the loss [n, units] of each hidden layer, and J_k^T H J_m [n, units_k, units_m] of layers
+    k <= m, where the layer after the last hidden one is the output; H is the second derivative by the outputs.
     """
     depth, vectors = len(at.hidden), len(problem.vectors)
     weights = [w[:, :-1] for w in (*at.hidden, at.output)]
@@ -162,9 +141,14 @@ def _sensitivities(
     a, b, c = last[0 : 2 * vectors : 2], last[1 : 2 * vectors : 2], last[2 * vectors :]
     # H times the last layer: [n, rows, units].
     heavy = torch.cat([torch.stack([aa * a + ab * b, ab * a + bb * b], 2).flatten(1, 2), scalar * c], 1)
+    ya, yb = at.outputs[part, 0 : 2 * vectors : 2], at.outputs[part, 1 : 2 * vectors : 2]
+    y = torch.stack([aa[..., 0] * ya + ab[..., 0] * yb, ab[..., 0] * ya + bb[..., 0] * yb], 2).flatten(1)
+    slope = torch.cat([y, scalar[..., 0] * at.outputs[part, 2 * vectors :]], 1) - problem.pull[part]
     bends = [1 - h[:, :-1] ** 2 for h in layers[1:]]
+    slopes: list[Tensor] = [torch.empty(0)] * depth
     table: dict[tuple[int, int], Tensor] = {}
     for k in range(depth - 1, -1, -1):
+        slope = slopes[k] = (slope @ weights[k + 1]) * bends[k]
         bend = bends[k][:, :, None]
         table[k, depth] = (
             heavy.transpose(1, 2) * bend if k == depth - 1 else (weights[k + 1].T @ table[k + 1, depth]) * bend
@@ -173,7 +157,7 @@ def _sensitivities(
             table[k, m] = (weights[k + 1].T @ table[k + 1, m]) * bend
         below = table[k, depth] if k == depth - 1 else table[k, k + 1]
         table[k, k] = (below @ weights[k + 1]) * bends[k][:, None]
-    return table
+    return slopes, table
 
 
 def _products(a: Tensor, b: Tensor) -> Tensor:
