@@ -15,6 +15,7 @@ from typing import Any
 
 from neurolens.cameras.model import load_model
 from neurolens.config import to_dict, to_toml
+from neurolens.errors import NeurolensWarning
 from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
 from neurolens.evaluate.experiment import Experiment, relative_to
 from neurolens.evaluate.gain import domain_facts, scene_gain
@@ -38,6 +39,8 @@ from neurolens.surrogates.fit import NETWORKS, Prepared, prepare
 from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs
 from neurolens.surrogates.threads import pinned_threads
 
+# False passes or blocks beyond this share are worth a word.
+POOR_SHARE = 0.01
 _IDEAL = ("thin lens", "pinhole")
 _PACKAGES = ("neurolens", "torch", "numpy", "onnxruntime", "onnx", "OpenEXR")
 
@@ -80,6 +83,7 @@ def run_experiment(
         for settings in experiment.model:
             with progress.stage(f"fit {settings.label}") as report:
                 measured.append(fit_and_measure(prepared, settings, models, count, report, fresh))
+            _say_what_is_poor(measured[-1])
         timed = _race(experiment, prepared, measured, progress)
         with progress.stage("illumination"):
             shown = [m for m in measured if m.settings.label in _shown(experiment, measured)]
@@ -108,6 +112,15 @@ def run_experiment(
     write_results(folder / "results.json", results)
     write_report(folder, results)
     return results
+
+
+def _say_what_is_poor(m: Measured) -> None:
+    """Warn of a fitted model that tells badly which rays pass: its card is true, but few would want it."""
+    shares = {key.replace("_", " "): m.record.get(key) or 0.0 for key in ("false_pass", "false_block")}
+    poor = [f"{name} {100 * share:.2g}%" for name, share in shares.items() if share > POOR_SHARE]
+    if poor and m.settings.family != "paraxial":
+        text = f"{m.settings.label}: {', '.join(poor)}; a smaller film or stop, or another method, may do better"
+        warnings.warn(text, NeurolensWarning, stacklevel=2)
 
 
 def _plan(experiment: Experiment) -> dict[str, float]:

@@ -142,7 +142,7 @@ def test_pages_tell_median_and_worst(made: tuple[Path, list[dict[str, Any]]], tm
     page = summary_page({"cooke": records, "other": worse}, "facts")
     row = next(line for line in page.splitlines() if line.startswith(f"| {name} |"))
     better = by_method(records)[name]["direction_rms_deg"]
-    assert f"{(better + 3) / 2:.3g}, 3" in row and row.rstrip(" |").endswith("–") and ", 0.25" in row
+    assert f"{(better + 3) / 2:.3g}, 3" in row and ", 0.25 |" in row  # the least speed-up
     assert f"- {name}: other 3" in page and "- refused: a paper" in page
     write_lens("cooke", records, "facts", tmp_path)
     assert (tmp_path / "cooke.png").stat().st_size > 10_000 and "cooke.png" in (tmp_path / "cooke.md").read_text()

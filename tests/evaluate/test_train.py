@@ -2,17 +2,18 @@
 
 import json
 import os
+import warnings
 from pathlib import Path
 
 import pytest
 
 from neurolens.cameras.model import load_model
-from neurolens.errors import InputError
+from neurolens.errors import InputError, NeurolensWarning
 from neurolens.evaluate.experiment import default_experiment, read_experiment
-from neurolens.evaluate.measure import fit_and_measure
-from neurolens.evaluate.train import run_experiment
+from neurolens.evaluate.measure import Measured, fit_and_measure
+from neurolens.evaluate.train import _say_what_is_poor, run_experiment
 from neurolens.progress import Progress
-from neurolens.surrogates.fit import prepare
+from neurolens.surrogates.fit import ModelSettings, prepare
 from neurolens.surrogates.pairs import make_pairs
 
 ROOT = Path(__file__).parents[2]
@@ -147,3 +148,13 @@ def test_a_lens_file_alone_makes_an_experiment() -> None:
     experiment = default_experiment(ROOT / "lenses/brendel_tessar_100.toml", ["pairs.train=5000"])
     assert [m.label for m in experiment.model] == ["ols-64", "mlp-32x2"]
     assert experiment.pairs.train == 5000
+
+
+def test_a_model_that_tells_badly_what_passes_is_said() -> None:
+    poor = Measured(ModelSettings(), Path("a"), {"false_pass": 0.3, "false_block": 0.001})
+    with pytest.warns(NeurolensWarning, match="ols-40: false pass 30%;"):
+        _say_what_is_poor(poor)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _say_what_is_poor(Measured(ModelSettings(), Path("a"), {"false_pass": 0.003, "false_block": None}))
+        _say_what_is_poor(Measured(ModelSettings("thin"), Path("a"), poor.record))
