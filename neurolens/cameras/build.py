@@ -152,6 +152,7 @@ def _model(path: Path, shot: Shot) -> Camera:
         focus_m=shot.focus_m,
         f_number=shot.f_number_for(widest),
         aperture=shot.aperture,
+        wavelength_nm=shot.wavelength_nm,
     )
 
 

@@ -43,6 +43,7 @@ class OnnxCamera:
         aperture: shape of the stop's opening; None is round.
         zoom: of a model of a zoom's whole range: a focal length in mm, or the name of a state of the source; None
             leaves it at `model.state`.
+        wavelength_nm: range of the light, which sets the exposure; None takes the model's own.
 
     Raises:
         InputError: a focus, stop or zoom position outside the model's domain.
@@ -57,6 +58,7 @@ class OnnxCamera:
         f_number: float | None = None,
         aperture: Aperture | None = None,
         zoom: str | float | None = None,
+        wavelength_nm: tuple[float, float] | None = None,
     ) -> None:
         self.focus_m = positive("focus_m", focus_m, infinite=True)
         if model.axes or zoom is not None:
@@ -71,11 +73,14 @@ class OnnxCamera:
         self.dispersive = low < high
         # A model for one wavelength of a dispersive lens knows that wavelength only; without dispersion any will do.
         self.wavelength_nm = (low, high) if lens["dispersive"] else None
+        # Glass takes more of some wavelengths than of others: exposure is for those that the light has.
+        light = (low, high) if wavelength_nm is None else wavelength_nm
+        used = (min(max(low, light[0]), high), max(min(high, light[1]), low))
         film_z = _film_z(model, self.focus_m)
         stop = _stop_radius(model, f_number)
         round_stop = _Scene(model, film_z, stop)
         scene = replace(round_stop, aperture=aperture)
-        self.film = LensFilm(PupilTable.of(domain["bounds"]), film_z, (low, high), scene, round_stop.passes)
+        self.film = LensFilm(PupilTable.of(domain["bounds"]), film_z, used, scene, round_stop.passes)
         self.settings: dict[str, Any] = {
             "camera": "model",
             "model": str(model.path),

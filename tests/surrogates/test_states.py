@@ -284,6 +284,15 @@ def test_cameras_zoom() -> None:
             OnnxCamera(loaded(), film_mm=film, focus_m=10.0, zoom=wrong)  # type: ignore[arg-type]
 
 
+def test_exposure_is_for_the_wavelengths_of_the_light() -> None:
+    """White light of narrow range on the axis: the mean weight is 1 for that light, whatever range the model knows."""
+    square = np.random.default_rng(0).random((2, 4000), np.float32)
+    for nm in (420.0, 680.0):
+        camera = OnnxCamera(loaded(), film_mm=(12, 8), focus_m=10.0, zoom=120.0, wavelength_nm=(nm, nm))
+        rays = camera.sample(np.zeros((2, 4000), np.float32), square, np.full(4000, nm, np.float32))
+        assert rays.weight.mean() == pytest.approx(1.0, abs=2e-3)
+
+
 def test_promises_are_checked_at_fresh_states(tmp_path: Path) -> None:
     lens_file = lens_models.LENSES / "nikon_zoom_80_200.toml"
     card = loaded().card
