@@ -136,4 +136,5 @@ def _place(
         else:
             ok &= (rays[4] >= low / slack) & (rays[4] <= high * slack)
         sides.append(ok)
-    return ~sides[0], sides[1]
+    # An opening whose square leaves float32 stops every ray but that through its middle, by one status or another.
+    return ~sides[0], sides[1] & (stop >= 1e-6 * d["stop_radius_mm"])
