@@ -20,6 +20,7 @@ from neurolens.surrogates.domain import Domain, domain_of
 # Degree of the polynomials between stated positions: of a zoom, by the largest ratio of two neighbours, so that
 # interpolation adds no more error than the nodes have (measured on five zooms).
 FOCUS_DEGREE, _BASE_DEGREE, _DEGREES_PER_LOG = 4, 2, 4.6
+_LEAST_STEPS = 6  # between nodes, over the whole range
 # With both axes the nodes multiply: one degree less of each.
 _FEWER = 1
 _SAME = 1e-3  # focal lengths that differ by less than this share are one
@@ -128,6 +129,7 @@ def zoom_axis(lens: Lens, degree: int | None = None) -> Axis:
     if degree is None:
         largest = max(b / a for a, b in zip(knots, knots[1:], strict=False))
         degree = _BASE_DEGREE + math.ceil(_DEGREES_PER_LOG * math.log(largest))
+        degree = max(degree, math.ceil(_LEAST_STEPS / (len(knots) - 1)))
     # Ray slopes go as 1 / f: in that coordinate they are straight.
     return Axis("zoom", "mm", tuple(knots), degree, reciprocal=True, stated=tuple((n, e) for e, n in found))
 
