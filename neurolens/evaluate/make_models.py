@@ -160,7 +160,7 @@ def _make_of_one_state(entry: Entry, library: Library, out: Path, progress: Prog
                 made = fit_and_measure(prepared, settings, Path(scratch), _VIGNETTING_RAYS, report, fresh)
                 measured.append(made)
         measured = best_of_each_kind(measured) if entry.best else measured
-        candidates = exact_candidates(lens, domain, compiled=library.compile_exact)
+        candidates = exact_candidates(lens, domain, compiled=library.compile_exact and entry.promise)
         candidates += [model_candidate(m.settings.label, load_model(m.file), domain.stop_radius_mm) for m in measured]
         with progress.stage(f"{entry.state}: race") as report:
             timed = race(candidates, domain, report=report)
