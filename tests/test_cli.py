@@ -470,7 +470,7 @@ def test_a_scene_wider_than_the_model_gets_its_widest_stop(
     [
         (["--f-number", "8", "--focus", "0.5"], ["focus", "0.5"]),
         (["--f-number", "4"], ["f_number", "4"]),
-        (["--f-number", "8", "--efl", "35"], ["efl_mm", "one state"]),
+        (["--f-number", "8", "--efl", "35"], ["efl_mm", "one size"]),
     ],
 )
 def test_a_shot_outside_the_model_is_one_line(
