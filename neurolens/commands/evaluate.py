@@ -38,7 +38,8 @@ examples:
   neurolens evaluate runs/quickstart/models/ols-60.onnx --rays 100000 --seed 5
   neurolens evaluate my.onnx --lens my_lens.toml --json
 
-The lens file is looked for by the card's lens id: ./lenses, lenses beside the model, the project's."""
+The lens file is looked for by the card's lens id: lenses/ beside the model and its folder, where a run
+keeps its own; ./lenses; the project's."""
 
 
 def add_parser(subparsers: Any) -> None:

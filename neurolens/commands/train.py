@@ -21,7 +21,8 @@ Needs the extra "train" (torch).
 Without an experiment file, --lens fits a polynomial and a network to that lens in its default state:
 full aperture, its whole lit film, all wavelengths from 380 to 780 nm (less where its glasses are stated
 for less; one where no dispersion is known), focus from infinity to 14 focal lengths (further where the
-lens is too long for that).
+lens is too long for that). A file of another program (Zemax, CODE V, ...) is read as "neurolens convert"
+reads it; where that lacks something, convert first, with its options.
 
 A run that was interrupted goes on where it stopped: models that are there, made by the same
 settings, are kept."""
@@ -35,7 +36,7 @@ examples:
       --set lens.efl_mm=50
 
 The folder holds report.html, results.json, config.toml (all settings, defaults written out),
-models/ and pictures/."""
+lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -79,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("neurolens train", "--zoom-range, --internal-focus", "(without --lens)", "--lens FILE")
     if args.lens is not None:
         args.overrides = [*states, *args.overrides]
-        experiment = default_experiment(args.lens, args.overrides)
+        experiment = default_experiment(_own_format(args.lens, folder), args.overrides)
     else:
         experiment = read_experiment(args.experiment, args.overrides)
     progress = Progress(quiet=args.quiet)
@@ -104,6 +105,23 @@ def _run_folder(args: argparse.Namespace) -> Path:
     if folder.exists() and not folder.is_dir():
         raise InputError("neurolens train", "--out", str(folder), "a folder, not a file")
     return folder
+
+
+def _own_format(file: Path, folder: Path) -> Path:
+    """The lens file, or what it converts to, kept in the run folder.
+
+    Raises:
+        InputError: as `read_any`; nothing is left behind then.
+    """
+    if file.suffix.lower() == ".toml" or not file.is_file():
+        return file
+    from neurolens.commands.convert import write_checked
+    from neurolens.readers.any_format import read_any
+
+    lens, kept = read_any(file), folder / "lenses" / f"{file.stem}.toml"
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    write_checked(lens, kept)
+    return kept
 
 
 def _command(args: argparse.Namespace) -> str:

@@ -19,9 +19,9 @@ from neurolens.evaluate.fresh import STOPS, ZONED, Findings, FreshRays, fresh_ra
 from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import EachRay
 from neurolens.evaluate.vignetting import ZONES
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.readers.any_format import read_any
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
@@ -173,15 +173,15 @@ def lens_of_card(
     """The exact lens that a model stands for, in the model's zoom state, size and stop.
 
     Args:
-        lens_file: None looks for the card's lens id in lenses/: of the working folder, beside the model's folder, and
-            of this project.
+        lens_file: None looks for the card's lens id in lenses/: beside the model, beside its folder (a run keeps its
+            lens there), of the working folder and of this project.
 
     Raises:
         InputError: no such file, or one whose prescription is not the card's in any zoom state.
     """
     wanted = card["lens"]
     path = Path(lens_file) if lens_file is not None else find_lens(str(wanted["id"]), Path(model_file))
-    tabled = read_lens(path)
+    tabled = read_any(path)
     for lens in _states(tabled, float(wanted["efl_mm"])):
         if lens.sha256 == wanted["sha256"]:
             return lens.with_stop_radius(float(card["domain"]["stop_radius_mm"]))
@@ -190,16 +190,16 @@ def lens_of_card(
 
 
 def find_lens(lens_id: str, model_file: Path) -> Path:
-    """The lens file of an id: in lenses/ of the working folder, beside the model's folder, or of this project.
+    """The lens file of an id: in lenses/ beside the model or its folder, of the working folder, or of this project.
 
     Raises:
         InputError: no such file.
     """
     name = f"{Path(lens_id).name}.toml"
     roots = (
-        Path("."),
         model_file.resolve().parent,
         model_file.resolve().parent.parent,
+        Path("."),
         Path(neurolens.__file__).parents[1],
     )
     for root in roots:

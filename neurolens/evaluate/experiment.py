@@ -12,6 +12,7 @@ from typing import Literal
 
 from neurolens.config import from_dict, read_config
 from neurolens.errors import InputError
+from neurolens.files import atomic_write_text
 from neurolens.optics.glass import glass_of
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
@@ -265,6 +266,14 @@ def relative_to(experiment: Experiment, folder: Path) -> Experiment:
         render=replace(experiment.render, scenes=tuple(moved(s) for s in experiment.render.scenes)),
         scene_domain=None if gain is None else replace(gain, scene=moved(gain.scene)),
     )
+
+
+def keep_lens(experiment: Experiment, folder: Path) -> None:
+    """Leave the lens file in lenses/ of a run folder, where `check.find_lens` looks: the run's models need no other."""
+    source, kept = experiment.lens.file, folder / "lenses" / experiment.lens.file.name
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    if not (kept.exists() and kept.samefile(source)):
+        atomic_write_text(kept, source.read_text(encoding="utf-8-sig"))
 
 
 def default_experiment(lens_file: str | Path, overrides: Sequence[str] = ()) -> Experiment:

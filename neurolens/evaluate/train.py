@@ -17,7 +17,7 @@ from neurolens.cameras.model import load_model
 from neurolens.config import to_dict, to_toml
 from neurolens.errors import NeurolensWarning
 from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
-from neurolens.evaluate.experiment import Experiment, relative_to
+from neurolens.evaluate.experiment import Experiment, keep_lens, relative_to
 from neurolens.evaluate.gain import domain_facts, scene_gain
 from neurolens.evaluate.image import DEFAULT
 from neurolens.evaluate.layout import layout_profile, refractions
@@ -50,8 +50,8 @@ def run_experiment(
 ) -> dict[str, Any]:
     """Run an experiment and leave everything in one folder.
 
-    Writes config.toml (resolved), models/*.onnx, pictures/, results.json and report.html. A run that was interrupted
-    goes on where it stopped when it is started again: models that are there are not fitted again.
+    Writes config.toml (resolved), lenses/ (its lens file), models/*.onnx, pictures/, results.json and report.html. A run
+    that was interrupted goes on where it stopped when it is started again: models that are there are not fitted again.
 
     Returns:
         The results, as in results.json (`records.Results`).
@@ -73,6 +73,7 @@ def run_experiment(
         for each in (models, pictures):  # only now: a lens that cannot be leaves no folder behind
             each.mkdir(parents=True, exist_ok=True)
         atomic_write_text(folder / "config.toml", to_toml(resolved))
+        keep_lens(experiment, folder)
         with progress.stage("trace ray pairs") as report:
             pairs = make_pairs(lens, domain, experiment.pairs, report)
             if experiment.save_pairs:

@@ -17,7 +17,7 @@ from neurolens.cameras.model import load_model
 from neurolens.config import to_dict, to_toml
 from neurolens.errors import InputError
 from neurolens.evaluate.candidates import model_candidate
-from neurolens.evaluate.experiment import Experiment, relative_to
+from neurolens.evaluate.experiment import Experiment, keep_lens, relative_to
 from neurolens.evaluate.plots_states import states_plot
 from neurolens.evaluate.records import plain
 from neurolens.evaluate.speed import race
@@ -98,7 +98,8 @@ def fit_and_measure_states(
 def run_states(experiment: Experiment, folder: Path, *, progress: Progress, command: str = "") -> dict[str, Any]:
     """Fit and measure the polynomials of an experiment whose lens is in many states.
 
-    Writes config.toml, models/*.onnx, states.png, results.json and report.html (a page with the table and the plot).
+    Writes config.toml, lenses/ (its lens file), models/*.onnx, states.png, results.json and report.html (a page with
+    the table and the plot).
 
     Raises:
         InputError: no model that can be of many states, and whatever is wrong with lens or domain.
@@ -111,6 +112,7 @@ def run_states(experiment: Experiment, folder: Path, *, progress: Progress, comm
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
         space = experiment.states()
+        keep_lens(experiment, folder)
         wanted = [m for m in experiment.model if m.method == "ols"]
         if not wanted:
             raise InputError("settings", "model", [m.label for m in experiment.model], 'a model of method "ols"')

@@ -10,6 +10,7 @@ import pytest
 from lens_models import LENSES
 
 from neurolens.cameras.model import load_model
+from neurolens.cli import main
 from neurolens.errors import InputError
 from neurolens.evaluate.check import check_model
 from neurolens.evaluate.experiment import default_experiment, near_limit_m, wavelengths_nm
@@ -102,8 +103,6 @@ def test_one_wavelength_without_dispersion(tmp_path: Path) -> None:
 def test_a_lens_without_a_real_focus_is_refused_and_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from neurolens.cli import main
-
     monkeypatch.chdir(tmp_path)
     diverging: Surfaces = [(math.inf, 2, 10, STOP), (-50, 2, 20, BK7), (50, 40, 20, AIR)]
     path = written(tmp_path, "diverging", 5, diverging)
@@ -113,3 +112,23 @@ def test_a_lens_without_a_real_focus_is_refused_and_leaves_nothing(
     assert not (tmp_path / "runs").exists()
     with pytest.raises(InputError, match="surfaces"):
         default_experiment(path).domain.of(read_lens(path))
+
+
+def test_a_run_folder_is_all_that_evaluate_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A table of another program, read by train; another lens of that name in ./lenses misleads nobody."""
+    table = tmp_path / "singlet.dat"
+    table.write_text("# Plano-convex\n0 8 0 10\n0 5 1.5168 30\n-31 0 1 30\n")
+    small = "pairs.train=1500", "pairs.held_out=1000", "pairs.rim=500", "evaluation.vignetting_rays=4000"
+    settings = *small, "evaluation.rounds=1", "evaluation.compile_exact=false", 'model=[{method="ols", terms=12}]'
+    folder = tmp_path / "run"
+    options = [word for setting in settings for word in ("--set", setting)]
+    assert main(["train", "--lens", str(table), "--out", str(folder), "--quiet", *options]) == 0
+    table.unlink()
+    (tmp_path / "lenses").mkdir()
+    written(tmp_path / "lenses", "singlet", *ODD["ball"])
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+    assert main(["evaluate", str(folder / "models/ols-12.onnx"), "--rays", "1000", "--quiet"]) == 0
+    assert "All promises hold" in capsys.readouterr().out
