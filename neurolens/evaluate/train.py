@@ -50,8 +50,8 @@ def run_experiment(
 ) -> dict[str, Any]:
     """Run an experiment and leave everything in one folder.
 
-    Writes config.toml (resolved), lenses/ (its lens file), models/*.onnx, pictures/, results.json and report.html. A run
-    that was interrupted goes on where it stopped when it is started again: models that are there are not fitted again.
+    Writes config.toml (resolved), lenses/ (its lens file), models/*.onnx, pictures/, results.json and report.html. A
+    run that was interrupted goes on where it stopped when it is started again: what is there is not fitted again.
 
     Returns:
         The results, as in results.json (`records.Results`).
