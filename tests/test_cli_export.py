@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from neurolens.cameras.model import load_model
+from neurolens.cameras.onnxderivatives import OnnxDerivatives
+from neurolens.cameras.onnxinverse import load_inverse
 from neurolens.cli import main
 from neurolens.modelfile import MODEL_KEY
 
@@ -66,6 +68,22 @@ def test_onnx_for_one_wavelength_promises_what_it_keeps(file: Path, tmp_path: Pa
     assert load_model(again).card["errors"] == fixed.card["errors"]
 
 
+@pytest.mark.slow
+def test_derivatives_and_inverse_maps(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Rays through a stop point cross the stop there; the film's derivatives are those of small steps."""
+    out = tmp_path / "lens.onnx"
+    assert main(["export", str(file), "--to", "onnx", "-o", str(out), "--derivatives", "--inverse", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["inverse"]
+    assert min(told["stop"]["converged"], told["scene"]["converged"]) >= 0.9999
+    film, stop = np.array([[0.0, 3.0, -9.0], [0.0, 5.0, 1.0]]), np.array([[0.5, 1.0, -2.0], [0.0, 2.0, -1.0]])
+    found = load_inverse(out).through_stop(film, stop, 550.0)
+    assert found.status.tolist() == [0, 0, 0] and np.abs(found.stop_xy_mm - stop).max() < 1e-3
+    model, pupil, step = load_model(out), found.rays[2:4], 0.02
+    slope = OnnxDerivatives(model)(film, pupil, np.full(3, 550.0), model.card["domain"]["film_z_mm"][0], 4.0).d_film
+    ahead, behind = (model.rays(film + [[h], [0]], pupil, 550.0).scene_ray for h in (step, -step))
+    assert np.abs((ahead - behind)[3:] / (2 * step) - slope[3:, 0]).max() < 2e-5
+
+
 def test_bad_input_is_one_line(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "a.h"
     old = tmp_path / "old.onnx"
@@ -82,6 +100,7 @@ def test_bad_input_is_one_line(file: Path, tmp_path: Path, capsys: pytest.Captur
         ([*base, "--only", "stop"], ["--only", "ray"]),
         ([*base, "--name", "1 2"], ["name"]),
         (["export", file, "--to", "onnx", "-o", out, "--only", "ray"], ["--only"]),
+        ([*base, "--inverse"], ["--inverse", "--to onnx"]),
         (["export", file, "--to", "onnx", "-o", out, "--fix", "wavelengths=450,550"], ["one wavelength"]),
         (["export", tmp_path / "no.onnx", "--to", "c", "-o", out], ["no.onnx", "no such file"]),
         (["export", old, "--to", "c", "-o", out], ["old.onnx", "export it again"]),

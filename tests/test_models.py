@@ -28,14 +28,16 @@ PROMISED = [
     ("laikin_double_gauss_50.ols-28.onnx", "coefficients_per_vector", 40),
     ("laikin_double_gauss_50.ols-60.onnx", "rms_um", 0.25),
     ("laikin_double_gauss_50.ols-60.onnx", "coefficients_per_vector", 100),
-    ("laikin_double_gauss_50.mlp-16x2.onnx", "rms_um", 0.75),
-    ("laikin_double_gauss_50.mlp-32x2.onnx", "rms_um", 0.35),
+    ("laikin_double_gauss_50.ols-36.onnx", "rms_um", 1.0),
+    ("laikin_double_gauss_50.mlp-10x1.onnx", "rms_um", 1.0),
+    ("laikin_double_gauss_50.mlp-16x2.onnx", "rms_um", 0.1),
+    ("laikin_double_gauss_50.mlp-32x2.onnx", "rms_um", 0.05),
     ("laikin_double_gauss_50.ols-60.onnx", "false_pass", 0.002),
     ("laikin_double_gauss_50.ols-60.onnx", "false_block", 0.002),
     ("muller_fisheye_100-14mm.ols-40.onnx", "direction_rms_deg", 0.001),
     ("muller_fisheye_100-14mm.mlp-16x2.onnx", "direction_rms_deg", 0.0003),
-    ("ogawa_zoom_70_200-72mm.ols-60.onnx", "rms_um", 0.6),
-    ("ogawa_zoom_70_200-72mm.mlp-32x2.onnx", "rms_um", 1.0),
+    ("ogawa_zoom_70_200-135mm.ols-60.onnx", "rms_um", 0.1),
+    ("ogawa_zoom_70_200-135mm.mlp-8x1.onnx", "rms_um", 1.0),
 ]
 
 

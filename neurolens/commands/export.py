@@ -13,6 +13,7 @@ from neurolens.errors import InputError
 
 if TYPE_CHECKING:
     from neurolens.surrogates.model import LensModel
+    from neurolens.surrogates.pairs import RayPairs
     from neurolens.surrogates.specialise import Fix
 
 _DESCRIPTION = """\
@@ -31,11 +32,13 @@ examples:
   neurolens export models/laikin_double_gauss_50.ols-60.onnx --to c -o gauss.h
   neurolens export models/NAME.onnx --to glsl -o lens.glsl --fix wavelengths=450,550,650 --fix focus=2
   neurolens export runs/quickstart --to c -o ray.h --only ray
-  neurolens export models/NAME.onnx --to onnx -o laser.onnx --fix wavelengths=633"""
+  neurolens export models/NAME.onnx --to onnx -o laser.onnx --fix wavelengths=633
+  neurolens export models/NAME.onnx --to onnx -o lens.onnx --derivatives   # for ray differentials
+  neurolens export models/NAME.onnx --to onnx -o lens.onnx --inverse       # and lens.stop.onnx, lens.scene.onnx"""
 _PARTS = ("ray", "transmittance", "stop", "vignetting")
 _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
-# Rays that measure the errors of an ONNX file for what is fixed.
-_HELD_OUT, _VIGNETTING = 20_000, 100_000
+# Rays that measure the errors of an ONNX file for what is fixed; those that teach inverse maps.
+_HELD_OUT, _VIGNETTING, _TRAIN = 20_000, 100_000, 15_000
 
 
 def add_parser(subparsers: Any) -> None:
@@ -57,6 +60,13 @@ def add_parser(subparsers: Any) -> None:
         help=f"comma-separated: {', '.join(_PARTS)} (default: all; the domain guard is always there)",
     )  # fmt: skip
     parser.add_argument("--name", metavar="WORD", help="of the function (default: the lens's id)")
+    parser.add_argument(
+        "--derivatives", action="store_true", help="of ONNX: outputs for ray differentials too, for who asks for them"
+    )
+    parser.add_argument(
+        "--inverse", action="store_true",
+        help="of ONNX: the inverse maps too (film and stop point to ray; scene ray to film), fitted and checked",
+    )  # fmt: skip
     add_json(parser)
     parser.set_defaults(run=run, kept="nothing is written")
 
@@ -68,6 +78,8 @@ def run(args: argparse.Namespace) -> int:
     given = _given(args.fix)
     if args.to == "onnx" and (args.name is not None or set(parts) != set(_PARTS)):
         raise InputError("neurolens export", "--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")
+    if args.to != "onnx" and (args.derivatives or args.inverse):
+        raise InputError("neurolens export", "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
     from neurolens.cameras.model import load_model
     from neurolens.surrogates.fused import Fixed, Parts
     from neurolens.surrogates.source import export_source
@@ -79,8 +91,8 @@ def run(args: argparse.Namespace) -> int:
     fix = _fix(given, model)
     models = fixed_models(model, fix)
     if args.to == "onnx":
-        _write_onnx(models, args.out, card if not given else None)
-        about: dict[str, Any] = {}
+        _write_onnx(models, args.out, card if not given else None, args.derivatives)
+        about: dict[str, Any] = _write_inverse(models[0], args.out) if args.inverse else {}
     else:
         asked = Parts(*(name in parts for name in _PARTS[1:]))
         fixed = Fixed(fix.film_z_mm, fix.stop_radius_mm)
@@ -93,6 +105,8 @@ def run(args: argparse.Namespace) -> int:
         print_json({"file": str(args.out), "to": args.to, "bytes": args.out.stat().st_size, **about})
     else:
         print(args.out)
+        for found in about.get("inverse", {}).values():
+            print(f"{found['file']}: finds {found['converged']:.3%} of the model's rays in three steps")
     return 0
 
 
@@ -153,24 +167,46 @@ def _fix(given: dict[str, list[float]], model: LensModel) -> Fix:
     return Fix(tuple(given.get("wavelengths", ())), film_z, stop)
 
 
-def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] | None) -> None:
+def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] | None, derivatives: bool) -> None:
     """The graph with its card: the errors of the card given, or measured anew for what was fixed."""
     from neurolens.cameras.model import load_model
-    from neurolens.evaluate.measure import FRESH, measure_errors
+    from neurolens.evaluate.measure import measure_errors
     from neurolens.surrogates.export import export_onnx
-    from neurolens.surrogates.pairs import PairSettings, make_pairs
 
     if len(models) > 1:
         wavelengths = [m.domain.wavelength_nm[0] for m in models]
         raise InputError("neurolens export", "--fix wavelengths", wavelengths, "one wavelength for an ONNX file")
     model = models[0]
     if card is not None:
-        export_onnx(model, out, card["errors"])
+        export_onnx(model, out, card["errors"], derivatives=derivatives)
         return
-    seed = int(model.settings.get("rays_seed") or 0) + FRESH
-    held_out = make_pairs(
-        model.lens, model.domain, PairSettings(train=1, held_out=_HELD_OUT, rim=1, seed=seed)
-    ).held_out
+    seed, held_out = _seed(model), _pairs(model, train=1).held_out
     export_onnx(model, out, {})
     errors = measure_errors(load_model(out), model.lens, model.domain, held_out, _VIGNETTING, seed + 1)
-    export_onnx(model, out, errors)
+    export_onnx(model, out, errors, derivatives=derivatives)
+
+
+def _write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
+    """Both inverse maps beside the model's file: their files, and the share of fresh rays that each finds."""
+    from neurolens.surrogates.inverse_fit import convergence, fit_inverse
+    from neurolens.surrogates.onnx_inverse import export_inverse
+
+    pairs = _pairs(model, train=_TRAIN)
+    inverse = fit_inverse(model, pairs)
+    found = convergence(inverse, pairs.held_out.inputs)
+    files = export_inverse(inverse, out)
+    return {"inverse": {n: {"file": str(f), **found[n]} for n, f in zip(("stop", "scene"), files, strict=True)}}
+
+
+def _seed(model: LensModel) -> int:
+    """Of rays that the model was not fitted to."""
+    from neurolens.evaluate.measure import FRESH
+
+    return int(model.settings.get("rays_seed") or 0) + FRESH
+
+
+def _pairs(model: LensModel, train: int) -> RayPairs:
+    from neurolens.surrogates.pairs import PairSettings, make_pairs
+
+    settings = PairSettings(train=train, held_out=_HELD_OUT, rim=train, seed=_seed(model))
+    return make_pairs(model.lens, model.domain, settings)

@@ -13,7 +13,7 @@ from neurolens.files import atomic_write_text
 _HEAD = """# Models that ship
 
 Made by `neurolens bench models` from experiments/models.toml: of every lens of lenses/ the best polynomial of at most
-100 coefficients a vector output and the best network of at most two layers of 32 units, each fitted within a minute,
+64 coefficients a vector output and the best network of two layers of 16 units, each fitted within half a minute,
 over the whole lit film, full aperture, focus from infinity to near and all wavelengths for which the glasses are known;
 of a few lenses also faster ones. Errors on held-out rays (`neurolens.evaluate.rays`), micrometres at an image radius of
 21.6 mm; every card was checked on fresh rays. Times on one core in onnxruntime, with stop, rims and transmittance;

@@ -104,12 +104,6 @@ def add_model(g: Graph, model: LensModel, series: DirectionSeries, derivatives: 
     g.reshape(rows.transmittance, [-1], out="transmittance")
 
 
-def _metadata(model: LensModel, errors: dict[str, Any]) -> dict[str, str]:
-    """The card, and the coefficients where their core has a form for files."""
-    card = {CARD_KEY: card_to_json(card_of(model, errors))}
-    return {**card, MODEL_KEY: model_to_text(model)} if storable(model.core) else card
-
-
 def largest_angle(model: LensModel, count: int = 32768) -> float:
     """Largest angle (rad) from the axis of the model's passing rays, a little enlarged. Sets the length of series."""
     rays = sample_domain(model.domain, count, seed=5)

@@ -31,7 +31,7 @@ LENSES = [
     ("muller_fisheye_100", 14.0, 8.0, 0.99),
     ("mizuguchi_fisheye_10", 10.5, 8.0, 0.97),
 ]
-MODELS = ["laikin_double_gauss_50.ols-28", "muller_fisheye_100-14mm.ols-40", "thorlabs_lb1471_biconvex_50.ols-60"]
+MODELS = ["laikin_double_gauss_50.ols-28", "muller_fisheye_100-14mm.ols-40", "thorlabs_lb1471_biconvex_50.ols-64"]
 
 
 @cache
