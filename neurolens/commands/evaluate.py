@@ -31,7 +31,7 @@ worst of them, and hold while they are at most 25% above the promise.
 
 Since the rays are others than the card's, an error holds while it is above the promise by at most
 4 standard deviations of what so many rays can tell, at least 10% and at most 50%; a share by at most
-4 standard deviations of its count. A largest error is only shown."""
+4 standard deviations of the root of its count. A largest error is only shown."""
 _EPILOG = """\
 examples:
   neurolens evaluate models/NAME.onnx

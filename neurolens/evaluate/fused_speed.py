@@ -14,7 +14,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from neurolens.cameras.model import load_model
+from neurolens.cameras.onnxsession import open_session
 from neurolens.errors import InputError
 from neurolens.evaluate.candidates import exact_candidates, model_candidate
 from neurolens.evaluate.experiment import LensChoice
@@ -22,9 +25,9 @@ from neurolens.evaluate.fused import fused_candidate, program_candidate
 from neurolens.evaluate.fused_exact import exact_program
 from neurolens.evaluate.layout import refractions
 from neurolens.evaluate.rays import ray_errors
-from neurolens.evaluate.speed import Candidate, Race, Unavailable, race
+from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, race
 from neurolens.optics.prescription import Lens
-from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.domain import Domain, FilmRays, domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.expressions import Program
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
@@ -35,7 +38,7 @@ from neurolens.surrogates.specialise import Fix, fixed_models
 
 WITHIN_UM = 1.0
 POLYNOMIALS = tuple(ModelSettings("ols", terms=n) for n in (8, 12, 16, 20, 24, 28, 32, 36, 40, 48, 56, 64, 80, 100))
-NETWORKS = tuple(ModelSettings("mlp", units=n, layers=1) for n in (4, 6, 8, 12, 16))
+NETWORKS = tuple(ModelSettings("mlp", units=n, layers=1) for n in (4, 6, 8, 10, 12, 16))
 WAVELENGTH_NM = 550.0
 _STOPPED = math.sqrt(0.5)  # one stop down, where a stop is fixed
 
@@ -138,8 +141,26 @@ def measure(
             file = export_onnx(model, Path(scratch) / f"{model.method}.onnx", {})
             candidate = model_candidate(model.method, load_model(file), domain.stop_radius_mm)
             add(f"{model.method}, onnxruntime", "whole", candidate, rms_um=error)
+            add(f"{model.method}, onnxruntime", "ray", ray_candidate(model.method, file), rms_um=error)
         timed = race([c for _, c in entries], domain, rounds=rounds, report=lambda s: report(0.3 + 0.7 * s))
     return [_timed(row, candidate.name, timed) for row, candidate in entries]
+
+
+def ray_candidate(name: str, file: Path) -> Candidate:
+    """The part of an exported graph that gives position and direction, alone in onnxruntime: no domain guard."""
+    import onnx
+    from onnx.utils import Extractor
+
+    part = Extractor(onnx.load(file)).extract_model(["rays", "film_z_mm"], ["scene_ray"]).SerializeToString()
+    wanted = {"rays": ("tensor(float)", 5, None), "film_z_mm": ("tensor(float)", 1)}
+    session = open_session(file, part, 1, wanted, {"scene_ray": ("tensor(float)", 6, None)})
+
+    def prepare(rays: FilmRays) -> Call:
+        columns = [np.ascontiguousarray(c.numpy(), dtype=np.float32) for c in rays.columns()]
+        feeds = {"film_z_mm": columns[2][:1]}
+        return lambda: session.run(None, {"rays": np.stack([*columns[0:2], *columns[3:6]]), **feeds})
+
+    return Candidate(name, prepare)
 
 
 def _add_exact(add: Callable[..., None], lens: Lens, domain: Domain, torch_compiled: bool) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from neurolens.axes import Axis
 from neurolens.cameras.model import OnnxLens
 from neurolens.errors import InputError
-from neurolens.evaluate.check import Promise, find_lens
+from neurolens.evaluate.check import Promise, find_lens, share_promise
 from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.vignetting import vignetting_errors
@@ -121,8 +121,7 @@ def check_states(
             continue
         allowed = None if key == "max_um" else promised * (1 + TOLERANCE) + _FLOOR
         if key in SHARES:
-            least = 1 / max(1.0, found["passing"])
-            variance = max(promised, least) * (least + 1 / max(1.0, float(errors.get("passing") or found["passing"])))
-            allowed = promised + SIGMAS * math.sqrt(variance)
+            promises.append(share_promise(key, promised, found[key], found["passing"], errors.get("passing")))
+            continue
         promises.append(Promise(key, float(promised), found[key], allowed))
     return {**found, "seed": seed}, promises

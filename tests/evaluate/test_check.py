@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from lens_models import domain, exported, lens, model
+from scipy.stats import poisson
 
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.check import check_model
+from neurolens.evaluate.check import check_model, share_promise
 from neurolens.evaluate.fresh import STOPS, ZONED, fresh_rays, measure
 from neurolens.evaluate.measure import measure_errors
 from neurolens.evaluate.vignetting import ZONES, vignetting_errors
@@ -68,6 +71,27 @@ def test_every_figure_that_promises_too_much_fails_and_no_other(errors: dict[str
     alone = copy.deepcopy(errors)
     alone["zones"]["full"]["mid"]["direction_rms_deg"] *= 0.6
     assert broken(alone) == {"full.mid.direction_rms_deg"}
+
+
+@pytest.mark.parametrize("counted", [0.1, 1.0, 5.0, 50.0, 500.0])
+@pytest.mark.parametrize("ratio", [0.1, 0.6, 3.0])
+def test_a_share_holds_on_other_rays_however_few_it_counts(counted: float, ratio: float) -> None:
+    """Exact sums over Poisson counts: a true promise breaks less than once in 5000; a double one of many is found."""
+    n, fresh = 50_000.0, 50_000.0 * ratio
+
+    def breaks(times: float) -> float:
+        def law(mean: float) -> Any:
+            return poisson.pmf(np.arange(int(mean + 12 * math.sqrt(mean) + 40)), mean)
+
+        return sum(
+            float(p) * float(poisson.sf(math.floor(promised.allowed * fresh + 1e-9), times * counted * ratio))
+            for k, p in enumerate(law(counted))
+            if (promised := share_promise("false_pass", k / n, 0.0, fresh, n)).allowed is not None
+        )
+
+    assert breaks(1.0) < 2e-4
+    if counted * ratio >= 50:
+        assert breaks(2.0 + 8 / math.sqrt(counted * min(ratio, 1.0))) > 0.99
 
 
 def test_a_model_that_blocks_what_the_card_says_it_passes_fails(errors: dict[str, Any]) -> None:

@@ -11,12 +11,13 @@ import pytest
 import torch
 
 from neurolens import status as st
+from neurolens.cameras.model import load_model
 from neurolens.errors import InputError
 from neurolens.evaluate.compiled_source import CompiledSource, find_compiler
 from neurolens.evaluate.fused import fused_candidate, fused_ns
 from neurolens.evaluate.fused_exact import exact_program
 from neurolens.evaluate.fused_page import goals, write
-from neurolens.evaluate.fused_speed import Row, selected
+from neurolens.evaluate.fused_speed import Row, ray_candidate, selected
 from neurolens.evaluate.speed import Unavailable
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.pupils import camera_rays
@@ -61,6 +62,16 @@ def test_candidates_time_models_and_files() -> None:
     timing = fused_ns(model, model.domain, parts=RAY_ONLY, rounds=1)
     assert timing is not None and 0 < timing["min"] < 1e4
     assert fused_candidate("x", lens_models.exported("invariants"), model.domain) is not None
+
+
+def test_the_part_of_a_graph_that_gives_rays_gives_the_same() -> None:
+    file, domain = lens_models.exported("invariants"), lens_models.domain()
+    rays = sample_domain(domain, 500, 3)
+    rays = replace(rays, film_z=torch.full_like(rays.film_z, domain.film_z_mm[0]))
+    (found,) = ray_candidate("ray", file).prepare(rays)()  # type: ignore[misc]
+    columns = [c.numpy().astype(np.float32) for c in rays.columns()]
+    whole = load_model(file).rays(np.stack(columns[0:2]), np.stack(columns[3:5]), columns[5], float(columns[2][0]))
+    assert (whole.status == st.PASSED).sum() > 100 and np.abs(found - whole.scene_ray).max() < 1e-5
 
 
 def test_without_a_compiler_or_coefficients_there_is_no_candidate(
