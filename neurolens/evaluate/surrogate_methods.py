@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from neurolens.errors import InputError
-from neurolens.surrogates.ablations import POLYNOMIAL_ABLATIONS, ablated
+from neurolens.surrogates.ablations import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.published import PUBLISHED
 
@@ -39,16 +39,19 @@ class Row:
 
 def _ours() -> tuple[ModelSettings, ...]:
     polynomials = tuple(ModelSettings("ols", terms=terms) for terms in (20, 40, 64, 100))
-    networks = tuple(ModelSettings("mlp", units=units, layers=2) for units in (8, 16, 32))
+    networks = tuple(ModelSettings("mlp", units=n, layers=k) for n, k in ((8, 1), (10, 1), (8, 2), (16, 2), (32, 2)))
     return *polynomials, *networks, *(ModelSettings("ols+mlp", terms=n, units=u) for n, u in ((40, 8), (64, 16)))
 
 
 def _ablations() -> Iterator[Row]:
-    """Our polynomial of 64 terms with one part left out."""
-    whole = ModelSettings("ols", terms=64)
-    for text in POLYNOMIAL_ABLATIONS:
-        name = f"{whole.label}-{text.replace(' ', '-')}"
-        yield Row(name, "ablations", replace(ablated(whole, text), name=name), text)
+    """Our polynomial of 64 terms and our network with one part left out."""
+    for whole, parts in (
+        (ModelSettings("ols", terms=64), POLYNOMIAL_ABLATIONS),
+        (ModelSettings("mlp"), NETWORK_ABLATIONS),
+    ):
+        for text in parts:
+            name = f"{whole.label}-{text.replace(' ', '-')}"
+            yield Row(name, "ablations", replace(ablated(whole, text), name=name), text)
 
 
 @cache

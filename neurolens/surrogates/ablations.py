@@ -33,13 +33,22 @@ POLYNOMIAL_ABLATIONS = _frozen(
     }
 )
 
+# Of networks.
+NETWORK_ABLATIONS = _frozen(
+    {
+        "20 steps of training": {"steps": 20},
+        "one layer": {"layers": 1},
+    }
+)
+
 
 def ablated(settings: ModelSettings, name: str) -> ModelSettings:
     """The settings with one part left out, named for the table.
 
     Raises:
-        InputError: an ablation that is not in `POLYNOMIAL_ABLATIONS`.
+        InputError: an ablation of neither table, or of the other kind of model.
     """
-    if name not in POLYNOMIAL_ABLATIONS:
-        raise InputError("ablation", "name", name, f"one of {', '.join(POLYNOMIAL_ABLATIONS)}")
-    return replace(settings, **POLYNOMIAL_ABLATIONS[name], name=f"{settings.label}, {name}")
+    known = NETWORK_ABLATIONS if settings.method == "mlp" else POLYNOMIAL_ABLATIONS
+    if name not in known:
+        raise InputError("ablation", "name", name, f"one of {', '.join(known)}")
+    return replace(settings, **known[name], name=f"{settings.label}, {name}")

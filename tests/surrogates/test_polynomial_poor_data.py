@@ -12,7 +12,7 @@ import torch
 
 from neurolens.errors import InputError
 from neurolens.optics.lensfile import read_lens
-from neurolens.surrogates.ablations import POLYNOMIAL_ABLATIONS, ablated
+from neurolens.surrogates.ablations import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
 from neurolens.surrogates.cores import InvariantPolynomial
 from neurolens.surrogates.domain import domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
@@ -139,12 +139,11 @@ def test_transmittance_terms_follow_absorption() -> None:
 
 
 def test_ablations_name_what_exists() -> None:
-    settings = ModelSettings(terms=20)
-    labels = [ablated(settings, name).label for name in POLYNOMIAL_ABLATIONS]
-    assert len(set(labels)) == len(labels)
-    assert all(
-        ablated(settings, name) != replace(settings, name=label)
-        for name, label in zip(POLYNOMIAL_ABLATIONS, labels, strict=True)
-    )
+    for settings, names in ((ModelSettings(terms=20), POLYNOMIAL_ABLATIONS), (ModelSettings("mlp"), NETWORK_ABLATIONS)):
+        labels = [ablated(settings, name).label for name in names]
+        assert len(set(labels)) == len(labels)
+        assert all(
+            ablated(settings, n) != replace(settings, name=label) for n, label in zip(names, labels, strict=True)
+        )
     with pytest.raises(InputError, match="ablation"):
         ablated(settings, "no magic")
