@@ -3,6 +3,11 @@
 Both rays meet an object plane; the distance between the two points is taken back to the film with the exact lens's
 local Jacobian at that film point (on the axis: the paraxial magnification). Points on a plane are given over its
 distance, so that infinity is no special case.
+
+Where distortion is so strong that the image folds, two film points see one object point, the Jacobian passes through
+zero, and an error would count for as much as one likes: a mean of its squares does not exist, and no sample of rays
+could confirm it on another. The Jacobian counts for at least a tenth of first order's there; imaging lenses, condensers
+among them, stay above a fifth over their whole film.
 """
 
 from __future__ import annotations
@@ -11,6 +16,7 @@ import torch
 from torch import Tensor
 
 from neurolens import status as st
+from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.surfaces import Rays
@@ -19,6 +25,8 @@ from neurolens.surrogates.domain import Domain, FilmRays, focused_plane_z_mm
 
 # Central differences over this share of the film radius: truncation and float64 rounding both stay below 1e-6.
 _STEP = 1e-4
+# The least that a Jacobian counts for, of the paraxial one.
+_LEAST = 0.1
 
 
 def focused_vergence(lens: Lens, film_z: Tensor) -> Tensor:
@@ -46,15 +54,17 @@ def film_equivalent_mm(
 ) -> Tensor:
     """[N] distance on the film (mm) that the distance between two rays on an object plane stands for."""
     dx, dy = plane_coordinates(rays, vergence) - plane_coordinates(exact, vergence)
+    least = _LEAST / abs(first_order(lens).efl_mm)
     if lens.anamorphic:
         along_x, along_y = _jacobian_columns(lens, domain, inputs, vergence)
-        area = along_x[0] * along_y[1] - along_x[1] * along_y[0]
+        area = (along_x[0] * along_y[1] - along_x[1] * along_y[0]).abs()
+        area = area.clamp_min(least / abs(first_order(lens, meridian="x").efl_mm))
         return torch.hypot((dx * along_y[1] - dy * along_y[0]) / area, (dy * along_x[0] - dx * along_x[1]) / area)
     radius = torch.hypot(inputs.film_x, inputs.film_y)
     centred = radius < 1e-12  # on the axis every direction is radial
     along_x = torch.where(centred, 1.0, inputs.film_x / torch.where(centred, 1.0, radius))
     along_y = torch.where(centred, 0.0, inputs.film_y / torch.where(centred, 1.0, radius))
-    radial, tangential = local_jacobian(lens, domain, inputs, vergence)
+    radial, tangential = (j.clamp_min(least) for j in local_jacobian(lens, domain, inputs, vergence))
     return torch.hypot((dx * along_x + dy * along_y) / radial, (dy * along_x - dx * along_y) / tangential)
 
 

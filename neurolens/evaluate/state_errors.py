@@ -27,8 +27,8 @@ RAY_KEYS = (
     "transmittance_rms",
 )  # fmt: skip
 SHARES = ("false_pass", "false_block")
-# A worst of other states and other rays may be so much worse: relative for errors, of a count in standard deviations.
-TOLERANCE, SIGMAS = 0.25, 4.0
+# An error that is the worst of other states and other rays may be so much worse, relatively.
+TOLERANCE = 0.25
 _FLOOR = 5e-7
 _VIGNETTING = 4  # rays that test it, for every ray that passes
 _FRESH = 7919

@@ -238,3 +238,22 @@ def test_the_middle_of_the_pupil_passes() -> None:
     zero = torch.zeros_like(radius)
     rays = camera_rays(radius, zero, domain.film_z_mm[0], pupil_middle(domain, radius), zero, domain.pupil_z_mm)
     assert bool((trace(lens, rays).status == 0).all())
+
+
+def test_where_the_image_folds_an_error_counts_for_ten_times_first_order_at_most() -> None:
+    """A loupe's film, far out, sees one direction twice: two samples of rays still agree about the same error."""
+    front, flat = Surface(51.5, 9.0, 60.0, n_d=1.7, V_d=40.0), Surface(math.inf, 20.0, 60.0)
+    lens = Lens(
+        name="loupe", source="made up", f_number=10.0, surfaces=(front, flat, Surface(math.inf, 40.0, 6.0, stop=True))
+    )
+    lens = lens.at()
+    domain, f = domain_of(lens, film_radius_mm=80.0), first_order(lens).efl_mm
+    rms = []
+    for seed in (1, 2):
+        rays = make_pairs(lens, domain, PairSettings(train=1, held_out=3000, rim=1, seed=seed)).held_out
+        errors = ray_errors(lens, domain, rays, lambda _, r=rays: says(turned(r.scene, 1e-6), r.transmittance))
+        rms.append(errors["rms_infinity_um"])
+        assert errors["max_infinity_um"] < 1000 * 10 * f * 1e-6 / math.cos(math.radians(60)) ** 2
+    radial, _ = local_jacobian(lens, domain, rays.inputs, focused_vergence(lens, rays.inputs.film_z))
+    assert float(radial.min()) < 0.01 / f
+    assert rms[0] == pytest.approx(rms[1], rel=0.1)
