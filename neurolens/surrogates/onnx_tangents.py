@@ -10,7 +10,7 @@ from onnx import NodeProto
 from neurolens.surrogates.onnx_graph import Graph
 
 # Operators on which a derivative acts as the value does (of the first input; the others are constants).
-_LINEAR = ("Identity", "Reshape", "Gather", "ReduceSum", "Neg", "Slice")
+_LINEAR = ("Identity", "Reshape", "Gather", "ReduceSum", "Neg")
 
 
 class Tangents:

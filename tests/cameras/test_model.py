@@ -90,6 +90,10 @@ def fewer_inputs(proto: ModelProto) -> None:
     proto.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 4
 
 
+def bytes_of(*numbers: int) -> bytes:
+    return np.array(numbers, "<i8").tobytes()
+
+
 DAMAGE: dict[str, tuple[Callable[[ModelProto], object], str]] = {
     "no card": (lambda p: p.ClearField("metadata_props"), "no card"),
     "card cut": (lambda p: setattr(p.metadata_props[0], "value", p.metadata_props[0].value[:-9]), "JSON"),
@@ -153,9 +157,24 @@ DAMAGE: dict[str, tuple[Callable[[ModelProto], object], str]] = {
         lambda p: p.graph.node.extend(
             helper.make_node("Concat", [f"g{k}" if k else "film_z_mm"] * 16, [f"g{k + 1}"], axis=0) for k in range(12)
         ),
-        "rows, expected at most",
+        "operator Concat has shape",
     ),
-    "broken graph": (lambda p: p.graph.node.pop(0), "cannot load"),
+    "a column that meets a row": (
+        lambda p: (
+            p.graph.initializer.append(helper.make_tensor("long", TensorProto.INT64, [2], bytes_of(1, -1), raw=True)),
+            p.graph.node.append(helper.make_node("Concat", ["rays"] * 9, ["q0"], axis=0)),
+            p.graph.node.append(helper.make_node("Reshape", ["q0", "long"], ["q1"])),
+            p.graph.initializer.append(helper.make_tensor("tall", TensorProto.INT64, [2], bytes_of(-1, 1), raw=True)),
+            p.graph.node.append(helper.make_node("Reshape", ["q0", "tall"], ["q2"])),
+            p.graph.node.append(helper.make_node("Mul", ["q1", "q2"], ["q3"])),
+        ),
+        "operator Mul has shape",
+    ),
+    "a shape that only running tells": (
+        lambda p: p.graph.node.append(helper.make_node("Reshape", ["rays", "film_z_mm"], ["q"])),
+        "operator Reshape",
+    ),
+    "broken graph": (lambda p: p.graph.node.pop(0), "do not fit"),
 }
 
 
@@ -185,6 +204,36 @@ def test_files_that_are_no_models(path: Path, tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(onnxfile, "MAX_BYTES", 1000)
     with pytest.raises(ModelError, match="at most 1000"):
         load_model(path)
+
+
+def test_what_other_readers_of_protobuf_see_is_what_was_checked(path: Path, tmp_path: Path) -> None:
+    """Others merge two graphs, and pass over an operator's second name where it is of another wire type."""
+    data, file = path.read_bytes(), tmp_path / "x.onnx"
+    hidden = ModelProto()
+    hidden.graph.node.append(helper.make_node("Erf", ["rays"], ["q"]))
+    whole = ModelProto.FromString(data)
+    named = helper.make_node("Erf", ["rays"], ["q"]).SerializeToString()
+    for name in (b"\x25Tanh", b"\x20\xff\xff\xff\xff\xff\x3f"):  # field 4: four bytes; a large number
+        graph = whole.graph.SerializeToString() + tagged(1, named + name)
+        whole.ClearField("graph")
+        file.write_bytes(whole.SerializeToString() + tagged(7, graph))
+        assert ModelProto.FromString(file.read_bytes()).graph.node[-1].op_type == "Erf"
+        with pytest.raises(ModelError, match="damaged"):
+            load_model(file)
+        whole = ModelProto.FromString(data)
+    file.write_bytes(hidden.SerializeToString() + data)
+    assert ModelProto.FromString(file.read_bytes()).graph.node[0].op_type == "Erf"
+    with pytest.raises(ModelError, match="field 7"):
+        load_model(file)
+
+
+def tagged(number: int, message: bytes) -> bytes:
+    """A message as a field of another."""
+    size, length = bytearray(), len(message)
+    while length > 0x7F:
+        size.append(length & 0x7F | 0x80)
+        length >>= 7
+    return bytes([number << 3 | 2, *size, length]) + message
 
 
 def test_flipped_bytes_never_crash(path: Path, tmp_path: Path) -> None:

@@ -1,0 +1,138 @@
+"""Sizes of everything that a graph computes, before any memory is taken for it.
+
+A file of a thousand bytes can ask for any amount: rows that double from node to node, or a column that meets a row. So
+the shapes are followed node by node, for the most rays of one call.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+Shape = tuple[int, ...]
+
+RAYS = 16_400  # of a call: `onnxlens.BATCH` with its padding
+MAX_NUMBERS = 20_000 * RAYS  # of any tensor; the largest polynomials known have a thousand terms
+
+ELEMENTWISE = frozenset("Abs Cast Clip Cos DequantizeLinear Identity Neg Reciprocal Relu Sin Sqrt Tanh".split())
+BROADCAST = frozenset("Add And Div Equal Greater GreaterOrEqual LessOrEqual Max Min Mul Sub Where".split())
+
+
+@dataclass(frozen=True)
+class Node:
+    """A node of a graph: its operator, its integer attributes, names of what it takes and makes."""
+
+    kind: str
+    attributes: Mapping[str, int]
+    inputs: Sequence[str]
+    outputs: Sequence[str]
+
+
+def check_shapes(
+    nodes: Sequence[Node], known: Sequence[tuple[str, Shape]], integers: Mapping[str, Sequence[int]]
+) -> None:
+    """Refuse graphs whose tensors grow beyond reason.
+
+    Args:
+        known: names and shapes of inputs and constants.
+        integers: values of the constants that are integers, by name.
+
+    Raises:
+        ValueError: a tensor of more than `MAX_NUMBERS`, shapes that do not fit, or that only running tells.
+    """
+    shapes: dict[str, Shape] = {}
+
+    def add(name: str, shape: Shape, what: str) -> None:
+        if name in shapes:
+            raise ValueError(f"{name} is made twice")
+        if min(shape, default=1) < 0 or math.prod(shape) > MAX_NUMBERS:
+            raise ValueError(f"{what} has shape {shape} for {RAYS} rays, expected at most {MAX_NUMBERS} numbers")
+        shapes[name] = shape
+
+    for name, shape in known:
+        add(name, shape, name)
+    for node in nodes:
+        try:
+            made = _shapes(node, [shapes[name] for name in node.inputs], [integers.get(name) for name in node.inputs])
+        except (KeyError, IndexError, ValueError, TypeError, ZeroDivisionError) as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise ValueError(f"operator {node.kind}: its inputs do not fit ({reason})") from error
+        if len(made) != len(node.outputs):
+            raise ValueError(f"operator {node.kind}: {len(node.outputs)} outputs, expected {len(made)}")
+        for name, shape in zip(node.outputs, made, strict=True):
+            add(name, shape, f"operator {node.kind}")
+
+
+def _shapes(node: Node, given: list[Shape], constants: list[Any]) -> list[Shape]:
+    """Shapes of the outputs; `constants` are the values of inputs that are constant integers, else None."""
+    if node.kind in ELEMENTWISE:
+        return [given[0]]
+    if node.kind in BROADCAST:
+        return [tuple(np.broadcast_shapes(*given))]
+    return SHAPED[node.kind](node, given, constants)
+
+
+def _product(node: Node, given: list[Shape], _: list[Any]) -> list[Shape]:
+    (rows, inner), (other, columns) = given[:2]
+    if inner != other or any(node.attributes.get(name) for name in ("transA", "transB")):
+        raise ValueError(f"{given[0]} times {given[1]}")
+    return [(rows, columns)]
+
+
+def _concat(node: Node, given: list[Shape], _: list[Any]) -> list[Shape]:
+    axis = _axis(node.attributes["axis"], given[0])
+    rests = {(*shape[:axis], *shape[axis + 1 :]) for shape in given}
+    if len(rests) > 1:
+        raise ValueError(f"{given}")
+    return [_with(given[0], axis, (sum(shape[axis] for shape in given),))]
+
+
+def _gather(node: Node, given: list[Shape], _: list[Any]) -> list[Shape]:
+    return [_with(given[0], _axis(node.attributes.get("axis", 0), given[0]), given[1])]
+
+
+def _split(node: Node, given: list[Shape], constants: list[Any]) -> list[Shape]:
+    axis = _axis(node.attributes.get("axis", 0), given[0])
+    parts = constants[1]
+    if sum(parts) != given[0][axis]:
+        raise ValueError(f"parts {list(parts)} of {given[0]}")
+    return [_with(given[0], axis, (int(part),)) for part in parts]
+
+
+def _reduce(node: Node, given: list[Shape], constants: list[Any]) -> list[Shape]:
+    axes = {_axis(a, given[0]) for a in constants[1]} if len(constants) > 1 else set(range(len(given[0])))
+    if node.attributes.get("keepdims", 1):
+        return [tuple(1 if k in axes else size for k, size in enumerate(given[0]))]
+    return [tuple(size for k, size in enumerate(given[0]) if k not in axes)]
+
+
+def _reshape(_: Node, given: list[Shape], constants: list[Any]) -> list[Shape]:
+    count, shape = math.prod(given[0]), [int(v) for v in constants[1]]
+    if -1 in shape:
+        shape[shape.index(-1)] = count // -math.prod(shape)
+    if min(shape, default=1) < 1 or math.prod(shape) != count:
+        raise ValueError(f"{given[0]} as {list(constants[1])}")
+    return [tuple(shape)]
+
+
+SHAPED: dict[str, Callable[[Node, list[Shape], list[Any]], list[Shape]]] = {
+    "MatMul": _product,
+    "Gemm": _product,
+    "Concat": _concat,
+    "Gather": _gather,
+    "Split": _split,
+    "ReduceSum": _reduce,
+    "Reshape": _reshape,
+}
+
+
+def _axis(axis: int, shape: Shape) -> int:
+    return range(len(shape))[axis]
+
+
+def _with(shape: Shape, axis: int, sizes: Shape) -> Shape:
+    return (*shape[:axis], *sizes, *shape[axis + 1 :])
