@@ -43,6 +43,9 @@ _NAMES = {kind: name for name, kind in CORES.items()}
 _MAX_FILE = 64 * 2**20
 _MAX_TEXT = 16 * 2**20  # of the JSON; the largest models known take 100 kB
 _MAX_DEPTH = 8
+_MAX_ROWS = 20_000  # of any array: terms, or units of a layer
+_MAX_DEGREE = 32  # of any term; settings allow half
+_MAX_RAYS = 1000  # of the card's reference; `card.reference_rays` gives 4 a status
 _LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "designer", "rims", "film_z_mm", "path")
 
 
@@ -162,8 +165,8 @@ def _pack(value: Any) -> Any:
         array = value.detach().cpu().numpy().astype("<f4")
         return {"f4": base64.b64encode(array.tobytes()).decode(), "shape": list(array.shape)}
     if isinstance(value, np.ndarray):
-        if value.size and not (0 <= value.min() and value.max() < 256):
-            raise InputError("export", "exponents", "(beyond 255)", "integers from 0 to 255")
+        if value.size and not (0 <= value.min() and value.sum(-1).max() <= _MAX_DEGREE):
+            raise InputError("export", "exponents", "(a negative or larger one)", f"terms of degree 0 to {_MAX_DEGREE}")
         return {"u1": base64.b64encode(value.astype("u1").tobytes()).decode(), "shape": list(value.shape)}
     if isinstance(value, tuple):
         return [_pack(v) for v in value]
@@ -183,9 +186,13 @@ def _core(packed: Any, depth: int = 0) -> Any:
     if "kind" in packed:
         kind = CORES[packed["kind"]]
         return kind(**{f.name: _core(packed[f.name], depth + 1) for f in fields(kind) if f.name in packed})
+    if max(packed["shape"], default=0) > _MAX_ROWS:
+        raise ValueError(f"an array of shape {packed['shape']}, expected at most {_MAX_ROWS} rows")
     form = "f4" if "f4" in packed else "u1"
     array = np.frombuffer(base64.b64decode(packed[form], validate=True), f"<{form}").reshape(packed["shape"])
     if form == "u1":
+        if array.size and int(array.sum(-1).max()) > _MAX_DEGREE:  # whoever writes terms as products would not end
+            raise ValueError(f"a term of degree {int(array.sum(-1).max())}, expected at most {_MAX_DEGREE}")
         return array.astype(np.int64)
     if not np.isfinite(array).all():
         raise ValueError("coefficients that are NaN or infinite")
@@ -246,6 +253,8 @@ def _check(file: Path, model: LensModel, card: dict[str, Any]) -> None:
     if model.lens.sha256 != card["lens"]["sha256"]:
         raise ModelError(f"{file}: its prescription is not that of its card")
     reference = card["reference"]
+    if len(reference["status"]) > _MAX_RAYS or any(len(row) > _MAX_RAYS for row in reference["rays"]):
+        raise ValueError(f"more than {_MAX_RAYS} reference rays")
     columns = torch.tensor(reference["rays"], dtype=torch.float64)
     film_z = torch.tensor(reference["film_z_mm"], dtype=torch.float64)
     with torch.no_grad():

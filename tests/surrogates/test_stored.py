@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from neurolens.errors import ModelError
-from neurolens.modelfile import MODEL_KEY
+from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.surrogates.cores import Partitioned
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
@@ -85,6 +85,18 @@ def shorten(data: dict[str, Any]) -> None:
     data["core"]["ab"]["shape"] = [3, 2, 10**9]
 
 
+def lengthen(data: dict[str, Any]) -> None:
+    """Terms that evaluation takes memory for before their coefficients, too few, are looked at."""
+    count = 200_000
+    data["core"]["exponents"] = {"u1": base64.b64encode(bytes(4 * count)).decode(), "shape": [count, 4]}
+
+
+def raise_degree(data: dict[str, Any]) -> None:
+    raw = bytearray(base64.b64decode(data["core"]["exponents"]["u1"]))
+    raw[-4:] = b"\xff\xff\xff\xff"
+    data["core"]["exponents"]["u1"] = base64.b64encode(raw).decode()
+
+
 def rename(data: dict[str, Any]) -> None:
     data["core"]["kind"] = "eval"
 
@@ -96,10 +108,21 @@ def nest(data: dict[str, Any]) -> None:
     data["core"] = core
 
 
-@pytest.mark.parametrize("change", [set_scalar, double_scale, bend, shorten, rename, nest])
+@pytest.mark.parametrize("change", [set_scalar, double_scale, bend, shorten, lengthen, raise_degree, rename, nest])
 def test_damaged_coefficients_are_refused(change: Callable[[dict[str, Any]], None], tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="damaged|prescription"):
         load_fitted(rewrite(lens_models.exported("invariants"), tmp_path / "bad.onnx", change))
+
+
+def test_more_reference_rays_than_any_card_has_are_refused(tmp_path: Path) -> None:
+    proto = onnx.load(str(lens_models.exported("invariants")))
+    entry = next(e for e in proto.metadata_props if e.key == CARD_KEY)
+    card = json.loads(entry.value)
+    card["reference"]["rays"] = [row * 100 for row in card["reference"]["rays"]]
+    entry.value = json.dumps(card)
+    (tmp_path / "many.onnx").write_bytes(proto.SerializeToString())
+    with pytest.raises(ModelError, match="reference rays"):
+        load_fitted(tmp_path / "many.onnx")
 
 
 def test_files_that_hold_none(tmp_path: Path) -> None:
