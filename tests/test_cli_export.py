@@ -88,6 +88,8 @@ def test_bad_input_is_one_line(file: Path, tmp_path: Path, capsys: pytest.Captur
     out = tmp_path / "a.h"
     old = tmp_path / "old.onnx"
     old.write_bytes(file.read_bytes().replace(MODEL_KEY.encode(), b"x" * len(MODEL_KEY)))
+    bare = tmp_path / "bare.onnx"
+    bare.write_bytes(file.read_bytes().replace(b'"refractions"', b'"reflections"'))
     base = ["export", file, "--to", "c", "-o", out]
     cases: list[tuple[list[object], list[str]]] = [
         ([*base, "--fix", "wavelengths=300"], ["400 to 700"]),
@@ -104,6 +106,7 @@ def test_bad_input_is_one_line(file: Path, tmp_path: Path, capsys: pytest.Captur
         (["export", file, "--to", "onnx", "-o", out, "--fix", "wavelengths=450,550"], ["one wavelength"]),
         (["export", tmp_path / "no.onnx", "--to", "c", "-o", out], ["no.onnx", "no such file"]),
         (["export", old, "--to", "c", "-o", out], ["old.onnx", "export it again"]),
+        (["export", bare, "--to", "c", "-o", out], ["card", "refractions"]),
         (["export", tmp_path / "empty", "--to", "c", "-o", out], ["empty", "name its file"]),
         (["export", file, "--to", "c", "-o", tmp_path / "no" / "a.h"], ["a.h"]),
         (["export", file, "--to", "fortran", "-o", out], ["fortran"]),

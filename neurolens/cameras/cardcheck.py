@@ -11,7 +11,8 @@ from neurolens.cameras.states import check_states
 from neurolens.errors import InputError, ModelError
 
 
-def _number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Whether this is a number of JSON that a float holds."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     try:
@@ -21,7 +22,7 @@ def _number(value: Any) -> bool:
 
 
 def _positive(value: Any) -> bool:
-    return _number(value) and value > 0
+    return is_number(value) and value > 0
 
 
 def _rising(value: Any) -> bool:
@@ -33,11 +34,15 @@ def _distances(value: Any) -> bool:
 
 
 def _numbers(value: Any) -> bool:
-    return isinstance(value, list) and len(value) >= 2 and all(map(_number, value))
+    return isinstance(value, list) and len(value) >= 2 and all(map(is_number, value))
 
 
 def _text(value: Any) -> bool:
     return isinstance(value, str)
+
+
+def _seed(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= 2**53
 
 
 def _table(value: Any) -> bool:
@@ -45,7 +50,7 @@ def _table(value: Any) -> bool:
 
 
 Rule = tuple[Callable[[Any], bool], str]
-NUMBER: Rule = (_number, "a finite number")
+NUMBER: Rule = (is_number, "a finite number")
 POSITIVE: Rule = (_positive, "a finite number above 0")
 TEXT: Rule = (_text, "a text")
 NUMBERS: Rule = (_numbers, "a list of two or more finite numbers")
@@ -57,7 +62,7 @@ _RULES: dict[str, Rule] = {
     "lens.name": TEXT,
     "lens.sha256": TEXT,
     "lens.dispersive": (lambda v: isinstance(v, bool), "true or false"),
-    "lens.efl_mm": (lambda v: _number(v) and v != 0, "a finite number other than 0"),
+    "lens.efl_mm": (lambda v: is_number(v) and v != 0, "a finite number other than 0"),
     "lens.f_number": POSITIVE,
     "lens.stop_radius_mm": POSITIVE,
     "lens.front_principal_z_mm": NUMBER,
@@ -85,7 +90,7 @@ _RULES: dict[str, Rule] = {
 _OPTIONAL: dict[str, Rule] = {
     "lens.stop_surface": (lambda v: isinstance(v, int) and not isinstance(v, bool) and 0 <= v < 10_000, "an integer"),
     "domain.nearest_m": (lambda v: v is None or _positive(v), "a number above 0, or null"),
-    "fit.settings.rays_seed": (lambda v: v is None or (_number(v) and isinstance(v, int)), "an integer, or null"),
+    "fit.settings.rays_seed": (lambda v: v is None or _seed(v), "an integer up to 2^53, or null"),
 }
 _MISSING = "(missing)"
 

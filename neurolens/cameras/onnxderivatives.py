@@ -8,7 +8,7 @@ import numpy as np
 
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.onnxlens import DERIVATIVES, INPUTS, OUTPUTS, LensRays, OnnxLens
-from neurolens.cameras.onnxsession import open_session
+from neurolens.cameras.onnxsession import open_session, run_session
 from neurolens.errors import InputError, ModelError
 
 # Rays a call: these graphs have more rows than those without derivatives.
@@ -54,7 +54,12 @@ class OnnxDerivatives:
         rays = np.empty((5, count), np.float32)
         rays[:2], rays[2:4], rays[4] = film, pupil, wavelength_nm
         parts = [
-            self._session.run([*OUTPUTS, *DERIVATIVES], {"rays": np.ascontiguousarray(rays[:, i : i + BATCH]), **feeds})
+            run_session(
+                self.model.path,
+                self._session,
+                (*OUTPUTS, *DERIVATIVES),
+                {"rays": np.ascontiguousarray(rays[:, i : i + BATCH]), **feeds},
+            )
             for i in range(0, max(count, 1), BATCH)
         ]
         out = [np.concatenate(columns, -1) for columns in zip(*parts, strict=True)]

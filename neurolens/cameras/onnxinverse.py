@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens import status as st
-from neurolens.cameras.cardcheck import check_card
+from neurolens.cameras.cardcheck import check_card, is_number
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.onnxfile import read_checked
 from neurolens.cameras.onnxlens import OUTPUTS
-from neurolens.cameras.onnxsession import open_session
+from neurolens.cameras.onnxsession import open_session, run_session
 from neurolens.errors import InputError, ModelError
 from neurolens.frontsurface import meet_front
 
@@ -123,9 +123,13 @@ class OnnxInverse:
         feeds = {key: np.array([value], np.float32) for key, value in call.items()}
         with np.errstate(over="ignore"):
             rays = given.astype(np.float32)
-        wanted = list(InverseRays._fields)
         parts = [
-            session.run(wanted, {_GIVEN[name]: np.ascontiguousarray(rays[:, i : i + BATCH]), **feeds})
+            run_session(
+                self.path,
+                session,
+                InverseRays._fields,
+                {_GIVEN[name]: np.ascontiguousarray(rays[:, i : i + BATCH]), **feeds},
+            )
             for i in range(0, max(rays.shape[1], 1), BATCH)
         ]
         return InverseRays(*(np.concatenate(columns, -1) for columns in zip(*parts, strict=True)))
@@ -159,12 +163,28 @@ def _load(file: Path, name: str, lens: str | None, threads: int) -> tuple[Any, d
     data, card = read_checked(file)
     check_card(file, card)
     facts = card.get("inverse")
-    if not isinstance(facts, dict) or facts.get("map") != name or "front" not in facts:
+    if not isinstance(facts, dict) or facts.get("map") != name or not _is_front(facts.get("front", "")):
         raise ModelError(f"{file}: card: inverse: got {str(facts)[:80]}, expected the facts of the {name} map")
     if lens is not None and card["lens"].get("sha256") != lens:
         raise ModelError(f"{file}: card: lens.sha256: the map stands for another lens, {card['lens'].get('name')}")
     inputs = {_GIVEN[name]: ("tensor(float)", 5, None), **_CALL}
     return open_session(file, data, threads, inputs, _OUTPUTS), card
+
+
+def _is_front(value: Any) -> bool:
+    """Whether this is a front surface as `meet_front` takes it: none, or a table of its shape."""
+    if value is None:
+        return True
+    if not isinstance(value, dict) or set(value) != {"curvature", "conic", "asphere", "cylinder"}:
+        return False
+    terms = value["asphere"]
+    return (
+        is_number(value["curvature"])
+        and is_number(value["conic"])
+        and value["cylinder"] in (None, "x", "y")
+        and isinstance(terms, list)
+        and all(isinstance(t, list) and len(t) == 2 and all(map(is_number, t)) for t in terms)
+    )
 
 
 def _check(inverse: OnnxInverse, name: str, card: dict[str, Any]) -> None:
@@ -193,7 +213,10 @@ def _arrays(a: ArrayLike, rows_a: int, b: ArrayLike, rows_b: int, wavelength: Ar
     Raises:
         InputError: other shapes.
     """
-    first, second, w = (np.asarray(v, np.float64) for v in (a, b, wavelength))
+    try:
+        first, second, w = (np.asarray(v, np.float64) for v in (a, b, wavelength))
+    except (ValueError, TypeError) as error:
+        raise InputError("OnnxInverse", "points", "(no arrays)", "arrays of numbers") from error
     if first.ndim != 2 or len(first) != rows_a:
         raise InputError("OnnxInverse", "points", f"({first.shape})", f"an array ({rows_a}, N)")
     count = first.shape[1]

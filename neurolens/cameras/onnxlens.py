@@ -14,7 +14,7 @@ from neurolens import status as st
 from neurolens.cameras.cardcheck import check_card
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.onnxfile import read_checked, without_outputs
-from neurolens.cameras.onnxsession import first_line, open_session
+from neurolens.cameras.onnxsession import open_session, run_session
 from neurolens.cameras.states import STATE, axes_of, card_at, default_state, state_numbers
 from neurolens.errors import InputError, ModelError
 
@@ -176,10 +176,7 @@ class OnnxLens:
         feeds = {"rays": rays, "film_z_mm": plane, "stop_radius_mm": stop}
         if self.axes:
             feeds[STATE] = np.array(self.state, np.float32)
-        try:
-            out = self._session.run(list(OUTPUTS), feeds)
-        except Exception as error:  # onnxruntime raises types of its own, without a common base
-            raise ModelError(f"{self.path}: onnxruntime cannot run it ({first_line(error)})") from error
+        out = run_session(self.path, self._session, tuple(OUTPUTS), feeds)
         return LensRays(*(a[..., :count] for a in out))
 
 

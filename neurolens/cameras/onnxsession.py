@@ -1,11 +1,14 @@
-"""Sessions of onnxruntime with the inputs and outputs that are expected, and no others."""
+"""Sessions of onnxruntime with the inputs and outputs that are expected, and no others; errors are ours."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import onnxruntime
+from numpy.typing import NDArray
 
 from neurolens.errors import ModelError
 
@@ -26,7 +29,7 @@ def open_session(
     try:
         session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises types of its own, without a common base
-        raise ModelError(f"{path}: onnxruntime cannot load it ({first_line(error)})") from error
+        raise ModelError(f"{path}: onnxruntime cannot load it ({_first_line(error)})") from error
     for what, expected, found in (("input", inputs, session.get_inputs()), ("output", outputs, session.get_outputs())):
         shapes = {v.name: (v.type, *(None if isinstance(d, str) else d for d in v.shape)) for v in found}
         if shapes != expected:
@@ -34,5 +37,20 @@ def open_session(
     return session
 
 
-def first_line(error: Exception) -> str:
+def run_session(
+    path: Path, session: Any, outputs: Sequence[str], feeds: Mapping[str, NDArray[np.float32]]
+) -> list[NDArray[Any]]:
+    """The outputs asked for.
+
+    Raises:
+        ModelError: onnxruntime cannot run the model `path`.
+    """
+    try:
+        found: list[NDArray[Any]] = session.run(list(outputs), dict(feeds))
+    except Exception as error:  # onnxruntime raises types of its own, without a common base
+        raise ModelError(f"{path}: onnxruntime cannot run it ({_first_line(error)})") from error
+    return found
+
+
+def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import print_json
 from neurolens.errors import InputError
+from neurolens.files import atomic_path
 
 if TYPE_CHECKING:
     from neurolens.surrogates.model import LensModel
@@ -181,9 +182,10 @@ def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] |
         export_onnx(model, out, card["errors"], derivatives=derivatives)
         return
     seed, held_out = _seed(model), _pairs(model, train=1).held_out
-    export_onnx(model, out, {})
-    errors = measure_errors(load_model(out), model.lens, model.domain, held_out, _VIGNETTING, seed + 1)
-    export_onnx(model, out, errors, derivatives=derivatives)
+    with atomic_path(out) as measured:  # a file without its errors never stands under the name asked for
+        export_onnx(model, measured, {})
+        errors = measure_errors(load_model(measured), model.lens, model.domain, held_out, _VIGNETTING, seed + 1)
+        export_onnx(model, measured, errors, derivatives=derivatives)
 
 
 def _write_inverse(model: LensModel, out: Path) -> dict[str, Any]:

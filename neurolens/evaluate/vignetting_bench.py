@@ -21,7 +21,7 @@ from torch import Tensor
 
 from neurolens import status as st
 from neurolens.apertures import Aperture
-from neurolens.errors import NeurolensError, NeurolensWarning
+from neurolens.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
 from neurolens.evaluate.vignetting import SEED, false_shares, relative_illumination
 from neurolens.files import atomic_write_text
@@ -111,10 +111,17 @@ def run(
     """Measure and write after every lens; rows of other lenses in the folder's vignetting.json stay.
 
     Returns all rows.
+
+    Raises:
+        InputError: a vignetting.json that holds something else.
     """
     target = folder / "vignetting.json"
-    known = json.loads(target.read_text(encoding="utf-8")) if target.exists() else []
-    rows = {(r["lens"], r["domain"]): r for r in known}
+    try:
+        known = json.loads(target.read_text(encoding="utf-8")) if target.exists() else []
+        rows = {(r["lens"], r["domain"]): r for r in known}
+    except (ValueError, KeyError, TypeError) as error:
+        expected = "rows of neurolens bench vignetting"
+        raise InputError(target, "file", f"({type(error).__name__})", expected) from error
     jobs = [(file, domain) for file in files for domain in domains]
     folder.mkdir(parents=True, exist_ok=True)
     for i, (file, domain) in enumerate(jobs):

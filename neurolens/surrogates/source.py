@@ -49,7 +49,8 @@ def export_source(
         name: of the function; None takes the lens's id.
 
     Raises:
-        InputError: another language, a name that is no identifier, numbers that float32 cannot hold.
+        InputError: another language, a name that is no identifier, numbers that float32 cannot hold, a card that lacks
+            what the comment says.
         TypeError: a core that has no such form.
     """
     if language not in WRITERS:
@@ -58,8 +59,14 @@ def export_source(
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,99}", own) or "__" in own:
         raise InputError("export", "name", own, "letters, digits and single underscores, a letter first")
     program = fused_program(models, parts, fixed)
+    try:
+        comment = comment_of(models, card, fixed)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(
+            "export", "card", f"({type(error).__name__}: {error})", "a card of neurolens, whole"
+        ) from error
     target = Path(path)
-    atomic_write_text(target, WRITERS[language](program, own, comment_of(models, card, fixed)))
+    atomic_write_text(target, WRITERS[language](program, own, comment))
     return Written(target, Signature.of(program, own), sum(program.count().values()))
 
 

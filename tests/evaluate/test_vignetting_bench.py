@@ -65,6 +65,15 @@ def test_cats_eyes_have_the_same_shape(fisheye: LensModel, share: float) -> None
         assert outline.sum() <= 0.004 * exact[name].sum() + 2
 
 
+def test_a_table_of_something_else_is_not_written_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["bench", "vignetting", "--only", "petzval", "--domain", "infinity", "--quiet", "--out", str(tmp_path)]
+    for text in ("half a fi", "3", '[{"lens": "other"}]'):
+        (tmp_path / "vignetting.json").write_text(text)
+        assert main(command) == 2
+        assert "rows of neurolens bench vignetting" in capsys.readouterr().err
+        assert (tmp_path / "vignetting.json").read_text() == text
+
+
 @pytest.mark.slow
 def test_the_command_writes_rows_and_keeps_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "vignetting.json").write_text('[{"lens": "other", "domain": "infinity", "failed": "not round"}]')

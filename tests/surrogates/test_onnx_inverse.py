@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from lens_models import lens, prepared
+from onnx import ModelProto
 
 from neurolens import status as st
 from neurolens.cameras.contract import FloatArray
@@ -21,6 +23,7 @@ from neurolens.cameras.onnxinverse import load_inverse
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.errors import InputError, ModelError
+from neurolens.modelfile import CARD_KEY
 from neurolens.surrogates.derivatives import differentiate
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_onnx
@@ -136,7 +139,8 @@ def test_inverse_maps_of_the_file_are_those_of_torch(kind: str, tmp_path: Path) 
     back = loaded.from_scene(scene[:3] + 50 * scene[3:], scene[3:], w, plane)
     side = inv.from_scene(forward.rays, rays.film_z, rays.wavelength_nm)
     assert (back.status == side.prediction.status.numpy())[sure].mean() > 0.999
-    for row, column in zip(back.rays[:4], (side.rays.film_x, side.rays.film_y, side.rays.pupil_x), strict=False):
+    inverted = (side.rays.film_x, side.rays.film_y, side.rays.pupil_x, side.rays.pupil_y)
+    for row, column in zip(back.rays[:4], inverted, strict=True):
         assert np.abs(row - column.numpy())[sure].max() < 2e-4 * scale
     np.testing.assert_allclose(back.density[sure], side.density.numpy()[sure], rtol=5e-3)
     fit = loaded.card["inverse"]["fit"]
@@ -154,8 +158,9 @@ def test_nonsense_gets_a_status(tmp_path: Path) -> None:
     assert (out.status != st.PASSED)[wild].all()
     back = loaded.from_scene(points, np.stack([c, a, b]), 550.0)
     assert (back.status != st.PASSED)[~np.isfinite(points).all(0)].all()
-    with pytest.raises(InputError, match="points"):
-        loaded.through_stop(np.zeros(3), np.zeros((2, 3)), 550.0)
+    for bad in (np.zeros(3), [["a"], ["b"]]):
+        with pytest.raises(InputError, match="points"):
+            loaded.through_stop(bad, np.zeros((2, 3)), 550.0)
 
 
 def test_files_that_are_no_inverse_maps_are_refused(tmp_path: Path) -> None:
@@ -167,6 +172,17 @@ def test_files_that_are_no_inverse_maps_are_refused(tmp_path: Path) -> None:
     export_inverse(inverse("invariants"), tmp_path / "m.onnx")
     with pytest.raises(ModelError, match="another lens"):
         load_inverse(tmp_path / "m.onnx", lens="0" * 64)
+    whole = (tmp_path / "m.scene.onnx").read_bytes()
+    for front in ({"curvature": 0.01}, {"curvature": 0.01, "conic": 0, "asphere": [4], "cylinder": None}, "flat"):
+        proto = ModelProto.FromString(whole)
+        entry = next(e for e in proto.metadata_props if e.key == CARD_KEY)
+        card = json.loads(entry.value)
+        card["inverse"]["front"] = front
+        entry.value = json.dumps(card)
+        (tmp_path / "m.scene.onnx").write_bytes(proto.SerializeToString())
+        with pytest.raises(ModelError, match="card: inverse"):
+            load_inverse(tmp_path / "m.onnx")
+    (tmp_path / "m.scene.onnx").write_bytes(whole)
     (tmp_path / "m.stop.onnx").unlink()
     with pytest.raises(InputError, match="map"):
         load_inverse(tmp_path / "m.onnx").through_stop(np.zeros((2, 1)), np.zeros((2, 1)), 550.0)
