@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import failure, run_json
 
 from neurolens.cli import main
 from neurolens.render.exr import read_exr
@@ -58,25 +59,6 @@ def scene(tmp_path: Path) -> Path:
     path = tmp_path / "ball.toml"
     path.write_text(SCENE)
     return path
-
-
-def run_json(capsys: pytest.CaptureFixture[str], *args: object) -> dict[str, Any]:
-    """Run a command with --json and parse all of its stdout."""
-    assert main([*map(str, args), "--json"]) == 0
-    data: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return data
-
-
-def failure(capsys: pytest.CaptureFixture[str], *args: object) -> str:
-    """Run a command that must fail with exit code 2, nothing on stdout, and one line on stderr; returns the line."""
-    try:
-        code = main([*map(str, args)])
-    except SystemExit as stopped:
-        code = int(stopped.code or 0)
-    captured = capsys.readouterr()
-    lines = captured.err.splitlines()
-    assert (code, captured.out, len(lines)) == (2, "", 1), captured
-    return lines[0]
 
 
 # Help

@@ -8,6 +8,7 @@ from pathlib import Path
 import lens_models
 import numpy as np
 import pytest
+from command_line import failure
 
 from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxderivatives import OnnxDerivatives
@@ -19,17 +20,6 @@ from neurolens.modelfile import MODEL_KEY
 @pytest.fixture(scope="module")
 def file() -> Path:
     return lens_models.exported("invariants")
-
-
-def failure(capsys: pytest.CaptureFixture[str], *args: object) -> str:
-    try:
-        code = main([*map(str, args)])
-    except SystemExit as stopped:
-        code = int(stopped.code or 0)
-    captured = capsys.readouterr()
-    lines = captured.err.splitlines()
-    assert (code, captured.out, len(lines)) == (2, "", 1), captured
-    return lines[0]
 
 
 def test_c_and_glsl(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

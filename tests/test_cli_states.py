@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from command_line import failure, run_json
 
 from neurolens.cli import main
 from neurolens.errors import InputError
@@ -40,36 +39,19 @@ def scene(tmp_path: Path) -> Path:
     return path
 
 
-def described(capsys: pytest.CaptureFixture[str], *args: object) -> dict[str, Any]:
-    assert main([*map(str, args), "--json"]) == 0
-    data: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return data
-
-
-def failure(capsys: pytest.CaptureFixture[str], *args: object) -> str:
-    """The one line on stderr of a command that exits with code 2."""
-    try:
-        code = main([*map(str, args)])
-    except SystemExit as stopped:
-        code = int(stopped.code or 0)
-    captured = capsys.readouterr()
-    assert (code, captured.out, len(captured.err.splitlines())) == (2, "", 1), captured
-    return captured.err
-
-
 def test_a_focus_state_is_focused_at_its_object(capsys: pytest.CaptureFixture[str]) -> None:
     """1588 mm before the front vertex, and the film 245 mm behind it; farther as the lens is larger."""
-    near = described(capsys, "lens", ANAMORPHIC, "--zoom", "1.6m")
+    near = run_json(capsys, "lens", ANAMORPHIC, "--zoom", "1.6m")
     assert near["focus_m"] == pytest.approx((1588.0 + near["film_z_mm"]) / 1000)
-    small = described(capsys, "lens", NIKON, "--zoom", "135mm near")
+    small = run_json(capsys, "lens", NIKON, "--zoom", "135mm near")
     assert small["focus_m"] == pytest.approx((750.55 + small["film_z_mm"]) / 1000)
-    large = described(capsys, "lens", NIKON, "--zoom", "135mm near", "--efl", 200)
+    large = run_json(capsys, "lens", NIKON, "--zoom", "135mm near", "--efl", 200)
     assert large["focus_m"] / small["focus_m"] == pytest.approx(large["efl_mm"] / small["efl_mm"])
 
 
 def test_an_anamorphic_lens_is_described_in_both_planes(capsys: pytest.CaptureFixture[str]) -> None:
     """The source: 42.47 mm, and half of it across; the edge of the circle is lit along y, the picture is wider."""
-    data = described(capsys, "lens", ANAMORPHIC)
+    data = run_json(capsys, "lens", ANAMORPHIC)
     assert data["efl_mm"] == pytest.approx(42.47, abs=0.05) and data["efl_x_mm"] == pytest.approx(21.47, rel=0.01)
     assert data["half_field_reached_deg"] > 15
     dark = [w for w in data["warnings"] if "no ray reaches" in w]
@@ -77,12 +59,12 @@ def test_an_anamorphic_lens_is_described_in_both_planes(capsys: pytest.CaptureFi
     assert main(["lens", str(ANAMORPHIC)]) == 0
     text = capsys.readouterr().out
     assert "in the x-z plane" in text and "cylinder y" in text
-    assert described(capsys, "lens", SINGLET)["efl_x_mm"] is None
+    assert run_json(capsys, "lens", SINGLET)["efl_x_mm"] is None
 
 
 def test_breathing_is_no_other_f_number(capsys: pytest.CaptureFixture[str]) -> None:
     state = ("--zoom", "135mm", "--focus", "2", "--focusing", "internal")
-    data = described(capsys, "lens", NIKON, *state)
+    data = run_json(capsys, "lens", NIKON, *state)
     assert data["efl_mm"] < 130  # it does breathe
     assert not [w for w in data["warnings"] if "the stop gives" in w]
 
@@ -92,7 +74,7 @@ def test_the_surface_table_hides_nothing(tmp_path: Path, capsys: pytest.CaptureF
     material = 'n_d = 1.5168, V_d = 64.17, material = "N-BK7"'
     more = 'coating = "quarter-wave", conic = -1.1, asphere = { 4 = 1e-7, 6 = 2e-10 }, absorption_per_mm = 0.01'
     path.write_text(SINGLET.read_text().replace(material, f'glass = "N-BK7", {more}'))
-    row = described(capsys, "lens", path)["surfaces"][1]
+    row = run_json(capsys, "lens", path)["surfaces"][1]
     assert (row["conic"], row["asphere"], row["glass"]) == (-1.1, {"4": 1e-7, "6": 2e-10}, "N-BK7")
     assert row["n_d"] == pytest.approx(1.5168, abs=1e-4) and row["V_d"] == pytest.approx(64.17, abs=0.02)
     (index, nanometres), *_ = row["coating"]["layers"]
@@ -150,7 +132,7 @@ def test_the_picture_keeps_the_state_of_its_lens(
 ) -> None:
     out = tmp_path / "a.exr"
     state = ("--zoom", "100", "--focusing", "internal", "--focus", "2")
-    described(capsys, "render", scene, "--camera", NIKON, "-o", out, "--quiet", *state)
+    run_json(capsys, "render", scene, "--camera", NIKON, "-o", out, "--quiet", *state)
     camera = read_exr(out)[1]["camera"]
     assert (camera["zoom"], camera["focusing"], camera["rims"]) == ("100", "internal", "derived")
     assert "100 mm" in camera["derived"]

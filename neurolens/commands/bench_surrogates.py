@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import platform
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -63,8 +66,6 @@ def add_parser(kinds: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make what is missing, and write the pages after every lens."""
-    import json
-
     from neurolens.evaluate.experiment import LensChoice
     from neurolens.evaluate.records import plain
     from neurolens.evaluate.surrogate_bench import Bench, run_bench
@@ -83,12 +84,12 @@ def run(args: argparse.Namespace) -> int:
     config = {
         "lenses": [str(file) for file in files],
         "methods": [row.name for row in rows],
-        "settings": settings,
+        "settings": asdict(settings),
         "seed": args.seed,
         "versions": versions(),
         "machine": {"processor": platform.processor() or platform.machine(), "system": platform.platform()},
     }
-    atomic_write_text(out / "config.json", json.dumps(plain(config | {"settings": _plain(settings)}), indent=1) + "\n")
+    atomic_write_text(out / "config.json", json.dumps(plain(config), indent=1) + "\n")
     facts = f"{_conditions(args, settings)} {NOTES}"
     found: dict[str, Any] = {}
 
@@ -102,15 +103,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _plain(settings: BenchSettings) -> dict[str, Any]:
-    from dataclasses import asdict
-
-    return asdict(settings)
-
-
 def _settings(args: argparse.Namespace) -> BenchSettings:
-    import math
-
     from neurolens.evaluate.experiment import DomainChoice
     from neurolens.evaluate.surrogate_bench import BenchSettings
     from neurolens.surrogates.pairs import PairSettings

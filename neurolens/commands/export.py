@@ -34,8 +34,8 @@ examples:
   neurolens export models/NAME.onnx --to glsl -o lens.glsl --fix wavelengths=450,550,650 --fix focus=2
   neurolens export runs/quickstart --to c -o ray.h --only ray
   neurolens export models/NAME.onnx --to onnx -o laser.onnx --fix wavelengths=633
-  neurolens export models/NAME.onnx --to onnx -o lens.onnx --derivatives   # for ray differentials
-  neurolens export models/NAME.onnx --to onnx -o lens.onnx --inverse       # and lens.stop.onnx, lens.scene.onnx"""
+  neurolens export models/NAME.onnx --to onnx -o lens.onnx --derivatives  # for ray differentials
+  neurolens export models/NAME.onnx --to onnx -o a.onnx --inverse         # and a.stop.onnx, a.scene.onnx"""
 _PARTS = ("ray", "transmittance", "stop", "vignetting")
 _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
 # Rays that measure the errors of an ONNX file for what is fixed; those that teach inverse maps.

@@ -54,7 +54,7 @@ def read_index(folder: Path) -> list[dict[str, Any]]:
     """Rows of models/index.json.
 
     Raises:
-        InputError: no such file, not JSON, or rows without a model file or a lens file.
+        InputError: no such file, not JSON, rows without a model file or a lens file, or a model elsewhere.
     """
     path = folder / "index.json"
     try:
@@ -69,6 +69,8 @@ def read_index(folder: Path) -> list[dict[str, Any]]:
         for key in ("file", "lens_file"):
             if not isinstance(row, dict) or not isinstance(row.get(key), str):
                 raise InputError(path, f"models {i}, {key}", "(missing)", "the name of a file")
+        if Path(row["file"]).name != row["file"]:  # files that an index names may be removed
+            raise InputError(path, f"models {i}, file", row["file"], "the name of a file beside the index")
     return rows
 
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from neurolens.errors import ModelError
 from neurolens.evaluate.compiled_source import CompiledSource, find_compiler
-from neurolens.evaluate.records import Timing
-from neurolens.evaluate.speed import Call, Candidate, Unavailable, race
+from neurolens.evaluate.speed import Call, Candidate, Unavailable
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.expressions import Program
 from neurolens.surrogates.fused import ALL, FREE, Fixed, Parts, fused_program
@@ -79,9 +78,3 @@ def fused_candidate(
     except (Unavailable, ModelError, TypeError):
         return None
     return program_candidate(name, program, domain, fixed.stop_radius_mm)
-
-
-def fused_ns(model: LensModel, domain: Domain, *, parts: Parts = ALL, rounds: int = 10) -> Timing | None:
-    """Nanoseconds per ray of a model as compiled C on one thread; None where it cannot be timed."""
-    candidate = fused_candidate("fused", model, domain, parts=parts)
-    return None if candidate is None else race([candidate], domain, rounds=rounds).timing("fused")

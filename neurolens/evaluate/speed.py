@@ -24,9 +24,8 @@ from neurolens.evaluate.records import ExactRecord, Timing
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
 from neurolens.surrogates.threads import pinned_threads
 
-POOL = (
-    65536  # rays of one pass: every batch size divides it, and float32 inputs of a pass stay in the third-level cache
-)
+# Rays of one pass: every batch size divides it, and float32 inputs of a pass stay in the third-level cache.
+POOL = 65536
 BATCHES = (4096, 8192, 16384)
 _SAMPLE_S = 0.001  # a sample lasts at least this long; short ones fall between the interruptions of a busy machine
 _SAMPLES = 5  # the best of so many is the time of a round
@@ -55,16 +54,6 @@ class Candidate:
     prepare: Callable[[FilmRays], Call]
     batches: tuple[int, ...] = BATCHES
     domain: Domain | None = None
-
-
-def time_per_ray(call: Call, rays: int, threads: int = 1, repeats: int = 20) -> Timing:
-    """Nanoseconds per ray of one call that does `rays` rays, after one call to warm up; torch's threads are pinned."""
-    with pinned_threads(threads):
-        one = _Pass(rays, (call,), None, 1)
-        one.sample_ns(1)
-        inner = _calls_for_a_sample(one.sample_ns(1))
-        samples = [one.sample_ns(inner) / rays for _ in range(repeats)]
-    return _timing(samples, threads, rays)
 
 
 @dataclass(frozen=True)

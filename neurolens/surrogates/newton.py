@@ -54,16 +54,6 @@ def limited_newton(evaluate: Evaluate, start: Tensor, steps: int, limit: float, 
     return best
 
 
-def plain_newton(evaluate: Evaluate, start: Tensor, steps: int) -> Solved:
-    """Newton's method as published: every step taken in full."""
-    x = start
-    for _ in range(steps):
-        residual, jacobian = evaluate(x)
-        x = x - solve_small(jacobian, residual)
-    residual, jacobian = evaluate(x)
-    return Solved(x, jacobian, _length(residual))
-
-
 def _length(residual: Tensor) -> Tensor:
     size = residual.norm(dim=0)
     return torch.where(torch.isfinite(size), size, torch.inf)

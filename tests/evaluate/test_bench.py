@@ -62,7 +62,17 @@ def test_the_table_holds_best_median_and_both_ratios() -> None:
 
 @pytest.mark.parametrize(
     "text",
-    [None, "", "{", "[]", '{"models": 3}', '{"models": [{"file": "a.onnx"}]}', '{"models": [3]}', '{"rows": []}'],
+    [
+        None,
+        "",
+        "{",
+        "[]",
+        '{"models": 3}',
+        '{"models": [{"file": "a.onnx"}]}',
+        '{"models": [3]}',
+        '{"rows": []}',
+        '{"models": [{"file": "../a.onnx", "lens_file": "a.toml"}]}',
+    ],
 )
 def test_a_bad_index_is_one_clear_error(tmp_path: Path, text: str | None, capsys: pytest.CaptureFixture[str]) -> None:
     if text is not None:

@@ -14,11 +14,11 @@ from neurolens import status as st
 from neurolens.cameras.model import load_model
 from neurolens.errors import InputError
 from neurolens.evaluate.compiled_source import CompiledSource, find_compiler
-from neurolens.evaluate.fused import fused_candidate, fused_ns
+from neurolens.evaluate.fused import fused_candidate
 from neurolens.evaluate.fused_exact import exact_program
 from neurolens.evaluate.fused_page import goals, write
 from neurolens.evaluate.fused_speed import Row, ray_candidate, selected
-from neurolens.evaluate.speed import Unavailable
+from neurolens.evaluate.speed import Unavailable, race
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
@@ -59,7 +59,9 @@ def test_candidates_time_models_and_files() -> None:
     except Unavailable as reason:
         pytest.skip(f"the C form is not timed here: {reason}")
     model = lens_models.model("invariants")
-    timing = fused_ns(model, model.domain, parts=RAY_ONLY, rounds=1)
+    candidate = fused_candidate("fused", model, model.domain, parts=RAY_ONLY)
+    assert candidate is not None
+    timing = race([candidate], model.domain, rounds=1).timing("fused")
     assert timing is not None and 0 < timing["min"] < 1e4
     assert fused_candidate("x", lens_models.exported("invariants"), model.domain) is not None
 

@@ -20,7 +20,6 @@ from neurolens.evaluate.speed import (
     Unavailable,
     pinned_threads,
     race,
-    time_per_ray,
 )
 from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of
@@ -31,16 +30,6 @@ LENSES = Path(__file__).parents[2] / "lenses"
 @pytest.fixture(scope="module")
 def domain() -> Domain:
     return domain_of(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml").at(), film_radius_mm=10.0)
-
-
-def test_one_call(domain: Domain) -> None:
-    before = torch.get_num_threads()
-    seen = []
-    result = time_per_ray(lambda: seen.append(torch.get_num_threads()), rays=100, threads=1, repeats=3)
-    assert 0 < result["min"] <= result["median"]
-    assert (result["threads"], result["batch"], result["repeats"]) == (1, 100, 3)
-    assert set(seen) == {1}
-    assert torch.get_num_threads() == before
 
 
 def test_threads_come_back_after_an_error() -> None:

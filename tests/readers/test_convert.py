@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from command_line import failure
 from lens_formats import WRITERS, CannotSay, plain
 
 from neurolens.cli import main
@@ -28,17 +29,6 @@ def table(tmp_path: Path) -> Path:
 @pytest.fixture
 def in_folder_of_table(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(table.parent)
-
-
-def failure(capsys: pytest.CaptureFixture[str], *args: object) -> str:
-    try:
-        code = main(["convert", *map(str, args)])
-    except SystemExit as stopped:
-        code = int(stopped.code or 0)
-    captured = capsys.readouterr()
-    assert (code, captured.out) == (2, ""), captured
-    assert len(captured.err.splitlines()) == 1
-    return captured.err
 
 
 def test_prints_what_was_read(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -67,7 +57,7 @@ def test_a_file_that_is_there_stays_without_force(
 ) -> None:
     out = tmp_path / "lens.toml"
     out.write_text("mine")
-    assert "--force" in failure(capsys, table, "-o", out)
+    assert "--force" in failure(capsys, "convert", table, "-o", out)
     assert out.read_text() == "mine"
     assert main(["convert", str(table), "-o", str(out), "--force"]) == 0
     assert read_lens(out).name == "Singlet"
@@ -75,7 +65,7 @@ def test_a_file_that_is_there_stays_without_force(
 
 def test_nothing_is_written_for_a_bad_file(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table.write_text(TABLE + "1 2 3\n")
-    assert "singlet.dat: line 5, row: got '1 2 3'" in failure(capsys, table, "-o", tmp_path / "lens.toml")
+    assert "singlet.dat: line 5, row: got '1 2 3'" in failure(capsys, "convert", table, "-o", tmp_path / "lens.toml")
     assert list(tmp_path.iterdir()) == [table]
 
 
@@ -98,13 +88,13 @@ def test_wrong_command_lines(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(table.parent)
-    assert message in failure(capsys, table, *args)
+    assert message in failure(capsys, "convert", table, *args)
 
 
 def test_options_for_tables_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "lens.zmx"
     path.write_text(WRITERS[".zmx"](plain(read_lens(LENSES[0]))))
-    assert "--gap-before" in failure(capsys, path, "-o", tmp_path / "lens.toml", "--gap-before")
+    assert "--gap-before" in failure(capsys, "convert", path, "-o", tmp_path / "lens.toml", "--gap-before")
 
 
 @pytest.mark.parametrize("path", LENSES[::4], ids=lambda p: p.stem)
@@ -127,7 +117,7 @@ def test_a_lens_file_of_our_own_is_read_too(tmp_path: Path, capsys: pytest.Captu
     assert main(["convert", str(LENSES[2]), "-o", str(out)]) == 0
     assert replace(read_lens(out), path=str(LENSES[2])) == read_lens(LENSES[2])
     capsys.readouterr()
-    assert "--name and --source only" in failure(capsys, LENSES[2], "-o", out, "--force", "--units", "in")
+    assert "--name and --source only" in failure(capsys, "convert", LENSES[2], "-o", out, "--force", "--units", "in")
     assert main(["convert", str(LENSES[2]), "-o", str(out), "--force", "--name", "mine"]) == 0
     assert read_lens(out).name == "mine"
 
