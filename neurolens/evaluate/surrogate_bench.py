@@ -107,8 +107,9 @@ class Bench:
     def fingerprint(self, row: Row) -> str:
         """Of all that decides a record but its times."""
         asked = [
-            __version__, self.lens.sha256, asdict(self.settings.domain), asdict(self.settings.pairs),
-            self.settings.vignetting_rays, asdict(row.settings),
+            __version__, self.lens.sha256, self.lens.stop_radius_mm, self.lens.image_radius_mm,
+            asdict(self.settings.domain), asdict(self.settings.pairs), self.settings.vignetting_rays,
+            asdict(row.settings),
         ]  # fmt: skip
         return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
 
