@@ -9,7 +9,7 @@ from neurolens.optics.prescription import Surface
 
 
 def sag_mm(surface: Surface, x: Tensor, y: Tensor) -> Tensor:
-    """z (mm) [N] of a surface above its vertex plane at (x, y) mm; beyond the conic's end, that of its end."""
+    """z (mm) [N] of a surface above its vertex plane at (x, y) mm; beyond the conic's end finite, without meaning."""
     h2 = _height_square(surface, x, y)
     c, bend = float(surface.curvature), (1 + float(surface.conic)) * float(surface.curvature) ** 2
     z = c * h2 / (1 + torch.sqrt((1 - bend * h2).clamp_min(0.0)))

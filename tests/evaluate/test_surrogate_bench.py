@@ -63,10 +63,10 @@ def test_a_lens_of_another_stop_is_another_lens(tmp_path: Path) -> None:
     """The hash of its glass is the same: the stop alone makes other records."""
     text = (LENSES / "cooke_triplet_50.toml").read_text(encoding="utf-8")
     marks = set()
-    for name, stop in (("a", "f_number = 5.0"), ("b", "f_number = 8.0")):
+    for name, stop in (("a", "diameter_mm = 7.6124"), ("b", "diameter_mm = 6.0")):
         (tmp_path / name).mkdir()
         file = tmp_path / name / "cooke_triplet_50.toml"
-        file.write_text(text.replace("f_number = 5.0", stop), encoding="utf-8")
+        file.write_text(text.replace("diameter_mm = 7.6124", stop), encoding="utf-8")
         bench = Bench(LensChoice(file), SETTINGS, tmp_path)
         marks.add((bench.lens.sha256, bench.fingerprint(ROWS[0])))
     assert len({glass for glass, _ in marks}) == 1 and len(marks) == 2
