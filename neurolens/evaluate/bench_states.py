@@ -17,6 +17,7 @@ from neurolens.axes import Axis
 from neurolens.evaluate.experiment import near_limit_m, wavelengths_nm
 from neurolens.evaluate.plots_states import panels_plot
 from neurolens.evaluate.rays import ray_errors
+from neurolens.evaluate.records import kept_rows
 from neurolens.evaluate.train_states import fit_and_measure_states
 from neurolens.files import atomic_write_text
 from neurolens.optics.lensfile import read_lens
@@ -107,10 +108,12 @@ def _fixed(space: StateSpace, place: float) -> dict[str, float]:
 
 
 def read_records(file: Path) -> dict[str, dict[str, Any]]:
-    """Records of earlier runs, by case."""
-    if not file.is_file():
-        return {}
-    return {r["case"]: r for r in json.loads(file.read_text(encoding="utf-8"))["cases"]}
+    """Records of earlier runs, by case.
+
+    Raises:
+        InputError: as `kept_rows`.
+    """
+    return kept_rows(file, "cases", "case", "neurolens bench zoom")
 
 
 def write_records(records: Mapping[str, Mapping[str, Any]], out: Path) -> str:

@@ -20,6 +20,7 @@ from torch import Tensor
 from neurolens import status as st
 from neurolens.errors import InputError, NeurolensWarning
 from neurolens.evaluate.experiment import LensChoice
+from neurolens.evaluate.records import kept_rows
 from neurolens.files import atomic_write_text
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -166,13 +167,12 @@ def _reachable(inverse: InverseModel, rays: FilmRays, x: Tensor, y: Tensor) -> T
 
 
 def read_records(path: Path) -> dict[str, dict[str, Any]]:
-    """Records of an earlier run, by lens; none where there is no such file."""
-    if not path.is_file():
-        return {}
-    try:
-        return {r["lens"]: r for r in json.loads(path.read_text())["lenses"]}
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(path, "file", f"({type(error).__name__})", "records of neurolens bench inverse") from error
+    """Records of an earlier run, by lens.
+
+    Raises:
+        InputError: as `kept_rows`.
+    """
+    return kept_rows(path, "lenses", "lens", "neurolens bench inverse")
 
 
 def write_records(records: Sequence[dict[str, Any]], folder: Path) -> str:

@@ -6,9 +6,11 @@ no pass over the rays is spent on scaling.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from neurolens.surrogates.cores import InvariantPolynomial, MirrorPolynomial, Network, Partitioned, RawPolynomial
@@ -65,20 +67,9 @@ def add_core(g: Graph, core: Core, field: Field, vector_scale: Array, gate_scale
     Raises:
         TypeError: a core that has no ONNX form.
     """
-    if isinstance(core, InvariantPolynomial):
-        return _invariant_polynomial(g, core, field, vector_scale, gate_scale)
-    if isinstance(core, MirrorPolynomial):
-        return _mirror_polynomial(g, core, field, vector_scale, gate_scale)
-    if isinstance(core, RawPolynomial):
-        return _raw_polynomial(g, core, field, vector_scale, gate_scale)
-    if isinstance(core, Network):
-        return _network(g, core, field, vector_scale, gate_scale)
-    if isinstance(core, Partitioned):
-        return _partitioned(g, core, field, vector_scale, gate_scale)
-    if isinstance(core, Residual):
-        from neurolens.surrogates.onnx_residual import add_residual  # made of the functions of this module
-
-        return add_residual(g, core, field, vector_scale, gate_scale)
+    write = _WRITERS.get(type(core))
+    if write is not None:
+        return write(g, core, field, vector_scale, gate_scale)
     from neurolens.surrogates.published.graph import add_published  # published cores hold cores of this module
 
     return add_published(g, core, field, vector_scale, gate_scale)
@@ -95,10 +86,10 @@ def _scaled_scalars(scalars: Array, gate_scale: float) -> Array:
 def _invariant_polynomial(
     g: Graph, core: InvariantPolynomial, field: Field, vector_scale: Array, gate_scale: float
 ) -> CoreRows:
-    return add_ab_rows(g, invariant_rows(g, core, field, vector_scale, gate_scale), field, 6 + len(core.scalars))
+    return _ab_rows(g, _invariant_rows(g, core, field, vector_scale, gate_scale), field, 6 + len(core.scalars))
 
 
-def invariant_rows(
+def _invariant_rows(
     g: Graph,
     core: InvariantPolynomial,
     field: Field,
@@ -126,21 +117,21 @@ def _mirror_polynomial(
     variables = list(range(7 if field.dispersive else 6))
     exponents, weight = without_constants(core.exponents, weight, variables)
     first = g.affine(field.weight[variables], field.squares, field.bias[variables])
-    return add_mirror_rows(g, add_polynomial(g, first, exponents, weight), field, len(weight))
+    return _mirror_rows(g, add_polynomial(g, first, exponents, weight), field, len(weight))
 
 
-def add_mirror_rows(g: Graph, out: str, field: Field, count: int) -> CoreRows:
+def _mirror_rows(g: Graph, out: str, field: Field, count: int) -> CoreRows:
     """A p + B u for three vectors, x and y by themselves, from rows A (x, y) three times, B likewise, scalars."""
     return _vectors(g, g.split(out, [2] * 6 + [1] * (count - 12)), field)
 
 
 def _network(g: Graph, core: Network, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
-    weight, bias = output_rows(core, vector_scale, gate_scale)
-    out = g.affine(weight, add_hidden(g, core, field), bias)
-    return (add_mirror_rows if core.mirror else add_ab_rows)(g, out, field, len(weight))
+    weight, bias = _output_rows(core, vector_scale, gate_scale)
+    out = g.affine(weight, _hidden(g, core, field), bias)
+    return (_mirror_rows if core.mirror else _ab_rows)(g, out, field, len(weight))
 
 
-def add_hidden(g: Graph, core: Network, field: Field) -> str:
+def _hidden(g: Graph, core: Network, field: Field) -> str:
     """The last tanh layer, [units, N]."""
     shift, scale = _numpy(core.shift), _numpy(core.scale)
     # The first layer takes the squares themselves: the invariants never exist in the graph.
@@ -155,10 +146,10 @@ def add_hidden(g: Graph, core: Network, field: Field) -> str:
     return h
 
 
-def output_rows(core: Network, vector_scale: Array, gate_scale: float) -> tuple[Array, Array]:
-    """Weight [6 + S, units] and bias [6 + S] of a network's last layer, in the order of `add_ab_rows`.
+def _output_rows(core: Network, vector_scale: Array, gate_scale: float) -> tuple[Array, Array]:
+    """Weight [6 + S, units] and bias [6 + S] of a network's last layer, in the order of `_ab_rows`.
 
-    12 + S rows in the order of `add_mirror_rows` for a lens with cylinders.
+    12 + S rows in the order of `_mirror_rows` for a lens with cylinders.
     """
     weight, bias = (np.array(_numpy(t)) for t in core.output)
     n, axes = core.ab_rows, core.ab_rows // 6
@@ -168,7 +159,7 @@ def output_rows(core: Network, vector_scale: Array, gate_scale: float) -> tuple[
     return factors[:, None] * weight[order], factors * bias[order]
 
 
-def add_ab_rows(g: Graph, out: str, field: Field, count: int) -> CoreRows:
+def _ab_rows(g: Graph, out: str, field: Field, count: int) -> CoreRows:
     """A p + B u for three vectors, from rows A, A, A, B, B, B, transmittance, gates."""
     return _vectors(g, g.split(out, [1] * count), field)
 
@@ -213,3 +204,33 @@ def _partitioned(g: Graph, core: Partitioned, field: Field, vector_scale: Array,
             [choose(a, b) for a, b in zip(outer.gates, chosen.gates, strict=True)],
         )
     return chosen
+
+
+def _residual(g: Graph, core: Residual, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
+    """The network's last product adds itself to the polynomial's."""
+    polynomial, network = core.parts
+    weight, bias = _output_rows(network, vector_scale, gate_scale)
+    rows = _invariant_rows(g, _with_constant(polynomial), field, vector_scale, gate_scale, bias)
+    return _ab_rows(g, g.op("Gemm", g.const(weight), _hidden(g, network, field), rows), field, len(weight))
+
+
+def _with_constant(core: InvariantPolynomial) -> InvariantPolynomial:
+    """The same polynomial with the constant among its terms."""
+    if (core.exponents == 0).all(1).any():
+        return core
+    nothing = torch.zeros((*core.ab.shape[:2], 1), dtype=core.ab.dtype)
+    return InvariantPolynomial(
+        np.concatenate([core.exponents, np.zeros((1, 4), np.int64)]),
+        torch.cat([core.ab, nothing], 2),
+        torch.cat([core.scalars, nothing.new_zeros(len(core.scalars), 1)], 1),
+    )
+
+
+_WRITERS: dict[type, Callable[..., CoreRows]] = {
+    InvariantPolynomial: _invariant_polynomial,
+    MirrorPolynomial: _mirror_polynomial,
+    RawPolynomial: _raw_polynomial,
+    Network: _network,
+    Partitioned: _partitioned,
+    Residual: _residual,
+}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -24,15 +25,10 @@ def add_published(g: Graph, core: Core, field: Field, vector_scale: Array, gate_
     Raises:
         TypeError: a core that has no ONNX form.
     """
-    if isinstance(core, OuterPupil):
-        return _outer_pupil(g, core, field, vector_scale, gate_scale)
-    if isinstance(core, Cells):
-        return _cells(g, core, field, vector_scale, gate_scale)
-    if isinstance(core, Meridian):
-        return _meridian(g, core, field, vector_scale, gate_scale)
-    if isinstance(core, Averaged):
-        return _averaged(g, core, field, vector_scale, gate_scale)
-    raise TypeError(f"no ONNX form for a core of type {type(core).__name__}")
+    write = _WRITERS.get(type(core))
+    if write is None:
+        raise TypeError(f"no ONNX form for a core of type {type(core).__name__}")
+    return write(g, core, field, vector_scale, gate_scale)
 
 
 def _cells(g: Graph, core: Cells, field: Field, vector_scale: Array, gate_scale: float) -> CoreRows:
@@ -180,3 +176,11 @@ def _ring(g: Graph, networks: tuple[Layers, ...], inputs: str, count: int) -> st
                 h = g.op("Relu", g.affine(w if k else w[:, :count], h, b))
         total = g.op("Add", total, h) if total else h
     return total
+
+
+_WRITERS: dict[type, Callable[..., CoreRows]] = {
+    OuterPupil: _outer_pupil,
+    Cells: _cells,
+    Meridian: _meridian,
+    Averaged: _averaged,
+}
