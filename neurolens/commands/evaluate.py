@@ -53,7 +53,8 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument(
         "--rays", metavar="N", type=whole(1000, 1_000_000), default=30_000,
-        help="rays that the lens passes; four times as many test the vignetting (default: 30000)",
+        help="rays that the lens passes, eight times as many where a few bad ones decide an error; "
+        "four times as many test the vignetting (default: 30000)",
     )  # fmt: skip
     parser.add_argument(
         "--seed", metavar="N", type=whole(0), help="of the rays (default: one that differs from the fit's)"

@@ -16,7 +16,7 @@ import torch
 from neurolens import __version__
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.evaluate import fresh
-from neurolens.evaluate.fresh import FreshRays, fresh_rays
+from neurolens.evaluate.fresh import FreshRays, fresh_rays, with_more
 from neurolens.evaluate.rays import ray_errors
 from neurolens.files import atomic_write_text
 from neurolens.optics.prescription import Lens
@@ -74,10 +74,13 @@ def measure_errors(
 
 
 def shared_rays(prepared: Prepared, vignetting_rays: int) -> FreshRays:
-    """The rays on which all models of one lens and domain are measured."""
+    """The rays on which all models of one lens and domain are measured: many, for a card's errors are to be found
+    again on others, and a few bad rays, one in ten thousand, may decide them.
+    """
     pairs = prepared.pairs
     seed = pairs.settings.seed + FRESH
-    return fresh_rays(pairs.lens, pairs.domain, pairs.held_out, count=vignetting_rays, seed=seed)
+    rays = fresh_rays(pairs.lens, pairs.domain, pairs.held_out, count=vignetting_rays, seed=seed)
+    return with_more(rays, seed)
 
 
 def measure_on(rays: FreshRays, model: OnnxLens) -> dict[str, Any]:

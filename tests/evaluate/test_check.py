@@ -16,8 +16,8 @@ from scipy.stats import poisson
 
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.check import check_model, share_promise
-from neurolens.evaluate.fresh import STOPS, ZONED, fresh_rays, measure
-from neurolens.evaluate.measure import measure_errors
+from neurolens.evaluate.fresh import STOPS, ZONED, fresh_rays, measure, with_more
+from neurolens.evaluate.measure import measure_errors, measure_on
 from neurolens.evaluate.vignetting import ZONES, vignetting_errors
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
@@ -71,6 +71,29 @@ def test_every_figure_that_promises_too_much_fails_and_no_other(errors: dict[str
     alone = copy.deepcopy(errors)
     alone["zones"]["full"]["mid"]["direction_rms_deg"] *= 0.6
     assert broken(alone) == {"full.mid.direction_rms_deg"}
+
+
+def test_an_error_that_few_rays_decide_is_found_again_on_others() -> None:
+    """One ray in five hundred, in a narrow band of colour, is off by far more than all others: the RMS is theirs."""
+    known, (low, high) = load_model(exported("invariants")), domain().wavelength_nm
+
+    def rays(film: Any, pupil: Any, wavelength: Any, *rest: Any) -> Any:
+        out = known.rays(film, pupil, wavelength, *rest)
+        out.scene_ray[3] += 1e-3 * (np.abs(wavelength - (low + high) / 2) < 0.001 * (high - low))
+        return out
+
+    model_ = SimpleNamespace(card=known.card, rays=rays)
+    pairs = make_pairs(lens(), domain(), PairSettings(train=1, held_out=RAYS, rim=1, seed=3))
+    few = fresh_rays(lens(), domain(), pairs.held_out, count=4 * RAYS, seed=55)
+    rms = []
+    for seed in (4, 5, 6, 7):
+        many = with_more(few, 100 * seed)
+        model_.card = {**known.card, "errors": measure_on(many, model_)}  # type: ignore[arg-type]
+        figures, promises = check_model(model_, lens(), rays=RAYS, seed=seed)  # type: ignore[arg-type]
+        assert [p for p in promises if not p.holds] == []
+        assert figures["rays"] == len(many.held_out) == 8 * RAYS
+        rms.append(figures["rms_um"])
+    assert max(rms) < 1.5 * min(rms) and min(rms) > 5 * measure_on(few, known)["rms_um"]
 
 
 @pytest.mark.parametrize("counted", [0.1, 1.0, 5.0, 50.0, 500.0])
