@@ -99,6 +99,7 @@ def run(args: argparse.Namespace) -> int:
             for p in promises
         ],
         "holds": holds,
+        "poor": model.card["errors"].get("poor") or [],
     }
     if args.json:
         print_json(data)
@@ -138,6 +139,7 @@ def _text(data: dict[str, Any], promises: list[Promise]) -> str:
             table(header, rows) if rows else _figures(data),
             f"{timing['min']:.1f} ns per ray (median {timing['median']:.1f}), {timing['threads']} thread(s), "
             f"batches of {timing['batch']}",
+            *([f"Poor, as the card says: {', '.join(data['poor'])}."] if data["poor"] else []),
             verdict,
         ]
     )

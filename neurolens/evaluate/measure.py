@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from neurolens import __version__
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.evaluate import fresh
 from neurolens.evaluate.fresh import FreshRays, fresh_rays, with_more
-from neurolens.evaluate.rays import ray_errors
+from neurolens.evaluate.rays import PIXELS_ACROSS, ray_errors
 from neurolens.files import atomic_write_text
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
@@ -34,6 +34,8 @@ CARD_KEYS = tuple(
     "rms_um p99_um max_um rms_infinity_um rms_px direction_rms_deg position_rms_um transmittance_rms transmittance_max "
     "false_pass false_block false_pass_near_rim false_block_near_rim".split()
 )
+# Worth a word: false passes or blocks beyond this share, an RMS error beyond so many pixels of 4000 across.
+POOR_SHARE, POOR_PX = 0.01, 1.0
 # Added to the seed of the fit's rays: the same seed would give the very rays that the rims were fitted to.
 FRESH = 104729
 
@@ -86,7 +88,18 @@ def shared_rays(prepared: Prepared, vignetting_rays: int) -> FreshRays:
 def measure_on(rays: FreshRays, model: OnnxLens) -> dict[str, Any]:
     """The same on rays that several models share."""
     errors = fresh.measure(rays, onnx_predictor(model)).errors(CARD_KEYS)
-    return {**errors, "rays": len(rays.held_out), "passing": int(rays.passes.sum())}
+    return {**errors, "poor": what_is_poor(errors), "rays": len(rays.held_out), "passing": int(rays.passes.sum())}
+
+
+def what_is_poor(errors: Mapping[str, Any]) -> list[str]:
+    """What of a model's errors shows in a picture, for its card and its maker: true promises that few would want."""
+    said = [
+        f"{key.replace('_', ' ')} {100 * errors[key]:.2g}%"
+        for key in ("false_pass", "false_block")
+        if (errors.get(key) or 0.0) > POOR_SHARE
+    ]
+    pixels = errors.get("rms_px") or 0.0
+    return [*said, f"RMS error {pixels:.2g} pixels of a picture {PIXELS_ACROSS} wide"] if pixels > POOR_PX else said
 
 
 def fit_and_measure(

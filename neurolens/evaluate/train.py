@@ -23,7 +23,7 @@ from neurolens.evaluate.gain import domain_facts, scene_gain
 from neurolens.evaluate.image import DEFAULT
 from neurolens.evaluate.layout import layout_profile, refractions
 from neurolens.evaluate.light import illumination
-from neurolens.evaluate.measure import Measured, fit_and_measure, shared_rays
+from neurolens.evaluate.measure import Measured, fit_and_measure, shared_rays, what_is_poor
 from neurolens.evaluate.pictures import Pictures, render_all
 from neurolens.evaluate.plots import error_against_coefficients_plot, illumination_plot, lens_layout, pareto_plot
 from neurolens.evaluate.rays import pixel_um, pupil_disc_share
@@ -40,8 +40,6 @@ from neurolens.surrogates.fit import NETWORKS, Prepared, prepare
 from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs
 from neurolens.surrogates.threads import pinned_threads
 
-# False passes or blocks beyond this share are worth a word.
-POOR_SHARE = 0.01
 _IDEAL = ("thin lens", "pinhole")
 _PACKAGES = ("neurolens", "torch", "numpy", "onnxruntime", "onnx", "OpenEXR")
 
@@ -117,9 +115,8 @@ def run_experiment(
 
 
 def _say_what_is_poor(m: Measured) -> None:
-    """Warn of a fitted model that tells badly which rays pass: its card is true, but few would want it."""
-    shares = {key.replace("_", " "): m.record.get(key) or 0.0 for key in ("false_pass", "false_block")}
-    poor = [f"{name} {100 * share:.2g}%" for name, share in shares.items() if share > POOR_SHARE]
+    """Warn of a fitted model whose errors show: its card is true, but few would want it."""
+    poor = what_is_poor(m.record)
     if poor and m.settings.family != "paraxial":
         text = f"{m.settings.label}: {', '.join(poor)}; a smaller film or stop, or another method, may do better"
         warnings.warn(text, NeurolensWarning, stacklevel=2)

@@ -100,6 +100,8 @@ def comment_of(models: Sequence[LensModel], card: Mapping[str, Any], fixed: Fixe
     known = [f"{key} {errors[key]:.3g}" for key in _ERRORS if isinstance(errors.get(key), (int, float))]
     if known:
         lines.append(f"Errors on held-out rays, whole domain of the exported model: {', '.join(known)}.")
+    if errors.get("poor"):
+        lines.append(f"Poor: {', '.join(errors['poor'])}.")
     lines.append("Units: mm, nm; directions are unit vectors, transmittance a share of the power.")
     codes = {g.status for g in model.gates}
     told = {c: w for c, w in card["status_codes"].items() if int(c) in codes or not _is_gate(card, int(c))}

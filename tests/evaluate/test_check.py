@@ -17,7 +17,7 @@ from scipy.stats import poisson
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.check import check_model, share_promise
 from neurolens.evaluate.fresh import STOPS, ZONED, fresh_rays, measure, with_more
-from neurolens.evaluate.measure import measure_errors, measure_on
+from neurolens.evaluate.measure import measure_errors, measure_on, what_is_poor
 from neurolens.evaluate.vignetting import ZONES, vignetting_errors
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
@@ -145,6 +145,22 @@ def test_one_trace_serves_every_stop(state: str) -> None:
         assert mine[key] == apart[key]
         if state in ZONED:
             assert {z: found.zones[state][z][key] for z in ZONES} == {z: apart["zones"][z][key] for z in ZONES}
+
+
+def test_a_poor_fit_is_said_by_its_card_the_command_and_the_source_code(
+    errors: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from neurolens.cli import main
+    from neurolens.surrogates.export import export_onnx
+
+    assert errors["poor"] == [] == what_is_poor({"false_pass": 0.01, "rms_px": 1.0, "false_block": None})
+    poor = {**errors, "poor": what_is_poor({**errors, "false_block": 0.042})}
+    path = export_onnx(model("invariants"), tmp_path / "model.onnx", poor)
+    assert load_model(path).card["errors"]["poor"] == ["false block 4.2%"]
+    assert main(["evaluate", str(path), "--rays", "1000", "--quiet"]) == 0
+    assert "Poor, as the card says: false block 4.2%." in capsys.readouterr().out
+    assert main(["export", str(path), "--to", "c", "-o", str(tmp_path / "model.h")]) == 0
+    assert "Poor: false block 4.2%." in (tmp_path / "model.h").read_text()
 
 
 def test_the_command_says_which_zone_breaks(errors: dict[str, Any], tmp_path: Path) -> None:

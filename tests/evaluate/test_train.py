@@ -150,11 +150,12 @@ def test_a_lens_file_alone_makes_an_experiment() -> None:
     assert experiment.pairs.train == 5000
 
 
-def test_a_model_that_tells_badly_what_passes_is_said() -> None:
-    poor = Measured(ModelSettings(), Path("a"), {"false_pass": 0.3, "false_block": 0.001})
-    with pytest.warns(NeurolensWarning, match="ols-40: false pass 30%;"):
+def test_a_model_whose_errors_show_is_said() -> None:
+    poor = Measured(ModelSettings(), Path("a"), {"false_pass": 0.3, "false_block": 0.001, "rms_px": 2.5})
+    with pytest.warns(NeurolensWarning, match="ols-40: false pass 30%, RMS error 2.5 pixels of a picture 4000 wide;"):
         _say_what_is_poor(poor)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        _say_what_is_poor(Measured(ModelSettings(), Path("a"), {"false_pass": 0.003, "false_block": None}))
+        good = {"false_pass": 0.003, "false_block": None, "rms_px": None}
+        _say_what_is_poor(Measured(ModelSettings(), Path("a"), good))
         _say_what_is_poor(Measured(ModelSettings("thin"), Path("a"), poor.record))
