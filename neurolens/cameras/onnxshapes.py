@@ -17,6 +17,7 @@ Shape = tuple[int, ...]
 
 RAYS = 16_400  # of a call: `onnxlens.BATCH` with its padding
 MAX_NUMBERS = 20_000 * RAYS  # of any tensor; the largest polynomials known have a thousand terms
+MAX_ALIVE = 2 * MAX_NUMBERS  # of all computed tensors that a later node still needs
 
 ELEMENTWISE = frozenset("Abs Cast Clip Cos DequantizeLinear Identity Neg Reciprocal Relu Sin Sqrt Tanh".split())
 BROADCAST = frozenset("Add And Div Equal Greater GreaterOrEqual LessOrEqual Max Min Mul Sub Where".split())
@@ -42,7 +43,8 @@ def check_shapes(
         integers: values of the constants that are integers, by name.
 
     Raises:
-        ValueError: a tensor of more than `MAX_NUMBERS`, shapes that do not fit, or that only running tells.
+        ValueError: a tensor of more than `MAX_NUMBERS`, more than `MAX_ALIVE` at a time, shapes that do not fit, or
+            that only running tells.
     """
     shapes: dict[str, Shape] = {}
 
@@ -65,6 +67,21 @@ def check_shapes(
             raise ValueError(f"operator {node.kind}: {len(node.outputs)} outputs, expected {len(made)}")
         for name, shape in zip(node.outputs, made, strict=True):
             add(name, shape, f"operator {node.kind}")
+    _check_alive(nodes, shapes)
+
+
+def _check_alive(nodes: Sequence[Node], shapes: Mapping[str, Shape]) -> None:
+    last = {name: i for i, node in enumerate(nodes) for name in node.inputs}
+    computed: set[str] = set()
+    alive = 0
+    for i, node in enumerate(nodes):
+        computed.update(node.outputs)
+        alive += sum(math.prod(shapes[name]) for name in node.outputs)
+        if alive > MAX_ALIVE:
+            raise ValueError(f"operator {node.kind}: {alive} numbers at a time, expected at most {MAX_ALIVE}")
+        # What no node takes is an output, or nothing: it goes at once, for outputs are few.
+        done = {name for name in (*node.inputs, *node.outputs) if name in computed and last.get(name, i) <= i}
+        alive -= sum(math.prod(shapes[name]) for name in done)
 
 
 def _shapes(node: Node, given: list[Shape], constants: list[Any]) -> list[Shape]:

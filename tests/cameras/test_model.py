@@ -170,6 +170,16 @@ DAMAGE: dict[str, tuple[Callable[[ModelProto], object], str]] = {
         ),
         "operator Mul has shape",
     ),
+    "many wide tensors at a time": (
+        lambda p: p.graph.node.extend(
+            [
+                helper.make_node("Concat", ["rays"] * 300, ["w"], axis=0),
+                *(helper.make_node("Neg", ["w"], [f"w{k}"]) for k in range(40)),
+                helper.make_node("Max", [f"w{k}" for k in range(40)], ["q"]),
+            ]
+        ),
+        "numbers at a time",
+    ),
     "a shape that only running tells": (
         lambda p: p.graph.node.append(helper.make_node("Reshape", ["rays", "film_z_mm"], ["q"])),
         "operator Reshape",
