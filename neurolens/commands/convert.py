@@ -22,7 +22,7 @@ _DESCRIPTION = """\
 Read a lens file of another program and write it as a lens file of neurolens (.toml).
 
 Formats: Zemax (.zmx), CODE V (.seq), OSLO (.len, the simple ones), plain tables of four
-columns as in pbrt and appleseed (.dat, .txt), and JSON prescriptions. The content decides.
+columns as in pbrt and appleseed (.dat, .txt), and JSON (our own, DeepLens, ISET). The content decides.
 What neurolens cannot hold or does not know is an error that names the line; what was left
 out, computed, assumed or doubtful is printed as a warning. Needs the extra "train" (torch)."""
 _EPILOG = """\

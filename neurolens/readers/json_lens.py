@@ -1,7 +1,8 @@
 """Prescriptions as JSON, in the form that ../shared/data/README.md defines: surfaces with full diameters in mm.
 
 A radius of 0 is a plane, an index of null is air, a last thickness of 0 or null stands for the computed back focus,
-`cyl-x` is a cylinder curved along x. States marked as interpolated by the transcriber are left out with a warning.
+`cyl-x` is a cylinder curved along x. States marked as interpolated by the transcriber are left out with a warning. The
+forms of DeepLens and ISET are read too (`json_others`).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from neurolens.optics.lensrows import MAX_SURFACES
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.readers.assemble import UNKNOWN, finish, same_glass
 from neurolens.readers.draft import Given
+from neurolens.readers.json_others import read_others
 from neurolens.readers.json_stated import check_computed, image_and_field, stated_efl
 from neurolens.readers.json_states import read_states
 from neurolens.readers.source import decode, read_bytes, warn
@@ -59,6 +61,9 @@ def read_json_lens(path: str | Path, given: Given | None = None, *, catalogue: b
     if given.units not in (None, "mm"):
         raise InputError(file, "--units", given.units, "mm, as the keys of the file say (or no --units)")
     data = _load(path)
+    other = read_others(data, file, given)
+    if other is not None:
+        return other
     reject_unknown(file, "", data, KEYS)
     rows = data.get("surfaces", "(missing)")
     if not isinstance(rows, list) or not rows or len(rows) > MAX_SURFACES:
