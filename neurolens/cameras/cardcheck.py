@@ -45,6 +45,17 @@ def _seed(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= 2**53
 
 
+def _errors(value: Any, depth: int = 3) -> bool:
+    """Figures by name, those of parts of the rays in tables of their own; lists are for readers."""
+    return isinstance(value, dict) and all(
+        v is None
+        or isinstance(v, (bool, str, list))
+        or (is_number(v) and v >= 0)
+        or (depth > 0 and _errors(v, depth - 1))
+        for v in value.values()
+    )
+
+
 def _table(value: Any) -> bool:
     return isinstance(value, dict)
 
@@ -85,11 +96,12 @@ _RULES: dict[str, Rule] = {
     "fit": (_table, "a table"),
     "fit.method": TEXT,
     "fit.settings": (_table, "a table"),
-    "errors": (_table, "a table"),
+    "errors": (_errors, "a table of figures from 0 up, of tables of such, of texts and lists"),
 }
 _OPTIONAL: dict[str, Rule] = {
     "lens.stop_surface": (lambda v: isinstance(v, int) and not isinstance(v, bool) and 0 <= v < 10_000, "an integer"),
     "domain.nearest_m": (lambda v: v is None or _positive(v), "a number above 0, or null"),
+    "errors.poor": (lambda v: isinstance(v, list) and all(map(_text, v)), "a list of texts"),
     "fit.settings.rays_seed": (lambda v: v is None or _seed(v), "an integer up to 2^53, or null"),
 }
 _MISSING = "(missing)"

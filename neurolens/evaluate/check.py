@@ -113,17 +113,17 @@ def _promises(errors: Mapping[str, Any], fresh: FreshRays, found: Findings) -> I
             yield share_promise(key, promised, measured, passing, promised_of)
         elif key in found.figures and key != "rays":
             yield _error(key, promised, measured, found.each, _count(errors, "rays"))
-    for state, shares in (errors.get("stopped_down") or {}).items():
+    for state, shares in _tables(errors.get("stopped_down")):
         for key, promised in _numbers(shares) if state in found.stopped_down else ():
             closed = 2 ** STOPS[state]  # so many times fewer rays pass
-            said = found.stopped_down[state][key]
+            said = found.stopped_down[state].get(key)
             yield share_promise(f"{state}.{key}", promised, said, passing / closed, (promised_of or passing) / closed)
 
 
 def _zone_promises(errors: Mapping[str, Any], fresh: FreshRays, found: Findings) -> Iterator[Promise]:
     """Promises of thirds of the film."""
-    for state, zones in (errors.get("zones") or {}).items():
-        for zone, promises in zones.items():
+    for state, zones in _tables(errors.get("zones")):
+        for zone, promises in _tables(zones):
             if state not in ZONED or zone not in ZONES:
                 continue
             measured, each = found.zones[state][zone], zone_of(fresh, found.each, state, zone)
@@ -135,6 +135,13 @@ def _zone_promises(errors: Mapping[str, Any], fresh: FreshRays, found: Findings)
                     yield share_promise(place, promised, said, measured["passing"], _count(promises, "passing"))
                 elif key in _RMS:
                     yield _error(place, promised, said, each, _count(promises, "rays"))
+
+
+def _tables(value: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """The tables within a table; what is none promises nothing."""
+    for name, inner in value.items() if isinstance(value, Mapping) else ():
+        if isinstance(inner, Mapping):
+            yield name, inner
 
 
 def _numbers(table: Mapping[str, Any]) -> Iterator[tuple[str, float]]:

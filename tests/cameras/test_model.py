@@ -132,6 +132,13 @@ DAMAGE: dict[str, tuple[Callable[[ModelProto], object], str]] = {
     "no settings": (change_card(lambda c: c["fit"].pop("settings")), "fit.settings"),
     "strange seed": (change_card(lambda c: c["fit"]["settings"].update(rays_seed="x")), "fit.settings.rays_seed"),
     "errors a list": (change_card(lambda c: c.update(errors=[1])), "errors"),
+    "a negative error": (change_card(lambda c: c["errors"].update(false_pass=-0.1)), "errors: got"),
+    "a count below nothing": (
+        change_card(lambda c: c["errors"].update(zones={"full": {"edge": {"rays": -3}}})),
+        "errors: got",
+    ),
+    "a number for words": (change_card(lambda c: c["errors"].update(poor=5)), "errors.poor"),
+    "an error beyond floats": (change_card(lambda c: c["errors"].update(rms_um=10**400)), "errors: got"),
     "reference beyond floats": (change_card(lambda c: c["reference"].update(stop_radius_mm=10**400)), "reference"),
     "no bounds": (change_card(lambda c: c["domain"].pop("bounds")), "domain.bounds"),
     "no reference rays": (change_card(lambda c: c.pop("reference")), "reference"),

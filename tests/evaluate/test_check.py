@@ -163,6 +163,12 @@ def test_a_poor_fit_is_said_by_its_card_the_command_and_the_source_code(
     assert "Poor: false block 4.2%." in (tmp_path / "model.h").read_text()
 
 
+@pytest.mark.parametrize("strange", [[1, 2], 3, "text", {"2_stops": 3, "full": [1], "new": {"edge": 1}}])
+def test_promises_of_another_shape_promise_nothing(errors: dict[str, Any], strange: Any) -> None:
+    assert broken({**errors, "stopped_down": strange, "zones": strange}) == set()
+    assert broken({**errors, "stopped_down": {"2_stops": {"what": 0.1}}}) == {"2_stops.what"}
+
+
 def test_the_command_says_which_zone_breaks(errors: dict[str, Any], tmp_path: Path) -> None:
     from neurolens.cli import main
     from neurolens.surrogates.export import export_onnx
