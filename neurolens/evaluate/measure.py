@@ -118,7 +118,7 @@ def fit_and_measure(
     """
     file, note = folder / f"{settings.label}.onnx", folder / f"{settings.label}.json"
     fingerprint = _fingerprint(prepared, settings, vignetting_rays)
-    known = _known_record(note, file, fingerprint)
+    known = known_record(note, file, fingerprint)
     if known is not None:
         return Measured(settings, file, known)
     training = folder / f"{settings.label}.training.npz"  # what a killed run left
@@ -143,8 +143,7 @@ def fit_and_measure(
         "fit_s": model.fit_s,
         "load_s": load_s,
     }
-    made = {"fingerprint": fingerprint, "sha256": _sha256(file), "record": record}
-    atomic_write_text(note, json.dumps(made, indent=1))
+    note_record(note, file, fingerprint, record)
     checkpoint.clear(training)
     return Measured(settings, file, record)
 
@@ -172,7 +171,13 @@ def _sha256(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def _known_record(note: Path, file: Path, fingerprint: str) -> dict[str, Any] | None:
+def note_record(note: Path, file: Path, fingerprint: str, record: dict[str, Any]) -> None:
+    """Leave the record of a finished fit beside its model, for `known_record`."""
+    made = {"fingerprint": fingerprint, "sha256": _sha256(file), "record": record}
+    atomic_write_text(note, json.dumps(made, indent=1, allow_nan=False))
+
+
+def known_record(note: Path, file: Path, fingerprint: str) -> dict[str, Any] | None:
     """The record of an earlier, finished fit of the very same settings, whose model is still as it was written."""
     try:
         data = json.loads(note.read_text(encoding="utf-8"))

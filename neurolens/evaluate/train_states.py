@@ -18,6 +18,7 @@ from neurolens.config import to_dict, to_toml
 from neurolens.errors import InputError
 from neurolens.evaluate.candidates import model_candidate
 from neurolens.evaluate.experiment import Experiment, keep_lens, relative_to
+from neurolens.evaluate.measure import known_record, note_record
 from neurolens.evaluate.plots_states import states_plot
 from neurolens.evaluate.records import plain
 from neurolens.evaluate.speed import race
@@ -62,7 +63,7 @@ def fit_and_measure_states(
     """
     file, note = folder / f"{settings.label}.onnx", folder / f"{settings.label}.json"
     fingerprint = _fingerprint(space, settings, states)
-    known = _known(note, file, fingerprint)
+    known = known_record(note, file, fingerprint)
     if known is not None:
         return known
     tell = report or (lambda _: None)
@@ -90,8 +91,7 @@ def fit_and_measure_states(
         "fit_s": model.fit_s,
         "load_s": time.perf_counter() - start,
     }
-    made = {"fingerprint": fingerprint, "sha256": _sha256(file), "record": record}
-    atomic_write_text(note, json.dumps(made, indent=1, allow_nan=False))
+    note_record(note, file, fingerprint, record)
     return record
 
 
@@ -184,16 +184,3 @@ def _fingerprint(space: StateSpace, settings: StateSettings, states: int) -> str
         states,
     ]
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
-
-
-def _sha256(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
-
-
-def _known(note: Path, file: Path, fingerprint: str) -> dict[str, Any] | None:
-    try:
-        data = json.loads(note.read_text(encoding="utf-8"))
-        same = data["fingerprint"] == fingerprint and data["sha256"] == _sha256(file)
-        return data["record"] if same else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
