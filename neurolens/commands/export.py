@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import print_json
 from neurolens.errors import InputError
-from neurolens.files import atomic_path
+from neurolens.files import atomic_path, check_writable
 
 if TYPE_CHECKING:
     from neurolens.surrogates.model import LensModel
@@ -81,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("neurolens export", "--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")
     if args.to != "onnx" and (args.derivatives or args.inverse):
         raise InputError("neurolens export", "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
+    check_writable(args.out)
     from neurolens.cameras.model import load_model
     from neurolens.surrogates.fused import Fixed, Parts
     from neurolens.surrogates.source import export_source

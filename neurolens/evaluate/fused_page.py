@@ -63,7 +63,7 @@ def goals(rows: Sequence[Row]) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
 
     def goal(text: str, wanted: float, measured: float | None, *, at_most: bool) -> None:
-        holds = None if measured is None else (measured <= wanted) == at_most
+        holds = None if measured is None else measured <= wanted if at_most else measured >= wanted
         found.append({"goal": text, "wanted": wanted, "measured": measured, "at_most": at_most, "holds": holds})
 
     for words, ending, work, wanted in (

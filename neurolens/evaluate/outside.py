@@ -74,9 +74,8 @@ def _one_batch(model: OnnxLens, rng: np.random.Generator, n: int, found: Outcome
 
 
 def _any_wavelength(model: OnnxLens) -> bool:
-    """Glass without dispersion takes any: the domain then holds one wavelength alone."""
-    low, high = model.card["domain"]["wavelength_nm"]
-    return bool(low == high)
+    """Glass without dispersion takes any; a model made for one wavelength of a lens that disperses takes that one."""
+    return not model.card["lens"]["dispersive"]
 
 
 def _rays(rng: np.random.Generator, n: int, d: dict[str, Any]) -> Floats:
@@ -134,7 +133,7 @@ def _place(
         if any_wavelength:
             ok &= (rays[4] > 0) & (rays[4] < np.inf)
         else:
-            ok &= (rays[4] >= low / slack) & (rays[4] <= high * slack)
+            ok &= (rays[4] >= low / (1 + give)) & (rays[4] <= high * (1 + give))  # one wavelength is a range, too
         sides.append(ok)
     # An opening whose square leaves float32 stops every ray but that through its middle, by one status or another.
     return ~sides[0], sides[1] & (stop >= 1e-6 * d["stop_radius_mm"])

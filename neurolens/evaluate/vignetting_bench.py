@@ -182,7 +182,8 @@ def _line(row: dict[str, Any]) -> str:
 def _summary(name: str, choose: Callable[[list[float]], float], rows: Sequence[dict[str, Any]]) -> str:
     cells = []
     for opening in OPENINGS:
-        both = ([r["openings"][opening][k] or 0.0 for r in rows] for k in ("false_pass", "false_block"))
-        cells.append(" / ".join(_percent(choose(v)) for v in both))
+        both = ([r["openings"][opening][k] for r in rows] for k in ("false_pass", "false_block"))
+        known = ([v for v in values if v is not None] for values in both)  # None where no ray counts
+        cells.append(" / ".join(_percent(choose(values) if values else None) for values in known))
     cells.append(_percent(choose([r["illumination"]["max_difference"] for r in rows])))
     return "| " + " | ".join([name, *cells, "", "", "", ""]) + " |"

@@ -22,6 +22,7 @@ from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.specialise import at_wavelength
 
 LENSES = Path(__file__).parents[2] / "lenses"
 
@@ -94,6 +95,13 @@ def test_nothing_passes_outside_the_domain(kind: str, tmp_path: Path) -> None:
     found = outside.send(model, 200_000, seed=7)
     assert found.broken == dict.fromkeys(found.broken, 0)
     assert found.inside > 10_000 and found.passed > 3000
+
+
+def test_a_model_for_one_wavelength_takes_no_other(tmp_path: Path) -> None:
+    path = export_onnx(at_wavelength(lens_models.model("invariants"), 550.0), tmp_path / "m.onnx")
+    found = outside.send(load_model(path), 40_000, seed=7)
+    assert found.broken == dict.fromkeys(found.broken, 0)
+    assert found.inside > 2000 and found.passed > 500
 
 
 def test_broken_promises_are_counted(tmp_path: Path) -> None:
