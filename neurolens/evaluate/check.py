@@ -101,7 +101,12 @@ def check_model(
         found = measure(fresh, onnx_predictor(model))
     figures = {**found.figures, "stopped_down": found.stopped_down, "zones": found.zones, "seed": seed}
     figures["rays"] = len(fresh.held_out)
-    return figures, [*_promises(card["errors"], fresh, found), *_zone_promises(card["errors"], fresh, found)]
+    return figures, promises_of(card["errors"], fresh, found)
+
+
+def promises_of(errors: Mapping[str, Any], fresh: FreshRays, found: Findings) -> list[Promise]:
+    """The promises of a card's `errors` against what a model's `measure` found on fresh rays."""
+    return [*_promises(errors, fresh, found), *_zone_promises(errors, fresh, found)]
 
 
 def _promises(errors: Mapping[str, Any], fresh: FreshRays, found: Findings) -> Iterator[Promise]:
