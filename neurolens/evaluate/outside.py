@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from neurolens import status as st
 from neurolens.cameras.onnxlens import OnnxLens
 from neurolens.modelfile import DOMAIN_SLACK
+from neurolens.surrogates.model import ANY_WAVELENGTH_NM
 
 _BATCH = 1 << 12  # of one film plane and stop
 # Bounds are tested in float32, a few roundings of which may fall either side.
@@ -57,7 +58,7 @@ def _one_batch(model: OnnxLens, rng: np.random.Generator, n: int, found: Outcome
     rays, film_z, stop = _rays(rng, n, d), _film_z(rng, d), _stop(rng, d)
     with np.errstate(all="ignore"):
         out = model.rays(rays[:2], rays[2:4], rays[4], float(film_z), float(stop))
-        surely_out, surely_in = _place(d, rays.astype(np.float64), float(film_z), float(stop), _any_wavelength(model))
+        surely_out, surely_in = _place(d, rays.astype(np.float64), float(film_z), float(stop), _wavelengths(model))
         passed = out.status == st.PASSED
         finite = np.isfinite(out.scene_ray).all(0) & np.isfinite(out.transmittance) & np.isfinite(out.stop_xy_mm).all(0)
         length = np.sqrt((out.scene_ray[3:].astype(np.float64) ** 2).sum(0))
@@ -73,9 +74,10 @@ def _one_batch(model: OnnxLens, rng: np.random.Generator, n: int, found: Outcome
         found.broken[promise] += int(bad.sum())
 
 
-def _any_wavelength(model: OnnxLens) -> bool:
-    """Glass without dispersion takes any; a model made for one wavelength of a lens that disperses takes that one."""
-    return not model.card["lens"]["dispersive"]
+def _wavelengths(model: OnnxLens) -> tuple[float, float]:
+    """Shortest and longest that the model takes: any where no glass disperses, though its domain then holds one."""
+    low, high = model.card["domain"]["wavelength_nm"] if model.card["lens"]["dispersive"] else ANY_WAVELENGTH_NM
+    return float(low), float(high)
 
 
 def _rays(rng: np.random.Generator, n: int, d: dict[str, Any]) -> Floats:
@@ -117,11 +119,11 @@ def _stop(rng: np.random.Generator, d: dict[str, Any]) -> np.float32:
 
 
 def _place(
-    d: dict[str, Any], rays: NDArray[np.float64], film_z: float, stop: float, any_wavelength: bool
+    d: dict[str, Any], rays: NDArray[np.float64], film_z: float, stop: float, wavelengths_nm: tuple[float, float]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Rays surely outside the domain, and surely inside: between lie those that rounding decides."""
     near, far = d["film_z_mm"]
-    low, high = d["wavelength_nm"]
+    low, high = wavelengths_nm
     sides = []
     for slack in (DOMAIN_SLACK * (1 + _ROUNDING), 1.0 - _ROUNDING):
         # abs: a bound of a negative z moves outwards too; compared so that NaN fails.
@@ -130,10 +132,7 @@ def _place(
         give = abs(slack - 1) + _ROUNDING
         ok &= (near - give * abs(near) <= film_z) & (film_z <= far + give * abs(far))
         ok &= (stop >= 0) & (stop <= d["stop_radius_mm"] * slack)
-        if any_wavelength:
-            ok &= (rays[4] > 0) & (rays[4] < np.inf)
-        else:
-            ok &= (rays[4] >= low / (1 + give)) & (rays[4] <= high * (1 + give))  # one wavelength is a range, too
+        ok &= (rays[4] >= low / (1 + give)) & (rays[4] <= high * (1 + give))  # one wavelength is a range, too
         sides.append(ok)
     # An opening whose square leaves float32 stops every ray but that through its middle, by one status or another.
     return ~sides[0], sides[1] & (stop >= 1e-6 * d["stop_radius_mm"])
