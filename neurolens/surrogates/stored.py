@@ -44,7 +44,7 @@ _MAX_FILE = 64 * 2**20
 _MAX_TEXT = 16 * 2**20  # of the JSON; the largest models known take 100 kB
 _MAX_DEPTH = 8
 _MAX_ROWS = 20_000  # of any array: terms, or units of a layer
-_MAX_DEGREE = 32  # of any term; settings allow half
+_MAX_DEGREE = 64  # of any term; settings allow half, and growth without limit stays far below
 _MAX_RAYS = 1000  # of the card's reference; `card.reference_rays` gives 4 a status
 _LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "designer", "rims", "film_z_mm", "path")
 
