@@ -120,7 +120,9 @@ def model_file(path: Path) -> Path:
     """
     if not path.is_dir():
         return path
-    found = sorted(p for folder in (path, path / "models") for p in folder.glob("*.onnx"))
+    files = sorted(p for folder in (path, path / "models") for p in folder.glob("*.onnx"))
+    # Beside models lie their inverse maps, and files that an interrupted run has not finished.
+    found = [p for p in files if not p.name.startswith(".") and not p.name.endswith((".stop.onnx", ".scene.onnx"))]
     if len(found) != 1:
         names = ", ".join(str(p) for p in found) or "(none)"
         raise InputError("neurolens export", str(path), f"({names})", "one exported model: name its file")
@@ -191,13 +193,14 @@ def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] |
 
 def _write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
     """Both inverse maps beside the model's file: their files, and the share of fresh rays that each finds."""
+    from neurolens.cameras.model import load_model
     from neurolens.surrogates.inverse_fit import convergence, fit_inverse
     from neurolens.surrogates.onnx_inverse import export_inverse
 
     pairs = _pairs(model, train=_TRAIN)
     inverse = fit_inverse(model, pairs)
     found = convergence(inverse, pairs.held_out.inputs)
-    files = export_inverse(inverse, out)
+    files = export_inverse(inverse, out, load_model(out).card["errors"])
     return {"inverse": {n: {"file": str(f), **found[n]} for n, f in zip(("stop", "scene"), files, strict=True)}}
 
 

@@ -111,9 +111,11 @@ def fingerprint(entry: Entry, pairs: PairSettings) -> str:
     Raises:
         InputError: a lens that cannot be read.
     """
-    settings = [asdict(m) for m in entry.models]
     c = entry.lens
-    state = [c.read().sha256, c.efl_mm, c.configuration, c.f_number, c.zoom, c.focusing]
+    lens = c.read()
+    glass = [lens.sha256, lens.stop_radius_mm, lens.image_radius_mm]
+    state = [*glass, c.efl_mm, c.configuration, c.f_number, c.zoom, c.focusing]
+    settings = [asdict(m) for m in entry.models]
     asked = [__version__, state, asdict(entry.domain), settings, entry.best, asdict(pairs)]
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -54,11 +55,14 @@ def send(model: OnnxLens, count: int, seed: int = 1, report: Callable[[float], N
 
 
 def _one_batch(model: OnnxLens, rng: np.random.Generator, n: int, found: Outcome) -> None:
-    d = model.card["domain"]
+    state, place = _state(model, rng)
+    d = (model.at(*state) if place is _Place.INSIDE else model).card["domain"]
     rays, film_z, stop = _rays(rng, n, d), _film_z(rng, d), _stop(rng, d)
     with np.errstate(all="ignore"):
-        out = model.rays(rays[:2], rays[2:4], rays[4], float(film_z), float(stop))
+        out = model.rays(rays[:2], rays[2:4], rays[4], float(film_z), float(stop), state or None)
         surely_out, surely_in = _place(d, rays.astype(np.float64), float(film_z), float(stop), _wavelengths(model))
+        if place is not _Place.INSIDE:
+            surely_out, surely_in = np.full(n, place is _Place.OUTSIDE), np.zeros(n, bool)
         passed = out.status == st.PASSED
         finite = np.isfinite(out.scene_ray).all(0) & np.isfinite(out.transmittance) & np.isfinite(out.stop_xy_mm).all(0)
         length = np.sqrt((out.scene_ray[3:].astype(np.float64) ** 2).sum(0))
@@ -78,6 +82,27 @@ def _wavelengths(model: OnnxLens) -> tuple[float, float]:
     """Shortest and longest that the model takes: any where no glass disperses, though its domain then holds one."""
     low, high = model.card["domain"]["wavelength_nm"] if model.card["lens"]["dispersive"] else ANY_WAVELENGTH_NM
     return float(low), float(high)
+
+
+class _Place(Enum):
+    """Of a state: among the model's, beyond them, or so close to their ends that rounding decides."""
+
+    INSIDE, OUTSIDE, BETWEEN = range(3)
+
+
+def _state(model: OnnxLens, rng: np.random.Generator) -> tuple[tuple[float, ...], _Place]:
+    """Of a model of many states: six times in seven one of its own, else any number; none for a model of one state."""
+    values, places = [], []
+    for low, high in (axis.limits for axis in model.axes):
+        v = low + (high - low) * rng.uniform()
+        if rng.uniform() < 1 / 7:
+            v = float(rng.choice(np.array([0.9 * low - 1e-3, 1.1 * high, *_SPECIAL], np.float32)))
+        give = 1e-3 * (high - low)
+        beyond = not low - give <= v <= high + give  # NaN too
+        values.append(v)
+        places.append(_Place.OUTSIDE if beyond else _Place.INSIDE if low <= v <= high else _Place.BETWEEN)
+    place = next((p for p in (_Place.OUTSIDE, _Place.BETWEEN) if p in places), _Place.INSIDE)
+    return tuple(values), place
 
 
 def _rays(rng: np.random.Generator, n: int, d: dict[str, Any]) -> Floats:

@@ -21,6 +21,7 @@ from neurolens.axes import Axis, product, weights
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import OnnxLens, load_model
 from neurolens.errors import InputError, ModelError
+from neurolens.evaluate import outside
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.state_errors import check_states, random_states, space_of_card
 from neurolens.evaluate.vignetting import vignetting_errors
@@ -193,6 +194,11 @@ def test_states_out_of_range_are_outside_the_domain(bad: float) -> None:
     assert (said.status == st.OUTSIDE_DOMAIN).all()  # type: ignore[attr-defined]
     with pytest.raises(InputError):
         loaded().at(bad)
+
+
+def test_random_states_and_rays_break_no_promise() -> None:
+    found = outside.send(loaded(), 200_000, seed=3)
+    assert found.broken == dict.fromkeys(found.broken, 0) and found.inside > 10_000 and found.passed > 3000
 
 
 def test_wrong_numbers_of_states_are_refused() -> None:
