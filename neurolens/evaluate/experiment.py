@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import os
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 from neurolens.config import from_dict, read_config
-from neurolens.errors import InputError
+from neurolens.errors import InputError, NeurolensWarning
 from neurolens.files import atomic_write_text
 from neurolens.optics.glass import glass_of
 from neurolens.optics.lensfile import read_lens
@@ -27,6 +28,8 @@ from neurolens.surrogates.state_space import StateSpace, axes_of
 NEAR_LIMIT_FOCAL_LENGTHS, NEAREST_OBJECT_FOCAL_LENGTHS = 14, 8
 # Wavelengths where none are stated, as far as the formulas of the lens's glasses reach.
 VISIBLE_NM = (380.0, 780.0)
+# A film that no light reaches beyond this share of its radius was stated too large.
+DARK_FROM = 0.9
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
@@ -97,17 +100,25 @@ class DomainChoice:
 
         Raises:
             InputError: as `domain_of`; a lens whose image is virtual, so that no film can lie there.
+
+        Warns:
+            NeurolensWarning: a film whose outer part no light reaches; one that was not asked for ends there then.
         """
         behind = first_order(lens).rear_focal_z_mm
         if not behind > lens.vertices_mm[len(lens.surfaces) - 1]:
             expected = "a lens whose focus at infinity lies behind its last surface"
             raise InputError(lens.path, "surfaces", f"(focus at z = {behind:.4g} mm)", expected)
-        return domain_of(
-            lens,
-            film_radius_mm=self.film_radius_mm,
-            focus_m=self.focus_m or (math.inf, near_limit_m(lens)),
-            wavelength_nm=self.wavelength_nm or wavelengths_nm(lens),
+        focus_m, wavelengths = (
+            self.focus_m or (math.inf, near_limit_m(lens)),
+            self.wavelength_nm or wavelengths_nm(lens),
         )
+        domain = domain_of(lens, film_radius_mm=self.film_radius_mm, focus_m=focus_m, wavelength_nm=wavelengths)
+        lit_mm, film_mm, asked = domain.bounds.lit_radius_mm, domain.film_radius_mm, self.film_radius_mm is not None
+        if lit_mm > DARK_FROM * film_mm:
+            return domain
+        said = f"{lens.path}: the film, {film_mm:.4g} mm in radius, is dark beyond {lit_mm:.4g} mm"
+        warnings.warn(said if asked else f"{said}: models are of what is lit", NeurolensWarning, stacklevel=2)
+        return domain if asked else domain_of(lens, film_radius_mm=lit_mm, focus_m=focus_m, wavelength_nm=wavelengths)
 
 
 def near_limit_m(lens: Lens) -> float:

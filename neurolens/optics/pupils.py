@@ -59,6 +59,14 @@ class PupilBounds:
     half_mm: tuple[float, ...]
     disc_mm: float
 
+    @property
+    def lit_radius_mm(self) -> float:
+        """The first film radius from which on every row is empty; that of the film where its edge is lit."""
+        last = max(
+            (k for k, (low, high) in enumerate(zip(self.low_mm, self.high_mm, strict=True)) if low <= high), default=0
+        )
+        return self.film_radius_mm * min(last + 1, len(self.low_mm) - 1) / (len(self.low_mm) - 1)
+
 
 def pupil_bounds(
     lens: Lens,

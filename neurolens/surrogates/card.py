@@ -135,13 +135,16 @@ def _status_codes(model: LensModel) -> dict[str, str]:
 def reference_rays(model: LensModel, passing: int = 24, others: int = 4) -> dict[str, Any]:
     """Rays with what the float64 model makes of them, so that a client can check its own evaluation.
 
-    Rays within 0.01 of any boundary (relative), or whose status float32 changes, are left out. For every status the
-    model gives there are up to `others` rays. `rounding` is what float32 may cost: of position and stop crossing in mm,
-    of direction and transmittance; eight times what it costs the reference evaluator on these rays.
+    Rays within 0.01 of any boundary (relative; 0.001 where none that passes is further from all), or whose status
+    float32 changes, are left out. For every status the model gives there are up to `others` rays. `rounding` is what
+    float32 may cost: of position and stop crossing in mm, of direction and transmittance; eight times what it costs
+    the reference evaluator on these rays.
     """
     rays, out, clear = _clear_rays(model, 20_000)
     if not bool((clear & (out.status == st.PASSED)).any()):  # few rays of the domain pass
         rays, out, clear = _clear_rays(model, 600_000)
+    if not bool((clear & (out.status == st.PASSED)).any()):  # and near the boundaries of a domain far wider
+        rays, out, clear = _clear_rays(model, 600_000, least=0.001)
     picked = [
         torch.nonzero(clear & (out.status == s))[: passing if s == st.PASSED else others, 0]
         for s in out.status.unique()
@@ -165,7 +168,7 @@ def reference_rays(model: LensModel, passing: int = 24, others: int = 4) -> dict
     }
 
 
-def _clear_rays(model: LensModel, count: int) -> tuple[FilmRays, Prediction, Tensor]:
+def _clear_rays(model: LensModel, count: int, least: float = 0.01) -> tuple[FilmRays, Prediction, Tensor]:
     """Rays of the domain, what the float64 model makes of them, and which of them are clear of every boundary."""
     rays = _float32(sample_domain(model.domain, count, seed=11))
     with torch.no_grad():
@@ -178,7 +181,7 @@ def _clear_rays(model: LensModel, count: int) -> tuple[FilmRays, Prediction, Ten
         [torch.hypot(rays.film_x, rays.film_y) / model.domain.film_radius_mm]
         + [torch.hypot(rays.pupil_x, rays.pupil_y) / model.domain.pupil_radius_mm]
     )
-    return rays, out, (margin > 0.01) & (radius < 0.999).all(0) & (rough.status == out.status)
+    return rays, out, (margin > least) & (radius < 0.999).all(0) & (rough.status == out.status)
 
 
 def _rounding(model: LensModel, rays: FilmRays) -> dict[str, float]:

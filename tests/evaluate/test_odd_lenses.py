@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from lens_models import LENSES
 
 from neurolens.cameras.model import load_model
@@ -18,6 +19,7 @@ from neurolens.evaluate.measure import measure_on, shared_rays
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
+from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
@@ -132,3 +134,21 @@ def test_a_run_folder_is_all_that_evaluate_needs(
     capsys.readouterr()
     assert main(["evaluate", str(folder / "models/ols-12.onnx"), "--rays", "1000", "--quiet"]) == 0
     assert "All promises hold" in capsys.readouterr().out
+
+
+def test_a_film_stated_beyond_the_light_ends_with_it(tmp_path: Path) -> None:
+    """A stated field of 59 degrees, more than the rims leave: models are of the lit film, and load."""
+    path = written(tmp_path, "triplet", *ODD["triplet_5mm"])
+    path.write_text(path.read_text().replace("rims =", "half_field_deg = 59\nrims ="))
+    experiment = default_experiment(path)
+    lens = experiment.lens.read()
+    with pytest.warns(match="dark beyond .* mm: models are of what is lit"):
+        domain = experiment.domain_of(lens)
+    wide = domain_of(lens)
+    assert domain.film_radius_mm < 0.9 * wide.film_radius_mm
+    assert domain.bounds.lit_radius_mm > 0.8 * domain.film_radius_mm
+    passing = make_pairs(lens, wide, PairSettings(3000, 1, 1)).train.inputs
+    assert float(torch.hypot(passing.film_x, passing.film_y).max()) <= domain.film_radius_mm
+    with pytest.warns(match="is dark beyond"):
+        asked = default_experiment(path, ["domain.film_radius_mm=9"]).domain_of(lens)
+    assert asked.film_radius_mm == 9
