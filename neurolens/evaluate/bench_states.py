@@ -24,8 +24,8 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.progress import Report
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.state_fit import StateSettings
-from neurolens.surrogates.state_space import StateSpace, axes_of
+from neurolens.surrogates.states.fit import StateSettings
+from neurolens.surrogates.states.space import StateSpace, axes_of
 
 # Coefficients per vector, rays of a node, rays of a single fit's test.
 TERMS, RAYS, TESTS = 64, 15_000, 8_000

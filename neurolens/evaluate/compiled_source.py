@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens.evaluate.speed import Call, Unavailable
-from neurolens.surrogates.expressions import Program
-from neurolens.surrogates.source_c import Signature, write_c
+from neurolens.surrogates.source.c import Signature, write_c
+from neurolens.surrogates.source.expressions import Program
 
 FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno")
 _SECONDS = 120  # the largest models known compile in five

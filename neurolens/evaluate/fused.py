@@ -14,9 +14,9 @@ from neurolens.errors import ModelError
 from neurolens.evaluate.compiled_source import CompiledSource, find_compiler
 from neurolens.evaluate.speed import Call, Candidate, Unavailable
 from neurolens.surrogates.domain import Domain, FilmRays
-from neurolens.surrogates.expressions import Program
-from neurolens.surrogates.fused import ALL, FREE, Fixed, Parts, fused_program
 from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.source.expressions import Program
+from neurolens.surrogates.source.fused import ALL, FREE, Fixed, Parts, fused_program
 from neurolens.surrogates.stored import load_fitted
 
 # Inputs and results of a batch lie in the second-level cache.

@@ -28,12 +28,12 @@ from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, race
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of
-from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.expressions import Program
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
-from neurolens.surrogates.fused import ALL, RAY_ONLY, Fixed, Parts, fused_program
 from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.source.expressions import Program
+from neurolens.surrogates.source.fused import ALL, RAY_ONLY, Fixed, Parts, fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 
 WITHIN_UM = 1.0

@@ -27,9 +27,9 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.inverse import LIMIT, STEPS, TOLERANCE, InverseModel, SceneSystem, StopSystem
-from neurolens.surrogates.inverse_fit import convergence, fit_inverse
-from neurolens.surrogates.newton import Solved, limited_newton, solve_small
+from neurolens.surrogates.inversion.fit import convergence, fit_inverse
+from neurolens.surrogates.inversion.maps import LIMIT, STEPS, TOLERANCE, InverseModel, SceneSystem, StopSystem
+from neurolens.surrogates.inversion.newton import Solved, limited_newton, solve_small
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.threads import pinned_threads
 

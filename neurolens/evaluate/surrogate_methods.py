@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from neurolens.errors import InputError
-from neurolens.surrogates.ablations import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
 from neurolens.surrogates.fit import ModelSettings
+from neurolens.surrogates.fits.ablations import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
 from neurolens.surrogates.published import PUBLISHED
 
 GROUPS = {

@@ -27,9 +27,9 @@ from neurolens.files import atomic_write_text
 from neurolens.progress import Progress
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.fit import ModelSettings
-from neurolens.surrogates.onnx_state import export_states
-from neurolens.surrogates.state_fit import StateSettings, fit_states
-from neurolens.surrogates.state_space import StateSpace
+from neurolens.surrogates.onnx.states import export_states
+from neurolens.surrogates.states.fit import StateSettings, fit_states
+from neurolens.surrogates.states.space import StateSpace
 
 # States at which a model is measured for its card, and the rays of each (that pass).
 STATES, RAYS = 16, 8_000

@@ -23,7 +23,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
 from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.fused import RAY_ONLY, SCENE_RAY
+from neurolens.surrogates.source.fused import RAY_ONLY, SCENE_RAY
 
 
 def test_the_exact_program_is_the_exact_trace() -> None:

@@ -18,8 +18,8 @@ from neurolens.evaluate.measure import measure_on, shared_rays
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
-from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
+from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 AIR: dict[str, float] = {}
