@@ -19,7 +19,7 @@ from neurolens.errors import InputError
 from neurolens.evaluate.candidates import model_candidate
 from neurolens.evaluate.experiment import Experiment, keep_lens, relative_to
 from neurolens.evaluate.measure import known_record, note_record
-from neurolens.evaluate.plots_states import states_plot
+from neurolens.evaluate.plots.states import states_plot
 from neurolens.evaluate.records import plain
 from neurolens.evaluate.speed import race
 from neurolens.evaluate.state_errors import card_errors, errors_at, random_states

@@ -12,7 +12,8 @@ from PIL import Image
 
 from neurolens.analysis import plot_layout
 from neurolens.errors import InputError
-from neurolens.evaluate import plots, plots_style
+from neurolens.evaluate import plots
+from neurolens.evaluate.plots import style as plots_style
 
 MODELS = [
     {"name": "thin lens", "family": "paraxial", "rms_um": 300.0, "ns_per_ray": {"min": 2.0, "median": 2.1}},

@@ -11,7 +11,7 @@ import pytest
 
 from neurolens.cameras.onnxlens import load_model
 from neurolens.errors import InputError
-from neurolens.evaluate.bench_states import CASES, page
+from neurolens.evaluate.benches.states import CASES, page
 from neurolens.evaluate.experiment import default_experiment
 from neurolens.evaluate.train_states import fit_and_measure_states, state_settings
 from neurolens.surrogates.fit import ModelSettings

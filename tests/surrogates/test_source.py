@@ -14,7 +14,7 @@ import torch
 
 from neurolens import status as st
 from neurolens.errors import InputError
-from neurolens.evaluate.compiled_source import FLAGS, CompiledSource, find_compiler
+from neurolens.evaluate.benches.compiled_source import FLAGS, CompiledSource, find_compiler
 from neurolens.evaluate.speed import Unavailable
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order

@@ -21,7 +21,7 @@ from neurolens.axes import Axis, product, weights
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import OnnxLens, load_model
 from neurolens.errors import InputError, ModelError
-from neurolens.evaluate import outside
+from neurolens.evaluate.benches import outside
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.state_errors import check_states, random_states, space_of_card
 from neurolens.evaluate.vignetting import vignetting_errors

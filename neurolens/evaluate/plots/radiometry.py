@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from neurolens.evaluate.plots_style import FIELD_COLOURS, INK, new_figure, save, style
+from neurolens.evaluate.plots.style import FIELD_COLOURS, INK, new_figure, save, style
 from neurolens.optics.radiometry import FilmLight, white_card
 
 _FACTORS = {

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neurolens.evaluate.plots_style import INK, new_figure, place_labels, plain_log_ticks, save, style
+from neurolens.evaluate.benches.surrogate_methods import GROUPS
+from neurolens.evaluate.plots.style import INK, new_figure, place_labels, plain_log_ticks, save, style
 from neurolens.evaluate.records import number, pareto_front
-from neurolens.evaluate.surrogate_methods import GROUPS
 
 Record = Mapping[str, Any]
 _LOOK = {  # Okabe and Ito's colours; shapes tell the groups apart without them

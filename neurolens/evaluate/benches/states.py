@@ -15,7 +15,7 @@ from typing import Any
 from neurolens import __version__
 from neurolens.axes import Axis
 from neurolens.evaluate.experiment import near_limit_m, wavelengths_nm
-from neurolens.evaluate.plots_states import panels_plot
+from neurolens.evaluate.plots.states import panels_plot
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.records import kept_rows
 from neurolens.evaluate.train_states import fit_and_measure_states

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.errors import ModelError
-from neurolens.evaluate.compiled_source import CompiledSource, find_compiler
+from neurolens.evaluate.benches.compiled_source import CompiledSource, find_compiler
 from neurolens.evaluate.speed import Call, Candidate, Unavailable
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.model import LensModel

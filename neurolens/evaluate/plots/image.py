@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from neurolens.errors import InputError
 from neurolens.evaluate.image import checked_image, to_srgb
-from neurolens.evaluate.plots_style import new_figure, save, style
+from neurolens.evaluate.plots.style import new_figure, save, style
 
 _Box = tuple[float, float, float, float]  # left, bottom, width, height in shares of the figure
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neurolens.evaluate.plots_surrogates import trade_plot
+from neurolens.evaluate.benches.surrogate_methods import GROUPS
+from neurolens.evaluate.plots.surrogates import trade_plot
 from neurolens.evaluate.records import number
-from neurolens.evaluate.surrogate_methods import GROUPS
 from neurolens.files import atomic_write_text
 
 Record = Mapping[str, Any]

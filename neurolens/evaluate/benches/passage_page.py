@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from neurolens.cameras.exact import ExactCamera
-from neurolens.evaluate.passage import FILM_MM, METHODS, OURS, Passage
-from neurolens.evaluate.plots_style import FAINT, FIELD_COLOURS, INK, new_figure, save, style
+from neurolens.evaluate.benches.passage import FILM_MM, METHODS, OURS, Passage
+from neurolens.evaluate.plots.style import FAINT, FIELD_COLOURS, INK, new_figure, save, style
 from neurolens.files import atomic_write_text
 
 _INTRO = """\

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.errors import InputError
-from neurolens.evaluate.plots_style import (
+from neurolens.evaluate.plots.style import (
     FAINT,
     FAMILY_NAMES,
     INK,

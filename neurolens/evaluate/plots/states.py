@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.axes import Axis
-from neurolens.evaluate.plots_style import FIELD_COLOURS, INK, new_figure, plain_log_ticks, save, style
+from neurolens.evaluate.plots.style import FIELD_COLOURS, INK, new_figure, plain_log_ticks, save, style
 
 _LABELS = {"zoom": "focal length (mm)", "focus": "1 / distance in focus (1/m)"}
 

@@ -1,6 +1,6 @@
 """Memory that tracing takes beyond its rays and its results, by number of rays: each size in a process of its own.
 
-    python -m neurolens.evaluate.trace_memory lenses/laikin_double_gauss_50.toml 1000000
+    python -m neurolens.evaluate.benches.trace_memory lenses/laikin_double_gauss_50.toml 1000000
 
 prints one JSON object. Linux only: it reads /proc.
 """
@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from neurolens.errors import NeurolensError
-from neurolens.evaluate.trace_speed import film_rays, launched
+from neurolens.evaluate.benches.trace_speed import film_rays, launched
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.trace import Rays, trace
 

@@ -10,9 +10,9 @@ from typing import Any
 
 from neurolens.cameras.model import load_model
 from neurolens.errors import NeurolensWarning
+from neurolens.evaluate.benches.models_list import Entry, Library
 from neurolens.evaluate.candidates import model_candidate
 from neurolens.evaluate.experiment import Experiment
-from neurolens.evaluate.models_list import Entry, Library
 from neurolens.evaluate.speed import race
 from neurolens.evaluate.state_errors import check_states
 from neurolens.evaluate.train_states import fit_and_measure_states, state_settings

@@ -21,12 +21,12 @@ from neurolens import __version__
 from neurolens.cameras.model import load_model
 from neurolens.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.evaluate.bench import read_index
+from neurolens.evaluate.benches.make_state_models import make_state_entry
+from neurolens.evaluate.benches.models_index import write_index
+from neurolens.evaluate.benches.models_list import Entry, Library
 from neurolens.evaluate.candidates import exact_candidates, model_candidate
 from neurolens.evaluate.check import check_model
-from neurolens.evaluate.make_state_models import make_state_entry
 from neurolens.evaluate.measure import Measured, fit_and_measure, shared_rays
-from neurolens.evaluate.models_index import write_index
-from neurolens.evaluate.models_list import Entry, Library
 from neurolens.evaluate.project import project_root
 from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
 from neurolens.evaluate.speed import race

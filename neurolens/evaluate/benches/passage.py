@@ -20,7 +20,7 @@ from torch.quasirandom import SobolEngine
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.evaluate.passage_cases import TABLE_5_3, Case
+from neurolens.evaluate.benches.passage_cases import TABLE_5_3, Case
 from neurolens.optics import pupil_methods as known
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens

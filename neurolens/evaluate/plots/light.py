@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from neurolens.errors import InputError
-from neurolens.evaluate.plots_style import FIELD_COLOURS, INK, new_figure, save, style
+from neurolens.evaluate.plots.style import FIELD_COLOURS, INK, new_figure, save, style
 
 
 def illumination_plot(light: Mapping[str, Any], path: str | Path, title: str = "Relative illumination") -> Path:

@@ -14,7 +14,7 @@ import numpy
 import torch
 
 from neurolens import __version__
-from neurolens.evaluate.trace_speed import goals
+from neurolens.evaluate.benches.trace_speed import goals
 from neurolens.files import atomic_write_text
 
 NOTES = """\

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from neurolens.config import read_config
 from neurolens.errors import InputError
+from neurolens.evaluate.benches.library import lens_files
 from neurolens.evaluate.experiment import DomainChoice, LensChoice, check_names
-from neurolens.evaluate.library import lens_files
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
 

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from neurolens import status as st
-from neurolens.evaluate.plots_style import FIELD_COLOURS, INK, new_figure, save, style
-from neurolens.evaluate.vignetting_bench import OPENINGS
+from neurolens.evaluate.benches.vignetting import OPENINGS
+from neurolens.evaluate.plots.style import FIELD_COLOURS, INK, new_figure, save, style
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import trace_pairs

@@ -19,10 +19,10 @@ import numpy as np
 from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxsession import open_session
 from neurolens.errors import InputError
+from neurolens.evaluate.benches.fused import fused_candidate, program_candidate
+from neurolens.evaluate.benches.fused_exact import exact_program
 from neurolens.evaluate.candidates import exact_candidates, model_candidate
 from neurolens.evaluate.experiment import LensChoice
-from neurolens.evaluate.fused import fused_candidate, program_candidate
-from neurolens.evaluate.fused_exact import exact_program
 from neurolens.evaluate.layout import refractions
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, race

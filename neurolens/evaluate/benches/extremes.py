@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from neurolens import status as st
-from neurolens.evaluate.extreme_cases import Case
-from neurolens.evaluate.reference import trace_reference
+from neurolens.evaluate.benches.extreme_cases import Case
+from neurolens.evaluate.benches.reference import trace_reference
 from neurolens.optics import glass
 from neurolens.optics.trace import Rays, Traced, trace
 

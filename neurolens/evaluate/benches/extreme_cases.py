@@ -9,7 +9,17 @@ from pathlib import Path
 
 import torch
 
-from neurolens.evaluate.bundles import disc, from_film, from_scene, generator, moved, returning, sag, uniform, unit
+from neurolens.evaluate.benches.bundles import (
+    disc,
+    from_film,
+    from_scene,
+    generator,
+    moved,
+    returning,
+    sag,
+    uniform,
+    unit,
+)
 from neurolens.optics import glass
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
