@@ -95,7 +95,7 @@ def check_row(check: Check) -> dict[str, Any]:
 
 
 def sections(files: list[Path]) -> list[dict[str, Any]]:
-    """The sections of lenses with rays, focused at infinity, as `plots_library.sheet` draws them.
+    """The sections of lenses with rays, focused at infinity, as `plots.library.sheet` draws them.
 
     An anamorphic lens is shown in its y-z plane.
     """
