@@ -22,33 +22,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.errors import InputError, NeurolensError
+from neurolens.errors import NeurolensError
 from neurolens.render.film import PixelGrid
+from neurolens.render.filmsettings import FilmSettings
 from neurolens.render.integrator import trace
 from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler
 from neurolens.render.scene import CameraSettings
 from neurolens.render.scenefile import Scene
-from neurolens.render.spectrum import SpectralRange
+from neurolens.render.wavelengths import spectral_range
 from neurolens.render.world import World
 
 BATCH = 32768  # paths; fewer, and calling numpy costs more than computing; many more, and their state leaves the cache
 CAMERA_BATCH = 8192  # rays a call: a network keeps more numbers a ray than the tracer
 SAMPLES_A_PASS = 16
 Progress = Callable[[float, float], None]
-
-
-def spectral_range(settings: CameraSettings, camera: Camera) -> SpectralRange:
-    """The scene's wavelengths, which a camera that disperses must cover.
-
-    Raises:
-        InputError: it does not.
-    """
-    low, high = settings.wavelengths_nm
-    accepted = camera.wavelength_nm
-    if camera.dispersive and accepted is not None and not (accepted[0] <= low and high <= accepted[1]):
-        expected = f"within the {accepted[0]:g}-{accepted[1]:g} nm of camera {camera.name}"
-        raise InputError("scene", "camera.wavelengths_nm", settings.wavelengths_nm, expected)
-    return SpectralRange(low, high)
 
 
 def camera_axes(settings: CameraSettings) -> FloatArray:
@@ -74,10 +61,19 @@ class Job:
         seconds in all. message: text of a worker's error. stop: set to end the work early.
     """
 
-    def __init__(self, scene: Scene, camera: Camera, grid: PixelGrid, samples: int, seed: int, max_depth: int) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        camera: Camera,
+        grid: PixelGrid,
+        samples: int,
+        seed: int,
+        max_depth: int,
+        film: FilmSettings,
+    ) -> None:
         settings = scene.settings.camera
         self.camera, self.grid, self.samples, self.max_depth = camera, grid, samples, max_depth
-        self.spectral = spectral_range(settings, camera)
+        self.spectral = spectral_range(scene, camera, film)
         self.world = World(scene, self.spectral)
         self.sampler = Sampler(samples, seed)
         self.axes, self.position = camera_axes(settings), np.array(settings.position_m, np.float32)
