@@ -52,10 +52,12 @@ class Palette:
 
     def freeze(self) -> None:
         """Lay the rows out for `look_up`."""
-        self._flat = np.concatenate(self._rows) if self._rows else np.zeros(self._spectral.bins, np.float32)
+        rows = np.stack(self._rows) if self._rows else np.zeros((1, self._spectral.bins), np.float32)
+        rows = self._spectral.rotated(rows)
+        self._flat = rows.reshape(*rows.shape[:-2], -1)
 
     def look_up(self, row: Index, bins: Index) -> FloatArray:
-        """Values [N] of rows [N] at wavelength bins [N]."""
+        """Values [N] of rows [N] at wavelength bins [N]; [lanes, N] where a path carries several wavelengths."""
         where = row * self._spectral.bins
         where += bins
-        return self._flat.take(where)
+        return self._flat.take(where, axis=-1)

@@ -85,6 +85,7 @@ def render(
         "max_depth": job.max_depth,
         "threads": threads,
         "wavelengths_nm": [job.spectral.low_nm, job.spectral.high_nm],
+        "wavelengths": job.mode,
         "wavelength_sampling": film.wavelength_sampling,
         "white_balance": film.white_balance,
         "seconds": seconds,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from functools import cache
 from importlib import resources
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,6 +50,7 @@ class SpectralRange:
     Args:
         low_nm, high_nm: the range; equal for light of one wavelength.
         bins: table length.
+        lanes: wavelengths that a path carries, a whole number of bins apart.
         light: spectrum (nm, radiance relative to D65) of the light to expect. None draws wavelengths evenly; else a
             wavelength is drawn in proportion to the film's response to it (root of the sum of squares of R, G and B)
             times light, and a tenth of all evenly.
@@ -64,10 +66,16 @@ class SpectralRange:
     """
 
     def __init__(
-        self, low_nm: float, high_nm: float, bins: int = 256, light: tuple[FloatArray64, FloatArray64] | None = None
+        self,
+        low_nm: float,
+        high_nm: float,
+        bins: int = 256,
+        light: tuple[FloatArray64, FloatArray64] | None = None,
+        lanes: int = 1,
     ) -> None:
         self.low_nm, self.high_nm = low_nm, high_nm
-        self.bins = bins
+        self.bins, self.lanes = bins, lanes
+        assert bins % lanes == 0
         self._set_edges(np.linspace(low_nm, high_nm, bins + 1))
         if light is not None and self.colours:
             self._set_edges(self._quantiles(*light))
@@ -121,6 +129,17 @@ class SpectralRange:
     def bin_of(self, sample: FloatArray) -> NDArray[np.intp]:
         """Bins [N] of uniform samples [N] in [0, 1)."""
         return (sample * np.float32(self.bins)).astype(np.intp)
+
+    def rotated(self, table: NDArray[Any]) -> NDArray[Any]:
+        """A table [..., bins] as it is for one lane; else [lanes, ..., bins], each lane's turned to its own bin.
+
+        Lane k of a path whose hero is in bin b is in bin b + k bins / lanes, counted round: as probable as the hero's,
+        for all bins are equally probable (Wilkie et al. 2014).
+        """
+        if self.lanes == 1:
+            return table
+        step = self.bins // self.lanes
+        return np.stack([np.roll(table, -lane * step, axis=-1) for lane in range(self.lanes)])
 
     def film_rgb(self, spectrum: ArrayLike) -> FloatArray64:
         """Linear sRGB film value [3] of a radiance [bins] relative to D65."""

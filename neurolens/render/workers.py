@@ -27,9 +27,10 @@ from neurolens.render.film import PixelGrid
 from neurolens.render.filmsettings import FilmSettings
 from neurolens.render.integrator import trace
 from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler
+from neurolens.render.scatter import lit
 from neurolens.render.scene import CameraSettings
 from neurolens.render.scenefile import Scene
-from neurolens.render.wavelengths import spectral_range
+from neurolens.render.wavelengths import LANES, mode_for, spectral_range
 from neurolens.render.world import World
 
 BATCH = 32768  # paths; fewer, and calling numpy costs more than computing; many more, and their state leaves the cache
@@ -72,9 +73,11 @@ class Job:
         film: FilmSettings,
     ) -> None:
         settings = scene.settings.camera
+        self.mode = mode_for(camera, grid, settings.wavelengths_nm, film)
         self.camera, self.grid, self.samples, self.max_depth = camera, grid, samples, max_depth
-        self.spectral = spectral_range(scene, camera, film)
+        self.spectral = spectral_range(scene, camera, film, LANES if self.mode == "hero" else 1)
         self.world = World(scene, self.spectral)
+        self.response = self.spectral.rotated(self.spectral.response)
         self.sampler = Sampler(samples, seed)
         self.axes, self.position = camera_axes(settings), np.array(settings.position_m, np.float32)
         self.pixels = grid.width * grid.height
@@ -120,22 +123,43 @@ class Job:
         pixels = np.arange(first, min(first + self.tile, self.pixels))
         indices = np.arange(part * self.samples_a_pass, min((part + 1) * self.samples_a_pass, self.samples))
         pixel, sample = np.repeat(pixels, len(indices)), np.tile(indices, len(pixels))
-        keys = self.sampler.keys(pixel, sample)
+        lanes = LANES if self.mode == "lanes" else 1
+        keys = self.sampler.keys(pixel, sample // lanes)
         hue = self.sampler.draw(keys, WAVELENGTH)
+        if lanes > 1:
+            hue = _turned(hue, (sample % lanes / lanes).astype(np.float32))
         film_mm = self.grid.film_points(pixel, self.sampler.draw2(keys, FILM))
         pupil = self.sampler.draw2(keys, PUPIL)
 
         asked = time.perf_counter()
-        origin, direction, weight = self._camera_rays(camera, film_mm, pupil, self._camera_wavelengths(hue))
+        origin, direction, weight = self._hero_rays(camera, film_mm, pupil, hue)
         answered = time.perf_counter()
 
         bins = self.spectral.bin_of(hue)
         value = trace(self.world, self.sampler, keys, origin, direction, weight, bins, self.max_depth)
         shape = (len(pixels), len(indices))
-        colour = self.spectral.response.take(bins, axis=1).reshape(3, *shape)
-        self.film[pixels] += np.einsum("cps,ps->pc", colour, value.reshape(shape))
-        passed = float(np.count_nonzero(weight))
+        colour = self.response.take(bins, axis=-1).reshape(-1, 3, *shape)
+        self.film[pixels] += np.einsum("lcps,lps->pc", colour, value.reshape(-1, *shape))
+        passed = float(lit(weight).size)
         return np.array([answered - asked, passed, time.perf_counter() - began])
+
+    def _hero_rays(
+        self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, hue: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Rays of the hero wavelengths; weights [lanes, N] of all lanes where there are several."""
+        rays = self._camera_rays(camera, film_mm, pupil, self._camera_wavelengths(hue))
+        lanes = self.spectral.lanes
+        if lanes == 1:
+            return rays
+        weight = np.empty((lanes, len(hue)), np.float32)
+        weight[:] = rays[2]
+        if camera.dispersive or not getattr(camera, "achromatic", False):
+            for lane in range(1, lanes):
+                wavelength_nm = self._camera_wavelengths(_turned(hue, np.float32(lane / lanes)))
+                weight[lane] = self._camera_rays(camera, film_mm, pupil, wavelength_nm)[2]
+            weight *= rays[2] > 0  # the hero's ray must exist
+        weight /= lanes
+        return rays[0], rays[1], weight
 
     def _camera_rays(
         self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray
@@ -160,6 +184,13 @@ class Job:
         if accepted is not None:
             np.clip(wavelengths, accepted[0], accepted[1], out=wavelengths)
         return wavelengths
+
+
+def _turned(hue: FloatArray, by: FloatArray | np.float32) -> FloatArray:
+    """Numbers in [0, 1) turned round."""
+    turned = hue + by
+    turned -= turned >= 1
+    return turned
 
 
 def run(job: Job, workers: int, progress: Progress | None) -> None:

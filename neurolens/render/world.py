@@ -220,13 +220,13 @@ class World:
         return normal, shading
 
     def reflectance(self, surface: Index, point: FloatArray, bins: Index) -> FloatArray:
-        """Reflectance [N] at wavelength bins [N], textures included."""
+        """Reflectance [..., N] at wavelength bins [N], textures included."""
         value = self.palette.look_up(self.reflectance_row.take(surface), bins)
         self.textures.apply(value, surface, point, bins, self.palette.look_up)
         return value
 
     def environment(self, direction: FloatArray, bins: Index) -> FloatArray:
-        """Radiance [N] from infinitely far along directions [3, N]."""
+        """Radiance [..., N] from infinitely far along directions [3, N]."""
         ground, horizon, zenith = self._bands
         height = direction[1]
         at_horizon = self.palette.look_up(np.full(len(bins), horizon), bins)
