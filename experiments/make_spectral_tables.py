@@ -1,5 +1,7 @@
 """Make neurolens/render/data/spectra.csv: CIE 1931 2-degree observer, D65, D50 and the Mallett-Yuksel 2019 sRGB basis.
 
+Also experiments/scenes/fl11.csv, the CIE's narrow-band fluorescent lamp FL11 (CIE 15:2004), a measured spectrum.
+
 Needs colour-science, which is no dependency of neurolens, so run it in an environment of its own:
 
     python -m venv spectra && spectra/bin/pip install colour-science==0.4.7
@@ -14,7 +16,9 @@ import colour
 import numpy as np
 from colour.recovery import MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019
 
-TARGET = Path(__file__).parent.parent / "neurolens" / "render" / "data" / "spectra.csv"
+ROOT = Path(__file__).parents[1]
+TARGET = ROOT / "neurolens" / "render" / "data" / "spectra.csv"
+LAMP = ROOT / "experiments" / "scenes" / "fl11.csv"
 SHAPE = colour.SpectralShape(380, 780, 5)
 
 
@@ -27,6 +31,9 @@ def main() -> None:
     header = "wavelength_nm,x,y,z,d65,d50,red,green,blue"
     formats = ["%.0f"] + ["%.7g"] * 8
     np.savetxt(TARGET, rows, fmt=formats, delimiter=",", header=header, comments="")
+    lamp = colour.SDS_ILLUMINANTS["FL11"].copy().align(SHAPE)
+    rows = np.column_stack([lamp.wavelengths, lamp.values])
+    np.savetxt(LAMP, rows, fmt=["%.0f", "%.7g"], delimiter=",", header="wavelength_nm,relative_power", comments="")
 
 
 if __name__ == "__main__":

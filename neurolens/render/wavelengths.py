@@ -39,23 +39,25 @@ def spectral_range(scene: Scene, camera: Camera, film: FilmSettings, lanes: int 
 def expected_light(scene: Scene) -> tuple[FloatArray64, FloatArray64]:
     """Spectrum (nm, radiance relative to D65) of a scene's light: its lamps by their area, and as much environment."""
     fine = SpectralRange(*scene.settings.camera.wavelengths_nm, _FINE)
-
-    def spectrum(rgb: tuple[float, float, float], name: str) -> FloatArray64:
-        found = illuminant(name, scene.illuminants)
-        assert found is not None  # names are checked where scenes are read
-        return fine.relative(*found) * fine.spectrum(rgb)
-
-    lamps, around = np.zeros(_FINE), np.zeros(_FINE)
+    lamps: dict[str, FloatArray64] = {}  # sums of emission by illuminant
     for quad in scene.settings.quads:
         area = float(np.linalg.norm(np.cross(quad.edge_u_m, quad.edge_v_m)))
-        lamps += area * spectrum(quad.emission, quad.illuminant)
+        lamps[quad.illuminant] = lamps.get(quad.illuminant, 0.0) + area * np.array(quad.emission)
     for sphere in scene.settings.spheres:
-        lamps += 4 * np.pi * sphere.radius_m**2 * spectrum(sphere.emission, sphere.illuminant)
-    environment = scene.settings.environment
-    for band in (environment.colour, environment.zenith, environment.horizon, environment.ground):
-        if band is not None:
-            around += spectrum(band, environment.illuminant)
-    total = sum((light / light.mean() for light in (lamps, around) if light.any()), np.zeros(_FINE))
+        area = 4 * np.pi * sphere.radius_m**2
+        lamps[sphere.illuminant] = lamps.get(sphere.illuminant, 0.0) + area * np.array(sphere.emission)
+    around = scene.settings.environment
+    bands = [b for b in (around.colour, around.zenith, around.horizon, around.ground) if b is not None]
+
+    total = np.zeros(_FINE)
+    for group in (lamps, {around.illuminant: np.sum(bands, axis=0)}):
+        light = np.zeros(_FINE)
+        for name, rgb in group.items():
+            found = illuminant(name, scene.illuminants)
+            assert found is not None  # names are checked where scenes are read
+            light += fine.relative(*found) * fine.spectrum(rgb)
+        if light.any():
+            total += light / light.mean()
     return fine.centres_nm, total if total.any() else np.ones(_FINE)
 
 
