@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 from render_helpers import WHITE, diffuse, scene
 
+from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.errors import InputError
@@ -19,7 +20,7 @@ from neurolens.render.filmsettings import FilmSettings
 from neurolens.render.renderer import render
 from neurolens.render.scenefile import Scene
 from neurolens.render.spectrum import SpectralRange
-from neurolens.render.wavelengths import dispersion_px
+from neurolens.render.wavelengths import dispersion_px, mode_for
 
 FILM = (36.0, 24.0)
 SMALL: dict[str, Any] = {"width": 12, "height": 8, "threads": 1}
@@ -168,3 +169,18 @@ def test_workers_do_not_change_the_picture(mode: str, tmp_path: Path, monkeypatc
         render(made, Pinhole(40.0, FILM), width=12, height=8, samples=22, film=film, threads=n).rgb for n in (1, 2)
     )
     assert np.array_equal(one, two)
+
+
+def test_a_lens_that_disperses_less_than_a_pixel_shows() -> None:
+    # Small enough a picture, and one ray serves all wavelengths; each lane still has the lens's transmittance for it.
+    lens = Path(__file__).parents[2] / "lenses" / "laikin_double_gauss_50.toml"
+    camera = make_camera(lens, Shot(FILM, 3.0, 2.8))
+    assert camera.dispersive
+    limits = (400.0, 700.0)
+    assert mode_for(camera, PixelGrid(24, 16, FILM), limits, FilmSettings()) == "hero"
+    assert mode_for(camera, PixelGrid(720, 480, FILM), limits, FilmSettings()) == "one"
+    ball = {"centre_m": [0, 0, -2], "radius_m": 0.4, "emission": [1, 2, 4], "illuminant": "A"}
+    made = scene(environment=WHITE, spheres=[ball])
+    one, hero = (renders(made, camera, mode, 16, width=24, height=16) for mode in ("one", "hero"))
+    assert_same_mean(one, hero, 0.01)
+    assert colour_noise(hero) < 0.3 * colour_noise(one)
