@@ -50,7 +50,7 @@ class IlluminantSettings:
 
 
 def check_spectrum(file: str | Path, field: str, rows: Sequence[Sequence[float]]) -> Spectrum:
-    """The rows (nm, value) as two arrays.
+    """The rows (nm, value) as two arrays, the largest value 1.
 
     Raises:
         InputError: names the row at fault.
@@ -67,7 +67,7 @@ def check_spectrum(file: str | Path, field: str, rows: Sequence[Sequence[float]]
     wavelengths, values = np.array(rows, np.float64).T
     if not values.any():
         raise InputError(file, field, "(all 0)", "a value above 0")
-    return wavelengths, values
+    return wavelengths, values / values.max()
 
 
 def read_spectrum(scene: Path, field: str, path: Path) -> Spectrum:

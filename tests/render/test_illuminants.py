@@ -125,6 +125,9 @@ def test_a_measured_spectrum_of_lines(tmp_path: Path) -> None:
     assert chromaticity(SRGB.to_xyz @ from_file) == pytest.approx(chromaticity(np.array(seen)), abs=4e-3)
     inline = uniform("lamp", illuminants={"lamp": {"spectrum": TRIPLE}})
     assert SRGB.to_xyz[1] @ inline == pytest.approx(1, abs=0.02)
+    for unit in (1e-300, 1e300):
+        scaled = [[nm, unit * value] for nm, value in TRIPLE]
+        assert uniform("lamp", illuminants={"lamp": {"spectrum": scaled}}) == pytest.approx(inline, rel=1e-5)
 
 
 @pytest.mark.parametrize(
