@@ -31,9 +31,9 @@ from optiland.materials import IdealMaterial
 from optiland.optic import Optic
 from optiland.rays import RealRays
 
+from neurolens.evaluate.benches.trace_speed import film_rays, with_aspheres
+from neurolens.evaluate.benches.trace_speed_page import machine
 from neurolens.evaluate.speed import Call, Candidate, Race, race
-from neurolens.evaluate.trace_speed import film_rays, with_aspheres
-from neurolens.evaluate.trace_speed_page import machine
 from neurolens.files import atomic_write_text
 from neurolens.optics import glass
 from neurolens.optics.lensfile import read_lens

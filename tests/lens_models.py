@@ -16,10 +16,10 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.cores import Network
 from neurolens.surrogates.domain import Domain, domain_of
-from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.gates import gate_values
 from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs
 from neurolens.surrogates.targets import scales_of, targets_of
 

@@ -52,6 +52,7 @@ class Camera(Protocol):
         film_mm: width and height of the film.
         wavelength_nm: range of wavelengths accepted, None for any.
         dispersive: whether rays depend on the wavelength.
+        achromatic: optional, true where neither rays nor weights depend on the wavelength.
         settings: JSON-able description (focal length, f-number, focus, model card), kept in the picture's metadata.
     """
 

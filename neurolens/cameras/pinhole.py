@@ -28,6 +28,7 @@ class Pinhole:
 
     name = "pinhole"
     dispersive = False
+    achromatic = True
     wavelength_nm: tuple[float, float] | None = None
 
     def __init__(self, focal_mm: float, film_mm: tuple[float, float] = (36.0, 24.0), f_number: float = 8.0) -> None:

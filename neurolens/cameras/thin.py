@@ -33,6 +33,7 @@ class ThinLens:
 
     name = "thin"
     dispersive = False
+    achromatic = True
     wavelength_nm: tuple[float, float] | None = None
 
     def __init__(

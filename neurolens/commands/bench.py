@@ -83,10 +83,10 @@ def _add_out(parser: argparse.ArgumentParser) -> None:
 
 def run_trace(args: argparse.Namespace) -> int:
     """Time the tracer, lens by lens; the table is written after each."""
+    from neurolens.evaluate.benches.trace_memory import SIZES, Unmeasured, memory_of
+    from neurolens.evaluate.benches.trace_speed import MAIN, chosen_lenses, selected, time_lens, with_aspheres
+    from neurolens.evaluate.benches.trace_speed_page import Found, page, write
     from neurolens.evaluate.project import project_root
-    from neurolens.evaluate.trace_memory import SIZES, Unmeasured, memory_of
-    from neurolens.evaluate.trace_speed import MAIN, chosen_lenses, selected, time_lens, with_aspheres
-    from neurolens.evaluate.trace_speed_page import Found, page, write
     from neurolens.progress import Progress
 
     _quiet_glasses()
@@ -134,8 +134,8 @@ def run_extremes(args: argparse.Namespace) -> int:
     """Measure every case; 1 where something happened that never may."""
     import json
 
-    from neurolens.evaluate import extremes
-    from neurolens.evaluate.extreme_cases import all_cases
+    from neurolens.evaluate.benches import extremes
+    from neurolens.evaluate.benches.extreme_cases import all_cases
     from neurolens.evaluate.project import project_root
     from neurolens.files import atomic_write_text
     from neurolens.progress import Progress
@@ -162,8 +162,8 @@ def run_extremes(args: argparse.Namespace) -> int:
 
 def run_pupils(args: argparse.Namespace) -> int:
     """Measure every case of the theses and draw three."""
-    from neurolens.evaluate import passage, passage_page
-    from neurolens.evaluate.passage_cases import CASES, DRAWN
+    from neurolens.evaluate.benches import passage, passage_page
+    from neurolens.evaluate.benches.passage_cases import CASES, DRAWN
     from neurolens.evaluate.project import project_root
     from neurolens.progress import Progress
 

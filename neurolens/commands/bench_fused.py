@@ -32,9 +32,9 @@ def run(args: argparse.Namespace) -> int:
     import warnings
 
     from neurolens.errors import NeurolensWarning
-    from neurolens.evaluate.compiled_source import find_compiler
-    from neurolens.evaluate.fused_page import earlier, write
-    from neurolens.evaluate.fused_speed import measure, selected
+    from neurolens.evaluate.benches.compiled_source import find_compiler
+    from neurolens.evaluate.benches.fused_page import earlier, write
+    from neurolens.evaluate.benches.fused_speed import measure, selected
     from neurolens.evaluate.project import project_root
     from neurolens.progress import Progress
 

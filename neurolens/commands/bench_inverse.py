@@ -29,7 +29,7 @@ def add_parser(kinds: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure what is missing, and write the tables after each lens."""
-    from neurolens.evaluate.inverse_bench import BenchSettings, measure_lens, page, read_records, write_records
+    from neurolens.evaluate.benches.inverse import BenchSettings, measure_lens, page, read_records, write_records
     from neurolens.evaluate.project import project_root
     from neurolens.progress import Progress
 

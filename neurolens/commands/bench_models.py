@@ -27,8 +27,8 @@ def add_parser(kinds: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make what is missing; 1 where something failed."""
-    from neurolens.evaluate.make_models import make_models
-    from neurolens.evaluate.models_list import chosen, read_list
+    from neurolens.evaluate.benches.make_models import make_models
+    from neurolens.evaluate.benches.models_list import chosen, read_list
     from neurolens.evaluate.project import project_root
     from neurolens.progress import Progress
 

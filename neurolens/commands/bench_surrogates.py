@@ -14,7 +14,7 @@ from neurolens.commands.arguments import whole
 from neurolens.errors import InputError
 
 if TYPE_CHECKING:
-    from neurolens.evaluate.surrogate_bench import BenchSettings
+    from neurolens.evaluate.benches.surrogates import BenchSettings
 
 # A standard lens, a long zoom, one that is hard for its aperture, a fisheye, and one of steep aspheres.
 DEFAULT_LENSES = (
@@ -66,11 +66,11 @@ def add_parser(kinds: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make what is missing, and write the pages after every lens."""
+    from neurolens.evaluate.benches.surrogate_methods import chosen_rows
+    from neurolens.evaluate.benches.surrogate_page import NOTES, summary_page, write_lens
+    from neurolens.evaluate.benches.surrogates import Bench, run_bench
     from neurolens.evaluate.experiment import LensChoice
     from neurolens.evaluate.records import plain
-    from neurolens.evaluate.surrogate_bench import Bench, run_bench
-    from neurolens.evaluate.surrogate_methods import chosen_rows
-    from neurolens.evaluate.surrogate_page import NOTES, summary_page, write_lens
     from neurolens.evaluate.train import versions
     from neurolens.files import atomic_write_text
     from neurolens.progress import Progress
@@ -104,8 +104,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _settings(args: argparse.Namespace) -> BenchSettings:
+    from neurolens.evaluate.benches.surrogates import BenchSettings
     from neurolens.evaluate.experiment import DomainChoice
-    from neurolens.evaluate.surrogate_bench import BenchSettings
     from neurolens.surrogates.pairs import PairSettings
 
     rays = args.rays or (6000 if args.quick else 30000)
@@ -127,7 +127,7 @@ def _lens_files(args: argparse.Namespace) -> list[Path]:
     Raises:
         InputError: no such file, or two of one name, whose records would be the same file.
     """
-    from neurolens.evaluate.library import lens_files
+    from neurolens.evaluate.benches.library import lens_files
     from neurolens.evaluate.project import project_root
 
     folder = project_root() / "lenses"

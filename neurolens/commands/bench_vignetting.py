@@ -42,9 +42,9 @@ def add_parsers(kinds: Any) -> None:
 
 def run_vignetting(args: argparse.Namespace) -> int:
     """Measure the lenses, draw four of them."""
-    from neurolens.evaluate import vignetting_bench
-    from neurolens.evaluate.library import lens_files, read_quietly
-    from neurolens.evaluate.plots_vignetting import cats_eyes
+    from neurolens.evaluate.benches import vignetting as vignetting_bench
+    from neurolens.evaluate.benches.library import lens_files, read_quietly
+    from neurolens.evaluate.plots.vignetting import cats_eyes
     from neurolens.evaluate.project import project_root
     from neurolens.progress import Progress
 
@@ -67,7 +67,7 @@ def run_vignetting(args: argparse.Namespace) -> int:
 def run_outside(args: argparse.Namespace) -> int:
     """Send random numbers; 1 where a promise is broken."""
     from neurolens.cameras.onnxlens import load_model
-    from neurolens.evaluate.outside import send
+    from neurolens.evaluate.benches.outside import send
     from neurolens.progress import Progress
 
     broken = 0

@@ -30,7 +30,7 @@ def add_parser(kinds: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure what is missing, and write the table after each case."""
-    from neurolens.evaluate.bench_states import CASES, measure_case, page, read_records, write_records
+    from neurolens.evaluate.benches.states import CASES, measure_case, page, read_records, write_records
     from neurolens.evaluate.project import project_root
     from neurolens.progress import Progress
     from neurolens.surrogates.threads import pinned_threads

@@ -83,8 +83,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("neurolens export", "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
     check_writable(args.out)
     from neurolens.cameras.model import load_model
-    from neurolens.surrogates.fused import Fixed, Parts
-    from neurolens.surrogates.source import export_source
+    from neurolens.surrogates.source.fused import Fixed, Parts
+    from neurolens.surrogates.source.writer import export_source
     from neurolens.surrogates.specialise import fixed_models
     from neurolens.surrogates.stored import load_fitted
 
@@ -175,7 +175,7 @@ def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] |
     """The graph with its card: the errors of the card given, or measured anew for what was fixed."""
     from neurolens.cameras.model import load_model
     from neurolens.evaluate.measure import measure_errors
-    from neurolens.surrogates.export import export_onnx
+    from neurolens.surrogates.onnx.export import export_onnx
 
     if len(models) > 1:
         wavelengths = [m.domain.wavelength_nm[0] for m in models]
@@ -194,8 +194,8 @@ def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] |
 def _write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
     """Both inverse maps beside the model's file: their files, and the share of fresh rays that each finds."""
     from neurolens.cameras.model import load_model
-    from neurolens.surrogates.inverse_fit import convergence, fit_inverse
-    from neurolens.surrogates.onnx_inverse import export_inverse
+    from neurolens.surrogates.inversion.fit import convergence, fit_inverse
+    from neurolens.surrogates.onnx.inverse import export_inverse
 
     pairs = _pairs(model, train=_TRAIN)
     inverse = fit_inverse(model, pairs)

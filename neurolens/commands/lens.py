@@ -133,7 +133,7 @@ def run(args: argparse.Namespace) -> int:
     if args.layout is not None:
         draw_layout(lens, domain, args.layout)
     if args.breathing is not None:
-        from neurolens.evaluate.plots_breathing import draw_breathing
+        from neurolens.evaluate.plots.breathing import draw_breathing
 
         found = draw_breathing(lens, args.breathing)
         data["breathing"] = {name: [asdict(b) for b in breaths] for name, breaths in found.items()}

@@ -22,14 +22,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the table; draw the sheet where asked."""
-    from neurolens.evaluate.library import lens_files, library, sections
+    from neurolens.evaluate.benches.library import lens_files, library, sections
 
     if args.layouts is not None and not args.layouts.parent.is_dir():
         raise InputError(args.layouts, "--layouts", str(args.layouts.parent), "a folder that exists")
     files = lens_files(_folder(args.folder))
     rows = library(files)
     if args.layouts is not None:
-        from neurolens.evaluate.plots_library import sheet
+        from neurolens.evaluate.plots.library import sheet
 
         sheet(sections([Path(r["file"]) for r in rows if "name" in r]), args.layouts)
     if args.json:

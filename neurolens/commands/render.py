@@ -15,6 +15,7 @@ from neurolens.errors import InputError
 from neurolens.evaluate.records import plain
 from neurolens.files import check_writable
 from neurolens.progress import Progress, duration
+from neurolens.render.filmsettings import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS, FilmSettings
 
 if TYPE_CHECKING:
     from neurolens.apertures import Aperture
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
     from neurolens.render.scene import CameraSettings
 
 _DESCRIPTION = """\
-Path-trace a scene (experiments/scenes/*.toml) and write OpenEXR, linear sRGB, with a PNG
-preview beside it. The settings, the camera and the card of a model are kept in the EXR's
+Path-trace a scene (experiments/scenes/*.toml) and write OpenEXR, linear sRGB or ACEScg, with
+a PNG preview beside it. The settings, the camera and the card of a model are kept in the EXR's
 metadata, attribute "neurolens", as JSON.
 
 The same seed gives the same picture, whatever the number of threads; all cameras share its
@@ -74,6 +75,7 @@ def add_parser(subparsers: Any) -> None:
         "--exposure", metavar="STOPS", type=between(-40, 40, "stops"), default=0.0,
         help="brightens the preview only (default: 0)",
     )  # fmt: skip
+    _add_colour(parser)
     add_lens_state(
         parser,
         {
@@ -88,17 +90,50 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(run=run, kept="no picture was written; older files of that name are untouched")
 
 
+def _add_colour(parser: argparse.ArgumentParser) -> None:
+    """Options that stand in for the scene's [film] table."""
+    colour = parser.add_argument_group("colour (left out: the scene's [film] table)")
+    colour.add_argument(
+        "--colour-space", choices=COLOUR_SPACE_NAMES,
+        help="of the EXR, linear: sRGB (D65) or ACEScg (AP1, the white of ACES)",
+    )  # fmt: skip
+    colour.add_argument(
+        "--white-balance", metavar="LIGHT",
+        help="light that becomes neutral: A, D50, D65, E, '3200 K' or a measured one of the scene",
+    )  # fmt: skip
+    colour.add_argument(
+        "--wavelengths", choices=WAVELENGTH_MODES,
+        help="of a path: one; hero, four that share it; lanes, four paths that share their random numbers; "
+        "auto, hero where the camera does not disperse",
+    )  # fmt: skip
+    colour.add_argument(
+        "--wavelength-sampling", choices=WAVELENGTH_SAMPLINGS,
+        help="by importance (film response times light) or uniform",
+    )  # fmt: skip
+
+
+def film_of(settings: FilmSettings, args: argparse.Namespace) -> FilmSettings:
+    """The scene's [film] table with the command line's on top."""
+    names = ("colour_space", "white_balance", "wavelengths", "wavelength_sampling")
+    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    return replace(settings, **given)
+
+
 def run(args: argparse.Namespace) -> int:
     """Render, write both pictures, say how it went."""
     preview = _preview_path(args.out)
     from neurolens.cameras.build import make_camera
+    from neurolens.render.colour import COLOUR_SPACES
     from neurolens.render.exr import write_exr, write_png
     from neurolens.render.film import PixelGrid
+    from neurolens.render.illuminants import check_name
     from neurolens.render.renderer import render
     from neurolens.render.scenefile import load_scene
 
     scene = load_scene(args.scene)
-    settings = scene.settings.camera
+    settings, film = scene.settings.camera, film_of(scene.settings.film, args)
+    if args.white_balance is not None:
+        check_name(args.scene, "--white-balance", args.white_balance, scene.illuminants)
     if args.film is not None:
         settings = replace(settings, film_width_mm=args.film[0], film_height_mm=args.film[1])
         if args.width is None and args.height is None:
@@ -111,11 +146,13 @@ def run(args: argparse.Namespace) -> int:
     with Progress(quiet=args.quiet).stage(f"render {scene.name}, {camera.name}") as report:
         result = render(
             scene, camera, width=width, height=height, samples=args.samples, seed=args.seed,
-            threads=args.threads, max_depth=args.max_depth, progress=report,
+            threads=args.threads, max_depth=args.max_depth, film=film, progress=report,
         )  # fmt: skip
     stats = plain(result.stats)
+    space = COLOUR_SPACES[film.colour_space]
     metadata = {"version": __version__, "scene": str(args.scene), "camera": plain(camera.settings), "render": stats}
-    write_exr(args.out, result.rgb, half=args.half, metadata=metadata)
+    metadata["colour"] = {"space": space.name, "white_xy": list(space.white), "adaptation": "Bradford"}
+    write_exr(args.out, result.rgb, half=args.half, metadata=metadata, space=space)
     write_png(preview, result.rgb, args.exposure)
     if args.json:
         print_json({"file": str(args.out), "preview": str(preview), **stats, "camera": camera.settings})

@@ -19,8 +19,8 @@ from typing import Any
 
 from neurolens.cameras.model import load_model
 from neurolens.errors import InputError, NeurolensError
+from neurolens.evaluate.benches.floors import Floor, check_floors, floor_table
 from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
-from neurolens.evaluate.floors import Floor, check_floors, floor_table
 from neurolens.evaluate.project import project_root
 from neurolens.evaluate.speed import Race, race
 from neurolens.evaluate.speed_table import COMPILED, markdown, notes, table_rows

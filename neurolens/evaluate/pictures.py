@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +59,7 @@ def render_all(
     scenes = [load_scene(path) for path in choice.scenes]
     done, total = 0, len(scenes) * ((1 + len(models)) * choice.seeds + 2)
     for scene in scenes:
+        film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
         renders: dict[str, list[FloatArray]] = {}
         for name, camera in scene_cameras(lens, domain, models, scene.settings.camera).items():
             seeds = choice.seeds if name == EXACT or name in models else 1
@@ -71,6 +72,7 @@ def render_all(
                     samples=choice.samples,
                     seed=seed,
                     threads=choice.threads,
+                    film=film,
                 )
                 renders.setdefault(name, []).append(result.rgb)
                 if seed == 0:

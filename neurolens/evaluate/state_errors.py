@@ -19,8 +19,8 @@ from neurolens.evaluate.vignetting import vignetting_errors
 from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.state_model import State
-from neurolens.surrogates.state_space import StateSpace
+from neurolens.surrogates.states.model import State
+from neurolens.surrogates.states.space import StateSpace
 
 RAY_KEYS = (
     "rms_um", "rms_um_at_21_6", "p99_um", "max_um", "rms_infinity_um", "direction_rms_deg", "position_rms_um",

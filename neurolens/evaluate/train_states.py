@@ -19,7 +19,7 @@ from neurolens.errors import InputError
 from neurolens.evaluate.candidates import model_candidate
 from neurolens.evaluate.experiment import Experiment, keep_lens, relative_to
 from neurolens.evaluate.measure import known_record, note_record
-from neurolens.evaluate.plots_states import states_plot
+from neurolens.evaluate.plots.states import states_plot
 from neurolens.evaluate.records import plain
 from neurolens.evaluate.speed import race
 from neurolens.evaluate.state_errors import card_errors, errors_at, random_states
@@ -27,9 +27,9 @@ from neurolens.files import atomic_write_text
 from neurolens.progress import Progress
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.fit import ModelSettings
-from neurolens.surrogates.onnx_state import export_states
-from neurolens.surrogates.state_fit import StateSettings, fit_states
-from neurolens.surrogates.state_space import StateSpace
+from neurolens.surrogates.onnx.states import export_states
+from neurolens.surrogates.states.fit import StateSettings, fit_states
+from neurolens.surrogates.states.space import StateSpace
 
 # States at which a model is measured for its card, and the rays of each (that pass).
 STATES, RAYS = 16, 8_000

@@ -15,6 +15,7 @@ from neurolens.cameras.thin import ThinLens
 from neurolens.errors import InputError, NeurolensError
 from neurolens.render.renderer import render
 from neurolens.render.scenefile import load_scene
+from neurolens.render.wavelengths import LANES
 
 
 def measure(
@@ -23,7 +24,8 @@ def measure(
     """Speed of a scene file at its own picture size.
 
     Returns:
-        mpaths_per_s of the fastest and of the median render, their seconds, threads, depth and paths a render.
+        mpaths_per_s of the fastest and of the median render, their seconds, threads, depth, lanes (wavelengths a path)
+        and paths a render.
 
     Raises:
         InputError: a scene that cannot be read, a count below 1.
@@ -47,6 +49,7 @@ def measure(
         "paths": paths,
         "threads": threads,
         "max_depth": depth,
+        "lanes": LANES if stats[0]["wavelengths"] == "hero" else 1,
     }
 
 
@@ -63,8 +66,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     print(
         f"{found['mpaths_per_s']:.2f} Mpath/s fastest, {found['mpaths_per_s_median']:.2f} median "
-        f"({found['paths']} paths of depth {found['max_depth']}, {found['threads']} threads, "
-        f"{found['seconds_min']:.2f} s fastest, {found['seconds_median']:.2f} s median)"
+        f"({found['paths']} paths of depth {found['max_depth']}, wavelengths each: {found['lanes']}, "
+        f"{found['threads']} threads, {found['seconds_min']:.2f} s fastest, {found['seconds_median']:.2f} s median)"
     )
     return 0
 

@@ -12,26 +12,37 @@ from typing import Any
 
 import numpy as np
 import OpenEXR
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from neurolens.cameras.contract import FloatArray
 from neurolens.errors import InputError
 from neurolens.files import atomic_path
+from neurolens.render.colour import SRGB, ColourSpace, conversion
 from neurolens.render.spectrum import linear_to_srgb
 
 METADATA_KEY = "neurolens"
 _HALF_MAX = 65504.0
 
 
-def write_exr(path: str | Path, rgb: ArrayLike, *, half: bool = False, metadata: dict[str, Any] | None = None) -> None:
+def write_exr(
+    path: str | Path,
+    rgb: ArrayLike,
+    *,
+    half: bool = False,
+    metadata: dict[str, Any] | None = None,
+    space: ColourSpace = SRGB,
+) -> None:
     """Write a picture as OpenEXR: channels R, G and B, ZIP compression, whole or not at all.
+
+    The attributes chromaticities, adoptedNeutral and colorInteropID say which colour space it is.
 
     Args:
         path: where to; the folder exists.
-        rgb: [H, W, 3] linear, any real type and memory layout; stored as float32.
+        rgb: [H, W, 3] linear sRGB, any real type and memory layout; stored as float32.
         half: store as float16, where values beyond 65504 become 65504.
         metadata: JSON-able settings, kept as one JSON text in the attribute "neurolens".
+        space: colour space to store.
 
     Raises:
         InputError: another shape, no pixels, complex or text, not finite, metadata that is not JSON, no such folder,
@@ -44,7 +55,7 @@ def write_exr(path: str | Path, rgb: ArrayLike, *, half: bool = False, metadata:
     if picture.dtype.kind not in "fiub":
         raise InputError(path, "rgb type", str(picture.dtype), "real numbers")
     with np.errstate(over="ignore"):
-        picture = picture.astype(np.float32)
+        picture = picture.astype(np.float32) if space is SRGB else _in_space(picture, space)
     if not np.all(np.isfinite(picture)):
         raise InputError(
             path, "rgb", f"({int(np.sum(~np.isfinite(picture)))} values not finite)", "finite float32 values"
@@ -57,7 +68,14 @@ def write_exr(path: str | Path, rgb: ArrayLike, *, half: bool = False, metadata:
         raise InputError(path, "folder", str(path.parent), "a folder that exists")
     stored = np.clip(picture, -_HALF_MAX, _HALF_MAX).astype(np.float16) if half else picture
     channels = {name: np.ascontiguousarray(stored[..., k]) for k, name in enumerate("RGB")}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, METADATA_KEY: text}
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "chromaticities": space.chromaticities,
+        "adoptedNeutral": np.array(space.white, np.float32),
+        "colorInteropID": space.interop_id,
+        METADATA_KEY: text,
+    }
     with atomic_path(path) as temporary:
         try:
             OpenEXR.File([OpenEXR.Part(header, channels)]).write(str(temporary))
@@ -66,8 +84,14 @@ def write_exr(path: str | Path, rgb: ArrayLike, *, half: bool = False, metadata:
             raise InputError(path, "file", f"({said})", "a place that can be written") from None
 
 
+def _in_space(picture: NDArray[Any], space: ColourSpace) -> FloatArray:
+    """Linear sRGB [H, W, 3] in another space."""
+    with np.errstate(invalid="ignore"):
+        return (picture @ conversion(SRGB, space).T).astype(np.float32)
+
+
 def read_exr(path: str | Path) -> tuple[FloatArray, dict[str, Any]]:
-    """A picture [H, W, 3] float32 and its metadata, {} where it has none of ours.
+    """A picture [H, W, 3] float32, in the colour space that it was written in, and its metadata, {} without ours.
 
     Raises:
         InputError: missing, no OpenEXR file, truncated, or without channels R, G and B.

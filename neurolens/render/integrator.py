@@ -15,7 +15,7 @@ from neurolens.render import sampler as dims
 from neurolens.render.palette import Index
 from neurolens.render.primitives import Rays, dot
 from neurolens.render.sampler import PathKeys, Sampler
-from neurolens.render.scatter import SPECULAR, Paths, Vertex, aim_at_lights, scatter
+from neurolens.render.scatter import SPECULAR, Paths, Vertex, aim_at_lights, deposit, lit, scatter
 from neurolens.render.world import GLASS, NOTHING, World
 
 _ROULETTE_FROM = 2  # surfaces that every path may reach before it can end by chance
@@ -33,17 +33,18 @@ def trace(
     *,
     aim: bool = True,
 ) -> FloatArray:
-    """Weight times radiance [N] that arrives along camera rays.
+    """Weight times radiance [N] that arrives along camera rays; [lanes, N] where paths carry several wavelengths.
 
     Args:
-        keys: random numbers of the paths. origin, direction: [3, N], m. weight: [N], paths of weight 0 cost nothing.
-        bins: [N] wavelength bins. max_depth: number of surfaces along a path at which light is scattered.
+        keys: random numbers of the paths. origin, direction: [3, N], m.
+        weight: [N] or [lanes, N]; paths of weight 0 cost nothing. bins: [N] wavelength bins, of the first lane.
+        max_depth: number of surfaces along a path at which light is scattered.
         aim: sample lights directly; without it the mean is the same, found by scattering alone.
     """
-    radiance = np.zeros(len(weight), np.float32)
-    slot = np.flatnonzero(weight)
-    density = np.full(len(weight), SPECULAR)
-    paths = Paths(origin, direction, weight, bins, np.arange(len(weight)), density).take(slot)
+    radiance = np.zeros(weight.shape, np.float32)
+    count = weight.shape[-1]
+    density, alone = np.full(count, SPECULAR), np.zeros(count, np.bool_)
+    paths = Paths(origin, direction, weight, bins, np.arange(count), density, alone).take(lit(weight))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for depth in range(max_depth + 1):
             if not paths.slot.size:
@@ -64,9 +65,9 @@ def trace(
             paths = scatter(vertex, sampler, alive, first)
             if depth >= _ROULETTE_FROM:
                 _roulette(paths, sampler.draw(alive, first + dims.ROULETTE))
-            ended = paths.throughput == 0
-            if ended.any():
-                paths = paths.take(np.flatnonzero(~ended))
+            alive_rows = lit(paths.throughput)
+            if alive_rows.size < paths.slot.size:
+                paths = paths.take(alive_rows)
     return radiance
 
 
@@ -77,7 +78,7 @@ def _add_environment(world: World, paths: Paths, found: NDArray[np.int32], radia
     rows = np.flatnonzero(found < 0)
     if rows.size:
         light = world.environment(paths.direction.take(rows, axis=1), paths.bins.take(rows))
-        radiance[paths.slot[rows]] += paths.throughput[rows] * light
+        deposit(radiance, paths.slot[rows], paths.throughput.take(rows, axis=-1) * light)
 
 
 def _add_emission(
@@ -101,12 +102,12 @@ def _add_emission(
     front = np.flatnonzero(cosine > 0)  # the back of a light is dark
     rows, cosine = rows[front], cosine[front]
     emitted = world.palette.look_up(world.emission_row.take(surface[rows]), paths.bins[rows])
-    emitted *= paths.throughput[rows]
+    emitted *= paths.throughput.take(rows, axis=-1)
     if aim:
         aimed = world.lights.pdf(light[rows], paths.origin.take(rows, axis=1), distance[rows], cosine)
         ratio = aimed / paths.density[rows]
         emitted /= 1 + ratio * ratio
-    radiance[paths.slot[rows]] += emitted
+    deposit(radiance, paths.slot[rows], emitted)
 
 
 def _arrive(world: World, paths: Paths, surface: Index, point: FloatArray, distance: FloatArray) -> Vertex:
@@ -119,6 +120,9 @@ def _arrive(world: World, paths: Paths, surface: Index, point: FloatArray, dista
 
 def _roulette(paths: Paths, sample: FloatArray) -> None:
     """End faint paths by chance; those that go on carry the light of those that end."""
-    survival = np.clip(paths.throughput, np.float32(0.05), np.float32(1))
+    brightest = paths.throughput
+    if brightest.ndim == 2:
+        brightest = brightest.max(axis=0) * np.where(paths.alone, np.float32(1), np.float32(len(brightest)))
+    survival = np.clip(brightest, np.float32(0.05), np.float32(1))
     paths.throughput /= survival
     paths.throughput *= sample < survival

@@ -1,7 +1,8 @@
 """How surfaces scatter: Lambert, a GGX coat over a Lambert base, mirror, smooth glass.
 
-Everything is for one wavelength a path: reflectances are numbers [N]. Directions are unit vectors [3, N] that point
-away from the surface, normals lie on the side of the incoming ray.
+Reflectances are numbers [N], or [lanes, N] where paths carry several wavelengths; what is drawn then depends on the
+lanes together, not on one of them, so that all give a path the same density. Directions are unit vectors [3, N] that
+point away from the surface, normals lie on the side of the incoming ray.
 
 Sources: Walter et al. 2007 (GGX); Heitz 2014 (Smith shadowing); Dupuy and Benyoub 2023, "Sampling visible GGX normals
 with spherical caps"; Schlick 1994.
@@ -57,7 +58,7 @@ def schlick(head_on: FloatArray, cosine: FloatArray) -> FloatArray:
 def glossy_evaluate(
     normal: FloatArray, out: FloatArray, inward: FloatArray, base: FloatArray, coat: FloatArray, alpha: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Scattering times cosine [N] of the glossy material, and the density [N] with which `glossy_sample` finds it.
+    """Scattering times cosine [..., N] of the glossy material, and the density [N] with which `glossy_sample` finds it.
 
     Args:
         out: towards the camera. inward: towards the light.
@@ -94,7 +95,8 @@ def _smith(cosine: FloatArray, alpha2: FloatArray) -> FloatArray:
 
 
 def coat_probability(cos_out: FloatArray, base: FloatArray, coat: FloatArray) -> FloatArray:
-    """Probability [N] of sampling the coat: its share of the reflected light, at least 1/5."""
+    """Probability [N] of sampling the coat: its share of the light reflected in all lanes, at least 1/5."""
+    base, coat = (a if a.ndim == 1 else a.mean(axis=0) for a in (base, coat))
     fresnel = schlick(coat, cos_out)
     share = fresnel / np.maximum(fresnel + (1 - fresnel) * base, np.float32(1e-6))
     return np.clip(share, np.float32(0.2), np.float32(1))
@@ -143,19 +145,25 @@ def fresnel_dielectric(cos_in: FloatArray, relative_index: FloatArray) -> tuple[
 
 
 def glass_direction(
-    direction: FloatArray, normal: FloatArray, outside: NDArray[np.bool_], index: FloatArray, choice: FloatArray
+    direction: FloatArray,
+    normal: FloatArray,
+    outside: NDArray[np.bool_],
+    index: FloatArray,
+    choice: FloatArray,
+    chance: FloatArray | None = None,
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Reflected or refracted travel directions [3, N], each chosen with its Fresnel probability, and which refract [N].
 
     Args:
         direction: of travel. outside: whether the ray comes from outside. index: of the glass. choice: in [0, 1).
+        chance: probability of reflection to use instead of Fresnel's.
 
     The throughput stays: the factor n^2 of radiance inside glass cancels on the way out, and no light stands in glass.
     """
     relative = np.where(outside, index, 1 / index)
     cos_in = np.clip(-dot(direction, normal), 0, 1)
     reflectance, cos_out = fresnel_dielectric(cos_in, relative)
-    refracts = choice >= reflectance
+    refracts = choice >= (reflectance if chance is None else chance)
     along = np.where(refracts, 1 / relative, np.float32(1))
     across = np.where(refracts, cos_in / relative - cos_out, 2 * cos_in)
     result = direction * along + normal * across

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
 from neurolens.render.checks import Vector
+from neurolens.render.illuminants import Spectrum, illuminant
 from neurolens.render.spectrum import SpectralRange
 
 Index = NDArray[np.intp]
@@ -17,8 +18,8 @@ Index = NDArray[np.intp]
 class Palette:
     """Spectra [rows, bins], looked up by row and wavelength bin; colours that occur twice share a row."""
 
-    def __init__(self, spectral: SpectralRange) -> None:
-        self._spectral = spectral
+    def __init__(self, spectral: SpectralRange, measured: Mapping[str, Spectrum] | None = None) -> None:
+        self._spectral, self._measured = spectral, measured or {}
         self._rows: list[FloatArray] = []
         self._numbers: dict[object, int] = {}
         self._flat: FloatArray = np.zeros(0, np.float32)
@@ -26,6 +27,18 @@ class Palette:
     def colour(self, rgb: Vector) -> int:
         """Row of a colour."""
         return self._row(rgb, lambda: self._spectral.spectrum(rgb))
+
+    def light(self, rgb: Vector, name: str) -> int:
+        """Row of the light of an illuminant, tinted by a colour; relative to D65."""
+        if name == "D65" or not any(rgb):
+            return self.colour(rgb)
+        return self._row((*rgb, name), lambda: self._spectral.spectrum(rgb) * self.illuminant(name))
+
+    def illuminant(self, name: str) -> FloatArray:
+        """Radiance [bins] relative to D65 of an illuminant of luminance 1 on the film."""
+        found = illuminant(name, self._measured)
+        assert found is not None  # names are checked where scenes are read
+        return self._spectral.relative(*found).astype(np.float32)
 
     def index(self, n_d: float, v_d: float | None) -> int:
         """Row of a refractive index."""
@@ -39,10 +52,12 @@ class Palette:
 
     def freeze(self) -> None:
         """Lay the rows out for `look_up`."""
-        self._flat = np.concatenate(self._rows) if self._rows else np.zeros(self._spectral.bins, np.float32)
+        rows = np.stack(self._rows) if self._rows else np.zeros((1, self._spectral.bins), np.float32)
+        rows = self._spectral.rotated(rows)
+        self._flat = rows.reshape(*rows.shape[:-2], -1)
 
     def look_up(self, row: Index, bins: Index) -> FloatArray:
-        """Values [N] of rows [N] at wavelength bins [N]."""
+        """Values [N] of rows [N] at wavelength bins [N]; [lanes, N] where a path carries several wavelengths."""
         where = row * self._spectral.bins
         where += bins
-        return self._flat.take(where)
+        return self._flat.take(where, axis=-1)

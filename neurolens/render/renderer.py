@@ -10,7 +10,10 @@ import numpy as np
 
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.errors import InputError
+from neurolens.render.colour import balance
 from neurolens.render.film import PixelGrid
+from neurolens.render.filmsettings import FilmSettings
+from neurolens.render.illuminants import check_name
 from neurolens.render.scenefile import Scene
 from neurolens.render.workers import Job, Progress, run
 
@@ -38,6 +41,7 @@ def render(
     seed: int = 0,
     threads: int = 2,
     max_depth: int | None = None,
+    film: FilmSettings | None = None,
     progress: Progress | None = None,
 ) -> RenderResult:
     """Path-trace `scene` through `camera`.
@@ -46,15 +50,18 @@ def render(
 
     Args:
         width, height, samples, max_depth: as in `CameraSettings`; left out, those of the scene.
+        film: spectral sampling and white balance; left out, those of the scene.
         threads: workers. A camera may have `for_worker() -> Camera`, called once in each, to open sessions of its own.
         progress: called now and then with the fraction done and the estimated seconds left.
 
     Raises:
-        InputError: a size or count below 1, picture and film of different shape, or a camera that disperses and does
-            not cover the scene's wavelengths.
+        InputError: a size or count below 1, an unknown illuminant, picture and film of different shape, or a camera
+            that disperses and does not cover the scene's wavelengths.
         NeurolensError: a worker failed; the message holds its traceback.
     """
-    settings = scene.settings.camera
+    settings, film = scene.settings.camera, film or scene.settings.film
+    if film.white_balance is not None:
+        check_name("render", "film.white_balance", film.white_balance, scene.illuminants)
     job = Job(
         scene,
         camera,
@@ -62,6 +69,7 @@ def render(
         _at_least_one("samples", settings.samples if samples is None else samples),
         seed,
         _at_least_one("max_depth", settings.max_depth if max_depth is None else max_depth),
+        film,
     )
     began = time.perf_counter()
     run(job, min(_at_least_one("threads", threads), len(job.done)), progress)
@@ -77,14 +85,19 @@ def render(
         "max_depth": job.max_depth,
         "threads": threads,
         "wavelengths_nm": [job.spectral.low_nm, job.spectral.high_nm],
+        "wavelengths": job.mode,
+        "wavelength_sampling": film.wavelength_sampling,
+        "white_balance": film.white_balance,
         "seconds": seconds,
         "paths": paths,
         "mpaths_per_s": paths / seconds * 1e-6,
         "passed_fraction": float(job.tallies[1]) / paths,
         "camera_fraction": float(job.tallies[0] / max(job.tallies[2], 1e-12)),
     }
-    rgb = (job.film / job.samples).astype(np.float32).reshape(grid.height, grid.width, 3)
-    return RenderResult(rgb, stats)
+    rgb = job.film / job.samples
+    if film.white_balance is not None and job.spectral.colours:
+        rgb = rgb @ balance(job.spectral.film_rgb(job.world.palette.illuminant(film.white_balance))).T
+    return RenderResult(rgb.astype(np.float32).reshape(grid.height, grid.width, 3), stats)
 
 
 def _at_least_one(field: str, value: int) -> int:

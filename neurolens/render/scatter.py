@@ -14,6 +14,7 @@ from neurolens.cameras.contract import FloatArray
 from neurolens.render import sampler as dims
 from neurolens.render.materials import (
     cosine_direction,
+    fresnel_dielectric,
     glass_direction,
     glossy_evaluate,
     glossy_sample,
@@ -33,9 +34,11 @@ class Paths:
     """The paths still alive.
 
     Attributes:
-        origin, direction: [3, N] of their rays. throughput: [N]. bins: [N] wavelength bin.
+        origin, direction: [3, N] of their rays. throughput: [N], or [lanes, N] where a path carries several
+            wavelengths, the hero first. bins: [N] wavelength bin, of the hero.
         slot: [N] place in the batch.
         density: [N] per solid angle with which the ray's direction was chosen.
+        alone: [N] whether the other lanes have left the hero, bent another way.
     """
 
     origin: FloatArray
@@ -44,13 +47,27 @@ class Paths:
     bins: Index
     slot: Index
     density: FloatArray
+    alone: NDArray[np.bool_]
 
     def take(self, rows: Index) -> Paths:
         """Some of the paths."""
         vectors = (self.origin.take(rows, axis=1), self.direction.take(rows, axis=1))
-        return Paths(
-            *vectors, self.throughput.take(rows), self.bins.take(rows), self.slot.take(rows), self.density.take(rows)
-        )
+        throughput, bins, slot = self.throughput.take(rows, axis=-1), self.bins.take(rows), self.slot.take(rows)
+        return Paths(*vectors, throughput, bins, slot, self.density.take(rows), self.alone.take(rows))
+
+
+def lit(value: FloatArray | NDArray[np.bool_]) -> Index:
+    """Where a number [N], or any lane of [lanes, N], is not 0."""
+    return np.flatnonzero(value if value.ndim == 1 else value.any(axis=0))
+
+
+def deposit(radiance: FloatArray, slot: Index, value: FloatArray) -> None:
+    """Add values [..., n] to the slots [n] of a batch, none of which occurs twice."""
+    if radiance.ndim == 1:
+        radiance[slot] += value
+        return
+    for lane, part in zip(radiance, value, strict=True):
+        lane[slot] += part
 
 
 class Vertex:
@@ -101,12 +118,14 @@ class Vertex:
         d, g = self.diffuse, self.glossy
         cosine = np.maximum(dot(self.shading[:, d], inward[:, d]), np.float32(0))
         cosine *= _ONE_OVER_PI
-        value = self.base[d] * cosine
+        value = self.base[..., d] * cosine
         if g.start == g.stop:
             return value, cosine
         out = -self.paths.direction[:, g]
-        shiny, density = glossy_evaluate(self.shading[:, g], out, inward[:, g], self.base[g], self.coat, self.alpha)
-        return np.concatenate([value, shiny]), np.concatenate([cosine, density])
+        shiny, density = glossy_evaluate(
+            self.shading[:, g], out, inward[:, g], self.base[..., g], self.coat, self.alpha
+        )
+        return np.concatenate([value, shiny], axis=-1), np.concatenate([cosine, density])
 
     def index(self) -> FloatArray:
         """Refractive index of the glass paths."""
@@ -128,13 +147,13 @@ def aim_at_lights(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int, 
     value *= aimed.inverse_pdf
     if vertex.smooth:
         value *= dot(vertex.facing[:, :rough], aimed.direction) > 0
-    rows = np.flatnonzero(value > 0)
-    value, ratio = value[rows], density[rows] * aimed.inverse_pdf[rows]
+    rows = lit(value > 0)
+    value, ratio = value.take(rows, axis=-1), density[rows] * aimed.inverse_pdf[rows]
     value /= 1 + ratio * ratio
     value *= world.palette.look_up(world.light_emission_row.take(aimed.light[rows]), paths.bins[rows])
-    value *= paths.throughput[rows]
+    value *= paths.throughput.take(rows, axis=-1)
     value *= world.visible(origin.take(rows, axis=1), aimed.direction.take(rows, axis=1), aimed.distance[rows])
-    radiance[paths.slot[rows]] += value
+    deposit(radiance, paths.slot[rows], value)
 
 
 def scatter(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int) -> Paths:
@@ -146,7 +165,7 @@ def scatter(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int) -> Pat
     if vertex.mirror.stop > vertex.mirror.start:
         m = vertex.mirror
         direction[:, m] = mirror_direction(paths.direction[:, m], vertex.shading[:, m])
-        paths.throughput[m] *= vertex.base[m]
+        paths.throughput[..., m] *= vertex.base[..., m]
     side = None
     if vertex.glass.stop > vertex.glass.start:
         refracts = _scatter_glass(vertex, sampler, keys, first, direction)
@@ -156,7 +175,7 @@ def scatter(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int) -> Pat
         # Interpolated normals can send a ray through the surface: it ends there.
         leaving = dot(direction, vertex.facing)
         paths.throughput *= (leaving if side is None else leaving * side) > 0
-    return Paths(vertex.start(side), direction, paths.throughput, paths.bins, paths.slot, density)
+    return Paths(vertex.start(side), direction, paths.throughput, paths.bins, paths.slot, density, paths.alone)
 
 
 def _scatter_rough(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int, direction: FloatArray) -> FloatArray:
@@ -164,25 +183,46 @@ def _scatter_rough(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int,
     d, g, paths = vertex.diffuse, vertex.glossy, vertex.paths
     square = sampler.draw2(keys.cut(0, vertex.rough), first + dims.SCATTER)
     direction[:, d], cosine = cosine_direction(vertex.shading[:, d], square[:, d])
-    paths.throughput[d] *= vertex.base[d]
+    paths.throughput[..., d] *= vertex.base[..., d]
     cosine *= _ONE_OVER_PI
     if g.start == g.stop:
         return cosine
     lobe = sampler.draw(keys.cut(g.start, g.stop), first + dims.LOBE)
-    normal, out, material = vertex.shading[:, g], -paths.direction[:, g], (vertex.base[g], vertex.coat, vertex.alpha)
+    normal, out, material = (
+        vertex.shading[:, g],
+        -paths.direction[:, g],
+        (vertex.base[..., g], vertex.coat, vertex.alpha),
+    )
     direction[:, g] = glossy_sample(normal, out, *material, square[:, g], lobe)
     value, density = glossy_evaluate(normal, out, direction[:, g], *material)
-    paths.throughput[g] *= value / density
+    paths.throughput[..., g] *= value / density
     return np.concatenate([cosine, density])
 
 
 def _scatter_glass(
     vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int, direction: FloatArray
 ) -> NDArray[np.bool_]:
-    """Write the directions of the glass paths; which of them refract."""
-    g = vertex.glass
+    """Write the directions of the glass paths; which of them refract.
+
+    The hero is refracted as its index says. Lanes of another index would go elsewhere: to them this path has density 0,
+    and the balance heuristic gives the hero the weight of all of them.
+    """
+    g, index = vertex.glass, vertex.index()
     choice = sampler.draw(keys.cut(g.start, g.stop), first + dims.LOBE)
-    direction[:, g], refracts = glass_direction(
-        vertex.paths.direction[:, g], vertex.shading[:, g], vertex.outside[g], vertex.index(), choice
-    )
+    travel, normal, outside = vertex.paths.direction[:, g], vertex.shading[:, g], vertex.outside[g]
+    if index.ndim == 1:
+        direction[:, g], refracts = glass_direction(travel, normal, outside, index, choice)
+        return refracts
+    alone = vertex.paths.alone[g]
+    cosine = np.clip(-dot(travel, normal), 0, 1)
+    reflectance, _ = fresnel_dielectric(cosine, np.where(outside, index, 1 / index))
+    chance = np.where(alone, reflectance[0], reflectance.mean(axis=0))
+    direction[:, g], refracts = glass_direction(travel, normal, outside, index[0], choice, chance)
+    factor = np.where(refracts, (1 - reflectance) / (1 - chance), reflectance / chance)
+    part = refracts & ~alone & (index != index[0]).any(axis=0)
+    factor[0] *= np.where(part, np.float32(len(index)), np.float32(1))
+    alone |= part
+    factor[1:] = np.where(alone, np.float32(0), factor[1:])
+    vertex.paths.throughput[:, g] *= factor
+    vertex.paths.alone[g] = alone
     return refracts

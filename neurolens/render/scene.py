@@ -21,6 +21,8 @@ from neurolens.render.checks import (
     require_positive,
     require_reflectance,
 )
+from neurolens.render.filmsettings import FilmSettings
+from neurolens.render.illuminants import IlluminantSettings
 from neurolens.render.shapes import Box, MeshSettings, Plane, Quad, Room, Sphere
 
 
@@ -81,12 +83,16 @@ def _cross(a: Vector, b: Vector) -> Vector:
 
 @dataclass(frozen=True)
 class Environment:
-    """Light from infinitely far: `colour` everywhere, or a gradient from ground over horizon to zenith by height."""
+    """Light from infinitely far: `colour` everywhere, or a gradient from ground over horizon to zenith by height.
+
+    `illuminant`: the light that those colours tint.
+    """
 
     colour: Vector | None = None
     zenith: Vector | None = None
     horizon: Vector | None = None
     ground: Vector | None = None
+    illuminant: str = "D65"
 
     def __post_init__(self) -> None:
         gradient = (self.zenith, self.horizon, self.ground)
@@ -180,6 +186,8 @@ class SceneSettings:
     """A whole scene file."""
 
     camera: CameraSettings
+    film: FilmSettings = FilmSettings()
+    illuminants: dict[str, IlluminantSettings] | None = None
     environment: Environment = Environment(colour=BLACK)
     textures: dict[str, Texture] | None = None
     materials: dict[str, Material] | None = None

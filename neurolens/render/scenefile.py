@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,14 @@ from neurolens.apertures import Aperture
 from neurolens.cameras.contract import FloatArray
 from neurolens.config import from_dict
 from neurolens.errors import InputError
+from neurolens.render.illuminants import (
+    IlluminantSettings,
+    Spectrum,
+    check_name,
+    check_spectrum,
+    illuminant,
+    read_spectrum,
+)
 from neurolens.render.masks import make_aperture
 from neurolens.render.mesh import read_obj
 from neurolens.render.scene import CameraSettings, Material, SceneSettings, Texture
@@ -42,6 +50,7 @@ class Scene:
         name: the file's name without ending. settings: the tables of the file.
         images: linear RGB [H, W, 3] of each image texture. triangles: one a mesh.
         aperture: shape of the stop's opening, None where the scene says nothing.
+        illuminants: measured spectra by name.
     """
 
     name: str
@@ -49,6 +58,7 @@ class Scene:
     images: dict[str, FloatArray]
     triangles: tuple[TriangleSet, ...]
     aperture: Aperture | None = None
+    illuminants: dict[str, Spectrum] = field(default_factory=dict)
 
 
 def load_scene(path: str | Path) -> Scene:
@@ -74,7 +84,8 @@ def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> 
         if texture.file is not None
     }
     triangles = tuple(_read_mesh(path, f"meshes[{k}]", mesh) for k, mesh in enumerate(settings.meshes))
-    return Scene(path.stem, settings, images, triangles, _aperture(path, settings.camera))
+    illuminants = _illuminants(path, settings)
+    return Scene(path.stem, settings, images, triangles, _aperture(path, settings.camera), illuminants)
 
 
 def _aperture(path: Path, camera: CameraSettings) -> Aperture | None:
@@ -83,6 +94,35 @@ def _aperture(path: Path, camera: CameraSettings) -> Aperture | None:
         return make_aperture(camera.blades, camera.blade_rotation_deg, camera.blade_curvature, mask)
     except InputError as error:
         raise InputError(path, f"camera, {error.file} {error.field}", error.value, error.expected) from None
+
+
+def _illuminants(path: Path, settings: SceneSettings) -> dict[str, Spectrum]:
+    """The measured spectra, each over all of the camera's wavelengths; every light's illuminant exists."""
+    low, high = settings.camera.wavelengths_nm
+    measured = {}
+    for name, given in (settings.illuminants or {}).items():
+        measured[name] = nm, values = _spectrum(path, f"illuminants.{name}", given)
+        if illuminant(name) is not None:
+            raise InputError(path, f"illuminants.{name}", name, "a name that no illuminant has yet")
+        if nm[0] > low or nm[-1] < high:
+            expected = f"the {low:g} to {high:g} nm of the camera; what is dark there is written as 0"
+            raise InputError(path, f"illuminants.{name}", f"({nm[0]:g} to {nm[-1]:g} nm)", expected)
+        if not np.interp(np.linspace(low, high, 4096), nm, values).any():
+            raise InputError(path, f"illuminants.{name}", "(all 0)", f"light between {low:g} and {high:g} nm")
+    for kind in ("quads", "spheres"):
+        for k, light in enumerate(getattr(settings, kind)):
+            check_name(path, f"{kind}[{k}].illuminant", light.illuminant, measured)
+    check_name(path, "environment.illuminant", settings.environment.illuminant, measured)
+    if settings.film.white_balance is not None:
+        check_name(path, "film.white_balance", settings.film.white_balance, measured)
+    return measured
+
+
+def _spectrum(path: Path, field: str, given: IlluminantSettings) -> Spectrum:
+    if given.file is not None:
+        return read_spectrum(path, f"{field}.file", path.parent / given.file)
+    assert given.spectrum is not None
+    return check_spectrum(path, f"{field}.spectrum", given.spectrum)
 
 
 def _check_references(

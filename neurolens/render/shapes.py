@@ -32,13 +32,18 @@ class Plane:
 
 @dataclass(frozen=True)
 class Quad:
-    """A rectangle: a corner and two perpendicular edges. `emission` is the radiance on the side of edge_u x edge_v."""
+    """A rectangle: a corner and two perpendicular edges. `emission` is the radiance on the side of edge_u x edge_v.
+
+    The emission's colour tints the light of `illuminant`: "A", "D50", "D65", "E", a black body such as "3200 K", or one
+    of the scene's own; emission [1, 1, 1] of each has the luminance that it has of D65.
+    """
 
     corner_m: Vector
     edge_u_m: Vector
     edge_v_m: Vector
     material: str | None = None
     emission: Vector = BLACK
+    illuminant: str = "D65"
 
     def __post_init__(self) -> None:
         for field in ("corner_m", "edge_u_m", "edge_v_m"):
@@ -52,12 +57,13 @@ class Quad:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A sphere; `emission` is the radiance of its outside, so that a small one is a point-like light."""
+    """A sphere; `emission` is the radiance of its outside, small ones are point-like; `illuminant` as for Quad."""
 
     centre_m: Vector
     radius_m: float
     material: str | None = None
     emission: Vector = BLACK
+    illuminant: str = "D65"
 
     def __post_init__(self) -> None:
         require_finite("centre_m", self.centre_m)

@@ -1,4 +1,4 @@
-"""Colour to spectrum and back: every path carries one wavelength, every surface colour and light colour is RGB.
+"""Colour to spectrum and back: surface and light colours are RGB, paths carry wavelengths.
 
 A colour becomes the spectrum r R(l) + g G(l) + b B(l) of three basis functions that add up to 1 (Mallett and Yuksel
 2019, "Spectral primary decomposition for rendering with sRGB reflectance"). Radiance is counted relative to daylight
@@ -9,66 +9,150 @@ from __future__ import annotations
 
 from functools import cache
 from importlib import resources
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from neurolens.cameras.contract import FloatArray
+from neurolens.render.colour import SRGB
 
 FloatArray64 = NDArray[np.float64]
 
-# CIE XYZ to linear sRGB, IEC 61966-2-1.
-XYZ_TO_RGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
 FRAUNHOFER_NM = {"d": 587.5618, "F": 486.1327, "C": 656.2725}
 # Beyond this the three responses are so alike over the range that separating them would only amplify noise.
 _LARGEST_CONDITION = 30.0
+_DEFENSIVE = 0.1  # share of the wavelengths that is spread evenly, whatever the importance says
+_STEPS = 2048  # at which the importance is read
 
 
 @cache
-def _tables() -> FloatArray64:
-    """Columns wavelength_nm, x, y, z, d65, red, green, blue; made by experiments/make_spectral_tables.py."""
+def _tables() -> dict[str, FloatArray64]:
+    """Columns wavelength_nm, x, y, z, d65, d50, red, green, blue; made by experiments/make_spectral_tables.py."""
     text = resources.files("neurolens.render").joinpath("data/spectra.csv").read_text(encoding="utf-8")
-    return np.array([[float(cell) for cell in line.split(",")] for line in text.splitlines()[1:]])
+    names, *rows = (line.split(",") for line in text.splitlines())
+    columns = np.array(rows, np.float64).T
+    columns.flags.writeable = False
+    return dict(zip(names, columns, strict=True))
+
+
+def table(name: str) -> FloatArray64:
+    """A column of the shipped table, one value every 5 nm from 380 to 780 nm."""
+    return _tables()[name]
 
 
 class SpectralRange:
-    """A wavelength range cut into bins, and the tables of basis functions and film response at the bins' centres.
+    """A wavelength range cut into bins of equal probability, and the tables of basis and film response by bin.
+
+    Wavelengths are continuous, drawn by inverting the piecewise linear distribution function that the bins are; spectra
+    are means over bins.
 
     Args:
         low_nm, high_nm: the range; equal for light of one wavelength.
-        bins: table length; wavelengths themselves stay continuous, only spectra are read from the nearest bin.
+        bins: table length.
+        lanes: wavelengths that a path carries, a whole number of bins apart.
+        light: spectrum (nm, radiance relative to D65) of the light to expect. None draws wavelengths evenly; else a
+            wavelength is drawn in proportion to the film's response to it (root of the sum of squares of R, G and B)
+            times light, and a tenth of all evenly.
 
     Attributes:
-        centres_nm: [bins] float64.
+        edges_nm: [bins + 1], centres_nm: [bins] float64.
         basis: [3, bins] float64, in [0, 1], adding up to 1.
-        response: [3, bins] float32, linear sRGB film value of radiance 1 at a wavelength drawn uniformly from the
-            range. The mean of response times basis is the unit matrix, so a colour lit by white light comes back as
-            itself whatever the range. A range too narrow to tell colours apart gives a grey film.
+        response: [3, bins] float32, linear sRGB film value of radiance 1 at a wavelength drawn from a bin, over the
+            density with which it is drawn. The mean of response times basis is the unit matrix, so a colour lit by
+            white light comes back as itself whatever the range. A range too narrow to tell colours apart gives a grey
+            film.
         colours: whether the range tells colours apart.
     """
 
-    def __init__(self, low_nm: float, high_nm: float, bins: int = 256) -> None:
+    def __init__(
+        self,
+        low_nm: float,
+        high_nm: float,
+        bins: int = 256,
+        light: tuple[FloatArray64, FloatArray64] | None = None,
+        lanes: int = 1,
+    ) -> None:
         self.low_nm, self.high_nm = low_nm, high_nm
-        self.bins = bins
-        self.centres_nm = low_nm + (np.arange(bins) + 0.5) / bins * (high_nm - low_nm)
-        tables = _tables()
-        columns = np.stack([np.interp(self.centres_nm, tables[:, 0], column) for column in tables[:, 1:].T])
-        self.basis = columns[4:] / columns[4:].sum(axis=0)
-        rgb = XYZ_TO_RGB @ (columns[:3] * columns[3])
-        mixing = rgb @ self.basis.T / bins  # [3 film, 3 basis], film value of each basis colour in white light
-        self.colours = bool(np.linalg.cond(mixing) < _LARGEST_CONDITION)
-        if self.colours:
-            self.response = np.linalg.solve(mixing, rgb).astype(np.float32)
-        else:
-            self.response = np.ones((3, bins), np.float32)
+        self.bins, self.lanes = bins, lanes
+        assert bins % lanes == 0
+        self._set_edges(np.linspace(low_nm, high_nm, bins + 1))
+        if light is not None and self.colours:
+            self._set_edges(self._quantiles(*light))
+
+    def _set_edges(self, edges: FloatArray64) -> None:
+        self.edges_nm, self.centres_nm = edges, 0.5 * (edges[1:] + edges[:-1])
+        self._edges, self._widths = edges[:-1].astype(np.float32), np.diff(edges).astype(np.float32)
+        nm = table("wavelength_nm")
+        basis = np.stack([self.means(nm, table(name)) for name in ("red", "green", "blue")])
+        self.basis = basis / basis.sum(axis=0)
+        # Bins stand for as much of the range as they are wide: 1 on average.
+        share = np.diff(edges) * self.bins / (self.high_nm - self.low_nm) if self.low_nm < self.high_nm else 1.0
+        observer = np.stack([self.means(nm, table(name) * table("d65")) for name in "xyz"]) * share
+        mixing = observer @ self.basis.T / self.bins  # [3 XYZ, 3 basis], of each basis colour in white light
+        self.colours = bool(np.linalg.cond(np.linalg.solve(SRGB.to_xyz, mixing)) < _LARGEST_CONDITION)
+        response = np.linalg.solve(mixing, observer) if self.colours else np.ones((3, self.bins)) * share
+        self.response = response.astype(np.float32)
+
+    def _quantiles(self, light_nm: FloatArray64, light: FloatArray64) -> FloatArray64:
+        """Edges [bins + 1] between which wavelengths are equally probable."""
+        nm = np.linspace(self.low_nm, self.high_nm, _STEPS + 1)
+        seen = np.sqrt(np.sum(self.response.astype(np.float64) ** 2, axis=0))
+        importance = np.interp(nm, self.centres_nm, seen) * np.interp(nm, light_nm, light)
+        each = 0.5 * (importance[1:] + importance[:-1])
+        if not each.sum() > 0:
+            return self.edges_nm
+        reached = np.concatenate([[0.0], np.cumsum((1 - _DEFENSIVE) * each / each.sum() + _DEFENSIVE / _STEPS)])
+        edges = np.interp(np.arange(self.bins + 1) / self.bins, reached / reached[-1], nm)
+        edges[[0, -1]] = self.low_nm, self.high_nm
+        return edges
+
+    def means(self, nm: ArrayLike, values: ArrayLike) -> FloatArray64:
+        """Mean [bins] over each bin of a spectrum given at wavelengths and linear in between."""
+        nm, values = np.asarray(nm, np.float64), np.asarray(values, np.float64)
+        if self.low_nm == self.high_nm:
+            return np.interp(self.centres_nm, nm, values)
+        x = np.union1d(nm, self.edges_nm)
+        y = np.interp(x, nm, values)
+        integral = np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(x))])
+        return np.diff(integral[np.searchsorted(x, self.edges_nm)]) / np.diff(self.edges_nm)
 
     def wavelengths_nm(self, sample: FloatArray) -> FloatArray:
         """Wavelengths [N] in nm for uniform samples [N] in [0, 1)."""
-        return np.float32(self.low_nm) + sample * np.float32(self.high_nm - self.low_nm)
+        place = sample * np.float32(self.bins)
+        number = place.astype(np.intp)
+        place -= number
+        place *= self._widths.take(number)
+        place += self._edges.take(number)
+        return place
 
     def bin_of(self, sample: FloatArray) -> NDArray[np.intp]:
         """Bins [N] of uniform samples [N] in [0, 1)."""
         return (sample * np.float32(self.bins)).astype(np.intp)
+
+    def rotated(self, table: NDArray[Any]) -> NDArray[Any]:
+        """A table [..., bins] as it is for one lane; else [lanes, ..., bins], each lane's turned to its own bin.
+
+        Lane k of a path whose hero is in bin b is in bin b + k bins / lanes, counted round: as probable as the hero's,
+        for all bins are equally probable (Wilkie et al. 2014).
+        """
+        if self.lanes == 1:
+            return table
+        step = self.bins // self.lanes
+        return np.stack([np.roll(table, -lane * step, axis=-1) for lane in range(self.lanes)])
+
+    def film_rgb(self, spectrum: ArrayLike) -> FloatArray64:
+        """Linear sRGB film value [3] of a radiance [bins] relative to D65."""
+        return np.asarray(self.response @ np.asarray(spectrum, np.float64) / self.bins)
+
+    def relative(self, nm: ArrayLike, values: ArrayLike) -> FloatArray64:
+        """Radiance [bins] relative to D65 of a light of any unit, scaled to the luminance of D65 on the film.
+
+        Zero everywhere where the light has nothing within the range.
+        """
+        ratio = self.means(nm, values) / self.means(table("wavelength_nm"), table("d65"))
+        luminance = float(SRGB.to_xyz[1] @ self.film_rgb(ratio))
+        return ratio / luminance if luminance > 0 else np.zeros(self.bins)
 
     def spectrum(self, rgb: tuple[float, float, float] | NDArray[np.floating]) -> FloatArray:
         """Spectrum [..., bins] of linear sRGB colours [..., 3]."""

@@ -22,33 +22,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.errors import InputError, NeurolensError
+from neurolens.errors import NeurolensError
 from neurolens.render.film import PixelGrid
+from neurolens.render.filmsettings import FilmSettings
 from neurolens.render.integrator import trace
 from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler
+from neurolens.render.scatter import lit
 from neurolens.render.scene import CameraSettings
 from neurolens.render.scenefile import Scene
-from neurolens.render.spectrum import SpectralRange
+from neurolens.render.wavelengths import LANES, mode_for, spectral_range
 from neurolens.render.world import World
 
 BATCH = 32768  # paths; fewer, and calling numpy costs more than computing; many more, and their state leaves the cache
 CAMERA_BATCH = 8192  # rays a call: a network keeps more numbers a ray than the tracer
 SAMPLES_A_PASS = 16
 Progress = Callable[[float, float], None]
-
-
-def spectral_range(settings: CameraSettings, camera: Camera) -> SpectralRange:
-    """The scene's wavelengths, which a camera that disperses must cover.
-
-    Raises:
-        InputError: it does not.
-    """
-    low, high = settings.wavelengths_nm
-    accepted = camera.wavelength_nm
-    if camera.dispersive and accepted is not None and not (accepted[0] <= low and high <= accepted[1]):
-        expected = f"within the {accepted[0]:g}-{accepted[1]:g} nm of camera {camera.name}"
-        raise InputError("scene", "camera.wavelengths_nm", settings.wavelengths_nm, expected)
-    return SpectralRange(low, high)
 
 
 def camera_axes(settings: CameraSettings) -> FloatArray:
@@ -74,11 +62,22 @@ class Job:
         seconds in all. message: text of a worker's error. stop: set to end the work early.
     """
 
-    def __init__(self, scene: Scene, camera: Camera, grid: PixelGrid, samples: int, seed: int, max_depth: int) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        camera: Camera,
+        grid: PixelGrid,
+        samples: int,
+        seed: int,
+        max_depth: int,
+        film: FilmSettings,
+    ) -> None:
         settings = scene.settings.camera
+        self.mode = mode_for(camera, grid, settings.wavelengths_nm, film)
         self.camera, self.grid, self.samples, self.max_depth = camera, grid, samples, max_depth
-        self.spectral = spectral_range(settings, camera)
+        self.spectral = spectral_range(scene, camera, film, LANES if self.mode == "hero" else 1)
         self.world = World(scene, self.spectral)
+        self.response = self.spectral.rotated(self.spectral.response)
         self.sampler = Sampler(samples, seed)
         self.axes, self.position = camera_axes(settings), np.array(settings.position_m, np.float32)
         self.pixels = grid.width * grid.height
@@ -124,22 +123,43 @@ class Job:
         pixels = np.arange(first, min(first + self.tile, self.pixels))
         indices = np.arange(part * self.samples_a_pass, min((part + 1) * self.samples_a_pass, self.samples))
         pixel, sample = np.repeat(pixels, len(indices)), np.tile(indices, len(pixels))
-        keys = self.sampler.keys(pixel, sample)
+        lanes = LANES if self.mode == "lanes" else 1
+        keys = self.sampler.keys(pixel, sample // lanes)
         hue = self.sampler.draw(keys, WAVELENGTH)
+        if lanes > 1:
+            hue = _turned(hue, (sample % lanes / lanes).astype(np.float32))
         film_mm = self.grid.film_points(pixel, self.sampler.draw2(keys, FILM))
         pupil = self.sampler.draw2(keys, PUPIL)
 
         asked = time.perf_counter()
-        origin, direction, weight = self._camera_rays(camera, film_mm, pupil, self._camera_wavelengths(hue))
+        origin, direction, weight = self._hero_rays(camera, film_mm, pupil, hue)
         answered = time.perf_counter()
 
         bins = self.spectral.bin_of(hue)
         value = trace(self.world, self.sampler, keys, origin, direction, weight, bins, self.max_depth)
         shape = (len(pixels), len(indices))
-        colour = self.spectral.response.take(bins, axis=1).reshape(3, *shape)
-        self.film[pixels] += np.einsum("cps,ps->pc", colour, value.reshape(shape))
-        passed = float(np.count_nonzero(weight))
+        colour = self.response.take(bins, axis=-1).reshape(-1, 3, *shape)
+        self.film[pixels] += np.einsum("lcps,lps->pc", colour, value.reshape(-1, *shape))
+        passed = float(lit(weight).size)
         return np.array([answered - asked, passed, time.perf_counter() - began])
+
+    def _hero_rays(
+        self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, hue: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Rays of the hero wavelengths; weights [lanes, N] of all lanes where there are several."""
+        rays = self._camera_rays(camera, film_mm, pupil, self._camera_wavelengths(hue))
+        lanes = self.spectral.lanes
+        if lanes == 1:
+            return rays
+        weight = np.empty((lanes, len(hue)), np.float32)
+        weight[:] = rays[2]
+        if camera.dispersive or not getattr(camera, "achromatic", False):
+            for lane in range(1, lanes):
+                wavelength_nm = self._camera_wavelengths(_turned(hue, np.float32(lane / lanes)))
+                weight[lane] = self._camera_rays(camera, film_mm, pupil, wavelength_nm)[2]
+            weight *= rays[2] > 0  # the hero's ray must exist
+        weight /= lanes
+        return rays[0], rays[1], weight
 
     def _camera_rays(
         self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray
@@ -164,6 +184,13 @@ class Job:
         if accepted is not None:
             np.clip(wavelengths, accepted[0], accepted[1], out=wavelengths)
         return wavelengths
+
+
+def _turned(hue: FloatArray, by: FloatArray | np.float32) -> FloatArray:
+    """Numbers in [0, 1) turned round."""
+    turned = hue + by
+    turned -= turned >= 1
+    return turned
 
 
 def run(job: Job, workers: int, progress: Progress | None) -> None:

@@ -36,6 +36,7 @@ class _Surface:
     material: Material | None
     light: int = -1
     emission: Vector = BLACK
+    illuminant: str = "D65"
     frame: NDArray[np.float64] | None = None
 
 
@@ -49,7 +50,7 @@ class World:
     """
 
     def __init__(self, scene: Scene, spectral: SpectralRange) -> None:
-        self.palette = Palette(spectral)
+        self.palette = Palette(spectral, scene.illuminants)
         self.scene = scene
         settings = scene.settings
         quads = [q for q in settings.quads if any(q.emission)]
@@ -85,7 +86,8 @@ class World:
             light = lights if any(quad.emission) else -1
             lights += light >= 0
             material = self._material(quad.material)
-            surfaces.append(_Surface(tuple(normal), material, light, quad.emission, quad_frame(corner, u, v)))
+            frame = quad_frame(corner, u, v)
+            surfaces.append(_Surface(tuple(normal), material, light, quad.emission, quad.illuminant, frame))
         for plane in self.scene.settings.planes:
             normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
             point = np.array(plane.point_m, np.float64)
@@ -115,7 +117,8 @@ class World:
         for sphere in spheres:
             light = lights if any(sphere.emission) else -1
             lights += light >= 0
-            surfaces.append(_Surface((0, 0, 0), self._material(sphere.material), light, sphere.emission))
+            material = self._material(sphere.material)
+            surfaces.append(_Surface((0, 0, 0), material, light, sphere.emission, sphere.illuminant))
 
     def _add_meshes(self, surfaces: list[_Surface]) -> None:
         for mesh, triangles in zip(self.scene.settings.meshes, self.scene.triangles, strict=True):
@@ -135,9 +138,9 @@ class World:
         self.normal = np.array([s.normal for s in rows], np.float32).T.copy()
         self.kind = np.array([_KINDS[m.kind] if m else NOTHING for m in materials], np.uint8)
         self.light = np.array([s.light for s in rows], np.intp)
-        self.emission_row = np.array([colour(s.emission) for s in rows], np.intp)
-        emitters = sorted((s.light, s.emission) for s in rows if s.light >= 0)
-        self.light_emission_row = np.array([colour(emission) for _, emission in emitters], np.intp)
+        self.emission_row = np.array([palette.light(s.emission, s.illuminant) for s in rows], np.intp)
+        emitters = sorted((s.light, k) for k, s in enumerate(rows) if s.light >= 0)
+        self.light_emission_row = self.emission_row[[k for _, k in emitters]]
         self.reflectance_row = np.array([colour((m and m.reflectance) or BLACK) for m in materials], np.intp)
         self.specular_row = np.array([colour((m and m.specular) or BLACK) for m in materials], np.intp)
         self.index_row = np.array([palette.index(m.n_d, m.V_d) if m and m.n_d else 0 for m in materials], np.intp)
@@ -153,7 +156,7 @@ class World:
     def _environment(self, environment: Environment) -> None:
         colour = environment.colour
         bands = (environment.ground, environment.horizon, environment.zenith) if colour is None else (colour,) * 3
-        self._bands = [self.palette.colour(band or BLACK) for band in bands]
+        self._bands = [self.palette.light(band or BLACK, environment.illuminant) for band in bands]
         self.dark = not any(any(band or BLACK) for band in bands)
 
     def _never_shades(self, shape: Primitive) -> bool:
@@ -217,13 +220,13 @@ class World:
         return normal, shading
 
     def reflectance(self, surface: Index, point: FloatArray, bins: Index) -> FloatArray:
-        """Reflectance [N] at wavelength bins [N], textures included."""
+        """Reflectance [..., N] at wavelength bins [N], textures included."""
         value = self.palette.look_up(self.reflectance_row.take(surface), bins)
         self.textures.apply(value, surface, point, bins, self.palette.look_up)
         return value
 
     def environment(self, direction: FloatArray, bins: Index) -> FloatArray:
-        """Radiance [N] from infinitely far along directions [3, N]."""
+        """Radiance [..., N] from infinitely far along directions [3, N]."""
         ground, horizon, zenith = self._bands
         height = direction[1]
         at_horizon = self.palette.look_up(np.full(len(bins), horizon), bins)

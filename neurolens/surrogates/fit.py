@@ -13,22 +13,22 @@ from typing import Literal, cast, get_args
 
 from neurolens import status as st
 from neurolens.errors import InputError, NeurolensWarning
-from neurolens.surrogates.checkpoint import of_zone, spent_s
 from neurolens.surrogates.cores import Basis, RawPolynomial
+from neurolens.surrogates.fits.checkpoint import of_zone, spent_s
+from neurolens.surrogates.fits.mirror import fit_mirror
+from neurolens.surrogates.fits.mlp import fit_network
+from neurolens.surrogates.fits.paraxial import fit_paraxial
+from neurolens.surrogates.fits.partition import ZoneCore, fit_partitioned
+from neurolens.surrogates.fits.planes import fit_planes
+from neurolens.surrogates.fits.polynomial import Method as PolynomialMethod
+from neurolens.surrogates.fits.polynomial import PolynomialSettings, fit_polynomial
+from neurolens.surrogates.fits.target import TERMS_LADDER, first_order_um, reach
 from neurolens.surrogates.gates import choose_gates, explained
 from neurolens.surrogates.lightfield import Encoding, fit_encoding
 from neurolens.surrogates.lit import draw_everywhere
-from neurolens.surrogates.mirror import fit_mirror
-from neurolens.surrogates.mlp import fit_network
 from neurolens.surrogates.model import Core, Gate, LensModel
 from neurolens.surrogates.pairs import RayPairs, trace_pairs
-from neurolens.surrogates.paraxial import fit_paraxial
-from neurolens.surrogates.partition import ZoneCore, fit_partitioned
-from neurolens.surrogates.planes import fit_planes
-from neurolens.surrogates.polynomial import Method as PolynomialMethod
-from neurolens.surrogates.polynomial import PolynomialSettings, fit_polynomial
 from neurolens.surrogates.residual import Residual
-from neurolens.surrogates.target import TERMS_LADDER, first_order_um, reach
 from neurolens.surrogates.targets import scales_of
 from neurolens.surrogates.threads import pinned_threads
 

@@ -10,7 +10,7 @@ import pytest
 from neurolens import cli
 from neurolens.errors import InputError
 from neurolens.evaluate.bench import Outcome, hold_to_promises, main, read_index, verdict
-from neurolens.evaluate.floors import Floor, floor_table
+from neurolens.evaluate.benches.floors import Floor, floor_table
 from neurolens.evaluate.speed import Race
 from neurolens.evaluate.speed_table import markdown, table_rows
 

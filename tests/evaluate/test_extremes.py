@@ -13,9 +13,9 @@ import torch
 
 from neurolens import cli
 from neurolens import status as st
-from neurolens.evaluate import extreme_cases as cases
-from neurolens.evaluate.extremes import Row, both_precisions, failures, measure, page
-from neurolens.evaluate.reference import trace_reference
+from neurolens.evaluate.benches import extreme_cases as cases
+from neurolens.evaluate.benches.extremes import Row, both_precisions, failures, measure, page
+from neurolens.evaluate.benches.reference import trace_reference
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import trace
 
@@ -74,7 +74,7 @@ def test_what_never_may_be_is_told(changes: dict[str, int], told: str) -> None:
 
 def test_a_status_that_is_wrong_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     """A tracer that loses float32 rays in the middle of the lens is caught."""
-    from neurolens.evaluate import extremes
+    from neurolens.evaluate.benches import extremes
 
     def broken(lens: Lens, rays: object, *args: object, **options: object) -> object:
         out = trace(lens, rays, *args, **options)  # type: ignore[arg-type]

@@ -13,17 +13,17 @@ import torch
 from neurolens import status as st
 from neurolens.cameras.model import load_model
 from neurolens.errors import InputError
-from neurolens.evaluate.compiled_source import CompiledSource, find_compiler
-from neurolens.evaluate.fused import fused_candidate
-from neurolens.evaluate.fused_exact import exact_program
-from neurolens.evaluate.fused_page import goals, write
-from neurolens.evaluate.fused_speed import Row, ray_candidate, selected
+from neurolens.evaluate.benches.compiled_source import CompiledSource, find_compiler
+from neurolens.evaluate.benches.fused import fused_candidate
+from neurolens.evaluate.benches.fused_exact import exact_program
+from neurolens.evaluate.benches.fused_page import goals, write
+from neurolens.evaluate.benches.fused_speed import Row, ray_candidate, selected
 from neurolens.evaluate.speed import Unavailable, race
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
 from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.fused import RAY_ONLY, SCENE_RAY
+from neurolens.surrogates.source.fused import RAY_ONLY, SCENE_RAY
 
 
 def test_the_exact_program_is_the_exact_trace() -> None:

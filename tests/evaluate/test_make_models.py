@@ -12,11 +12,11 @@ from lens_models import LENSES
 from neurolens.cli import main
 from neurolens.config import from_dict
 from neurolens.errors import InputError
-from neurolens.evaluate import make_models, models_index
 from neurolens.evaluate.bench import read_index
-from neurolens.evaluate.make_models import fingerprint
+from neurolens.evaluate.benches import make_models, models_index
+from neurolens.evaluate.benches.make_models import fingerprint
+from neurolens.evaluate.benches.models_list import Entry, Library, chosen, read_list
 from neurolens.evaluate.measure import Measured
-from neurolens.evaluate.models_list import Entry, Library, chosen, read_list
 from neurolens.progress import Progress
 from neurolens.surrogates.fit import ModelSettings
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from neurolens import cli
-from neurolens.evaluate import passage, passage_page
-from neurolens.evaluate.passage_cases import CASES, DRAWN, TABLE_5_3, Case
+from neurolens.evaluate.benches import passage, passage_page
+from neurolens.evaluate.benches.passage_cases import CASES, DRAWN, TABLE_5_3, Case
 
 pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
 LENSES = Path(__file__).parents[2] / "lenses"

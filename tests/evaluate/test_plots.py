@@ -12,7 +12,8 @@ from PIL import Image
 
 from neurolens.analysis import plot_layout
 from neurolens.errors import InputError
-from neurolens.evaluate import plots, plots_style
+from neurolens.evaluate import plots
+from neurolens.evaluate.plots import style
 
 MODELS = [
     {"name": "thin lens", "family": "paraxial", "rms_um": 300.0, "ns_per_ray": {"min": 2.0, "median": 2.1}},
@@ -52,12 +53,8 @@ def biconvex(**changes: Any) -> dict[str, Any]:
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Every figure made, so that a test can read its axes."""
     made: list[Any] = []
-    for module in (plots.__name__, "plots_trade", "plots_image", "neurolens.analysis.plot_layout"):
-        name = module if module.startswith("neurolens") else f"neurolens.evaluate.{module}"
-        if hasattr(__import__(name, fromlist=["x"]), "new_figure"):
-            monkeypatch.setattr(
-                f"{name}.new_figure", lambda *size: made.append(plots_style.new_figure(*size)) or made[-1]
-            )
+    for name in ("neurolens.evaluate.plots.trade", "neurolens.evaluate.plots.image", "neurolens.analysis.plot_layout"):
+        monkeypatch.setattr(f"{name}.new_figure", lambda *size: made.append(style.new_figure(*size)) or made[-1])
     return made
 
 

@@ -24,7 +24,7 @@ from pathlib import Path
 sys.path[:0] = sys.argv[2:]
 from lens_models import prepared
 from neurolens.evaluate.measure import fit_and_measure
-from neurolens.surrogates import checkpoint
+from neurolens.surrogates.fits import checkpoint
 from test_resume import SETTINGS
 checkpoint.EVERY_S = 0.0
 fit_and_measure(prepared(), SETTINGS, Path(sys.argv[1]), 2000, lambda share: None)

@@ -11,10 +11,8 @@ import pytest
 import torch
 
 from neurolens import cli
-from neurolens.evaluate import trace_memory
-from neurolens.evaluate.candidates import COMPILED_BATCHES
-from neurolens.evaluate.layout import refractions
-from neurolens.evaluate.trace_speed import (
+from neurolens.evaluate.benches import trace_memory
+from neurolens.evaluate.benches.trace_speed import (
     ASPHERIC_SURFACES,
     LENSES,
     MAIN,
@@ -24,7 +22,9 @@ from neurolens.evaluate.trace_speed import (
     launched,
     with_aspheres,
 )
-from neurolens.evaluate.trace_speed_page import Found, page, write
+from neurolens.evaluate.benches.trace_speed_page import Found, page, write
+from neurolens.evaluate.candidates import COMPILED_BATCHES
+from neurolens.evaluate.layout import refractions
 from neurolens.optics.trace import trace
 
 pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")

@@ -11,11 +11,11 @@ import pytest
 
 from neurolens.cameras.onnxlens import load_model
 from neurolens.errors import InputError
-from neurolens.evaluate.bench_states import CASES, page
+from neurolens.evaluate.benches.states import CASES, page
 from neurolens.evaluate.experiment import default_experiment
 from neurolens.evaluate.train_states import fit_and_measure_states, state_settings
 from neurolens.surrogates.fit import ModelSettings
-from neurolens.surrogates.state_fit import StateSettings
+from neurolens.surrogates.states.fit import StateSettings
 
 ZOOM = lens_models.LENSES / "nikon_zoom_70_200.toml"
 

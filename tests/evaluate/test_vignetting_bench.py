@@ -13,14 +13,14 @@ import torch
 from neurolens import status as st
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
-from neurolens.evaluate import outside
+from neurolens.evaluate.benches import outside
+from neurolens.evaluate.benches.vignetting import DOMAINS, OPENINGS, opening_errors
 from neurolens.evaluate.experiment import LensChoice
-from neurolens.evaluate.plots_vignetting import pupil_masks
+from neurolens.evaluate.plots.vignetting import pupil_masks
 from neurolens.evaluate.vignetting import relative_illumination, vignetting_errors
-from neurolens.evaluate.vignetting_bench import DOMAINS, OPENINGS, opening_errors
-from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.specialise import at_wavelength
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neurolens import status as st
-from neurolens.evaluate.bundles import from_film, from_scene, generator, moved, unit
+from neurolens.evaluate.benches.bundles import from_film, from_scene, generator, moved, unit
 from neurolens.optics import glass
 from neurolens.optics.coatings import design, reflectance
 from neurolens.optics.lensfile import read_lens

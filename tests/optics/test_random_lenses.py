@@ -11,9 +11,9 @@ from hypothesis import strategies as hs
 from random_lenses import lenses
 
 from neurolens import status as st
-from neurolens.evaluate.bundles import disc, unit
-from neurolens.evaluate.extreme_cases import Case
-from neurolens.evaluate.extremes import measure
+from neurolens.evaluate.benches.bundles import disc, unit
+from neurolens.evaluate.benches.extreme_cases import Case
+from neurolens.evaluate.benches.extremes import measure
 from neurolens.optics.prescription import Lens
 from neurolens.optics.trace import Rays, trace
 

@@ -29,13 +29,14 @@ QUAD = {"corner_m": [0, 0, 0], "edge_u_m": [1, 0, 0], "edge_v_m": [0, 1, 0], "ma
 MESH = {"material": "m", "vertices_m": [[0, 0, 0], [1, 0, 0], [0, 1, 0]], "faces": [[0, 1, 2]]}
 
 
-@pytest.mark.parametrize("name", ["grid", "lights", "room"])
+@pytest.mark.parametrize("name", ["grid", "lamps", "lights", "room"])
 def test_shipped_scenes_render(name: str) -> None:
     loaded = load_scene(SCENES / f"{name}.toml")
     settings = loaded.settings.camera
     film = (settings.film_width_mm, settings.film_height_mm)
     camera = ThinLens(50.0, settings.f_number or 2.0, settings.focus_m, film)
-    picture = render(loaded, camera, width=64, height=36, samples=4, threads=1).rgb
+    height = round(64 * film[1] / film[0])
+    picture = render(loaded, camera, width=64, height=height, samples=4, threads=1).rgb
     assert np.all(np.isfinite(picture)) and 0.02 < picture.mean() < 1
 
 

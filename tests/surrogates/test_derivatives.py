@@ -14,9 +14,9 @@ from neurolens import status as st
 from neurolens.optics.differentials import film_tangents, trace_differentials
 from neurolens.optics.pupil_rays import camera_rays
 from neurolens.surrogates.cores import MirrorPolynomial, Partitioned
-from neurolens.surrogates.derivatives import differentiate, forward_mode, slopes_of
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
+from neurolens.surrogates.inversion.derivatives import differentiate, forward_mode, slopes_of
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import Core, LensModel
 

@@ -11,10 +11,11 @@ import pytest
 from lens_models import prepared
 
 from neurolens.errors import InputError, NeurolensWarning
-from neurolens.surrogates import checkpoint, fit
+from neurolens.surrogates import fit
 from neurolens.surrogates.card import card_of
 from neurolens.surrogates.fit import ModelSettings, fit_model
-from neurolens.surrogates.target import TERMS_LADDER
+from neurolens.surrogates.fits import checkpoint
+from neurolens.surrogates.fits.target import TERMS_LADDER
 
 # The plainest polynomial: what is tested here is the choice of its size.
 PLAIN = ModelSettings("omp", degree=4)

@@ -15,12 +15,12 @@ from torch import Tensor
 from neurolens import status as st
 from neurolens.errors import InputError
 from neurolens.optics.surfaces import Rays
-from neurolens.surrogates.derivatives import differentiate
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
-from neurolens.surrogates.inverse import InverseModel, StopRays
-from neurolens.surrogates.inverse_fit import convergence, fit_inverse
-from neurolens.surrogates.newton import determinant, solve_small
+from neurolens.surrogates.inversion.derivatives import differentiate
+from neurolens.surrogates.inversion.fit import convergence, fit_inverse
+from neurolens.surrogates.inversion.maps import InverseModel, StopRays
+from neurolens.surrogates.inversion.newton import determinant, solve_small
 from neurolens.surrogates.pairs import PairSet
 
 GAUSS, FISHEYE, ASPHERE = "laikin_double_gauss_50", "muller_fisheye_100", "canon_aspheric_50"

@@ -19,12 +19,12 @@ from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.vignetting import vignetting_errors
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
-from neurolens.surrogates.derivatives import slopes_of
 from neurolens.surrogates.domain import domain_of, sample_domain
-from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
-from neurolens.surrogates.mirror import mirror_exponents
+from neurolens.surrogates.fits.mirror import mirror_exponents
+from neurolens.surrogates.inversion.derivatives import slopes_of
 from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 pytestmark = pytest.mark.slow

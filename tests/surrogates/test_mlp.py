@@ -8,17 +8,17 @@ import torch
 
 from neurolens.errors import InputError
 from neurolens.optics.lensfile import read_lens
-from neurolens.surrogates import checkpoint, schedule
 from neurolens.surrogates.cores import Network
 from neurolens.surrogates.domain import domain_of, sample_domain
+from neurolens.surrogates.fits import checkpoint, schedule
+from neurolens.surrogates.fits.mlp import fit_network
+from neurolens.surrogates.fits.projection import Problem, activations, project
+from neurolens.surrogates.fits.training import Stand, minimise, normal_equations
 from neurolens.surrogates.gates import choose_gates
 from neurolens.surrogates.lightfield import LightField, fit_encoding
-from neurolens.surrogates.mlp import fit_network
 from neurolens.surrogates.model import DIRECTION, POSITION, STOP, LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs, trace_pairs
-from neurolens.surrogates.projection import Problem, activations, project
 from neurolens.surrogates.targets import film_equivalent_weights, scales_of, targets_of
-from neurolens.surrogates.training import Stand, minimise, normal_equations
 
 LENSES = Path(__file__).parents[2] / "lenses"
 F64 = torch.float64

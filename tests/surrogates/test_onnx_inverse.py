@@ -24,13 +24,13 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.errors import InputError, ModelError
 from neurolens.modelfile import CARD_KEY
-from neurolens.surrogates.derivatives import differentiate
 from neurolens.surrogates.domain import FilmRays, sample_domain
-from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
-from neurolens.surrogates.inverse import InverseModel
-from neurolens.surrogates.inverse_fit import fit_inverse
-from neurolens.surrogates.onnx_inverse import export_inverse
+from neurolens.surrogates.inversion.derivatives import differentiate
+from neurolens.surrogates.inversion.fit import fit_inverse
+from neurolens.surrogates.inversion.maps import InverseModel
+from neurolens.surrogates.onnx.export import export_onnx
+from neurolens.surrogates.onnx.inverse import export_inverse
 
 KINDS = ("invariants", "raw", "network", "thick", "fisheye")
 

@@ -14,10 +14,10 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.bases import invariant_exponents, monomials, solve, vector_columns
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
+from neurolens.surrogates.fits.planes import fit_planes, shifted
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.planes import fit_planes, shifted
 from neurolens.surrogates.targets import targets_of
 
 ROOT = Path(__file__).parents[2] / "lenses"

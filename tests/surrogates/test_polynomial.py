@@ -20,12 +20,12 @@ from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
 from neurolens.surrogates.cores import InvariantPolynomial, RawPolynomial
 from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
+from neurolens.surrogates.fits.paraxial import ParaxialMethod, fit_paraxial
+from neurolens.surrogates.fits.polynomial import Method, PolynomialSettings, fit_polynomial
 from neurolens.surrogates.gates import choose_gates
 from neurolens.surrogates.lightfield import Encoding, fit_encoding
 from neurolens.surrogates.model import Gate, LensModel, Prediction
 from neurolens.surrogates.pairs import PairSet, PairSettings, RayPairs, make_pairs, trace_pairs
-from neurolens.surrogates.paraxial import ParaxialMethod, fit_paraxial
-from neurolens.surrogates.polynomial import Method, PolynomialSettings, fit_polynomial
 from neurolens.surrogates.targets import film_equivalent_weights, scales_of
 
 ROOT = Path(__file__).parents[2] / "lenses"

@@ -12,15 +12,15 @@ import torch
 
 from neurolens.errors import InputError
 from neurolens.optics.lensfile import read_lens
-from neurolens.surrogates.ablations import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
 from neurolens.surrogates.cores import InvariantPolynomial
 from neurolens.surrogates.domain import domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
+from neurolens.surrogates.fits.ablations import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
+from neurolens.surrogates.fits.polynomial import PolynomialSettings, fit_polynomial
+from neurolens.surrogates.fits.selection import Sweep, backward, forward
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, trace_pairs
-from neurolens.surrogates.polynomial import PolynomialSettings, fit_polynomial
-from neurolens.surrogates.selection import Sweep, backward, forward
 from neurolens.surrogates.targets import targets_of
 
 ROOT = Path(__file__).parents[2] / "lenses"

@@ -18,7 +18,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.surrogates.domain import Domain, domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.gate_fit import GateFit
+from neurolens.surrogates.fits.gates import GateFit
 from neurolens.surrogates.lit import SPARSE, lit_share, sample_lit
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs, trace_pairs

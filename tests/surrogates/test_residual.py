@@ -12,9 +12,9 @@ from lens_models import prepared
 from neurolens.cameras.model import load_model
 from neurolens.errors import InputError
 from neurolens.surrogates.cores import Partitioned
-from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.residual import Residual
 from neurolens.surrogates.specialise import at_wavelength
 from neurolens.surrogates.stored import load_fitted

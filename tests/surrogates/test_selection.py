@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from neurolens.surrogates.bases import invariant_exponents, raw_exponents, solve, vector_columns, vector_gram
 from neurolens.surrogates.cores import monomials
+from neurolens.surrogates.fits.selection import Sweep, forward, matching_pursuit, replace_terms
 from neurolens.surrogates.lightfield import LightField
-from neurolens.surrogates.selection import Sweep, forward, matching_pursuit, replace_terms
 
 Floats = NDArray[np.float64]
 

@@ -14,20 +14,20 @@ import torch
 
 from neurolens import status as st
 from neurolens.errors import InputError
-from neurolens.evaluate.compiled_source import FLAGS, CompiledSource, find_compiler
+from neurolens.evaluate.benches.compiled_source import FLAGS, CompiledSource, find_compiler
 from neurolens.evaluate.speed import Unavailable
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.card import card_of
 from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
-from neurolens.surrogates.expressions import Program
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.fused import ALL, RAY_ONLY, SCENE_RAY, Fixed, Parts, fused_program
-from neurolens.surrogates.fused_tanh import add_tanh
 from neurolens.surrogates.model import LensModel, Prediction
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.source import export_source
-from neurolens.surrogates.source_c import literal
+from neurolens.surrogates.source.c import literal
+from neurolens.surrogates.source.expressions import Program
+from neurolens.surrogates.source.fused import ALL, RAY_ONLY, SCENE_RAY, Fixed, Parts, fused_program
+from neurolens.surrogates.source.tanh import add_tanh
+from neurolens.surrogates.source.writer import export_source
 from neurolens.surrogates.specialise import Fix, fixed_models
 
 COUNT = 50_000

@@ -17,11 +17,11 @@ import torch
 from neurolens import status as st
 from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.expressions import Program
-from neurolens.surrogates.fused import ALL, FREE, SCENE_RAY, Fixed, fused_program
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.source_c import Signature
-from neurolens.surrogates.source_glsl import write_glsl
+from neurolens.surrogates.source.c import Signature
+from neurolens.surrogates.source.expressions import Program
+from neurolens.surrogates.source.fused import ALL, FREE, SCENE_RAY, Fixed, fused_program
+from neurolens.surrogates.source.glsl import write_glsl
 from neurolens.surrogates.specialise import Fix, fixed_models
 
 COUNT = 20_000

@@ -13,8 +13,8 @@ import torch
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.errors import InputError
 from neurolens.surrogates.domain import FilmRays, sample_domain
-from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
+from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.specialise import at_wavelength
 
 

@@ -21,7 +21,7 @@ from neurolens.axes import Axis, product, weights
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import OnnxLens, load_model
 from neurolens.errors import InputError, ModelError
-from neurolens.evaluate import outside
+from neurolens.evaluate.benches import outside
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.state_errors import check_states, random_states, space_of_card
 from neurolens.evaluate.vignetting import vignetting_errors
@@ -30,11 +30,11 @@ from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx_state import export_states
+from neurolens.surrogates.onnx.states import export_states
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.state_fit import StateSettings, fit_states
-from neurolens.surrogates.state_model import StateModel, mix
-from neurolens.surrogates.state_space import StateSpace, focus_axis, zoom_axis
+from neurolens.surrogates.states.fit import StateSettings, fit_states
+from neurolens.surrogates.states.model import StateModel, mix
+from neurolens.surrogates.states.space import StateSpace, focus_axis, zoom_axis
 
 ZOOM = Axis("zoom", "mm", (70.0, 135.0, 200.0), 3, reciprocal=True, stated=(("70mm", 70.0),))
 FOCUS = Axis("focus", "1/m", (0.0, 1.0), 4)

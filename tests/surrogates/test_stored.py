@@ -17,10 +17,10 @@ import torch
 from neurolens.errors import ModelError
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.surrogates.cores import Partitioned
-from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
-from neurolens.surrogates.fused import fused_program
 from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.onnx.export import export_onnx
+from neurolens.surrogates.source.fused import fused_program
 from neurolens.surrogates.stored import load_fitted, model_to_text
 
 

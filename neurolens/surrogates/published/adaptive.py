@@ -1,9 +1,9 @@
 """Adaptive sparse polynomials with a partition of the light field (Zheng and Zheng 2017, The Visual Computer).
 
 Every scalar output has terms of its own, grown from the lowest: each chosen term brings its products with the variables
-into the candidates, so that no degree limits them (`neurolens.surrogates.growth`). Where the error stays high the light
-field is divided: the cell with the largest summed error is cut in two halves of its rays, along whichever of its
-coordinates leaves least, and each half is fitted anew, until the number of cells asked for is reached.
+into the candidates, so that no degree limits them (`fits.growth`). Where the error stays high the light field is
+divided: the cell with the largest summed error is cut in two halves of its rays, along whichever of its coordinates
+leaves least, and each half is fitted anew, until the number of cells asked for is reached.
 
 Left open by the paper and chosen here: the coordinates that may be cut are the squared film radius, the squared slope
 and the product of both (rho, tau, sigma of the light field), since cuts in x or y alone would break the lens's
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from neurolens.errors import InputError
 from neurolens.surrogates.cores import RawPolynomial
-from neurolens.surrogates.growth import grow
+from neurolens.surrogates.fits.growth import grow
 from neurolens.surrogates.pairs import PairSet
 from neurolens.surrogates.published.cores import Cells
 from neurolens.surrogates.published.data import Exponents, Outputs, RawData, outer_pupil, solve_outputs

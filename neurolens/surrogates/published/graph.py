@@ -1,4 +1,4 @@
-"""The cores of the published methods as ONNX nodes; `neurolens.surrogates.onnx_cores` does all others."""
+"""The cores of the published methods as ONNX nodes; `neurolens.surrogates.onnx.cores` does all others."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.surrogates.model import Core
-from neurolens.surrogates.onnx_cores import CoreRows, Field, add_core
-from neurolens.surrogates.onnx_graph import Graph
-from neurolens.surrogates.onnx_monomials import add_polynomial, without_constants
+from neurolens.surrogates.onnx.cores import CoreRows, Field, add_core
+from neurolens.surrogates.onnx.graph import Graph
+from neurolens.surrogates.onnx.monomials import add_polynomial, without_constants
 from neurolens.surrogates.published.cores import Cells, OuterPupil
 from neurolens.surrogates.published.neural import Averaged, Layers
 from neurolens.surrogates.published.rtf import Meridian

@@ -1,0 +1,1 @@
+"""Benchmarks: what `neurolens bench` measures and writes."""

@@ -1,0 +1,160 @@
+"""The exact tracer written as the same kind of program as fused models: the best that tracing can do in C.
+
+A surrogate is only worth what it saves over this one. Spherical and plane surfaces, stop, rims, missed surfaces, total
+reflection, dispersion; transmittance of bare surfaces (Fresnel, unpolarised, averaged at each surface) and of coated
+ones as if they were bare: no lens is slower for its coatings here. Ray tracing after Feder, J. Opt. Soc. Am. 41 (1951).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurolens import status as st
+from neurolens.evaluate.speed import Unavailable
+from neurolens.optics.glass import index_of
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.source.expressions import Expr, Program
+from neurolens.surrogates.source.fused import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
+
+# The index is a polynomial in 1 / lambda^2 that holds it to float32's last bit.
+_INDEX = 3e-8
+_AIR = "air"
+
+
+def exact_program(lens: Lens, domain: Domain, *, whole: bool = True) -> Program:
+    """Film and pupil points in; scene ray and status out, as `surrogates.fused` has them.
+
+    Args:
+        whole: with stop, rims and transmittance; else the ray alone, and whether it gets through.
+
+    Raises:
+        Unavailable: aspheres or cylinders.
+    """
+    if any(s.asphere or s.cylinder or float(s.conic) for s in lens.surfaces):
+        raise Unavailable("the C tracer of the bench knows spheres and planes only")
+    return _Tracing(lens, domain, whole).program
+
+
+class _Tracing:
+    def __init__(self, lens: Lens, domain: Domain, whole: bool) -> None:
+        self.lens, self.domain, self.whole = lens, domain, whole
+        self.program = p = Program()
+        fx, fy, px, py = (p.input(name) for name in RAY)
+        self.inverse_square = p.literal(0.0)
+        if lens.dispersive:
+            v = p.literal(1000.0) / p.input(WAVELENGTH)
+            self.inverse_square = v * v
+        z = p.input(FILM_Z)
+        self.stop_square = p.literal(0.0)
+        if whole:
+            radius = p.input(STOP_RADIUS)
+            self.stop_square = radius * radius
+        self.indices: dict[object, Expr] = {}
+        self.lost: list[tuple[Expr, Expr, int]] = []
+        self.power = p.literal(1.0)
+        self._start(fx, fy, z, px, py)
+        self._through()
+
+    def _start(self, fx: Expr, fy: Expr, z: Expr, px: Expr, py: Expr) -> None:
+        p = self.program
+        dx, dy, dz = px - fx, py - fy, p.literal(self.domain.pupil_z_mm) - z
+        square = p.fma(dx, dx, p.fma(dy, dy, dz * dz))
+        scale = p.literal(1.0) / p.op("sqrt", square)
+        self.d = [dx * scale, dy * scale, dz * scale]
+        self.x = [fx, fy, z]
+
+    def _index(self, k: int) -> Expr:
+        """Of the medium before surface k, as light comes from the scene."""
+        p = self.program
+        if k == 0:
+            return p.literal(1.0)
+        s = self.lens.surfaces[k - 1]
+        key = (s.glass, float(s.n_d), s.V_d)
+        if key not in self.indices:
+            self.indices[key] = self._polynomial(s)
+        return self.indices[key]
+
+    def _polynomial(self, s: Surface) -> Expr:
+        p = self.program
+        if s.glass is None and s.V_d is None:
+            return p.literal(float(s.n_d))
+        long, short = ((1000 / w) ** 2 for w in reversed(self.domain.wavelength_nm))
+        if long == short:
+            return p.literal(float(index_of(s, 1000 / long**0.5)))
+        inverse = np.linspace(long, short, 200)
+        n = np.array([float(index_of(s, 1000 / v**0.5)) for v in inverse])
+        for degree in range(1, 8):
+            fit = np.polynomial.Polynomial.fit(inverse, n, degree)
+            if np.abs(fit(inverse) - n).max() < _INDEX:
+                break
+        return p.horner(self.inverse_square, list(fit.convert().coef))
+
+    def _through(self) -> None:
+        p, lens = self.program, self.lens
+        vertex = 0.0
+        for k in range(len(lens.surfaces) - 1, -1, -1):
+            here = float(lens.vertices_mm[k])
+            self.x[2] = self.x[2] + (vertex - here)
+            vertex = here
+            self._surface(k, lens.surfaces[k])
+        for name, value in zip(SCENE_RAY, (*self.x, *self.d), strict=True):
+            p.outputs[name] = value
+        if self.whole:
+            p.outputs["transmittance"] = self.power
+        status = p.literal(float(st.PASSED))
+        # Rays meet the last surface first: the first failure is the one written last.
+        for low, high, code in reversed(self.lost):
+            status = p.select(low, high, status, float(code))
+        p.outputs["status"] = status
+
+    def _surface(self, k: int, s: Surface) -> None:
+        p, (x, y, z), (dx, dy, dz) = self.program, self.x, self.d
+        c = float(s.curvature)
+        # The point nearest to the vertex, then along the ray to the sphere (Feder's e, M1 and L).
+        e = -p.fma(x, dx, p.fma(y, dy, z * dz))
+        mx, my, mz = p.fma(e, dx, x), p.fma(e, dy, y), p.fma(e, dz, z)
+        if c:
+            m2 = p.fma(mx, mx, p.fma(my, my, mz * mz))
+            f = p.fma(m2, c, mz * -2.0)
+            q2 = p.fma(f, -c, dz * dz)
+            self._test(q2, k, st.MISSED)
+            q = p.op("sqrt", q2)  # |cosine| of the angle of incidence
+            way = f / (dz - q)  # towards -z
+        else:
+            q = -dz
+            way = -(mz / dz)
+        self.x = [p.fma(way, dx, mx), p.fma(way, dy, my), p.fma(way, dz, mz)]
+        x, y, z = self.x
+        if self.whole:
+            limit = self.stop_square if s.stop else p.literal(s.semi_diameter_mm**2)
+            self.lost.append((p.fma(x, x, y * y), limit, st.blocked(k, st.RIM)))
+        before, after = self._index(k + 1), self._index(k)
+        if before.argument == after.argument:
+            return
+        ratio = before / after
+        cos2 = p.fma(ratio * ratio, p.fma(q, q, -1.0), 1.0)
+        self._test(cos2, k, st.TOTAL_REFLECTION)
+        cos = p.op("sqrt", cos2)
+        # Unit normal towards the film: (-c x, -c y, 1 - c z).
+        g = cos - ratio * q
+        self.d = [
+            p.fma(g * c, x, ratio * dx),
+            p.fma(g * c, y, ratio * dy),
+            p.fma(ratio, dz, p.fma(g * c, z, -g)),
+        ]
+        if self.whole:
+            self._fresnel(q, cos, before, after)
+
+    def _test(self, square: Expr, k: int, reason: int) -> None:
+        """Lost where what stands under a root is not positive; NaN too."""
+        self.lost.append((self.program.literal(1e-30), square, st.blocked(k, reason)))
+
+    def _fresnel(self, cos_i: Expr, cos_t: Expr, before: Expr, after: Expr) -> None:
+        """(Ts + Tp) / 2 with one division: 2 a b (1 / s^2 + 1 / p^2), s = n1 c1 + n2 c2, p = n2 c1 + n1 c2."""
+        p = self.program
+        s = p.fma(before, cos_i, after * cos_t)
+        t = p.fma(after, cos_i, before * cos_t)
+        product = (before * cos_i) * (after * cos_t)
+        st_ = s * t
+        self.power = self.power * (product * 2.0 * p.fma(s, s, t * t) / (st_ * st_))

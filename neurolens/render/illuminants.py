@@ -1,0 +1,139 @@
+"""Light sources: CIE illuminants, black bodies and measured spectra.
+
+Only the shape of a spectrum is used: the emission of a light says how bright it is. Every spectrum is scaled as a
+whole, which keeps its chromaticity, so that emission 1 has the luminance of daylight D65 of emission 1.
+
+Sources: CIE 15:2018 (illuminants A, D50, D65, E), CODATA 2018 (second radiation constant).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from neurolens.errors import InputError
+from neurolens.render.checks import require
+from neurolens.render.spectrum import table
+from neurolens.tomlfile import suggestion
+
+Spectrum = tuple[NDArray[np.float64], NDArray[np.float64]]  # wavelengths in nm, increasing, and values there
+
+CIE_NAMES = ("D65", "D50", "A", "E")
+_KELVIN = re.compile(r"(\d+(?:\.\d*)?) ?K")
+COLDEST_K, HOTTEST_K = 500.0, 1e5
+_SECOND_RADIATION_CONSTANT = 1.438776877e-2  # h c / k, m K
+_MOST_ROWS, _LARGEST_FILE = 10_000, 1_000_000
+
+
+@dataclass(frozen=True)
+class IlluminantSettings:
+    """A measured spectrum: `spectrum` = [[nm, value], ...], or a CSV `file` beside the scene file with such rows.
+
+    Values are radiance per nm in any unit; between them they are interpolated linearly. Increasing wavelengths, which
+    cover those of the camera, and values of 0 or more, one of them above 0.
+    """
+
+    spectrum: tuple[tuple[float, float], ...] | None = None
+    file: Path | None = None
+
+    def __post_init__(self) -> None:
+        one = (self.spectrum is None) != (self.file is None)
+        require(one, "spectrum", "(missing)" if self.file is None else "(given)", "either spectrum or file")
+        if self.spectrum is not None:
+            check_spectrum("settings", "spectrum", self.spectrum)
+
+
+def check_spectrum(file: str | Path, field: str, rows: Sequence[Sequence[float]]) -> Spectrum:
+    """The rows (nm, value) as two arrays, the largest value 1.
+
+    Raises:
+        InputError: names the row at fault.
+    """
+    if not 2 <= len(rows) <= _MOST_ROWS:
+        raise InputError(file, field, f"({len(rows)} rows)", f"2 to {_MOST_ROWS} rows of nm, value")
+    last = 0.0
+    for k, (nm, value) in enumerate(rows):
+        if not last < nm < math.inf:
+            raise InputError(file, f"{field}[{k}]", nm, "wavelengths in nm that increase")
+        if not 0 <= value < math.inf:
+            raise InputError(file, f"{field}[{k}]", value, "a finite value of 0 or more")
+        last = nm
+    wavelengths, values = np.array(rows, np.float64).T
+    if not values.any():
+        raise InputError(file, field, "(all 0)", "a value above 0")
+    return wavelengths, values / values.max()
+
+
+def read_spectrum(scene: Path, field: str, path: Path) -> Spectrum:
+    """A CSV file of rows "nm, value"; a line of words may come first, and lines that start with # are passed over.
+
+    Raises:
+        InputError: missing, too large, no numbers, or what `check_spectrum` refuses.
+    """
+    try:
+        if path.stat().st_size > _LARGEST_FILE:
+            raise InputError(scene, field, str(path), f"a file of at most {_LARGEST_FILE} bytes")
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(scene, field, str(path), f"a readable CSV file ({error})") from None
+    rows: list[tuple[float, float]] = []
+    for number, line in enumerate(lines, 1):
+        cells = line.split(",")
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            nm, value = (float(cell) for cell in cells)
+        except ValueError:
+            if not rows and not any(character.isdigit() for character in cells[0]):
+                continue  # the names of the columns
+            raise InputError(path, f"line {number}", line[:60], "wavelength in nm, value") from None
+        rows.append((nm, value))
+    return check_spectrum(path, "row", rows)
+
+
+def planck(wavelength_nm: ArrayLike, kelvin: float) -> NDArray[np.float64]:
+    """Spectral radiance of a black body by Planck's law, 1 at 560 nm."""
+    nm = np.asarray(wavelength_nm, np.float64)
+
+    def exponent(length_nm: ArrayLike) -> NDArray[np.float64]:
+        return _SECOND_RADIATION_CONSTANT / (np.asarray(length_nm) * 1e-9 * kelvin)
+
+    # expm1(b) / expm1(a) without overflow where a black body is cold.
+    a, b = exponent(nm), exponent(560.0)
+    return (560.0 / nm) ** 5 * np.exp(b - a) * np.expm1(-b) / np.expm1(-a)
+
+
+def illuminant(name: str, measured: Mapping[str, Spectrum] | None = None) -> Spectrum | None:
+    """The spectrum that a name stands for: a CIE illuminant, "3200 K", or a measured one; None if it is unknown."""
+    nm = table("wavelength_nm")
+    if measured and name in measured:
+        return measured[name]
+    if name in ("D65", "D50"):
+        return nm, table(name.lower())
+    if name == "A":
+        # CIE 15: Planck's law at 2848 K with the constant of its day, 0.01435 m K: the law at 2855.5 K of today.
+        return nm, planck(nm, 2848 * _SECOND_RADIATION_CONSTANT / 1.435e-2)
+    if name == "E":
+        return nm, np.ones_like(nm)
+    if (kelvin := _KELVIN.fullmatch(name)) and COLDEST_K <= float(kelvin[1]) <= HOTTEST_K:
+        return nm, planck(nm, float(kelvin[1]))
+    return None
+
+
+def check_name(file: str | Path, field: str, name: str, measured: Mapping[str, object]) -> None:
+    """Refuse a name that stands for no spectrum.
+
+    Raises:
+        InputError: names file, field and what is known.
+    """
+    if name in measured or illuminant(name) is not None:
+        return
+    known = [*CIE_NAMES, *measured]
+    kelvin = f"or a black body from {COLDEST_K:g} K to {HOTTEST_K:g} K such as '3200 K'"
+    raise InputError(file, field, name, f"one of: {', '.join(known)}, {kelvin}{suggestion(name, known)}")

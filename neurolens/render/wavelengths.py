@@ -1,0 +1,117 @@
+"""Which wavelengths paths carry: drawn by importance, one a path or four."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.cameras.contract import Camera, CameraRays, FloatArray
+from neurolens.errors import InputError
+from neurolens.render.film import PixelGrid
+from neurolens.render.filmsettings import FilmSettings, WavelengthMode
+from neurolens.render.illuminants import illuminant
+from neurolens.render.scenefile import Scene
+from neurolens.render.spectrum import FloatArray64, SpectralRange
+
+LANES = 4  # wavelengths of a hero path, and paths that share their random numbers
+_FINE = 1024  # wavelengths at which the light of a scene is summed up
+_PROBES, _PROBED_WAVELENGTHS = 1024, 5
+_LITTLE_PX = 0.05  # a shift that the pixel, a box one pixel wide, hides
+_FARTHEST_M = 1e4
+
+
+def spectral_range(scene: Scene, camera: Camera, film: FilmSettings, lanes: int = 1) -> SpectralRange:
+    """The scene's wavelengths, which a camera that disperses must cover, in bins by their importance.
+
+    Raises:
+        InputError: it does not.
+    """
+    settings = scene.settings.camera
+    low, high = settings.wavelengths_nm
+    accepted = camera.wavelength_nm
+    if camera.dispersive and accepted is not None and not (accepted[0] <= low and high <= accepted[1]):
+        expected = f"within the {accepted[0]:g}-{accepted[1]:g} nm of camera {camera.name}"
+        raise InputError("scene", "camera.wavelengths_nm", settings.wavelengths_nm, expected)
+    light = expected_light(scene) if film.wavelength_sampling == "importance" else None
+    return SpectralRange(low, high, light=light, lanes=lanes)
+
+
+def expected_light(scene: Scene) -> tuple[FloatArray64, FloatArray64]:
+    """Spectrum (nm, radiance relative to D65) of a scene's light: its lamps by their area, and as much environment."""
+    fine = SpectralRange(*scene.settings.camera.wavelengths_nm, _FINE)
+    lamps: dict[str, FloatArray64] = {}  # sums of emission by illuminant
+    for quad in scene.settings.quads:
+        area = float(np.linalg.norm(np.cross(quad.edge_u_m, quad.edge_v_m)))
+        lamps[quad.illuminant] = lamps.get(quad.illuminant, 0.0) + area * np.array(quad.emission)
+    for sphere in scene.settings.spheres:
+        area = 4 * np.pi * sphere.radius_m**2
+        lamps[sphere.illuminant] = lamps.get(sphere.illuminant, 0.0) + area * np.array(sphere.emission)
+    around = scene.settings.environment
+    bands = [b for b in (around.colour, around.zenith, around.horizon, around.ground) if b is not None]
+
+    total = np.zeros(_FINE)
+    for group in (lamps, {around.illuminant: np.sum(bands, axis=0)}):
+        light = np.zeros(_FINE)
+        for name, rgb in group.items():
+            found = illuminant(name, scene.illuminants)
+            assert found is not None  # names are checked where scenes are read
+            light += fine.relative(*found) * fine.spectrum(rgb)
+        if light.any():
+            total += light / light.mean()
+    return fine.centres_nm, total if total.any() else np.ones(_FINE)
+
+
+def mode_for(camera: Camera, grid: PixelGrid, limits_nm: tuple[float, float], film: FilmSettings) -> WavelengthMode:
+    """What "auto" means for a camera: "hero" where one ray serves all wavelengths, else "one".
+
+    Raises:
+        InputError: "hero" is asked for and the camera disperses.
+    """
+    if film.wavelengths in ("one", "lanes"):
+        return film.wavelengths
+    shift = dispersion_px(camera, grid, limits_nm) if camera.dispersive else 0.0
+    if shift <= _LITTLE_PX:
+        return "hero"
+    if film.wavelengths == "hero":
+        expected = f"one or lanes: camera {camera.name} moves its picture by {shift:.2g} pixels with the wavelength"
+        raise InputError("render", "film.wavelengths", "hero", expected)
+    return "one"
+
+
+def dispersion_px(camera: Camera, grid: PixelGrid, limits_nm: tuple[float, float]) -> float:
+    """How far the point in focus that a ray finds moves with the wavelength: RMS over film and pupil, in pixels.
+
+    A pixel is what the point moves by when the film point moves by a pixel. The largest over five wavelengths against
+    the middle one, of the rays that pass at both.
+    """
+    low, high = limits_nm
+    random = np.random.default_rng(0)
+    film = ((random.random((2, _PROBES)) - 0.5) * np.array(grid.film_mm)[:, None]).astype(np.float32)
+    pupil = random.random((2, _PROBES), np.float32)
+    focus = camera.settings.get("focus_m")
+    reach = min(_FARTHEST_M if focus is None else float(focus), _FARTHEST_M)
+
+    def found(nm: float, at: FloatArray) -> tuple[FloatArray64, NDArray[np.bool_]]:
+        rays: CameraRays = camera.sample(at, pupil, np.full(_PROBES, nm, np.float32))
+        point = rays.origin_m.astype(np.float64) + rays.direction.astype(np.float64) * reach
+        return point, (rays.status == 0) & np.isfinite(point).all(axis=0)
+
+    middle, passed = found(0.5 * (low + high), film)
+    steps = []
+    for axis, pixels in enumerate((grid.width, grid.height)):
+        moved = film.copy()
+        # Towards the middle, so that no point leaves the film.
+        sign = np.where(film[axis] > 0, -1, 1)
+        moved[axis] += sign * grid.film_mm[axis] / pixels
+        point, also = found(0.5 * (low + high), moved)
+        steps.append((point - middle) * sign)
+        passed &= also
+    worst = 0.0
+    step = np.stack(steps, axis=-1).transpose(1, 0, 2)  # [N, 3, 2]
+    for nm in np.linspace(low, high, _PROBED_WAVELENGTHS):
+        point, also = found(float(nm), film)
+        rows = np.flatnonzero(passed & also)
+        if rows.size:
+            shift = np.linalg.pinv(step[rows]) @ (point - middle).T[rows, :, None]
+            worst = max(worst, float(np.sqrt(np.mean(np.sum(shift**2, axis=(1, 2))))))
+    return worst

@@ -1,0 +1,1 @@
+"""How surrogates are fitted: polynomials, networks, tests of what passes."""

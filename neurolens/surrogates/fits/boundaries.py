@@ -1,0 +1,183 @@
+"""What every polynomial fits after position and direction: stop crossing, transmittance and gates.
+
+They use the terms that are there anyway, and more where those do not tell the boundaries well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neurolens.errors import InputError
+from neurolens.surrogates.bases import (
+    Exponents,
+    invariant_exponents,
+    monomials,
+    solve,
+    vector_columns,
+    vector_gram,
+)
+from neurolens.surrogates.fits.gates import GateFit
+from neurolens.surrogates.fits.selection import Sweep
+from neurolens.surrogates.gates import boundary_rays, boundary_weights, gate_reach, gate_values
+from neurolens.surrogates.lightfield import Encoding, LightField
+from neurolens.surrogates.model import Gate
+from neurolens.surrogates.pairs import PairSet, RayPairs
+from neurolens.surrogates.targets import Targets, targets_of
+
+# Terms are added for boundaries until each is met to this RMS: of a gate (twice the relative radius of a rim), and of
+# the stop crossing in stop radii.
+GATE_ERROR, STOP_ERROR = 2e-3, 5e-4
+MOST_BOUNDARY_TERMS = 64
+_DEGREE = 9  # of the terms among which those for boundaries are found
+_RAYS = 12_000  # on which they are found
+
+
+@dataclass(frozen=True)
+class FitData:
+    """What every polynomial fit of one set of ray pairs shares."""
+
+    pairs: RayPairs
+    encoding: Encoding
+    gates: tuple[Gate, ...]
+
+    @property
+    def train(self) -> Targets:
+        return targets_of(self.pairs.lens, self.encoding, self.pairs.train)
+
+    @cached_property
+    def boundary(self) -> PairSet:
+        """The rays on which gates and the stop crossing are fitted."""
+        return boundary_rays(self.pairs, self.gates)
+
+    @property
+    def boundary_field(self) -> LightField:
+        return self.encoding(self.boundary.inputs)
+
+    @cached_property
+    def boundary_weights(self) -> tuple[Tensor, Tensor]:
+        """Of the gates [G, N] and of the stop crossing [N]."""
+        return boundary_weights(self.pairs.lens, self.gates, self.boundary)
+
+
+def fit_stop(data: FitData, exponents: Exponents) -> Tensor:
+    """[2 M]: A and B of the stop crossing (in stop radii) on the monomials given, from rays on both sides of rims."""
+    crossing, weight = stop_crossing(data)
+    field = data.boundary_field
+    columns = vector_columns(monomials(field.invariants(), exponents), field)
+    return solve(columns, crossing.reshape(1, -1), weight.repeat(2))[0]
+
+
+def stop_crossing(data: FitData) -> tuple[Tensor, Tensor]:
+    """[2, N] crossings of the boundary rays in stop radii, and their weights [N]."""
+    pairs, lens = data.boundary, data.pairs.lens
+    crossing = torch.stack([pairs.cross_x[lens.stop_index], pairs.cross_y[lens.stop_index]]) / lens.stop_radius_mm
+    return crossing, data.boundary_weights[1]
+
+
+def fit_scalars(data: FitData, exponents: Exponents) -> Tensor:
+    """[1 + G, M]: transmittance and gates on the monomials of the invariants given."""
+
+    def features(rays: PairSet) -> Tensor:
+        return monomials(data.encoding(rays.inputs).invariants(), exponents)
+
+    train, near, far = (features(r) for r in (data.pairs.train, data.boundary, data.pairs.far))
+    return solve_scalars(data, train, data.pairs.train.transmittance, near, far)
+
+
+def solve_scalars(
+    data: FitData, features: Tensor, transmittance: Tensor, boundary_features: Tensor, far_features: Tensor
+) -> Tensor:
+    """Transmittance on the passing rays, each gate on the rays that get as far, most on those that it decides.
+
+    Features are those of `pairs.train`, of `boundary` and of `pairs.far`.
+
+    Raises:
+        InputError: no more rays near the boundaries than terms.
+    """
+    if len(data.boundary) <= len(features):
+        expected = f"more rays near the rims than the {len(features)} terms"
+        raise InputError("fit", "rim", len(data.boundary), expected)
+    fit = GateFit(boundary_features, gate_values(data.pairs.lens, data.gates, data.boundary), data.boundary_weights[0])
+    values = gate_values(data.pairs.lens, data.gates, data.pairs.far)
+    fit.block(far_features, values, gate_reach(data.gates, data.pairs.far))
+    return torch.cat([solve(features, transmittance[None]), fit.coefficients()])
+
+
+def boundary_terms(data: FitData, exponents: Exponents, most: int = MOST_BOUNDARY_TERMS) -> Exponents:
+    """[K, 4] further exponents, where those given [M, 4] meet the stop crossing or a gate badly; often none.
+
+    Forward selection by the gain of all those boundaries together, in squares of the error that each may have.
+    """
+    every = invariant_exponents(_DEGREE, dispersive=data.encoding.w_half != 0)
+    known = {tuple(e) for e in exponents.tolist()}
+    added = np.array([e for e in every.tolist() if tuple(e) not in known], dtype=np.int64).reshape(-1, 4)
+    candidates = np.concatenate([exponents, added])
+    field = LightField(*(c[..., :_RAYS] for c in data.boundary_field))
+    bad = [
+        k for k, f in enumerate(_boundary_fits(data, field, monomials(field.invariants(), exponents))) if f.error > 1
+    ]
+    if not bad:
+        return added[:0]
+    features = monomials(field.invariants(), candidates)
+    fits = _boundary_fits(data, field, features, len(exponents), bad)
+    chosen: list[int] = []
+    while fits and len(chosen) < min(most, len(added)):
+        scores = np.sum([f.scores() for f in fits], axis=0)
+        best = int(np.argmax(scores))
+        if not scores[best] > 0:
+            break
+        chosen.append(best)
+        for f in fits:
+            f.add(best)
+        fits = [f for f in fits if f.error > 1]
+    return candidates[chosen]
+
+
+class _BoundaryFit:
+    """One boundary's normal equations: `blocks` columns a term (A and B of a vector, or one)."""
+
+    def __init__(self, sweep: Sweep, terms: int, scale: float) -> None:
+        self.sweep, self.terms, self.scale, self.blocks = sweep, terms, scale, sweep.count // terms
+
+    @property
+    def error(self) -> float:
+        """Mean squared error over the square of the one allowed."""
+        return self.sweep.residual * self.scale
+
+    def add(self, term: int) -> None:
+        for column in range(term, self.sweep.count, self.terms):
+            if self.sweep.scores("ols")[column] > 0:
+                self.sweep.add(column)
+
+    def scores(self) -> np.ndarray:
+        return self.scale * np.maximum(self.sweep.scores("ols"), 0.0).reshape(self.blocks, self.terms).sum(0)
+
+
+def _boundary_fits(
+    data: FitData, field: LightField, features: Tensor, start: int | None = None, only: list[int] | None = None
+) -> list[_BoundaryFit]:
+    """The fits of the stop crossing and of every gate, or `only` some of them, with the first `start` terms in."""
+    crossing, weight = stop_crossing(data)
+    values, weights = gate_values(data.pairs.lens, data.gates, data.boundary), data.boundary_weights[0]
+    rays, terms, fits = features.shape[1], len(features), []
+    for k in range(1 + len(values)) if only is None else only:
+        w = (weights[k - 1] if k else weight)[:rays]
+        if k:
+            rows, outputs = features * w, (values[k - 1, :rays] * w)[None]
+            gram, moments = (rows @ rows.T).numpy(), (rows @ outputs.T).numpy()
+        else:
+            weighed = LightField(field.p * w, field.u * w, field.w)  # only p.p, p.u and u.u of it are used
+            outputs = (crossing[:, :rays] * w)[None]
+            gram, moments = vector_gram(features, weighed, outputs)
+        squares = (outputs.flatten(1) ** 2).sum(1).numpy()
+        allowed = (GATE_ERROR if k else STOP_ERROR) ** 2 * max(float((w * w).sum()), 1e-300)
+        fit = _BoundaryFit(Sweep(gram, moments, squares), terms, 1 / allowed)
+        for term in range(terms if start is None else start):
+            fit.add(term)
+        fits.append(fit)
+    return fits

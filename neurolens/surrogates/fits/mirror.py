@@ -1,0 +1,150 @@
+"""Polynomials of lenses with cylinders, which keep two planes of symmetry: fitted component by component.
+
+The x of a vector is odd in (p_x, u_x) and even in (p_y, u_y), the y the other way about. Terms of x are p_x or u_x
+times a monomial of `LightField.mirror_invariants` without p_x u_x (p_x (p_x u_x) is p_x^2 u_x, which is there), and
+with p_y u_y at most once (its square is p_y^2 u_y^2): so every term stands once.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neurolens.errors import InputError
+from neurolens.surrogates.bases import Exponents, solve
+from neurolens.surrogates.cores import MirrorPolynomial, monomials
+from neurolens.surrogates.fits.boundaries import FitData, solve_scalars, stop_crossing
+from neurolens.surrogates.fits.selection import Sweep, forward, replace_terms
+from neurolens.surrogates.lightfield import Encoding, LightField
+from neurolens.surrogates.model import STOP, Gate
+from neurolens.surrogates.pairs import RayPairs
+from neurolens.surrogates.targets import film_equivalent
+
+METHODS = ("omp", "ols")  # and networks (`mlp`)
+# Gram matrices are made of so many rays at a time; more candidates than this would take too long to choose from.
+_CHUNK, _MOST_CANDIDATES = 4096, 2500
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """Candidate terms of one component: monomials [M, 7], each times p (first M columns) and times u (M more)."""
+
+    exponents: Exponents
+    axis: int
+
+    def columns(self, field: LightField) -> Tensor:
+        """[2 M, N]."""
+        m = monomials(field.mirror_invariants(), self.exponents)
+        return torch.cat([m * field.p[self.axis], m * field.u[self.axis]])
+
+
+def mirror_exponents(degree: int, axis: int, *, dispersive: bool = True) -> Exponents:
+    """[M, 7] exponents of the monomials that multiply p and u of one axis, up to a total `degree` in the invariants.
+
+    The wavelength multiplies lower degrees only, as in `bases.invariant_exponents`.
+    """
+    own, other = (0, 3) if axis == 0 else (3, 0)
+    rows = []
+    for w, most in enumerate([degree, degree - 2, degree - 3] if dispersive else [degree]):
+        reach = range(max(most, 0) + 1)
+        for rho, tau, rho_other, tau_other, sigma_other in itertools.product(reach, reach, reach, reach, (0, 1)):
+            if rho + tau + rho_other + tau_other + sigma_other <= most:
+                row = [0, 0, 0, 0, 0, 0, w]
+                row[own], row[own + 2] = rho, tau
+                row[other : other + 3] = rho_other, sigma_other, tau_other
+                rows.append(tuple(row))
+    return np.array(sorted(rows, key=lambda r: (sum(r), r)), dtype=np.int64)
+
+
+def fit_mirror(
+    pairs: RayPairs, encoding: Encoding, gates: tuple[Gate, ...], method: str, terms: int, degree: int
+) -> MirrorPolynomial:
+    """Choose and fit terms; position and direction share them, x and y have their own.
+
+    Args:
+        method: "ols" (orthogonal least squares with replacement) or "omp" (matching pursuit).
+        terms: coefficients per vector output, half of them of x and half of y.
+        degree: of the candidates in the invariants, twice that in the raw coordinates; lowered where there
+            would be more than 2500 candidates.
+
+    Raises:
+        InputError: another method, fewer than four terms, or too few rays.
+    """
+    if method not in METHODS:
+        raise InputError("fit", "method", method, f"{', '.join(METHODS)} or mlp, the fits of lenses with cylinders")
+    if terms < 4:
+        raise InputError("fit", "terms", terms, "at least 4 coefficients per vector output")
+    if len(pairs.train) <= terms:
+        raise InputError("fit", "train", len(pairs.train), f"more training rays than the {terms} terms")
+    data = FitData(pairs, encoding, gates)
+    train = data.train
+    outputs = film_equivalent(pairs.lens, pairs.domain, train.vectors)
+    place: dict[tuple[int, ...], int] = {}
+    supports = []
+    for axis in (0, 1):
+        candidates = _candidates(degree, axis, dispersive=encoding.w_half != 0)
+        sweep = Sweep(*_normal_equations(candidates, train.field, outputs[:, axis]))
+        forward(sweep, terms // 2, "ols" if method == "ols" else "omp")
+        if method == "ols":
+            replace_terms(sweep)
+        count = len(candidates.exponents)
+        chosen = [(tuple(int(e) for e in candidates.exponents[k % count]), k >= count) for k in sorted(sweep.chosen)]
+        supports.append([(place.setdefault(e, len(place)), of_u) for e, of_u in chosen])
+    for e in _scalar_terms(dispersive=encoding.w_half != 0):
+        place.setdefault(e, len(place))
+    exponents = np.array(list(place), dtype=np.int64)
+    features = monomials(train.field.mirror_invariants(), exponents)
+    ab = torch.zeros((3, 2, 2, len(exponents)), dtype=torch.float64)
+    for axis, support in enumerate(supports):
+        columns = torch.stack([features[i] * (train.field.u if of_u else train.field.p)[axis] for i, of_u in support])
+        found = solve(columns, train.vectors[:2, axis])
+        for (i, of_u), column in zip(support, found.T, strict=True):
+            ab[:2, int(of_u), axis, i] = column
+    ab[STOP] = _fit_stop(data, exponents)
+    boundary, far = (
+        monomials(encoding(rays.inputs).mirror_invariants(), exponents) for rays in (data.boundary, pairs.far)
+    )
+    return MirrorPolynomial(exponents, ab, solve_scalars(data, features, train.transmittance, boundary, far))
+
+
+def _scalar_terms(*, dispersive: bool) -> list[tuple[int, ...]]:
+    """What transmittance and gates need besides: every invariant, and high powers of w, for glass that absorbs blue."""
+    units = [tuple(int(i == k) for i in range(6)) for k in range(6)]
+    if not dispersive:
+        return [(0,) * 7, *((*e, 0) for e in units)]
+    return [*((0, 0, 0, 0, 0, 0, w) for w in range(8)), *((*e, w) for e in units for w in range(3))]
+
+
+def _candidates(degree: int, axis: int, *, dispersive: bool) -> _Terms:
+    while True:
+        exponents = mirror_exponents(degree, axis, dispersive=dispersive)
+        if 2 * len(exponents) <= _MOST_CANDIDATES or degree == 0:
+            return _Terms(exponents, axis)
+        degree -= 1
+
+
+def _normal_equations(terms: _Terms, field: LightField, outputs: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gram matrix [2 M, 2 M], products with the outputs [R, N], and the outputs' squared norms [R]."""
+    size = 2 * len(terms.exponents)
+    gram, moments = (
+        torch.zeros((size, size), dtype=torch.float64),
+        torch.zeros((size, len(outputs)), dtype=torch.float64),
+    )
+    for start in range(0, outputs.shape[1], _CHUNK):
+        part = slice(start, start + _CHUNK)
+        columns = terms.columns(LightField(*(c[..., part] for c in field)))
+        gram += columns @ columns.T
+        moments += columns @ outputs[:, part].T
+    return gram.numpy(), moments.numpy(), (outputs**2).sum(1).numpy()
+
+
+def _fit_stop(data: FitData, exponents: Exponents) -> Tensor:
+    """[2, 2, M]: A and B, of x and y, of the stop crossing in stop radii, from rays on both sides of rims."""
+    crossing, weight = stop_crossing(data)
+    field = data.boundary_field
+    found = [solve(_Terms(exponents, axis).columns(field), crossing[axis][None], weight)[0] for axis in (0, 1)]
+    return torch.stack([row.reshape(2, -1) for row in found], 1)

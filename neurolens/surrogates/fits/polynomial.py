@@ -1,0 +1,217 @@
+"""Polynomial surrogates: dense, matching pursuit, orthogonal least squares with replacement, adaptive growth.
+
+One support serves position and direction, chosen by the film-equivalent error in the nearest focused plane and at
+infinity. The stop crossing, the transmittance and the gates are then fitted on the monomials that are computed anyway.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neurolens.errors import InputError
+from neurolens.surrogates.bases import (
+    Exponents,
+    invariant_exponents,
+    monomials,
+    raw_exponents,
+    raw_variables,
+    solve,
+    vector_columns,
+    vector_gram,
+)
+from neurolens.surrogates.cores import Basis, InvariantPolynomial, RawPolynomial
+from neurolens.surrogates.fits.boundaries import (
+    FitData,
+    boundary_terms,
+    fit_scalars,
+    fit_stop,
+    solve_scalars,
+    stop_crossing,
+)
+from neurolens.surrogates.fits.growth import grow
+from neurolens.surrogates.fits.selection import Sweep, backward, forward, matching_pursuit, replace_terms
+from neurolens.surrogates.fits.transmittance_terms import transmittance_terms
+from neurolens.surrogates.gates import gate_values
+from neurolens.surrogates.lightfield import Encoding, LightField
+from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate
+from neurolens.surrogates.pairs import RayPairs
+from neurolens.surrogates.targets import weighed_apart
+
+Method = Literal["dense", "omp", "ols", "adaptive"]
+
+SELECTION_RAYS = 10_000
+SURPLUS = 1.5
+
+
+@dataclass(frozen=True)
+class PolynomialSettings:
+    """How a polynomial is fitted.
+
+    Attributes:
+        method: "dense" (all terms up to `degree`), "omp" (matching pursuit), "ols" (orthogonal least squares with
+            replacement), "adaptive" (terms of any degree grown from chosen terms).
+        basis: "invariants" (rotational symmetry held exactly) or "raw" (p_x, p_y, u_x, u_y, w).
+        terms: coefficients per vector output; ignored by "dense".
+        degree: largest total degree of the candidates that a fit starts from; ignored by "adaptive".
+        replacement: whether "ols" exchanges terms afterwards.
+        elimination: whether "ols" first chooses half as many terms again, and drops those that cost least.
+        growth: rounds in which "ols" in the invariants adds to the candidates what the chosen terms give, multiplied by
+            each variable: terms of higher degree where they help.
+        position_weight: how much more than to first order the position counts in the choice of terms.
+        transmittance_terms: how many more terms the transmittance may have where it needs them.
+    """
+
+    method: Method = "ols"
+    basis: Basis = "invariants"
+    terms: int = 40
+    degree: int = 7
+    replacement: bool = True
+    elimination: bool = True
+    growth: int = 2
+    position_weight: float = 2.0
+    transmittance_terms: int = 16
+
+
+def fit_polynomial(
+    pairs: RayPairs, encoding: Encoding, gates: tuple[Gate, ...], settings: PolynomialSettings
+) -> InvariantPolynomial | RawPolynomial:
+    """Fit by one of the methods of `PolynomialSettings`.
+
+    Raises:
+        InputError: an unknown method or basis, fewer than two terms, a negative degree, or too few training rays.
+    """
+    for name, value, known in (
+        ("method", settings.method, get_args(Method)),
+        ("basis", settings.basis, get_args(Basis)),
+    ):
+        if value not in known:
+            raise InputError("fit", name, value, f"one of {', '.join(known)}")
+    if settings.terms < 2:
+        raise InputError("fit", "terms", settings.terms, "at least 2 coefficients per vector output")
+    if settings.degree < 0:
+        raise InputError("fit", "degree", settings.degree, "a total degree of 0 or more")
+    if len(pairs.train) <= settings.terms:
+        raise InputError("fit", "train", len(pairs.train), f"more training rays than the {settings.terms} terms")
+    data = FitData(pairs, encoding, gates)
+    return _fit_invariant(data, settings) if settings.basis == "invariants" else _fit_raw(data, settings)
+
+
+def _fit_invariant(data: FitData, settings: PolynomialSettings) -> InvariantPolynomial:
+    train = data.train
+    invariants = train.field.invariants()
+    outputs = weighed_apart(data.pairs.lens, data.pairs.domain, train.vectors, settings.position_weight)
+    dispersive = data.encoding.w_half != 0
+    if settings.method == "adaptive":
+        exponents, chosen = grow(invariants, train.field, outputs, settings.terms, dispersive=dispersive)
+    else:
+        # Many rays more than candidates make a choice no better; the coefficients are fitted on all of them.
+        field, wanted = LightField(*(c[..., :SELECTION_RAYS] for c in train.field)), outputs[..., :SELECTION_RAYS]
+        exponents = invariant_exponents(settings.degree, dispersive=dispersive)
+        for _ in range(settings.growth if settings.method == "ols" else 0):
+            if 2 * len(exponents) <= settings.terms:
+                break
+            chosen = _choose(_sweep(exponents, field, wanted), replace(settings, replacement=False))
+            exponents = _grown(exponents, chosen, dispersive=dispersive)
+        chosen = _choose(_sweep(exponents, field, wanted), settings)
+    chosen = chosen or [0]  # rays on the axis alone choose nothing
+    count = len(exponents)
+    kept = sorted({k % count for k in chosen})
+    place = {k: i for i, k in enumerate(kept)}
+    exponents = exponents[kept]
+    features = monomials(invariants, exponents)
+    # The chosen columns only; position and direction share them.
+    columns = [place[k % count] + (k >= count) * len(kept) for k in chosen]
+    coefficients = solve(vector_columns(features, train.field)[columns], train.vectors[:2].flatten(1))
+    exponents = np.concatenate([exponents, boundary_terms(data, exponents)])
+    exponents = np.concatenate([exponents, transmittance_terms(data, exponents, settings.transmittance_terms)])
+    ab = torch.zeros((3, 2 * len(exponents)), dtype=torch.float64)
+    ab[:2, [c if c < len(kept) else c - len(kept) + len(exponents) for c in columns]] = coefficients
+    ab[STOP] = fit_stop(data, exponents)
+    return InvariantPolynomial(exponents, ab.reshape(3, 2, -1), fit_scalars(data, exponents))
+
+
+def _sweep(exponents: Exponents, field: LightField, outputs: Tensor) -> Sweep:
+    return Sweep(*vector_gram(monomials(field.invariants(), exponents), field, outputs), _squares(outputs))
+
+
+def _grown(exponents: Exponents, chosen: list[int], *, dispersive: bool) -> Exponents:
+    """The exponents [M, 4], and below them those of the chosen columns raised by one in each variable."""
+    parents = exponents[sorted({k % len(exponents) for k in chosen})]
+    children = np.concatenate([parents + step for step in np.eye(4, dtype=np.int64)[: 4 if dispersive else 3]])
+    known = {tuple(e) for e in exponents.tolist()}
+    new = [e for e in dict.fromkeys(map(tuple, children.tolist())) if e not in known]
+    return np.concatenate([exponents, np.array(new, dtype=np.int64).reshape(-1, 4)])
+
+
+def _choose(sweep: Sweep, settings: PolynomialSettings) -> list[int]:
+    if settings.method == "dense":
+        return list(range(sweep.count))
+    surplus = SURPLUS if settings.method == "ols" and settings.elimination else 1.0
+    forward(sweep, math.ceil(surplus * settings.terms), "omp" if settings.method == "omp" else "ols")
+    backward(sweep, settings.terms)
+    if settings.method == "ols" and settings.replacement:
+        replace_terms(sweep)
+    return sorted(sweep.chosen)
+
+
+def _squares(outputs: Tensor) -> np.ndarray:
+    return (outputs.flatten(1) ** 2).sum(1).numpy()
+
+
+def _fit_raw(data: FitData, settings: PolynomialSettings) -> RawPolynomial:
+    """Every component with a support of its own, as published, half of `terms` each; one more for the scalars."""
+    train = data.train
+    # Supports are chosen on the rays near the rims, where every output has a value; coefficients on all boundary rays.
+    rim = data.pairs.rim
+    variables, rim_variables = raw_variables(train.field), raw_variables(data.encoding(rim.inputs))
+    dispersive = data.encoding.w_half != 0
+    half = replace(settings, terms=max(settings.terms // 2, 1))
+    supports: dict[str, Exponents] = {}
+    stop = data.pairs.lens.stop_index
+    crossing = torch.stack([rim.cross_x[stop], rim.cross_y[stop]]) / data.pairs.lens.stop_radius_mm
+    gates = gate_values(data.pairs.lens, data.gates, rim)
+    wanted = {"scalars": (rim_variables, torch.cat([gates, rim.transmittance[None]]))}
+    for axis in (0, 1):
+        wanted[f"stop {axis}"] = (rim_variables, crossing[axis][None])
+        for vector in (POSITION, DIRECTION):
+            wanted[f"{vector} {axis}"] = (variables, train.vectors[vector, axis][None])
+    for name, (inputs, outputs) in wanted.items():
+        supports[name] = _raw_support(inputs, outputs, half, dispersive)
+    place: dict[tuple[int, ...], int] = {}
+    columns = {n: [place.setdefault(tuple(map(int, e)), len(place)) for e in s] for n, s in supports.items()}
+    exponents = np.array(list(place), dtype=np.int64)
+    features, boundary = monomials(variables, exponents), monomials(raw_variables(data.boundary_field), exponents)
+    far = monomials(raw_variables(data.encoding(data.pairs.far.inputs)), exponents)
+    crossing, weight = stop_crossing(data)
+    components = torch.zeros((3, 2, len(place)), dtype=torch.float64)
+    for axis in (0, 1):
+        for vector in (POSITION, DIRECTION):
+            at = columns[f"{vector} {axis}"]
+            components[vector, axis, at] = solve(features[at], train.vectors[vector, axis][None])[0]
+        at = columns[f"stop {axis}"]
+        components[STOP, axis, at] = solve(boundary[at], crossing[axis][None], weight)[0]
+    at = columns["scalars"]
+    scalars = torch.zeros((1 + len(data.gates), len(place)), dtype=torch.float64)
+    scalars[:, at] = solve_scalars(data, features[at], train.transmittance, boundary[at], far[at])
+    return RawPolynomial(exponents, components, scalars)
+
+
+def _raw_support(variables: Tensor, outputs: Tensor, settings: PolynomialSettings, dispersive: bool) -> Exponents:
+    """Exponents [K, 5] chosen for outputs [R, N] in common."""
+    # Outputs count by how much they vary: transmittance varies little about a large mean, which one term explains.
+    outputs = outputs / (outputs - outputs.mean(1, keepdim=True)).norm(dim=1, keepdim=True).clamp_min(1e-300)
+    if settings.method == "adaptive":
+        exponents, chosen = grow(variables, None, outputs[:, None], settings.terms, dispersive=dispersive)
+        return exponents[chosen]
+    exponents = raw_exponents(settings.degree, dispersive=dispersive)
+    features = monomials(variables, exponents)
+    gram, moments = (features @ features.T).numpy(), (features @ outputs.T).numpy()
+    if settings.method == "omp" and len(outputs) == 1:
+        return exponents[matching_pursuit(gram, moments[:, 0], settings.terms)]
+    return exponents[_choose(Sweep(gram, moments, _squares(outputs)), settings)]

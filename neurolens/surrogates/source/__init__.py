@@ -1,0 +1,1 @@
+"""Surrogates, and the exact lens, as C and GLSL."""

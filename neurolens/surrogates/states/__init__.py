@@ -1,0 +1,1 @@
+"""Models of many states: zoom and internal focus as one more input."""

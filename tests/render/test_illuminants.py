@@ -1,0 +1,181 @@
+"""Lights of known spectra: closed forms, the CIE's chromaticities, and mistakes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from render_helpers import WHITE, diffuse, scene
+
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.errors import InputError
+from neurolens.render.colour import SRGB
+from neurolens.render.filmsettings import FilmSettings
+from neurolens.render.illuminants import illuminant, planck
+from neurolens.render.renderer import render
+from neurolens.render.scenefile import load_scene
+from neurolens.render.spectrum import SpectralRange, table
+
+FILM = (36.0, 24.0)
+CAMERA = Pinhole(400.0, FILM)
+# CIE 15:2018, tables T.3 and T.8.1; black bodies: Wyszecki and Stiles 1982, table 1(3.11), c2 = 0.014388 m K.
+PUBLISHED = {
+    "A": (0.44758, 0.40745),
+    "D50": (0.34567, 0.35851),
+    "D65": (0.31272, 0.32903),
+    "E": (0.33333, 0.33333),
+    "1500 K": (0.5857, 0.3931),
+    "2000 K": (0.5267, 0.4133),
+    "3000 K": (0.4369, 0.4041),
+    "4000 K": (0.3805, 0.3768),
+    "5000 K": (0.3451, 0.3516),
+    "6500 K": (0.3135, 0.3237),
+    "10000 K": (0.2806, 0.2883),
+}
+
+
+def chromaticity(xyz: np.ndarray) -> np.ndarray:
+    return np.asarray(xyz[:2] / xyz.sum())
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_chromaticities_of_the_cie(name: str) -> None:
+    found = illuminant(name)
+    assert found is not None
+    values = np.interp(table("wavelength_nm"), *found)
+    xyz = np.array([table(axis) @ values for axis in "xyz"])
+    assert chromaticity(xyz) == pytest.approx(PUBLISHED[name], abs=1e-4)
+
+
+@pytest.mark.parametrize(("limits", "tolerance"), [((380, 780), 8e-4), ((400, 700), 1.2e-3)])
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_the_film_sees_those_chromaticities(name: str, limits: tuple[float, float], tolerance: float) -> None:
+    # The film's response is bent a little so that surface colours come back exactly: the price is here.
+    found = illuminant(name)
+    assert found is not None
+    light = SpectralRange(*limits).relative(*found)
+    xyz = SRGB.to_xyz @ SpectralRange(*limits).film_rgb(light)
+    assert xyz[1] == pytest.approx(1, abs=1e-9)
+    assert chromaticity(xyz) == pytest.approx(PUBLISHED[name], abs=tolerance)
+
+
+@pytest.mark.parametrize("kelvin", [1000.0, 2856.0, 6500.0, 20000.0])
+def test_black_bodies_obey_wien_and_stefan_and_boltzmann(kelvin: float) -> None:
+    nm = np.geomspace(10.0, 3e6, 200_001)
+    radiance = planck(nm, kelvin)
+    assert nm[np.argmax(radiance)] * 1e-9 * kelvin == pytest.approx(2.897771955e-3, rel=1e-4)
+    # Integral of x^3 / (e^x - 1) is pi^4 / 15; the value at 560 nm is 1.
+    integral = np.sum(0.5 * (radiance[1:] + radiance[:-1]) * np.diff(nm))
+    x = 1.438776877e-2 / (560e-9 * kelvin)
+    assert integral == pytest.approx(560 * np.pi**4 / 15 * np.expm1(x) / x**4, rel=1e-5)
+
+
+def test_cold_black_bodies_do_not_overflow() -> None:
+    values = planck(table("wavelength_nm"), 500.0)
+    assert np.all(np.isfinite(values)) and np.all(np.diff(values) > 0)
+
+
+def uniform(name: str, film: dict[str, Any] | None = None, **tables: Any) -> np.ndarray:
+    made = scene(environment=WHITE | {"illuminant": name}, film=film or {}, **tables)
+    return np.asarray(render(made, CAMERA, width=48, height=32, samples=64).rgb.mean(axis=(0, 1)))
+
+
+@pytest.mark.parametrize("sampling", ["importance", "uniform"])
+@pytest.mark.parametrize("name", ["A", "D50", "8000 K"])
+def test_a_uniform_environment_has_luminance_1_and_is_white_once_balanced(name: str, sampling: str) -> None:
+    film = {"wavelength_sampling": sampling}
+    rgb = uniform(name, film)
+    assert SRGB.to_xyz[1] @ rgb == pytest.approx(1, abs=5e-3)
+    assert chromaticity(SRGB.to_xyz @ rgb) == pytest.approx(PUBLISHED.get(name, (0.2952, 0.3048)), abs=2e-3)
+    assert uniform(name, film | {"white_balance": name}) == pytest.approx([1, 1, 1], abs=8e-3)
+
+
+def test_lamps_and_walls_take_their_light_s_colour() -> None:
+    lamp = {"corner_m": [-9, -9, -3], "edge_u_m": [18, 0, 0], "edge_v_m": [0, 18, 0], "emission": [2, 2, 2]}
+    ball = {"centre_m": [0, 0, -3], "radius_m": 1, "emission": [2, 2, 2], "illuminant": "A"}
+    seen = [
+        render(scene(quads=[lamp | {"illuminant": "A"}]), CAMERA, width=48, height=32, samples=64),
+        render(scene(spheres=[ball]), CAMERA, width=48, height=32, samples=64),
+    ]
+    expected = 2 * uniform("A")
+    for picture in seen:
+        assert picture.rgb.mean(axis=(0, 1)) == pytest.approx(expected, rel=0.02)
+    wall = {"point_m": [0, 0, -1], "normal": [0, 0, 1], "material": "m"}
+    lit = scene(environment=WHITE | {"illuminant": "A"}, materials={"m": diffuse(0.5, 0.5, 0.5)}, planes=[wall])
+    picture = render(lit, CAMERA, width=48, height=32, samples=64, film=FilmSettings(white_balance="A"))
+    assert picture.rgb.mean(axis=(0, 1)) == pytest.approx([0.5] * 3, abs=5e-3)
+
+
+TRIPLE = [[380, 0], [439, 0], [440, 1], [441, 0], [539, 0], [540, 1], [541, 0], [609, 0], [610, 1], [611, 0], [780, 0]]
+
+
+def test_a_measured_spectrum_of_lines(tmp_path: Path) -> None:
+    # Three lines: the colour is the observer's, weighted by nothing else.
+    seen = [np.interp((440, 540, 610), table("wavelength_nm"), table(axis)).sum() for axis in "xyz"]
+    rows = "nm, power\n# a comment\n" + "\n".join(f"{nm}, {value}" for nm, value in TRIPLE)
+    (tmp_path / "lamp.csv").write_text(rows)
+    path = tmp_path / "s.toml"
+    path.write_text(
+        "[camera]\nposition_m = [0, 0, 0]\nlook_at_m = [0, 0, -1]\nfocus_m = 2\nwavelengths_nm = [380, 780]\n"
+        '[illuminants.lamp]\nfile = "lamp.csv"\n[environment]\ncolour = [1, 1, 1]\nilluminant = "lamp"\n'
+    )
+    from_file = render(load_scene(path), CAMERA, width=48, height=32, samples=256).rgb.mean(axis=(0, 1))
+    assert chromaticity(SRGB.to_xyz @ from_file) == pytest.approx(chromaticity(np.array(seen)), abs=4e-3)
+    inline = uniform("lamp", illuminants={"lamp": {"spectrum": TRIPLE}})
+    assert SRGB.to_xyz[1] @ inline == pytest.approx(1, abs=0.02)
+    for unit in (1e-300, 1e300):
+        scaled = [[nm, unit * value] for nm, value in TRIPLE]
+        assert uniform("lamp", illuminants={"lamp": {"spectrum": scaled}}) == pytest.approx(inline, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("tables", "said"),
+    [
+        (
+            {"environment": WHITE | {"illuminant": "F99"}},
+            r"environment\.illuminant: got 'F99', expected one of: D65,",
+        ),
+        ({"environment": WHITE | {"illuminant": "100 K"}}, r"environment\.illuminant: got '100 K'.*500 K to 100000 K"),
+        ({"film": {"white_balance": "D60"}}, r"film\.white_balance: got 'D60'.*did you mean 'D65'"),
+        ({"illuminants": {"lamp": {}}}, r"illuminants\.lamp\.spectrum: got \(missing\)"),
+        ({"illuminants": {"lamp": {"spectrum": TRIPLE, "file": "a.csv"}}}, "either spectrum or file"),
+        ({"illuminants": {"lamp": {"file": "none.csv"}}}, r"illuminants\.lamp\.file: got 'none.csv'.*readable CSV"),
+        ({"illuminants": {"lamp": {"spectrum": [[400, 1]]}}}, r"lamp\.spectrum: got \(1 rows\), expected 2 to 10000"),
+        ({"illuminants": {"lamp": {"spectrum": [[400, 1], [400, 1]]}}}, r"spectrum\[1\]: got 400.0.*increase"),
+        ({"illuminants": {"lamp": {"spectrum": [[380, 1], [780, -1]]}}}, r"spectrum\[1\]: got -1.0.*0 or more"),
+        ({"illuminants": {"lamp": {"spectrum": [[380, 1], [780, float("inf")]]}}}, r"spectrum\[1\]: got inf"),
+        ({"illuminants": {"lamp": {"spectrum": [[380, 0], [780, 0]]}}}, r"got \(all 0\)"),
+        ({"illuminants": {"lamp": {"spectrum": [[450, 1], [780, 1]]}}}, r"illuminants\.lamp: got \(450 to 780 nm\)"),
+        ({"illuminants": {"lamp": {"spectrum": [[300, 1], [350, 0], [780, 0]]}}}, "light between 400 and 700 nm"),
+        ({"illuminants": {"A": {"spectrum": [[380, 1], [780, 1]]}}}, r"illuminants\.A: got 'A', expected a name"),
+    ],
+)
+def test_each_mistake_is_named(tables: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=said) as caught:
+        scene(**tables)
+    assert str(caught.value).startswith("test.toml: ")
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("nm,value\n400,1\n700,x\n", r"a\.csv: line 3: got '700,x', expected wavelength in nm, value"),
+        ("400,1,2\n700,1,2\n", r"a\.csv: line 1"),
+        ("", r"a\.csv: row: got \(0 rows\)"),
+        ("400;1\n700;1\n", r"a\.csv: line 1"),
+        ("700,1\n400,1\n", r"a\.csv: row\[1\]: got 400"),
+        ("400,nan\n700,1\n", r"a\.csv: row\[0\]: got nan"),
+        ("1,1\n" * 300_000, "at most 1000000 bytes"),
+    ],
+)
+def test_broken_csv_files_are_named(content: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(content)
+    with pytest.raises(InputError, match=said):
+        scene(illuminants={"lamp": {"file": str(tmp_path / "a.csv")}})
+
+
+def test_an_unknown_white_is_refused_by_render_itself() -> None:
+    with pytest.raises(InputError, match=r"film\.white_balance.*F99"):
+        render(scene(environment=WHITE), CAMERA, width=36, height=24, samples=1, film=FilmSettings(white_balance="F99"))
