@@ -38,7 +38,7 @@ from neurolens.surrogates.specialise import Fix, fixed_models
 
 WITHIN_UM = 1.0
 POLYNOMIALS = tuple(ModelSettings("ols", terms=n) for n in (8, 12, 16, 20, 24, 28, 32, 36, 40, 48, 56, 64, 80, 100))
-NETWORKS = tuple(ModelSettings("mlp", units=n, layers=1) for n in (4, 6, 8, 10, 12, 16))
+NETWORKS = tuple(ModelSettings("mlp", units=n, layers=1) for n in (4, 5, 6, 7, 8, 9, 10, 12, 16))
 WAVELENGTH_NM = 550.0
 _STOPPED = math.sqrt(0.5)  # one stop down, where a stop is fixed
 

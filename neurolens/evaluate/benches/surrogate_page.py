@@ -66,6 +66,10 @@ SUMMED = tuple(
     "rms_um_at_21_6 direction_rms_deg position_rms_um_at_21_6 transmittance_rms false_pass false_block "
     "coefficients_per_vector fit_s ns_per_ray.min fused_ns_per_ray.min speedup fused_speedup".split()
 )  # fmt: skip
+_OF_A_LENS = tuple(
+    Column(c.heading, c.key, c.factor, 2) for c in SUMMED if c.key in
+    "rms_um_at_21_6 direction_rms_deg position_rms_um_at_21_6 transmittance_rms false_pass false_block".split()
+)  # fmt: skip
 _WORST: dict[str, Callable[[Sequence[float]], float]] = {"speedup": min, "fused_speedup": min}
 
 NOTES = (
@@ -98,7 +102,7 @@ def lens_page(name: str, records: Sequence[Record], facts: str) -> str:
 
 
 def summary_page(found: Mapping[str, Sequence[Record]], facts: str) -> str:
-    """Median and worst lens of every method, and which lens that was."""
+    """Median and worst lens of every method, then lens by lens."""
     every = [r for records in found.values() for r in records]
     methods = {r["method"]: r for r in _ordered(every)}
     head = ["method", "lenses", *(c.heading for c in SUMMED)]
@@ -111,7 +115,8 @@ def summary_page(found: Mapping[str, Sequence[Record]], facts: str) -> str:
     failures = [f"- {r['method']}, {r['lens']}: {_cell(r['failed'])}" for r in every if r["failed"]]
     sources = {r["method"]: r["source"] for r in methods.values() if r["source"]}
     parts = ["# Surrogates over lenses", "", facts, "", "Each cell: median, then worst lens.", "", *lines]
-    parts += ["", "## Worst lens by direction", "", *_worst_lenses(every, list(methods))]
+    figures = " / ".join(c.heading for c in _OF_A_LENS)
+    parts += ["", "## By lens", "", f"{figures}.", "", *_by_lens(found, list(methods))]
     parts += ["", "## What failed", "", *failures] if failures else []
     parts += ["", "## Sources", "", *(f"- {m}: {s}" for m, s in sources.items())] if sources else []
     return "\n".join([*parts, ""])
@@ -145,13 +150,18 @@ def _median_and_worst(column: Column, records: Sequence[Record]) -> str:
     return f"{_digits(column.factor * median, column.digits)}, {_digits(column.factor * worst, column.digits)}"
 
 
-def _worst_lenses(records: Sequence[Record], methods: Sequence[str]) -> list[str]:
-    lines = []
-    for method in methods:
-        known = [(v, r["lens"]) for r in records if r["method"] == method and (v := number(r, "direction_rms_deg"))]
-        if known:
-            first = ", ".join(f"{lens} {value:.2g}" for value, lens in sorted(known, reverse=True)[:3])
-            lines.append(f"- {method}: {first}")
+def _by_lens(found: Mapping[str, Sequence[Record]], methods: Sequence[str]) -> list[str]:
+    """Every lens by every method, the worst of the first method first."""
+    lines = ["| lens | " + " | ".join(methods) + " |", "|---" * (len(methods) + 1) + "|"]
+    rows = {lens: {r["method"]: r for r in records if not r["failed"]} for lens, records in found.items()}
+
+    def worst(lens: str) -> float:
+        first = rows[lens].get(methods[0]) if methods else None
+        return -((number(first, "direction_rms_deg") if first else None) or 0.0)
+
+    for lens in sorted(rows, key=worst):
+        cells = [" / ".join(c.cell(rows[lens][m]) for c in _OF_A_LENS) if m in rows[lens] else "–" for m in methods]
+        lines.append("| " + " | ".join([lens, *cells]) + " |")
     return lines
 
 
