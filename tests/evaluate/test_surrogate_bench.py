@@ -140,6 +140,14 @@ def test_other_settings_and_lost_files_are_made_again(
     assert len(fitted) == 6  # tried again
 
 
+def test_stored_weights_are_rows_of_their_own(tmp_path: Path) -> None:
+    network = ModelSettings("mlp", units=6, layers=1, steps=20)
+    rows = (Row("net", "ours", network), Row("net-int8", "ours", network, weights="int8"))
+    whole, small = run(tmp_path, rows, replace(SETTINGS, rounds=0))
+    assert small["rms_um"] > 2 * whole["rms_um"] and small["bytes"] != whole["bytes"]
+    assert small["fingerprint"] != whole["fingerprint"]
+
+
 def test_a_lens_that_cannot_be_is_rows_too(tmp_path: Path) -> None:
     bench = Bench(LensChoice(tmp_path / "missing.toml"), SETTINGS, tmp_path)
     records = run_bench([bench], ROWS, progress=Progress(quiet=True))["missing"]

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import get_args
 
 from neurolens.errors import InputError
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.fits.ablations import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
+from neurolens.surrogates.precision import Precision
 from neurolens.surrogates.published import PUBLISHED
 
 GROUPS = {
@@ -29,12 +31,14 @@ class Row:
         group: of `GROUPS`.
         settings: of the fit.
         source: the paper, or what an ablation changes.
+        weights: how a network's weights are stored in the file, where not in float32.
     """
 
     name: str
     group: str
     settings: ModelSettings
     source: str = ""
+    weights: Precision | None = None
 
 
 def _ours() -> tuple[ModelSettings, ...]:
@@ -61,6 +65,8 @@ def all_rows() -> tuple[Row, ...]:
     for method in PUBLISHED.values():
         rows += [Row(s.label, "published", s, method.citation) for s in method.presets]
     rows += [Row(s.label, "ours", s) for s in _ours()]
+    network = ModelSettings("mlp")
+    rows += [Row(f"{network.label}-{p}", "ours", network, weights=p) for p in get_args(Precision)]
     return tuple([*rows, *_ablations()])
 
 

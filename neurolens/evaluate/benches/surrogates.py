@@ -36,6 +36,7 @@ from neurolens.surrogates.fit import NETWORKS, Prepared, fit_model, prepare
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.precision import store_weights
 
 _FIGURES = (
     "rms_um p99_um max_um rms_infinity_um rms_px p99_px max_px rms_um_at_21_6 direction_rms_deg direction_p99_deg "
@@ -109,7 +110,7 @@ class Bench:
         asked = [
             __version__, self.lens.sha256, self.lens.stop_radius_mm, self.lens.image_radius_mm,
             asdict(self.settings.domain), asdict(self.settings.pairs), self.settings.vignetting_rays,
-            asdict(row.settings),
+            asdict(row.settings), *([row.weights] if row.weights else []),
         ]  # fmt: skip
         return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
 
@@ -186,6 +187,8 @@ def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
     prepared, file = bench.prepared, bench.model_file(row)
     model = fit_model(prepared, row.settings, report)
     refused = _export(model, file)
+    if row.weights and refused is None:
+        store_weights(file, file, row.weights, {})
     predict: Any = model.predict
     load_s = None
     if refused is None:
