@@ -19,6 +19,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.stored import load_fitted
 
 ROOT = Path(__file__).parents[1]
 INDEX: dict[str, Any] = json.loads((ROOT / "models" / "index.json").read_text(encoding="utf-8"))
@@ -79,6 +80,7 @@ def test_model_keeps_its_card_and_index_on_fresh_rays(row: dict[str, Any]) -> No
     assert all(row[figure] == card["errors"][figure] for figure in ("rms_um", "direction_rms_deg", "false_pass"))
     promises = promises_of(card["errors"], fresh, measure(fresh, onnx_predictor(model(row["file"]))))
     assert len(promises) > 10 and not [p for p in promises if not p.holds]
+    assert load_fitted(ROOT / "models" / row["file"]).domain == fresh.domain  # for source code of it
 
 
 @pytest.mark.slow

@@ -178,7 +178,7 @@ def _mark(bench: Bench, row: Row) -> str:
 
 
 def _reason(error: Exception) -> str:
-    text = " ".join(str(error).split())[:300]
+    text = " ".join(str(error).split()).replace(f"{Path.cwd()}/", "")[:300]
     return text if isinstance(error, NeurolensError) else f"{type(error).__name__}: {text}"
 
 
