@@ -24,7 +24,8 @@ class RenderResult:
 
     Attributes:
         rgb: [H, W, 3] float32 linear sRGB; a uniform environment of radiance 1 gives 1 on the axis.
-        stats: JSON-able; seconds, paths, mpaths_per_s, passed_fraction, camera_fraction (share of the time), settings.
+        stats: JSON-able; settings, seconds, paths, mpaths_per_s, passed_fraction, thread_seconds (summed over the
+            workers), camera_thread_seconds (of these, in the camera), camera_fraction (their ratio).
     """
 
     rgb: FloatArray
@@ -42,6 +43,7 @@ def render(
     threads: int = 2,
     max_depth: int | None = None,
     film: FilmSettings | None = None,
+    differentials: bool = False,
     progress: Progress | None = None,
 ) -> RenderResult:
     """Path-trace `scene` through `camera`.
@@ -52,11 +54,12 @@ def render(
         width, height, samples, max_depth: as in `CameraSettings`; left out, those of the scene.
         film: spectral sampling and white balance; left out, those of the scene.
         threads: workers. A camera may have `for_worker() -> Camera`, called once in each, to open sessions of its own.
+        differentials: ask the camera for ray differentials, too. Nothing uses them: for measuring what they cost.
         progress: called now and then with the fraction done and the estimated seconds left.
 
     Raises:
-        InputError: a size or count below 1, an unknown illuminant, picture and film of different shape, or a camera
-            that disperses and does not cover the scene's wavelengths.
+        InputError: a size or count below 1, an unknown illuminant, picture and film of different shape, a camera
+            that disperses and does not cover the scene's wavelengths, or one without the differentials asked for.
         NeurolensError: a worker failed; the message holds its traceback.
     """
     settings, film = scene.settings.camera, film or scene.settings.film
@@ -70,7 +73,10 @@ def render(
         seed,
         _at_least_one("max_depth", settings.max_depth if max_depth is None else max_depth),
         film,
+        differentials,
     )
+    if differentials:
+        _check_differentials(camera)
     began = time.perf_counter()
     run(job, min(_at_least_one("threads", threads), len(job.done)), progress)
     seconds = time.perf_counter() - began
@@ -92,12 +98,24 @@ def render(
         "paths": paths,
         "mpaths_per_s": paths / seconds * 1e-6,
         "passed_fraction": float(job.tallies[1]) / paths,
+        "differentials": differentials,
+        "thread_seconds": float(job.tallies[2]),
+        "camera_thread_seconds": float(job.tallies[0]),
         "camera_fraction": float(job.tallies[0] / max(job.tallies[2], 1e-12)),
     }
     rgb = job.film / job.samples
     if film.white_balance is not None and job.spectral.colours:
         rgb = rgb @ balance(job.spectral.film_rgb(job.world.palette.illuminant(film.white_balance))).T
     return RenderResult(rgb.astype(np.float32).reshape(grid.height, grid.width, 3), stats)
+
+
+def _check_differentials(camera: Camera) -> None:
+    """Ask for the differentials of one ray, so that a camera without them is found before the work."""
+    ask = getattr(camera, "sample_differentials", None)
+    if ask is None:
+        raise InputError("render", "differentials", True, f"left out: camera {camera.name} has none")
+    low, high = camera.wavelength_nm or (550.0, 550.0)
+    ask(np.zeros((2, 1), np.float32), np.full((2, 1), 0.5, np.float32), np.full(1, (low + high) / 2, np.float32))
 
 
 def _at_least_one(field: str, value: int) -> int:

@@ -71,10 +71,12 @@ class Job:
         seed: int,
         max_depth: int,
         film: FilmSettings,
+        differentials: bool = False,
     ) -> None:
         settings = scene.settings.camera
         self.mode = mode_for(camera, grid, settings.wavelengths_nm, film)
         self.camera, self.grid, self.samples, self.max_depth = camera, grid, samples, max_depth
+        self.differentials = differentials
         self.spectral = spectral_range(scene, camera, film, LANES if self.mode == "hero" else 1)
         self.world = World(scene, self.spectral)
         self.response = self.spectral.rotated(self.spectral.response)
@@ -168,10 +170,11 @@ class Job:
         count = len(wavelength_nm)
         origin, direction = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
         weight = np.empty(count, np.float32)
+        sample = camera.sample_differentials if self.differentials else camera.sample  # type: ignore[attr-defined]
         for start in range(0, count, CAMERA_BATCH):
             part = slice(start, start + CAMERA_BATCH)
             inputs = (film_mm[:, part], pupil[:, part], wavelength_nm[part])
-            rays = camera.sample(*(np.ascontiguousarray(x) for x in inputs))
+            rays = sample(*(np.ascontiguousarray(x) for x in inputs))
             np.add(self.axes @ rays.origin_m, self.position[:, None], out=origin[:, part])
             np.matmul(self.axes, rays.direction, out=direction[:, part])
             weight[part] = np.where(rays.status == 0, rays.weight, np.float32(0))
