@@ -11,6 +11,14 @@ from neurolens.cameras.contract import FloatArray
 from neurolens.render.job import Job
 from neurolens.render.sums import DEPTH, HITS, LUMINANCE2, PASSED, RGB
 
+# Of the layers, for the metadata of a picture.
+MEANING = {
+    "samples": "samples in the pixel",
+    "variance": "of the pixel's luminance (linear sRGB), from its samples as if they were independent",
+    "depth": "channel Z: m along the optical axis from the film's plane to the first surface, mean; inf: none",
+    "blocked": "share of the samples whose camera ray did not pass",
+}
+
 
 @dataclass(frozen=True)
 class Layers:
