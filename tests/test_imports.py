@@ -52,7 +52,7 @@ PACKAGES = {
     "analysis": {"numpy", "torch", "matplotlib"},
     "readers": set(),
     "cameras": {"numpy", "onnxruntime"},
-    "render": {"numpy", "OpenEXR", "PIL"},
+    "render": {"numpy", "OpenEXR", "PIL", "trimesh"},
 }
 # The one camera that traces rays exactly, and the maker of cameras, which imports it when one is asked for.
 EXACT_CAMERA = {

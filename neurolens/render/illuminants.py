@@ -49,8 +49,10 @@ class IlluminantSettings:
             check_spectrum("settings", "spectrum", self.spectrum)
 
 
-def check_spectrum(file: str | Path, field: str, rows: Sequence[Sequence[float]]) -> Spectrum:
-    """The rows (nm, value) as two arrays, the largest value 1.
+def check_spectrum(
+    file: str | Path, field: str, rows: Sequence[Sequence[float]], most: float | None = None
+) -> Spectrum:
+    """The rows (nm, value) as two arrays: scaled to the largest value 1, or with `most` as they are and at most that.
 
     Raises:
         InputError: names the row at fault.
@@ -63,14 +65,18 @@ def check_spectrum(file: str | Path, field: str, rows: Sequence[Sequence[float]]
             raise InputError(file, f"{field}[{k}]", nm, "wavelengths in nm that increase")
         if not 0 <= value < math.inf:
             raise InputError(file, f"{field}[{k}]", value, "a finite value of 0 or more")
+        if most is not None and value > most:
+            raise InputError(file, f"{field}[{k}]", value, f"a value from 0 to {most:g}")
         last = nm
     wavelengths, values = np.array(rows, np.float64).T
+    if most is not None:
+        return wavelengths, values
     if not values.any():
         raise InputError(file, field, "(all 0)", "a value above 0")
     return wavelengths, values / values.max()
 
 
-def read_spectrum(scene: Path, field: str, path: Path) -> Spectrum:
+def read_spectrum(scene: Path, field: str, path: Path, most: float | None = None) -> Spectrum:
     """A CSV file of rows "nm, value"; a line of words may come first, and lines that start with # are passed over.
 
     Raises:
@@ -94,7 +100,7 @@ def read_spectrum(scene: Path, field: str, path: Path) -> Spectrum:
                 continue  # the names of the columns
             raise InputError(path, f"line {number}", line[:60], "wavelength in nm, value") from None
         rows.append((nm, value))
-    return check_spectrum(path, "row", rows)
+    return check_spectrum(path, "row", rows, most)
 
 
 def planck(wavelength_nm: ArrayLike, kelvin: float) -> NDArray[np.float64]:

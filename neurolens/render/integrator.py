@@ -2,7 +2,7 @@
 
 At each surface the paths are sorted by kind of material, so that every kind is one contiguous slice and paths that have
 ended drop off the end. Light is found in two ways, by aiming at a light and by scattering into it, weighted by the
-power heuristic (Veach 1997); the environment and what mirrors and glass show are found by scattering alone.
+power heuristic (Veach 1997). What mirrors and glass show is found by scattering alone, points and spots by aiming.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def trace(
             point = paths.direction * distance
             point += paths.origin
             surface = world.surfaces(found, point)
-            _add_environment(world, paths, found, radiance)
+            _add_environment(world, paths, found, aim, radiance)
             _add_emission(world, paths, surface, point, distance, aim, radiance)
             if depth == max_depth:
                 break
@@ -76,13 +76,14 @@ def trace(
     return radiance
 
 
-def _add_environment(world: World, paths: Paths, found: NDArray[np.int32], radiance: FloatArray) -> None:
+def _add_environment(world: World, paths: Paths, found: NDArray[np.int32], aim: bool, radiance: FloatArray) -> None:
     """Light from paths that leave the scene."""
     if world.dark:
         return
     rows = np.flatnonzero(found < 0)
     if rows.size:
-        light = world.environment(paths.direction.take(rows, axis=1), paths.bins.take(rows))
+        density = paths.density[rows] if aim else None
+        light = world.environment(paths.direction.take(rows, axis=1), paths.bins.take(rows), density)
         deposit(radiance, paths.slot[rows], paths.throughput.take(rows, axis=-1) * light)
 
 

@@ -4,8 +4,7 @@ Reflectances are numbers [N], or [lanes, N] where paths carry several wavelength
 lanes together, not on one of them, so that all give a path the same density. Directions are unit vectors [3, N] that
 point away from the surface, normals lie on the side of the incoming ray.
 
-Sources: Walter et al. 2007 (GGX); Heitz 2014 (Smith shadowing); Dupuy and Benyoub 2023, "Sampling visible GGX normals
-with spherical caps"; Schlick 1994.
+Sources: Walter et al. 2007 (GGX); Heitz 2014 (Smith shadowing); and those of `neurolens.render.coat`.
 """
 
 from __future__ import annotations
@@ -16,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.lights import orthonormal
+from neurolens.render.arealights import orthonormal
+from neurolens.render.coat import CoatTable, fifth_power, smith, visible_normal
 from neurolens.render.primitives import dot
 
 _PI = np.float32(math.pi)
@@ -48,84 +48,84 @@ def mirror_direction(direction: FloatArray, normal: FloatArray) -> FloatArray:
     return result
 
 
-def schlick(head_on: FloatArray, cosine: FloatArray) -> FloatArray:
-    """Fresnel reflectance [N] by Schlick's approximation."""
-    grazing = np.clip(1 - cosine, 0, 1)
-    squared = grazing * grazing
-    return head_on + (1 - head_on) * squared * squared * grazing
+class GlossyLobes:
+    """A GGX coat over a Lambert base, seen from one direction: what it scatters, and directions to sample.
 
-
-def glossy_evaluate(
-    normal: FloatArray, out: FloatArray, inward: FloatArray, base: FloatArray, coat: FloatArray, alpha: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Scattering times cosine [..., N] of the glossy material, and the density [N] with which `glossy_sample` finds it.
+    Coat and base together reflect all light where nothing absorbs: the coat also scatters light from facet to facet
+    (Kulla and Conty 2017), and the base gets what the coat's albedo leaves, on the way in and out (Kelemen and
+    Szirmay-Kalos 2001). Both are lobes without direction.
 
     Args:
-        out: towards the camera. inward: towards the light.
-        base: diffuse reflectance. coat: Fresnel reflectance head on. alpha: GGX width, roughness squared.
-
-    The base is dimmed by 1 - F on the way in and out, so that coat and base never reflect more than arrives.
+        normal, out: [3, N], out towards the camera.
+        base: diffuse reflectance [..., N]. coat: Fresnel reflectance head on [..., N]. alpha: GGX width [N], roughness
+            squared. table, row: the coat's albedo, and which of its rows [N].
     """
-    cos_out = np.maximum(dot(normal, out), np.float32(1e-6))
-    cos_in = dot(normal, inward)
-    half = out + inward
-    half /= np.sqrt(np.maximum(dot(half, half), np.float32(1e-12)))
-    cos_half = dot(normal, half)
-    alpha2 = alpha * alpha
-    spread = cos_half * cos_half * (alpha2 - 1) + 1
-    peak = alpha2 / (_PI * spread * spread)
-    lambda_out, lambda_in = _smith(cos_out, alpha2), _smith(np.maximum(cos_in, np.float32(1e-6)), alpha2)
 
-    fresnel = schlick(coat, dot(out, half))
-    common = peak / (4 * cos_out)
-    scattered = fresnel * common / (1 + lambda_out + lambda_in)
-    enter = (1 - schlick(coat, cos_out)) * (1 - schlick(coat, cos_in))
-    scattered += enter * base * cos_in / _PI
-    choice = coat_probability(cos_out, base, coat)
-    density = choice * common / (1 + lambda_out) + (1 - choice) * cos_in / _PI
-    above = cos_in > 0
-    return np.where(above, scattered, np.float32(0)), np.where(above, density, np.float32(1))
+    def __init__(
+        self,
+        normal: FloatArray,
+        out: FloatArray,
+        base: FloatArray,
+        coat: FloatArray,
+        alpha: FloatArray,
+        table: CoatTable,
+        row: NDArray[np.intp],
+    ) -> None:
+        self._normal, self._out, self._coat = normal, out, coat
+        self._alpha, self._table, self._row = alpha, table, row
+        self._cos_out = np.maximum(dot(normal, out), np.float32(1e-6))
+        whole_mean, power_mean = table.means(row)
+        left = np.maximum(1 - whole_mean, np.float32(1e-6))
+        fresnel = coat + (1 - coat) / 21  # mean over all directions
+        self._more = fresnel * fresnel * whole_mean / (1 - fresnel * left)
+        mean = coat * (whole_mean - power_mean) + power_mean + left * self._more
+        self._below = base / np.maximum(1 - mean, np.float32(1e-6))
+        self._again = self._more / left
 
+        whole, power = table.at(row, self._cos_out)
+        self._left_out, once = 1 - whole, coat * (whole - power) + power
+        self._through_out = np.maximum(1 - once - self._left_out * self._more, 0)
+        rest = self._left_out * self._more + self._through_out * base
+        if once.ndim > 1:
+            once, rest = once.mean(axis=0), rest.mean(axis=0)
+        # At least 1/5: highlights are narrow and bright.
+        self._choice = np.clip(once / np.maximum(once + rest, np.float32(1e-6)), np.float32(0.2), np.float32(1))
 
-def _smith(cosine: FloatArray, alpha2: FloatArray) -> FloatArray:
-    """Smith's Lambda [N] for GGX."""
-    cos2 = cosine * cosine
-    result: FloatArray = np.float32(0.5) * (np.sqrt(1 + alpha2 * (1 - cos2) / cos2) - 1)
-    return result
+    def evaluate(self, inward: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Scattering times cosine [..., N] towards light in directions [3, N], and the density of `sample` there."""
+        cos_out, cos_in = self._cos_out, dot(self._normal, inward)
+        half = self._out + inward
+        half /= np.sqrt(np.maximum(dot(half, half), np.float32(1e-12)))
+        cos_half = dot(self._normal, half)
+        alpha2 = self._alpha * self._alpha
+        spread = cos_half * cos_half * (alpha2 - 1) + 1
+        peak = alpha2 / (_PI * spread * spread)
+        lambda_out, lambda_in = smith(cos_out, alpha2), smith(np.maximum(cos_in, np.float32(1e-6)), alpha2)
+        common = peak / (4 * cos_out)
+        power = fifth_power(dot(self._out, half))
+        scattered = (self._coat + (1 - self._coat) * power) * (common / (1 + lambda_out + lambda_in))
 
+        cosine = cos_in / _PI
+        whole, power = self._table.at(self._row, np.clip(cos_in, 0, 1))
+        through = np.maximum(1 - self._coat * (whole - power) - power - (1 - whole) * self._more, 0)
+        even = self._below * self._through_out * through
+        even += self._again * (self._left_out * (1 - whole))
+        even *= cosine
+        scattered += even
+        density = self._choice * common / (1 + lambda_out) + (1 - self._choice) * cosine
+        above = cos_in > 0
+        return np.where(above, scattered, np.float32(0)), np.where(above, density, np.float32(1))
 
-def coat_probability(cos_out: FloatArray, base: FloatArray, coat: FloatArray) -> FloatArray:
-    """Probability [N] of sampling the coat: its share of the light reflected in all lanes, at least 1/5."""
-    base, coat = (a if a.ndim == 1 else a.mean(axis=0) for a in (base, coat))
-    fresnel = schlick(coat, cos_out)
-    share = fresnel / np.maximum(fresnel + (1 - fresnel) * base, np.float32(1e-6))
-    return np.clip(share, np.float32(0.2), np.float32(1))
-
-
-def glossy_sample(
-    normal: FloatArray,
-    out: FloatArray,
-    base: FloatArray,
-    coat: FloatArray,
-    alpha: FloatArray,
-    square: FloatArray,
-    lobe: FloatArray,
-) -> FloatArray:
-    """Directions towards light [3, N]: off a visible GGX normal, or by cosine for the base."""
-    diffuse, _ = cosine_direction(normal, square)
-    tangent, bitangent = orthonormal(normal)
-    local = np.stack([dot(tangent, out) * alpha, dot(bitangent, out) * alpha, np.maximum(dot(normal, out), 1e-6)])
-    local /= np.sqrt(dot(local, local))
-    angle = square[0] * (2 * _PI)
-    height = (1 - square[1]) * (1 + local[2]) - local[2]
-    radius = np.sqrt(np.clip(1 - height * height, 0, 1))
-    local += np.stack([radius * np.cos(angle), radius * np.sin(angle), height])
-    local[:2] *= alpha
-    half = tangent * local[0] + bitangent * local[1] + normal * local[2]
-    half /= np.sqrt(np.maximum(dot(half, half), np.float32(1e-12)))
-    coated = half * (2 * dot(out, half)) - out
-    chosen = lobe < coat_probability(np.maximum(dot(normal, out), np.float32(1e-6)), base, coat)
-    return np.where(chosen, coated, diffuse)
+    def sample(self, square: FloatArray, lobe: FloatArray) -> FloatArray:
+        """Directions towards light [3, N]: off a visible GGX normal, or by cosine for the rest."""
+        normal, out = self._normal, self._out
+        diffuse, _ = cosine_direction(normal, square)
+        tangent, bitangent = orthonormal(normal)
+        local = np.stack([dot(tangent, out), dot(bitangent, out), np.maximum(dot(normal, out), np.float32(1e-6))])
+        local = visible_normal(local, self._alpha, square)
+        half = tangent * local[0] + bitangent * local[1] + normal * local[2]
+        coated = half * (2 * dot(out, half)) - out
+        return np.where(lobe < self._choice, coated, diffuse)
 
 
 def fresnel_dielectric(cos_in: FloatArray, relative_index: FloatArray) -> tuple[FloatArray, FloatArray]:

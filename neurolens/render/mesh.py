@@ -1,4 +1,4 @@
-"""Triangle meshes: OBJ reading and a bounding-volume tree traversed by whole batches of rays.
+"""Triangle meshes: a bounding-volume tree traversed by whole batches of rays.
 
 Nodes have 16 children and leaves 8 triangles: few levels, and at each level one dense test of every (ray, node) pair
 against 16 boxes or 8 triangles, which is what numpy does fast. Triangles carry the three planes of Havel and Herout
@@ -7,48 +7,14 @@ against 16 boxes or 8 triangles, which is what numpy does fast. Triangles carry 
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.errors import InputError
 from neurolens.render.primitives import NEAREST, IntArray, Rays, slabs
 
 _BRANCHES, _LEAF = 16, 8
 _PAIRS_AT_ONCE = 4096  # keeps the [pairs, 8] temporaries inside the L2 cache
-
-
-def read_obj(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices [V, 3] and triangles [T, 3] of a Wavefront OBJ file; polygons are cut into fans, other lines ignored.
-
-    Raises:
-        InputError: the file is missing, or a vertex or face cannot be read; names the line.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, "mesh file", f"({error})", "a readable OBJ file") from None
-    vertices: list[list[float]] = []
-    faces: list[tuple[int, int, int]] = []
-    for number, line in enumerate(lines, 1):
-        word, *rest = line.split() or [""]
-        try:
-            if word == "v":
-                vertices.append([float(x) for x in rest[:3]])
-                if len(rest) < 3:
-                    raise ValueError
-            elif word == "f":
-                # Indices count from 1, or backwards from the last vertex when negative.
-                ring = [int(x.split("/")[0]) for x in rest]
-                ring = [k - 1 if k > 0 else len(vertices) + k for k in ring]
-                if len(ring) < 3:
-                    raise ValueError
-                faces += [(ring[0], ring[k], ring[k + 1]) for k in range(1, len(ring) - 1)]
-        except ValueError:
-            raise InputError(path, f"line {number}", line, "v X Y Z or f I J K ...") from None
-    return np.array(vertices, np.float64).reshape(-1, 3), np.array(faces, np.int64).reshape(-1, 3)
 
 
 def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -91,7 +57,6 @@ class Mesh:
         self.first, self.count = first, len(faces)
         corners = vertices[faces]  # [T, 3 corners, 3]
         low, high = corners.min(axis=1), corners.max(axis=1)
-        self.planes = _planes(corners).astype(np.float32)  # [T, 3 planes, 4]
         boxes: list[NDArray[np.float64]] = []
         children: list[NDArray[np.int32]] = []
         leaves: list[NDArray[np.intp]] = []
@@ -105,7 +70,7 @@ class Mesh:
         self._children = np.array(children)
         self._leaf_rows = np.array(leaves, np.int32)  # [L, 8]
         self._leaf_planes = np.ascontiguousarray(
-            self.planes[self._leaf_rows].transpose(2, 3, 0, 1)
+            triangle_planes(corners).astype(np.float32)[self._leaf_rows].transpose(2, 3, 0, 1)
         )  # [3, 4, leaves, 8]
 
     def _build(
@@ -205,8 +170,11 @@ class Mesh:
         found[ray[won]] = self.first + self._leaf_rows[leaf[won], column[won]]
 
 
-def _planes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Plane and barycentric coordinates of triangles [T, 3, 3] as affine functions of a point, [T, 3, 4]."""
+def triangle_planes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Plane and barycentric coordinates of triangles [T, 3, 3] as affine functions of a point, [T, 3, 4].
+
+    Row 0 is the distance from the plane, rows 1 and 2 the weights of corners 1 and 2.
+    """
     a, edge_b, edge_c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(edge_b, edge_c)
     area2 = np.sum(normal**2, axis=1, keepdims=True)

@@ -146,6 +146,30 @@ class Quad:
         _keep(ok, distance, self.first, best, found)
 
 
+class Disc:
+    """A flat disc about `centre` with unit `normal`."""
+
+    count = 1
+
+    def __init__(self, first: int, centre: NDArray[np.float64], normal: NDArray[np.float64], radius: float) -> None:
+        self.first = first
+        self._centre, self._normal = centre.astype(np.float32)[:, None], normal.astype(np.float32)
+        self._radius2 = np.float32(radius**2)
+
+    def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
+        """See `Primitive`."""
+        to_centre = self._centre - rays.origin
+        distance = dot(self._normal, to_centre)
+        distance /= dot(self._normal, rays.direction) + _TINY
+        ok = distance > NEAREST
+        ok &= distance < best
+        if not ok.any():
+            return
+        to_centre -= rays.direction * distance
+        ok &= dot(to_centre, to_centre) < self._radius2
+        _keep(ok, distance, self.first, best, found)
+
+
 class Box:
     """An axis-aligned box: six surfaces, in the order x-, x+, y-, y+, z-, z+.
 

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from neurolens.cameras.contract import FloatArray
 from neurolens.render import sampler as dims
 from neurolens.render.materials import (
+    GlossyLobes,
     cosine_direction,
     fresnel_dielectric,
     glass_direction,
-    glossy_evaluate,
-    glossy_sample,
     mirror_direction,
 )
 from neurolens.render.palette import Index
@@ -106,8 +105,25 @@ class Vertex:
         self._reach += np.float32(1e-4)
 
         self.base = world.reflectance(surface[:mirror], point[:, :mirror], paths.bins[:mirror])
-        self.coat = world.palette.look_up(world.specular_row.take(surface[self.glossy]), paths.bins[self.glossy])
-        self.alpha = world.alpha.take(surface[self.glossy])
+        if rough > glossy:
+            self.gloss = self._lobes(surface[self.glossy])
+        if world.absorbs and glass > mirror:
+            self._absorb(surface[self.glass], distance[self.glass])
+
+    def _lobes(self, surface: Index) -> GlossyLobes:
+        world, g = self.world, self.glossy
+        coat = world.palette.look_up(world.specular_row.take(surface), self.paths.bins[g])
+        table, row = world.coat, world.coat_row.take(surface)
+        out = -self.paths.direction[:, g]
+        return GlossyLobes(self.shading[:, g], out, self.base[..., g], coat, world.alpha.take(surface), table, row)
+
+    def _absorb(self, surface: Index, distance: FloatArray) -> None:
+        """Dim the paths that reach their glass from inside, by Beer and Lambert's law."""
+        inside = np.flatnonzero(~self.outside[self.glass])
+        rows = inside + self.glass.start
+        absorbed = self.world.palette.look_up(self.world.absorption_row.take(surface[inside]), self.paths.bins[rows])
+        absorbed *= -distance[inside]
+        self.paths.throughput[..., rows] *= np.exp(absorbed)
 
     def start(self, side: FloatArray | None = None) -> FloatArray:
         """Origins [3, N] of rays that leave on the near side, or where `side` is negative on the far side."""
@@ -121,10 +137,7 @@ class Vertex:
         value = self.base[..., d] * cosine
         if g.start == g.stop:
             return value, cosine
-        out = -self.paths.direction[:, g]
-        shiny, density = glossy_evaluate(
-            self.shading[:, g], out, inward[:, g], self.base[..., g], self.coat, self.alpha
-        )
+        shiny, density = self.gloss.evaluate(inward[:, g])
         return np.concatenate([value, shiny], axis=-1), np.concatenate([cosine, density])
 
     def index(self) -> FloatArray:
@@ -144,13 +157,13 @@ def aim_at_lights(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int, 
         choice = sampler.draw(keys, first + dims.LIGHT_CHOICE)
     aimed = world.lights.sample(origin, choice, sampler.draw2(keys, first + dims.LIGHT))
     value, density = vertex.evaluate(aimed.direction)
-    value *= aimed.inverse_pdf
+    value *= aimed.scale
     if vertex.smooth:
         value *= dot(vertex.facing[:, :rough], aimed.direction) > 0
     rows = lit(value > 0)
     value, ratio = value.take(rows, axis=-1), density[rows] * aimed.inverse_pdf[rows]
     value /= 1 + ratio * ratio
-    value *= world.palette.look_up(world.light_emission_row.take(aimed.light[rows]), paths.bins[rows])
+    value *= world.aimed_emission(aimed, rows, paths.bins[rows])
     value *= paths.throughput.take(rows, axis=-1)
     value *= world.visible(origin.take(rows, axis=1), aimed.direction.take(rows, axis=1), aimed.distance[rows])
     deposit(radiance, paths.slot[rows], value)
@@ -188,13 +201,8 @@ def _scatter_rough(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int,
     if g.start == g.stop:
         return cosine
     lobe = sampler.draw(keys.cut(g.start, g.stop), first + dims.LOBE)
-    normal, out, material = (
-        vertex.shading[:, g],
-        -paths.direction[:, g],
-        (vertex.base[..., g], vertex.coat, vertex.alpha),
-    )
-    direction[:, g] = glossy_sample(normal, out, *material, square[:, g], lobe)
-    value, density = glossy_evaluate(normal, out, direction[:, g], *material)
+    direction[:, g] = vertex.gloss.sample(square[:, g], lobe)
+    value, density = vertex.gloss.evaluate(direction[:, g])
     paths.throughput[..., g] *= value / density
     return np.concatenate([cosine, density])
 

@@ -1,29 +1,20 @@
 """What a scene file says: frozen dataclasses, one for each kind of table, checked one by one.
 
-Metres, y up, colours linear sRGB. The reader is `neurolens.render.scenefile`. Shapes are in `neurolens.render.shapes`.
+Metres, y up, colours linear sRGB. The reader is `neurolens.render.scenefile`. Shapes are in `neurolens.render.shapes`,
+materials in `materialsettings`, lights without a surface in `lightsettings`.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-from neurolens.render.checks import (
-    BLACK,
-    Vector,
-    check_fields,
-    length,
-    require,
-    require_emission,
-    require_finite,
-    require_positive,
-    require_reflectance,
-)
+from neurolens.render.checks import BLACK, Vector, length, require, require_finite, require_positive
 from neurolens.render.filmsettings import FilmSettings
 from neurolens.render.illuminants import IlluminantSettings
-from neurolens.render.shapes import Box, MeshSettings, Plane, Quad, Room, Sphere
+from neurolens.render.lightsettings import Environment, PointLight, Sky, SpotLight
+from neurolens.render.materialsettings import Material, ReflectanceSettings, Texture
+from neurolens.render.shapes import Box, Disc, MeshSettings, Plane, Quad, Room, Sphere
 
 
 @dataclass(frozen=True)
@@ -82,106 +73,6 @@ def _cross(a: Vector, b: Vector) -> Vector:
 
 
 @dataclass(frozen=True)
-class Environment:
-    """Light from infinitely far: `colour` everywhere, or a gradient from ground over horizon to zenith by height.
-
-    `illuminant`: the light that those colours tint.
-    """
-
-    colour: Vector | None = None
-    zenith: Vector | None = None
-    horizon: Vector | None = None
-    ground: Vector | None = None
-    illuminant: str = "D65"
-
-    def __post_init__(self) -> None:
-        gradient = (self.zenith, self.horizon, self.ground)
-        for field in ("colour", "zenith", "horizon", "ground"):
-            if (value := getattr(self, field)) is not None:
-                require_emission(field, value)
-        if self.colour is None:
-            require(all(gradient), "environment", "(incomplete)", "colour, or zenith, horizon and ground")
-        else:
-            require(not any(gradient), "colour", self.colour, "either colour or zenith, horizon and ground")
-
-
-@dataclass(frozen=True)
-class Texture:
-    """A pattern on flat surfaces, in metres along them.
-
-    kind "checker": squares of `cell_m` in two `colours`. kind "grid": lines `line_m` wide every `cell_m`, the first
-    colour for the lines. kind "image": the picture `file` (beside the scene file), repeated every `size_m` (width,
-    height); without `size_m` it fills the rectangle.
-    """
-
-    kind: Literal["checker", "grid", "image"]
-    colours: tuple[Vector, Vector] | None = None
-    cell_m: float | None = None
-    line_m: float | None = None
-    file: Path | None = None
-    size_m: tuple[float, float] | None = None
-
-    _FIELDS = {
-        "checker": (("colours", "cell_m"), ()),
-        "grid": (("colours", "cell_m", "line_m"), ()),
-        "image": (("file",), ("size_m",)),
-    }
-
-    def __post_init__(self) -> None:
-        needed, optional = self._FIELDS[self.kind]
-        check_fields(self, f"a {self.kind} texture", needed, optional)
-        for colour in self.colours or ():
-            require_reflectance("colours", colour)
-        if self.cell_m is not None:
-            require_positive("cell_m", self.cell_m)
-            if self.line_m is not None:
-                require(0 < self.line_m < self.cell_m, "line_m", self.line_m, "above 0 and below cell_m")
-        for size in self.size_m or ():
-            require_positive("size_m", size)
-
-
-@dataclass(frozen=True)
-class Material:
-    """How a surface scatters light.
-
-    kind "diffuse": Lambert of `reflectance` or `texture`. kind "glossy": a rough coat (GGX of `roughness`, Fresnel
-    reflectance `specular` head on) over a diffuse base of `reflectance` or `texture` (black: bare metal).
-    kind "mirror": `reflectance`. kind "glass": smooth, index `n_d`, Abbe number `V_d` (left out: no dispersion).
-    """
-
-    kind: Literal["diffuse", "glossy", "mirror", "glass"]
-    reflectance: Vector | None = None
-    texture: str | None = None
-    specular: Vector | None = None
-    roughness: float | None = None
-    n_d: float | None = None
-    V_d: float | None = None
-
-    _FIELDS = {
-        "diffuse": ((), ("reflectance", "texture")),
-        "glossy": (("specular", "roughness"), ("reflectance", "texture")),
-        "mirror": (("reflectance",), ()),
-        "glass": (("n_d",), ("V_d",)),
-    }
-
-    def __post_init__(self) -> None:
-        needed, optional = self._FIELDS[self.kind]
-        check_fields(self, f"a {self.kind} material", needed, optional)
-        if "texture" in optional:
-            one = (self.reflectance is None) != (self.texture is None)
-            require(one, "reflectance", self.reflectance or "(missing)", "either reflectance or texture")
-        for field in ("reflectance", "specular"):
-            if (value := getattr(self, field)) is not None:
-                require_reflectance(field, value)
-        if self.roughness is not None:
-            require(0.02 <= self.roughness <= 1, "roughness", self.roughness, "a number from 0.02 to 1")
-        if self.n_d is not None:
-            require(1 < self.n_d <= 4, "n_d", self.n_d, "a number above 1, at most 4")
-        if self.V_d is not None:
-            require(10 <= self.V_d < math.inf, "V_d", self.V_d, "a number from 10")
-
-
-@dataclass(frozen=True)
 class SceneSettings:
     """A whole scene file."""
 
@@ -189,11 +80,21 @@ class SceneSettings:
     film: FilmSettings = FilmSettings()
     illuminants: dict[str, IlluminantSettings] | None = None
     environment: Environment = Environment(colour=BLACK)
+    sky: Sky | None = None
+    reflectances: dict[str, ReflectanceSettings] | None = None
     textures: dict[str, Texture] | None = None
     materials: dict[str, Material] | None = None
     planes: tuple[Plane, ...] = ()
     quads: tuple[Quad, ...] = ()
+    discs: tuple[Disc, ...] = ()
     spheres: tuple[Sphere, ...] = ()
     boxes: tuple[Box, ...] = ()
     rooms: tuple[Room, ...] = ()
     meshes: tuple[MeshSettings, ...] = ()
+    points: tuple[PointLight, ...] = ()
+    spots: tuple[SpotLight, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.sky is not None:
+            dark = self.environment == Environment(colour=BLACK)
+            require(dark, "sky", "(given)", "either sky or environment")

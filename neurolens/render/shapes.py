@@ -1,4 +1,4 @@
-"""Shapes in a scene file: flat, round, boxes, rooms and meshes."""
+"""Shapes in a scene file: flat ones, spheres, boxes, rooms and meshes."""
 
 from __future__ import annotations
 
@@ -52,6 +52,25 @@ class Quad:
         require(u > 0, "edge_u_m", self.edge_u_m, "an edge longer than 0")
         cosine = sum(a * b for a, b in zip(self.edge_u_m, self.edge_v_m, strict=True))
         require(v > 0 and abs(cosine) <= 1e-5 * u * v, "edge_v_m", self.edge_v_m, "an edge perpendicular to edge_u_m")
+        _check_light(self.material, self.emission)
+
+
+@dataclass(frozen=True)
+class Disc:
+    """A flat disc; `emission` is the radiance on the side of `normal`; `illuminant` as for Quad."""
+
+    centre_m: Vector
+    normal: Vector
+    radius_m: float
+    material: str | None = None
+    emission: Vector = BLACK
+    illuminant: str = "D65"
+
+    def __post_init__(self) -> None:
+        require_finite("centre_m", self.centre_m)
+        require_finite("normal", self.normal)
+        require(length(self.normal) > 0, "normal", self.normal, "a direction")
+        require_positive("radius_m", self.radius_m)
         _check_light(self.material, self.emission)
 
 
@@ -122,9 +141,10 @@ def _check_corners(low: Vector, high: Vector) -> None:
 
 @dataclass(frozen=True)
 class MeshSettings:
-    """Triangles: `vertices_m` and `faces` (counted from 0), or an OBJ `file` beside the scene file.
+    """Triangles: `vertices_m` and `faces` (counted from 0), or an OBJ or PLY `file` beside the scene file.
 
-    Scaled, turned about y, then moved. `smooth` interpolates vertex normals.
+    Scaled, turned about y, then moved. `smooth` interpolates vertex normals, those of the file or else the mean of the
+    triangles around; left out, those of the file where it has them; false leaves the triangles flat.
     """
 
     material: str
@@ -134,7 +154,7 @@ class MeshSettings:
     scale: float = 1.0
     rotate_y_deg: float = 0.0
     translate_m: Vector = BLACK
-    smooth: bool = False
+    smooth: bool | None = None
 
     def __post_init__(self) -> None:
         inline = self.vertices_m is not None and self.faces is not None

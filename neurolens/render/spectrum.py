@@ -150,9 +150,17 @@ class SpectralRange:
 
         Zero everywhere where the light has nothing within the range.
         """
-        ratio = self.means(nm, values) / self.means(table("wavelength_nm"), table("d65"))
-        luminance = float(SRGB.to_xyz[1] @ self.film_rgb(ratio))
+        ratio = self.over_d65(nm, values)
+        luminance = self.luminance(ratio)
         return ratio / luminance if luminance > 0 else np.zeros(self.bins)
+
+    def over_d65(self, nm: ArrayLike, values: ArrayLike) -> FloatArray64:
+        """A spectrum over that of D65, [bins]."""
+        return self.means(nm, values) / self.means(table("wavelength_nm"), table("d65"))
+
+    def luminance(self, spectrum: ArrayLike) -> float:
+        """Luminance on the film of a radiance [bins] relative to D65."""
+        return float(SRGB.to_xyz[1] @ self.film_rgb(spectrum))
 
     def spectrum(self, rgb: tuple[float, float, float] | NDArray[np.floating]) -> FloatArray:
         """Spectrum [..., bins] of linear sRGB colours [..., 3]."""

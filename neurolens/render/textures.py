@@ -1,16 +1,17 @@
-"""Patterns on flat surfaces: checker, lines, pictures."""
+"""Patterns on flat surfaces: checker, lines, pictures; and pictures on meshes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
 from neurolens.render.checks import Vector
+from neurolens.render.materialsettings import Texture
 from neurolens.render.palette import Index
-from neurolens.render.scene import Texture
 from neurolens.render.spectrum import SpectralRange
 
 Frame = NDArray[np.float64]
@@ -36,10 +37,42 @@ def plane_frame(point: Frame, normal: Frame) -> Frame:
     return _frame(point, u, np.cross(normal, u), (1.0, 1.0))
 
 
+def disc_frame(centre: Frame, normal: Frame, radius: float) -> Frame:
+    """As for a plane, from the lower left corner of the square around a disc."""
+    frame = plane_frame(centre, normal)
+    frame[:, 3] += radius
+    frame[:, 4] = 2 * radius
+    return frame
+
+
 def box_frame(low: Frame, axis: int) -> Frame:
     """From the lowest corner of a box along the axes of a face: x or z across, y up; x and z on floor and ceiling."""
     u, v = {0: (2, 1), 1: (0, 2), 2: (0, 1)}[axis]
     return _frame(low, np.eye(3)[u], np.eye(3)[v], (1.0, 1.0))
+
+
+def triangle_frames(planes: Frame, uv: Frame) -> Frame:
+    """Texture coordinates [T, 3 corners, 2] of triangles as affine functions of a point, [T, 2, 5], in pictures.
+
+    `planes`: [T, 3, 4] from `neurolens.render.mesh.triangle_planes`; rows 1 and 2 are the weights of corners 1 and 2.
+    """
+    step = uv[:, 1:] - uv[:, :1]  # [T, 2, 2]
+    rows = np.einsum("tkc,tkj->tcj", step, planes[:, 1:])
+    rows[:, :, 3] += uv[:, 0]
+    return np.concatenate([rows, np.ones((len(uv), 2, 1))], axis=2)
+
+
+@dataclass(frozen=True)
+class Textured:
+    """Surfaces in a row with one texture, or none.
+
+    Attributes:
+        count: how many. texture: its name. frames: [count, 2, 5] from `_frame` or `triangle_frames`.
+    """
+
+    count: int
+    texture: str | None = None
+    frames: Frame | None = None
 
 
 class TextureTable:
@@ -47,16 +80,14 @@ class TextureTable:
 
     Args:
         textures: by name. images: linear RGB [H, W, 3] of those of kind "image".
-        names: texture of each surface, or None.
-        frames: [2, 5] from `_frame` of each surface, or None. colour: gives a colour's row of the palette.
+        surfaces: all surfaces. colour: gives a colour's row of the palette.
     """
 
     def __init__(
         self,
         textures: dict[str, Texture],
         images: dict[str, FloatArray],
-        names: list[str | None],
-        frames: list[Frame | None],
+        surfaces: Sequence[Textured],
         colour: Callable[[Vector], int],
         spectral: SpectralRange,
     ) -> None:
@@ -64,15 +95,19 @@ class TextureTable:
         self._images = images
         self._basis = spectral.rotated(spectral.basis.astype(np.float32))
         numbers = {name: k for k, name in enumerate(textures)}
-        self._number = np.array([-1 if name is None else numbers[name] for name in names])
         self._rows = [np.array([colour(c) for c in t.colours or ()], np.intp) for t in textures.values()]
-        self._frames = np.zeros((2, 4, len(names)), np.float32)
-        for surface, (name, frame) in enumerate(zip(names, frames, strict=True)):
-            if name is not None and frame is not None:
-                texture = textures[name]
+        total = sum(part.count for part in surfaces)
+        self._number, self._frames = np.full(total, -1), np.zeros((2, 4, total), np.float32)
+        first = 0
+        for part in surfaces:
+            if part.texture is not None and part.frames is not None:
+                texture, rows = textures[part.texture], slice(first, first + part.count)
                 cell = texture.cell_m
-                size = texture.size_m or ((cell, cell) if cell else frame[:, 4])
-                self._frames[:, :, surface] = frame[:, :4] / np.array(size)[:, None]  # in cells, or in pictures
+                size = texture.size_m or ((cell, cell) if cell else part.frames[0, :, 4])
+                self._number[rows] = numbers[part.texture]
+                # In cells, or in pictures.
+                self._frames[:, :, rows] = np.moveaxis(part.frames[:, :, :4] / np.array(size)[:, None], 0, -1)
+            first += part.count
         self._used = bool(np.any(self._number >= 0))
 
     def apply(

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 from neurolens.errors import InputError
+from neurolens.render.checks import Vector
+from neurolens.render.directions import centres
 from neurolens.render.film import PixelGrid
 from neurolens.render.filmsettings import FilmSettings, WavelengthMode
 from neurolens.render.illuminants import illuminant
 from neurolens.render.scenefile import Scene
+from neurolens.render.sky import sun_spectrum, total_spectrum
 from neurolens.render.spectrum import FloatArray64, SpectralRange
 
 LANES = 4  # wavelengths of a hero path, and paths that share their random numbers
@@ -40,14 +45,12 @@ def expected_light(scene: Scene) -> tuple[FloatArray64, FloatArray64]:
     """Spectrum (nm, radiance relative to D65) of a scene's light: its lamps by their area, and as much environment."""
     fine = SpectralRange(*scene.settings.camera.wavelengths_nm, _FINE)
     lamps: dict[str, FloatArray64] = {}  # sums of emission by illuminant
-    for quad in scene.settings.quads:
-        area = float(np.linalg.norm(np.cross(quad.edge_u_m, quad.edge_v_m)))
-        lamps[quad.illuminant] = lamps.get(quad.illuminant, 0.0) + area * np.array(quad.emission)
-    for sphere in scene.settings.spheres:
-        area = 4 * np.pi * sphere.radius_m**2
-        lamps[sphere.illuminant] = lamps.get(sphere.illuminant, 0.0) + area * np.array(sphere.emission)
+    for name, emission, area in _lamps(scene):
+        lamps[name] = lamps.get(name, 0.0) + area * np.array(emission)
     around = scene.settings.environment
     bands = [b for b in (around.colour, around.zenith, around.horizon, around.ground) if b is not None]
+    if scene.environment is not None:
+        bands = list(scene.environment.mean(axis=0, dtype=np.float64))
 
     total = np.zeros(_FINE)
     for group in (lamps, {around.illuminant: np.sum(bands, axis=0)}):
@@ -58,7 +61,35 @@ def expected_light(scene: Scene) -> tuple[FloatArray64, FloatArray64]:
             light += fine.relative(*found) * fine.spectrum(rgb)
         if light.any():
             total += light / light.mean()
+    for spectrum in _daylight(scene):
+        shine = fine.relative(*spectrum)
+        total += shine / shine.mean()
     return fine.centres_nm, total if total.any() else np.ones(_FINE)
+
+
+def _lamps(scene: Scene) -> Iterator[tuple[str, Vector, float]]:
+    """Illuminant, emission and area of the lamps; for those without size, the area that gives their flux."""
+    settings = scene.settings
+    for quad in settings.quads:
+        yield quad.illuminant, quad.emission, float(np.linalg.norm(np.cross(quad.edge_u_m, quad.edge_v_m)))
+    for disc in settings.discs:
+        yield disc.illuminant, disc.emission, np.pi * disc.radius_m**2
+    for sphere in settings.spheres:
+        yield sphere.illuminant, sphere.emission, 4 * np.pi * sphere.radius_m**2
+    for point in settings.points:
+        yield point.illuminant, point.intensity, 4.0
+    for spot in settings.spots:
+        middle = np.radians(0.5 * (spot.inner_deg + spot.outer_deg))
+        yield spot.illuminant, spot.intensity, 2 * (1 - float(np.cos(middle)))
+
+
+def _daylight(scene: Scene) -> Iterator[tuple[FloatArray64, FloatArray64]]:
+    """Spectra of the clear sky and of the sun, where the scene has them."""
+    if (sky := scene.settings.sky) is not None:
+        upper = centres(32, 16)
+        yield total_spectrum(sky, upper[:, upper[1] > 0])
+        if sky.sun:
+            yield sun_spectrum(sky)[:2]
 
 
 def mode_for(camera: Camera, grid: PixelGrid, limits_nm: tuple[float, float], film: FilmSettings) -> WavelengthMode:

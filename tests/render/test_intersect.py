@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from render_helpers import diffuse, world
 
-from neurolens.errors import InputError
-from neurolens.render.mesh import Mesh, read_obj
+from neurolens.render.mesh import Mesh
 from neurolens.render.primitives import Rays
 
 RANDOM = np.random.default_rng(11)
@@ -161,16 +158,3 @@ def test_smooth_normals_follow_the_curve() -> None:
     point = batch.origin + best * batch.direction
     flat, smooth = made.normals(made.surfaces(found, point), point)
     assert np.sum(smooth * radial, axis=0).min() > 0.9995 > np.sum(flat * radial, axis=0).min()
-
-
-def test_obj_reads_polygons_and_names_bad_lines(tmp_path: Path) -> None:
-    path = tmp_path / "a.obj"
-    path.write_text("# square\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvn 0 0 1\nf 1/1/1 2//1 3 -1\n")
-    vertices, faces = read_obj(path)
-    assert vertices.shape == (4, 3) and faces.tolist() == [[0, 1, 2], [0, 2, 3]]
-    for bad in ("v 0 0", "v 0 0 x", "f 1 2", "f 1 b 3"):
-        path.write_text(f"v 0 0 0\n{bad}\n")
-        with pytest.raises(InputError, match="line 2"):
-            read_obj(path)
-    with pytest.raises(InputError, match=r"none\.obj"):
-        read_obj(tmp_path / "none.obj")

@@ -114,7 +114,7 @@ def test_aiming_at_lights_changes_the_noise_and_not_the_mean(floor: str) -> None
     made = world(materials=MATERIALS, environment=WHITE, planes=[plane], spheres=lamps, quads=[panel])
     aimed = radiance(made, [0, 1, 3], [0.1, 0, 0], samples=16384, max_depth=3)
     found = radiance(made, [0, 1, 3], [0.1, 0, 0], samples=65536, max_depth=3, aim=False, seed=1)
-    assert aimed.std() < 0.7 * found.std()
+    assert aimed.std() < 0.75 * found.std()
     tolerance = 4 * math.hypot(aimed.std() / 128, found.std() / 256)
     assert tolerance < 0.03 * aimed.mean()
     assert abs(aimed.mean() - found.mean()) < tolerance

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from neurolens.render.coat import CoatTable
 from neurolens.render.materials import (
+    GlossyLobes,
     cosine_direction,
     fresnel_dielectric,
     glass_direction,
-    glossy_evaluate,
-    glossy_sample,
 )
 
 RANDOM = np.random.default_rng(7)
@@ -25,6 +25,12 @@ def repeated(vector: tuple[float, float, float], count: int = COUNT) -> np.ndarr
 
 def full(value: float, count: int = COUNT) -> np.ndarray:
     return np.full(count, value, np.float32)
+
+
+def glossy(normal: np.ndarray, out: np.ndarray, base: float, coat: float, alpha: float) -> GlossyLobes:
+    count = normal.shape[1]
+    numbers = [full(value, count) for value in (base, coat, alpha)]
+    return GlossyLobes(normal, out, *numbers, CoatTable([alpha]), np.zeros(count, np.intp))
 
 
 def test_cosine_directions_have_the_moments_of_the_cosine_law() -> None:
@@ -40,10 +46,10 @@ def test_cosine_directions_have_the_moments_of_the_cosine_law() -> None:
 def test_glossy_sampling_and_evaluation_agree(angle_deg: float, base: float, coat: float, roughness: float) -> None:
     angle = math.radians(angle_deg)
     normal, out = repeated((0, 0, 1)), repeated((math.sin(angle), 0, math.cos(angle)))
-    material = (full(base), full(coat), full(roughness**2))
+    lobes = glossy(normal, out, base, coat, roughness**2)
     square, lobe = RANDOM.random((2, COUNT), np.float32), RANDOM.random(COUNT, np.float32)
-    inward = glossy_sample(normal, out, *material, square, lobe)
-    value, density = glossy_evaluate(normal, out, inward, *material)
+    inward = lobes.sample(square, lobe)
+    value, density = lobes.evaluate(inward)
     above = inward[2] > 0
     sampled = np.where(above, value / density, 0).mean()
 
@@ -51,7 +57,7 @@ def test_glossy_sampling_and_evaluation_agree(angle_deg: float, base: float, coa
     u, v = RANDOM.random((2, COUNT), np.float32)
     uniform[2], side = u, np.sqrt(1 - u * u)
     uniform[0], uniform[1] = side * np.cos(2 * np.pi * v), side * np.sin(2 * np.pi * v)
-    value, density = glossy_evaluate(normal, out, uniform, *material)
+    value, density = lobes.evaluate(uniform)
     error = float(5 * 2 * np.pi * value.std() / math.sqrt(COUNT))
     assert sampled == pytest.approx(float(2 * np.pi * value.mean()), abs=error + 2e-3)
     assert sampled <= 1.0 + 2e-3
@@ -66,8 +72,7 @@ def test_glossy_scattering_is_reciprocal() -> None:
         v[2] = np.abs(v[2]) + 0.05
         v /= np.linalg.norm(v, axis=0)
     normal = repeated((0, 0, 1), 1000)
-    material = (full(0.5, 1000), full(0.1, 1000), full(0.16, 1000))
-    forth, back = (glossy_evaluate(normal, *pair, *material)[0] for pair in ((a, b), (b, a)))
+    forth, back = (glossy(normal, x, 0.5, 0.1, 0.16).evaluate(y)[0] for x, y in ((a, b), (b, a)))
     assert np.allclose(forth / b[2], back / a[2], rtol=1e-3)
 
 

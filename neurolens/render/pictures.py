@@ -1,0 +1,71 @@
+"""Pictures that a scene names: textures and environments, bounded before they are decoded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from neurolens.cameras.contract import FloatArray
+from neurolens.errors import InputError
+from neurolens.render.spectrum import srgb_to_linear
+
+LARGEST_PICTURE, LARGEST_ENVIRONMENT = 8192, 4096  # pixels a side
+
+
+def read_picture(scene: Path, field: str, path: Path, most: int = LARGEST_PICTURE) -> FloatArray:
+    """Linear RGB [H, W, 3] of an sRGB picture.
+
+    Raises:
+        InputError: names scene file, field and picture, which is missing, too large or broken.
+    """
+    try:
+        with Image.open(path) as picture:
+            if max(picture.size) > most:
+                raise InputError(scene, field, str(path), f"a picture of at most {most} pixels a side")
+            return srgb_to_linear(np.asarray(picture.convert("RGB"), np.float32) / 255)
+    except FileNotFoundError:
+        raise InputError(scene, field, str(path), "a picture that exists") from None
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(scene, field, str(path), f"a readable picture ({error})") from None
+
+
+def read_environment(scene: Path, field: str, path: Path) -> FloatArray:
+    """Linear sRGB [H, W, 3] of an equirectangular picture, OpenEXR or whatever Pillow reads.
+
+    Raises:
+        InputError: as `read_picture`; also a picture that is not twice as wide as high, values that are negative or not
+            finite, and black all over.
+    """
+    exr = path.suffix.lower() == ".exr"
+    picture = _read_exr(scene, field, path) if exr else read_picture(scene, field, path, LARGEST_ENVIRONMENT)
+    height, width = picture.shape[:2]
+    if width != 2 * height:
+        raise InputError(scene, field, f"({width} x {height} pixels)", "an equirectangular picture, 2 : 1")
+    if not np.all((picture >= 0) & np.isfinite(picture)):
+        raise InputError(scene, field, str(path), "a picture of finite values, 0 or more")
+    if not picture.any():
+        raise InputError(scene, field, str(path), "a picture that is not black all over")
+    return picture
+
+
+def _read_exr(scene: Path, field: str, path: Path) -> FloatArray:
+    import OpenEXR
+
+    try:
+        if not path.is_file():
+            raise InputError(scene, field, str(path), "a picture that exists")
+        with OpenEXR.File(str(path), header_only=True) as file:
+            low, high = file.header()["dataWindow"]
+        if max(high[k] - low[k] + 1 for k in range(2)) > LARGEST_ENVIRONMENT:
+            raise InputError(scene, field, str(path), f"a picture of at most {LARGEST_ENVIRONMENT} pixels a side")
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
+    except InputError:
+        raise
+    except Exception as error:  # the binding raises RuntimeError and others
+        raise InputError(scene, field, str(path), f"a readable OpenEXR file ({error})") from None
+    if not {"R", "G", "B"} <= channels.keys():
+        raise InputError(scene, field, f"(channels {', '.join(channels)})", "channels R, G and B")
+    return np.stack([channels[name] for name in "RGB"], axis=-1)
