@@ -32,6 +32,7 @@ BASE = {
     "frontsurface",
     "axes",
     "statetable",
+    "programs",
 }
 # Parts of the package that each part may import, besides itself and the base.
 PARTS = {

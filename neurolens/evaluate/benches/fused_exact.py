@@ -14,7 +14,7 @@ from neurolens.evaluate.speed import Unavailable
 from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.surrogates.domain import Domain
-from neurolens.surrogates.source.expressions import Expr, Program
+from neurolens.programs.expressions import Expr, Program
 from neurolens.surrogates.source.fused import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
 
 # The index is a polynomial in 1 / lambda^2 that holds it to float32's last bit.

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from neurolens.evaluate.benches.compiled_source import FLAGS
+from neurolens.programs.compiler import FLAGS
 from neurolens.evaluate.benches.fused_speed import WAVELENGTH_NM, WITHIN_UM, Row
 from neurolens.evaluate.benches.trace_speed_page import machine
 from neurolens.files import atomic_write_text

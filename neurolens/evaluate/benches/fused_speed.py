@@ -32,7 +32,7 @@ from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.source.expressions import Program
+from neurolens.programs.expressions import Program
 from neurolens.surrogates.source.fused import ALL, RAY_ONLY, Fixed, Parts, fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 
