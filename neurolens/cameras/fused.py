@@ -7,7 +7,6 @@ The system's C compiler makes the code when the camera is made (1 to 10 s, kept 
 from __future__ import annotations
 
 import ctypes
-from dataclasses import replace
 from typing import Any
 
 import numpy as np

@@ -9,7 +9,17 @@ from __future__ import annotations
 import ctypes
 
 from neurolens.programs.c import Signature, write_c
-from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STATUS, STOP, STOP_RADIUS, TRANSMITTANCE, WAVELENGTH, derivative
+from neurolens.programs.contract import (
+    FILM_Z,
+    RAY,
+    SCENE_RAY,
+    STATUS,
+    STOP,
+    STOP_RADIUS,
+    TRANSMITTANCE,
+    WAVELENGTH,
+    derivative,
+)
 from neurolens.programs.expressions import Program
 
 BLOCK = 256  # rays: their numbers between the stages fit the first cache
@@ -31,14 +41,20 @@ class Setting(ctypes.Structure):
         ("centres", ctypes.c_void_p),
         ("rows", ctypes.c_int),
         ("segments", ctypes.c_int),
-        *((name, ctypes.c_float) for name in (
-            "per_radius", "wave_first", "wave_scale", "per_distance", "scale", "film_z_mm", "stop_radius_mm", "film_z_m",
-        )),
-    ]  # fmt: skip
+        *((name, ctypes.c_float) for name in ("per_radius", "wave_first", "wave_scale", "per_distance")),
+        *((name, ctypes.c_float) for name in ("scale", "film_z_mm", "stop_radius_mm", "film_z_m")),
+    ]
 
 
 _TEXT = """
 #define BLOCK {block}
+
+/* Functions of their own: where they are put into their caller, what is known of their arguments is lost. */
+#if defined(__GNUC__)
+#define APART static __attribute__((noinline))
+#else
+#define APART static
+#endif
 
 typedef struct {{
     const float *edges, *centres;
@@ -51,7 +67,7 @@ typedef struct {{ float x, y, dx, dy; }} edge;
 LENS_INLINE float up(float a, float b) {{ return a > b ? a : b; }}
 
 /* Points of the pupil for numbers u, v of the unit square, and the pupil's area, 0 where nothing passes. */
-static void pupil_points(
+APART void pupil_points(
     int count, const setting *s, const float *LENS_RESTRICT fx, const float *LENS_RESTRICT fy,
     const float *LENS_RESTRICT u, const float *LENS_RESTRICT v, const float *LENS_RESTRICT wavelength,
     float *LENS_RESTRICT px, float *LENS_RESTRICT py, float *LENS_RESTRICT area)
@@ -106,22 +122,23 @@ static void pupil_points(
 }}
 
 /* Weights from the transmittance; metres in the camera's frame; what is dark, or does not pass, weighs nothing. */
-static void finish(
+APART void finish(
     int count, const setting *s, const float *LENS_RESTRICT fx, const float *LENS_RESTRICT fy,
     const float *LENS_RESTRICT px, const float *LENS_RESTRICT py, const float *LENS_RESTRICT area,
     float *LENS_RESTRICT x, float *LENS_RESTRICT y, float *LENS_RESTRICT z,
     float *LENS_RESTRICT dx, float *LENS_RESTRICT dy, float *LENS_RESTRICT dz,
     float *LENS_RESTRICT weight, int *LENS_RESTRICT status)
 {{
+    const float per_distance = s->per_distance, scale = s->scale, film_z_m = s->film_z_m;
     for (int i = 0; i < count; i++) {{
-        const float tx = (px[i] - fx[i]) * s->per_distance, ty = (py[i] - fy[i]) * s->per_distance;
+        const float tx = (px[i] - fx[i]) * per_distance, ty = (py[i] - fy[i]) * per_distance;
         const float cos2 = 1.0f / (1.0f + (tx * tx + ty * ty));
-        const float w = up(weight[i], 0.0f) * area[i] * cos2 * cos2 * s->scale;
+        const float w = up(weight[i], 0.0f) * area[i] * cos2 * cos2 * scale;
         weight[i] = area[i] > 0.0f && status[i] == {passed} ? w : 0.0f;
         status[i] = area[i] > 0.0f ? status[i] : {outside};
         x[i] = area[i] > 0.0f ? x[i] * 1e-3f : 0.0f;
         y[i] = area[i] > 0.0f ? y[i] * 1e-3f : 0.0f;
-        z[i] = area[i] > 0.0f ? z[i] * 1e-3f - s->film_z_m : 0.0f;
+        z[i] = area[i] > 0.0f ? z[i] * 1e-3f - film_z_m : 0.0f;
         dx[i] = area[i] > 0.0f ? dx[i] : 0.0f;
         dy[i] = area[i] > 0.0f ? dy[i] : 0.0f;
         dz[i] = area[i] > 0.0f ? dz[i] : -1.0f;

@@ -60,7 +60,7 @@ class CompiledSource:
         kinds = ["(const float *)a[{}]"] * len(s.per_ray) + ["*(const float *)a[{}]"] * len(s.per_call)
         kinds += ["*(const int *)a[{}]"] * (s.bands > 1) + ["(float *)a[{}]"] * len(s.outputs) + ["(int *)a[{}]"]
         given = ", ".join(kind.format(i) for i, kind in enumerate(kinds))
-        return f'void neurolens_run(size_t n, void **a) {{ {_NAME}_rays(n, {given}); }}\n'
+        return f"void neurolens_run(size_t n, void **a) {{ {_NAME}_rays(n, {given}); }}\n"
 
     def outputs(self, count: int) -> dict[str, NDArray[Any]]:
         """Arrays for the results of so many rays."""

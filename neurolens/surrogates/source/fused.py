@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from neurolens import status as st
 from neurolens.errors import InputError
 from neurolens.modelfile import DOMAIN_SLACK
+from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
+from neurolens.programs.expressions import Expr, Program
 from neurolens.surrogates.front import sag_mm
 from neurolens.surrogates.model import DIRECTION, POSITION, STOP, LensModel
 from neurolens.surrogates.onnx.export import largest_angle
 from neurolens.surrogates.onnx.series import fit_series
 from neurolens.surrogates.source.cores import Field, Results, Wanted, add_core
-from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
-from neurolens.programs.expressions import Expr, Program
 
 _T = TypeVar("_T")
 # Passing rays cross the front surface within its rim; a little more, for the model's own error.
