@@ -1,6 +1,6 @@
 """The folders are layers: imports go one way, a render needs no torch, and modules stay short enough to read.
 
-base (errors, status, files, tomlfile, config, progress, focus, modelfile)
+base (errors, status, files, tomlfile, config, progress, focus, modelfile, programs)
 base <- optics <- surrogates <- evaluate <- commands <- cli
         optics <- analysis   <- evaluate
      <- cameras <- render    <- evaluate
@@ -32,6 +32,7 @@ BASE = {
     "frontsurface",
     "axes",
     "statetable",
+    "programs",
 }
 # Parts of the package that each part may import, besides itself and the base.
 PARTS = {
@@ -58,9 +59,10 @@ PACKAGES = {
 EXACT_CAMERA = {
     "neurolens.cameras.exact": ({"optics"}, {"torch"}),
     "neurolens.cameras.exact_pupils": ({"optics"}, set()),
+    "neurolens.cameras.fusedexact": ({"optics"}, set()),
     "neurolens.cameras.build": ({"optics"}, set()),
 }
-NEEDS_TORCH = {"neurolens.cameras.exact", "neurolens.cameras.exact_pupils"}
+NEEDS_TORCH = {f"neurolens.cameras.{name}" for name in ("exact", "exact_pupils", "fusedexact")}
 
 
 def module_name(path: Path) -> str:

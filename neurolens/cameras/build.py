@@ -6,6 +6,7 @@
     thick:LENS.toml                     principal planes and pupils of a lens file
     LENS.toml                           the lens, traced exactly
     MODEL.onnx                          an exported model of one
+    fused:LENS.toml, fused:MODEL.onnx   the same, compiled by the system's C compiler
 
 Only a lens file needs torch, which is imported when one is asked for.
 """
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 FISHEYES = tuple(f"fisheye-{name}" for name in PROJECTIONS)
 IDEAL = ("thin", "pinhole", *FISHEYES)
 THICK = "thick:"
+FUSED = "fused:"  # before a path: compiled by the system's C compiler
 _DARK_FILM = 1.25  # diagonal of the film over the image circle
 _EFL_MM, _FISHEYE_EFL_MM, _THIN_F_NUMBER, _PINHOLE_F_NUMBER = 50.0, 14.0, 4.0, 8.0
 
@@ -95,22 +97,21 @@ def make_camera(spec: str | Path, shot: Shot) -> Camera:
 
 
 def _camera(spec: str, shot: Shot) -> Camera:
-    thick = spec.startswith(THICK)
-    path = Path(spec.removeprefix(THICK))
+    thick, fused = spec.startswith(THICK), spec.startswith(FUSED)
+    path = Path(spec.removeprefix(THICK).removeprefix(FUSED))
     exact = path.suffix == ".toml" and not thick
-    _refuse(
-        spec, "pupil", None if exact or shot.pupil == "outline" else shot.pupil, "left out: only a lens file has it"
-    )
+    only = "left out: only a lens file that is traced as it is has it"
+    _refuse(spec, "pupil", None if (exact and not fused) or shot.pupil == "outline" else shot.pupil, only)
     if spec in IDEAL:
         return _ideal(spec, shot)
     if path.suffix not in (".toml", ".onnx") or (thick and path.suffix != ".toml"):
-        expected = f"a lens file (.toml), {THICK}FILE.toml, a model (.onnx), {' or '.join(IDEAL)}"
+        expected = f"a lens file (.toml), {THICK}FILE.toml, a model (.onnx), {FUSED}FILE, {' or '.join(IDEAL)}"
         raise InputError("camera", "--camera", spec, expected)
     if not path.is_file():
         raise InputError(path, "file", "(missing)", "a lens file" if path.suffix == ".toml" else "an ONNX model")
     if thick:
         return _thick(path, shot)
-    return _exact(path, shot) if exact else _model(path, shot)
+    return _exact(path, shot, fused) if exact else _model(path, shot, fused)
 
 
 def _ideal(kind: str, shot: Shot) -> Camera:
@@ -167,8 +168,9 @@ def _thick(path: Path, shot: Shot) -> Camera:
     return camera
 
 
-def _exact(path: Path, shot: Shot) -> Camera:
+def _exact(path: Path, shot: Shot, fused: bool) -> Camera:
     from neurolens.cameras.exact import ExactCamera
+    from neurolens.cameras.fusedexact import FusedExactCamera
     from neurolens.optics.lenscheck import check_lens, doubts
     from neurolens.optics.lensfile import read_lens
     from neurolens.optics.paraxial import first_order
@@ -178,7 +180,7 @@ def _exact(path: Path, shot: Shot) -> Camera:
     if shot.aperture is not None:
         lens = lens.with_aperture(shot.aperture)
     f_number = shot.f_number_for(first_order(lens).f_number)
-    camera = ExactCamera(
+    camera = (FusedExactCamera if fused else ExactCamera)(
         lens,
         film_mm=shot.film_mm,
         focus_m=shot.focus_m,
@@ -206,7 +208,8 @@ def _dark_film(lens: Lens, film_mm: tuple[float, float]) -> list[str]:
     ]
 
 
-def _model(path: Path, shot: Shot) -> Camera:
+def _model(path: Path, shot: Shot, fused: bool) -> Camera:
+    from neurolens.cameras.fused import FusedCamera
     from neurolens.cameras.model import OnnxCamera, load_model
     from neurolens.cameras.states import state_for
 
@@ -222,7 +225,7 @@ def _model(path: Path, shot: Shot) -> Camera:
         model = model.at(*state_for(path, model.axes, model.state, shot.zoom, shot.focus_m))
     lens, domain = model.card["lens"], model.card["domain"]
     widest = float(lens["f_number"] * lens["stop_radius_mm"] / domain["stop_radius_mm"])
-    return OnnxCamera(
+    return (FusedCamera if fused else OnnxCamera)(
         model,
         film_mm=shot.film_mm,
         focus_m=shot.focus_m,

@@ -84,7 +84,7 @@ class OnnxCamera:
         self._light_nm = used
         film_z = _film_z(model, self.focus_m)
         stop = _stop_radius(model, f_number)
-        round_stop = _Scene(model, film_z, stop)
+        round_stop = ModelScene(model, film_z, stop)
         scene = replace(round_stop, aperture=aperture)
         self.film = LensFilm(PupilTable.of(domain["bounds"]), film_z, used, scene, round_stop.passes)
         self.settings: dict[str, Any] = {
@@ -111,7 +111,7 @@ class OnnxCamera:
         Raises:
             InputError: a model exported without derivatives.
         """
-        assert isinstance(self.film.scene, _Scene)
+        assert isinstance(self.film.scene, ModelScene)
         if self._derivatives is None:
             self._derivatives = OnnxDerivatives(self.model)
         whole = partial(self.film.scene.with_differentials, self._derivatives)
@@ -131,7 +131,7 @@ class OnnxCamera:
         """
         inverse, front = self._inverse_map()
         scene = self.film.scene
-        assert isinstance(scene, _Scene)
+        assert isinstance(scene, ModelScene)
         aim = front.aim(1e3 * point_m.astype(np.float64) + [[0], [0], [scene.film_z_mm]], pupil)
         out = inverse.from_scene(aim.position, aim.direction, wavelength_nm, scene.film_z_mm, scene.stop_radius_mm)
         status = np.where(aim.status == st.PASSED, scene.stopped(out.status, out.stop_xy_mm), aim.status)
@@ -158,13 +158,13 @@ class OnnxCamera:
         other = copy(self)
         other.model, other.film, other._derivatives = self.model.reopened(), copy(self.film), None
         other._inverse = None
-        assert isinstance(self.film.scene, _Scene)
+        assert isinstance(self.film.scene, ModelScene)
         other.film.scene = replace(self.film.scene, model=other.model)
         return other
 
 
 @dataclass(frozen=True)
-class _Scene:
+class ModelScene:
     """A model at one focus and stop. The graph knows a round stop; blades and masks are tested on its crossing."""
 
     model: OnnxLens
