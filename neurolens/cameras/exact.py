@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -35,6 +35,7 @@ class ExactCamera:
         wavelength_nm: range of the wavelengths; the d line stands in for a lens without known dispersion.
         dtype: precision of the trace.
         focus: how the lens is focused; see `Lens.at`.
+        film_offset_mm: moves the film away from the lens (negative: towards it) after focusing.
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
 
@@ -53,6 +54,7 @@ class ExactCamera:
         dtype: Literal["float32", "float64"] = "float32",
         bounds: PupilBounds | None = None,
         focus: Focus = "film",
+        film_offset_mm: float = 0.0,
     ) -> None:
         self._pid = os.getpid()
         self.film_mm = check_film(film_mm)
@@ -64,6 +66,9 @@ class ExactCamera:
         used = wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
         film_z = self.lens.film_z_mm
         assert film_z is not None  # `at` places the film
+        if film_offset_mm:
+            film_z += film_offset_mm
+            self.lens = replace(self.lens, film_z_mm=film_z)
         # A lens with cylinders is searched at many azimuths for one outline: coarser, for it fits none of them closely.
         round_ = symmetric_about_axis(self.lens)
         detail = FINE if round_ else COARSE._replace(tighten=bounds is not None)
@@ -85,6 +90,7 @@ class ExactCamera:
             "focus_m": None if math.isinf(self.focus_m) else self.focus_m,
             "film_mm": list(self.film_mm),
             "film_z_mm": float(film_z),
+            "film_offset_mm": film_offset_mm,
             "stop_radius_mm": float(self.lens.stop_radius_mm),
             "focusing": focus,
             "derived": self.lens.derived,
