@@ -55,6 +55,7 @@ class Shot:
             projection, what the circle within the film shall see: sets its focal length, and what lies beyond is dark.
         focus: how a lens file is focused: "film", "best" or "internal"; see `Lens.at`.
         aperture: shape of the stop's opening; None is that of the lens file, else round.
+        film_offset_mm: moves the film away from the lens after focusing; not of a pinhole.
         clamp_f_number: an f-number wider than the lens opens becomes its widest; else it is an error of a model, and
             opens the stop of a lens file as far as the rims let light through.
         wavelength_nm: shortest and longest wavelength of the light.
@@ -71,6 +72,7 @@ class Shot:
     focus: Literal["film", "best", "internal"] = "film"
     aperture: Aperture | None = None
     wavelength_nm: tuple[float, float] = (400.0, 700.0)
+    film_offset_mm: float = 0.0
     clamp_f_number: bool = False
     pupil: str = "outline"
     vignetting: str = "both"
@@ -122,12 +124,16 @@ def _ideal(kind: str, shot: Shot) -> Camera:
     _refuse(kind, "field_deg", shot.field_deg, "left out: set efl_mm")
     focal = _EFL_MM if shot.efl_mm is None else shot.efl_mm
     if kind == "thin":
-        return ThinLens(focal, shot.f_number or _THIN_F_NUMBER, shot.focus_m, shot.film_mm, aperture=shot.aperture)
+        f_number = shot.f_number or _THIN_F_NUMBER
+        moved = shot.film_offset_mm
+        return ThinLens(focal, f_number, shot.focus_m, shot.film_mm, aperture=shot.aperture, film_offset_mm=moved)
+    _refuse(kind, "film_offset_mm", shot.film_offset_mm or None, "left out: set efl_mm")
     _refuse(kind, "aperture", shot.aperture and shot.aperture.settings(), "left out: this pinhole is a point")
     return Pinhole(focal, shot.film_mm, shot.f_number or _PINHOLE_F_NUMBER)
 
 
 def _fisheye(kind: str, shot: Shot) -> Camera:
+    _refuse(kind, "film_offset_mm", shot.film_offset_mm or None, "left out: set efl_mm")
     _refuse(kind, "aperture", shot.aperture and shot.aperture.settings(), "left out: this camera is a point")
     projection = kind.removeprefix("fisheye-")
     focal = _FISHEYE_EFL_MM if shot.efl_mm is None else shot.efl_mm
@@ -140,6 +146,7 @@ def _fisheye(kind: str, shot: Shot) -> Camera:
 
 
 def _thick(path: Path, shot: Shot) -> Camera:
+    _refuse(f"{THICK}{path}", "film_offset_mm", shot.film_offset_mm or None, "left out: set focus_m")
     from neurolens.optics.lensfile import read_lens
     from neurolens.optics.paraxial import first_order
 
@@ -188,6 +195,7 @@ def _exact(path: Path, shot: Shot, fused: bool) -> Camera:
         wavelength_nm=shot.wavelength_nm,
         focus=shot.focus,
         pupil=shot.pupil,
+        film_offset_mm=shot.film_offset_mm,
     )
     camera.settings |= {"zoom": shot.zoom, "notes": [*doubts(check_lens(tabled)), *_dark_film(lens, shot.film_mm)]}
     return camera
@@ -232,6 +240,7 @@ def _model(path: Path, shot: Shot, fused: bool) -> Camera:
         f_number=shot.f_number_for(widest),
         aperture=shot.aperture,
         wavelength_nm=shot.wavelength_nm,
+        film_offset_mm=shot.film_offset_mm,
     )
 
 

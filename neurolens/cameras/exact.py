@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -38,6 +38,7 @@ class ExactCamera:
         wavelength_nm: range of the wavelengths; the d line stands in for a lens without known dispersion.
         dtype: precision of the trace.
         focus: how the lens is focused; see `Lens.at`.
+        film_offset_mm: moves the film away from the lens (negative: towards it) after focusing.
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
         pupil: how the pupil is sampled, one of `exact_pupils.PUPILS`. All give the same picture in expectation; fewer
@@ -59,6 +60,7 @@ class ExactCamera:
         bounds: PupilBounds | None = None,
         focus: Focus = "film",
         pupil: str = OUTLINE,
+        film_offset_mm: float = 0.0,
     ) -> None:
         self._pid = os.getpid()
         self.film_mm = check_film(film_mm)
@@ -70,6 +72,9 @@ class ExactCamera:
         used = wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
         film_z = self.lens.film_z_mm
         assert film_z is not None  # `at` places the film
+        if film_offset_mm:
+            film_z += film_offset_mm
+            self.lens = replace(self.lens, film_z_mm=film_z)
         # A lens with cylinders is searched at many azimuths for one outline: coarser, for it fits none of them closely.
         round_ = symmetric_about_axis(self.lens)
         detail = FINE if round_ else COARSE._replace(tighten=bounds is not None)
@@ -95,6 +100,7 @@ class ExactCamera:
             "focus_m": None if math.isinf(self.focus_m) else self.focus_m,
             "film_mm": list(self.film_mm),
             "film_z_mm": float(film_z),
+            "film_offset_mm": film_offset_mm,
             "stop_radius_mm": float(self.lens.stop_radius_mm),
             "focusing": focus,
             "derived": self.lens.derived,

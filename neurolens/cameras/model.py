@@ -48,6 +48,7 @@ class OnnxCamera:
         zoom: of a model of a zoom's whole range: a focal length in mm, or the name of a state of the source; None
             leaves it at `model.state`.
         wavelength_nm: range of the light, which sets the exposure; None takes the model's own.
+        film_offset_mm: moves the film away from the lens (negative: towards it) after focusing.
 
     Raises:
         InputError: a focus, stop or zoom position outside the model's domain.
@@ -63,6 +64,7 @@ class OnnxCamera:
         aperture: Aperture | None = None,
         zoom: str | float | None = None,
         wavelength_nm: tuple[float, float] | None = None,
+        film_offset_mm: float = 0.0,
     ) -> None:
         self.focus_m = positive("focus_m", focus_m, infinite=True)
         if model.axes or zoom is not None:
@@ -82,7 +84,7 @@ class OnnxCamera:
         light = (low, high) if wavelength_nm is None else wavelength_nm
         used = (min(max(low, light[0]), high), max(min(high, light[1]), low))
         self._light_nm = used
-        film_z = _film_z(model, self.focus_m)
+        film_z = _film_z(model, self.focus_m, film_offset_mm)
         stop = _stop_radius(model, f_number)
         round_stop = ModelScene(model, film_z, stop)
         scene = replace(round_stop, aperture=aperture)
@@ -95,6 +97,7 @@ class OnnxCamera:
             "focus_m": None if math.isinf(self.focus_m) else self.focus_m,
             "film_mm": list(self.film_mm),
             "film_z_mm": film_z,
+            "film_offset_mm": film_offset_mm,
             "stop_radius_mm": stop,
             "aperture": aperture and aperture.settings(),
             "state": dict(zip((a.name for a in model.axes), model.state, strict=True)),
@@ -201,13 +204,18 @@ class ModelScene:
         return self(film, pupil, np.full(film.shape[1], wavelength_nm, np.float32)).status == st.PASSED
 
 
-def _film_z(model: OnnxLens, focus_m: float) -> float:
+def _film_z(model: OnnxLens, focus_m: float, offset_mm: float) -> float:
     lens, (near, far) = model.card["lens"], model.card["domain"]["film_z_mm"]
     if any(a.name == "focus" for a in model.axes):
+        if offset_mm:
+            raise InputError(model.path, "film_offset_mm", offset_mm, "0: the model knows one film position a state")
         return float(near)  # its groups focus, on the one film position of the state
-    z = film_z_mm(lens["efl_mm"], lens["front_principal_z_mm"], lens["rear_principal_z_mm"], focus_m)
+    z = film_z_mm(lens["efl_mm"], lens["front_principal_z_mm"], lens["rear_principal_z_mm"], focus_m) + offset_mm
     if not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
         limits = " to ".join(f"{v} m" for v in reversed(model.card["domain"]["focus_m"]))
+        if offset_mm:
+            expected = f"a film position within the model's domain, {near:.6g} to {far:.6g} mm (focus {limits})"
+            raise InputError(model.path, "film_offset_mm", offset_mm, expected)
         raise InputError(model.path, "focus_m", focus_m, f"a focus within the model's domain, {limits}")
     return min(max(z, near), far)
 

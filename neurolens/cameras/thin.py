@@ -26,9 +26,10 @@ class ThinLens:
         focus_m: distance from film to the object in focus, or infinity.
         film_mm: width and height of the film.
         aperture: shape of the opening; None is round.
+        film_offset_mm: moves the film away from the lens (negative: towards it) after focusing.
 
     Raises:
-        InputError: a value is not above 0, or `focus_m` is below 4 focal lengths.
+        InputError: a value is not above 0, `focus_m` is below 4 focal lengths, or the offset leaves no way to the film.
     """
 
     name = "thin"
@@ -44,12 +45,18 @@ class ThinLens:
         film_mm: tuple[float, float] = (36.0, 24.0),
         *,
         aperture: Aperture | None = None,
+        film_offset_mm: float = 0.0,
     ) -> None:
         self.focal_mm = positive("focal_mm", focal_mm)
         self.f_number = positive("f_number", f_number)
         self.focus_m = positive("focus_m", focus_m, infinite=True)
         self.film_mm = check_film(film_mm)
         self.image_distance_mm = film_z_mm(self.focal_mm, 0.0, 0.0, self.focus_m)
+        self._object_distance_mm = 1e3 * self.focus_m - self.image_distance_mm
+        if film_offset_mm:
+            self.image_distance_mm = positive("film_offset_mm, film distance", self.image_distance_mm + film_offset_mm)
+            power = 1 / self.focal_mm - 1 / self.image_distance_mm  # negative: what is sharp is virtual
+            self._object_distance_mm = 1 / power if power else math.inf
         self.radius_mm = self.focal_mm / (2 * self.f_number)
         self.settings: dict[str, Any] = {
             "camera": self.name,
@@ -57,6 +64,7 @@ class ThinLens:
             "f_number": self.f_number,
             "focus_m": None if math.isinf(self.focus_m) else self.focus_m,
             "film_mm": list(self.film_mm),
+            "film_offset_mm": film_offset_mm,
             "aperture": aperture and aperture.settings(),
         }
         self.aperture = aperture
@@ -70,7 +78,7 @@ class ThinLens:
         """Rays for film points [2, N] in mm and pupil samples [2, N]; the wavelength changes nothing."""
         count = film_mm.shape[1]
         behind = np.float32(self.image_distance_mm)
-        in_front = np.float32(1e3 * self.focus_m - self.image_distance_mm)
+        in_front = np.float32(self._object_distance_mm)
         lens = concentric_disk(pupil) * np.float32(self.radius_mm)  # [2, N] mm
 
         # All rays of a film point leave for the point where its ray through the lens centre meets the focus plane;

@@ -1,0 +1,1 @@
+"""A gallery of what real lenses do: each effect a small file, rendered and measured exact, as a surrogate and thin."""

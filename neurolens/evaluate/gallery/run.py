@@ -1,0 +1,195 @@
+"""Renders and measures the effects of the gallery; what an earlier run finished is kept."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from neurolens.errors import InputError
+from neurolens.evaluate.gallery.cameras import CAMERAS, Window
+from neurolens.evaluate.gallery.figure import Row, difference_of, draw, exposure_of
+from neurolens.evaluate.gallery.lenses import Shot, Surrogate, same_state, shot_of, surrogate_of
+from neurolens.evaluate.gallery.measures import MEASURES
+from neurolens.evaluate.gallery.measures.view import View
+from neurolens.evaluate.gallery.settings import Effect, Panel
+from neurolens.evaluate.train import versions
+from neurolens.files import atomic_write_text
+from neurolens.progress import Progress, Report
+from neurolens.render.renderer import render
+from neurolens.render.scenefile import load_scene
+
+SCHEMA = 1
+
+
+def run_effect(
+    effect: Effect, out: Path, cache: Path, *, samples: int | None = None, threads: int = 2, progress: Progress
+) -> dict[str, Any]:
+    """Render and measure an effect: NAME.png and NAME.json in `out`, fitted models in `cache`.
+
+    Args:
+        samples: a pixel; None takes each panel's own.
+
+    Returns:
+        The record, as in NAME.json; that of an earlier run where nothing has changed since.
+
+    Raises:
+        InputError: whatever is wrong with lenses, scenes, columns or the measure's name.
+    """
+    check(effect)
+    fingerprint = fingerprint_of(effect, samples)
+    known = finished(effect, out)
+    if known is not None and known["fingerprint"] == fingerprint:
+        progress.note(f"{effect.name}: done by an earlier run")
+        return known
+    shots = [shot_of(panel, load_scene(panel.scene)) for panel in effect.panel]
+    surrogates = _surrogates(effect, shots, cache, progress)
+    rows, panels = [], []
+    with progress.stage(f"{effect.name}: render") as report:
+        for k, (shot, surrogate) in enumerate(zip(shots, surrogates, strict=True)):
+            views = _views(effect, shot, surrogate, samples, threads, _part(report, k, len(shots)))
+            row = _row(shot, views)
+            rows.append(row)
+            panels.append(_record(effect, shot, surrogate, views, row))
+    record = {
+        "schema": SCHEMA,
+        "name": effect.name,
+        "title": effect.title,
+        "text": effect.text,
+        "source": effect.source,
+        "command": f"neurolens gallery {effect.name}",
+        "panels": panels,
+        "samples": samples,
+        "versions": versions(),
+        "fingerprint": fingerprint,
+    }
+    draw(effect.title, rows, out / f"{effect.name}.png")
+    atomic_write_text(out / f"{effect.name}.json", json.dumps(_plain(record), indent=1, allow_nan=False) + "\n")
+    return record
+
+
+def check(effect: Effect) -> None:
+    """Refuse names of columns and of a measure that do not exist, before anything is rendered."""
+    if effect.measure not in MEASURES:
+        raise InputError(effect.path, "measure", effect.measure, f"one of: {', '.join(MEASURES)}")
+    for column in effect.columns:
+        if column not in CAMERAS:
+            raise InputError(effect.path, "columns", column, f"one of: {', '.join(CAMERAS)}")
+    if not effect.columns:
+        raise InputError(effect.path, "columns", "(none)", f"some of: {', '.join(CAMERAS)}")
+
+
+def fingerprint_of(effect: Effect, samples: int | None) -> str:
+    """A hash of everything that a figure depends on: the files named, the versions, the samples asked for."""
+    found = hashlib.sha256(json.dumps([SCHEMA, versions(), samples], sort_keys=True).encode())
+    for file in [effect.path, *(file for panel in effect.panel for file in panel.files())]:
+        found.update(file.read_bytes())
+    return found.hexdigest()[:16]
+
+
+def finished(effect: Effect, out: Path) -> dict[str, Any] | None:
+    """The record that an earlier run left, with its figure."""
+    try:
+        record = json.loads((out / f"{effect.name}.json").read_text(encoding="utf-8"))
+        return record if record["schema"] == SCHEMA and (out / f"{effect.name}.png").is_file() else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _part(report: Report, k: int, count: int) -> Report:
+    """Progress of the k-th of so many equal parts."""
+    return lambda fraction, _left=None: report((k + fraction) / count)
+
+
+def _surrogates(effect: Effect, shots: Sequence[Shot], cache: Path, progress: Progress) -> list[Surrogate | None]:
+    """One for each shot; shots through one state of the lens share theirs."""
+    if "surrogate" not in effect.columns:
+        return [None] * len(shots)
+    made: list[tuple[Shot, Surrogate]] = []
+    for shot in shots:
+        if not any(same_state(shot, other) for other, _ in made):
+            alike = [s for s in shots if same_state(shot, s)]
+            with progress.stage(f"{effect.name}: surrogate of {shot.lens.lens_id}") as report:
+                surrogate = surrogate_of(alike, cache, report)
+            progress.note(f"{effect.name}: {surrogate.file.stem}, {_error(surrogate.record)}")
+            made.append((shot, surrogate))
+    return [next(s for other, s in made if same_state(shot, other)) for shot in shots]
+
+
+def _error(record: dict[str, Any]) -> str:
+    if record.get("rms_um") is not None:
+        return f"RMS {record['rms_um']:.3g} um on the film"
+    return f"RMS {record.get('direction_rms_deg') or math.nan:.3g} degrees"
+
+
+def _views(
+    effect: Effect, shot: Shot, surrogate: Surrogate | None, samples: int | None, threads: int, report: Report
+) -> dict[str, View]:
+    """What every camera of a panel saw."""
+    panel, views = shot.panel, {}
+    window = panel.window_mm or (0.0, 0.0, *shot.film_mm)
+    for k, column in enumerate(effect.columns):
+        camera = CAMERAS[column](shot, surrogate)
+        # One wavelength a path where the lens disperses: exact lens and surrogate then share their random numbers.
+        film = replace(shot.scene.settings.film, wavelengths="one" if camera.dispersive else "hero")
+        done = render(
+            shot.scene,
+            Window(camera, window),
+            width=panel.width,
+            height=height_of(panel, window),
+            samples=samples or panel.samples,
+            threads=threads,
+            film=film,
+        )
+        views[column] = View(shot, camera, column, done.rgb)
+        report((k + 1) / len(effect.columns))
+    return views
+
+
+def height_of(panel: Panel, window_mm: tuple[float, float, float, float]) -> int:
+    """Of the picture, in pixels."""
+    return max(1, round(panel.width * window_mm[3] / window_mm[2]))
+
+
+def _row(shot: Shot, views: dict[str, View]) -> Row:
+    first = next(iter(views.values()))
+    exposure = exposure_of(views.get("exact", first).rgb, shot.panel.exposure)
+    difference = None
+    if "exact" in views and "surrogate" in views:
+        difference = difference_of(views["surrogate"].rgb, views["exact"].rgb, exposure)
+    return Row(shot.panel.label, first.window_mm, {c: v.rgb for c, v in views.items()}, exposure, difference)
+
+
+def _record(
+    effect: Effect, shot: Shot, surrogate: Surrogate | None, views: dict[str, View], row: Row
+) -> dict[str, Any]:
+    measured = {column: MEASURES[effect.measure](view) for column, view in views.items()}
+    names = list(dict.fromkeys(name for found in measured.values() for name in found))
+    return {
+        "label": shot.panel.label,
+        "lens": shot.lens.lens_id,
+        "f_number": shot.f_number,
+        "surrogate": None
+        if surrogate is None
+        else {
+            "name": surrogate.file.stem,
+            **{k: surrogate.record.get(k) for k in ("rms_um", "direction_rms_deg", "false_pass", "false_block")},
+        },
+        "difference_mean": None if row.difference is None else float(row.difference.mean()),
+        "measured": {name: {c: found.get(name) for c, found in measured.items()} for name in names},
+    }
+
+
+def _plain(value: Any) -> Any:
+    """JSON-able: numbers of four digits, those that are none as null."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return float(f"{value:.4g}") if math.isfinite(value) else None
+    return value
