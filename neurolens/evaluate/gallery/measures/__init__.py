@@ -10,4 +10,10 @@ from neurolens.evaluate.gallery.measures.view import View
 # A measure takes what one camera saw and gives numbers; their names carry the unit.
 MEASURES: dict[str, Callable[[View], dict[str, float]]] = {
     "light_profile": aberrations.light_profile,
+    "comet": aberrations.comet,
+    "line_blur": aberrations.line_blur,
+    "edge_blur": aberrations.edge_blur,
+    "line_bow": aberrations.line_bow,
+    "colour_blur": aberrations.colour_blur,
+    "lateral_colour": aberrations.lateral_colour,
 }
