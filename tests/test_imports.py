@@ -57,9 +57,10 @@ PACKAGES = {
 # The one camera that traces rays exactly, and the maker of cameras, which imports it when one is asked for.
 EXACT_CAMERA = {
     "neurolens.cameras.exact": ({"optics"}, {"torch"}),
+    "neurolens.cameras.exact_pupils": ({"optics"}, set()),
     "neurolens.cameras.build": ({"optics"}, set()),
 }
-NEEDS_TORCH = {"neurolens.cameras.exact"}
+NEEDS_TORCH = {"neurolens.cameras.exact", "neurolens.cameras.exact_pupils"}
 
 
 def module_name(path: Path) -> str:
