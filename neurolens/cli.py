@@ -1,4 +1,4 @@
-"""The command line: `neurolens lens | analyse | glass | convert | train | evaluate | export | render | gallery | bench`.
+"""The command line: `neurolens COMMAND`, one module of `neurolens.commands` each.
 
 Errors are one line and exit code 2.
 """

@@ -28,7 +28,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("effects", metavar="EFFECT", nargs="*", help="names of effects (default: all)")
     parser.add_argument("--list", action="store_true", help="list the effects and stop")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="folder to write (default: experiments/results/gallery)")
+    parser.add_argument("--out", metavar="DIR", type=Path, help="folder (default: experiments/results/gallery)")
     parser.add_argument("--effects-in", metavar="DIR", type=Path, help="effect files (default: experiments/gallery)")
     parser.add_argument(
         "--samples", metavar="N", type=whole(1, 1 << 16), help="samples a pixel (default: the effect's own)"
@@ -60,21 +60,20 @@ def run(args: argparse.Namespace) -> int:
     progress, records = Progress(quiet=args.quiet), []
     for effect in effects:
         cache = root / "runs" / "gallery"
-        records.append(
-            run_effect(effect, out, cache, samples=args.samples, threads=args.threads, progress=progress)
-        )
+        records.append(run_effect(effect, out, cache, samples=args.samples, threads=args.threads, progress=progress))
         everything = [finished(read_effect(path), out) for path in find_effects(folder)]
         write_page([record for record in everything if record is not None], out / "README.md")
     if args.json:
         print_json({"effects": records})
         return 0
+    columns = ("exact", "surrogate", "thin")
     rows = [
-        (record["name"], panel["label"], quantity_name(name), *(_cell(found.get(c)) for c in ("exact", "surrogate", "thin")))
+        (record["name"], panel["label"], quantity_name(name), *(_cell(found.get(c)) for c in columns))
         for record in records
         for panel in record["panels"]
         for name, found in panel["measured"].items()
     ]
-    print(table(("effect", "panel", "measured", "exact", "surrogate", "thin"), rows, left=3))
+    print(table(("effect", "panel", "measured", *columns), rows, left=3))
     print(out / "README.md")
     return 0
 

@@ -89,8 +89,8 @@ def draw(title: str, rows: Sequence[Row], path: Path) -> None:
                     height = places[0][1] + places[0][3] + _LABEL / figure.get_figheight()
                     figure.text(place[0], height, name, fontsize=9.5, fontweight="bold", va="bottom")
         if shown is not None:
-            colours = figure.colorbar(shown, cax=figure.add_axes(bar))
-            colours.set_label("difference in luminance (share of white)", fontsize=8.5)
+            colours = figure.colorbar(shown, cax=figure.add_axes(bar), format="%.1e")
+            colours.set_label("share of white", fontsize=8)
             colours.ax.tick_params(labelsize=7)
             colours.outline.set_visible(False)
         _save_small(figure, path)
@@ -131,7 +131,7 @@ def _page(rows: Sequence[Row], maps: bool) -> tuple[Any, list[list[Any]], Any]:
     for (_, across), tall in zip(sizes, heights, strict=True):
         boxes.append([box(_LEFT + k * (wide + _GAP), top, across / DPI, tall) for k in range(columns)])
         top += tall + _FOOT + _LABEL
-    return figure, boxes, box(page[0] - _BAR + 0.08, _HEAD, 0.13, min(heights[0], 2.6))
+    return figure, boxes, box(page[0] - _BAR + 0.08, _HEAD, 0.13, min(max(heights[0], 1.4), 2.6))
 
 
 def _rounded_up(value: float) -> float:

@@ -138,7 +138,7 @@ def fitted(
     report: Report,
     pairs: PairSettings = PairSettings(),  # noqa: B008  frozen
 ) -> Surrogate:
-    """A surrogate of `lens` over the domain `asked` (arguments of `domain_of`), kept in `cache` by what it is made of."""
+    """A surrogate of `lens` over the domain `asked` (arguments of `domain_of`), kept in `cache`."""
     made_of = [__version__, lens.sha256, lens.stop_radius_mm, asked, asdict(fit), asdict(pairs)]
     fingerprint = hashlib.sha256(json.dumps(made_of, sort_keys=True, default=str).encode()).hexdigest()
     folder = cache / f"{lens.lens_id}-{fingerprint[:12]}"
@@ -153,6 +153,6 @@ def fitted(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NeurolensWarning)  # its errors stand in the table
         domain = domain_of(lens, **asked)
-        prepared = prepare(make_pairs(lens, domain, pairs, lambda share, _left=None: report(share / 3)))
+        prepared = prepare(make_pairs(lens, domain, pairs))
         measured = fit_and_measure(prepared, fit, folder, _VIGNETTING_RAYS, report)
     return Surrogate(measured.file, domain, measured.record)

@@ -12,9 +12,9 @@ from neurolens.files import atomic_write_text
 _HEAD = """\
 # What real lenses do
 
-Small scenes after the figures of three theses (Steinert 2009, Willi 2021, Keshmirian 2008), each through the exact lens,
-a surrogate of it and a thin lens of the same focal length and f-number; the last column is the difference of surrogate
-and exact in luminance, the same random numbers in both. Below each figure what is measured of the effect. Axes are
+Small scenes after the figures of two theses (Steinert 2009, Willi 2021), each through the exact lens, a surrogate of it
+and a thin lens of the same focal length and f-number; the last column is the difference of surrogate and exact in
+luminance, the same random numbers in both. Below each figure stands what is measured of the effect. Axes are
 millimetres of film, pictures upright. Made by `neurolens gallery`; one effect by the command beside it.
 """
 

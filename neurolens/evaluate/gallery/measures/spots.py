@@ -25,7 +25,7 @@ class Spot:
     """Light on the film about its centroid.
 
     Attributes:
-        radial_um, tangential_um: [N], outward from the film's centre and square to that; on the axis x and y as printed.
+        radial_um, tangential_um: [N], outward from the film's centre and square to that; on the axis x and y.
         weight: [N], sums to 1.
         scene_m: x and y of the scene point, camera frame.
     """
@@ -80,9 +80,7 @@ def scene_point(camera: Camera, printed_mm: tuple[float, float], depth_m: float,
     return points @ (weight / total) if total > 0 else np.full(2, np.nan)
 
 
-def film_shift(
-    camera: Camera, printed_mm: tuple[float, float], depth_m: float, from_nm: float, to_nm: float
-) -> float:
+def film_shift(camera: Camera, printed_mm: tuple[float, float], depth_m: float, from_nm: float, to_nm: float) -> float:
     """How much farther from the film's centre, in um, a scene point's image lies at one wavelength than at another.
 
     The scene point is the one seen at `printed_mm` at the first wavelength.
@@ -109,7 +107,7 @@ def _crossings(camera: Camera, film: Floats, depth_m: float, wavelength_nm: floa
     middle = (np.arange(_SIDE, dtype=np.float32) + np.float32(0.5)) / _SIDE
     pupil = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
     count = pupil.shape[1]
-    points = np.repeat(film.astype(np.float32)[:, None], count, axis=1)
+    points = np.repeat(film[:, None], count, axis=1).astype(np.float32)
     rays = camera.sample(points, pupil, np.full(count, wavelength_nm, np.float32))
     weight = rays.weight.astype(np.float64)
     origin, direction = rays.origin_m.astype(np.float64), rays.direction.astype(np.float64)

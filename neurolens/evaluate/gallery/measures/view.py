@@ -41,8 +41,8 @@ class View:
         x, y, wide, tall = self.window_mm
         across = x + wide * ((np.arange(width) + 0.5) / width - 0.5)
         up = y + tall * (0.5 - (np.arange(height) + 0.5) / height)
-        grid: tuple[Image, Image] = tuple(np.meshgrid(across, up))  # type: ignore[assignment]
-        return grid
+        x_mm, y_mm = np.meshgrid(across, up)
+        return x_mm, y_mm
 
 
 def luminance(rgb: FloatArray) -> Image:
