@@ -14,6 +14,7 @@ from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.evaluate.gallery.lenses import Shot, Surrogate
+from neurolens.evaluate.gallery.vignettes import PostProcessed
 from neurolens.optics.paraxial import first_order
 
 
@@ -90,11 +91,17 @@ def pinhole_camera(shot: Shot, surrogate: Surrogate | None) -> Camera:
     return Pinhole(float(first_order(shot.lens).efl_mm), shot.film_mm, shot.f_number)
 
 
+def post_processed(shot: Shot, surrogate: Surrogate | None) -> Camera:
+    """A thin lens without vignetting, darkened afterwards to the exact lens's centre and corner."""
+    return PostProcessed(thin_camera(shot, surrogate), exact_camera(shot, surrogate))
+
+
 # Columns that an effect may ask for. A camera is made of the shot and of the surrogate, None where no column needs one.
 CAMERAS: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
     "exact": exact_camera,
     "surrogate": surrogate_camera,
     "thin": thin_camera,
     "pinhole": pinhole_camera,
+    "post": post_processed,
 }
-TITLES = {"exact": "exact lens", "surrogate": "surrogate", "thin": "thin lens", "pinhole": "pinhole"}
+TITLES = {"exact": "exact lens", "surrogate": "surrogate", "thin": "thin lens", "pinhole": "pinhole", "post": "post-process"}

@@ -1,0 +1,210 @@
+"""The disc that a camera draws of a point of light: what a photographer calls bokeh.
+
+For each point of a grid over the pupil, the film point is sought whose ray meets the light: the light's rays, traced
+backwards, without noise. The same code for the exact lens, a surrogate and the thin lens.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens import status as st
+from neurolens.cameras.contract import Camera
+from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.model import OnnxCamera
+from neurolens.errors import InputError
+
+Array = NDArray[np.float64]
+
+_STEP_MM = 0.02  # of the finite differences: float32 rays resolve a thousandth of it
+_STEPS = 4  # of Newton's method, which stops moving after three
+_FOUND_MM = 2e-3  # a film point that the last step moved by less
+_COARSE = 24  # film points a side of the search for a start
+_MARGIN = 1.06  # of the pupil's box, for rims that cut it differently across the disc
+
+
+@dataclass(frozen=True)
+class LightDisc:
+    """A point of light as it lies on the film.
+
+    Attributes:
+        film_mm: [2, N] where its rays arrive, lens frame.
+        flux: [N] what each carries, above 0, in the camera's own scale (its exposure on the axis).
+    """
+
+    film_mm: Array
+    flux: Array
+
+    @property
+    def total(self) -> float:
+        """Flux of all rays: compare it within one camera only."""
+        return float(self.flux.sum())
+
+    @property
+    def centre_mm(self) -> Array:
+        """Centroid [2]."""
+        return np.asarray(self.film_mm @ self.flux / self.total)
+
+    @property
+    def axes_mm(self) -> tuple[float, float]:
+        """Longer and shorter diameter of the evenly lit ellipse of the same second moments: four standard deviations.
+
+        Of an evenly lit disc they are its diameter.
+        """
+        short, long = np.sqrt(np.maximum(np.linalg.eigvalsh(self._covariance()), 0))
+        return 4 * float(long), 4 * float(short)
+
+    @property
+    def widths_mm(self) -> tuple[float, float]:
+        """Four standard deviations along x and along y."""
+        x, y = 4 * np.sqrt(np.diag(self._covariance()))
+        return float(x), float(y)
+
+    @property
+    def area_mm2(self) -> float:
+        """Area of the ellipse of `axes_mm`."""
+        long, short = self.axes_mm
+        return float(np.pi / 4 * long * short)
+
+    @property
+    def long_axis_deg(self) -> float:
+        """Direction of the longer axis, from x towards y, in [0, 180)."""
+        vector = np.linalg.eigh(self._covariance())[1][:, 1]
+        return float(np.degrees(np.arctan2(vector[1], vector[0])) % 180)
+
+    def outline_mm(self, bins: int = 120) -> Array:
+        """Largest distance from the centroid in each of `bins` equal angles from x towards y, [bins]."""
+        x, y = self.film_mm - self.centre_mm[:, None]
+        angle = np.floor((np.arctan2(y, x) / (2 * np.pi) % 1) * bins).astype(np.intp) % bins
+        outline = np.zeros(bins)
+        np.maximum.at(outline, angle, np.hypot(x, y))
+        return outline
+
+    def _covariance(self) -> Array:
+        off = self.film_mm - self.centre_mm[:, None]
+        return np.asarray((off * self.flux) @ off.T / self.total)
+
+
+def light_disc(
+    camera: Camera, light_m: tuple[float, float, float], *, side: int = 96, wavelength_nm: float = 550.0
+) -> LightDisc:
+    """The disc of a point of light.
+
+    Args:
+        light_m: where it is, camera frame: film centre at the origin, looking along -z, y up.
+        side: the pupil is sampled at side x side points.
+
+    The flux through a pupil point is the ray's weight over |d miss / d film|, miss being by how much the ray of a film
+    point passes the light: a point of light is a delta function of it.
+
+    Raises:
+        InputError: no ray of the camera's film reaches the light.
+    """
+    target = np.asarray(light_m, np.float64)
+    across = _across(target)
+    middle = ((np.arange(side) + 0.5) / side).astype(np.float32)
+    square = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
+    start = _nearest(camera, target, across, wavelength_nm)
+    films = np.repeat(start[:, None], square.shape[1], axis=1)
+    rounds = 2 if isinstance(camera, ExactCamera | OnnxCamera) else 1
+    for _ in range(rounds):  # the first finds the disc, the second the pupil that all of the disc sees
+        rays = _held_pupil(camera, films, square, wavelength_nm)
+        found, flux = _aim(rays, films, partial(_miss, target, across))
+        if found.shape[1] == 0:
+            raise InputError("light_disc", "light_m", light_m, "a light that the camera's film sees")
+        films = found[:, np.arange(square.shape[1]) * 7919 % found.shape[1]]
+    return LightDisc(found, flux)
+
+
+class _HeldPupil:
+    """Rays from film points through pupil points that stay where they are when the film point moves."""
+
+    def __init__(self, camera: Camera, square: NDArray[np.float32], wavelength_nm: float) -> None:
+        self.camera, self.pupil = camera, square
+        self.wavelength = np.full(square.shape[1], wavelength_nm, np.float32)
+
+    def __call__(self, film: Array) -> tuple[Array, Array, Array]:
+        """Origins [3, N] in metres and directions [3, N], camera frame; weights [N], 0 where the ray is stopped."""
+        rays = self.camera.sample(np.ascontiguousarray(film, np.float32), self.pupil, self.wavelength)
+        weight = np.where(rays.status == st.PASSED, rays.weight, 0) / self.pupil.shape[1]
+        return rays.origin_m.astype(np.float64), rays.direction.astype(np.float64), weight.astype(np.float64)
+
+
+class _LensPupil(_HeldPupil):
+    """The same of a lens or model, whose `sample` turns the pupil with the film point: pupil points in mm."""
+
+    camera: ExactCamera | OnnxCamera
+
+    def __init__(
+        self, camera: ExactCamera | OnnxCamera, square: NDArray[np.float32], wavelength_nm: float, films: Array
+    ) -> None:
+        super().__init__(camera, square, wavelength_nm)
+        seen, area = camera.film.outline.sample(films.astype(np.float32), square, self.wavelength)
+        low, high = (np.asarray(f(seen[:, area > 0], axis=1), np.float64) for f in (np.min, np.max))
+        centre, size = (low + high) / 2, (high - low) * _MARGIN
+        self.area = float(np.prod(size))
+        self.pupil = (centre[:, None] + size[:, None] * (square - 0.5)).astype(np.float32)
+
+    def __call__(self, film: Array) -> tuple[Array, Array, Array]:
+        lens = self.camera.film
+        points = np.ascontiguousarray(film, np.float32)
+        rays = lens.scene(points, self.pupil, self.wavelength)
+        slope2 = ((self.pupil - points).astype(np.float64) ** 2).sum(axis=0) / lens.distance_mm**2
+        weight = rays.transmittance * self.area / (1 + slope2) ** 2 / (lens.distance_mm**2 * lens.exposure)
+        weight = np.where(rays.status == st.PASSED, weight, 0) / self.pupil.shape[1]
+        origin = rays.scene_ray[:3].astype(np.float64)
+        origin[2] -= lens.film_z_mm
+        return 1e-3 * origin, rays.scene_ray[3:].astype(np.float64), weight
+
+
+def _held_pupil(camera: Camera, films: Array, square: NDArray[np.float32], wavelength_nm: float) -> _HeldPupil:
+    if isinstance(camera, ExactCamera | OnnxCamera):
+        return _LensPupil(camera, square, wavelength_nm, films)
+    return _HeldPupil(camera, square, wavelength_nm)
+
+
+def _aim(rays: _HeldPupil, film: Array, miss_of: partial[Array]) -> tuple[Array, Array]:
+    """Film points [2, M] whose rays meet the light, and their flux [M], by Newton's method from `film` [2, N]."""
+    for _ in range(_STEPS):
+        *ray, weight = rays(film)
+        miss = miss_of(*ray)
+        (a, c), (b, d) = ((miss_of(*rays(film + move)[:2]) - miss) / _STEP_MM for move in _MOVES)
+        density = a * d - b * c  # 0 where the film point left what the lens lights
+        step = np.stack([d * miss[0] - b * miss[1], a * miss[1] - c * miss[0]])
+        step = np.divide(step, density, out=np.zeros_like(step), where=density != 0)
+        film = film - step
+    good = (weight > 0) & (density != 0) & (np.hypot(*step) < _FOUND_MM)
+    return film[:, good], weight[good] / np.abs(density[good])
+
+
+_MOVES = np.eye(2)[:, :, None] * _STEP_MM
+
+
+def _miss(target: Array, across: Array, origin: Array, direction: Array) -> Array:
+    """How far rays pass a point, [2, N] metres along the two directions `across` [2, 3]."""
+    gap = origin - target[:, None]
+    return np.asarray(across @ (gap - np.einsum("in,in->n", gap, direction) * direction))
+
+
+def _nearest(camera: Camera, target: Array, across: Array, wavelength_nm: float) -> Array:
+    """The film point [2] of a coarse grid whose middle ray passes nearest to the light."""
+    places = (np.arange(_COARSE) + 0.5) / _COARSE - 0.5
+    film = np.stack([a.ravel() for a in np.meshgrid(places * camera.film_mm[0], places * camera.film_mm[1])])
+    origin, direction, weight = _HeldPupil(camera, np.full(film.shape, 0.5, np.float32), wavelength_nm)(film)
+    if not (weight > 0).any():
+        raise InputError("light_disc", "camera", camera.name, "a camera that lights its film")
+    miss = np.hypot(*_miss(target, across, origin, direction))
+    ahead = np.einsum("in,in->n", target[:, None] - origin, direction) > 0
+    return np.asarray(film[:, np.argmin(np.where((weight > 0) & ahead, miss, np.inf))])
+
+
+def _across(target: Array) -> Array:
+    """Two unit vectors [2, 3] across the line of sight from the film's centre."""
+    sight = target / np.linalg.norm(target)
+    right = np.cross(sight, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(right, sight)])
