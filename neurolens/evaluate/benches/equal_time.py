@@ -55,7 +55,7 @@ class Counts:
     Attributes:
         size: width and height in pixels.
         short: samples of the renders shorter than a pass, each `repeats` times. pass_samples, passes: of a pass, and
-            how many. reference: samples of each half of the reference.
+            how many. reference: samples of each half of the reference, rendered in `parts` with a seed each.
     """
 
     size: tuple[int, int] = (160, 90)
@@ -64,6 +64,7 @@ class Counts:
     pass_samples: int = 64
     passes: int = 16
     reference: int = 4096
+    parts: int = 4
 
     @property
     def jobs(self) -> list[tuple[int, int]]:
@@ -175,7 +176,7 @@ def measure_scene(
     reference = (halves[0] + halves[1]) / 2
     by = {measure: weights(reference, eps) for measure, eps in MEASURES.items()}
     found = {
-        name: _camera_result(name, pictures, rendered[EXACT], halves, by, counts, maps[name])
+        name: camera_result(name, pictures, rendered[EXACT], halves, by, counts, maps[name])
         for name, pictures in rendered.items()
     }
     noise2 = {measure: reference_variance(halves, weight) for measure, weight in by.items()}
@@ -185,7 +186,7 @@ def measure_scene(
 
 
 @dataclass(frozen=True)
-class _Rendered:
+class Rendered:
     """Pictures [H, W, 3] and seconds of one camera, in the order of `Counts.jobs`."""
 
     pictures: list[FloatArray]
@@ -194,17 +195,20 @@ class _Rendered:
 
 def _render(
     shelves: Mapping[str, Shelf], counts: Counts, threads: int, report: Callable[[float], None]
-) -> tuple[list[FloatArray], dict[str, _Rendered]]:
+) -> tuple[list[FloatArray], dict[str, Rendered]]:
     """The reference's halves, and every camera's renders: the cameras in turn, so that none has the quiet minutes."""
     jobs = counts.jobs
     total = 2 * counts.reference + len(shelves) * sum(n for n, _ in jobs)
     done, halves = 0, []
     for half in range(2):
-        rgb, _ = shelves[EXACT].take(counts.reference, _REFERENCE_SEED + half, threads=2)
-        halves.append(rgb.astype(np.float64))
-        done += counts.reference
-        report(done / total)
-    rendered = {name: _Rendered([], []) for name in shelves}
+        pictures, part = [], counts.reference // counts.parts
+        for k in range(counts.parts):
+            seed = _REFERENCE_SEED + half * counts.parts + k
+            pictures.append(shelves[EXACT].take(part, seed, threads=2)[0].astype(np.float64))
+            done += part
+            report(done / total)
+        halves.append(np.mean(pictures, axis=0))
+    rendered = {name: Rendered([], []) for name in shelves}
     for kept in shelves.values():
         if not all(kept.file(n, seed, threads).exists() for n, seed in jobs):
             kept.warm_up()
@@ -218,15 +222,16 @@ def _render(
     return halves, rendered
 
 
-def _camera_result(
+def camera_result(
     name: str,
-    own: _Rendered,
-    exact: _Rendered,
+    own: Rendered,
+    exact: Rendered,
     halves: list[FloatArray],
     by: Mapping[str, FloatArray],
     counts: Counts,
     film: FilmMap,
 ) -> CameraResult:
+    """What one camera's renders say, against the exact lens's and the halves of the reference; weights `by` measure."""
     passes, others = np.stack(own.pictures[-counts.passes :]), np.stack(exact.pictures[-counts.passes :])
     times = own.seconds[-counts.passes :]
     both = {measure: bias_and_variance(passes, halves, weight) for measure, weight in by.items()}
@@ -245,7 +250,7 @@ def _camera_result(
     )
 
 
-def _levels(own: _Rendered, halves: list[FloatArray], by: Mapping[str, FloatArray], counts: Counts) -> Iterator[Level]:
+def _levels(own: Rendered, halves: list[FloatArray], by: Mapping[str, FloatArray], counts: Counts) -> Iterator[Level]:
     """Errors by sample count: of the short renders, then of as many passes as fit, in groups that share none."""
     reference = (halves[0] + halves[1]) / 2
 

@@ -86,8 +86,8 @@ def _scene_text(result: SceneResult) -> str:
     return "\n".join(
         [
             f"## {stem}\n",
-            f"Focused at {result.settings.focus_m:g} m, f/{result.f_number:.3g}. The reference's own noise: {noise:.3g}%;\n"
-            f"FLIP between its halves {result.flip_halves:.3g}.\n",
+            f"Focused at {result.settings.focus_m:g} m, f/{result.f_number:.3g}."
+            f" The reference's own noise: {noise:.3g}%; FLIP between its halves {result.flip_halves:.3g}.\n",
             *_table(
                 ["camera", "bias paired %", "bias alone %", "variance a sample", "ms a sample", "efficiency 1/s"]
                 + ["exact ahead"],
