@@ -121,7 +121,7 @@ def film_of(settings: FilmSettings, args: argparse.Namespace) -> FilmSettings:
 
 def run(args: argparse.Namespace) -> int:
     """Render, write both pictures, say how it went."""
-    preview = _preview_path(args.out)
+    preview = preview_path(args.out)
     from neurolens.cameras.build import make_camera
     from neurolens.render.colour import COLOUR_SPACES
     from neurolens.render.exr import write_exr, write_png
@@ -201,7 +201,7 @@ def film_size(text: str) -> tuple[float, float]:
         raise argparse.ArgumentTypeError(f"{text!r}: {error}") from None
 
 
-def _preview_path(out: Path) -> Path:
+def preview_path(out: Path) -> Path:
     """The PNG beside the EXR; refuses names that cannot be written before anything is rendered.
 
     Raises:
