@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from neurolens import __version__
-from neurolens.commands import analyse, bench, convert, evaluate, export, gallery, glass, lens, render, train
+from neurolens.commands import analyse, bench, convert, evaluate, export, gallery, glass, lens, mitsuba, render, train
 from neurolens.commands.arguments import Parser
 from neurolens.errors import NeurolensError, NeurolensWarning
 
@@ -40,7 +40,7 @@ def build_parser() -> Parser:
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    for command in (lens, analyse, glass, convert, train, evaluate, export, render, gallery, bench):
+    for command in (lens, analyse, glass, convert, train, evaluate, export, render, gallery, mitsuba, bench):
         command.add_parser(subparsers)
     return parser
 

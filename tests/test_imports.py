@@ -4,6 +4,7 @@ base (errors, status, files, tomlfile, config, progress, focus, modelfile, progr
 base <- optics <- surrogates <- evaluate <- commands <- cli
         optics <- analysis   <- evaluate
      <- cameras <- render    <- evaluate
+                   render    <- mitsuba  <- evaluate
 """
 
 from __future__ import annotations
@@ -42,8 +43,9 @@ PARTS = {
     "surrogates": {"optics"},
     "cameras": set(),
     "render": {"cameras"},
-    "evaluate": {"optics", "analysis", "readers", "surrogates", "cameras", "render"},
-    "commands": {"optics", "analysis", "readers", "surrogates", "cameras", "render", "evaluate"},
+    "mitsuba": {"cameras", "render"},
+    "evaluate": {"optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba"},
+    "commands": {"optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "evaluate"},
     "cli": {"commands"},
 }
 # Packages from elsewhere that each part may import; what is not listed here is not restricted.
@@ -54,6 +56,7 @@ PACKAGES = {
     "readers": set(),
     "cameras": {"numpy", "onnxruntime"},
     "render": {"numpy", "OpenEXR", "PIL", "trimesh"},
+    "mitsuba": {"numpy"},
 }
 # The one camera that traces rays exactly, and the maker of cameras, which imports it when one is asked for.
 EXACT_CAMERA = {
@@ -63,6 +66,8 @@ EXACT_CAMERA = {
     "neurolens.cameras.build": ({"optics"}, set()),
 }
 NEEDS_TORCH = {f"neurolens.cameras.{name}" for name in ("exact", "exact_pupils", "fusedexact")}
+# Parts that load in a base install.
+LEAN = ("cameras", "render", "mitsuba", "commands", "cli", "base")
 
 
 def module_name(path: Path) -> str:
@@ -114,9 +119,9 @@ def test_modules_stay_short(path: Path) -> None:
 
 
 def test_cameras_renderer_and_command_line_load_without_the_training_packages() -> None:
-    wanted = [m for m in map(module_name, MODULES) if part_of(m) in ("cameras", "render", "commands", "cli", "base")]
+    wanted = [m for m in map(module_name, MODULES) if part_of(m) in LEAN]
     wanted = [m for m in wanted if m not in NEEDS_TORCH]
-    forbidden = ["torch", "sklearn", "onnx", "matplotlib", "scipy", "flip_evaluator"]
+    forbidden = ["torch", "sklearn", "onnx", "matplotlib", "scipy", "flip_evaluator", "mitsuba", "drjit"]
     code = (
         f"import importlib, sys\n"
         f"sys.modules.update(dict.fromkeys({forbidden!r}))\n"  # None makes an import fail

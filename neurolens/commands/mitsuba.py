@@ -1,0 +1,121 @@
+"""`neurolens mitsuba SCENE --camera ...`: a scene of Mitsuba 3, as it stands, through a camera of ours."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import Any
+
+from neurolens import __version__
+from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between, positive, whole
+from neurolens.commands.output import print_json
+from neurolens.commands.render import film_size
+from neurolens.commands.render_files import Files
+from neurolens.evaluate.records import plain
+from neurolens.progress import Progress, duration
+
+_DESCRIPTION = """\
+Render a scene of Mitsuba 3 (.xml, or its own cornell-box) with its integrator and its film, through
+a lens where its camera stands, and write OpenEXR with a PNG preview beside it.
+Needs the extra "mitsuba"; its llvm variants need libLLVM too, scalar ones trace one lens ray at a time."""
+_EPILOG = """\
+examples:
+  neurolens mitsuba cornell-box --camera models/NAME.onnx --film 28x28 --focus 3.6 -o box.exr
+  neurolens mitsuba scene.xml --camera thin --f-number 2 --focus 4 --variant llvm_ad_rgb -o thin.exr"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser(
+        "mitsuba", help="render a scene of Mitsuba 3 through a camera of ours",
+        description=_DESCRIPTION, epilog=_EPILOG,
+    )  # fmt: skip
+    parser.add_argument("scene", metavar="SCENE", help="scene file (.xml), or cornell-box")
+    parser.add_argument(
+        "--camera", metavar="CAMERA", required=True,
+        help="lens file (.toml, traced exactly), model (.onnx), thin or pinhole",
+    )  # fmt: skip
+    parser.add_argument(
+        "-o", "--out", metavar="OUT.exr", type=Path, required=True, help="picture to write; the preview is OUT.png"
+    )
+    parser.add_argument("--variant", metavar="NAME", help="of Mitsuba (default: llvm_ad_spectral)")
+    parser.add_argument("--samples", metavar="N", type=whole(1, 1 << 20), help="a pixel (default: the scene's)")
+    parser.add_argument(
+        "--film", metavar="WxH", type=film_size, help="size in mm (default: 36 wide, the picture's shape)"
+    )
+    parser.add_argument("--seed", metavar="N", type=whole(0, 1 << 15), default=0, help="default: 0")
+    parser.add_argument(
+        "--units-per-m", metavar="N", type=positive("scene units in a metre"), default=1.0,
+        help="of the scene (default: 1; 1000 for one in millimetres)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--exposure", metavar="STOPS", type=between(-40, 40, "stops"), default=0.0,
+        help="brightens the preview only (default: 0)",
+    )  # fmt: skip
+    add_lens_state(
+        parser,
+        {
+            "efl": "as tabled; 50 for thin and pinhole; a model has its own",
+            "f_number": "the widest; 4 for thin",
+            "focus": "inf",
+        },
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_json(parser)
+    parser.set_defaults(run=run, kept="no picture was written; older files of that name are untouched")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Render, write both pictures, say how it went."""
+    import time
+
+    preview = Files.of(args.out).preview
+    from neurolens.cameras.build import Shot, make_camera
+    from neurolens.mitsuba import load_scene, render
+    from neurolens.mitsuba.library import libraries
+    from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM
+    from neurolens.render.exr import write_exr, write_png
+
+    scene = load_scene(args.scene, args.variant)
+    width, height = (int(v) for v in scene.sensors()[0].film().size())
+    shot = Shot(
+        film_mm=args.film or (FILM_WIDTH_MM, FILM_WIDTH_MM * height / width),
+        focus_m=math.inf if args.focus is None else args.focus,
+        f_number=args.f_number,
+        efl_mm=args.efl,
+        zoom=args.zoom,
+        field_deg=args.field,
+        focus=args.focusing,
+        aperture=aperture_of(args),
+        wavelength_nm=LIGHT_NM,
+    )
+    camera = make_camera(args.camera, shot)
+    began = time.perf_counter()
+    with Progress(quiet=args.quiet).stage(f"render {args.scene}, {camera.name}") as report:
+        picture = render(
+            scene, camera, spp=args.samples, seed=args.seed, units_per_m=args.units_per_m, progress=report
+        )  # fmt: skip
+    mi, _ = libraries()
+    stats = {
+        "scene": args.scene,
+        "width": picture.shape[1],
+        "height": picture.shape[0],
+        "samples": args.samples,
+        "seed": args.seed,
+        "seconds": time.perf_counter() - began,
+        "mitsuba": mi.__version__,
+        "variant": mi.variant(),
+    }
+    write_exr(
+        args.out, picture, metadata={"version": __version__, "camera": plain(camera.settings), "render": plain(stats)}
+    )
+    write_png(preview, picture, args.exposure)
+    if args.json:
+        print_json({"file": str(args.out), "preview": str(preview), **stats, "camera": camera.settings})
+    else:
+        took = duration(float(stats["seconds"]))
+        print(
+            f"{args.scene} through {camera.name}: {width} x {height} in {took} ({mi.variant()})\n{args.out}\n{preview}"
+        )
+    return 0

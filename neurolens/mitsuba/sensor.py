@@ -1,0 +1,179 @@
+"""The Mitsuba sensor "neurolens": any camera of our contract, one numpy call a wavefront.
+
+In spectral variants a ray carries four wavelengths. Where the camera's rays hardly depend on the wavelength they are
+Mitsuba's own four, each with its weight (hero wavelengths, Wilkie et al. 2014); a lens that disperses gives all four
+lanes the wavelength of the first, for one ray is of one wavelength. RGB variants: see `wavelengths`.
+
+Weights are ours: a uniform environment of radiance 1 gives 1 on the axis, and falls off towards the edge as the lens
+vignettes. Scalar variants ask for one ray at a time, which takes half a millisecond each: for tests.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.contract import Camera, FloatArray
+from neurolens.errors import InputError
+from neurolens.mitsuba.arrays import matrix, rows, vector
+from neurolens.mitsuba.library import libraries, require_mitsuba
+from neurolens.mitsuba.rays import FilmRays, LocalRays
+from neurolens.mitsuba.wavelengths import ChannelWavelengths, extra_sample
+from neurolens.render.film import PixelGrid
+from neurolens.render.filmsettings import FilmSettings
+from neurolens.render.masks import make_aperture
+from neurolens.render.wavelengths import mode_for
+
+PLUGIN = "neurolens"
+LIGHT_NM = (400.0, 700.0)  # which sets the exposure, and the wavelengths of RGB variants; as our scenes have it
+FILM_WIDTH_MM = 36.0
+_MIDDLE_NM = 550.0
+_CLASSES: dict[str, type] = {}
+
+
+def register() -> type:
+    """Make the plugin known to the current variant of Mitsuba, once; returns the sensor's class.
+
+    Raises:
+        NeurolensError: no Mitsuba. InputError: a variant that carries neither RGB nor spectra.
+    """
+    mi = require_mitsuba()
+    variant = str(mi.variant())
+    if variant not in _CLASSES:
+        methods = {"__init__": _initialise, "to_string": _to_string, "sample_ray": _sample_ray}
+        made = type("LensSensor", (mi.Sensor,), methods | {"sample_ray_differential": _sample_ray_differential})
+        mi.register_sensor(PLUGIN, lambda props: made(props))
+        _CLASSES[variant] = made
+    return _CLASSES[variant]
+
+
+def _initialise(self: Any, props: Any, camera: Camera | None = None) -> None:
+    """The plugin's constructor.
+
+    Parameters in a scene: camera (a model, a lens file, "thin" or "pinhole"), focus_m (default inf), f_number, efl_mm,
+    zoom, film_width_mm (default 36), film_height_mm (default: by the picture's shape), blades, blade_rotation_deg,
+    blade_curvature, aperture_mask, units_per_m (default 1), to_world (of the centre of the film plane, without scale),
+    film, sampler. From Python `camera` may be an object, which brings the film's size in mm.
+    """
+    libraries()[0].Sensor.__init__(self, props)
+    film = self.film()
+    (width, height), crop, offset = (tuple(map(int, of())) for of in (film.size, film.crop_size, film.crop_offset))
+    if camera is None:
+        camera = _camera_of(props, height / width)
+    units = float(props.get("units_per_m", 1.0))
+    if not 0 < units < math.inf:
+        raise InputError(PLUGIN, "units_per_m", units, "a finite number above 0")
+    _check_rigid(self.world_transform())
+    self.rays = FilmRays(
+        camera,
+        PixelGrid(width, height, camera.film_mm),
+        (offset[0] / width, offset[1] / height),
+        (crop[0] / width, crop[1] / height),
+        units,
+    )
+    self.m_needs_sample_2 = self.m_needs_sample_3 = True
+    self.achromatic = bool(getattr(camera, "achromatic", False))
+    low, high = camera.wavelength_nm or LIGHT_NM
+    low, high = max(low, LIGHT_NM[0]), min(high, LIGHT_NM[1])
+    self.hero = mode_for(camera, self.rays.grid, (low, high), FilmSettings()) == "hero"
+    self.channels = None if self.achromatic or not low < high else ChannelWavelengths(low, high)
+
+
+def _camera_of(props: Any, shape: float) -> Camera:
+    """The camera that a scene's parameters describe, for a picture of `shape`, its height over its width.
+
+    Raises:
+        InputError, ModelError: as `make_camera`.
+    """
+    width_mm = float(props.get("film_width_mm", FILM_WIDTH_MM))
+    height_mm = float(props.get("film_height_mm", width_mm * shape))
+    name = props.get("camera", None)
+    if not isinstance(name, str):
+        raise InputError(PLUGIN, "camera", "(missing)", "a model (.onnx), a lens file (.toml), thin or pinhole")
+    aperture = make_aperture(
+        *(props.get(k, None) for k in ("blades", "blade_rotation_deg", "blade_curvature", "aperture_mask"))
+    )
+    shot = Shot(
+        film_mm=(width_mm, height_mm),
+        focus_m=float(props.get("focus_m", math.inf)),
+        f_number=props.get("f_number", None),
+        efl_mm=props.get("efl_mm", None),
+        zoom=props.get("zoom", None),
+        aperture=aperture,
+        wavelength_nm=LIGHT_NM,
+    )
+    return make_camera(_found(name), shot)
+
+
+def _found(name: str) -> str:
+    """The file of that name, sought beside an XML scene too."""
+    return str(libraries()[0].file_resolver().resolve(name))
+
+
+def _check_rigid(transform: Any) -> None:
+    turn = matrix(transform)[:3, :3]
+    if not np.allclose(turn.T @ turn, np.eye(3), atol=1e-4):
+        expected = "a rotation and a translation; set units_per_m for scenes in other units"
+        raise InputError(PLUGIN, "to_world", turn.round(4).tolist(), expected)
+
+
+def _to_string(self: Any) -> str:
+    return f"LensSensor[camera = {self.rays.camera.name}, film_mm = {list(self.rays.grid.film_mm)}]"
+
+
+def _sample_ray(self: Any, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> tuple[Any, Any]:
+    mi, _ = libraries()
+    ray, weight = _sample_ray_differential(self, time, sample1, sample2, sample3, active)
+    return mi.Ray3f(ray), weight
+
+
+def _sample_ray_differential(
+    self: Any, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
+) -> tuple[Any, Any]:
+    """Rays of one wavefront. They carry no differentials: nothing in Mitsuba 3 filters textures by them."""
+    mi, dr = libraries()
+    samples = rows(sample2.x, sample2.y, sample3.x, sample3.y)
+    position, aperture = samples[:2], samples[2:]
+    ray = dr.zeros(mi.RayDifferential3f)
+    if mi.is_spectral:
+        wavelengths, worth = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
+        if not self.hero:
+            wavelengths, worth = type(wavelengths)(wavelengths[0]), mi.Spectrum(worth[0])
+        local, weights = _lanes(self, position, aperture, rows(*wavelengths))
+        ray.wavelengths, weight = wavelengths, worth * vector(mi.Spectrum, weights)
+    else:
+        local, weights = _channels(self, position, aperture)
+        weight = vector(mi.Spectrum, weights)
+    to_world = self.world_transform()
+    ray.o = to_world @ vector(mi.Point3f, local.origin)
+    ray.d = to_world @ vector(mi.Vector3f, local.direction)
+    ray.time, ray.maxt, ray.has_differentials = time, dr.inf, False
+    return ray, weight
+
+
+def _lanes(
+    self: Any, position: FloatArray, aperture: FloatArray, wavelength_nm: FloatArray
+) -> tuple[LocalRays, FloatArray]:
+    """Rays of the first lane, and weights [4, N] of all lanes along them, at wavelengths [4, N]."""
+    wavelength_nm = np.broadcast_to(wavelength_nm, (len(wavelength_nm), position.shape[1]))
+    local = self.rays.sample(position, aperture, wavelength_nm[0])
+    weights = np.tile(local.weight, (len(wavelength_nm), 1))
+    if self.hero and not self.achromatic:
+        for lane in range(1, len(weights)):
+            weights[lane] = self.rays.sample(position, aperture, wavelength_nm[lane]).weight
+        weights *= local.weight > 0  # the ray must exist
+    return local, weights
+
+
+def _channels(self: Any, position: FloatArray, aperture: FloatArray) -> tuple[LocalRays, FloatArray]:
+    """Rays of one wavelength each, and weights [3, N] of R, G and B."""
+    if self.channels is None:
+        middle = np.full(position.shape[1], _MIDDLE_NM, np.float32)
+        local = self.rays.sample(position, aperture, middle)
+        return local, np.tile(local.weight, (3, 1))
+    wavelength_nm, worth = self.channels.draw(extra_sample(position, aperture))
+    local = self.rays.sample(position, aperture, wavelength_nm)
+    return local, worth * local.weight

@@ -1,0 +1,135 @@
+"""What needs no Mitsuba: film samples to rays in its camera frame, wavelengths for RGB, and the error without it."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.thin import ThinLens
+from neurolens.errors import InputError, NeurolensError
+from neurolens.mitsuba import load_scene
+from neurolens.mitsuba.rays import BATCH, FilmRays
+from neurolens.mitsuba.scenes import our_scene
+from neurolens.mitsuba.wavelengths import ChannelWavelengths, extra_sample
+from neurolens.render.film import PixelGrid
+from neurolens.render.spectrum import SpectralRange
+
+FILM = (30.0, 20.0)
+
+
+def film_rays(**more: object) -> FilmRays:
+    return FilmRays(Pinhole(50.0, FILM), PixelGrid(300, 200, FILM), **more)  # type: ignore[arg-type]
+
+
+def ask(rays: FilmRays, points: list[tuple[float, float]]) -> np.ndarray:
+    position = np.array(points, np.float32).T
+    return rays.sample(position, np.full_like(position, 0.5), np.full(len(points), 550, np.float32)).direction
+
+
+def test_the_picture_is_upright_and_not_mirrored() -> None:
+    # Mitsuba's camera: x to the left of the picture, y up, z into the scene; film positions from the top left.
+    middle, right, top = ask(film_rays(), [(0.5, 0.5), (1.0, 0.5), (0.5, 0.0)]).T
+    np.testing.assert_allclose(middle, [0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(right / right[2], [-15 / 50, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(top / top[2], [0, 10 / 50, 1], atol=1e-6)
+
+
+def test_a_crop_window_is_the_part_of_the_film_that_it_says() -> None:
+    part = film_rays(crop_offset=(0.25, 0.5), crop_size=(0.5, 0.25))
+    whole = ask(film_rays(), [(0.25, 0.5), (0.75, 0.75), (0.5, 0.625)])
+    np.testing.assert_allclose(ask(part, [(0, 0), (1, 1), (0.5, 0.5)]), whole, atol=1e-6)
+
+
+def test_scene_units_scale_origins_alone() -> None:
+    metres, millimetres = film_rays(), film_rays(units_per_m=1000.0)
+    position = np.array([[0.2], [0.7]], np.float32)
+    a, b = (r.sample(position, position, np.array([550.0], np.float32)) for r in (metres, millimetres))
+    np.testing.assert_allclose(a.origin[:, 0], [0, 0, 0.05], atol=1e-7)  # the hole, 50 mm in front of the film
+    np.testing.assert_allclose(b.origin, 1000 * a.origin)
+    np.testing.assert_array_equal(a.direction, b.direction)
+
+
+def test_batches_are_joined_where_they_were_cut() -> None:
+    random = np.random.default_rng(0)
+    position, aperture = random.random((2, 2, BATCH + 37), dtype=np.float32)
+    rays = FilmRays(ThinLens(50, 2, 3, FILM), PixelGrid(300, 200, FILM))
+    nm = np.full(BATCH + 37, 550, np.float32)
+    whole, tail = rays.sample(position, aperture, nm), rays.sample(position[:, BATCH:], aperture[:, BATCH:], nm[BATCH:])
+    for a, b in zip(whole, tail, strict=True):
+        np.testing.assert_allclose(a[..., BATCH:], b, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("limits", [(400, 700), (380, 780), (450, 650)])
+def test_white_stays_white_and_colours_stay_themselves(limits: tuple[float, float]) -> None:
+    # The mean over the wavelengths of what a ray is worth is 1 for each channel, and never negative.
+    sample = ((np.arange(1 << 16) + 0.5) / (1 << 16)).astype(np.float32)
+    nm, weights = ChannelWavelengths(*limits).draw(sample)
+    assert nm.min() >= limits[0] and nm.max() <= limits[1]
+    assert weights.min() >= 0
+    np.testing.assert_allclose(weights.mean(axis=1), 1, atol=1e-5)
+    # Red light is longer than green, green than blue.
+    red, green, blue = (weights * nm).mean(axis=1)
+    assert red > green > blue
+
+
+def test_light_of_one_wavelength_is_grey() -> None:
+    nm, weights = ChannelWavelengths(550, 550).draw(np.array([0, 0.5, 0.99], np.float32))
+    np.testing.assert_array_equal(weights, 1)
+    np.testing.assert_allclose(nm, 550)
+
+
+def test_fringes_take_the_colour_of_our_film() -> None:
+    # A white edge blurred in one third of the spectrum: the RGB weights show the colour that our spectral film shows,
+    # to within what lies off the diagonal of its response.
+    full = SpectralRange(400, 700)
+    sample = ((np.arange(1 << 14) + 0.5) / (1 << 14)).astype(np.float32)
+    for low, high in ((400, 500), (500, 600), (600, 700)):
+        nm, weights = ChannelWavelengths(400, 700).draw(sample)
+        seen = (weights * ((nm >= low) & (nm < high))).mean(axis=1)
+        exact = full.film_rgb((full.centres_nm >= low) & (full.centres_nm < high))
+        assert np.argmax(seen) == np.argmax(exact)
+        assert np.abs(seen - exact).max() < 0.2
+
+
+def test_the_extra_number_is_uniform_and_new() -> None:
+    random = np.random.default_rng(1)
+    position, aperture = random.random((2, 2, 1 << 16), dtype=np.float32)
+    number = extra_sample(position, aperture)
+    assert 0 <= number.min() and number.max() < 1
+    counts = np.histogram(number, 64, (0, 1))[0]
+    assert ((counts - 1024) ** 2 / 1024).sum() < 110  # chi squared of 63 degrees of freedom, 0.9998
+    for row in (*position, *aperture):
+        assert abs(np.corrcoef(row, number)[0, 1]) < 0.02
+
+
+def test_without_mitsuba_one_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    with pytest.raises(NeurolensError, match=r"pip install '\.\[mitsuba\]'"):
+        load_scene("cornell-box")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"type": "sphere"}, "ball.type: got 'sphere'"),
+        ({"type": "rectangle", "bsdf": {"type": "ref", "id": "gone"}}, "ball.bsdf: got 'gone', expected one of: grey"),
+        ({"type": "rectangle", "bsdf": {"id": "grey"}, "emitter": {"type": "spot"}}, "ball.emitter: got 'spot'"),
+        ({"type": "diffuse", "reflectance": {"type": "bitmap"}}, "ball: colour: got 'bitmap', expected rgb"),
+    ],
+)
+def test_scenes_that_are_not_ours_are_refused(change: dict[str, object], words: str) -> None:
+    class At:
+        matrix = np.eye(4)
+
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path"},
+        "sensor": {"to_world": At, "film": {"width": 8, "height": 8}},
+        "grey": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
+        "ball": {"to_world": At, **change},
+    }
+    with pytest.raises(InputError, match=words.replace("[", r"\[")):
+        our_scene(scene, (20.0, 20.0))
