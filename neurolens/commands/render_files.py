@@ -17,6 +17,7 @@ from neurolens.commands.arguments import positive
 from neurolens.errors import InputError, NeurolensError
 from neurolens.evaluate.records import plain
 from neurolens.files import check_writable
+from neurolens.progress import duration
 
 if TYPE_CHECKING:
     from neurolens.render.filmsettings import FilmSettings
@@ -174,3 +175,13 @@ def so_far(result: RenderResult, files: Files) -> str:
     least, most = int(samples.min()), int(samples.max())
     spread = f" ({least} to {most})" if least < most else ""
     return f"{files.out} holds {result.stats['samples_done']:.3g} of {result.stats['samples']} samples a pixel{spread}"
+
+
+def summary(stats: dict[str, Any], files: Files) -> str:
+    """What was rendered, how fast, and where it is."""
+    return (
+        f"{stats['scene']} through {stats['camera']}: {stats['width']} x {stats['height']}, {stats['samples']} samples "
+        f"in {duration(stats['seconds'])} ({stats['mpaths_per_s']:.2f} Mpath/s, "
+        f"{100 * stats['passed_fraction']:.0f}% of the rays pass, "
+        f"{100 * stats['camera_fraction']:.0f}% of the time in the camera)\n{files.out}\n{files.preview}"
+    )

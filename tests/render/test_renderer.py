@@ -15,7 +15,7 @@ from render_helpers import WHITE, diffuse, scene
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
-from neurolens.errors import InputError, NeurolensError
+from neurolens.errors import InputError, ModelError, NeurolensError
 from neurolens.render import bench
 from neurolens.render.renderer import render
 from neurolens.render.sums import Film, Tiling
@@ -160,6 +160,32 @@ class Broken(Pinhole):
 
     def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
         raise RuntimeError("no rays today")
+
+
+class Raising(Pinhole):
+    """Fails as told."""
+
+    error: Exception = Exception()
+
+    def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (ModelError("a.onnx: cannot run it"), "a.onnx: cannot run it"),
+        (MemoryError("2 TB"), "a render worker ran out of memory (2 TB)"),
+        (ValueError("x" * 10_000), "a render worker failed: ValueError: xxx"),
+    ],
+)
+def test_what_a_worker_raises_is_one_line(error: Exception, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.render.sums.BATCH", 64)
+    camera = Raising(50.0, FILM)
+    camera.error = error
+    with pytest.raises(NeurolensError) as failed:
+        render(scene(environment=WHITE), camera, width=36, height=24, samples=1, threads=2)
+    assert str(failed.value).startswith(said) and len(str(failed.value).splitlines()) == 1
 
 
 class Killed(Pinhole):
