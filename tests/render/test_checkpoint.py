@@ -78,7 +78,7 @@ def test_what_a_failed_render_had_goes_on_to_the_same_picture(first: int, then: 
 @pytest.mark.usefixtures("small_tiles")
 def test_a_render_that_is_asked_to_stop_gives_the_picture_so_far(tmp_path: Path) -> None:
     part, camera = tmp_path / "a.exr.part", ThinLens(50.0, 2.0, 3.0, FILM)
-    stopped = render(lit_scene(), camera, samples=160_000, watch=Watch(checkpoint=part, stop=lambda: True), **SIZE)
+    stopped = render(lit_scene(), camera, samples=100_000, watch=Watch(checkpoint=part, stop=lambda: True), **SIZE)
     samples = stopped.layers.samples
     assert not stopped.stats["complete"] and stopped.stats["samples_done"] == pytest.approx(samples.mean())
     assert samples.max() - samples.min() <= 16 and not samples.max() % 16
@@ -86,6 +86,26 @@ def test_a_render_that_is_asked_to_stop_gives_the_picture_so_far(tmp_path: Path)
     enough = int(samples.max()) + 16
     resumed = render(lit_scene(), camera, samples=enough, watch=Watch(checkpoint=part), **SIZE)
     assert same(resumed, render(lit_scene(), camera, samples=enough, threads=1, **SIZE))
+
+
+@pytest.mark.usefixtures("small_tiles")
+def test_an_interrupt_that_nobody_asked_about_keeps_the_checkpoint_too(tmp_path: Path) -> None:
+    part, camera, begun = tmp_path / "a.exr.part", ThinLens(50.0, 2.0, 3.0, FILM), False
+
+    def progress(fraction: float, _: float) -> None:
+        nonlocal begun
+        begun = fraction > 0
+
+    def stop() -> bool:
+        if begun:
+            raise KeyboardInterrupt
+        return False
+
+    watch = Watch(checkpoint=part, stop=stop)
+    with pytest.raises(KeyboardInterrupt):
+        render(lit_scene(), camera, samples=100_000, watch=watch, progress=progress, **SIZE)
+    with np.load(part, allow_pickle=False) as kept:
+        assert kept["done"].any()
 
 
 @pytest.mark.usefixtures("small_tiles")

@@ -136,6 +136,19 @@ def test_a_worker_holds_a_tile_and_the_picture_156_bytes_a_pixel(monkeypatch: py
     assert peak_bytes(lambda: develop(large)) < (BYTES_A_PIXEL - 8 * COLUMNS) * 960 * 640
 
 
+def test_previews_come_while_the_render_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So many samples take longer than the first preview, which is white where there is anything."""
+    monkeypatch.setattr("neurolens.render.sums.BATCH", 16 * 100)
+    shown: list[Any] = []
+    watch = Watch(preview=shown.append, preview_s=0, stop=lambda: len(shown) > 1)
+    made = scene(GREY, environment=WHITE)
+    found = render(made, Pinhole(4000.0, FILM), width=36, height=24, samples=100_000, watch=watch)
+    assert not found.stats["complete"] and found.layers.samples.max() < 100_000
+    for preview in (*shown, found.rgb):
+        lit = preview > 0
+        assert lit.any() and preview[lit] == pytest.approx(np.ones(np.count_nonzero(lit)), rel=1e-4)
+
+
 def test_a_preview_that_cannot_be_written_is_told_once_and_the_render_goes_on(tmp_path: Path) -> None:
     told: list[str] = []
 
