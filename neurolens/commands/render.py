@@ -16,13 +16,14 @@ from neurolens.commands.render_files import (
     Unfinished,
     add_safety,
     so_far,
+    summary,
     warn,
     watch_of,
     write_pictures,
 )
 from neurolens.errors import NeurolensError
 from neurolens.evaluate.records import plain
-from neurolens.progress import Progress, duration
+from neurolens.progress import Progress
 from neurolens.render.filmsettings import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS, FilmSettings
 
 if TYPE_CHECKING:
@@ -105,7 +106,10 @@ def add_parser(subparsers: Any) -> None:
             "focus": "the scene's",
         },
     )
-    parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=2, help="workers (default: 2)")
+    parser.add_argument(
+        "--threads", metavar="N", type=whole(1, 256), default=2,
+        help="workers, each kept on a core of its own where there are as many as cores (default: 2)",
+    )  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     add_json(parser)
     parser.set_defaults(run=run_kept, kept="no picture was written; older files of that name are untouched")
@@ -202,7 +206,7 @@ def _deliver(
     if args.json:
         print_json({"file": str(files.out), "preview": str(files.preview), **stats, "camera": camera.settings})
     else:
-        print(_text(stats, files))
+        print(summary(stats, files))
     return 0
 
 
@@ -244,12 +248,3 @@ def film_size(text: str) -> tuple[float, float]:
         return side(width), side(height)
     except argparse.ArgumentTypeError as error:
         raise argparse.ArgumentTypeError(f"{text!r}: {error}") from None
-
-
-def _text(stats: dict[str, Any], files: Files) -> str:
-    return (
-        f"{stats['scene']} through {stats['camera']}: {stats['width']} x {stats['height']}, {stats['samples']} samples "
-        f"in {duration(stats['seconds'])} ({stats['mpaths_per_s']:.2f} Mpath/s, "
-        f"{100 * stats['passed_fraction']:.0f}% of the rays pass, "
-        f"{100 * stats['camera_fraction']:.0f}% of the time in the camera)\n{files.out}\n{files.preview}"
-    )

@@ -6,6 +6,7 @@ import argparse
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -16,11 +17,14 @@ from neurolens.commands.arguments import positive
 from neurolens.errors import InputError, NeurolensError
 from neurolens.evaluate.records import plain
 from neurolens.files import check_writable
+from neurolens.progress import duration
 
 if TYPE_CHECKING:
     from neurolens.render.filmsettings import FilmSettings
     from neurolens.render.renderer import RenderResult
     from neurolens.render.watch import Watch
+
+_AT_ONCE_S = 1.0
 
 
 def add_safety(parser: argparse.ArgumentParser) -> None:
@@ -70,11 +74,15 @@ class Files:
 
 
 class Stopping:
-    """Ctrl-C and SIGTERM ask for a stop while the block lasts; a second one is not asked but obeyed."""
+    """Ctrl-C and SIGTERM ask for a stop while the block lasts; one that comes later is not asked but obeyed.
+
+    `timeout` and others send a signal twice at once, to the process and to its group: that is one.
+    """
 
     def __init__(self) -> None:
         self._before: dict[int, Any] = {}
         self._number: int | None = None
+        self._at = 0.0
 
     def __enter__(self) -> Stopping:
         if threading.current_thread() is threading.main_thread():  # others cannot hear signals
@@ -95,8 +103,11 @@ class Stopping:
         return self._number is not None
 
     def _asked(self, number: int, _: object) -> None:
-        self._number = number
-        signal.signal(number, self._before[number])
+        if self._number is None:
+            self._number, self._at = number, time.monotonic()
+        elif time.monotonic() > self._at + _AT_ONCE_S:
+            signal.signal(number, self._before[number])
+            signal.raise_signal(number)
 
     def say(self, what: str) -> int:
         """Say on stderr what is left of an interrupted render; its exit code, 128 plus the signal's number."""
@@ -164,3 +175,13 @@ def so_far(result: RenderResult, files: Files) -> str:
     least, most = int(samples.min()), int(samples.max())
     spread = f" ({least} to {most})" if least < most else ""
     return f"{files.out} holds {result.stats['samples_done']:.3g} of {result.stats['samples']} samples a pixel{spread}"
+
+
+def summary(stats: dict[str, Any], files: Files) -> str:
+    """What was rendered, how fast, and where it is."""
+    return (
+        f"{stats['scene']} through {stats['camera']}: {stats['width']} x {stats['height']}, {stats['samples']} samples "
+        f"in {duration(stats['seconds'])} ({stats['mpaths_per_s']:.2f} Mpath/s, "
+        f"{100 * stats['passed_fraction']:.0f}% of the rays pass, "
+        f"{100 * stats['camera_fraction']:.0f}% of the time in the camera)\n{files.out}\n{files.preview}"
+    )

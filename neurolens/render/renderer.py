@@ -59,9 +59,10 @@ def render(
     """Path-trace `scene` through `camera`.
 
     The result depends on the seed, not on the number of threads, nor on whether it was interrupted and went on from a
-    checkpoint: bit for bit. Cameras share all random numbers. Samples are taken in the order of the Sobol' sequence,
-    so that more can be added to those that a checkpoint has. Memory: the film's sums, picture and layers, 156 bytes a
-    pixel at most, and for each worker what one tile takes, whatever the size of the picture.
+    checkpoint: bit for bit, on one machine with one set of packages. Cameras share all random numbers. Samples are
+    taken in the order of the Sobol' sequence, so that more can be added to those that a checkpoint has. Memory: the
+    film's sums, picture and layers, 156 bytes a pixel at most, and for each worker what one tile takes, whatever the
+    size of the picture.
 
     Args:
         width, height, samples, max_depth: as in `CameraSettings`; left out, those of the scene.

@@ -18,6 +18,7 @@ from neurolens.errors import InputError, NeurolensError
 
 BATCH = 32768  # paths; fewer, and calling numpy costs more than computing; many more, and their state leaves the cache
 SAMPLES_A_PASS = 16
+CHUNK_BYTES = 16 << 20  # of the sums that are copied at a time
 
 # Columns of the sums: linear sRGB; squared luminance of independent samples; depth in m over the samples that hit
 # something, and how many those are; samples whose camera ray passed.
@@ -83,8 +84,8 @@ class Tiling:
         return np.minimum(done * self.step, self.samples)
 
     def chunks(self) -> Iterator[tuple[int, int]]:
-        """Tiles from, and up to, of parts of the picture of some 16 MB of sums."""
-        tiles = max(1, (16 << 20) // (8 * COLUMNS * self.tile))
+        """First tile, and the one after the last, of parts of the picture."""
+        tiles = max(1, CHUNK_BYTES // (8 * COLUMNS * self.tile))
         for first in range(0, self.tiles, tiles):
             yield first, min(first + tiles, self.tiles)
 

@@ -82,7 +82,7 @@ class Keeper:
         """What is due; True where the render shall stop."""
         self._report()
         now = time.perf_counter()
-        if self._watch.preview is not None and now >= self._preview_at:
+        if self._watch.preview is not None and now >= self._preview_at and self._job.film.done.any():
             self._try("preview", self._preview)
             done = time.perf_counter()
             self._preview_at = done + max(self._watch.preview_s, _REST * (done - now))
@@ -133,4 +133,4 @@ class Keeper:
                 self._failed.add(what)
                 place = getattr(error, "filename", None)
                 said = getattr(error, "strerror", None) or str(error) or type(error).__name__
-                self._watch.note(f"no {what}: {f'{place}: ' if place else ''}{said}")
+                self._watch.note(f"{what} not written: {f'{place}: ' if place else ''}{said}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from PIL import Image
 
 from neurolens.errors import InputError
-from neurolens.render.exr import read_exr, write_exr, write_png
+from neurolens.render.exr import read_exr, read_layers, write_exr, write_png
 
 PICTURE = np.random.default_rng(0).random((5, 7, 3), np.float32) * 10
 
@@ -60,6 +61,28 @@ def test_channels_are_named_and_metadata_is_one_json_text(tmp_path: Path) -> Non
         assert isinstance(file.header()["neurolens"], str)
 
 
+def test_layers_come_back_exactly_beside_the_picture(tmp_path: Path) -> None:
+    path, numbers = tmp_path / "a.exr", np.random.default_rng(2)
+    layers = {
+        "samples": np.full((5, 7), 100_001),
+        "depth": numbers.random((5, 7)),
+        "variance": numbers.random((7, 5)).T,
+    }
+    layers["depth"][2, 3] = np.inf
+    write_exr(path, PICTURE, half=True, layers=layers)
+    found = read_layers(path)
+    assert sorted(found) == ["depth", "samples", "variance"]
+    assert all(np.array_equal(found[name], np.float32(layers[name])) for name in layers)
+    assert np.array_equal(read_exr(path)[0], PICTURE.astype(np.float16).astype(np.float32))
+    file = OpenEXR.File(str(path), separate_channels=True)
+    assert sorted(file.channels()) == ["B", "G", "R", "Z", "samples", "variance"]  # Z is what other programs know
+    for wrong in ({"depth": np.zeros((7, 5))}, {"R": np.zeros((5, 7))}, {"a": np.full((5, 7), np.nan)}):
+        with pytest.raises(InputError, match="layer"):
+            write_exr(path, PICTURE, layers=wrong)
+    with pytest.raises(InputError, match="missing"):
+        read_layers(tmp_path / "none.exr")
+
+
 @pytest.mark.parametrize(
     ("rgb", "metadata", "field"),
     [
@@ -80,6 +103,25 @@ def test_bad_pictures_are_refused_and_leave_the_old_file(
     with pytest.raises(InputError, match=field):
         write_exr(path, rgb, metadata=metadata)
     assert np.array_equal(read_exr(path)[0], PICTURE) and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_disk_that_is_too_small_leaves_the_old_pictures(tmp_path: Path) -> None:
+    exr, png = tmp_path / "a.exr", tmp_path / "a.png"
+    write_exr(exr, PICTURE)
+    write_png(png, PICTURE)
+    large = np.random.default_rng(3).random((300, 300, 3))
+    before, limits = png.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))  # what is beyond fails as on a full disk
+    try:
+        with pytest.raises(InputError, match=r"a\.exr: file: got \(.*File too large"):
+            write_exr(exr, large)
+        with pytest.raises(OSError) as failed:
+            write_png(png, large)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert failed.value.filename == str(png)
+    assert np.array_equal(read_exr(exr)[0], PICTURE) and png.read_bytes() == before
+    assert sorted(tmp_path.iterdir()) == [exr, png]
 
 
 def test_bad_files_are_named(tmp_path: Path) -> None:

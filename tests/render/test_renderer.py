@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +15,11 @@ from render_helpers import WHITE, diffuse, scene
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
-from neurolens.errors import InputError, NeurolensError
+from neurolens.errors import InputError, ModelError, NeurolensError
 from neurolens.render import bench
 from neurolens.render.renderer import render
+from neurolens.render.sums import Film, Tiling
+from neurolens.render.watch import Watch
 
 FILM = (36.0, 24.0)
 LETTER_F = ["#####", "#....", "####.", "#....", "#....", "#...."]
@@ -162,18 +162,77 @@ class Broken(Pinhole):
         raise RuntimeError("no rays today")
 
 
+class Raising(Pinhole):
+    """Fails as told."""
+
+    error: Exception = Exception()
+
+    def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (ModelError("a.onnx: cannot run it"), "a.onnx: cannot run it"),
+        (MemoryError("2 TB"), "a render worker ran out of memory (2 TB)"),
+        (ValueError("x" * 10_000), "a render worker failed: ValueError: xxx"),
+    ],
+)
+def test_what_a_worker_raises_is_one_line(error: Exception, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.render.sums.BATCH", 64)
+    camera = Raising(50.0, FILM)
+    camera.error = error
+    with pytest.raises(NeurolensError) as failed:
+        render(scene(environment=WHITE), camera, width=36, height=24, samples=1, threads=2)
+    assert str(failed.value).startswith(said) and len(str(failed.value).splitlines()) == 1
+
+
 class Killed(Pinhole):
     """Takes its process along."""
 
     def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
-        os._exit(9)
+        if len(wavelength_nm) == 4 * 8:  # in the last pass
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().sample(film_mm, pupil, wavelength_nm)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="workers are threads")
-def test_a_killed_worker_ends_the_render(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_worker_ends_the_render_and_what_was_done_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("neurolens.render.sums.BATCH", 64)
-    with pytest.raises(NeurolensError, match="killed"):
-        render(scene(environment=WHITE), Killed(50.0, FILM), width=36, height=24, samples=40, threads=2)
+    part, camera = tmp_path / "a.exr.part", Killed(50.0, FILM)
+    options: dict[str, Any] = {"width": 36, "height": 24, "samples": 40, "threads": 2}
+    with pytest.raises(NeurolensError, match=r"killed \(signal 9: did the memory run out\?\).* kept in .*a\.exr\.part"):
+        render(scene(environment=WHITE), camera, watch=Watch(checkpoint=part), **options)
+    with np.load(part, allow_pickle=False) as kept:
+        assert kept["done"].min() >= 1 and kept["done"].max() == 2
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system does not pin processes")
+def test_workers_are_pinned_where_there_is_one_for_each_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.render.sums.BATCH", 256)
+    free = os.sched_getaffinity(0)
+
+    class Telling(Pinhole):
+        def for_worker(self) -> Pinhole:
+            (tmp_path / str(os.getpid())).write_text(",".join(map(str, os.sched_getaffinity(0))))
+            return self
+
+    threads = max(2, len(free))
+    render(scene(environment=WHITE), Telling(50.0, FILM), width=36, height=24, samples=16, threads=threads)
+    told = [path.read_text() for path in tmp_path.iterdir()]
+    assert len(told) == threads and {int(core) for core in told} == free
+    assert os.sched_getaffinity(0) == free  # those of the caller stay
+
+
+def test_a_film_that_a_dead_worker_holds_is_an_error_not_a_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.render.sums._LONGEST_WAIT_S", 0.01)
+    film = Film(Tiling.of(100, 16))
+    film.lock.acquire()
+    with pytest.raises(NeurolensError, match="killed while it wrote"):
+        film.copy(0, 1)
 
 
 class Reopened(Pinhole):
@@ -195,7 +254,13 @@ def test_each_worker_opens_its_own_camera(threads: int, monkeypatch: pytest.Monk
 
 def test_errors_are_clear(monkeypatch: pytest.MonkeyPatch) -> None:
     made, small = scene(environment=WHITE), {"width": 36, "height": 24, "samples": 1}
-    for change, field in (({"samples": 0}, "samples"), ({"threads": 0}, "threads"), ({"width": 20}, "width x height")):
+    for change, field in (
+        ({"samples": 0}, "samples"),
+        ({"samples": 1 << 40}, "samples.*at most 1048576"),
+        ({"threads": 0}, "threads"),
+        ({"width": 20}, "width x height"),
+        ({"width": 3_000_000, "height": 2_000_000}, "width x height.*156 bytes"),
+    ):
         with pytest.raises(InputError, match=field):
             render(made, Pinhole(50.0, FILM), **(small | change))
     with pytest.raises(InputError, match="450-650 nm"):
@@ -203,29 +268,8 @@ def test_errors_are_clear(monkeypatch: pytest.MonkeyPatch) -> None:
     narrow = scene({"wavelengths_nm": [460, 640]}, environment=WHITE)
     assert render(narrow, Prism(50.0, FILM), **small).rgb.shape == (24, 36, 3)
     monkeypatch.setattr("neurolens.render.sums.BATCH", 64)
-    with pytest.raises(NeurolensError, match="no rays today"):
+    with pytest.raises(NeurolensError, match=r"^a render worker failed: RuntimeError: no rays today \(.*\.py:\d+\)$"):
         render(made, Broken(50.0, FILM), threads=2, **small)
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="workers are forked on Linux")
-def test_an_interrupt_ends_workers_without_a_word(tmp_path: Path) -> None:
-    """Ctrl-C reaches the whole group of processes: the command says one line, its workers none."""
-    (tmp_path / "white.toml").write_text(
-        "[camera]\nposition_m = [0, 0, 0]\nlook_at_m = [0, 0, -1]\nfocus_m = 2\nwidth = 960\nheight = 540\n"
-        "samples = 4096\n[environment]\ncolour = [1, 1, 1]\n"
-    )
-    arguments = ["render", "white.toml", "--camera", "pinhole", "-o", "a.exr", "--quiet"]
-    command = [sys.executable, "-m", "neurolens", *arguments]
-    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    deadline = time.monotonic() + 60
-    while len(children.read_text().split()) < 2:
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGINT)
-    said = process.communicate(timeout=60)[1]
-    assert process.returncode == 130
-    assert said.strip() == "neurolens: interrupted; no picture was written; older files of that name are untouched"
 
 
 def test_the_bench_says_one_line_of_a_missing_scene(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,174 @@
+"""`neurolens render` when things go wrong: signals, places that cannot be written, checkpoints."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import failure, run_json
+
+from neurolens.render.exr import read_exr, read_layers, write_exr
+
+SCENE = """\
+[camera]
+position_m = [0.0, 0.0, 2.0]
+look_at_m = [0.0, 0.0, 0.0]
+focus_m = 2.0
+width = 64
+height = 36
+samples = 16
+
+[environment]
+colour = [1.0, 1.0, 1.0]
+
+[materials]
+grey = { kind = "diffuse", reflectance = [0.5, 0.4, 0.3] }
+
+[[spheres]]
+centre_m = [0.1, 0.0, 0.0]
+radius_m = 0.2
+material = "grey"
+"""
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    path = tmp_path / "ball.toml"
+    path.write_text(SCENE)
+    return path
+
+
+def children(process: subprocess.Popen[str]) -> list[int]:
+    return [int(p) for p in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that has ended may wait for somebody to ask."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def wait(condition: Any) -> None:
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="workers are forked on Linux")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_signal_in_mid_render_loses_nothing(
+    number: int, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The signal reaches the whole group, as from a terminal, or the command alone where it is killed."""
+    out, part = tmp_path / "a.exr", tmp_path / "a.exr.part"
+    arguments = ["render", scene.name, "--camera", "thin", "-o", out.name, "--quiet", "--checkpoint-every", "0.05"]
+    command = [sys.executable, "-m", "neurolens", *arguments, "--samples", "100000"]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    wait(lambda: part.exists() or process.poll() is not None)
+    workers = children(process)
+    assert len(workers) == 2
+    if number == signal.SIGKILL:
+        process.kill()
+    else:  # as `timeout` sends it, which is one request
+        process.send_signal(number)
+        os.killpg(process.pid, number)
+    said = process.communicate(timeout=60)[1].strip()
+    wait(lambda: not any(map(alive, workers)))
+    if number == signal.SIGKILL:
+        assert process.returncode == -signal.SIGKILL and said == "" and not out.exists()
+    else:
+        assert process.returncode == 128 + number
+        assert said.startswith("neurolens: interrupted; a.exr holds ") and len(said.splitlines()) == 1
+        assert said.endswith("of 100000 samples a pixel; the same command goes on from a.exr.part") or "to" in said
+        samples = read_layers(out)["samples"]
+        assert samples.min() > 0 and samples.max() - samples.min() <= 16
+        assert not read_exr(out)[1]["render"]["complete"] and out.with_suffix(".png").exists()
+    # So many samples that there is more to do, and not so many that it takes long.
+    with np.load(part, allow_pickle=False) as kept:
+        enough = 16 * (int(kept["done"].max()) + 2)
+    common = ("render", scene, "--camera", "thin", "--quiet", "--samples", enough)
+    data = run_json(capsys, *common, "-o", out, "--threads", 1)
+    assert data["complete"] and not part.exists()
+    run_json(capsys, *common, "-o", tmp_path / "b.exr")
+    assert np.array_equal(read_exr(out)[0], read_exr(tmp_path / "b.exr")[0])
+    one, other = read_layers(out), read_layers(tmp_path / "b.exr")
+    assert sorted(one) == ["blocked", "depth", "samples", "variance"]
+    assert all(np.array_equal(one[name], other[name]) for name in one)
+
+
+def test_layers_are_chosen_and_explained(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "a.exr"
+    common = ("render", scene, "--camera", "thin", "--quiet", "-o", out)
+    run_json(capsys, *common, "--layers", "beauty")
+    assert read_layers(out) == {} and "layers" not in read_exr(out)[1]
+    run_json(capsys, *common, "--half")
+    assert sorted(read_exr(out)[1]["layers"]) == sorted(read_layers(out))
+    assert np.all(read_layers(out)["samples"] == 16)
+
+
+def test_a_picture_that_cannot_be_written_keeps_the_render_and_the_older_picture(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "a.exr"
+    write_exr(out, np.full((2, 2, 3), 7.0))
+    common = ("render", scene, "--camera", "thin", "--quiet", "-o", out)
+
+    def full(path: Path, *_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("neurolens.render.exr.write_exr", full)
+        line = failure(capsys, *common, "--keep-checkpoint")
+    assert line == (
+        f"neurolens: {out}: No space left on device; the render is kept: the same command goes on from {out}.part"
+    )
+    assert np.all(read_exr(out)[0] == 7)
+    data = run_json(capsys, *common)
+    assert data["complete"] and read_exr(out)[0].shape == (36, 64, 3) and sorted(os.listdir(tmp_path)) == [
+        "a.exr", "a.png", "ball.toml",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["a.exr", "a.png", "a.exr.part"])
+def test_a_folder_where_a_file_shall_be_is_one_line(
+    name: str, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).mkdir()
+    line = failure(capsys, "render", scene, "--camera", "thin", "--quiet", "-o", tmp_path / "a.exr")
+    assert line == f"neurolens: {tmp_path / name}: Is a directory"
+
+
+def test_a_stale_checkpoint_is_one_line_and_restart_begins_again(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    common = ("render", scene, "--camera", "thin", "--quiet", "-o", tmp_path / "a.exr")
+    run_json(capsys, *common, "--keep-checkpoint")
+    line = failure(capsys, *common, "--f-number", "8")
+    assert line == (
+        f"neurolens: {tmp_path / 'a.exr.part'}: camera.f_number: got 4.0, expected 8.0 as asked now, "
+        "or --restart to begin again"
+    )
+    run_json(capsys, *common, "--f-number", "8", "--restart")
+    assert not (tmp_path / "a.exr.part").exists()
+
+
+def test_a_picture_beyond_memory_is_one_line(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    common = ("render", scene, "--camera", "thin", "--quiet", "-o", tmp_path / "a.exr")
+    with monkeypatch.context() as patch:
+        patch.setattr("neurolens.render.sums.os.sysconf", lambda _: 590)
+        assert "64, 36" in (line := failure(capsys, *common)) and "2231 pixels" in line
+    monkeypatch.setattr("neurolens.render.sums.mmap.mmap", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOMEM, "")))
+    assert "out of memory" in failure(capsys, *common)
