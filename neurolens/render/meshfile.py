@@ -114,7 +114,7 @@ def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
     except MemoryError:
         raise
     except Exception as error:  # trimesh raises whatever its parsing runs into
-        raise InputError(scene, field, str(path), f"a mesh file without mistakes ({error})") from None
+        raise InputError(scene, field, str(path), f"a mesh file that trimesh can read ({error})") from None
     if len(mesh.faces) < least:
         raise InputError(scene, field, str(path), f"{least} faces, as the file says, not {len(mesh.faces)}")
     return mesh
@@ -158,7 +158,7 @@ def _load_obj(content: bytes) -> list[dict[str, Any]]:
     from trimesh.exchange.obj import load_obj
 
     # A loader of text; what it calls geometry is one part for each material.
-    loaded = load_obj(io.StringIO(content.decode("utf-8")), skip_materials=True, maintain_order=True)
+    loaded = load_obj(io.StringIO(content.decode("utf-8")), skip_materials=True)
     return list(loaded.get("geometry", {}).values())
 
 
