@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 from render_helpers import diffuse, radiance, scene, world
 
+from neurolens.cameras.pinhole import Pinhole
 from neurolens.render.colour import SRGB
+from neurolens.render.filmsettings import FilmSettings
 from neurolens.render.lightsettings import Sky
+from neurolens.render.renderer import render
 from neurolens.render.sky import daylight_table, daylight_weights, sky_colour, sun_direction, sun_spectrum, zenith
 from neurolens.render.spectrum import SpectralRange, table
 from neurolens.render.wavelengths import expected_light
@@ -111,6 +114,26 @@ def test_colour_and_brightness_of_the_sky() -> None:
                 Sky(elevation, turbidity=turbidity), (grid / np.linalg.norm(grid, axis=0)).astype(np.float32)
             )
             assert np.all(bright >= 0) and np.all((x > 0.2) & (x < 0.55) & (y > 0.2) & (y < 0.5))
+
+
+def test_one_and_four_wavelengths_a_path_see_the_same_sky() -> None:
+    ball = {"centre_m": [0.3, 0.5, 0], "radius_m": 0.4, "material": "coat"}
+    coat = {"kind": "glossy", "specular": [0.9, 0.6, 0.3], "roughness": 0.4, "reflectance": [0, 0, 0]}
+    spot = {"position_m": [2, 2, 2], "look_at_m": [0, 0, 0], "intensity": [2, 1, 1], "outer_deg": 40, "illuminant": "A"}
+    made = scene(
+        {"position_m": [0, 1, 3]},
+        materials=MATERIALS | {"coat": coat},
+        sky={"sun_elevation_deg": 35, "sun_azimuth_deg": 220},
+        planes=[FLOOR],
+        spheres=[ball],
+        spots=[spot],
+    )
+    means = []
+    for mode, samples in (("one", 256), ("hero", 128)):
+        film = FilmSettings(wavelengths=mode)
+        picture = render(made, Pinhole(30.0, (24.0, 24.0)), width=16, height=16, samples=samples, threads=2, film=film)
+        means.append(np.median(picture.rgb.reshape(-1, 3), axis=0))
+    assert np.allclose(*means, rtol=0.02)
 
 
 def test_wavelengths_are_drawn_for_the_sky_and_the_lamps() -> None:
