@@ -61,7 +61,7 @@ def test_every_format_gives_the_same_solid(form: str, tmp_path: Path) -> None:
 def test_nothing_is_merged_or_mended(tmp_path: Path) -> None:
     # Two triangles in one place, one of them the other way round, and two vertices in one place.
     path = tmp_path / "a.obj"
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 1 0\nf 1 2 3\nf 1 4 2\n")
+    path.write_text("\tv 0 0 0 # origin\nv 1 0 0\nv  0 1 0\n v 0 1 0\nf 1 2 3\n f\t1 4 2\n")
     mesh = read_file(HERE, "file", path)
     assert len(mesh.faces) == 2 and enclosed(TriangleSet(mesh.vertices + [0, 0, 1], mesh.faces)) == pytest.approx(0)
 
@@ -138,14 +138,16 @@ def test_normals_of_the_file_are_used_and_turned(smooth: bool | None, tilted: bo
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "line 4.*counted from 1"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -3\n", "line 4.*counted from 1"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 b 3\n", "line 4.*f I J K"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "trimesh can read"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "line 4.*'9'.*v from 1 to 3"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/2\n", "line 5.*'3/2'.*vt from 1 to 1"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 2//1 3//1\n", "line 4.*vn from 1 to 0"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "degenerate"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1e400 0\nf 1 2 3\n", "finite"),
         ("a.obj", b"\xff\xfe\x00v", "text file"),
         ("a.ply", b"", "begins with ply"),
         ("a.ply", b"solid cube", "begins with ply"),
         ("a.ply", ply("binary_little_endian")[:-7], "trimesh can read"),
-        ("a.ply", ply("ascii")[:-30], "trimesh can read|faces"),
+        ("a.ply", ply("ascii")[:-30], "trimesh can read|5 triangles"),
         ("a.ply", ply("ascii").replace(b"1.25", b"nan"), "finite numbers"),
         ("a.ply", ply("ascii").replace(b"3 0 1 4", b"3 0 1 9"), "vertices from 0 to 4"),
         ("a.ply", ply("ascii").replace(b"3 0 1 4", b"3 0 1 1"), "degenerate"),
