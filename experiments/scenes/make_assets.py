@@ -1,4 +1,5 @@
-"""Make what the scenes in experiments/scenes load: knot.obj (a torus knot) and poster.png (a test picture).
+"""Make what the scenes in experiments/scenes load: the meshes knot.obj (a torus knot) and vase.ply (with normals and
+texture coordinates), the pictures poster.png, glaze.png (for the vase) and studio.png (lamps all around).
 
 python experiments/scenes/make_assets.py
 """
@@ -59,14 +60,71 @@ def poster(size: int = 384) -> np.ndarray:
     return picture.astype(np.uint8)
 
 
+def vase(around: int = 30, up: int = 20) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 8] (point, normal, texture coordinates) and faces [T, 3] of a vase 1 m high that stands on y = 0."""
+    t, angle = np.linspace(0, 1, up), np.linspace(0, 2 * np.pi, around + 1)
+
+    def outline(t: np.ndarray) -> np.ndarray:
+        return 0.20 + 0.11 * np.sin(2 * np.pi * (1.25 * t - 0.25 * t * t) - 0.6) - 0.04 * t
+
+    radius, slope = outline(t), (outline(t + 1e-5) - outline(t - 1e-5)) / 2e-5
+    t, angle = np.meshgrid(t, angle, indexing="ij")
+    radius, slope = (np.broadcast_to(x[:, None], t.shape) for x in (radius, slope))
+    point = [radius * np.cos(angle), t, -radius * np.sin(angle)]
+    normal = np.stack([np.cos(angle), -slope, -np.sin(angle)])
+    normal /= np.linalg.norm(normal, axis=0)
+    vertices = np.stack([*point, *normal, 3 * angle / (2 * np.pi), t], axis=-1).reshape(-1, 8)
+    i, j = np.meshgrid(np.arange(up - 1), np.arange(around), indexing="ij")
+    a, b, c, d = (x * (around + 1) + y for x, y in ((i, j), (i, j + 1), (i + 1, j + 1), (i + 1, j)))
+    return vertices, np.concatenate([np.stack(x, axis=-1).reshape(-1, 3) for x in ((a, b, c), (a, c, d))])
+
+
+def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Write a binary PLY file of vertices [V, 8] and triangles [T, 3]."""
+    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz", "s", "t"))
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{names}"
+    header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
+    rows["count"], rows["corners"] = 3, faces
+    path.write_bytes(header.encode() + vertices.astype("<f4").tobytes() + rows.tobytes())
+
+
+def glaze(size: int = 96) -> np.ndarray:
+    """A picture [size, size, 3] uint8 that repeats sideways: waves and dots in blue on cream."""
+    y, x = np.mgrid[0:size, 0:size] / size
+    picture = np.empty((size, size, 3))
+    picture[:] = (236, 228, 206)
+    wave = np.abs(y - 0.5 - 0.07 * np.sin(4 * np.pi * x))
+    picture[(wave < 0.03) | ((wave > 0.26) & (wave < 0.30))] = (24, 66, 140)
+    for row in (0.34, 0.66):
+        picture[np.hypot((4 * x) % 1 - 0.5, 4 * (y - row)) < 0.28] = (176, 60, 40)
+    return picture.astype(np.uint8)
+
+
+def studio(height: int = 64) -> np.ndarray:
+    """An equirectangular picture [height, 2 height, 3] uint8: three soft lamps in a dim room."""
+    v, u = (np.mgrid[0:height, 0 : 2 * height] + 0.5) / height
+    picture = np.empty((height, 2 * height, 3))
+    picture[:] = (np.array([26, 28, 34]) * (1.3 - v[..., None])).clip(0)
+    for left, right, top, bottom, colour in (
+        (0.25, 0.55, 0.22, 0.46, (255, 240, 220)),
+        (1.20, 1.32, 0.15, 0.60, (190, 215, 255)),
+        (1.65, 1.90, 0.30, 0.36, (255, 180, 120)),
+    ):
+        picture[(u > left) & (u < right) & (v > top) & (v < bottom)] = colour
+    return picture.astype(np.uint8)
+
+
 def main() -> None:
-    """Write both files."""
+    """Write all files."""
     vertices, faces = knot()
     lines = ["# A (2, 3) torus knot, made by experiments/scenes/make_assets.py"]
     lines += ["v " + " ".join(f"{x:.4f}" for x in vertex) for vertex in vertices]
     lines += ["f " + " ".join(str(k + 1) for k in face) for face in faces]
     (TARGET / "knot.obj").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    Image.fromarray(poster()).save(TARGET / "poster.png", optimize=True)
+    write_ply(TARGET / "vase.ply", *vase())
+    for name, picture in (("poster", poster()), ("glaze", glaze()), ("studio", studio())):
+        Image.fromarray(picture).save(TARGET / f"{name}.png", optimize=True)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ than once (Kulla and Conty 2017) and what is left for the base underneath.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
 
-_NODES, _ENTRIES, _GRID = 48, 1024, 48
+_NODES, _ENTRIES, _AROUND, _OUTWARDS = 48, 1024, 24, 128
 
 
 def smith(cosine: Any, alpha2: Any) -> Any:
@@ -76,12 +77,15 @@ class CoatTable:
         return self._mean_whole.take(row), self._mean_power.take(row)
 
 
+@cache
 def _albedos(alpha: float) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Cosines and S, cosines and T, by the mean over a grid of visible normals, which the lobe is smooth in."""
+    """Cosines and S, cosines and T, by quadrature over visible normals, which the lobe is smooth in."""
     cosine = ((np.arange(_NODES) + 0.5) / _NODES) ** 2
-    part = (np.arange(_GRID) + 0.5) / _GRID
-    u, v = (x.ravel() for x in np.meshgrid(part, part))
-    cos_out = np.repeat(cosine, _GRID * _GRID)
+    around, outwards = (np.arange(_AROUND) + 0.5) / _AROUND, (np.arange(_OUTWARDS) + 0.5) / _OUTWARDS
+    # The tail of the lobe, from which light is lost, is a narrow strip at 1: nodes are dense there.
+    u, v = (x.ravel() for x in np.meshgrid(around, 1 - (1 - outwards) ** 3))
+    weight = np.repeat(3 * (1 - outwards) ** 2, _AROUND) / u.size
+    cos_out = np.repeat(cosine, u.size)
     out = np.stack([np.sqrt(1 - cos_out**2), 0 * cos_out, cos_out])
     width = np.full(cos_out.size, alpha)
     half = visible_normal(out, width, np.stack([np.tile(u, _NODES), np.tile(v, _NODES)]))
@@ -89,6 +93,6 @@ def _albedos(alpha: float) -> list[tuple[NDArray[np.float64], NDArray[np.float64
     cos_in = 2 * cos_half * half[2] - cos_out
     lambda_out, lambda_in = smith(cos_out, width**2), smith(np.maximum(cos_in, 1e-6), width**2)
     share = np.where(cos_in > 0, (1 + lambda_out) / (1 + lambda_out + lambda_in), 0)
-    whole = share.reshape(_NODES, -1).mean(axis=1)
-    power = (share * fifth_power(cos_half)).reshape(_NODES, -1).mean(axis=1)
+    whole = share.reshape(_NODES, -1) @ weight
+    power = (share * fifth_power(cos_half)).reshape(_NODES, -1) @ weight
     return [(cosine, whole), (cosine, power)]

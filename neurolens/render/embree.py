@@ -6,7 +6,6 @@ Without it, the tree of `neurolens.render.mesh` does the same. Hits agree within
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.util import find_spec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,10 @@ _STEP = np.float32(1e-5)  # m by which a ray starts again that met the surface t
 
 def make_mesh(first: int, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Primitive:
     """Triangles to hit, through Embree if it is installed; arguments as for `Mesh`."""
-    return EmbreeMesh(first, vertices, faces) if find_spec("embreex") else Mesh(first, vertices, faces)
+    try:
+        return EmbreeMesh(first, vertices, faces)
+    except ImportError:
+        return Mesh(first, vertices, faces)
 
 
 class EmbreeMesh:

@@ -146,7 +146,7 @@ class SkyLight:
         """See `LightGroup`."""
         assert self._table is not None
         direction, density = self._table.sample(square)
-        inverse: FloatArray = np.float32(1) / np.maximum(density, np.float32(1e-20))
+        inverse: FloatArray = np.reciprocal(np.maximum(density, np.float32(1e-20)))
         return direction, np.full(len(number), np.inf, np.float32), inverse
 
     def pdf(self, number: Numbers, point: FloatArray, distance: FloatArray, cosine: FloatArray) -> FloatArray:

@@ -1,7 +1,8 @@
 """Reads triangle meshes: OBJ and PLY files through trimesh, or tables of the scene itself.
 
 trimesh passes over what it does not understand. Files are therefore looked through first, so that no vertex and no face
-of one is lost without a word; its own loaders then do the reading, without merging or mending anything.
+of one is lost without a word; its loaders then do the reading, without merging or mending anything. Texture coordinates
+and normals of an OBJ file count where every face has them.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ LARGEST_FILE = 500_000_000  # bytes
 _LARGEST_HEADER = 100_000
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _OBJ_LINES = {
-    "v": (re.compile(rf"v(?:\s+{_NUMBER}){{3,7}}\s*"), "v X Y Z"),
-    "vt": (re.compile(rf"vt(?:\s+{_NUMBER}){{2,3}}\s*"), "vt U V"),
-    "vn": (re.compile(rf"vn(?:\s+{_NUMBER}){{3}}\s*"), "vn X Y Z"),
-    "f": (re.compile(r"f(?:\s+[1-9]\d*(?:/(?:[1-9]\d*)?(?:/(?:[1-9]\d*)?)?)?){3,}\s*"), "f I J K, counted from 1"),
+    "v": (re.compile(rf"v(?: {_NUMBER}){{3,7}}"), "v X Y Z"),
+    "vt": (re.compile(rf"vt(?: {_NUMBER}){{2,3}}"), "vt U V"),
+    "vn": (re.compile(rf"vn(?: {_NUMBER}){{3}}"), "vn X Y Z"),
+    "f": (re.compile(r"f(?: [1-9]\d*(?:/(?:[1-9]\d*)?(?:/[1-9]\d*)?)?){3,}"), "f I J K, counted from 1"),
 }
 
 
@@ -107,42 +108,60 @@ def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
         content = path.read_bytes()
     except OSError as error:
         raise InputError(scene, field, str(path), f"a mesh file that can be read ({error.strerror})") from None
-    least = _check_obj(scene, field, path, content) if kind == ".obj" else _check_ply(scene, field, path, content)
     try:
-        parts = _load_obj(content) if kind == ".obj" else _load_ply(content)
-        mesh = _joined(parts)
-    except MemoryError:
+        if kind == ".obj":
+            text, least = _checked_obj(scene, field, path, content)
+            mesh = _load_obj(text)
+        else:
+            least = _promised_faces(scene, field, path, content)
+            mesh = _load_ply(content)
+    except (InputError, MemoryError):
         raise
     except Exception as error:  # trimesh raises whatever its parsing runs into
-        raise InputError(scene, field, str(path), f"a mesh file without mistakes ({error})") from None
+        raise InputError(scene, field, str(path), f"a mesh file that trimesh can read ({error})") from None
     if len(mesh.faces) < least:
-        raise InputError(scene, field, str(path), f"{least} faces, as the file says, not {len(mesh.faces)}")
+        raise InputError(scene, field, str(path), f"{least} triangles, as the file says, not {len(mesh.faces)}")
     return mesh
 
 
-def _check_obj(scene: Path, field: str, path: Path, content: bytes) -> int:
-    """Refuse lines that the loader would misread or pass over; returns the number of triangles."""
+def _checked_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[str, int]:
+    """The vertices and faces of an OBJ file, line by line in one form, and the number of triangles.
+
+    The loader passes over lines that it does not understand; here they are refused. So are indices beyond the
+    lines before, which it takes for texture coordinates or normals that are not there.
+    """
     try:
         # A line may go on after a backslash.
         text = content.decode("utf-8").replace("\\\r\n", " ").replace("\\\n", " ")
     except UnicodeDecodeError as error:
         raise InputError(scene, field, str(path), f"a text file ({error})") from None
-    triangles = 0
+    lines, triangles = [""], 0
+    counts = dict.fromkeys(_OBJ_LINES, 0)
     for number, line in enumerate(text.splitlines(), 1):
-        words = line.partition("#")[0].strip()
-        known = _OBJ_LINES.get(words.split(maxsplit=1)[0]) if words else None
-        if known is None:
+        words = line.partition("#")[0].split()
+        if not words or words[0] not in _OBJ_LINES:
             continue
-        pattern, form = known
-        if not pattern.fullmatch(words):
+        pattern, form = _OBJ_LINES[words[0]]
+        lines.append(" ".join(words))
+        if not pattern.fullmatch(lines[-1]):
             raise InputError(scene, f"{field} {path.name}, line {number}", line[:60], form)
+        counts[words[0]] += 1
         if words[0] == "f":
-            triangles += len(words.split()) - 3
-    return triangles
+            triangles += len(words) - 3
+            _check_indices(scene, f"{field} {path.name}, line {number}", words[1:], counts)
+    return "\n".join(lines) + "\n", triangles
 
 
-def _check_ply(scene: Path, field: str, path: Path, content: bytes) -> int:
-    """The number of faces that the header of a PLY file promises, which also bounds the file."""
+def _check_indices(scene: Path, field: str, corners: list[str], counts: dict[str, int]) -> None:
+    """Refuse a corner of a face that refers to something that does not come before it."""
+    for corner in corners:
+        for index, kind in zip(corner.split("/"), ("v", "vt", "vn"), strict=False):
+            if index and int(index) > counts[kind]:
+                raise InputError(scene, field, corner, f"{kind} from 1 to {counts[kind]}, the lines before")
+
+
+def _promised_faces(scene: Path, field: str, path: Path, content: bytes) -> int:
+    """The number of faces that the header of a PLY file promises; no more than the file can hold."""
     head, end, _ = content[:_LARGEST_HEADER].partition(b"end_header")
     if not head.startswith(b"ply") or not end:
         raise InputError(scene, field, str(path), "a PLY file, which begins with ply and a header")
@@ -154,42 +173,26 @@ def _check_ply(scene: Path, field: str, path: Path, content: bytes) -> int:
     return promised.get(b"face", 0)
 
 
-def _load_obj(content: bytes) -> list[dict[str, Any]]:
+def _load_obj(text: str) -> TriangleSet:
     from trimesh.exchange.obj import load_obj
 
-    # A loader of text; what it calls geometry is one part for each material.
-    loaded = load_obj(io.StringIO(content.decode("utf-8")), skip_materials=True, maintain_order=True)
-    return list(loaded.get("geometry", {}).values())
+    # One part, as groups and materials are left out.
+    parts = list(load_obj(io.StringIO(text), skip_materials=True).get("geometry", {}).values())
+    return _triangles(parts[0]) if parts else _triangles({})
 
 
-def _load_ply(content: bytes) -> list[dict[str, Any]]:
+def _load_ply(content: bytes) -> TriangleSet:
     from trimesh.exchange.ply import load_ply
 
-    return [load_ply(io.BytesIO(content), skip_materials=True)]
+    return _triangles(load_ply(io.BytesIO(content), skip_materials=True))
 
 
-def _joined(parts: list[dict[str, Any]]) -> TriangleSet:
-    """Parts as one mesh; texture coordinates and normals are kept where every part has them."""
-    vertices: list[NDArray[np.float64]] = []
-    faces: list[NDArray[np.int64]] = []
-    uv: list[NDArray[np.float64]] = []
-    normals: list[NDArray[np.float64]] = []
-    first = 0
-    for part in parts:
-        if not len(part.get("faces", ())):
-            continue
-        own = np.asarray(part["vertices"], np.float64).reshape(-1, 3)
-        triangles = np.asarray(part["faces"], np.int64)
-        if triangles.ndim == 2 and triangles.shape[1] > 3:
-            fan = [triangles[:, [0, k, k + 1]] for k in range(1, triangles.shape[1] - 1)]
-            triangles = np.stack(fan, axis=1)
-        vertices.append(own)
-        faces.append(triangles.reshape(-1, 3) + first)
-        first += len(own)
-        for found, lists in ((getattr(part.get("visual"), "uv", None), uv), (part.get("vertex_normals"), normals)):
-            if found is not None and len(found) == len(own):
-                lists.append(np.asarray(found, np.float64))
-    if not faces:
-        return TriangleSet(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
-    extra = [np.concatenate(lists) if len(lists) == len(faces) else None for lists in (uv, normals)]
-    return TriangleSet(np.concatenate(vertices), np.concatenate(faces), *extra)
+def _triangles(loaded: dict[str, Any]) -> TriangleSet:
+    """What trimesh has loaded, polygons of more than three corners cut into fans."""
+    vertices = np.asarray(loaded.get("vertices", ()), np.float64).reshape(-1, 3)
+    faces = np.asarray(loaded.get("faces", ()), np.int64)
+    if faces.ndim == 2 and faces.shape[1] > 3:
+        faces = np.stack([faces[:, [0, k, k + 1]] for k in range(1, faces.shape[1] - 1)], axis=1)
+    uv, normals = getattr(loaded.get("visual"), "uv", None), loaded.get("vertex_normals")
+    extra = [None if x is None or len(x) != len(vertices) else np.asarray(x, np.float64) for x in (uv, normals)]
+    return TriangleSet(vertices, faces.reshape(-1, 3), *extra)

@@ -20,8 +20,8 @@ def scene(camera: dict[str, Any] | None = None, **tables: Any) -> Scene:
     return scene_from_tables({"camera": CAMERA | (camera or {}), **tables}, "test.toml")
 
 
-def world(**tables: Any) -> World:
-    return World(scene(**tables), SpectralRange(400, 700))
+def world(camera: dict[str, Any] | None = None, **tables: Any) -> World:
+    return World(scene(camera, **tables), SpectralRange(400, 700))
 
 
 def diffuse(*rgb: float) -> dict[str, Any]:

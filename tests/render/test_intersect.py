@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from render_helpers import diffuse, world
 
+from neurolens.render.embree import EmbreeMesh
 from neurolens.render.mesh import Mesh
 from neurolens.render.primitives import Rays
 
@@ -158,3 +159,24 @@ def test_smooth_normals_follow_the_curve() -> None:
     point = batch.origin + best * batch.direction
     flat, smooth = made.normals(made.surfaces(found, point), point)
     assert np.sum(smooth * radial, axis=0).min() > 0.9995 > np.sum(flat * radial, axis=0).min()
+
+
+def test_embree_and_the_tree_give_the_same_hits() -> None:
+    pytest.importorskip("embreex", reason="embreex is not installed: only the tree in numpy is tested")
+    centre = RANDOM.normal(size=(500, 1, 3))
+    corners = (centre + RANDOM.normal(size=(500, 3, 3)) * 0.2).reshape(-1, 3)
+    faces, batch = np.arange(1500).reshape(-1, 3), rays(20000)
+    # Rays that start just off a triangle, as shadow rays do, and limits that some hits are beyond.
+    on = corners[faces].mean(axis=1)[RANDOM.integers(500, size=5000)].T.astype(np.float32)
+    batch.origin[:, :5000] = on + batch.direction[:, :5000] * np.float32(1e-3)
+    limit = np.where(RANDOM.random(20000) < 0.5, np.inf, RANDOM.uniform(0, 12, 20000)).astype(np.float32)
+    hits = []
+    for made in (Mesh(7, corners, faces), EmbreeMesh(7, corners, faces)):
+        best, found = limit.copy(), np.full(20000, -1, np.int32)
+        made.nearer(batch, best, found)
+        hits.append((best, found))
+    (a, tree), (b, embree) = hits
+    # The tree's triangles are a hair larger.
+    same = (tree == embree) & ((tree < 0) | np.isclose(a, b, rtol=1e-5, atol=1e-5))
+    assert np.mean(~same) < 2e-3 and 0.2 < np.mean(tree >= 0) < 0.9
+    assert np.all(b[embree < 0] == limit[embree < 0]) and np.all(b <= limit)

@@ -104,3 +104,39 @@ def test_glass_bends_by_snell_and_splits_by_fresnel(outside: bool) -> None:
     assert np.allclose(direction[:, ~refracts].T, (math.sin(angle), 0, math.cos(angle)), atol=1e-6)
     reflectance, _ = fresnel_dielectric(full(math.cos(angle), 1), full(relative, 1))
     assert np.mean(~refracts) == pytest.approx(float(reflectance[0]), abs=2e-3)
+
+
+@pytest.mark.parametrize("roughness", [0.02, 0.1, 0.3, 0.6, 1.0])
+@pytest.mark.parametrize(("base", "coat"), [(0.0, 1.0), (1.0, 0.04), (1.0, 0.5), (0.0, 0.5)])
+def test_glossy_loses_and_gains_nothing(roughness: float, base: float, coat: float) -> None:
+    # Light 1 from everywhere: a material that absorbs nothing reflects 1, a metal the less the more often it reflects.
+    count = 40_000
+    cosine = np.repeat(np.float32([0.05, 0.2, 0.5, 0.9, 1.0]), count)
+    out = np.stack([np.sqrt(1 - cosine**2), 0 * cosine, cosine])
+    lobes = glossy(repeated((0, 0, 1), 5 * count), out, base, coat, roughness**2)
+    inward = lobes.sample(RANDOM.random((2, 5 * count), np.float32), RANDOM.random(5 * count, np.float32))
+    value, density = lobes.evaluate(inward)
+    each = (value / density).reshape(5, count)
+    albedo, error = each.mean(axis=1), each.std(axis=1) / math.sqrt(count)
+    if base or coat == 1:
+        assert np.all(np.abs(albedo - 1) < 2e-3 + 4 * error)
+    else:
+        assert np.all(albedo < 1) and np.all(albedo > 0.5 * coat)
+
+
+def test_albedo_of_a_coat_agrees_with_a_plain_integral() -> None:
+    # F = 1, by quadrature over the hemisphere of D G2 / (4 cos_out) for width 0.5.
+    alpha2, cos_out = 0.25, 0.6
+    theta, phi = np.meshgrid((np.arange(600) + 0.5) * np.pi / 1200, (np.arange(600) + 0.5) * 2 * np.pi / 600)
+    inward = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+    half = inward + np.array([0.8, 0, cos_out])[:, None, None]
+    half /= np.linalg.norm(half, axis=0)
+    peak = alpha2 / (np.pi * (half[2] ** 2 * (alpha2 - 1) + 1) ** 2)
+
+    def smith(c: np.ndarray | float) -> np.ndarray:
+        return 0.5 * (np.sqrt(1 + alpha2 * (1 / np.square(c) - 1)) - 1)
+
+    value = peak / (1 + smith(cos_out) + smith(inward[2])) / (4 * cos_out)
+    expected = np.sum(value * np.sin(theta)) * (np.pi / 1200) * (2 * np.pi / 600)
+    whole, power = CoatTable([0.5]).at(np.zeros(1, np.intp), np.float32([cos_out]))
+    assert whole[0] == pytest.approx(expected, rel=2e-3) and 0 < power[0] < 0.2

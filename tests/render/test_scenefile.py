@@ -29,7 +29,7 @@ QUAD = {"corner_m": [0, 0, 0], "edge_u_m": [1, 0, 0], "edge_v_m": [0, 1, 0], "ma
 MESH = {"material": "m", "vertices_m": [[0, 0, 0], [1, 0, 0], [0, 1, 0]], "faces": [[0, 1, 2]]}
 
 
-@pytest.mark.parametrize("name", ["grid", "lamps", "lights", "room"])
+@pytest.mark.parametrize("name", ["cornell", "garden", "grid", "lamps", "lights", "room", "studio"])
 def test_shipped_scenes_render(name: str) -> None:
     loaded = load_scene(SCENES / f"{name}.toml")
     settings = loaded.settings.camera

@@ -1,0 +1,161 @@
+"""Lights against closed forms, and aiming at them against finding them by chance."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from render_helpers import diffuse, radiance, world
+
+from neurolens.render.directions import DirectionTable, centres
+
+MATERIALS: dict[str, Any] = {
+    "grey": diffuse(0.5, 0.5, 0.5),
+    "plastic": {"kind": "glossy", "specular": [0.05] * 3, "roughness": 0.3, "reflectance": [0.5] * 3},
+}
+FLOOR = {"point_m": [0, 0, 0], "normal": [0, 1, 0], "material": "grey"}
+
+
+@pytest.mark.parametrize(("height", "aside"), [(2.0, 0.0), (1.0, 1.5), (30.0, 40.0)])
+def test_point_light_obeys_the_inverse_square_and_the_cosine_law(height: float, aside: float) -> None:
+    point = {"position_m": [aside, height, 0], "intensity": [3, 3, 3]}
+    made = world(materials=MATERIALS, planes=[FLOOR], points=[point])
+    values = radiance(made, [0, 1, 1], [0, 0, 0], samples=64, max_depth=1)
+    distance2 = height**2 + aside**2
+    expected = 0.5 / math.pi * 3 / distance2 * height / math.sqrt(distance2)
+    assert np.allclose(values, expected, rtol=3e-4)
+
+
+def test_point_light_is_a_small_sphere_of_the_same_intensity() -> None:
+    point = {"position_m": [1, 2, 0], "intensity": [math.pi * 0.01**2 * 7] * 3}
+    sphere = {"centre_m": [1, 2, 0], "radius_m": 0.01, "emission": [7, 7, 7]}
+    a, b = (
+        radiance(world(materials=MATERIALS, planes=[FLOOR], **lights), [0, 1, 1], [0, 0, 0], max_depth=1).mean()
+        for lights in ({"points": [point]}, {"spheres": [sphere]})
+    )
+    assert a == pytest.approx(b, rel=2e-3)
+
+
+def test_points_cast_sharp_shadows_and_are_not_seen() -> None:
+    point = {"position_m": [0, 4, 0], "intensity": [9, 9, 9]}
+    ball = {"centre_m": [0, 2, 0], "radius_m": 0.5, "material": "grey"}
+    made = world(materials=MATERIALS, planes=[FLOOR], spheres=[ball], points=[point])
+    edge = 4 * math.tan(math.asin(0.25))
+    assert not radiance(made, [0, 1, 3], [edge - 0.01, 0, 0], samples=64, max_depth=1).any()
+    assert radiance(made, [0, 1, 3], [edge + 0.01, 0, 0], samples=64, max_depth=1).all()
+    assert not radiance(made, [0, 5, 0], [0, 4, 0.0], samples=64, max_depth=0).any()
+
+
+def test_spot_falls_off_as_the_smoothstep_of_its_cosine() -> None:
+    spot = {"position_m": [0, 2, 0], "look_at_m": [0, 0, 0], "intensity": [4, 4, 4], "inner_deg": 20, "outer_deg": 40}
+    made = world(materials=MATERIALS, planes=[FLOOR], spots=[spot])
+    inner, outer = math.cos(math.radians(20)), math.cos(math.radians(40))
+    for angle in (0.0, 19.0, 25.0, 30.0, 38.0, 41.0):
+        cos = math.cos(math.radians(angle))
+        t = min(max((cos - outer) / (inner - outer), 0), 1)
+        expected = 0.5 / math.pi * 4 * t * t * (3 - 2 * t) * cos / (2 / cos) ** 2
+        at = 2 * math.tan(math.radians(angle))
+        values = radiance(made, [0, 1, 3], [at, 0, 0], samples=16, max_depth=1)
+        assert np.allclose(values, expected, rtol=2e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize(("radius", "height"), [(0.5, 2.0), (3.0, 1.0)])
+def test_disc_light_on_its_axis(radius: float, height: float) -> None:
+    light = {"centre_m": [0, height, 0], "normal": [0, -1, 0], "radius_m": radius, "emission": [3, 3, 3]}
+    made = world(materials=MATERIALS, planes=[FLOOR], discs=[light])
+    values = radiance(made, [0, 0.5, 1], [0, 0, 0], samples=16384, max_depth=1)
+    # E = pi L sin^2 of the half angle that it fills.
+    assert values.mean() == pytest.approx(0.5 * 3 * radius**2 / (radius**2 + height**2), rel=3e-3)
+    above = radiance(made, [0, height + 1, 0.1], [0, height, 0.1], samples=16, max_depth=1)
+    below = radiance(made, [0, height - 0.5, 0.1], [0, height, 0.1], samples=16, max_depth=1)
+    assert not above.any() and np.allclose(below, 3)
+
+
+def test_disc_reflects_and_ends_at_its_rim() -> None:
+    disc = {"centre_m": [1, 0, -2], "normal": [0, 0, 1], "radius_m": 0.5, "material": "grey"}
+    made = world(materials=MATERIALS, environment={"colour": [1, 1, 1]}, discs=[disc])
+    for x, expected in ((1.0, 0.5), (1.49, 0.5), (1.51, 1.0), (0.49, 1.0)):
+        values = radiance(made, [x, 0, 0], [x, 0, -2], samples=64, max_depth=1)
+        assert np.allclose(values, expected, rtol=1e-3)
+
+
+def test_direction_table_draws_what_it_says() -> None:
+    random = np.random.default_rng(3)
+    weights = random.random((8, 16)) + 0.1
+    weights[2, 5], weights[6], weights[3, 2:9] = 30.0, 0.0, 0.0
+    table = DirectionTable(weights, turn=0.7)
+    square = random.random((2, 200_000), np.float32)
+    direction, density = table.sample(square)
+    assert np.allclose(np.sum(direction**2, axis=0), 1, atol=1e-5)
+    # What is drawn has the density that is asked for, but for a few on the edges of cells.
+    assert np.mean(np.isclose(table.pdf(direction), density, rtol=1e-4)) > 0.999 and density.min() > 0
+    # The mean of 1 / density is the solid angle of all cells that weigh anything; of f / density, the integral of f.
+    cosine = np.cos(np.linspace(0, np.pi, 9))
+    solid = np.repeat((cosine[:-1] - cosine[1:])[:, None] * np.pi / 8, 16, axis=1)
+    assert np.mean(1 / density) == pytest.approx(solid[weights > 0].sum(), rel=0.02)
+    uniform = random.normal(size=(3, 400_000))
+    uniform = (uniform / np.linalg.norm(uniform, axis=0)).astype(np.float32)
+    assert 4 * np.pi * np.mean(table.pdf(uniform)) == pytest.approx(1, abs=0.03)
+    assert centres(4, 8).shape == (3, 32)
+
+
+@pytest.fixture(scope="module")
+def panorama(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dim gradient with a small bright window towards +x, and a red half towards -z on the left."""
+    picture = np.full((32, 64, 3), 40, np.uint8)
+    picture[:16] = 90
+    picture[8:11, 46:50] = 255
+    picture[:, :20, 1:] //= 3
+    path = tmp_path_factory.mktemp("sky") / "panorama.png"
+    Image.fromarray(picture).save(path)
+    return path
+
+
+@pytest.mark.parametrize("floor", ["grey", "plastic"])
+def test_aiming_at_an_environment_changes_the_noise_and_not_the_mean(floor: str, panorama: Path) -> None:
+    made = world(
+        materials=MATERIALS,
+        environment={"file": str(panorama), "scale": 3.0, "rotate_y_deg": 30},
+        planes=[FLOOR | {"material": floor}],
+        spheres=[{"centre_m": [0.4, 0.3, 0], "radius_m": 0.3, "material": "plastic"}],
+        quads=[
+            {"corner_m": [-1, 1, -1], "edge_u_m": [0.5, 0, 0], "edge_v_m": [0, 0, 0.5], "emission": [1, 2, 3]},
+        ],
+    )
+    aimed = radiance(made, [0, 1, 3], [-0.2, 0, 0], samples=16384, max_depth=3)
+    found = radiance(made, [0, 1, 3], [-0.2, 0, 0], samples=65536, max_depth=3, aim=False, seed=1)
+    assert aimed.std() < 0.75 * found.std()
+    tolerance = 4 * math.hypot(aimed.std() / 128, found.std() / 256)
+    assert tolerance < 0.03 * aimed.mean()
+    assert abs(aimed.mean() - found.mean()) < tolerance
+
+
+def test_a_gradient_is_aimed_at_without_bias() -> None:
+    around = {"zenith": [0.2, 0.4, 1.0], "horizon": [1.5, 1.2, 1.0], "ground": [0, 0, 0]}
+    made = world(materials=MATERIALS, environment=around, planes=[FLOOR])
+    values = radiance(made, [0, 1, 3], [0, 0, 0], samples=16384, max_depth=1)
+    # Irradiance of h + (z - h) cos over the upper half: pi (h + (z - h) 2 / 3), of each wavelength, so of their means.
+    means = [radiance(made, [0, 1, 0], [0, y, 1], samples=4096, max_depth=0).mean() for y in (1.0, 1e9)]
+    horizon, zenith = means
+    assert values.mean() == pytest.approx(0.5 * (horizon + (zenith - horizon) * 2 / 3), rel=4e-3)
+
+
+def test_an_environment_lies_where_it_is_said_to_lie(panorama: Path) -> None:
+    turn = math.radians(30)
+    for rotation, azimuth in ((0.0, (48 / 64 - 0.5) * 2 * math.pi), (30.0, (48 / 64 - 0.5) * 2 * math.pi - turn)):
+        made = world(environment={"file": str(panorama), "rotate_y_deg": rotation})
+        up = math.pi / 2 - 9.5 / 32 * math.pi
+        window = [math.cos(up) * math.sin(azimuth), math.sin(up), -math.cos(up) * math.cos(azimuth)]
+        assert np.allclose(radiance(made, [0, 0, 0], window, samples=64), 1, atol=1e-4)
+        below = radiance(made, [0, 0, 0], [0, -1, 0.2], samples=64).mean()
+        assert below < 0.1
+
+
+def test_a_room_keeps_the_sky_out(panorama: Path) -> None:
+    room = {"min_m": [-1, -1, -1], "max_m": [1, 1, 1], "material": "grey"}
+    made = world(materials=MATERIALS, environment={"file": str(panorama)}, rooms=[room])
+    assert not radiance(made, [0, 0, 3], [0, -0.2, -1], max_depth=5).any()

@@ -1,0 +1,177 @@
+"""Mesh files: what is in them arrives, and each mistake is one clear error."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from render_helpers import diffuse, radiance, scene, world
+
+from neurolens.errors import InputError
+from neurolens.render import meshfile
+from neurolens.render.meshfile import TriangleSet, read_file
+from neurolens.render.primitives import Rays
+
+HERE = Path("scene.toml")
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1.25]], float)
+# A pyramid that faces outwards: a square and four triangles.
+SQUARE, SIDES = [0, 3, 2, 1], [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]
+HEADER = "ply\nformat {form} 1.0\ncomment a pyramid\nelement vertex 5\nproperty float x\nproperty float y\n"
+HEADER += "property float z\nelement face 5\nproperty list uchar int vertex_indices\nend_header\n"
+
+
+def obj() -> bytes:
+    lines = ["# a pyramid", *(f"v {x:g} {y:g} {z:g}" for x, y, z in CORNERS), "g base"]
+    lines += ["f " + " ".join(str(k + 1) for k in face) for face in (SQUARE, *SIDES)]
+    return "\n".join(lines).encode()
+
+
+def ply(form: str) -> bytes:
+    header = HEADER.format(form=form).encode()
+    if form == "ascii":
+        rows = [" ".join(f"{x:g}" for x in v) for v in CORNERS]
+        rows += [f"{len(f)} " + " ".join(map(str, f)) for f in (SQUARE, *SIDES)]
+        return header + "\n".join(rows).encode() + b"\n"
+    # The loader reads binary files of triangles, or of quadrilaterals; not of both.
+    header, faces = header.replace(b"face 5", b"face 6"), [SQUARE[:3], [SQUARE[0], *SQUARE[2:]], *SIDES]
+    order = "<" if form == "binary_little_endian" else ">"
+    body = b"".join(struct.pack(f"{order}3f", *v) for v in CORNERS)
+    return header + body + b"".join(struct.pack(f"{order}B3i", 3, *f) for f in faces)
+
+
+def enclosed(mesh: TriangleSet) -> float:
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    return float(np.sum(a * np.cross(b, c)) / 6)
+
+
+@pytest.mark.parametrize("form", ["obj", "ascii", "binary_little_endian", "binary_big_endian"])
+def test_every_format_gives_the_same_solid(form: str, tmp_path: Path) -> None:
+    path = tmp_path / ("a.obj" if form == "obj" else "a.ply")
+    path.write_bytes(obj() if form == "obj" else ply(form))
+    mesh = read_file(HERE, "meshes[0].file", path)
+    assert mesh.faces.shape == (6, 3) and mesh.uv is None and mesh.normals is None
+    assert np.array_equal(np.unique(mesh.vertices, axis=0), np.unique(CORNERS, axis=0))
+    assert enclosed(mesh) == pytest.approx(1.25 / 3)  # base times height over three: no face is lost or turned
+
+
+def test_nothing_is_merged_or_mended(tmp_path: Path) -> None:
+    # Two triangles in one place, one of them the other way round, and two vertices in one place.
+    path = tmp_path / "a.obj"
+    path.write_text("\tv 0 0 0 # origin\nv 1 0 0\nv  0 1 0\n v 0 1 0\nf 1 2 3\n f\t1 4 2\n")
+    mesh = read_file(HERE, "file", path)
+    assert len(mesh.faces) == 2 and enclosed(TriangleSet(mesh.vertices + [0, 0, 1], mesh.faces)) == pytest.approx(0)
+
+
+def test_texture_coordinates_and_normals_of_parts_and_polygons(tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text(
+        "mtllib none.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvn 0 0 1\nvn 0.6 0 0.8\n"
+        "usemtl a\nf 1/1/1 2/2/2 3/3/1 \\\n 4/4/1\nusemtl b\nf 1/4/1 2/3/1 3/2/1\n"
+    )
+    mesh = read_file(HERE, "file", path)
+    assert mesh.faces.shape == (3, 3) and mesh.uv is not None and mesh.normals is not None
+    quad = [k for k in range(3) if not np.allclose(mesh.uv[mesh.faces[k]], [[0, 1], [1, 1], [1, 0]])]
+    assert len(quad) == 2
+    for k in quad:
+        corner, uv = mesh.vertices[mesh.faces[k]], mesh.uv[mesh.faces[k]]
+        assert np.allclose(corner[:, :2], uv)
+        tilted = (corner[:, 0] == 1) & (corner[:, 1] == 0)
+        assert np.allclose(mesh.normals[mesh.faces[k]][tilted], [0.6, 0, 0.8])
+
+
+def test_a_picture_lies_on_a_mesh_as_its_coordinates_say(tmp_path: Path) -> None:
+    picture = np.zeros((2, 2, 3), np.uint8)
+    picture[0, 1], picture[1, 0], picture[1, 1] = 255, (255, 0, 0), (0, 255, 0)
+    Image.fromarray(picture).save(tmp_path / "p.png")
+    # Turned by a quarter: u runs along +y, v along -x.
+    (tmp_path / "a.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        "property float s\nproperty float t\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        "0 0 0 0 1\n1 0 0 0 0\n1 1 0 1 0\n0 1 0 1 1\n4 0 1 2 3\n"
+    )
+    made = world(
+        textures={"p": {"kind": "image", "file": str(tmp_path / "p.png")}},
+        materials={"m": {"kind": "diffuse", "texture": "p"}},
+        meshes=[{"file": str(tmp_path / "a.ply"), "material": "m", "translate_m": [0, 0, -2]}],
+        environment={"colour": [1, 1, 1]},
+    )
+    for (x, y), shown in {
+        (0.25, 0.25): 0.0,
+        (0.25, 0.75): 1.0,
+        (0.75, 0.25): (1, 0, 0),
+        (0.75, 0.75): (0, 1, 0),
+    }.items():
+        values = radiance(made, [x, y, 0], [x, y, -2], samples=256, max_depth=1)
+        other = world(
+            materials={"m": diffuse(*np.broadcast_to(shown, 3).astype(float))},
+            planes=[{"point_m": [0, 0, -2], "normal": [0, 0, 1], "material": "m"}],
+            environment={"colour": [1, 1, 1]},
+        )
+        assert np.allclose(values, radiance(other, [x, y, 0], [x, y, -2], samples=256, max_depth=1), atol=2e-3)
+
+
+@pytest.mark.parametrize(("smooth", "tilted"), [(None, True), (True, True), (False, False)])
+def test_normals_of_the_file_are_used_and_turned(smooth: bool | None, tilted: bool, tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nvn 0.6 0 0.8\nf 1//1 2//1 3//1\n")
+    table: dict[str, Any] = {"file": str(path), "material": "m", "rotate_y_deg": 90, "scale": 2}
+    made = world(materials={"m": diffuse(1, 1, 1)}, meshes=[table | ({} if smooth is None else {"smooth": smooth})])
+    batch = Rays.of(np.float32([[5], [0], [0]]), np.float32([[-1], [0], [0]]))
+    distance, found = made.nearest(batch)
+    flat, shading = made.normals(found.astype(np.intp), batch.origin + distance * batch.direction)
+    assert np.allclose(flat[:, 0], [1, 0, 0], atol=1e-6)
+    assert np.allclose(shading[:, 0], [0.8, 0, -0.6] if tilted else [1, 0, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.obj", b"", "at least one triangle"),
+        ("a.obj", b"v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", "line 2.*v X Y Z"),
+        ("a.obj", b"v 0 0 x\n", "line 1.*v X Y Z"),
+        ("a.obj", b"v 0 0 nan\n", "line 1.*v X Y Z"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\n", "line 4.*f I J K"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "line 4.*counted from 1"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -3\n", "line 4.*counted from 1"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 b 3\n", "line 4.*f I J K"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "line 4.*'9'.*v from 1 to 3"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/2\n", "line 5.*'3/2'.*vt from 1 to 1"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 2//1 3//1\n", "line 4.*vn from 1 to 0"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "degenerate"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1e400 0\nf 1 2 3\n", "finite"),
+        ("a.obj", b"\xff\xfe\x00v", "text file"),
+        ("a.ply", b"", "begins with ply"),
+        ("a.ply", b"solid cube", "begins with ply"),
+        ("a.ply", ply("binary_little_endian")[:-7], "trimesh can read"),
+        ("a.ply", ply("ascii")[:-30], "trimesh can read|5 triangles"),
+        ("a.ply", ply("ascii").replace(b"1.25", b"nan"), "finite numbers"),
+        ("a.ply", ply("ascii").replace(b"3 0 1 4", b"3 0 1 9"), "vertices from 0 to 4"),
+        ("a.ply", ply("ascii").replace(b"3 0 1 4", b"3 0 1 1"), "degenerate"),
+        ("a.ply", ply("ascii").replace(b"element face 5", b"element face 0"), "at least one triangle|trimesh"),
+        ("a.ply", ply("binary_little_endian").replace(b"vertex 5", b"vertex 50000000"), "no more elements than bytes"),
+        ("a.stl", b"solid", r"\.obj or \.ply"),
+    ],
+)
+def test_each_broken_file_is_named(name: str, content: bytes, message: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        scene(materials={"m": diffuse(1, 1, 1)}, meshes=[{"file": str(path), "material": "m"}])
+    assert str(caught.value).startswith("test.toml: meshes[0]") and ", expected " in str(caught.value)
+
+
+def test_large_and_missing_files_are_refused_before_they_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.obj"
+    path.write_bytes(obj())
+    monkeypatch.setattr(meshfile, "LARGEST_FILE", 100)
+    with pytest.raises(InputError, match="at most 100 bytes"):
+        read_file(HERE, "meshes[0].file", path)
+    for missing in (tmp_path / "none.ply", tmp_path):
+        with pytest.raises(InputError, match="can be read|ends in"):
+            read_file(HERE, "meshes[0].file", missing)
