@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import lens_models
 import numpy as np
+import torch
 
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.cameras.vignetting import Vignetted
+from neurolens.optics.radiometry import FilmLight, film_light
 
 ROOT = Path(__file__).parents[2]
 FILM = (36.0, 24.0)
@@ -25,20 +29,33 @@ _MODELS = {"polynomial": "ols-60", "network": "mlp-16x2"}
 @cache
 def camera(kind: str, focus_m: float = 2.0, f_number: float | None = 4.0) -> Any:
     """A camera of a 50 mm lens (14 mm for a fisheye projection) on `FILM`."""
-    if kind in ("exact", "exact64"):
+    if kind == "exact":
         bounds = lens_models.domain().bounds
-        return ExactCamera(
-            lens_models.lens(),
-            film_mm=FILM,
-            focus_m=focus_m,
-            f_number=f_number,
-            bounds=bounds,
-            dtype="float64" if kind == "exact64" else "float32",
-        )
+        return ExactCamera(lens_models.lens(), film_mm=FILM, focus_m=focus_m, f_number=f_number, bounds=bounds)
+    if kind == "exact64":  # the same outline, not searched again
+        double = copy(camera("exact", focus_m, f_number))
+        double._dtype, double.film = torch.float64, copy(double.film)
+        double.film.scene = double._scene
+        return double
     if kind in _MODELS:
         model = load_model(ROOT / "models" / f"{GAUSS.stem}.{_MODELS[kind]}.onnx")
         return OnnxCamera(model, film_mm=FILM, focus_m=focus_m, f_number=f_number, wavelength_nm=(400.0, 700.0))
     return make_camera(f"thick:{GAUSS}" if kind == "thick" else kind, Shot(FILM, focus_m, f_number))
+
+
+@cache
+def tabled(kind: str) -> Vignetted:
+    """The camera without vignetting."""
+    return Vignetted(camera(kind))
+
+
+RADII = np.array([0.0, 8.0, 16.0, 21.4])
+
+
+@cache
+def light() -> FilmLight:
+    """Light of the exact lens at `RADII` and 550 nm, by an integral over the pupil's boundary that knows no camera."""
+    return film_light(camera("exact").lens, RADII, wavelength_nm=550.0, directions=40)
 
 
 def at(point: tuple[float, float], count: int) -> np.ndarray:
@@ -53,9 +70,11 @@ def jittered(side: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     return square, rng.permutation(np.linspace(400, 700, side * side)).astype(np.float32)
 
 
-def film_value(camera: Any, point: tuple[float, float], side: int = 128) -> float:
-    """Film value of white surroundings."""
+def film_value(camera: Any, point: tuple[float, float], side: int = 112, wavelength_nm: float | None = None) -> float:
+    """Film value of white surroundings, over 400 to 700 nm or at one wavelength."""
     square, wavelength = jittered(side)
+    if wavelength_nm is not None:
+        wavelength[:] = wavelength_nm
     return float(camera.sample(at(point, side * side), square, wavelength).weight.mean(dtype=np.float64))
 
 
