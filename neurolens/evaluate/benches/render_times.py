@@ -80,7 +80,7 @@ class Subject:
 
     @property
     def name(self) -> str:
-        return self.kind if self.refractions is None else f"{self.lens}, {self.kind}"
+        return self.kind if self.lens == self.kind else f"{self.lens}, {self.kind}"
 
 
 @dataclass

@@ -199,9 +199,8 @@ def _camera_table(found: Found) -> str:
         row, more = found.row(s, "cheap"), found.row(s, "cheap", True)
         both = [None if r is None else f"{min(r.camera_s) / r.paths * 1e9:.3g}" for r in (row, more)]
         passed, made = None if row is None else _percent(row.passed), f"{s.made_s:.2g}"
-        rows.append(
-            [s.name, s.refractions, ns, moves, *both, _percent(_moves_share(found, s)), passed, f"{s.made_s:.2g}"]
-        )
+        known = [s.name, s.refractions, ns, moves, *both, _percent(_moves_share(found, s)), passed, made]
+        rows.append(known)
     head = (
         "camera|refractions|ns a ray, alone|with differentials|ns a ray in the cheap render|with differentials|"
         "differentials add|rays that pass|made in s"
