@@ -131,7 +131,7 @@ def test_arrays_of_other_layouts_and_shapes() -> None:
 
 
 @pytest.mark.parametrize(
-    "aperture", [Aperture(blades=5, rotation_deg=20), Aperture(mask=np.eye(64) + np.eye(64)[::-1])]
+    "aperture", [Aperture(blades=5, rotation_deg=20), Aperture(mask=BAND)]
 )
 def test_blades_and_masks(aperture: Aperture) -> None:
     plain, fused = pair(5.6, aperture)
