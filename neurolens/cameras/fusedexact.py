@@ -23,8 +23,9 @@ class FusedExactCamera(ExactCamera):
     """
 
     def __init__(self, lens: Lens, **kwargs: Any) -> None:
+        exact_program(lens, 0.0, (LINE_D_NM, LINE_D_NM))  # refuses what it does not know, before the pupil is sought
+        _check(lens)
         super().__init__(lens, **kwargs)
-        _check(self.lens)
         waves = self.wavelength_nm or (LINE_D_NM, LINE_D_NM)
         program = exact_program(self.lens, self._pupil_z_mm, waves)
         stop, surface = float(self.lens.stop_radius_mm), self.lens.stop_index

@@ -147,7 +147,8 @@ class _Writer:
             if isinstance(product.argument, int):
                 step = self.program.steps[product.argument]
                 if step.kind == "mul":
-                    return self.program.fma(*(Expr(self.program, x) for x in step.arguments), other)
+                    left, right = (Expr(self.program, x) for x in step.arguments)
+                    return self.program.fma(left, right, other)
         return a + b
 
     def _sum(self, array: Array, axes: list[int], keepdims: bool) -> Array:

@@ -67,7 +67,7 @@ def load_compiled(source: str) -> ctypes.CDLL:
     library = folder / f"{_key(source)}.so"
     if not library.is_file():
         with atomic_path(library) as temporary:
-            compile_c(source, temporary)
+            compile_c(source, temporary, FLAGS)
             temporary.chmod(0o700)
         _forget_oldest(folder)
     return ctypes.CDLL(str(library))

@@ -1,0 +1,246 @@
+"""Fused cameras against the cameras that they stand for: same random numbers, same rays."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import lens_models
+import numpy as np
+import onnx
+import pytest
+
+from neurolens import status as st
+from neurolens.apertures import Aperture
+from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.contract import CameraRays
+from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.fused import FusedCamera
+from neurolens.cameras.fusedexact import FusedExactCamera
+from neurolens.cameras.graphprogram import program_of
+from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.errors import InputError
+from neurolens.optics.lensfile import read_lens
+from neurolens.programs import compiler
+from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
+from neurolens.render.renderer import render
+from neurolens.render.scenefile import load_scene
+from neurolens.surrogates.onnx.export import export_onnx
+from neurolens.surrogates.precision import store_weights
+
+ROOT = Path(__file__).parents[2]
+FILM = (36.0, 24.0)
+Numbers = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick(tmp_path_factory: pytest.TempPathFactory) -> object:
+    """Compiled with less effort, into a folder of the tests; -O3 is for those who render."""
+    try:
+        compiler.find_compiler()
+    except InputError as reason:
+        pytest.skip(f"nothing is compiled here: {reason}")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiler, "FLAGS", ("-std=c99", "-O1", "-march=native"))
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@cache
+def model_file() -> Path:
+    """A polynomial, exported with derivatives."""
+    file = lens_models.exported("invariants")
+    return export_onnx(lens_models.model("invariants"), file.with_name("moves.onnx"), derivatives=True)
+
+
+@cache
+def pair(f_number: float | None = None, aperture: Aperture | None = None) -> tuple[OnnxCamera, FusedCamera]:
+    """The same model in onnxruntime and fused."""
+    model = load_model(model_file())
+    plain, fused = (
+        kind(model, film_mm=FILM, focus_m=2.0, f_number=f_number, aperture=aperture)
+        for kind in (OnnxCamera, FusedCamera)
+    )
+    return plain, fused
+
+
+def numbers(count: int, seed: int = 0, film: tuple[float, float] = FILM) -> Numbers:
+    """Points beyond the film too, the whole square, wavelengths beyond the model's."""
+    rng = np.random.default_rng(seed)
+    points = (rng.random((2, count)) - 0.5) * 1.4 * np.array(film)[:, None]
+    square, wavelength = rng.random((2, count), np.float32), rng.uniform(360, 800, count)
+    return points.astype(np.float32), square, wavelength.astype(np.float32)
+
+
+def agree(found: CameraRays, wanted: CameraRays, differ: float = 0.0, metres: float = 1e-7, unit: float = 1e-6) -> None:
+    """Equal to rounding where both pass; statuses may differ for a share of rays, at an edge."""
+    same = found.status == wanted.status
+    assert np.count_nonzero(~same) <= differ * same.size
+    assert found.status.dtype == np.int32 and found.weight.dtype == found.origin_m.dtype == np.float32
+    ok = same & (wanted.status == st.PASSED)
+    np.testing.assert_allclose(found.origin_m[:, ok], wanted.origin_m[:, ok], rtol=0, atol=metres)
+    np.testing.assert_allclose(found.direction[:, ok], wanted.direction[:, ok], rtol=0, atol=unit)
+    np.testing.assert_allclose(found.weight[same], wanted.weight[same], rtol=5e-6, atol=1e-6)
+
+
+def test_a_model_gives_the_rays_of_onnxruntime() -> None:
+    plain, fused = pair()
+    given = numbers(20_000)
+    wanted = plain.sample(*given)
+    agree(fused.sample(*given), wanted, differ=2e-4)
+    assert 0.3 < (wanted.status == st.PASSED).mean() < 0.9 and (wanted.status == st.OUTSIDE_DOMAIN).any()
+
+
+def test_extremes_of_film_square_and_wavelength() -> None:
+    plain, fused = pair()
+    below = np.nextafter(np.float32(1), np.float32(0))
+    square = np.array([[0.0, 0.5, below, 0.0, 0.5, 1e-30, below], [0.0, 0.5, below, below, 0.0, 0.5, 0.5]], np.float32)
+    strange = np.float32([0.0, math.nan, math.inf, -math.inf, 1e-40, 3e38, 21.0, -17.9])
+    x, y, k = (a.ravel() for a in np.meshgrid(strange, strange, np.arange(square.shape[1])))
+    for wavelength in (550.0, 400.0, 380.0, 0.0, math.nan, math.inf, -550.0):
+        given = np.stack([x, y]), square[:, k], np.full(x.size, wavelength, np.float32)
+        with np.errstate(all="ignore"):
+            wanted, found = plain.sample(*given), fused.sample(*given)
+        assert np.array_equal(found.status, wanted.status), wavelength
+        assert np.isfinite(found.weight).all() and (found.weight[found.status != st.PASSED] == 0).all()
+        agree(found, wanted)
+        dark = ~np.isfinite(x) | ~np.isfinite(y) | (x > 1e3) | (y > 1e3)
+        assert (found.direction[:, dark].T == (0, 0, -1)).all() and not found.weight[dark].any()
+
+
+@pytest.mark.parametrize("count", [0, 1, 255, 257])
+def test_batches_of_any_size(count: int) -> None:
+    plain, fused = pair()
+    given = numbers(count)
+    agree(fused.sample(*given), plain.sample(*given))
+    moves = fused.sample_differentials(*given).differentials
+    assert moves is not None and moves.origin_m.shape == moves.direction.shape == (3, 2, count)
+
+
+def test_arrays_of_other_layouts_and_shapes() -> None:
+    _, fused = pair()
+    film, square, wavelength = numbers(300)
+    wide = np.repeat(film, 2, axis=1)[:, ::2].astype(np.float64)
+    assert np.array_equal(fused.sample(wide, square, wavelength).weight, fused.sample(film, square, wavelength).weight)
+    for bad in ((film[:1], square, wavelength), (film, square[:, :9], wavelength), (film, square, wavelength[:9])):
+        with pytest.raises(ValueError):
+            fused.sample(*bad)
+
+
+@pytest.mark.parametrize(
+    "aperture", [Aperture(blades=5, rotation_deg=20), Aperture(mask=BAND)]
+)
+def test_blades_and_masks(aperture: Aperture) -> None:
+    plain, fused = pair(5.6, aperture)
+    given = numbers(20_000, seed=3)
+    wanted = plain.sample(*given)
+    agree(fused.sample(*given), wanted, differ=2e-3)
+    stopped = wanted.status == st.blocked(lens_models.lens().stop_index, st.RIM)
+    assert stopped.mean() > 0.1 and (wanted.status == st.PASSED).mean() > 0.1
+
+
+def test_differentials_of_a_model_are_those_of_its_graph() -> None:
+    plain, fused = pair()
+    given = numbers(5000, seed=5)
+    wanted, found = plain.sample_differentials(*given), fused.sample_differentials(*given)
+    agree(found, wanted, differ=2e-4)
+    ok = (found.status == st.PASSED) & (wanted.status == st.PASSED)
+    assert found.differentials is not None and wanted.differentials is not None
+    for name in ("origin_m", "direction"):
+        a, b = (getattr(d, name)[..., ok] for d in (found.differentials, wanted.differentials))
+        np.testing.assert_allclose(a, b, rtol=0, atol=2e-5 * np.abs(b).max())
+    dark = found.status == st.OUTSIDE_DOMAIN
+    assert not found.differentials.direction[..., dark & (found.direction[2] == -1)].any()
+
+
+def test_the_exact_lens() -> None:
+    lens = read_lens(lens_models.LENSES / "thorlabs_lb1471_biconvex_50.toml").with_aperture(Aperture(blades=6))
+    plain, fused = (kind(lens, film_mm=FILM, focus_m=3.0) for kind in (ExactCamera, FusedExactCamera))
+    film, square, _ = numbers(4000, seed=7)
+    given = film, square, np.linspace(400, 700, 4000, dtype=np.float32)
+    wanted, found = plain.sample_differentials(*given), fused.sample_differentials(*given)
+    agree(found, wanted, differ=1e-3, metres=5e-7, unit=5e-6)
+    agree(fused.sample(*given), wanted, differ=1e-3, metres=5e-7, unit=5e-6)
+    ok = (found.status == st.PASSED) & (wanted.status == st.PASSED)
+    assert ok.mean() > 0.3 and found.differentials is not None and wanted.differentials is not None
+    a, b = (d.direction[..., ok] for d in (found.differentials, wanted.differentials))
+    np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * np.abs(b).max())
+
+
+def test_lenses_that_a_c_tracer_does_not_know() -> None:
+    for name, said in (("phone_lens_6", "spheres"), ("cooke_triplet_50", "absorbs")):
+        with pytest.raises(InputError, match=said):
+            make_camera(f"fused:{lens_models.LENSES / name}.toml", Shot((4.0, 3.0), math.inf))
+    for spec in ("fused:thin", "fused:", "fused:nothing.onnx"):
+        with pytest.raises(InputError):
+            make_camera(spec, Shot(FILM, 2.0))
+
+
+def evaluated_as_onnxruntime(file: Path, state: tuple[float, ...] = (), differ: float = 2e-4) -> None:
+    """A graph's program, evaluated in numpy, against onnxruntime."""
+    model = load_model(file)
+    model = model.at(*state) if state else model
+    domain, rng = model.card["domain"], np.random.default_rng(2)
+    film, pupil = ((rng.random((2, 5000)) - 0.5) * 1.6 * domain[k] for k in ("film_radius_mm", "pupil_radius_mm"))
+    wavelength, z, stop = rng.uniform(390, 720, 5000), domain["film_z_mm"][0], 0.8 * domain["stop_radius_mm"]
+    wanted = model.rays(film, pupil, wavelength, z, stop)
+    inputs = dict(zip((*RAY, WAVELENGTH), (*film, *pupil, wavelength), strict=True)) | {FILM_Z: z, STOP_RADIUS: stop}
+    found = program_of(file, model.data, state).evaluate(inputs)
+    same = found["status"] == wanted.status
+    ok = same & (wanted.status == st.PASSED)
+    assert same.mean() >= 1 - differ and ok.mean() > 0.05 and len(np.unique(wanted.status)) > 2
+    for name, row in zip(SCENE_RAY, wanted.scene_ray, strict=True):
+        assert np.abs(found[name] - row)[ok].max() < (1e-4 if name.endswith("mm") else 2e-6)
+    assert np.abs(found["transmittance"] - wanted.transmittance)[ok].max() < 1e-5
+
+
+@pytest.mark.parametrize("kind", lens_models.KINDS)
+def test_programs_of_every_kind_of_graph(kind: str) -> None:
+    evaluated_as_onnxruntime(lens_models.exported(kind))
+
+
+@pytest.mark.parametrize("precision", ["int8", "float16"])
+def test_programs_of_rounded_weights(precision: str, tmp_path: Path) -> None:
+    file = store_weights(lens_models.exported("network"), tmp_path / "rounded.onnx", precision)  # type: ignore[arg-type]
+    evaluated_as_onnxruntime(file)
+
+
+def test_programs_of_many_states() -> None:
+    file = ROOT / "models" / "nikon_zoom_80_200-range.states-64.onnx"
+    for share in (0.0, 0.37, 1.0):
+        state = tuple(a.range[0] + share * (a.range[1] - a.range[0]) for a in load_model(file).axes)
+        evaluated_as_onnxruntime(file, state, differ=1e-3)
+
+
+def test_an_operator_without_a_fused_form(tmp_path: Path) -> None:
+    proto = onnx.load(lens_models.exported("network"))
+    next(n for n in proto.graph.node if n.op_type == "Tanh").op_type = "Sin"
+    with pytest.raises(InputError, match="Sin"):
+        program_of(tmp_path / "model.onnx", proto.SerializeToString())
+
+
+def test_workers_share_one_library() -> None:
+    _, fused = pair()
+    scene = load_scene(ROOT / "experiments" / "scenes" / "grid.toml")
+    one, two = (render(scene, fused, width=24, height=16, samples=4, threads=t) for t in (1, 2))
+    assert np.array_equal(one.rgb, two.rgb) and one.rgb.max() > 0
+
+
+def test_no_torch_no_onnx(tmp_path: Path) -> None:
+    pair()
+    code = (
+        "import sys\n"
+        "sys.modules.update(dict.fromkeys(['torch', 'onnx', 'sklearn', 'matplotlib']))\n"
+        "from neurolens.programs import compiler\n"
+        f"compiler.FLAGS = {compiler.FLAGS!r}\n"
+        "from neurolens.cameras.build import Shot, make_camera\n"
+        f"camera = make_camera('fused:{model_file()}', Shot((36.0, 24.0), 2.0))\n"
+        "import numpy as np\n"
+        "rays = camera.sample(np.zeros((2, 9), 'f4'), np.full((2, 9), .5, 'f4'), np.full(9, 550, 'f4'))\n"
+        "assert (rays.status == 0).all() and (rays.direction[2] < -.9).all()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr

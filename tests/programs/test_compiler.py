@@ -1,0 +1,55 @@
+"""Compiled libraries: kept for the next time, never taken from a folder that others can write to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from neurolens.errors import InputError
+from neurolens.programs import compiler
+
+SOURCE = "int answer(void) { return 42; }\n"
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    try:
+        compiler.find_compiler()
+    except InputError as reason:
+        pytest.skip(f"nothing is compiled here: {reason}")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+
+def test_compiled_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert compiler.load_compiled(SOURCE).answer() == 42
+    (library,) = (tmp_path / "neurolens").glob("*.so")
+    assert (tmp_path / "neurolens").stat().st_mode & 0o077 == 0 and library.stat().st_mode & 0o077 == 0
+    monkeypatch.setattr(compiler, "compile_c", None)  # not called again
+    assert compiler.load_compiled(SOURCE).answer() == 42
+
+
+def test_other_sources_flags_and_compilers_make_other_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiler.load_compiled(SOURCE)
+    assert compiler.load_compiled(SOURCE.replace("42", "43")).answer() == 43
+    first = compiler._key(SOURCE)
+    monkeypatch.setattr(compiler, "FLAGS", ("-std=c99", "-O1"))
+    assert compiler._key(SOURCE) != first
+
+
+def test_a_folder_open_to_others_is_not_used(tmp_path: Path) -> None:
+    folder = tmp_path / "neurolens"
+    folder.mkdir()
+    folder.chmod(0o777)
+    assert compiler.load_compiled(SOURCE).answer() == 42
+    assert not list(folder.iterdir())
+
+
+def test_no_compiler_and_one_that_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="error"):
+        compiler.load_compiled("this is no C\n")
+    assert not list((tmp_path / "neurolens").iterdir())
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("CC", "")
+    with pytest.raises(InputError, match="a C compiler"):
+        compiler.load_compiled(SOURCE)

@@ -1,0 +1,59 @@
+"""Derivatives of programs against closed forms, and programs put into another order."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurolens.programs.contract import derivative
+from neurolens.programs.expressions import Program
+from neurolens.programs.tangents import with_derivatives
+from neurolens.programs.tanh import add_tanh
+
+X, Y = (v.ravel() for v in np.meshgrid(np.linspace(0.3, 2.0, 9), np.linspace(0.35, 1.9, 8)))
+
+
+def program() -> Program:
+    """Every kind of step."""
+    p = Program()
+    x, y = p.input("x"), p.input("y")
+    p.outputs = {
+        "sum": -(x + y) - y * 3.0,
+        "ratio": p.fma(x, y, p.op("sqrt", x * y)) / (x + 1.0),
+        "choice": p.select(x, y, x * x, y * 5.0),
+        "largest": p.op("max", x * 2.0, p.op("min", y, x)),
+        "tanh": add_tanh(p, [x * y])[0],
+        "constant": p.literal(4.0),
+    }
+    return p
+
+
+def test_derivatives_are_those_of_the_closed_forms() -> None:
+    found = with_derivatives(program(), list(program().outputs), ("x", "y")).evaluate({"x": X, "y": Y})
+    root, above = np.sqrt(X * Y), X + 1
+    slope = 1 / np.cosh(X * Y) ** 2
+    wanted = {
+        "sum": (-1 + 0 * X, -4 + 0 * X),
+        "ratio": ((Y + Y / (2 * root)) / above - (X * Y + root) / above**2, (X + X / (2 * root)) / above),
+        "choice": (np.where(X <= Y, 2 * X, 0), np.where(X <= Y, 0, 5)),
+        "largest": (2 + 0 * X, 0 * X),
+        "tanh": (Y * slope, X * slope),
+        "constant": (0 * X, 0 * X),
+    }
+    for name, pair in wanted.items():
+        for by, value in zip(("x", "y"), pair, strict=True):
+            np.testing.assert_allclose(found[derivative(name, by)] + 0 * X, value, rtol=0, atol=3e-6, err_msg=name)
+
+
+def test_values_stay_the_same_to_the_bit() -> None:
+    values = program().evaluate({"x": X, "y": Y})
+    others = (with_derivatives(program(), ["ratio"], ("x",)), program().in_order_of_need())
+    for other in others:
+        found = other.evaluate({"x": X, "y": Y})
+        assert all(np.array_equal(found[name], value) for name, value in values.items())
+    assert others[1].count() == program().count()
+
+
+def test_every_step_comes_after_what_it_takes() -> None:
+    ordered = with_derivatives(program().in_order_of_need(), ["ratio", "tanh"], ("x", "y"))
+    for k, step in enumerate(ordered.steps):
+        assert all(a < k for a in step.arguments if isinstance(a, int))
