@@ -68,8 +68,8 @@ def film_map(
     camera = on_same_pupil(camera, exact)
     across, down = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
     # The picture shows the film turned by 180 degrees: see render.film.PixelGrid.
-    film = np.stack([(0.5 - across) * exact.film_mm[0], (down - 0.5) * exact.film_mm[1]]).reshape(2, -1)
-    film = np.repeat(film, samples, axis=1).astype(np.float32)
+    middles = np.stack([(0.5 - across) * exact.film_mm[0], (down - 0.5) * exact.film_mm[1]]).reshape(2, -1)
+    film = np.repeat(middles, samples, axis=1).astype(np.float32)
     random = np.random.default_rng(seed).random((3, film.shape[1]), np.float32)
     low, high = wavelengths_nm
     pupil, light = random[:2], (low + (high - low) * random[2]).astype(np.float32)
