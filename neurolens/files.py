@@ -24,7 +24,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, target)
     except OSError as error:
-        if error.errno is None or error.filename is None or os.fspath(error.filename) != str(temporary):
+        # A full disk names no file, others name the temporary one.
+        if error.errno is None or error.filename not in (None, str(temporary), temporary):
             raise
         raise OSError(error.errno, error.strerror, str(target)) from None
     finally:

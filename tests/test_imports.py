@@ -1,6 +1,6 @@
 """The folders are layers: imports go one way, a render needs no torch, and modules stay short enough to read.
 
-base (errors, status, files, tomlfile, config, progress, focus, modelfile)
+base (errors, status, files, tomlfile, config, progress, focus, modelfile, programs)
 base <- optics <- surrogates <- evaluate <- commands <- cli
         optics <- analysis   <- evaluate
      <- cameras <- render    <- evaluate
@@ -32,6 +32,7 @@ BASE = {
     "frontsurface",
     "axes",
     "statetable",
+    "programs",
 }
 # Parts of the package that each part may import, besides itself and the base.
 PARTS = {
@@ -57,9 +58,10 @@ PACKAGES = {
 # The one camera that traces rays exactly, and the maker of cameras, which imports it when one is asked for.
 EXACT_CAMERA = {
     "neurolens.cameras.exact": ({"optics"}, {"torch"}),
+    "neurolens.cameras.fusedexact": ({"optics"}, set()),
     "neurolens.cameras.build": ({"optics"}, set()),
 }
-NEEDS_TORCH = {"neurolens.cameras.exact"}
+NEEDS_TORCH = {"neurolens.cameras.exact", "neurolens.cameras.fusedexact"}
 
 
 def module_name(path: Path) -> str:

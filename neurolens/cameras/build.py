@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens
 
 IDEAL = ("thin", "pinhole")
+FUSED = "fused:"  # before a path: compiled by the system's C compiler
 _DARK_FILM = 1.25  # diagonal of the film over the image circle
 _EFL_MM, _THIN_F_NUMBER, _PINHOLE_F_NUMBER = 50.0, 4.0, 8.0
 
@@ -63,7 +64,8 @@ def make_camera(spec: str | Path, shot: Shot) -> Camera:
     """The camera that `spec` names, set for a shot.
 
     Args:
-        spec: "thin", "pinhole", the path of a lens file (.toml) or of a model (.onnx).
+        spec: "thin", "pinhole", the path of a lens file (.toml) or of a model (.onnx); "fused:" and such a path runs it
+            compiled by the system's C compiler instead of in torch or onnxruntime.
 
     Raises:
         InputError: an unknown kind of camera, a missing file, a setting that this kind does not have or cannot reach.
@@ -72,13 +74,14 @@ def make_camera(spec: str | Path, shot: Shot) -> Camera:
     """
     if str(spec) in IDEAL:
         return _ideal(str(spec), shot)
-    path = Path(spec)
+    fused = str(spec).startswith(FUSED)
+    path = Path(str(spec).removeprefix(FUSED))
     if path.suffix not in (".toml", ".onnx"):
         expected = f"a lens file (.toml), a model (.onnx), {' or '.join(IDEAL)}"
         raise InputError("camera", "--camera", str(spec), expected)
     if not path.is_file():
         raise InputError(path, "file", "(missing)", "a lens file" if path.suffix == ".toml" else "an ONNX model")
-    return _exact(path, shot) if path.suffix == ".toml" else _model(path, shot)
+    return _exact(path, shot, fused) if path.suffix == ".toml" else _model(path, shot, fused)
 
 
 def _ideal(kind: str, shot: Shot) -> Camera:
@@ -92,8 +95,9 @@ def _ideal(kind: str, shot: Shot) -> Camera:
     return Pinhole(focal, shot.film_mm, shot.f_number or _PINHOLE_F_NUMBER)
 
 
-def _exact(path: Path, shot: Shot) -> Camera:
+def _exact(path: Path, shot: Shot, fused: bool) -> Camera:
     from neurolens.cameras.exact import ExactCamera
+    from neurolens.cameras.fusedexact import FusedExactCamera
     from neurolens.optics.lenscheck import check_lens, doubts
     from neurolens.optics.lensfile import read_lens
     from neurolens.optics.paraxial import first_order
@@ -103,7 +107,7 @@ def _exact(path: Path, shot: Shot) -> Camera:
     if shot.aperture is not None:
         lens = lens.with_aperture(shot.aperture)
     f_number = shot.f_number_for(first_order(lens).f_number)
-    camera = ExactCamera(
+    camera = (FusedExactCamera if fused else ExactCamera)(
         lens,
         film_mm=shot.film_mm,
         focus_m=shot.focus_m,
@@ -130,7 +134,8 @@ def _dark_film(lens: Lens, film_mm: tuple[float, float]) -> list[str]:
     ]
 
 
-def _model(path: Path, shot: Shot) -> Camera:
+def _model(path: Path, shot: Shot, fused: bool) -> Camera:
+    from neurolens.cameras.fused import FusedCamera
     from neurolens.cameras.model import OnnxCamera, load_model
     from neurolens.cameras.states import state_for
 
@@ -146,7 +151,7 @@ def _model(path: Path, shot: Shot) -> Camera:
         model = model.at(*state_for(path, model.axes, model.state, shot.zoom, shot.focus_m))
     lens, domain = model.card["lens"], model.card["domain"]
     widest = float(lens["f_number"] * lens["stop_radius_mm"] / domain["stop_radius_mm"])
-    return OnnxCamera(
+    return (FusedCamera if fused else OnnxCamera)(
         model,
         film_mm=shot.film_mm,
         focus_m=shot.focus_m,

@@ -78,7 +78,7 @@ class OnnxCamera:
         used = (min(max(low, light[0]), high), max(min(high, light[1]), low))
         film_z = _film_z(model, self.focus_m)
         stop = _stop_radius(model, f_number)
-        round_stop = _Scene(model, film_z, stop)
+        round_stop = ModelScene(model, film_z, stop)
         scene = replace(round_stop, aperture=aperture)
         self.film = LensFilm(PupilTable.of(domain["bounds"]), film_z, used, scene, round_stop.passes)
         self.settings: dict[str, Any] = {
@@ -105,7 +105,7 @@ class OnnxCamera:
         Raises:
             InputError: a model exported without derivatives.
         """
-        assert isinstance(self.film.scene, _Scene)
+        assert isinstance(self.film.scene, ModelScene)
         if self._derivatives is None:
             self._derivatives = OnnxDerivatives(self.model)
         whole = partial(self.film.scene.with_differentials, self._derivatives)
@@ -115,13 +115,13 @@ class OnnxCamera:
         """The same camera with a session of its own, for another process or thread."""
         other = copy(self)
         other.model, other.film, other._derivatives = self.model.reopened(), copy(self.film), None
-        assert isinstance(self.film.scene, _Scene)
+        assert isinstance(self.film.scene, ModelScene)
         other.film.scene = replace(self.film.scene, model=other.model)
         return other
 
 
 @dataclass(frozen=True)
-class _Scene:
+class ModelScene:
     """A model at one focus and stop. The graph knows a round stop; blades and masks are tested on its crossing."""
 
     model: OnnxLens

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurolens.cameras.onnxshapes import BROADCAST, ELEMENTWISE, RAYS, SHAPED, Node, Shape, check_shapes
 from neurolens.cameras.protobuf import Fields, as_text, fields_of, integers, message, one, text, walk
@@ -66,6 +67,17 @@ def without_outputs(data: bytes, names: frozenset[str]) -> bytes:
 
     graph = message(f for f in walk(memoryview(one(fields_of(memoryview(data)), 7))) if kept(f[0], f[2]))
     return message((n, wire, graph if n == 7 else value) for n, wire, value in walk(memoryview(data)))
+
+
+def constants_and_nodes(data: bytes) -> tuple[dict[str, NDArray[Any]], list[Node]]:
+    """Constants by name, and nodes in order, of a model that `read_checked` gave."""
+    graph = fields_of(one(fields_of(memoryview(data)), 7))
+    constants = {}
+    for tensor in (fields_of(t, _FLOATS["tensor"]) for t in graph.get(5, [])):
+        kind, raw = int(one(tensor, 2)), tensor.get(9, [b""])[-1]
+        values = np.frombuffer(raw, _TYPES[kind]) if len(raw) or kind != 1 else _floats(tensor.get(4, []))
+        constants[text(tensor, 8)] = values.reshape(integers(tensor.get(1, [])))
+    return constants, [_node(fields_of(node)) for node in graph.get(1, [])]
 
 
 def _card(file: Path, metadata: dict[str, str]) -> dict[str, Any]:

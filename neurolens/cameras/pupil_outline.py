@@ -86,7 +86,7 @@ class PupilOutline:
         dy *= along
         dy += y
         dy *= np.copysign(size, b)
-        centre, centre_step = self._centres.take(row, axis=1)
+        centre, centre_step = self.centres.take(row, axis=1)
         centre_step *= step
         dx += centre
         dx += centre_step
@@ -108,7 +108,7 @@ class PupilOutline:
 
     def _edge(self, index: NDArray[np.intp], step: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
         """First vertex (x, y) and edge (dx, dy) [4, N] at a fraction of the way to the next row, for wavelengths."""
-        known = self._edges.take(index, axis=2)
+        known = self.edges.take(index, axis=2)
         rows = known[:, 4:]
         rows *= step
         here = known[:, :4]
@@ -129,7 +129,7 @@ class PupilOutline:
         return np.clip(share, np.float32(0), np.float32(1), out=share)
 
     @cached_property
-    def _edges(self) -> FloatArray:
+    def edges(self) -> FloatArray:
         """[W, 8, R * K]: first vertex and edge at each row, their steps to the next row; second the change of all."""
         first = np.stack([self.x[..., :-1], self.y[..., :-1], np.diff(self.x), np.diff(self.y)], axis=1)
         steps = np.diff(first, axis=2, append=first[:, :, -1:])
@@ -138,7 +138,7 @@ class PupilOutline:
         return np.ascontiguousarray(both.reshape(len(both), 8, -1), np.float32)
 
     @cached_property
-    def _centres(self) -> FloatArray:
+    def centres(self) -> FloatArray:
         """[2, R]: centre at each row and its step to the next."""
         return np.stack([self.centre, np.diff(self.centre, append=self.centre[-1:])]).astype(np.float32)
 

@@ -12,6 +12,7 @@ from neurolens.commands import (
     bench_fused,
     bench_inverse,
     bench_models,
+    bench_render,
     bench_surrogates,
     bench_vignetting,
     bench_zoom,
@@ -55,6 +56,7 @@ def add_parser(subparsers: Any) -> None:
     bench_models.add_parser(kinds)
     bench_inverse.add_parser(kinds)
     bench_zoom.add_parser(kinds)
+    bench_render.add_parser(kinds)
     bench_equal_time.add_parser(kinds)
 
 

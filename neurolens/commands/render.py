@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,15 +10,26 @@ from typing import TYPE_CHECKING, Any
 from neurolens import __version__
 from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between, whole
 from neurolens.commands.output import print_json
-from neurolens.errors import InputError
+from neurolens.commands.render_files import (
+    Files,
+    Stopping,
+    Unfinished,
+    add_safety,
+    so_far,
+    warn,
+    watch_of,
+    write_pictures,
+)
+from neurolens.errors import NeurolensError
 from neurolens.evaluate.records import plain
-from neurolens.files import check_writable
 from neurolens.progress import Progress, duration
 from neurolens.render.filmsettings import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS, FilmSettings
 
 if TYPE_CHECKING:
     from neurolens.apertures import Aperture
     from neurolens.cameras.build import Shot
+    from neurolens.cameras.contract import Camera
+    from neurolens.render.renderer import RenderResult
     from neurolens.render.scene import CameraSettings
 
 _DESCRIPTION = """\
@@ -29,7 +39,10 @@ metadata, attribute "neurolens", as JSON.
 
 The same seed gives the same picture, whatever the number of threads; all cameras share its
 random numbers. A model (.onnx), the thin lens and the pinhole need no torch; a lens file
-(.toml) is traced exactly and does (extra "train")."""
+(.toml) is traced exactly and does (extra "train").
+
+The preview follows the render. Ctrl-C (and SIGTERM) writes the picture so far; the same command
+then goes on from OUT.exr.part and ends with the same picture, bit for bit."""
 _EPILOG = """\
 examples:
   neurolens render experiments/scenes/room.toml --camera pinhole --samples 4 -o quick.exr
@@ -37,7 +50,9 @@ examples:
   neurolens render experiments/scenes/lights.toml --camera models/NAME.onnx --f-number 2.8 \\
       --half -o lights.exr
   neurolens render experiments/scenes/grid.toml --camera lenses/ogawa_zoom_70_200.toml \\
-      --zoom 100 --blades 8 --blade-curvature 0.5 -o zoom.exr"""
+      --zoom 100 --blades 8 --blade-curvature 0.5 -o zoom.exr
+  neurolens render experiments/scenes/room.toml --camera thin --samples 64 --keep-checkpoint -o room.exr
+  neurolens render experiments/scenes/room.toml --camera thin --samples 256 -o room.exr   # 192 more"""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -75,7 +90,13 @@ def add_parser(subparsers: Any) -> None:
         "--exposure", metavar="STOPS", type=between(-40, 40, "stops"), default=0.0,
         help="brightens the preview only (default: 0)",
     )  # fmt: skip
+    picture.add_argument(
+        "--layers", choices=("all", "beauty"), default="all",
+        help="of the EXR: colour alone, or also samples, variance (of the pixel's luminance), Z (depth in m along the "
+        "axis from the film) and blocked (share of camera rays that do not pass) (default: all)",
+    )  # fmt: skip
     _add_colour(parser)
+    add_safety(parser)
     add_lens_state(
         parser,
         {
@@ -87,7 +108,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=2, help="workers (default: 2)")
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     add_json(parser)
-    parser.set_defaults(run=run, kept="no picture was written; older files of that name are untouched")
+    parser.set_defaults(run=run_kept, kept="no picture was written; older files of that name are untouched")
 
 
 def _add_colour(parser: argparse.ArgumentParser) -> None:
@@ -119,12 +140,18 @@ def film_of(settings: FilmSettings, args: argparse.Namespace) -> FilmSettings:
     return replace(settings, **given)
 
 
+def run_kept(args: argparse.Namespace) -> int:
+    """As `run`; what memory cannot hold is one line, too."""
+    try:
+        return run(args)
+    except MemoryError as error:
+        raise NeurolensError(f"render: out of memory ({str(error) or 'no more said'})") from None
+
+
 def run(args: argparse.Namespace) -> int:
     """Render, write both pictures, say how it went."""
-    preview = _preview_path(args.out)
+    files = Files.of(args.out)
     from neurolens.cameras.build import make_camera
-    from neurolens.render.colour import COLOUR_SPACES
-    from neurolens.render.exr import write_exr, write_png
     from neurolens.render.film import PixelGrid
     from neurolens.render.illuminants import check_name
     from neurolens.render.renderer import render
@@ -142,22 +169,40 @@ def run(args: argparse.Namespace) -> int:
     PixelGrid(width, height, (settings.film_width_mm, settings.film_height_mm))  # before the slow making of a camera
     camera = make_camera(args.camera, shot_of(settings, args, scene.aperture))
     for note in camera.settings.get("notes", ()):
-        print(f"neurolens: warning: {note}", file=sys.stderr)
-    with Progress(quiet=args.quiet).stage(f"render {scene.name}, {camera.name}") as report:
+        warn(note)
+    with (
+        Stopping() as stopping,
+        Progress(quiet=args.quiet).stage(f"render {scene.name}, {camera.name}") as report,
+    ):
         result = render(
             scene, camera, width=width, height=height, samples=args.samples, seed=args.seed,
             threads=args.threads, max_depth=args.max_depth, film=film, progress=report,
+            watch=watch_of(args, files, stopping),
         )  # fmt: skip
+        if not result.stats["complete"]:
+            raise Unfinished
+    return _deliver(args, files, result, camera, film, stopping)
+
+
+def _deliver(
+    args: argparse.Namespace, files: Files, result: RenderResult, camera: Camera, film: FilmSettings, stopping: Stopping
+) -> int:
+    """Write the pictures, whole or as far as they got, and say what they are; the exit code."""
+    if stopping():
+        args.kept = files.kept()
+    if not result.stats["paths"]:
+        return stopping.say(args.kept)
+    metadata = {"version": __version__, "scene": str(args.scene), "camera": plain(camera.settings)}
+    write_pictures(files, result, metadata, film, args)
+    if not result.stats["complete"]:
+        return stopping.say(f"{so_far(result, files)}; {files.kept()}")
+    if not args.keep_checkpoint:
+        files.checkpoint.unlink(missing_ok=True)
     stats = plain(result.stats)
-    space = COLOUR_SPACES[film.colour_space]
-    metadata = {"version": __version__, "scene": str(args.scene), "camera": plain(camera.settings), "render": stats}
-    metadata["colour"] = {"space": space.name, "white_xy": list(space.white), "adaptation": "Bradford"}
-    write_exr(args.out, result.rgb, half=args.half, metadata=metadata, space=space)
-    write_png(preview, result.rgb, args.exposure)
     if args.json:
-        print_json({"file": str(args.out), "preview": str(preview), **stats, "camera": camera.settings})
+        print_json({"file": str(files.out), "preview": str(files.preview), **stats, "camera": camera.settings})
     else:
-        print(_text(stats, args.out, preview))
+        print(_text(stats, files))
     return 0
 
 
@@ -201,27 +246,10 @@ def film_size(text: str) -> tuple[float, float]:
         raise argparse.ArgumentTypeError(f"{text!r}: {error}") from None
 
 
-def _preview_path(out: Path) -> Path:
-    """The PNG beside the EXR; refuses names that cannot be written before anything is rendered.
-
-    Raises:
-        InputError: not .exr, or no such folder.
-        OSError: a folder that cannot be written.
-    """
-    if out.suffix.lower() != ".exr":
-        raise InputError(out, "--out", out.suffix or "(no suffix)", "a name that ends in .exr")
-    if not out.parent.is_dir():
-        raise InputError(out, "--out", str(out.parent), "a folder that exists")
-    preview = out.with_suffix(".png")
-    for path in (out, preview):
-        check_writable(path)
-    return preview
-
-
-def _text(stats: dict[str, Any], out: Path, preview: Path) -> str:
+def _text(stats: dict[str, Any], files: Files) -> str:
     return (
         f"{stats['scene']} through {stats['camera']}: {stats['width']} x {stats['height']}, {stats['samples']} samples "
         f"in {duration(stats['seconds'])} ({stats['mpaths_per_s']:.2f} Mpath/s, "
         f"{100 * stats['passed_fraction']:.0f}% of the rays pass, "
-        f"{100 * stats['camera_fraction']:.0f}% of the time in the camera)\n{out}\n{preview}"
+        f"{100 * stats['camera_fraction']:.0f}% of the time in the camera)\n{files.out}\n{files.preview}"
     )

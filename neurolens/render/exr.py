@@ -7,6 +7,7 @@ int32; `write_exr` takes care of all three.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ from neurolens.render.spectrum import linear_to_srgb
 
 METADATA_KEY = "neurolens"
 _HALF_MAX = 65504.0
+_COLOURS = "RGB"
+_DEPTH = "Z"  # the name that other programs know
 
 
 def write_exr(
@@ -32,8 +35,9 @@ def write_exr(
     half: bool = False,
     metadata: dict[str, Any] | None = None,
     space: ColourSpace = SRGB,
+    layers: Mapping[str, ArrayLike] | None = None,
 ) -> None:
-    """Write a picture as OpenEXR: channels R, G and B, ZIP compression, whole or not at all.
+    """Write a picture as OpenEXR: channels R, G and B, then layers, ZIP compression, whole or not at all.
 
     The attributes chromaticities, adoptedNeutral and colorInteropID say which colour space it is.
 
@@ -43,10 +47,11 @@ def write_exr(
         half: store as float16, where values beyond 65504 become 65504.
         metadata: JSON-able settings, kept as one JSON text in the attribute "neurolens".
         space: colour space to store.
+        layers: [H, W] more channels by name, always float32, inf allowed; "depth" becomes the channel Z.
 
     Raises:
-        InputError: another shape, no pixels, complex or text, not finite, metadata that is not JSON, no such folder,
-            a place that cannot be written.
+        InputError: another shape, no pixels, complex or text, not finite, a layer with NaN or of a colour's name,
+            metadata that is not JSON, no such folder, a place that cannot be written.
     """
     path = Path(path)
     picture = np.asarray(rgb)
@@ -55,7 +60,7 @@ def write_exr(
     if picture.dtype.kind not in "fiub":
         raise InputError(path, "rgb type", str(picture.dtype), "real numbers")
     with np.errstate(over="ignore"):
-        picture = picture.astype(np.float32) if space is SRGB else _in_space(picture, space)
+        picture = picture.astype(np.float32, copy=False) if space is SRGB else _in_space(picture, space)
     if not np.all(np.isfinite(picture)):
         raise InputError(
             path, "rgb", f"({int(np.sum(~np.isfinite(picture)))} values not finite)", "finite float32 values"
@@ -67,7 +72,8 @@ def write_exr(
     if not path.parent.is_dir():
         raise InputError(path, "folder", str(path.parent), "a folder that exists")
     stored = np.clip(picture, -_HALF_MAX, _HALF_MAX).astype(np.float16) if half else picture
-    channels = {name: np.ascontiguousarray(stored[..., k]) for k, name in enumerate("RGB")}
+    channels = {name: np.ascontiguousarray(stored[..., k]) for k, name in enumerate(_COLOURS)}
+    channels |= _layer_channels(path, layers or {}, picture.shape[:2])
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
@@ -84,6 +90,18 @@ def write_exr(
             raise InputError(path, "file", f"({said})", "a place that can be written") from None
 
 
+def _layer_channels(path: Path, layers: Mapping[str, ArrayLike], shape: tuple[int, ...]) -> dict[str, FloatArray]:
+    channels = {}
+    for name, values in layers.items():
+        plane = np.ascontiguousarray(values, np.float32)
+        if plane.shape != shape:
+            raise InputError(path, f"layer {name}, shape", plane.shape, f"{shape}, the picture's")
+        if name in (*_COLOURS, _DEPTH) or np.isnan(plane).any():
+            raise InputError(path, f"layer {name}", "(a colour's name, or NaN)", "another name, and numbers")
+        channels[_DEPTH if name == "depth" else name] = plane
+    return channels
+
+
 def _in_space(picture: NDArray[Any], space: ColourSpace) -> FloatArray:
     """Linear sRGB [H, W, 3] in another space."""
     with np.errstate(invalid="ignore"):
@@ -96,24 +114,38 @@ def read_exr(path: str | Path) -> tuple[FloatArray, dict[str, Any]]:
     Raises:
         InputError: missing, no OpenEXR file, truncated, or without channels R, G and B.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(path, "file", "(missing)", "an OpenEXR file")
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            part = file.parts[0]
-            planes = {name: np.array(channel.pixels, np.float32) for name, channel in part.channels.items()}
-            text = part.header.get(METADATA_KEY, "{}")
-    except Exception as error:  # the library raises bare RuntimeError, ValueError and its own
-        raise InputError(path, "file", f"({error})", "a whole OpenEXR file") from None
-    missing = [name for name in "RGB" if name not in planes]
+    planes, text = _read_channels(Path(path))
+    missing = [name for name in _COLOURS if name not in planes]
     if missing:
         raise InputError(path, "channels", sorted(planes), "R, G and B")
     try:
         metadata = json.loads(text)
     except ValueError:
         raise InputError(path, METADATA_KEY, text, "JSON text") from None
-    return np.stack([planes[name] for name in "RGB"], axis=-1), metadata
+    return np.stack([planes[name] for name in _COLOURS], axis=-1), metadata
+
+
+def read_layers(path: str | Path) -> dict[str, FloatArray]:
+    """The channels [H, W] float32 besides R, G and B by name; Z is called depth.
+
+    Raises:
+        InputError: missing, no OpenEXR file, or truncated.
+    """
+    planes, _ = _read_channels(Path(path))
+    return {"depth" if name == _DEPTH else name: plane for name, plane in planes.items() if name not in _COLOURS}
+
+
+def _read_channels(path: Path) -> tuple[dict[str, FloatArray], str]:
+    """All channels as float32, and the text of our metadata."""
+    if not path.is_file():
+        raise InputError(path, "file", "(missing)", "an OpenEXR file")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            part = file.parts[0]
+            planes = {name: np.array(channel.pixels, np.float32) for name, channel in part.channels.items()}
+            return planes, part.header.get(METADATA_KEY, "{}")
+    except Exception as error:  # the library raises bare RuntimeError, ValueError and its own
+        raise InputError(path, "file", f"({error})", "a whole OpenEXR file") from None
 
 
 def write_png(path: str | Path, rgb: ArrayLike, exposure: float = 0.0) -> None:

@@ -32,6 +32,7 @@ def trace(
     max_depth: int,
     *,
     aim: bool = True,
+    first_distance: FloatArray | None = None,
 ) -> FloatArray:
     """Weight times radiance [N] that arrives along camera rays; [lanes, N] where paths carry several wavelengths.
 
@@ -40,6 +41,8 @@ def trace(
         weight: [N] or [lanes, N]; paths of weight 0 cost nothing. bins: [N] wavelength bins, of the first lane.
         max_depth: number of surfaces along a path at which light is scattered.
         aim: sample lights directly; without it the mean is the same, found by scattering alone.
+        first_distance: [N], where to write the distance in m to what camera rays hit first, inf for nothing; paths of
+            weight 0 are left out.
     """
     radiance = np.zeros(weight.shape, np.float32)
     count = weight.shape[-1]
@@ -50,6 +53,8 @@ def trace(
             if not paths.slot.size:
                 break
             distance, found = world.nearest(Rays.of(paths.origin, paths.direction))
+            if depth == 0 and first_distance is not None:
+                first_distance[paths.slot] = distance
             point = paths.direction * distance
             point += paths.origin
             surface = world.surfaces(found, point)

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.errors import InputError
-from neurolens.render.colour import balance
+from neurolens.errors import InputError, NeurolensError
+from neurolens.render.develop import Layers, develop
 from neurolens.render.film import PixelGrid
 from neurolens.render.filmsettings import FilmSettings
+from neurolens.render.identity import identity
 from neurolens.render.illuminants import check_name
+from neurolens.render.job import Job
 from neurolens.render.scenefile import Scene
-from neurolens.render.workers import Job, Progress, run
+from neurolens.render.sums import PASSED, check_memory
+from neurolens.render.watch import Keeper, Progress, Watch
+from neurolens.render.workers import run
+
+_MOST_SAMPLES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -24,11 +30,15 @@ class RenderResult:
 
     Attributes:
         rgb: [H, W, 3] float32 linear sRGB; a uniform environment of radiance 1 gives 1 on the axis.
-        stats: JSON-able; seconds, paths, mpaths_per_s, passed_fraction, camera_fraction (share of the time), settings.
+        stats: JSON-able; settings, complete, samples_done (mean a pixel), seconds, paths, mpaths_per_s,
+            passed_fraction, thread_seconds (summed over the workers), camera_thread_seconds (of these, in the camera),
+            camera_fraction (their ratio). Seconds count those before a checkpoint, too.
+        layers: what the picture says of its own pixels.
     """
 
     rgb: FloatArray
     stats: dict[str, Any]
+    layers: Layers
 
 
 def render(
@@ -42,65 +52,98 @@ def render(
     threads: int = 2,
     max_depth: int | None = None,
     film: FilmSettings | None = None,
+    differentials: bool = False,
     progress: Progress | None = None,
+    watch: Watch | None = None,
 ) -> RenderResult:
     """Path-trace `scene` through `camera`.
 
-    The result depends on the seed, not on the number of threads; cameras share all random numbers.
+    The result depends on the seed, not on the number of threads, nor on whether it was interrupted and went on from a
+    checkpoint: bit for bit. Cameras share all random numbers. Samples are taken in the order of the Sobol' sequence,
+    so that more can be added to those that a checkpoint has. Memory: the film's sums, picture and layers, 156 bytes a
+    pixel at most, and for each worker what one tile takes, whatever the size of the picture.
 
     Args:
         width, height, samples, max_depth: as in `CameraSettings`; left out, those of the scene.
         film: spectral sampling and white balance; left out, those of the scene.
         threads: workers. A camera may have `for_worker() -> Camera`, called once in each, to open sessions of its own.
+        differentials: ask the camera for ray differentials, too. Nothing uses them: for measuring what they cost.
         progress: called now and then with the fraction done and the estimated seconds left.
+        watch: previews, checkpoints and an early end.
 
     Raises:
-        InputError: a size or count below 1, an unknown illuminant, picture and film of different shape, or a camera
-            that disperses and does not cover the scene's wavelengths.
-        NeurolensError: a worker failed; the message holds its traceback.
+        InputError: a size or count below 1 or beyond memory, an unknown illuminant, picture and film of different
+            shape, a camera that disperses and does not cover the scene's wavelengths, or one without the differentials
+            asked for; a checkpoint that is not whole or of another render.
+        NeurolensError: a worker failed; what was done is in the checkpoint.
     """
     settings, film = scene.settings.camera, film or scene.settings.film
     if film.white_balance is not None:
         check_name("render", "film.white_balance", film.white_balance, scene.illuminants)
-    job = Job(
-        scene,
-        camera,
-        PixelGrid(width or settings.width, height or settings.height, camera.film_mm),
-        _at_least_one("samples", settings.samples if samples is None else samples),
-        seed,
-        _at_least_one("max_depth", settings.max_depth if max_depth is None else max_depth),
-        film,
-    )
-    began = time.perf_counter()
-    run(job, min(_at_least_one("threads", threads), len(job.done)), progress)
-    seconds = time.perf_counter() - began
-    grid, paths = job.grid, job.pixels * job.samples
-    stats = {
-        "scene": scene.name,
-        "camera": camera.name,
+    samples = _count("samples", settings.samples if samples is None else samples, _MOST_SAMPLES)
+    max_depth = _count("max_depth", settings.max_depth if max_depth is None else max_depth)
+    threads = _count("threads", threads)
+    grid = PixelGrid(width or settings.width, height or settings.height, camera.film_mm)
+    check_memory(grid.width, grid.height)
+    if differentials:
+        _check_differentials(camera)
+    job = Job(scene, camera, grid, samples, seed, max_depth, film, differentials)
+    named = partial(identity, scene, camera, grid, seed, max_depth, film, differentials)
+    keeper = Keeper(job, watch or Watch(), named, progress)
+    try:
+        idle = watch is None and progress is None
+        run(job, min(threads, job.tiling.tiles), None if idle else keeper)
+    except NeurolensError as error:
+        raise keeper.rescue(error) from None
+    except KeyboardInterrupt:
+        keeper.finish()
+        raise
+    finally:
+        seconds = keeper.seconds
+    keeper.finish()
+    rgb, layers = develop(job)
+    return RenderResult(rgb, {"scene": scene.name, "threads": threads, **_stats(job, film, seed, seconds)}, layers)
+
+
+def _stats(job: Job, film: FilmSettings, seed: int, seconds: float) -> dict[str, Any]:
+    grid, tiling = job.grid, job.tiling
+    pixels = np.minimum(tiling.tile, tiling.pixels - tiling.tile * np.arange(tiling.tiles))
+    paths = int(np.sum(pixels * tiling.samples_done(job.film.done)))
+    camera_s, thread_s = (float(s) for s in job.seconds)
+    return {
+        "camera": job.camera.name,
         "width": grid.width,
         "height": grid.height,
-        "samples": job.samples,
+        "samples": tiling.samples,
+        "samples_done": paths / tiling.pixels,
+        "complete": job.film.fraction == 1,
         "seed": seed,
         "max_depth": job.max_depth,
-        "threads": threads,
         "wavelengths_nm": [job.spectral.low_nm, job.spectral.high_nm],
         "wavelengths": job.mode,
         "wavelength_sampling": film.wavelength_sampling,
         "white_balance": film.white_balance,
+        "differentials": job.differentials,
         "seconds": seconds,
         "paths": paths,
         "mpaths_per_s": paths / seconds * 1e-6,
-        "passed_fraction": float(job.tallies[1]) / paths,
-        "camera_fraction": float(job.tallies[0] / max(job.tallies[2], 1e-12)),
+        "passed_fraction": float(job.film.sums[:, PASSED].sum()) / max(paths, 1),
+        "thread_seconds": thread_s,
+        "camera_thread_seconds": camera_s,
+        "camera_fraction": camera_s / max(thread_s, 1e-12),
     }
-    rgb = job.film / job.samples
-    if film.white_balance is not None and job.spectral.colours:
-        rgb = rgb @ balance(job.spectral.film_rgb(job.world.palette.illuminant(film.white_balance))).T
-    return RenderResult(rgb.astype(np.float32).reshape(grid.height, grid.width, 3), stats)
 
 
-def _at_least_one(field: str, value: int) -> int:
-    if value < 1:
-        raise InputError("render", field, value, "an integer above 0")
+def _check_differentials(camera: Camera) -> None:
+    """Ask for the differentials of one ray, so that a camera without them is found before the work."""
+    ask = getattr(camera, "sample_differentials", None)
+    if ask is None:
+        raise InputError("render", "differentials", True, f"left out: camera {camera.name} has none")
+    low, high = camera.wavelength_nm or (550.0, 550.0)
+    ask(np.zeros((2, 1), np.float32), np.full((2, 1), 0.5, np.float32), np.full(1, (low + high) / 2, np.float32))
+
+
+def _count(field: str, value: int, most: int | None = None) -> int:
+    if value < 1 or (most is not None and value > most):
+        raise InputError("render", field, value, f"an integer above 0{'' if most is None else f', at most {most}'}")
     return value

@@ -15,13 +15,13 @@ from neurolens.cameras.model import load_model
 from neurolens.errors import InputError
 from neurolens.evaluate.benches.compiled_source import CompiledSource, find_compiler
 from neurolens.evaluate.benches.fused import fused_candidate
-from neurolens.evaluate.benches.fused_exact import exact_program
 from neurolens.evaluate.benches.fused_page import goals, write
 from neurolens.evaluate.benches.fused_speed import Row, ray_candidate, selected
 from neurolens.evaluate.speed import Unavailable, race
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
+from neurolens.optics.traceprogram import exact_program
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.source.fused import RAY_ONLY, SCENE_RAY
 
@@ -35,7 +35,7 @@ def test_the_exact_program_is_the_exact_trace() -> None:
     columns = {"film_x_mm": s.film_x, "film_y_mm": s.film_y, "pupil_x_mm": s.pupil_x, "pupil_y_mm": s.pupil_y}
     inputs = {k: v.numpy() for k, v in columns.items()} | {"wavelength_nm": s.wavelength_nm.numpy()}
     inputs |= {"film_z_mm": domain.film_z_mm[0], "stop_radius_mm": lens.stop_radius_mm}
-    found = exact_program(lens, domain).evaluate(inputs)
+    found = exact_program(lens, domain.pupil_z_mm, domain.wavelength_nm).evaluate(inputs)
     status = exact.status.numpy()
     assert np.mean(found["status"] != status) < 1e-4 and len(np.unique(status)) > 3
     passed = (status == st.PASSED) & (found["status"] == st.PASSED)
@@ -43,14 +43,14 @@ def test_the_exact_program_is_the_exact_trace() -> None:
         assert np.abs(found[name] - column.numpy())[passed].max() < 1e-4
     assert exact.transmittance is not None
     assert np.abs(found["transmittance"] - exact.transmittance.numpy())[passed].max() < 1e-5
-    alone = exact_program(lens, domain, whole=False).evaluate(inputs)
+    alone = exact_program(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=False).evaluate(inputs)
     assert np.array_equal(alone["dx"][passed], found["dx"][passed]) and "transmittance" not in alone
 
 
 def test_aspheres_are_not_for_the_exact_program() -> None:
     lens = read_lens(lens_models.LENSES / "phone_lens_6.toml")
-    with pytest.raises(Unavailable, match="spheres"):
-        exact_program(lens, lens_models.domain())
+    with pytest.raises(InputError, match="spheres"):
+        exact_program(lens, 0.0, (400.0, 700.0))
 
 
 def test_candidates_time_models_and_files() -> None:
@@ -85,7 +85,7 @@ def test_without_a_compiler_or_coefficients_there_is_no_candidate(
     monkeypatch.setenv("CC", "")
     assert fused_candidate("x", model, model.domain) is None
     with pytest.raises(Unavailable, match="no C compiler"):
-        CompiledSource(exact_program(lens_models.lens(), lens_models.domain()))
+        CompiledSource(exact_program(lens_models.lens(), 0.0, (400.0, 700.0)))
 
 
 def test_goals_and_page(tmp_path: Path) -> None:

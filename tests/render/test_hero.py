@@ -162,7 +162,7 @@ def test_one_wavelength_of_light_makes_the_same_grey_with_four_lanes() -> None:
 
 @pytest.mark.parametrize("mode", ["hero", "lanes"])
 def test_workers_do_not_change_the_picture(mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.workers.BATCH", 256)
+    monkeypatch.setattr("neurolens.render.sums.BATCH", 256)
     film = FilmSettings(wavelengths=mode)  # type: ignore[arg-type]
     made = room(tmp_path, "flint")
     one, two = (

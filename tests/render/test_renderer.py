@@ -86,7 +86,7 @@ def lit_scene() -> Any:
 
 
 def test_workers_do_not_change_the_picture_and_seeds_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.workers.BATCH", 1024)
+    monkeypatch.setattr("neurolens.render.sums.BATCH", 1024)
     made, camera = lit_scene(), ThinLens(50.0, 2.0, 3.0, FILM)
     options: dict[str, Any] = {"width": 36, "height": 24, "samples": 40}
     one = render(made, camera, threads=1, **options)
@@ -106,6 +106,30 @@ def test_cameras_share_their_noise() -> None:
     almost = render(made, ThinLens(50.0, 1e5, np.inf, FILM), **options).rgb
     other = render(made, Pinhole(50.0, FILM), seed=1, **options).rgb
     assert np.abs(pinhole - almost).mean() < 0.02 * np.abs(pinhole - other).mean()
+
+
+class Bare(Pinhole):
+    """Has no differentials."""
+
+    sample_differentials = None  # type: ignore[assignment]
+
+
+def test_differentials_are_asked_for_and_change_nothing() -> None:
+    made, options = lit_scene(), {"width": 36, "height": 24, "samples": 4, "threads": 1}
+    asked = 0
+
+    class Counting(ThinLens):
+        def sample_differentials(self, *at: Any) -> CameraRays:
+            nonlocal asked
+            asked += at[0].shape[1]
+            return super().sample_differentials(*at)
+
+    camera = Counting(50.0, 2.0, 3.0, FILM)
+    plain, with_them = render(made, camera, **options), render(made, camera, differentials=True, **options)
+    assert asked >= 36 * 24 * 4 and np.array_equal(plain.rgb, with_them.rgb)
+    assert 0 < with_them.stats["camera_thread_seconds"] < with_them.stats["thread_seconds"]
+    with pytest.raises(InputError, match="differentials"):
+        render(made, Bare(50.0, FILM), differentials=True, **options)
 
 
 class HalfBlocked(Pinhole):
@@ -147,7 +171,7 @@ class Killed(Pinhole):
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="workers are threads")
 def test_a_killed_worker_ends_the_render(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.workers.BATCH", 64)
+    monkeypatch.setattr("neurolens.render.sums.BATCH", 64)
     with pytest.raises(NeurolensError, match="killed"):
         render(scene(environment=WHITE), Killed(50.0, FILM), width=36, height=24, samples=40, threads=2)
 
@@ -164,7 +188,7 @@ class Reopened(Pinhole):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_each_worker_opens_its_own_camera(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.workers.BATCH", 256)
+    monkeypatch.setattr("neurolens.render.sums.BATCH", 256)
     made = scene(environment=WHITE)
     assert render(made, Reopened(50.0, FILM), width=36, height=24, samples=1, threads=threads).rgb.any()
 
@@ -178,7 +202,7 @@ def test_errors_are_clear(monkeypatch: pytest.MonkeyPatch) -> None:
         render(made, Prism(50.0, FILM), **small)
     narrow = scene({"wavelengths_nm": [460, 640]}, environment=WHITE)
     assert render(narrow, Prism(50.0, FILM), **small).rgb.shape == (24, 36, 3)
-    monkeypatch.setattr("neurolens.render.workers.BATCH", 64)
+    monkeypatch.setattr("neurolens.render.sums.BATCH", 64)
     with pytest.raises(NeurolensError, match="no rays today"):
         render(made, Broken(50.0, FILM), threads=2, **small)
 

@@ -18,15 +18,15 @@ from neurolens.evaluate.benches.compiled_source import FLAGS, CompiledSource, fi
 from neurolens.evaluate.speed import Unavailable
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
+from neurolens.programs.c import literal
+from neurolens.programs.expressions import Program
+from neurolens.programs.tanh import add_tanh
 from neurolens.surrogates.card import card_of
 from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.model import LensModel, Prediction
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.source.c import literal
-from neurolens.surrogates.source.expressions import Program
 from neurolens.surrogates.source.fused import ALL, RAY_ONLY, SCENE_RAY, Fixed, Parts, fused_program
-from neurolens.surrogates.source.tanh import add_tanh
 from neurolens.surrogates.source.writer import export_source
 from neurolens.surrogates.specialise import Fix, fixed_models
 

@@ -16,10 +16,10 @@ import torch
 
 from neurolens import status as st
 from neurolens.optics.paraxial import first_order
+from neurolens.programs.c import Signature
+from neurolens.programs.expressions import Program
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.source.c import Signature
-from neurolens.surrogates.source.expressions import Program
 from neurolens.surrogates.source.fused import ALL, FREE, SCENE_RAY, Fixed, fused_program
 from neurolens.surrogates.source.glsl import write_glsl
 from neurolens.surrogates.specialise import Fix, fixed_models

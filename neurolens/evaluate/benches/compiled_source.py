@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
-import shutil
-import subprocess
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from neurolens.errors import InputError
 from neurolens.evaluate.speed import Call, Unavailable
-from neurolens.surrogates.source.c import Signature, write_c
-from neurolens.surrogates.source.expressions import Program
+from neurolens.programs import compiler
+from neurolens.programs.c import Signature, write_c
+from neurolens.programs.compiler import FLAGS, compile_c
+from neurolens.programs.expressions import Program
 
-FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno")
-_SECONDS = 120  # the largest models known compile in five
 _NAME = "lens"
 
 
@@ -29,11 +27,10 @@ def find_compiler() -> str:
     Raises:
         Unavailable: none is there.
     """
-    for name in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
-        found = shutil.which(name) if name else None
-        if found:
-            return found
-    raise Unavailable("no C compiler (looked for $CC, cc, gcc, clang)")
+    try:
+        return compiler.find_compiler()
+    except InputError as error:
+        raise Unavailable("no C compiler (looked for $CC, cc, gcc, clang)") from error
 
 
 class CompiledSource:
@@ -47,17 +44,13 @@ class CompiledSource:
         self.signature = Signature.of(program, _NAME)
         self._folder = tempfile.TemporaryDirectory(prefix="neurolens-source-")
         folder = Path(self._folder.name)
-        (folder / "lens.h").write_text(write_c(program, _NAME, ["A model on the clock."]), encoding="utf-8")
-        (folder / "lens.c").write_text(self._wrapper(), encoding="utf-8")
         library = folder / "lens.so"
-        command = [find_compiler(), *flags, "-shared", "-fPIC", str(folder / "lens.c"), "-o", str(library), "-lm"]
+        text = write_c(program, _NAME, ["A model on the clock."]) + self._wrapper()
+        find_compiler()
         try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=_SECONDS, check=False)
-        except (OSError, subprocess.TimeoutExpired) as error:
-            raise Unavailable(f"the C compiler does not finish: {error}") from error
-        if done.returncode:
-            raise Unavailable(f"the C compiler fails: {(done.stderr.splitlines() or ['no word'])[0][:200]}")
-        self.warnings = done.stderr
+            self.warnings = compile_c(text, library, flags)
+        except InputError as error:
+            raise Unavailable(str(error)) from error
         self._run = ctypes.CDLL(str(library)).neurolens_run
         self._run.argtypes, self._run.restype = [ctypes.c_size_t, ctypes.c_void_p], None
 
@@ -67,7 +60,7 @@ class CompiledSource:
         kinds = ["(const float *)a[{}]"] * len(s.per_ray) + ["*(const float *)a[{}]"] * len(s.per_call)
         kinds += ["*(const int *)a[{}]"] * (s.bands > 1) + ["(float *)a[{}]"] * len(s.outputs) + ["(int *)a[{}]"]
         given = ", ".join(kind.format(i) for i, kind in enumerate(kinds))
-        return f'#include "lens.h"\nvoid neurolens_run(size_t n, void **a) {{ {_NAME}_rays(n, {given}); }}\n'
+        return f"void neurolens_run(size_t n, void **a) {{ {_NAME}_rays(n, {given}); }}\n"
 
     def outputs(self, count: int) -> dict[str, NDArray[Any]]:
         """Arrays for the results of so many rays."""

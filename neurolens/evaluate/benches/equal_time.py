@@ -11,13 +11,15 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import FUSED, Shot, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.fusedexact import FusedExactCamera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.evaluate.benches.equal_time_film import FilmMap, film_map
 from neurolens.evaluate.benches.equal_time_fit import (
@@ -41,8 +43,10 @@ from neurolens.surrogates.domain import Domain
 EXACT, THIN = "exact", "thin lens"
 SCENES = ("grid", "lights", "room")
 LENS = "laikin_double_gauss_50"
-# Name in the tables to what `make_camera` takes, beside the models' folder; a fused model has its line here.
+# Name in the tables to the file in models/; those named fused run as compiled C (`cameras.fused`).
 MODELS = {"ols-28": f"{LENS}.ols-28.onnx", "mlp-16x2": f"{LENS}.mlp-16x2.onnx"}
+MODELS["fused mlp-16x2"] = MODELS["mlp-16x2"]
+FUSED_EXACT = "fused exact"
 # Weight of a squared error: that of the RMSE, and of the relative MSE.
 MEASURES: dict[str, float | None] = {"mse": None, "rel_mse": DEFAULT.eps}
 _PASS_SEED, _SHORT_SEED, _REFERENCE_SEED = 100, 1000, 1_000_000
@@ -62,9 +66,9 @@ class Counts:
     short: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
     repeats: int = 4
     pass_samples: int = 64
-    passes: int = 16
-    reference: int = 4096
-    parts: int = 4
+    passes: int = 8
+    reference: int = 2048
+    parts: int = 2
 
     @property
     def jobs(self) -> list[tuple[int, int]]:
@@ -73,7 +77,7 @@ class Counts:
         return short + [(self.pass_samples, _PASS_SEED + k) for k in range(self.passes)]
 
 
-QUICK = Counts((64, 36), (1, 2, 4, 8), 2, 16, 4, 256)
+QUICK = Counts((64, 36), (1, 2, 4, 8), 2, 16, 4, 256, 1)
 
 
 @dataclass(frozen=True)
@@ -149,16 +153,20 @@ def scene_cameras(root: Path, shot: CameraSettings) -> tuple[dict[str, Camera], 
     film = (shot.film_width_mm, shot.film_height_mm)
     set_ = Shot(film, shot.focus_m, None if widest else f_number, wavelength_nm=shot.wavelengths_nm)
 
-    def exact(dtype: str) -> ExactCamera:
-        return ExactCamera(
-            lens, film_mm=film, focus_m=shot.focus_m, f_number=set_.f_number, wavelength_nm=shot.wavelengths_nm,
-            dtype="float64" if dtype == "float64" else "float32", bounds=bounds,
-        )  # fmt: skip
-
-    cameras: dict[str, Camera] = {EXACT: exact("float32")}
-    cameras |= {name: make_camera(root / "models" / file, set_) for name, file in MODELS.items()}
+    same: dict[str, Any] = {
+        "film_mm": film,
+        "focus_m": shot.focus_m,
+        "f_number": set_.f_number,
+        "wavelength_nm": shot.wavelengths_nm,
+        "bounds": bounds,
+    }
+    cameras: dict[str, Camera] = {EXACT: ExactCamera(lens, **same)}
+    for name, model in MODELS.items():
+        spec = str(root / "models" / model)
+        cameras[name] = make_camera(FUSED + spec if name.startswith("fused") else spec, set_)
+    cameras[FUSED_EXACT] = FusedExactCamera(lens, **same)
     cameras[THIN] = make_camera("thin", replace(set_, efl_mm=data.efl_mm, f_number=f_number))
-    return cameras, exact("float64")
+    return cameras, ExactCamera(lens, dtype="float64", **same)
 
 
 def measure_scene(

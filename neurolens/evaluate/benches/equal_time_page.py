@@ -24,8 +24,8 @@ from neurolens.files import atomic_path, atomic_write_text
 _INTRO = """\
 # Equal time and equal samples
 
-`neurolens bench equal-time`: {lens} exact, through surrogates in onnxruntime, and as a thin lens of its focal length
-and f-number. Against the exact lens with other seeds and {reference} samples a pixel, in two halves. Every camera draws
+`neurolens bench equal-time`: {lens} exact in torch, through surrogates in onnxruntime, both as compiled C (fused), and
+as a thin lens of its focal length and f-number. Against the exact lens with other seeds and {reference} samples a pixel, in two halves. Every camera draws
 the same random numbers, one wavelength a path. Times are the render's own seconds (best; median in brackets), {threads}
 thread{s}, {size} pixels; making a camera, its fit and the scene's tables are not in them.
 

@@ -9,10 +9,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from neurolens.evaluate.benches.compiled_source import FLAGS
 from neurolens.evaluate.benches.fused_speed import WAVELENGTH_NM, WITHIN_UM, Row
 from neurolens.evaluate.benches.trace_speed_page import machine
 from neurolens.files import atomic_write_text
+from neurolens.programs.compiler import FLAGS
 
 _NOTES = """\
 One thread, float32, batches that fit the caches, {rounds} rounds in turn in one process (best; median in brackets).

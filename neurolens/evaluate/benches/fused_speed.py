@@ -20,19 +20,19 @@ from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxsession import open_session
 from neurolens.errors import InputError
 from neurolens.evaluate.benches.fused import fused_candidate, program_candidate
-from neurolens.evaluate.benches.fused_exact import exact_program
 from neurolens.evaluate.candidates import exact_candidates, model_candidate
 from neurolens.evaluate.experiment import LensChoice
 from neurolens.evaluate.layout import refractions
 from neurolens.evaluate.rays import ray_errors
-from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, race
+from neurolens.evaluate.speed import Call, Candidate, Race, race
 from neurolens.optics.prescription import Lens
+from neurolens.optics.traceprogram import exact_program
+from neurolens.programs.expressions import Program
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.source.expressions import Program
 from neurolens.surrogates.source.fused import ALL, RAY_ONLY, Fixed, Parts, fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 
@@ -166,9 +166,9 @@ def ray_candidate(name: str, file: Path) -> Candidate:
 def _add_exact(add: Callable[..., None], lens: Lens, domain: Domain, torch_compiled: bool) -> None:
     for work in ("ray", "whole"):
         try:
-            program = exact_program(lens, domain, whole=work == "whole")
+            program = exact_program(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=work == "whole")
             add("exact C", work, program_candidate("", program, domain), program)
-        except Unavailable:
+        except InputError:
             pass
         if torch_compiled:
             add("exact torch", work, exact_candidates(lens, domain, transmittance=work == "whole")[1])

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.programs.expressions import Expr, Program
+from neurolens.programs.tanh import add_tanh
 from neurolens.surrogates.cores import InvariantPolynomial, MirrorPolynomial, Network, Partitioned, RawPolynomial
 from neurolens.surrogates.model import Core
 from neurolens.surrogates.residual import Residual
-from neurolens.surrogates.source.expressions import Expr, Program
 from neurolens.surrogates.source.monomials import add_polynomial
-from neurolens.surrogates.source.tanh import add_tanh
 
 Array = NDArray[np.float64]
 Pair = tuple[Expr, Expr]

@@ -17,17 +17,15 @@ from numpy.typing import NDArray
 from neurolens import status as st
 from neurolens.errors import InputError
 from neurolens.modelfile import DOMAIN_SLACK
+from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
+from neurolens.programs.expressions import Expr, Program
 from neurolens.surrogates.front import sag_mm
 from neurolens.surrogates.model import DIRECTION, POSITION, STOP, LensModel
 from neurolens.surrogates.onnx.export import largest_angle
 from neurolens.surrogates.onnx.series import fit_series
 from neurolens.surrogates.source.cores import Field, Results, Wanted, add_core
-from neurolens.surrogates.source.expressions import Expr, Program
 
 _T = TypeVar("_T")
-RAY = ("film_x_mm", "film_y_mm", "pupil_x_mm", "pupil_y_mm")
-WAVELENGTH, FILM_Z, STOP_RADIUS = "wavelength_nm", "film_z_mm", "stop_radius_mm"
-SCENE_RAY = ("x_mm", "y_mm", "z_mm", "dx", "dy", "dz")
 # Passing rays cross the front surface within its rim; a little more, for the model's own error.
 _FRONT_REACH = 1.02
 _SAG_MM = 1e-6

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from neurolens.surrogates.source.c import Signature, Writer, literal
-from neurolens.surrogates.source.expressions import Program
+from neurolens.programs.c import Signature, Writer, literal
+from neurolens.programs.expressions import Program
 
 _HEAD = """\
 /*

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.surrogates.source.expressions import Expr, Program
+from neurolens.programs.expressions import Expr, Program
 
 Array = NDArray[np.float64]
 Exponent = tuple[int, ...]

@@ -12,8 +12,8 @@ from typing import Any
 import neurolens
 from neurolens.errors import InputError
 from neurolens.files import atomic_write_text
+from neurolens.programs.c import Signature, write_c
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.source.c import Signature, write_c
 from neurolens.surrogates.source.fused import ALL, FREE, Fixed, Parts, fused_program
 from neurolens.surrogates.source.glsl import write_glsl
 

@@ -83,11 +83,13 @@ class Program:
 
     Attributes:
         tables: coefficient tables, the length of every literal.
+        tanhs: steps that are the tanh of another: their derivatives are short.
     """
 
     tables: int = 1
     steps: list[Step] = field(default_factory=list)
     outputs: dict[str, Expr] = field(default_factory=dict)
+    tanhs: dict[int, Argument] = field(default_factory=dict)
     _known: dict[Step, int] = field(default_factory=dict)
 
     def input(self, name: str) -> Expr:
@@ -165,6 +167,33 @@ class Program:
             if k in wanted:
                 wanted.update(a for a in self.steps[k].arguments if isinstance(a, int))
         return sorted(wanted)
+
+    def in_order_of_need(self) -> Program:
+        """The same program, every product right before the first sum that spends it: so, few values wait in registers.
+
+        Sums (fma) keep their order, for a row of a matrix product after the other would need all products at once.
+        """
+        order: dict[int, None] = {}
+        live = self.live()
+        for k in [k for k in live if self.steps[k].kind == "fma"] + live:
+            stack = [k]
+            while stack:
+                missing = [a for a in self.steps[stack[-1]].arguments if isinstance(a, int) and a not in order]
+                if missing:
+                    stack += missing[::-1]
+                else:
+                    order[stack.pop()] = None
+        place = {k: n for n, k in enumerate(order)}
+
+        def moved(argument: Argument) -> Argument:
+            return place[argument] if isinstance(argument, int) else argument
+
+        found = Program(self.tables)
+        for step in (self.steps[k] for k in order):
+            found._append(Step(step.kind, tuple(moved(a) for a in step.arguments), step.name))
+        found.outputs = {name: Expr(found, moved(e.argument)) for name, e in self.outputs.items()}
+        found.tanhs = {place[k]: moved(a) for k, a in self.tanhs.items() if k in place}
+        return found
 
     def count(self) -> dict[str, int]:
         """Operations by kind: the floor of the work."""

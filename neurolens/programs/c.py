@@ -7,10 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neurolens.surrogates.source.expressions import Argument, Program, Step
-
-# What a model in one function is given and gives, in order; arrays are per ray.
-SCALARS = ("film_z_mm", "stop_radius_mm")
+from neurolens.programs.contract import is_per_call
+from neurolens.programs.expressions import Argument, Program, Step
 
 _HEAD = """\
 /*
@@ -89,16 +87,16 @@ class Signature:
         inputs = [s.name for s in program.steps if s.kind == "input"]
         outputs = [o for o in program.outputs if o != "status"]
         # What holds for a whole call goes last.
-        ordered = [i for i in inputs if i not in SCALARS] + [i for i in inputs if i in SCALARS]
+        ordered = [i for i in inputs if not is_per_call(i)] + [i for i in inputs if is_per_call(i)]
         return Signature(name, tuple(ordered), tuple(outputs), program.tables)
 
     @property
     def per_ray(self) -> tuple[str, ...]:
-        return tuple(i for i in self.inputs if i not in SCALARS)
+        return tuple(i for i in self.inputs if not is_per_call(i))
 
     @property
     def per_call(self) -> tuple[str, ...]:
-        return tuple(i for i in self.inputs if i in SCALARS)
+        return tuple(i for i in self.inputs if is_per_call(i))
 
 
 def write_c(program: Program, name: str, comment: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""The exact tracer written as the same kind of program as fused models: the best that tracing can do in C.
+"""The exact tracer as a program of float steps, from which C is written: the best that tracing can do.
 
 A surrogate is only worth what it saves over this one. Spherical and plane surfaces, stop, rims, missed surfaces, total
 reflection, dispersion; transmittance of bare surfaces (Fresnel, unpolarised, averaged at each surface) and of coated
@@ -10,35 +10,36 @@ from __future__ import annotations
 import numpy as np
 
 from neurolens import status as st
-from neurolens.evaluate.speed import Unavailable
+from neurolens.errors import InputError
 from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.surrogates.domain import Domain
-from neurolens.surrogates.source.expressions import Expr, Program
-from neurolens.surrogates.source.fused import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
+from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STATUS, STOP, STOP_RADIUS, TRANSMITTANCE, WAVELENGTH
+from neurolens.programs.expressions import Expr, Program
 
 # The index is a polynomial in 1 / lambda^2 that holds it to float32's last bit.
 _INDEX = 3e-8
 _AIR = "air"
 
 
-def exact_program(lens: Lens, domain: Domain, *, whole: bool = True) -> Program:
-    """Film and pupil points in; scene ray and status out, as `surrogates.fused` has them.
+def exact_program(lens: Lens, pupil_z_mm: float, wavelength_nm: tuple[float, float], *, whole: bool = True) -> Program:
+    """Film and pupil points in; scene ray and status out, as `programs.contract` has them.
 
     Args:
+        pupil_z_mm: plane of the pupil points. wavelength_nm: range in which the indices hold to float32's last bit.
         whole: with stop, rims and transmittance; else the ray alone, and whether it gets through.
 
     Raises:
-        Unavailable: aspheres or cylinders.
+        InputError: aspheres, cylinders or layers of coatings.
     """
-    if any(s.asphere or s.cylinder or float(s.conic) for s in lens.surfaces):
-        raise Unavailable("the C tracer of the bench knows spheres and planes only")
-    return _Tracing(lens, domain, whole).program
+    odd = [k for k, s in enumerate(lens.surfaces) if s.asphere or s.cylinder or float(s.conic)]
+    if odd:
+        raise InputError(lens.path, f"surface {odd[0]}", "(asphere or cylinder)", "spheres and planes, for a C tracer")
+    return _Tracing(lens, pupil_z_mm, wavelength_nm, whole).program
 
 
 class _Tracing:
-    def __init__(self, lens: Lens, domain: Domain, whole: bool) -> None:
-        self.lens, self.domain, self.whole = lens, domain, whole
+    def __init__(self, lens: Lens, pupil_z_mm: float, wavelength_nm: tuple[float, float], whole: bool) -> None:
+        self.lens, self.pupil_z_mm, self.wavelength_nm, self.whole = lens, pupil_z_mm, wavelength_nm, whole
         self.program = p = Program()
         fx, fy, px, py = (p.input(name) for name in RAY)
         self.inverse_square = p.literal(0.0)
@@ -52,13 +53,14 @@ class _Tracing:
             self.stop_square = radius * radius
         self.indices: dict[object, Expr] = {}
         self.lost: list[tuple[Expr, Expr, int]] = []
+        self.at_stop = (fx, fy)
         self.power = p.literal(1.0)
         self._start(fx, fy, z, px, py)
         self._through()
 
     def _start(self, fx: Expr, fy: Expr, z: Expr, px: Expr, py: Expr) -> None:
         p = self.program
-        dx, dy, dz = px - fx, py - fy, p.literal(self.domain.pupil_z_mm) - z
+        dx, dy, dz = px - fx, py - fy, p.literal(self.pupil_z_mm) - z
         square = p.fma(dx, dx, p.fma(dy, dy, dz * dz))
         scale = p.literal(1.0) / p.op("sqrt", square)
         self.d = [dx * scale, dy * scale, dz * scale]
@@ -79,7 +81,7 @@ class _Tracing:
         p = self.program
         if s.glass is None and s.V_d is None:
             return p.literal(float(s.n_d))
-        long, short = ((1000 / w) ** 2 for w in reversed(self.domain.wavelength_nm))
+        long, short = ((1000 / w) ** 2 for w in reversed(self.wavelength_nm))
         if long == short:
             return p.literal(float(index_of(s, 1000 / long**0.5)))
         inverse = np.linspace(long, short, 200)
@@ -101,12 +103,13 @@ class _Tracing:
         for name, value in zip(SCENE_RAY, (*self.x, *self.d), strict=True):
             p.outputs[name] = value
         if self.whole:
-            p.outputs["transmittance"] = self.power
+            p.outputs[TRANSMITTANCE] = self.power
+            p.outputs.update(zip(STOP, self.at_stop, strict=True))
         status = p.literal(float(st.PASSED))
         # Rays meet the last surface first: the first failure is the one written last.
         for low, high, code in reversed(self.lost):
             status = p.select(low, high, status, float(code))
-        p.outputs["status"] = status
+        p.outputs[STATUS] = status
 
     def _surface(self, k: int, s: Surface) -> None:
         p, (x, y, z), (dx, dy, dz) = self.program, self.x, self.d
@@ -126,6 +129,8 @@ class _Tracing:
             way = -(mz / dz)
         self.x = [p.fma(way, dx, mx), p.fma(way, dy, my), p.fma(way, dz, mz)]
         x, y, z = self.x
+        if s.stop:
+            self.at_stop = (x, y)
         if self.whole:
             limit = self.stop_square if s.stop else p.literal(s.semi_diameter_mm**2)
             self.lost.append((p.fma(x, x, y * y), limit, st.blocked(k, st.RIM)))

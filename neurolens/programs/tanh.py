@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from neurolens.surrogates.source.expressions import Expr, Program
+from neurolens.programs.expressions import Expr, Program
 
 # tanh x = x P(x^2) / Q(x^2) on [-9.02, 9.02], beyond which float32 has 1: the rational function of these degrees of
 # least relative error (2.1e-8), by reweighted least squares. Evaluated in float32 the error is at most 3.1e-7.
@@ -19,5 +19,8 @@ def add_tanh(program: Program, values: Sequence[Expr]) -> list[Expr]:
     for value in values:
         x = program.op("max", program.op("min", value, LIMIT), -LIMIT)
         t = x * x
-        found.append(x * program.horner(t, NUMERATOR) / program.horner(t, DENOMINATOR))
+        y = x * program.horner(t, NUMERATOR) / program.horner(t, DENOMINATOR)
+        if isinstance(y.argument, int):
+            program.tanhs[y.argument] = value.argument
+        found.append(y)
     return found

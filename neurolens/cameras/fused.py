@@ -1,0 +1,151 @@
+"""Lenses as compiled C cameras: everything between the random numbers and the weighted ray in one call.
+
+The system's C compiler makes the code when the camera is made (1 to 10 s, kept for the next time; see
+`programs.compiler`). It runs in float32 on the thread that calls it; workers that are forked share it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens import status as st
+from neurolens.apertures import Aperture
+from neurolens.cameras.contract import CameraRays, FloatArray, RayDifferentials
+from neurolens.cameras.fusedsource import FILM_X_Y, Setting, camera_source
+from neurolens.cameras.graphprogram import program_of
+from neurolens.cameras.lens_film import LensFilm
+from neurolens.cameras.model import ModelScene, OnnxCamera
+from neurolens.programs.compiler import load_compiled
+from neurolens.programs.contract import SCENE_RAY
+from neurolens.programs.expressions import Program
+from neurolens.programs.tangents import with_derivatives
+
+
+class FusedFilm:
+    """A lens's film and pupil, and the lens itself as a program, as one compiled function.
+
+    Args:
+        film: of the same lens, focus and stop.
+        program: inputs and outputs of `programs.contract`.
+        stop_radius_mm: of the round stop that the program knows.
+        aperture: the shape of the opening, tested on the rays' crossings with the stop; None is round.
+        stop_surface: of the lens, for the status of rays that the shape blocks.
+
+    Raises:
+        InputError: no C compiler, or one that fails.
+    """
+
+    def __init__(
+        self,
+        film: LensFilm,
+        program: Program,
+        stop_radius_mm: float,
+        aperture: Aperture | None = None,
+        stop_surface: int = 0,
+    ) -> None:
+        self._program = program.in_order_of_need()
+        self._aperture, self._stop_radius_mm = aperture, stop_radius_mm
+        self._stopped = np.int32(st.blocked(stop_surface, st.RIM))
+        self._edges, self._centres = _tables(film)
+        outline = film.outline
+        waves = [w**-2 for w in outline.wavelength_nm]
+        self._setting = Setting(
+            self._edges.ctypes.data,
+            self._centres.ctypes.data,
+            outline.centre.size,
+            outline.x.shape[2] - 1,
+            1 / outline.film_radius_mm,
+            waves[0],
+            1 / (waves[1] - waves[0]) if len(waves) > 1 else 0.0,
+            1 / film.distance_mm,
+            1 / (film.distance_mm**2 * film.exposure),
+            film.film_z_mm,
+            stop_radius_mm,
+            1e-3 * film.film_z_mm,
+        )
+        self._rays: Any = _compiled(self._program)
+        self._rays_and_moves: Any = None
+
+    def sample(
+        self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, differentials: bool = False
+    ) -> CameraRays:
+        """As `LensFilm.sample`, with the differentials of the rays where asked for."""
+        film, square, wavelength = (np.ascontiguousarray(a, np.float32) for a in (film_mm, square, wavelength_nm))
+        count = film.shape[1]
+        if film.shape != (2, count) or square.shape != (2, count) or wavelength.shape != (count,):
+            raise ValueError(f"film {film.shape}, square {square.shape}, wavelengths {wavelength.shape}")
+        origin, direction = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
+        weight, status = np.empty(count, np.float32), np.empty(count, np.int32)
+        stop = np.empty((2, count), np.float32)
+        moves = np.empty((2, 3, 2, count), np.float32) if differentials else None
+        arrays = [film, square, wavelength, origin, direction, weight, status, stop]
+        self._call(moves is not None)(
+            count, ctypes.byref(self._setting), *map(_address, arrays), None if moves is None else _address(moves)
+        )
+        if self._aperture is not None:
+            inside = self._aperture.inside(stop[0], stop[1], self._stop_radius_mm)
+            shut = ~inside & (status == st.PASSED)
+            weight[shut], status[shut] = 0, self._stopped
+        found = None if moves is None else RayDifferentials(moves[0], moves[1])
+        return CameraRays(origin, direction, weight, status, found)
+
+    def _call(self, differentials: bool) -> Any:
+        if not differentials:
+            return self._rays
+        if self._rays_and_moves is None:
+            self._rays_and_moves = _compiled(with_derivatives(self._program, SCENE_RAY, FILM_X_Y))
+        return self._rays_and_moves
+
+
+class FusedCamera(OnnxCamera):
+    """An exported model as a compiled camera: the rays of `OnnxCamera` to rounding, at a fraction of its cost.
+
+    Args and attributes are those of `OnnxCamera`; differentials need no model exported with derivatives.
+
+    Raises:
+        InputError: as `OnnxCamera`; no C compiler; a model of operators that have no such form.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        program = program_of(self.model.path, self.model.data, self.model.state if self.model.axes else ())
+        scene = self.film.scene
+        assert isinstance(scene, ModelScene)
+        surface = int(self.model.card["lens"].get("stop_surface", 0))
+        self._fused = FusedFilm(self.film, program, scene.stop_radius_mm, scene.aperture, surface)
+        self.settings |= {"runtime": "fused"}
+
+    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
+        return self._fused.sample(film_mm, pupil, wavelength_nm)
+
+    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """As `sample`, with the differentials of the rays, which come from the same pass."""
+        return self._fused.sample(film_mm, pupil, wavelength_nm, True)
+
+    def for_worker(self) -> FusedCamera:
+        """This camera: nothing in it is a thread's own."""
+        return self
+
+
+def _tables(film: LensFilm) -> tuple[FloatArray, FloatArray]:
+    """The outline as `Setting` has it: edges [R * K, 16], centres [R, 2]."""
+    outline = film.outline
+    edges = outline.edges  # [W, 8, R * K]
+    both = np.zeros((2, *edges.shape[1:]), np.float32)
+    both[: len(edges)] = edges
+    return np.ascontiguousarray(both.reshape(16, -1).T), np.ascontiguousarray(outline.centres.T)
+
+
+def _compiled(program: Program) -> Any:
+    function = load_compiled(camera_source(program, st.PASSED, st.OUTSIDE_DOMAIN)).neurolens_camera
+    function.argtypes, function.restype = [ctypes.c_size_t] + [ctypes.c_void_p] * 10, None
+    return function
+
+
+def _address(array: NDArray[Any]) -> int:
+    return int(array.__array_interface__["data"][0])

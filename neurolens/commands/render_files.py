@@ -1,0 +1,166 @@
+"""What `neurolens render` keeps: the picture, its preview, the checkpoint; and how it stops when asked to."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens.commands.arguments import positive
+from neurolens.errors import InputError, NeurolensError
+from neurolens.evaluate.records import plain
+from neurolens.files import check_writable
+
+if TYPE_CHECKING:
+    from neurolens.render.filmsettings import FilmSettings
+    from neurolens.render.renderer import RenderResult
+    from neurolens.render.watch import Watch
+
+
+def add_safety(parser: argparse.ArgumentParser) -> None:
+    """Add the options of long renders."""
+    group = parser.add_argument_group("long renders")
+    group.add_argument(
+        "--checkpoint-every", metavar="S", type=positive("seconds", infinite=True), default=30.0,
+        help="seconds between checkpoints, OUT.exr.part; inf: only when the render is stopped (default: 30)",
+    )  # fmt: skip
+    group.add_argument("--restart", action="store_true", help="begin again, whatever OUT.exr.part holds")
+    group.add_argument(
+        "--keep-checkpoint", action="store_true",
+        help="keep OUT.exr.part, so that the same command with more --samples adds them (from a multiple of 16)",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Files:
+    """Where a render goes: the EXR, the PNG beside it, and the checkpoint while it lasts."""
+
+    out: Path
+    preview: Path
+    checkpoint: Path
+
+    @classmethod
+    def of(cls, out: Path) -> Files:
+        """The files of `--out`; refuses names that cannot be written before anything is rendered.
+
+        Raises:
+            InputError: not .exr, or no such folder.
+            OSError: a folder that cannot be written, a folder of that name.
+        """
+        if out.suffix.lower() != ".exr":
+            raise InputError(out, "--out", out.suffix or "(no suffix)", "a name that ends in .exr")
+        if not out.parent.is_dir():
+            raise InputError(out, "--out", str(out.parent), "a folder that exists")
+        files = cls(out, out.with_suffix(".png"), out.with_name(f"{out.name}.part"))
+        for path in (files.out, files.preview, files.checkpoint):
+            check_writable(path)
+        return files
+
+    def kept(self) -> str:
+        """What a render that ended early can go on from."""
+        if self.checkpoint.exists():
+            return f"the same command goes on from {self.checkpoint}"
+        return "there is no checkpoint to go on from"
+
+
+class Stopping:
+    """Ctrl-C and SIGTERM ask for a stop while the block lasts; a second one is not asked but obeyed."""
+
+    def __init__(self) -> None:
+        self._before: dict[int, Any] = {}
+        self._number: int | None = None
+
+    def __enter__(self) -> Stopping:
+        if threading.current_thread() is threading.main_thread():  # others cannot hear signals
+            for number in (signal.SIGINT, signal.SIGTERM):
+                before = signal.getsignal(number)
+                if before not in (signal.SIG_IGN, None):
+                    self._before[number] = before
+                    signal.signal(number, self._asked)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> bool:
+        for number, before in self._before.items():
+            signal.signal(number, before)
+        return kind is Unfinished
+
+    def __call__(self) -> bool:
+        """Whether somebody asked."""
+        return self._number is not None
+
+    def _asked(self, number: int, _: object) -> None:
+        self._number = number
+        signal.signal(number, self._before[number])
+
+    def say(self, what: str) -> int:
+        """Say on stderr what is left of an interrupted render; its exit code, 128 plus the signal's number."""
+        print(f"\nneurolens: interrupted; {what}", file=sys.stderr)
+        return 128 + (self._number or signal.SIGINT)
+
+
+class Unfinished(Exception):
+    """Leaves the block of a `Stopping`, and so a stage of the progress without a word of its end."""
+
+
+def warn(text: str) -> None:
+    """Say a doubt on stderr."""
+    print(f"neurolens: warning: {text}", file=sys.stderr)
+
+
+def watch_of(args: argparse.Namespace, files: Files, stop: Callable[[], bool]) -> Watch:
+    """What the command line asks for beside the render."""
+    from neurolens.render.exr import write_png
+    from neurolens.render.watch import Watch
+
+    return Watch(
+        preview=partial(write_png, files.preview, exposure=args.exposure),
+        checkpoint=files.checkpoint,
+        checkpoint_s=args.checkpoint_every,
+        restart=args.restart,
+        keep=args.keep_checkpoint,
+        stop=stop,
+        note=warn,
+    )
+
+
+def write_pictures(
+    files: Files, result: RenderResult, metadata: dict[str, Any], film: FilmSettings, args: argparse.Namespace
+) -> None:
+    """Write EXR and PNG.
+
+    Raises:
+        NeurolensError: they cannot be written, and the checkpoint has the whole render.
+        OSError: they cannot be written.
+    """
+    from neurolens.render.colour import COLOUR_SPACES
+    from neurolens.render.develop import MEANING
+    from neurolens.render.exr import write_exr, write_png
+
+    space = COLOUR_SPACES[film.colour_space]
+    told = metadata | {"render": plain(result.stats)}
+    told["colour"] = {"space": space.name, "white_xy": list(space.white), "adaptation": "Bradford"}
+    layers = {}
+    if args.layers == "all" or not result.stats["complete"]:
+        layers, told["layers"] = asdict(result.layers), MEANING
+    try:
+        write_exr(files.out, result.rgb, half=args.half, metadata=told, space=space, layers=layers)
+        write_png(files.preview, result.rgb, args.exposure)
+    except (OSError, NeurolensError) as error:
+        if not files.checkpoint.exists():
+            raise
+        said = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else error
+        raise NeurolensError(f"{said}; the render is kept: {files.kept()}") from None
+
+
+def so_far(result: RenderResult, files: Files) -> str:
+    """How much of an interrupted picture is there."""
+    samples = result.layers.samples
+    least, most = int(samples.min()), int(samples.max())
+    spread = f" ({least} to {most})" if least < most else ""
+    return f"{files.out} holds {result.stats['samples_done']:.3g} of {result.stats['samples']} samples a pixel{spread}"

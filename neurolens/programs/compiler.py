@@ -1,0 +1,121 @@
+"""C text compiled by the system's compiler into a library, kept in a folder that only its owner can write to."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import shutil
+import stat
+import subprocess
+import tempfile
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+from neurolens.errors import InputError
+from neurolens.files import atomic_path
+
+# -march=native takes what the machine has; the others let square roots and divisions become vectors, also where only
+# one side of a choice needs them. NaN and infinity stay what they are.
+FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math")
+_SECONDS = 300  # the largest models known compile in ten
+_KEPT = 64  # libraries of 50 to 200 kB
+
+
+def find_compiler() -> str:
+    """A C compiler: $CC, else cc, gcc or clang.
+
+    Raises:
+        InputError: none is there.
+    """
+    for name in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
+        found = shutil.which(name) if name else None
+        if found:
+            return found
+    raise InputError("compiler", "CC", "(none found)", "a C compiler: $CC, cc, gcc or clang")
+
+
+def compile_c(source: str, library: Path, flags: tuple[str, ...] = FLAGS) -> str:
+    """Compile a source into the shared library `library`; returns the compiler's warnings.
+
+    Raises:
+        InputError: there is no compiler, or it fails; the message says how.
+    """
+    command = [find_compiler(), *flags, "-shared", "-fPIC", "-x", "c", "-", "-o", str(library), "-lm"]
+    try:
+        done = subprocess.run(command, input=source, capture_output=True, text=True, timeout=_SECONDS, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise InputError(command[0], "compile", f"({error})", "a C compiler that works") from error
+    if done.returncode:
+        said = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr[:200] or "no word")
+        raise InputError(command[0], "compile", f"({said[:200]})", "a C compiler that knows C99")
+    return done.stderr
+
+
+def load_compiled(source: str) -> ctypes.CDLL:
+    """The library of a source: compiled once for this machine, then taken from the folder.
+
+    The folder is `neurolens` in $XDG_CACHE_HOME or ~/.cache; where that is not this user's alone, a temporary one that
+    goes with the process.
+
+    Raises:
+        InputError: as `compile_c`.
+    """
+    folder = _folder()
+    library = folder / f"{_key(source)}.so"
+    if not library.is_file():
+        with atomic_path(library) as temporary:
+            compile_c(source, temporary)
+            temporary.chmod(0o700)
+        _forget_oldest(folder)
+    return ctypes.CDLL(str(library))
+
+
+def _key(source: str) -> str:
+    """Of a source, its flags, the compiler and the processor: a library for another processor may crash on this one."""
+    made_by = _compiler_and_processor(find_compiler())
+    return hashlib.sha256("\0".join((source, *FLAGS, made_by)).encode()).hexdigest()[:32]
+
+
+@cache
+def _compiler_and_processor(compiler: str) -> str:
+    asked = subprocess.run([compiler, "--version"], capture_output=True, text=True, timeout=_SECONDS, check=False)
+    processor = platform.processor()
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        known = ("model name", "flags", "Features", "CPU part")
+        processor += "".join(dict.fromkeys(line for line in lines if line.startswith(known)))
+    return "\0".join((compiler, asked.stdout, platform.machine(), processor))
+
+
+def _folder() -> Path:
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    folder = Path(home) / "neurolens"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.lstat()
+        if stat.S_ISDIR(found.st_mode) and _mine(found) and os.access(folder, os.W_OK | os.X_OK):
+            return folder
+    except OSError:
+        pass
+    return Path(_temporary().name)
+
+
+def _mine(found: os.stat_result) -> bool:
+    """What others can write to, others can put code into."""
+    return hasattr(os, "getuid") and found.st_uid == os.getuid() and not found.st_mode & 0o022
+
+
+@cache
+def _temporary() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix="neurolens-")
+
+
+def _forget_oldest(folder: Path) -> None:
+    """Keep the folder small; a library in use stays readable for those that have opened it."""
+    with suppress(OSError):
+        files = sorted(folder.glob("*.so"), key=lambda f: f.stat().st_mtime)
+        for old in files[:-_KEPT]:
+            old.unlink()

@@ -1,0 +1,160 @@
+"""A render kept on disk: its sums, and all that they depend on, in one file that is whole or not there.
+
+The file is a zip of numpy arrays (an .npz), stored as they are: `sums.npy`, `done.npy` and `about.json`. It is read
+with suspicion: names, sizes and headers must be those that this render would write, before a byte reaches memory, and
+the checksums of zip find what rotted.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import zipfile
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.errors import InputError
+from neurolens.files import atomic_path
+from neurolens.render.identity import difference
+from neurolens.render.sums import Film, Tiling
+
+_FORMAT = 1
+_ABOUT, _SUMS, _DONE = "about.json", "sums.npy", "done.npy"
+_LARGEST_ABOUT = 8 << 20
+AGAIN = "or --restart to begin again"
+
+
+def write_checkpoint(path: Path, film: Film, identity: dict[str, Any], spent: dict[str, float]) -> None:
+    """Write what a film has, while workers may go on.
+
+    Args:
+        identity: see `neurolens.render.identity`. spent: seconds so far, by name.
+
+    Raises:
+        OSError: it cannot be written; an older checkpoint is still there.
+        NeurolensError: a worker was killed while it wrote to the film.
+    """
+    tiling = film.tiling
+    done: list[NDArray[np.int64]] = []
+    with atomic_path(path) as temporary:
+        with open(temporary, "wb") as file:
+            with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+                with archive.open(_SUMS, "w", force_zip64=True) as member:
+                    member.write(_header(film.sums))
+                    for first, stop in tiling.chunks():
+                        sums, passes = film.copy(first, stop)
+                        member.write(np.ascontiguousarray(sums).data)
+                        done.append(passes)
+                archive.writestr(_DONE, _header(film.done) + np.concatenate(done).tobytes())
+                about = {"format": _FORMAT, "samples": tiling.samples, "tile": tiling.tile, "step": tiling.step}
+                archive.writestr(_ABOUT, json.dumps(about | {"render": identity, "spent": spent}, indent=1))
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[str, float]:
+    """Go on from a checkpoint: fill a film that is still empty, and return the seconds spent.
+
+    More samples than the checkpoint was made for go on from it, as long as none of its tiles has had a pass cut short
+    by the end: any multiple of 16 samples can be raised to any number.
+
+    Raises:
+        InputError: missing, not whole, or of another render; it names what differs.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = {info.filename: info for info in archive.infolist()}
+            stored = all(i.compress_type == zipfile.ZIP_STORED and not i.flag_bits & 1 for i in members.values())
+            if sorted(members) != sorted((_ABOUT, _SUMS, _DONE)) or not stored:
+                raise _corrupt(path, "other contents")
+            if members[_ABOUT].file_size > _LARGEST_ABOUT:
+                raise _corrupt(path, "settings too long")
+            about = json.loads(archive.read(_ABOUT))
+            _check_render(path, about, identity)
+            _check_tiling(path, about, film.tiling)
+            done = np.empty_like(film.done)
+            _fill(path, archive, members[_DONE], done)
+            _check_samples(path, about["samples"], film.tiling, done)
+            _fill(path, archive, members[_SUMS], film.sums)
+            film.done[:] = done
+            return {name: float(value) for name, value in about["spent"].items()}
+    except FileNotFoundError:
+        raise InputError(path, "file", "(missing)", "a checkpoint of this render") from None
+    except (zipfile.BadZipFile, ValueError, KeyError, TypeError, AttributeError, EOFError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise _corrupt(path, str(error) or type(error).__name__) from None
+    except (NotImplementedError, RuntimeError) as error:  # zip's own, of features that we do not write
+        raise _corrupt(path, str(error)) from None
+
+
+def _corrupt(path: Path, why: str) -> InputError:
+    return InputError(path, "file", f"({why})", f"a whole checkpoint of a render, {AGAIN}")
+
+
+def _check_render(path: Path, about: dict[str, Any], identity: dict[str, Any]) -> None:
+    if about["format"] != _FORMAT:
+        raise InputError(path, "format", about["format"], f"{_FORMAT}, {AGAIN}")
+    found = difference(about["render"], identity)
+    if found is not None:
+        place, there, here = found
+        raise InputError(path, place, there, f"{here!r} as asked now, {AGAIN}")
+
+
+def _check_tiling(path: Path, about: dict[str, Any], tiling: Tiling) -> None:
+    """Tiles and passes are cut alike; only below 16 samples they depend on the number of samples."""
+    if not isinstance(about["samples"], int) or not 1 <= about["samples"] < 1 << 31:
+        raise _corrupt(path, f"{about['samples']} samples")
+    if not all(0 <= float(value) < math.inf for value in about["spent"].values()):
+        raise _corrupt(path, "impossible times")
+    if (about["tile"], about["step"]) != (tiling.tile, tiling.step):
+        expected = f"{tiling.samples} as asked now: below {max(tiling.step, about['step'])} samples none can be added"
+        raise InputError(path, "samples", about["samples"], f"{expected}; give the same, {AGAIN}")
+
+
+def _check_samples(path: Path, samples: int, tiling: Tiling, done: NDArray[np.int64]) -> None:
+    """What is done of every tile is a part of what is asked now."""
+    if done.min() < 0 or done.max() > -(-samples // tiling.step):
+        raise _corrupt(path, "impossible numbers of passes")
+    had, counts = np.minimum(done * tiling.step, samples), tiling.samples_done(done)
+    if np.array_equal(had, counts):
+        return
+    most = int(had.max())
+    if most > tiling.samples:
+        raise InputError(path, "samples", most, f"{tiling.samples} at most, as asked now: ask for more, {AGAIN}")
+    expected = f"a multiple of {tiling.step}, which alone can be raised to {tiling.samples}; give the same, {AGAIN}"
+    raise InputError(path, "samples", samples, expected)
+
+
+def _header(array: NDArray[Any]) -> bytes:
+    """The header of an .npy file."""
+    out = io.BytesIO()
+    np.lib.format.write_array_header_1_0(out, np.lib.format.header_data_from_array_1_0(array))
+    return out.getvalue()
+
+
+def _fill(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, array: NDArray[Any]) -> None:
+    """Read a member into an array of just its size and type; nothing else is taken, and no memory besides."""
+    header = _header(array)
+    if info.file_size != len(header) + array.nbytes:
+        raise _corrupt(path, f"{info.filename} of {info.file_size} bytes")
+    with archive.open(info) as member:
+        if member.read(len(header)) != header:
+            raise _corrupt(path, f"{info.filename} of another shape or type")
+        _read_into(member, array.reshape(-1).data.cast("B"))
+        if member.read(1):
+            raise _corrupt(path, f"{info.filename} too long")
+
+
+def _read_into(member: IO[bytes], memory: memoryview) -> None:
+    place = 0
+    while place < len(memory):
+        got = member.readinto(memory[place : place + (1 << 24)])  # type: ignore[attr-defined]
+        if not got:
+            raise EOFError("it ends too early")
+        place += got

@@ -1,0 +1,187 @@
+"""One render made ready: scene, camera and film, and how one pass of one tile is rendered."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.cameras.contract import Camera, CameraRays, FloatArray
+from neurolens.render.colour import SRGB, balance
+from neurolens.render.film import PixelGrid
+from neurolens.render.filmsettings import FilmSettings
+from neurolens.render.integrator import trace
+from neurolens.render.palette import Index
+from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler
+from neurolens.render.scatter import lit
+from neurolens.render.scene import CameraSettings
+from neurolens.render.scenefile import Scene
+from neurolens.render.sums import COLUMNS, DEPTH, HITS, LUMINANCE2, PASSED, RGB, Film, Tiling, shared
+from neurolens.render.wavelengths import LANES, mode_for, spectral_range
+from neurolens.render.world import World
+
+CAMERA_BATCH = 8192  # rays a call: a network keeps more numbers a ray than the tracer
+
+
+def camera_axes(settings: CameraSettings) -> FloatArray:
+    """Rotation [3, 3] from camera to scene axes: columns right, up, backwards."""
+    backwards = np.subtract(settings.position_m, settings.look_at_m)
+    backwards = backwards / np.linalg.norm(backwards)
+    right = np.cross(settings.up, backwards)
+    right = right / np.linalg.norm(right)
+    return np.column_stack([right, np.cross(backwards, right), backwards]).astype(np.float32)
+
+
+class Job:
+    """One render: the scene made ready, and memory shared by the workers.
+
+    Attributes:
+        mode: how wavelengths are taken. balance: matrix [3, 3] on the film's linear sRGB that makes the light of the
+            white balance neutral; where there is none, `neutral`. luminance_row: [3], of the film's sRGB after that.
+        paths_a_sample: lanes of a sample; film: see `Film`.
+        seconds: [2] of all workers: in the camera, and in all.
+        message: text of a worker's error. stop: set to end the work early.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        camera: Camera,
+        grid: PixelGrid,
+        samples: int,
+        seed: int,
+        max_depth: int,
+        film: FilmSettings,
+        differentials: bool = False,
+    ) -> None:
+        settings = scene.settings.camera
+        self.mode = mode_for(camera, grid, settings.wavelengths_nm, film)
+        self.camera, self.grid, self.max_depth, self.differentials = camera, grid, max_depth, differentials
+        self.spectral = spectral_range(scene, camera, film, LANES if self.mode == "hero" else 1)
+        self.world = World(scene, self.spectral)
+        self.balance = np.eye(3)
+        self.neutral = film.white_balance is None or not self.spectral.colours
+        if film.white_balance is not None and not self.neutral:
+            self.balance = balance(self.spectral.film_rgb(self.world.palette.illuminant(film.white_balance)))
+        response = self.spectral.rotated(self.spectral.response)
+        self._response = response.reshape(-1, 3, self.spectral.bins)  # [lanes, 3, bins]
+        self.luminance_row = SRGB.to_xyz[1] @ self.balance
+        self._luminance = np.einsum("c,lcb->lb", self.luminance_row, self._response).astype(np.float32)
+        self.sampler = Sampler(samples, seed)
+        self._axes, self._position = camera_axes(settings), np.array(settings.position_m, np.float32)
+        # Paths of one sample: four lanes share their random numbers, and are independent of the others only together.
+        self.paths_a_sample = LANES if self.mode == "lanes" else 1
+        self.tiling = Tiling.of(grid.width * grid.height, samples)
+        self.film = Film(self.tiling)
+        self.seconds = shared((2,), np.float64)
+        self.message, self.stop = shared((4096,), np.uint8), shared((1,), np.uint8)
+
+    def render_tile(self, camera: Camera, tile: int, part: int) -> tuple[NDArray[np.float64], float]:
+        """Sums [pixels, COLUMNS] of one pass of one tile, and the seconds that the camera took."""
+        within = self.tiling.pixels_of(tile)
+        step = self.tiling.step
+        pixels = np.arange(within.start, within.stop)
+        indices = np.arange(part * step, min((part + 1) * step, self.tiling.samples))
+        pixel, sample = np.repeat(pixels, len(indices)), np.tile(indices, len(pixels))
+        keys = self.sampler.keys(pixel, sample // self.paths_a_sample)
+        hue = self.sampler.draw(keys, WAVELENGTH)
+        if self.paths_a_sample > 1:
+            hue = _turned(hue, (sample % self.paths_a_sample / self.paths_a_sample).astype(np.float32))
+        film_mm = self.grid.film_points(pixel, self.sampler.draw2(keys, FILM))
+        pupil = self.sampler.draw2(keys, PUPIL)
+
+        asked = time.perf_counter()
+        origin, direction, weight = self._hero_rays(camera, film_mm, pupil, hue)
+        answered = time.perf_counter()
+
+        bins, distance = self.spectral.bin_of(hue), np.full(len(hue), np.inf, np.float32)
+        value = trace(
+            self.world, self.sampler, keys, origin, direction, weight, bins, self.max_depth, first_distance=distance
+        )
+        shape = (len(pixels), len(indices))
+        sums = np.empty((len(pixels), COLUMNS))
+        self._sum_light(sums, value, bins, shape)
+        self._sum_depth(sums, origin, direction, distance, shape)
+        passed = np.zeros(len(hue), np.bool_)
+        passed[lit(weight)] = True
+        sums[:, PASSED] = np.count_nonzero(passed.reshape(shape), axis=1)
+        return sums, answered - asked
+
+    def _sum_light(self, sums: NDArray[np.float64], value: FloatArray, bins: Index, shape: tuple[int, int]) -> None:
+        """Colour, and the squared luminance of each sample, whose paths are together."""
+        value = value.reshape(-1, len(bins))
+        colour = self._response.take(bins, axis=-1).reshape(-1, 3, *shape)
+        sums[:, RGB] = np.einsum("lcps,lps->pc", colour, value.reshape(-1, *shape))
+        luminance = np.einsum("ln,ln->n", self._luminance.take(bins, axis=-1), value).reshape(shape)
+        if self.paths_a_sample > 1:
+            luminance = np.add.reduceat(luminance, np.arange(0, shape[1], self.paths_a_sample), axis=1)
+        sums[:, LUMINANCE2] = np.einsum("ps,ps->p", luminance, luminance, dtype=np.float64)
+
+    def _sum_depth(
+        self,
+        sums: NDArray[np.float64],
+        origin: FloatArray,
+        direction: FloatArray,
+        distance: FloatArray,
+        shape: tuple[int, int],
+    ) -> None:
+        """Distance along the optical axis from the film's plane to what camera rays hit first."""
+        hit = np.isfinite(distance)
+        away = -self._axes[:, 2]
+        with np.errstate(over="ignore", invalid="ignore"):  # rays that do not pass hold anything
+            depth = away @ (origin - self._position[:, None])
+            depth += distance * (away @ direction)
+        sums[:, DEPTH] = np.where(hit, depth, np.float32(0)).reshape(shape).sum(axis=1, dtype=np.float64)
+        sums[:, HITS] = np.count_nonzero(hit.reshape(shape), axis=1)
+
+    def _hero_rays(
+        self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, hue: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Rays of the hero wavelengths; weights [lanes, N] of all lanes where there are several."""
+        sample = camera.sample_differentials if self.differentials else camera.sample  # type: ignore[attr-defined]
+        rays = self._camera_rays(sample, film_mm, pupil, self._camera_wavelengths(hue))
+        lanes = self.spectral.lanes
+        if lanes == 1:
+            return rays
+        weight = np.empty((lanes, len(hue)), np.float32)
+        weight[:] = rays[2]
+        if camera.dispersive or not getattr(camera, "achromatic", False):
+            for lane in range(1, lanes):
+                wavelength_nm = self._camera_wavelengths(_turned(hue, np.float32(lane / lanes)))
+                weight[lane] = self._camera_rays(camera.sample, film_mm, pupil, wavelength_nm)[2]
+            weight *= rays[2] > 0  # the hero's ray must exist
+        weight /= lanes
+        return rays[0], rays[1], weight
+
+    def _camera_rays(
+        self, sample: Callable[..., CameraRays], film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Origins and directions [3, N] in the scene and weights [N], 0 for rays that do not pass."""
+        count = len(wavelength_nm)
+        origin, direction = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
+        weight = np.empty(count, np.float32)
+        for start in range(0, count, CAMERA_BATCH):
+            part = slice(start, start + CAMERA_BATCH)
+            inputs = (film_mm[:, part], pupil[:, part], wavelength_nm[part])
+            rays = sample(*(np.ascontiguousarray(x) for x in inputs))
+            np.add(self._axes @ rays.origin_m, self._position[:, None], out=origin[:, part])
+            np.matmul(self._axes, rays.direction, out=direction[:, part])
+            weight[part] = np.where(rays.status == 0, rays.weight, np.float32(0))
+        return origin, direction, weight
+
+    def _camera_wavelengths(self, hue: FloatArray) -> FloatArray:
+        """Wavelengths for the camera; one that does not disperse gets them clipped to what it was made for."""
+        wavelengths = self.spectral.wavelengths_nm(hue)
+        accepted = self.camera.wavelength_nm
+        if accepted is not None:
+            np.clip(wavelengths, accepted[0], accepted[1], out=wavelengths)
+        return wavelengths
+
+
+def _turned(hue: FloatArray, by: FloatArray | np.float32) -> FloatArray:
+    """Numbers in [0, 1) turned round."""
+    turned = hue + by
+    turned -= turned >= 1
+    return turned
