@@ -15,7 +15,6 @@ from neurolens.errors import InputError
 from neurolens.evaluate.plots.style import (
     FAINT,
     INK,
-    OTHER_COLOUR,
     family_colour,
     new_figure,
     plain_log_ticks,
