@@ -9,12 +9,13 @@ from typing import Any
 from neurolens.commands.arguments import whole
 
 _DESCRIPTION = """\
-Error over time of the exact lens, a polynomial, a network and a thin lens in three scenes, against a converged exact
-render with other seeds: bias and variance told apart, seconds a sample, from when the exact lens is ahead, equal time
-and equal samples, FLIP maps and film-space error maps in micrometres. Best and median seconds, one thread.
-Renders are kept in the run folder: one that was interrupted goes on where it was, and what would give another picture
-is rendered again. Needs the extra "train" (torch, matplotlib, flip-evaluator).
-Writes README.md, equal_time.csv, equal_time.json and three pictures a scene (about eight minutes)."""
+Error over time of the exact lens, a polynomial, a network and a thin lens in three scenes, against a
+converged exact render with other seeds: bias and variance told apart, seconds a sample, from when the
+exact lens is ahead, equal time and equal samples, FLIP maps and film-space error maps in micrometres.
+Best and median seconds; the exact lens and the network as compiled C, too.
+Renders are kept in the run folder: a run that was interrupted goes on where it was, and what would give
+another picture is rendered again. Needs the extra "train" (torch, matplotlib, flip-evaluator) and a C
+compiler. Writes README.md, equal_time.csv, equal_time.json and three pictures a scene (about ten minutes)."""
 
 
 def add_parser(kinds: Any) -> None:

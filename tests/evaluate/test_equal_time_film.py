@@ -80,7 +80,7 @@ def test_a_shift_behind_a_real_lens_is_found_through_its_aberrations(singlet: Ex
 
 
 def test_another_pupil_outline_is_no_error_of_the_rays(singlet: ExactCamera) -> None:
-    """The same lens whose outline was searched to another accuracy: pupil points would differ by far more."""
+    """The same lens whose pupil is a tenth narrower: pupil points differ, and so would the rays."""
     other: Any = copy(singlet)
     other.film = copy(singlet.film)
     outline = singlet.film.outline

@@ -15,10 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neurolens.cameras.build import Shot, make_camera
-from neurolens.cameras.contract import Camera
-from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.onnxlens import load_model
+from neurolens.evaluate.benches.equal_time_cameras import EXACT, scene_cameras
 from neurolens.evaluate.benches.equal_time_film import FilmMap, film_map
 from neurolens.evaluate.benches.equal_time_fit import (
     Estimate,
@@ -32,17 +29,10 @@ from neurolens.evaluate.benches.equal_time_fit import (
 )
 from neurolens.evaluate.benches.equal_time_renders import Shelf, shelf
 from neurolens.evaluate.image import DEFAULT, flip, flip_map
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order
 from neurolens.render.scene import CameraSettings
 from neurolens.render.scenefile import load_scene
-from neurolens.surrogates.domain import Domain
 
-EXACT, THIN = "exact", "thin lens"
 SCENES = ("grid", "lights", "room")
-LENS = "laikin_double_gauss_50"
-# Name in the tables to what `make_camera` takes, beside the models' folder; a fused model has its line here.
-MODELS = {"ols-28": f"{LENS}.ols-28.onnx", "mlp-16x2": f"{LENS}.mlp-16x2.onnx"}
 # Weight of a squared error: that of the RMSE, and of the relative MSE.
 MEASURES: dict[str, float | None] = {"mse": None, "rel_mse": DEFAULT.eps}
 _PASS_SEED, _SHORT_SEED, _REFERENCE_SEED = 100, 1000, 1_000_000
@@ -62,9 +52,9 @@ class Counts:
     short: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
     repeats: int = 4
     pass_samples: int = 64
-    passes: int = 16
-    reference: int = 4096
-    parts: int = 4
+    passes: int = 8
+    reference: int = 2048
+    parts: int = 2
 
     @property
     def jobs(self) -> list[tuple[int, int]]:
@@ -73,7 +63,7 @@ class Counts:
         return short + [(self.pass_samples, _PASS_SEED + k) for k in range(self.passes)]
 
 
-QUICK = Counts((64, 36), (1, 2, 4, 8), 2, 16, 4, 256)
+QUICK = Counts((64, 36), (1, 2, 4, 8), 2, 16, 4, 256, 1)
 
 
 @dataclass(frozen=True)
@@ -133,32 +123,6 @@ class SceneResult:
     noise2: dict[str, float]
     flip_halves: float
     cameras: dict[str, CameraResult]
-
-
-def scene_cameras(root: Path, shot: CameraSettings) -> tuple[dict[str, Camera], ExactCamera]:
-    """The cameras of a scene by name, the exact one first, and the exact one in float64 for film-space errors.
-
-    All of the lens share the pupil bounds of the models' domain, so that the same random numbers are the same rays.
-    """
-    lens = read_lens(root / "lenses" / f"{LENS}.toml")
-    data = first_order(lens)
-    widest = shot.f_number is None or shot.f_number < data.f_number
-    f_number = data.f_number if widest else float(shot.f_number or 0)
-    card = load_model(root / "models" / next(iter(MODELS.values()))).card
-    bounds = Domain.from_dict(card["domain"]).bounds
-    film = (shot.film_width_mm, shot.film_height_mm)
-    set_ = Shot(film, shot.focus_m, None if widest else f_number, wavelength_nm=shot.wavelengths_nm)
-
-    def exact(dtype: str) -> ExactCamera:
-        return ExactCamera(
-            lens, film_mm=film, focus_m=shot.focus_m, f_number=set_.f_number, wavelength_nm=shot.wavelengths_nm,
-            dtype="float64" if dtype == "float64" else "float32", bounds=bounds,
-        )  # fmt: skip
-
-    cameras: dict[str, Camera] = {EXACT: exact("float32")}
-    cameras |= {name: make_camera(root / "models" / file, set_) for name, file in MODELS.items()}
-    cameras[THIN] = make_camera("thin", replace(set_, efl_mm=data.efl_mm, f_number=f_number))
-    return cameras, exact("float64")
 
 
 def measure_scene(

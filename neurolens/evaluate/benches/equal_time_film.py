@@ -54,6 +54,7 @@ def film_map(
     """Error of `camera` against `exact` at the middles of columns x rows parts of the film.
 
     Args:
+        exact: traced ray by ray, not compiled: it takes the pupil outline of a camera of the same lens.
         wavelengths_nm: range, drawn uniformly.
         samples: random pupil points (and wavelengths) a film point, the same for both cameras.
 
@@ -65,11 +66,11 @@ def film_map(
     focus = exact.settings.get("focus_m")
     if camera.settings.get("focus_m") != focus:
         raise InputError("film map", "focus_m", camera.settings.get("focus_m"), f"that of the exact camera, {focus}")
-    camera = on_same_pupil(camera, exact)
+    exact = on_pupil_of(exact, camera)
     across, down = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
     # The picture shows the film turned by 180 degrees: see render.film.PixelGrid.
-    film = np.stack([(0.5 - across) * exact.film_mm[0], (down - 0.5) * exact.film_mm[1]]).reshape(2, -1)
-    film = np.repeat(film, samples, axis=1).astype(np.float32)
+    middles = np.stack([(0.5 - across) * exact.film_mm[0], (down - 0.5) * exact.film_mm[1]]).reshape(2, -1)
+    film = np.repeat(middles, samples, axis=1).astype(np.float32)
     random = np.random.default_rng(seed).random((3, film.shape[1]), np.float32)
     low, high = wavelengths_nm
     pupil, light = random[:2], (low + (high - low) * random[2]).astype(np.float32)
@@ -80,21 +81,21 @@ def film_map(
     return FilmMap(_medians(each.reshape(rows * columns, samples)).reshape(rows, columns), float(p50), float(p99))
 
 
-def on_same_pupil(camera: Camera, exact: Camera) -> Camera:
-    """`camera` with the pupil outline of `exact`, where both are of one lens: a pupil sample is then one pupil point.
+def on_pupil_of(exact: DifferentialCamera, camera: Camera) -> DifferentialCamera:
+    """`exact` with the pupil outline of `camera`, where both are of one lens: a pupil sample is then one pupil point.
 
     Each searches its own outline else, and rims that differ by a hair would count as an error of the rays.
     """
-    own, true = getattr(camera, "film", None), getattr(exact, "film", None)
-    if (
-        not (isinstance(own, LensFilm) and isinstance(true, LensFilm))
-        or abs(own.distance_mm / true.distance_mm - 1) > _SAME
-    ):
-        return camera
-    other: Any = copy(camera)
-    other.film = copy(own)
-    other.film.outline = true.outline
-    return other
+    own, other = getattr(exact, "film", None), getattr(camera, "film", None)
+    if not (isinstance(own, LensFilm) and isinstance(other, LensFilm)):
+        return exact
+    if abs(own.distance_mm / other.distance_mm - 1) > _SAME:
+        return exact
+    turned: Any = copy(exact)
+    turned.film = copy(own)
+    turned.film.outline = other.outline
+    found: DifferentialCamera = turned
+    return found
 
 
 def film_error_um(

@@ -11,23 +11,22 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
-from neurolens.evaluate.benches.equal_time import EXACT, LENS, MEASURES, CameraResult, SceneResult
+from neurolens.evaluate.benches.equal_time import MEASURES, CameraResult, SceneResult
+from neurolens.evaluate.benches.equal_time_cameras import EXACT, EXACTS, LENS
 from neurolens.evaluate.benches.equal_time_fit import Estimate, crossover_s, log_interpolate
+from neurolens.evaluate.benches.equal_time_pictures import draw, um_text
 from neurolens.evaluate.benches.trace_speed_page import machine
-from neurolens.evaluate.plots.equal_time import Panel, error_over_time_plot, film_maps_plot
-from neurolens.evaluate.plots.image import side_by_side
 from neurolens.evaluate.records import plain
-from neurolens.files import atomic_path, atomic_write_text
+from neurolens.files import atomic_write_text
 
 _INTRO = """\
 # Equal time and equal samples
 
-`neurolens bench equal-time`: {lens} exact, through surrogates in onnxruntime, and as a thin lens of its focal length
-and f-number. Against the exact lens with other seeds and {reference} samples a pixel, in two halves. Every camera draws
-the same random numbers, one wavelength a path. Times are the render's own seconds (best; median in brackets), {threads}
-thread{s}, {size} pixels; making a camera, its fit and the scene's tables are not in them.
+`neurolens bench equal-time`: {lens} exact in torch, through surrogates in onnxruntime, both as compiled
+C (fused), and as a thin lens of its focal length and f-number. Against the exact lens with other seeds and {reference}
+samples a pixel, in two halves. Every camera draws the same random numbers, one wavelength a path. Times are the
+render's own seconds (best; median in brackets), {threads} thread{s}, {size} pixels; making a camera, its fit and the
+scene's tables are not in them.
 
 - *Error*: relative RMSE, the root of the mean of (a - b)^2 / (b^2 + 0.01) on linear radiance, in percent; mean FLIP.
   The reference's own noise is taken out of the first (products of the differences from its two halves), not of FLIP.
@@ -36,13 +35,12 @@ thread{s}, {size} pixels; making a camera, its fit and the scene's tables are no
   and the reference; *paired* compares its passes with the exact lens's of the same random numbers, where most noise
   cancels. Deviations by the jackknife over passes; where a square is below two of them, "<" gives the bound of two.
 - *Variance*: V times the samples of a pass, relative. *Efficiency*: 1 / (V x seconds of a pass).
-- *Exact ahead*: the time from which the exact lens has the smaller error, for the paired bias (for two deviations more
-  and less); beyond the measured times by the law.
+- *Exact ahead*, *fused exact ahead*: the time from which the exact lens, in torch and as C, has the smaller error, for
+  the paired bias (for two deviations more and less); beyond the measured times by the law.
 - *FLIP paired*: between the camera's mean picture and the exact lens's of the same random numbers.
 - *Film*: where the camera's ray meets the plane in focus, taken back to the film by the exact lens's differential, from
   the exact ray in float64 of the same film and pupil point and wavelength: median and 99th percentile of all rays, um.
 """
-_TITLES = {"mse": "RMSE (linear radiance)", "rel_mse": "relative RMSE (share of 1)"}
 
 
 def write(results: Sequence[SceneResult], folder: Path) -> str:
@@ -53,8 +51,7 @@ def write(results: Sequence[SceneResult], folder: Path) -> str:
     data = {"machine": machine(), "scenes": [_scene_data(r) for r in results]}
     atomic_write_text(folder / "equal_time.json", json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
     for result in results:
-        for picture in _draw(result, folder):
-            _fewer_colours(picture)
+        draw(result, folder)
     atomic_write_text(folder / "README.md", text)
     return text
 
@@ -90,7 +87,7 @@ def _scene_text(result: SceneResult) -> str:
             f" The reference's own noise: {noise:.3g}%; FLIP between its halves {result.flip_halves:.3g}.\n",
             *_table(
                 ["camera", "bias paired %", "bias alone %", "variance a sample", "ms a sample", "efficiency 1/s"]
-                + ["exact ahead"],
+                + [f"{name} ahead" for name in _exacts(result)],
                 [_law_cells(result, c) for c in result.cameras.values()],
             ),
             "",
@@ -120,7 +117,7 @@ def _law_cells(result: SceneResult, camera: CameraResult) -> list[str]:
         f"{samples * variance:.3g}",
         f"{1000 * best / samples:.3g} ({1000 * middle / samples:.3g})",
         f"{1 / (variance * best):.3g}",
-        "–" if exact else _crossover_text(result, camera),
+        *("–" if camera.name in EXACTS else _crossover_text(result, camera, name) for name in _exacts(result)),
     ]
 
 
@@ -135,13 +132,9 @@ def _equal_cells(result: SceneResult, camera: CameraResult, seconds: float) -> l
         _percent(camera.law("rel_mse").at(seconds)),
         f"{seen:.3g}",
         "0" if camera.name == EXACT else f"{camera.flip_same:.2g}",
-        _um(camera.film.p50_um),
-        _um(camera.film.p99_um),
+        um_text(camera.film.p50_um),
+        um_text(camera.film.p99_um),
     ]
-
-
-def _um(value: float) -> str:
-    return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
 
 
 def _percent(square: float) -> str:
@@ -156,20 +149,25 @@ def _root(square: Estimate) -> str:
     return f"{100 * root:.3g} ± {100 * square.sd / (2 * root):.1g}"
 
 
-def crossovers_s(result: SceneResult, camera: CameraResult) -> tuple[float, float, float]:
+def _exacts(result: SceneResult) -> list[str]:
+    """The exact lens's cameras in a scene: in torch, and as C."""
+    return [name for name in EXACTS if name in result.cameras]
+
+
+def crossovers_s(result: SceneResult, camera: CameraResult, exact: str) -> tuple[float, float, float]:
     """When the exact lens is ahead for good: by the paired bias, and with two deviations more and less."""
-    law, bias = result.cameras[EXACT].law("rel_mse"), camera.bias2["rel_mse"]
+    law, bias = result.cameras[exact].law("rel_mse", 0.0), camera.bias2["rel_mse"]
     least = max(bias.value - 2 * bias.sd, 0.0)
     times = [crossover_s(law, camera.law("rel_mse", b)) for b in (max(bias.value, 0.0), bias.upper, least)]
     return times[0], times[1], times[2]
 
 
-def _crossover_text(result: SceneResult, camera: CameraResult) -> str:
-    middle, early, late = crossovers_s(result, camera)
+def _crossover_text(result: SceneResult, camera: CameraResult, exact: str) -> str:
+    middle, early, late = crossovers_s(result, camera, exact)
     if middle == 0.0:
         return "from the first sample"
     if not camera.bias2["rel_mse"].resolved:
-        return f"after more than {_time(early)}"
+        return f"after more than {_time(early)}" if early > 0 else "not resolved"
     times = [_time(t) for t in (middle, early, late)]
     return f"after {times[0]}" if len(set(times)) == 1 else f"after {times[0]} ({times[1]} to {times[2]})"
 
@@ -208,7 +206,7 @@ def _scene_data(result: SceneResult) -> dict[str, Any]:
             "flip_same_seeds": c.flip_same,
             "film_p50_um": c.film.p50_um,
             "film_p99_um": c.film.p99_um,
-            "exact_ahead_after_s": None if c.name == EXACT else crossovers_s(result, c),
+            "ahead_after_s": {} if c.name in EXACTS else {n: crossovers_s(result, c, n) for n in _exacts(result)},
         }
 
     return {
@@ -225,63 +223,3 @@ def _scene_data(result: SceneResult) -> dict[str, Any]:
 
 
 _ESTIMATES = ("bias2", "extrapolated2", "variance")
-
-
-def _fewer_colours(picture: Path) -> None:
-    """Keep 256 colours of a PNG: a third of the bytes, and no difference that one sees in plots."""
-    with Image.open(picture) as full, atomic_path(picture) as temporary:
-        full.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(temporary, optimize=True)
-
-
-def _draw(result: SceneResult, folder: Path) -> list[Path]:
-    """Three pictures: error over time, FLIP maps at equal samples, film-space maps."""
-    shot, counts = result.settings, result.counts
-    threads = f"{result.threads} thread" + ("" if result.threads == 1 else "s")
-    where = f"{result.name}, f/{result.f_number:.3g}, focused at {shot.focus_m:g} m"
-    size = f"{counts.size[0]} x {counts.size[1]} pixels"
-    over_time = error_over_time_plot(
-        [*(_root_panel(result, measure) for measure in MEASURES), _flip_panel(result)],
-        folder / f"{result.name}-error.png",
-        f"Error against render time: {where}",
-        f"{size}, {threads}; markers: 1, 2, 4 ... samples a pixel; the reference has {2 * counts.reference}",
-    )
-    total = counts.pass_samples * counts.passes
-    flips = side_by_side(
-        {"reference": result.reference} | {n: c.picture for n, c in result.cameras.items()},
-        {n: c.flip_map for n, c in result.cameras.items()},
-        folder / f"{result.name}-flip.png",
-        {n: _flip_caption(c) for n, c in result.cameras.items()},
-        title=f"{result.name}: FLIP against the reference, {total} samples each",
-    )
-    films = film_maps_plot(
-        {n: c.film.median_um for n, c in result.cameras.items()},
-        (shot.film_width_mm, shot.film_height_mm),
-        folder / f"{result.name}-film.png",
-        f"Film-space error: {where}",
-        "against the exact ray in float64 of the same film and pupil point; median over pupil and wavelengths",
-        {n: f"all rays: median {_um(c.film.p50_um)}, 99% {_um(c.film.p99_um)} µm" for n, c in result.cameras.items()},
-    )
-    return [over_time, flips, films]
-
-
-def _flip_caption(camera: CameraResult) -> str:
-    same = "" if camera.name == EXACT else f"\nfrom exact, same random numbers: {camera.flip_same:.2g}"
-    return f"FLIP {camera.flip_map.mean():.3g}{same}"
-
-
-def _root_panel(result: SceneResult, measure: str) -> Panel:
-    def curve(camera: CameraResult) -> tuple[list[float], list[float]]:
-        squares = [getattr(level, measure) for level in camera.levels]
-        return [level.seconds_min for level in camera.levels], [math.sqrt(s) if s > 0 else math.nan for s in squares]
-
-    biased = {n: math.sqrt(c.bias2[measure].value) for n, c in result.cameras.items() if c.bias2[measure].resolved}
-    curves = {n: curve(c) for n, c in result.cameras.items()}
-    return Panel(_TITLES[measure], curves, math.sqrt(result.noise2[measure]), "noise of the reference", biased)
-
-
-def _flip_panel(result: SceneResult) -> Panel:
-    curves = {
-        n: ([level.seconds_min for level in c.levels], [level.flip for level in c.levels])
-        for n, c in result.cameras.items()
-    }
-    return Panel("mean FLIP (0 to 1)", curves, result.flip_halves, "between halves of the reference", {})

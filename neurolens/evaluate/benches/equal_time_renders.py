@@ -22,7 +22,7 @@ from neurolens.render.renderer import render
 from neurolens.render.scenefile import Scene
 from neurolens.tomlfile import read_toml
 
-_SOURCES = ("cameras", "optics", "render")  # folders of the package that a picture depends on
+_SOURCES = ("cameras", "optics", "programs", "render")  # folders of the package that a picture depends on
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from neurolens.errors import InputError
 from neurolens.evaluate.plots.style import (
     FAINT,
     INK,
-    OTHER_COLOUR,
     family_colour,
     new_figure,
     plain_log_ticks,
@@ -24,6 +23,7 @@ from neurolens.evaluate.plots.style import (
 )
 
 _MARKERS = "osD^vP"
+_FUSED = "fused "
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,7 @@ def _draw(axes: Any, panel: Panel) -> dict[str, Any]:
         t, e = np.asarray(seconds, np.float64), np.asarray(errors, np.float64)
         kept = np.isfinite(e) & (e > 0)
         look = {"color": _colour(name), "marker": _MARKERS[k % len(_MARKERS)], "ms": 4.2, "lw": 1.4}
+        look |= {"ls": "--", "mfc": "white"} if name.startswith(_FUSED) else {}
         handles[name] = axes.plot(t[kept], e[kept], **look)[0]
     axes.set(xscale="log", yscale="log", xlabel="render time (s)", ylabel=panel.label)
     low = min(axes.get_ylim()[0], 0.7 * panel.floor) if panel.floor > 0 else axes.get_ylim()[0]
@@ -127,11 +128,8 @@ def film_maps_plot(
 
 
 def _colour(name: str) -> str:
-    """Black for the exact lens, else that of the family that a name begins with."""
-    if name == "exact":
+    """Black for the exact lens, else that of the family that a name begins with; a fused camera is drawn dashed."""
+    kind = name.removeprefix(_FUSED)
+    if kind == "exact":
         return INK
-    if name.startswith("thin"):
-        return family_colour("paraxial")
-    if name.startswith("fused"):
-        return OTHER_COLOUR
-    return family_colour(name.split("-")[0])
+    return family_colour("paraxial" if kind.startswith("thin") else kind.split("-")[0])
