@@ -7,7 +7,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from neurolens.commands import bench_fused, bench_inverse, bench_models, bench_surrogates, bench_vignetting, bench_zoom
+from neurolens.commands import (
+    bench_fused,
+    bench_inverse,
+    bench_mitsuba,
+    bench_models,
+    bench_surrogates,
+    bench_vignetting,
+    bench_zoom,
+)
 from neurolens.commands.arguments import Parser, whole
 from neurolens.errors import InputError
 
@@ -47,6 +55,7 @@ def add_parser(subparsers: Any) -> None:
     bench_models.add_parser(kinds)
     bench_inverse.add_parser(kinds)
     bench_zoom.add_parser(kinds)
+    bench_mitsuba.add_parser(kinds)
 
 
 def _add_trace(kinds: Any) -> None:
