@@ -37,7 +37,8 @@ _STAGE = {
     "integrator": "integrator",
 }
 _OF_THE_WORLD = {"nearest": "intersection", "visible": "intersection", "surfaces": "intersection"}
-_FUNCTIONS = {"aim_at_lights": "lights", "dot": "shading"}
+_FUNCTIONS = {"aim_at_lights": "lights"}
+_HELPERS = {"dot", "take", "cut"}  # which count as part of those who call them
 
 Function = tuple[str, int, str]
 
@@ -59,7 +60,7 @@ def profile(scene: Scene, camera: Camera, width: int, height: int, samples: int)
 
 
 def shares(stats: pstats.Stats) -> dict[str, float]:
-    """Own time of every function by stage; numpy's belongs to those who called it, in proportion."""
+    """Own time of every function by stage; that of numpy and of helpers belongs to those who called them."""
     table: dict[Function, Any] = stats.stats  # type: ignore[attr-defined]
     path: set[Function] = set()
 
@@ -86,9 +87,9 @@ def shares(stats: pstats.Stats) -> dict[str, float]:
 
 
 def _stage_of(function: Function) -> str | None:
-    """Stage of a function of ours; None for all others."""
+    """Stage of a function of ours; None for helpers and for all others."""
     file, _, name = function
-    if not file.startswith(_ROOT):
+    if not file.startswith(_ROOT) or name in _HELPERS:
         return None
     part, module = Path(file).parent.name, Path(file).stem
     if part == "cameras" or name in ("_hero_rays", "_camera_rays"):

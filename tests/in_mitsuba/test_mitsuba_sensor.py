@@ -1,6 +1,7 @@
 """The sensor inside Mitsuba 3: white furnace, Mitsuba's own cameras, our renderer, wavelengths, files and mistakes.
 
-Skipped where the extra "mitsuba", or for its compiled variants libLLVM, is not installed.
+Skipped where the extra "mitsuba", or for its compiled variants libLLVM, is not installed. (The folder is not called
+mitsuba, which Python would then take for the package.)
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def cornell(mi: Any, *, grey: bool) -> dict[str, Any]:
     """Mitsuba's own Cornell box, small, its colours made grey where two ways to mix them would differ."""
     scene = mi.cornell_box()
     scene["sensor"]["film"] = box_film(SIZE)
-    scene["integrator"]["max_depth"] = 4
+    scene["integrator"]["max_depth"] = 3
     if grey:
         for item in scene.values():
             if isinstance(item, dict) and item["type"] == "diffuse":
@@ -114,7 +115,7 @@ def test_scalar_variants_see_the_same_white(name: str) -> None:
     seen = render(load_scene(furnace(mi, 2)), ThinLens(50.0, 2.0, 3.9, (26.0, 26.0)), spp=16)
     np.testing.assert_allclose(seen.mean(), 0.92, atol=0.1)  # cos^4 over the film
     chosen = camera(MODEL, film_mm=(2.0, 2.0), focus_m=3.9, f_number=2.0)
-    seen = render(load_scene(furnace(mi, 2)), chosen, spp=64)
+    seen = render(load_scene(furnace(mi, 2)), chosen, spp=32)
     np.testing.assert_allclose(seen.mean(), 1, atol=0.2)
 
 
@@ -124,8 +125,8 @@ def test_the_picture_is_that_of_our_renderer(name: str, lens: Camera) -> None:
     spectral = "spectral" in name
     box = cornell(mi, grey=not spectral)
     scene, ours = load_scene(with_our_spectra(box) if spectral else box), our_scene(box, lens.film_mm)
-    theirs = [render(scene, lens, spp=64, seed=k) for k in range(4)]
-    assert_same(theirs, [our_render(ours, lens, samples=64, seed=k, threads=1).rgb for k in range(4)])
+    theirs = [render(scene, lens, spp=48, seed=k) for k in range(4)]
+    assert_same(theirs, [our_render(ours, lens, samples=32, seed=k, threads=1).rgb for k in range(4)])
 
 
 def test_thin_lens_and_pinhole_are_mitsubas_own() -> None:
@@ -145,10 +146,10 @@ def test_thin_lens_and_pinhole_are_mitsubas_own() -> None:
         own = {"to_world": place, "fov": fov, "film": box_film(SIZE), **more}
         scene = load_scene({**box, "sensor": own})
         back = place @ mi.ScalarTransform4f().translate([0, 0, -1e-3 * behind])
-        ours = [render(scene, ideal, spp=64, seed=k, to_world=back) for k in range(4)]
+        ours = [render(scene, ideal, spp=48, seed=k, to_world=back) for k in range(4)]
         # Mitsuba's cameras know no natural vignetting: what our white card has is put on their pictures.
         white = render(load_scene(furnace(mi, SIZE)), ideal, spp=64)
-        assert_same(ours, [white * np.array(mi.render(scene, spp=64, seed=k)) for k in range(4)], share=0.02)
+        assert_same(ours, [white * np.array(mi.render(scene, spp=48, seed=k)) for k in range(4)], share=0.02)
 
 
 def test_lanes_share_a_wavelength_only_where_the_lens_disperses(lens: Camera) -> None:
