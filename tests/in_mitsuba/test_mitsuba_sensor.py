@@ -7,6 +7,7 @@ mitsuba, which Python would then take for the package.)
 from __future__ import annotations
 
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,11 @@ import pytest
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
+from neurolens.cli import main
 from neurolens.errors import InputError, NeurolensError
 from neurolens.mitsuba import camera, load_scene, register, render, require_mitsuba
 from neurolens.mitsuba.scenes import our_scene, with_our_spectra
+from neurolens.render.exr import read_exr
 from neurolens.render.renderer import render as our_render
 from neurolens.render.scenefile import scene_from_tables
 
@@ -189,7 +192,7 @@ XML = """<scene version="3.0.0">
 <integrator type="path"/>
 <emitter type="constant"><rgb name="radiance" value="1"/></emitter>
 <sensor type="neurolens">
-  <string name="camera" value="thin"/> <float name="focus_m" value="2"/> <integer name="blades" value="6"/>
+  <string name="camera" value="{camera}"/> <float name="focus_m" value="2"/> <integer name="blades" value="6"/>
   <float name="film_width_mm" value="{width}"/> {more}
   <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="4"/></film>
 </sensor></scene>"""
@@ -198,10 +201,26 @@ XML = """<scene version="3.0.0">
 def test_a_scene_file_names_its_camera(tmp_path: Path) -> None:
     mi = variant("llvm_ad_rgb")
     file = tmp_path / "scene.xml"
-    file.write_text(XML.format(width=12, more=""))
+    shutil.copy(MODEL, tmp_path / "lens.onnx")  # found beside the scene
+    file.write_text(XML.format(width=12, more="", camera="lens.onnx"))
     picture = np.array(mi.render(load_scene(file), spp=64))
     assert picture.shape == (4, 8, 3)
     np.testing.assert_allclose(picture[1:3, 2:6].mean(), 1, atol=0.03)
+
+
+def test_the_command_renders_a_scene_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    variant("llvm_ad_rgb")
+    (tmp_path / "scene.xml").write_text(XML.format(width=12, more="", camera="thin"))
+    out = tmp_path / "out.exr"
+    words = (
+        f"mitsuba {tmp_path}/scene.xml --camera {MODEL} --film 8x4 --samples 64 --variant llvm_ad_rgb -o {out} --quiet"
+    )
+    assert main(words.split()) == 0
+    assert "8 x 4" in capsys.readouterr().out
+    picture, metadata = read_exr(out)
+    np.testing.assert_allclose(picture.mean(), 1, atol=0.1)
+    assert metadata["camera"]["camera"] == "model" and metadata["render"]["variant"] == "llvm_ad_rgb"
+    assert out.with_suffix(".png").is_file()
 
 
 @pytest.mark.parametrize(
@@ -217,7 +236,7 @@ def test_a_scene_file_names_its_camera(tmp_path: Path) -> None:
 def test_mistakes_in_a_scene_are_one_line(tmp_path: Path, more: str, words: str) -> None:
     variant("scalar_rgb")
     file = tmp_path / "scene.xml"
-    file.write_text(XML.format(width=12, more=more))
+    file.write_text(XML.format(width=12, more=more, camera="thin"))
     with pytest.raises(NeurolensError, match=words) as caught:
         load_scene(file)
     assert "\n" not in str(caught.value) and "scene.xml" in str(caught.value)
