@@ -205,7 +205,7 @@ def test_a_scene_file_names_its_camera(tmp_path: Path) -> None:
     file.write_text(XML.format(width=12, more="", camera="lens.onnx"))
     picture = np.array(mi.render(load_scene(file), spp=64))
     assert picture.shape == (4, 8, 3)
-    np.testing.assert_allclose(picture[1:3, 2:6].mean(), 1, atol=0.03)
+    np.testing.assert_allclose(picture[1:3, 2:6].mean(), 1, atol=0.1)
 
 
 def test_the_command_renders_a_scene_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
