@@ -53,10 +53,10 @@ PACKAGES = {
     "base": {"numpy"},
     "optics": {"numpy", "torch"},
     "analysis": {"numpy", "torch", "matplotlib"},
+    "mitsuba": {"numpy"},
     "readers": set(),
     "cameras": {"numpy", "onnxruntime"},
     "render": {"numpy", "OpenEXR", "PIL", "trimesh"},
-    "mitsuba": {"numpy"},
 }
 # The one camera that traces rays exactly, and the maker of cameras, which imports it when one is asked for.
 EXACT_CAMERA = {

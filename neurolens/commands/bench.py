@@ -13,6 +13,7 @@ from neurolens.commands import (
     bench_inverse,
     bench_models,
     bench_render,
+    bench_mitsuba,
     bench_surrogates,
     bench_vignetting,
     bench_zoom,
@@ -58,6 +59,7 @@ def add_parser(subparsers: Any) -> None:
     bench_zoom.add_parser(kinds)
     bench_equal_time.add_parser(kinds)
     bench_render.add_parser(kinds)
+    bench_mitsuba.add_parser(kinds)
 
 
 def _add_trace(kinds: Any) -> None:

@@ -46,6 +46,8 @@ def camera(
 def load_scene(scene: str | Path | Mapping[str, Any], variant: str | None = None, **parameters: Any) -> Any:
     """A scene of Mitsuba (mi.Scene): an XML file, its own "cornell-box", or a dictionary for mi.load_dict.
 
+    Mitsuba reads no glTF; its Blender add-on turns such a scene into XML.
+
     Args:
         variant: of Mitsuba; None is the one that is set, else llvm_ad_spectral.
         parameters: values for the $names of an XML file.

@@ -32,6 +32,7 @@ def our_scene(
     *,
     back_m: float = 0.0,
     wavelengths_nm: tuple[float, float] = (400.0, 700.0),
+    triangles: bool = False,
 ) -> Scene:
     """A dictionary of Mitsuba, such as mi.cornell_box(), as a scene of ours: the same geometry, colours and depth.
 
@@ -41,6 +42,7 @@ def our_scene(
         back_m: how far behind the place of Mitsuba's sensor the film stands. Its own pinhole and thin lens stand at
             that place themselves, one image distance in front of the film.
         wavelengths_nm: of the light.
+        triangles: a mesh for each material instead of rectangles; lights stay rectangles.
 
     Raises:
         InputError: shapes, materials or lights that are not among the few above.
@@ -53,11 +55,24 @@ def our_scene(
             quads += _quads(name, item, materials)
         elif name not in materials:
             raise InputError("mitsuba scene", f"{name}.type", item["type"], "rectangle, cube or diffuse")
+    flat = [q for q in quads if not triangles or "emission" in q]
+    tables = {
+        "camera": _camera(description, film_mm, back_m, wavelengths_nm),
+        "materials": {k: {"kind": "diffuse", "reflectance": _rgb(k, v["reflectance"])} for k, v in materials.items()},
+        "quads": flat,
+        "meshes": [] if not triangles else [_mesh(k, [q for q in quads if q not in flat]) for k in materials],
+    }
+    return scene_from_tables(tables, "mitsuba scene")
+
+
+def _camera(
+    description: Mapping[str, Any], film_mm: tuple[float, float], back_m: float, wavelengths_nm: tuple[float, float]
+) -> dict[str, Any]:
+    """The camera table: place, picture and depth of Mitsuba's sensor, film and integrator."""
     sensor = description["sensor"]
-    at = matrix(sensor["to_world"])
+    at, film, depth = matrix(sensor["to_world"]), sensor["film"], description["integrator"].get("max_depth", -1)
     position = at[:3, 3] - back_m * at[:3, 2]
-    film, depth = sensor["film"], description["integrator"].get("max_depth", -1)
-    camera = {
+    return {
         "position_m": position.tolist(),
         "look_at_m": (position + at[:3, 2]).tolist(),
         "up": at[:3, 1].tolist(),
@@ -67,11 +82,9 @@ def our_scene(
         "width": film["width"],
         "height": film["height"],
         "wavelengths_nm": list(wavelengths_nm),
-        # Mitsuba counts the path's segments, we count the surfaces between them; -1 is no limit there.
+        # Mitsuba counts the segments of a path, we count the surfaces between them; -1 is no limit there.
         "max_depth": depth - 1 if depth > 1 else 1000,
     }
-    colours = {k: {"kind": "diffuse", "reflectance": _rgb(k, v["reflectance"])} for k, v in materials.items()}
-    return scene_from_tables({"camera": camera, "materials": colours, "quads": quads}, "mitsuba scene")
 
 
 def _quads(name: str, item: Mapping[str, Any], materials: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -92,6 +105,19 @@ def _quads(name: str, item: Mapping[str, Any], materials: Mapping[str, Any]) -> 
         light = {} if emitter is None else {"emission": _rgb(name, emitter["radiance"])}
         quads.append({**quad, "material": material, **light})
     return quads
+
+
+def _mesh(material: str, quads: list[dict[str, Any]]) -> dict[str, Any]:
+    """Two triangles for each rectangle of a material."""
+    vertices: list[Any] = []
+    faces: list[list[int]] = []
+    for quad in quads:
+        if quad["material"] == material:
+            corner, u, v = (np.array(quad[k]) for k in ("corner_m", "edge_u_m", "edge_v_m"))
+            k = len(vertices)
+            vertices += [x.tolist() for x in (corner, corner + u, corner + u + v, corner + v)]
+            faces += [[k, k + 1, k + 2], [k, k + 2, k + 3]]
+    return {"material": material, "vertices_m": vertices, "faces": faces}
 
 
 def _rgb(name: str, colour: Mapping[str, Any]) -> list[float]:

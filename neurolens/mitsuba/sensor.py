@@ -5,7 +5,7 @@ Mitsuba's own four, each with its weight (hero wavelengths, Wilkie et al. 2014);
 lanes the wavelength of the first, for one ray is of one wavelength. RGB variants: see `wavelengths`.
 
 Weights are ours: a uniform environment of radiance 1 gives 1 on the axis, and falls off towards the edge as the lens
-vignettes. Scalar variants ask for one ray at a time, which takes half a millisecond each: for tests.
+vignettes. Scalar variants ask for one ray at a time, which takes a model about a millisecond: for tests.
 """
 
 from __future__ import annotations

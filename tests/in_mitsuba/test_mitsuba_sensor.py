@@ -1,11 +1,13 @@
 """The sensor inside Mitsuba 3: white furnace, Mitsuba's own cameras, our renderer, wavelengths, files and mistakes.
 
-Skipped where the extra "mitsuba", or for its compiled variants libLLVM, is not installed.
+Skipped where the extra "mitsuba", or for its compiled variants libLLVM, is not installed. (The folder is not called
+mitsuba, which Python would then take for the package.)
 """
 
 from __future__ import annotations
 
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +17,11 @@ import pytest
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
+from neurolens.cli import main
 from neurolens.errors import InputError, NeurolensError
 from neurolens.mitsuba import camera, load_scene, register, render, require_mitsuba
 from neurolens.mitsuba.scenes import our_scene, with_our_spectra
+from neurolens.render.exr import read_exr
 from neurolens.render.renderer import render as our_render
 from neurolens.render.scenefile import scene_from_tables
 
@@ -59,7 +63,7 @@ def cornell(mi: Any, *, grey: bool) -> dict[str, Any]:
     """Mitsuba's own Cornell box, small, its colours made grey where two ways to mix them would differ."""
     scene = mi.cornell_box()
     scene["sensor"]["film"] = box_film(SIZE)
-    scene["integrator"]["max_depth"] = 4
+    scene["integrator"]["max_depth"] = 3
     if grey:
         for item in scene.values():
             if isinstance(item, dict) and item["type"] == "diffuse":
@@ -114,7 +118,7 @@ def test_scalar_variants_see_the_same_white(name: str) -> None:
     seen = render(load_scene(furnace(mi, 2)), ThinLens(50.0, 2.0, 3.9, (26.0, 26.0)), spp=16)
     np.testing.assert_allclose(seen.mean(), 0.92, atol=0.1)  # cos^4 over the film
     chosen = camera(MODEL, film_mm=(2.0, 2.0), focus_m=3.9, f_number=2.0)
-    seen = render(load_scene(furnace(mi, 2)), chosen, spp=64)
+    seen = render(load_scene(furnace(mi, 2)), chosen, spp=32)
     np.testing.assert_allclose(seen.mean(), 1, atol=0.2)
 
 
@@ -124,8 +128,8 @@ def test_the_picture_is_that_of_our_renderer(name: str, lens: Camera) -> None:
     spectral = "spectral" in name
     box = cornell(mi, grey=not spectral)
     scene, ours = load_scene(with_our_spectra(box) if spectral else box), our_scene(box, lens.film_mm)
-    theirs = [render(scene, lens, spp=64, seed=k) for k in range(4)]
-    assert_same(theirs, [our_render(ours, lens, samples=64, seed=k, threads=1).rgb for k in range(4)])
+    theirs = [render(scene, lens, spp=48, seed=k) for k in range(4)]
+    assert_same(theirs, [our_render(ours, lens, samples=32, seed=k, threads=1).rgb for k in range(4)])
 
 
 def test_thin_lens_and_pinhole_are_mitsubas_own() -> None:
@@ -145,10 +149,10 @@ def test_thin_lens_and_pinhole_are_mitsubas_own() -> None:
         own = {"to_world": place, "fov": fov, "film": box_film(SIZE), **more}
         scene = load_scene({**box, "sensor": own})
         back = place @ mi.ScalarTransform4f().translate([0, 0, -1e-3 * behind])
-        ours = [render(scene, ideal, spp=64, seed=k, to_world=back) for k in range(4)]
+        ours = [render(scene, ideal, spp=48, seed=k, to_world=back) for k in range(4)]
         # Mitsuba's cameras know no natural vignetting: what our white card has is put on their pictures.
         white = render(load_scene(furnace(mi, SIZE)), ideal, spp=64)
-        assert_same(ours, [white * np.array(mi.render(scene, spp=64, seed=k)) for k in range(4)], share=0.02)
+        assert_same(ours, [white * np.array(mi.render(scene, spp=48, seed=k)) for k in range(4)], share=0.02)
 
 
 def test_lanes_share_a_wavelength_only_where_the_lens_disperses(lens: Camera) -> None:
@@ -188,7 +192,7 @@ XML = """<scene version="3.0.0">
 <integrator type="path"/>
 <emitter type="constant"><rgb name="radiance" value="1"/></emitter>
 <sensor type="neurolens">
-  <string name="camera" value="thin"/> <float name="focus_m" value="2"/> <integer name="blades" value="6"/>
+  <string name="camera" value="{camera}"/> <float name="focus_m" value="2"/> <integer name="blades" value="6"/>
   <float name="film_width_mm" value="{width}"/> {more}
   <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="4"/></film>
 </sensor></scene>"""
@@ -197,10 +201,26 @@ XML = """<scene version="3.0.0">
 def test_a_scene_file_names_its_camera(tmp_path: Path) -> None:
     mi = variant("llvm_ad_rgb")
     file = tmp_path / "scene.xml"
-    file.write_text(XML.format(width=12, more=""))
+    shutil.copy(MODEL, tmp_path / "lens.onnx")  # found beside the scene
+    file.write_text(XML.format(width=12, more="", camera="lens.onnx"))
     picture = np.array(mi.render(load_scene(file), spp=64))
     assert picture.shape == (4, 8, 3)
-    np.testing.assert_allclose(picture[1:3, 2:6].mean(), 1, atol=0.03)
+    np.testing.assert_allclose(picture[1:3, 2:6].mean(), 1, atol=0.1)
+
+
+def test_the_command_renders_a_scene_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    variant("llvm_ad_rgb")
+    (tmp_path / "scene.xml").write_text(XML.format(width=12, more="", camera="thin"))
+    out = tmp_path / "out.exr"
+    words = (
+        f"mitsuba {tmp_path}/scene.xml --camera {MODEL} --film 8x4 --samples 64 --variant llvm_ad_rgb -o {out} --quiet"
+    )
+    assert main(words.split()) == 0
+    assert "8 x 4" in capsys.readouterr().out
+    picture, metadata = read_exr(out)
+    np.testing.assert_allclose(picture.mean(), 1, atol=0.1)
+    assert metadata["camera"]["camera"] == "model" and metadata["render"]["variant"] == "llvm_ad_rgb"
+    assert out.with_suffix(".png").is_file()
 
 
 @pytest.mark.parametrize(
@@ -216,7 +236,7 @@ def test_a_scene_file_names_its_camera(tmp_path: Path) -> None:
 def test_mistakes_in_a_scene_are_one_line(tmp_path: Path, more: str, words: str) -> None:
     variant("scalar_rgb")
     file = tmp_path / "scene.xml"
-    file.write_text(XML.format(width=12, more=more))
+    file.write_text(XML.format(width=12, more=more, camera="thin"))
     with pytest.raises(NeurolensError, match=words) as caught:
         load_scene(file)
     assert "\n" not in str(caught.value) and "scene.xml" in str(caught.value)
