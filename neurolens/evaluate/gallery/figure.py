@@ -21,7 +21,7 @@ from neurolens.files import atomic_path
 
 DPI = 100  # a picture of 240 pixels is 2.4 inches wide: one pixel of it, one of the figure
 MOST_BYTES = 150_000
-_LEFT, _GAP, _HEAD, _FOOT, _BAR, _LABEL = 0.52, 0.1, 0.62, 0.34, 0.86, 0.2  # inches
+_LEFT, _GAP, _HEAD, _FOOT, _BAR, _LABEL = 0.52, 0.1, 0.62, 0.34, 0.98, 0.2  # inches
 
 
 @dataclass(frozen=True)
