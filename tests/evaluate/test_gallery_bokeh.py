@@ -91,7 +91,7 @@ def test_the_disc_found_backwards_is_that_of_light_traced_forwards(place: str) -
 
 @pytest.mark.parametrize("kind", ["exact", "surrogate"])
 def test_rims_cut_cats_eyes_across_the_radius(kind: str) -> None:
-    """Narrower, smaller and darker the nearer to the corner, the long side square to the radius; of the thin lens never."""
+    """Narrower, smaller and darker the nearer to the corner, long across the radius; a thin lens has none."""
     far, half, edge = (disc(kind, "round", place) for place in ("far", "half", "edge"))
     ratios = [d.axes_mm[1] / d.axes_mm[0] for d in (far, half, edge)]
     assert ratios[0] > 0.995 and 0.75 < ratios[1] < 0.9 and 0.6 < ratios[2] < 0.7

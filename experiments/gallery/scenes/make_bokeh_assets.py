@@ -1,4 +1,6 @@
-"""Make masks, signs and grids of lights for the scenes beside this file: python experiments/gallery/scenes/make_bokeh_assets.py
+"""Make masks, signs and grids of lights for the scenes beside this file.
+
+python experiments/gallery/scenes/make_bokeh_assets.py
 
 The masks open the shares of the stop that Willi 2021 (Table 6.3) has for his: star 45.2%, heart 47.0%.
 """
@@ -88,9 +90,8 @@ def lights(points: Iterable[tuple[float, float, float]], angle: float) -> str:
     rows = []
     for k, (x, y, distance) in enumerate(points):
         colour = COLOURS[k % len(COLOURS)]
-        rows.append(
-            f"  {{ centre_m = [{x:.4f}, {y:.4f}, {-distance:.3f}], radius_m = {angle * distance:.5f}, emission = {colour} }},"
-        )
+        ball = f"centre_m = [{x:.4f}, {y:.4f}, {-distance:.3f}], radius_m = {angle * distance:.5f}"
+        rows.append(f"  {{ {ball}, emission = {colour} }},")
     return "spheres = [\n" + "\n".join(rows) + "\n]\n"
 
 
@@ -158,7 +159,7 @@ def grid(
 def main() -> None:
     """Write them all."""
     for name, mask in (("star", star()), ("heart", heart())):
-        Image.fromarray((mask * np.uint8(255))).convert("1").save(TARGET / f"{name}.png", optimize=True)
+        Image.fromarray(mask * np.uint8(255)).convert("1").save(TARGET / f"{name}.png", optimize=True)
     for k in range(6):
         sign(f"{1 + 0.2 * k:.1f}").convert("P").save(TARGET / f"sign-{10 + 2 * k}.png", optimize=True)
     made = "# Made by make_bokeh_assets.py: "
