@@ -118,7 +118,7 @@ class ThinLens:
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Film points of scene points [3, N] in m through points of the lens chosen by `pupil`."""
         lens = concentric_disk(pupil).astype(np.float64) * self.radius_mm
-        behind, in_front = self.image_distance_mm, 1e3 * self.focus_m - self.image_distance_mm
+        behind, in_front = self.image_distance_mm, self._object_distance_mm
         origin = np.concatenate([1e-3 * lens, np.full((1, lens.shape[1]), -1e-3 * behind)])
         with np.errstate(all="ignore"):
             depth = -1e-3 * behind - point_m[2].astype(np.float64)

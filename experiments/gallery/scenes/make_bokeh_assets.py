@@ -1,4 +1,6 @@
-"""Make masks, signs and grids of lights for the scenes beside this file: python experiments/gallery/scenes/make_bokeh_assets.py
+"""Make masks, signs and grids of lights for the scenes beside this file.
+
+python experiments/gallery/scenes/make_bokeh_assets.py
 
 The masks open the shares of the stop that Willi 2021 (Table 6.3) has for his: star 45.2%, heart 47.0%.
 """
@@ -88,9 +90,8 @@ def lights(points: Iterable[tuple[float, float, float]], angle: float) -> str:
     rows = []
     for k, (x, y, distance) in enumerate(points):
         colour = COLOURS[k % len(COLOURS)]
-        rows.append(
-            f"  {{ centre_m = [{x:.4f}, {y:.4f}, {-distance:.3f}], radius_m = {angle * distance:.5f}, emission = {colour} }},"
-        )
+        ball = f"centre_m = [{x:.4f}, {y:.4f}, {-distance:.3f}], radius_m = {angle * distance:.5f}"
+        rows.append(f"  {{ {ball}, emission = {colour} }},")
     return "spheres = [\n" + "\n".join(rows) + "\n]\n"
 
 
@@ -144,6 +145,11 @@ material = "wall"
 """
 
 
+def one_line(table: str) -> str:
+    """A camera's table for one wavelength: a grey picture, without the noise of wavelengths."""
+    return table.replace("[400, 700]", "[550, 550]")
+
+
 def grid(
     focal_mm: tuple[float, float], xs_mm: Iterable[float], rows: Iterable[tuple[float, float]]
 ) -> list[tuple[float, float, float]]:
@@ -158,7 +164,7 @@ def grid(
 def main() -> None:
     """Write them all."""
     for name, mask in (("star", star()), ("heart", heart())):
-        Image.fromarray((mask * np.uint8(255))).convert("1").save(TARGET / f"{name}.png", optimize=True)
+        Image.fromarray(mask * np.uint8(255)).convert("1").save(TARGET / f"{name}.png", optimize=True)
     for k in range(6):
         sign(f"{1 + 0.2 * k:.1f}").convert("P").save(TARGET / f"sign-{10 + 2 * k}.png", optimize=True)
     made = "# Made by make_bokeh_assets.py: "
@@ -176,14 +182,16 @@ def main() -> None:
             camera(1.0, (54.0, 36.0), 2.0, "for a lens of 100 mm"),
         ),
         "lights-anamorphic": (
-            "lights from 20 m (top) through 1.6 m, in focus, to 1.1 m (bottom), for a picture squeezed twice across.",
+            "lights from 20 m (top) through 1.6 m, in focus, to 1.08 m (bottom), for a picture squeezed twice across.",
             lights(
                 grid(
-                    (21.7, 43.6), np.linspace(-3, 3, 9), [(1.8, 20.0), (0.9, 5.0), (0, 1.6), (-0.9, 1.3), (-1.75, 1.08)]
+                    (21.7, 43.6),
+                    np.linspace(-2, 2, 9),
+                    [(1.25, 20.0), (0.62, 5.0), (0, 1.6), (-0.6, 1.3), (-1.2, 1.08)],
                 ),
-                0.0012,
+                0.0009,
             ),
-            camera(1.6, (7.2, 4.8), 2.4, "the middle of the film of an anamorphic lens"),
+            one_line(camera(1.6, (4.8, 3.2), 2.4, "the middle of the film of an anamorphic lens")),
         ),
     }
     stage = camera(1.4, (24.0, 16.0), 2.0, "for 35 to 75 mm").split("\n[environment]")[0] + "\n" + STREET + signs()

@@ -13,6 +13,7 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
+from neurolens.cameras.vignetting import Vignetted
 from neurolens.evaluate.gallery.lenses import Shot, Surrogate
 from neurolens.evaluate.gallery.vignettes import PostProcessed
 from neurolens.optics.paraxial import first_order
@@ -104,4 +105,17 @@ CAMERAS: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
     "pinhole": pinhole_camera,
     "post": post_processed,
 }
-TITLES = {"exact": "exact lens", "surrogate": "surrogate", "thin": "thin lens", "pinhole": "pinhole", "post": "post-process"}
+TITLES = {
+    "exact": "exact lens",
+    "surrogate": "surrogate",
+    "thin": "thin lens",
+    "pinhole": "pinhole",
+    "post": "post-process",
+}
+
+
+def camera_of(column: str, shot: Shot, surrogate: Surrogate | None) -> Camera:
+    """The camera of a column, with what the panel leaves of its vignetting."""
+    camera = CAMERAS[column](shot, surrogate)
+    left = shot.panel.vignetting
+    return camera if left == "both" else Vignetted(camera, left, shot.wavelength_nm)

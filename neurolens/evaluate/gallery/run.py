@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.errors import InputError
-from neurolens.evaluate.gallery.cameras import CAMERAS, Window
+from neurolens.evaluate.gallery.cameras import CAMERAS, Window, camera_of
 from neurolens.evaluate.gallery.figure import Row, difference_of, draw, exposure_of
 from neurolens.evaluate.gallery.lenses import Shot, Surrogate, same_state, shot_of, surrogate_of
 from neurolens.evaluate.gallery.measures import MEASURES
@@ -133,7 +133,7 @@ def _views(
     panel, views = shot.panel, {}
     window = panel.window_mm or (0.0, 0.0, *shot.film_mm)
     for k, column in enumerate(effect.columns):
-        camera = CAMERAS[column](shot, surrogate)
+        camera = camera_of(column, shot, surrogate)
         # One wavelength a path where the lens disperses: exact lens and surrogate then share their random numbers.
         film = replace(shot.scene.settings.film, wavelengths="one" if camera.dispersive else "hero")
         done = render(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from neurolens.cameras.vignetting import Vignetting
 from neurolens.config import from_dict
 from neurolens.errors import InputError
 from neurolens.surrogates.fit import ModelSettings
@@ -32,6 +33,7 @@ class Panel:
         width, samples: of the picture.
         exposure: stops, or "auto": the exact picture's 99.5th percentile becomes nine tenths of white.
         blades, blade_rotation_deg, blade_curvature, aperture_mask: shape of the stop; see `Aperture`.
+        vignetting: what is left of it; see `neurolens.cameras.vignetting`.
         fit: settings of the surrogate.
         options: numbers that the effect's measure asks for, by name.
     """
@@ -57,6 +59,7 @@ class Panel:
     blade_curvature: float | None = None
     aperture_mask: Path | None = None
     model: Path | None = None
+    vignetting: Vignetting = "both"
     fit: ModelSettings = ModelSettings(terms=100)
     options: dict[str, float] | None = None
 

@@ -15,7 +15,7 @@ from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 Array = NDArray[np.float64]
 
 NEAR_CORNER = 0.95  # of the way to the film's corner, where falloff is matched and measured
-_SQUARE = 96  # pupil samples a side
+_SQUARE = 64  # pupil samples a side
 _WAVELENGTHS = (450.0, 550.0, 650.0)
 
 

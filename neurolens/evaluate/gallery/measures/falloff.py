@@ -13,8 +13,11 @@ _RADII = 13
 
 
 def falloff(view: View) -> dict[str, float]:
-    """Light half way to the film's corner and near it, over that in the middle."""
-    corner = math.hypot(*view.shot.film_mm) / 2
+    """Light half way to the film's corner and near it, over that in the middle.
+
+    Option of the panel: edge_mm, a film radius that stands for the corner's, where the lens leaves corners dark.
+    """
+    corner = view.shot.panel.option("edge_mm", math.hypot(*view.shot.film_mm) / 2)
     middle, half, edge = illumination(view.camera, np.array([0.0, 0.5, NEAR_CORNER]) * corner)
     return {
         "light_half_way_percent": 100 * half / middle,

@@ -23,8 +23,10 @@ Array = NDArray[np.float64]
 _STEP_MM = 0.02  # of the finite differences: float32 rays resolve a thousandth of it
 _STEPS = 4  # of Newton's method, which stops moving after three
 _FOUND_MM = 2e-3  # a film point that the last step moved by less
+_FAR_MM = 100.0  # no step is longer: rays that are lost must not carry the film point to infinity
 _COARSE = 24  # film points a side of the search for a start
-_MARGIN = 1.06  # of the pupil's box, for rims that cut it differently across the disc
+_FEW = 7  # of the pupil's points one in so many finds the disc; sharing no factor with the points of a row
+_MARGIN = 1.1  # of the pupil's box, for rims that cut it differently across the disc
 
 
 @dataclass(frozen=True)
@@ -108,15 +110,16 @@ def light_disc(
     across = _across(target)
     middle = ((np.arange(side) + 0.5) / side).astype(np.float32)
     square = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
-    start = _nearest(camera, target, across, wavelength_nm)
-    films = np.repeat(start[:, None], square.shape[1], axis=1)
-    rounds = 2 if isinstance(camera, ExactCamera | OnnxCamera) else 1
-    for _ in range(rounds):  # the first finds the disc, the second the pupil that all of the disc sees
-        rays = _held_pupil(camera, films, square, wavelength_nm)
-        found, flux = _aim(rays, films, partial(_miss, target, across))
-        if found.shape[1] == 0:
-            raise InputError("light_disc", "light_m", light_m, "a light that the camera's film sees")
-        films = found[:, np.arange(square.shape[1]) * 7919 % found.shape[1]]
+    films = np.repeat(_nearest(camera, target, across, wavelength_nm)[:, None], square.shape[1], axis=1)
+    miss_of = partial(_miss, target, across)
+    if isinstance(camera, ExactCamera | OnnxCamera):
+        # A few rays find the disc, so that all others are sent through the pupil that all of the disc sees.
+        few = np.arange(0, square.shape[1], _FEW)
+        found, _ = _aim(_held_pupil(camera, films[:, few], square[:, few], wavelength_nm), films[:, few], miss_of)
+        films = found[:, np.arange(square.shape[1]) % found.shape[1]] if found.size else films
+    found, flux = _aim(_held_pupil(camera, films, square, wavelength_nm), films, miss_of)
+    if not found.size:
+        raise InputError("light_disc", "light_m", light_m, "a light that the camera's film sees")
     return LightDisc(found, flux)
 
 
@@ -176,7 +179,7 @@ def _aim(rays: _HeldPupil, film: Array, miss_of: partial[Array]) -> tuple[Array,
         density = a * d - b * c  # 0 where the film point left what the lens lights
         step = np.stack([d * miss[0] - b * miss[1], a * miss[1] - c * miss[0]])
         step = np.divide(step, density, out=np.zeros_like(step), where=density != 0)
-        film = film - step
+        film = film - np.clip(step, -_FAR_MM, _FAR_MM)
     good = (weight > 0) & (density != 0) & (np.hypot(*step) < _FOUND_MM)
     return film[:, good], weight[good] / np.abs(density[good])
 
@@ -195,11 +198,11 @@ def _nearest(camera: Camera, target: Array, across: Array, wavelength_nm: float)
     places = (np.arange(_COARSE) + 0.5) / _COARSE - 0.5
     film = np.stack([a.ravel() for a in np.meshgrid(places * camera.film_mm[0], places * camera.film_mm[1])])
     origin, direction, weight = _HeldPupil(camera, np.full(film.shape, 0.5, np.float32), wavelength_nm)(film)
-    if not (weight > 0).any():
-        raise InputError("light_disc", "camera", camera.name, "a camera that lights its film")
+    ahead = (weight > 0) & (np.einsum("in,in->n", target[:, None] - origin, direction) > 0)
+    if not ahead.any():
+        raise InputError("light_disc", "light_m", tuple(target.tolist()), "a light that the camera's film sees")
     miss = np.hypot(*_miss(target, across, origin, direction))
-    ahead = np.einsum("in,in->n", target[:, None] - origin, direction) > 0
-    return np.asarray(film[:, np.argmin(np.where((weight > 0) & ahead, miss, np.inf))])
+    return np.asarray(film[:, np.argmin(np.where(ahead, miss, np.inf))])
 
 
 def _across(target: Array) -> Array:

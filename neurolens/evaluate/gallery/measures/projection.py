@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +17,7 @@ Array = NDArray[np.float64]
 
 _SQUARE = 16  # pupil samples a side, whose mean direction is taken
 # Film radius over focal length of an angle to the axis.
-PROJECTIONS = {
+PROJECTIONS: dict[str, Callable[[Any], Any]] = {
     "rectilinear": np.tan,
     "stereographic": lambda angle: 2 * np.tan(angle / 2),
     "equidistant": lambda angle: angle,
