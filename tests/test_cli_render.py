@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -89,10 +90,12 @@ def test_a_signal_in_mid_render_loses_nothing(
         assert process.returncode == -signal.SIGKILL and said == "" and not out.exists()
     else:
         assert process.returncode == 128 + number
-        assert said.startswith("neurolens: interrupted; a.exr holds ") and len(said.splitlines()) == 1
-        assert said.endswith("of 100000 samples a pixel; the same command goes on from a.exr.part") or "to" in said
+        count = r"[\d.e+]+ of 100000 samples a pixel( \(\d+ to \d+\))?"
+        assert re.fullmatch(
+            rf"neurolens: interrupted; a\.exr holds {count}; the same command goes on from a\.exr\.part", said
+        )
         samples = read_layers(out)["samples"]
-        assert samples.min() > 0 and samples.max() - samples.min() <= 16
+        assert samples.max() >= 16 and samples.max() - samples.min() <= 16
         assert not read_exr(out)[1]["render"]["complete"] and out.with_suffix(".png").exists()
     # So many samples that there is more to do, and not so many that it takes long.
     with np.load(part, allow_pickle=False) as kept:

@@ -20,12 +20,14 @@ from numpy.typing import NDArray
 
 from neurolens.errors import InputError
 from neurolens.files import atomic_path
-from neurolens.render.identity import difference
+from neurolens.render.identity import NOTHING, difference
 from neurolens.render.sums import Film, Tiling
 
 _FORMAT = 1
 _ABOUT, _SUMS, _DONE = "about.json", "sums.npy", "done.npy"
+SPENT = ("seconds", "camera_thread_seconds", "thread_seconds")
 _LARGEST_ABOUT = 8 << 20
+_LONGEST = 80  # characters of a value in a message
 AGAIN = "or --restart to begin again"
 
 
@@ -33,7 +35,7 @@ def write_checkpoint(path: Path, film: Film, identity: dict[str, Any], spent: di
     """Write what a film has, while workers may go on.
 
     Args:
-        identity: see `neurolens.render.identity`. spent: seconds so far, by name.
+        identity: see `neurolens.render.identity`. spent: seconds so far, by the names of `SPENT`.
 
     Raises:
         OSError: it cannot be written; an older checkpoint is still there.
@@ -103,14 +105,21 @@ def _check_render(path: Path, about: dict[str, Any], identity: dict[str, Any]) -
     found = difference(about["render"], identity)
     if found is not None:
         place, there, here = found
-        raise InputError(path, place, there, f"{here!r} as asked now, {AGAIN}")
+        shown = there if len(repr(there)) <= _LONGEST else f"({_short(there)})"
+        raise InputError(path, place, shown, f"{_short(here)} as asked now, {AGAIN}")
+
+
+def _short(value: Any) -> str:
+    text = "nothing" if value == NOTHING else repr(value)
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
 def _check_tiling(path: Path, about: dict[str, Any], tiling: Tiling) -> None:
     """Tiles and passes are cut alike; only below 16 samples they depend on the number of samples."""
     if not isinstance(about["samples"], int) or not 1 <= about["samples"] < 1 << 31:
         raise _corrupt(path, f"{about['samples']} samples")
-    if not all(0 <= float(value) < math.inf for value in about["spent"].values()):
+    spent = about["spent"]
+    if set(spent) != set(SPENT) or not all(0 <= float(value) < math.inf for value in spent.values()):
         raise _corrupt(path, "impossible times")
     if (about["tile"], about["step"]) != (tiling.tile, tiling.step):
         expected = f"{tiling.samples} as asked now: below {max(tiling.step, about['step'])} samples none can be added"

@@ -18,6 +18,7 @@ from neurolens.render.scenefile import Scene
 
 # Settings of a camera that say where it was read and what was noted, not what it does.
 _NO_MATTER = ("model", "notes")
+NOTHING = "(nothing)"  # a place that one of two identities lacks
 _PROBES, _DIGITS = 1024, 16
 
 
@@ -55,7 +56,7 @@ def difference(found: Any, wanted: Any) -> tuple[str, Any, Any] | None:
     """The first place where two identities differ, with what is there in each; None where they agree."""
     one, other = _leaves(found), _leaves(wanted)
     for place in [*other, *one]:
-        values = [side.get(place, "(nothing)") for side in (one, other)]
+        values = [side.get(place, NOTHING) for side in (one, other)]
         if json.dumps(values[0]) != json.dumps(values[1]):  # as text: NaN equals NaN
             return (place, *values)
     return None

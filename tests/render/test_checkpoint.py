@@ -139,6 +139,14 @@ class Bent(ThinLens):
         return super().sample(film_mm * np.float32(1.0001), pupil, wavelength_nm)
 
 
+class Noted(ThinLens):
+    """Says more of itself than a line can hold."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.settings["log"] = ["all that was ever done to it"] * 100
+
+
 def test_a_checkpoint_of_another_render_is_refused_and_what_differs_is_named(tmp_path: Path) -> None:
     part = tmp_path / "a.exr.part"
     kept_render(part)
@@ -153,6 +161,7 @@ def test_a_checkpoint_of_another_render_is_refused_and_what_differs_is_named(tmp
         ({"camera": Bent(50.0, 2.0, 3.0, FILM)}, r"camera\.rays: got '[0-9a-f]{16}'"),
         ({"film": FilmSettings(white_balance="A")}, "white_balance: got None, expected 'A'"),
         ({"scene": lit_scene(0.71)}, "scene: got '[0-9a-f]{16}'"),
+        ({"camera": Noted(50.0, 2.0, 3.0, FILM)}, r"camera\.log: got \(nothing\), expected .{,100}\.\.\. as asked now"),
     ]
     for change, said in changes:
         with pytest.raises(InputError, match=said) as refused:
@@ -220,6 +229,7 @@ WRONG: dict[str, Callable[[Path], Any]] = {
     "huge number of samples": lambda p: rewritten(p, about(samples=10**30)),
     "samples in words": lambda p: rewritten(p, about(samples="many")),
     "impossible time": lambda p: rewritten(p, about(spent={"seconds": float("inf")})),
+    "times missing": lambda p: rewritten(p, about(spent={})),
     "no times": lambda p: rewritten(p, about(spent=None)),
 }
 
