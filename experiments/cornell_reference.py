@@ -1,6 +1,6 @@
 """Make tests/render/cornell_reference.csv: the Cornell box of experiments/scenes/cornell.toml rendered by Mitsuba 3.
 
-python experiments/cornell_reference.py --samples 4096     # two minutes
+python experiments/cornell_reference.py                     # a minute
 
 Needs mitsuba, which only this command does. The three channels of its RGB mode stand for three wavelengths; a lamp of
 radiance 1 and the reflectances there. One row a wavelength and row of the picture: means of radiance over 8 x 8 parts.
@@ -27,7 +27,7 @@ PARTS, PIXELS = 8, 64
 def main() -> None:
     """Render and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--samples", type=int, default=4096, help="a pixel, of 64 x 64; default 4096")
+    parser.add_argument("--samples", type=int, default=2048, help="a pixel, of 64 x 64; default 2048")
     samples = parser.parse_args().samples
     mi.set_variant("scalar_rgb")
     scene = load_scene(ROOT / "experiments" / "scenes" / "cornell.toml")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,14 +118,6 @@ def _clear_sky(sky: Sky, palette: Palette) -> Surroundings:
     return Surroundings(palette, rows, coefficients, _weights(palette, rows, coefficients, _TABLE))
 
 
-class FarLight(Protocol):
-    """A light infinitely far away, seen by rays that meet nothing."""
-
-    def far_pdf(self, direction: FloatArray) -> FloatArray:
-        """Density [N] per solid angle with which it is aimed at in directions [3, N]."""
-        ...
-
-
 class SkyLight:
     """The surroundings as a light to aim at, if they have a table."""
 
@@ -154,7 +145,7 @@ class SkyLight:
         return np.zeros_like(distance)
 
     def far_pdf(self, direction: FloatArray) -> FloatArray:
-        """See `FarLight`."""
+        """Density [N] per solid angle with which `sample` takes directions [3, N]."""
         assert self._table is not None
         return self._table.pdf(direction)
 
@@ -193,7 +184,7 @@ class SunLight:
         return np.zeros_like(distance)
 
     def far_pdf(self, direction: FloatArray) -> FloatArray:
-        """See `FarLight`; 0 beside the disc."""
+        """Density [N] per solid angle with which `sample` takes directions [3, N]; 0 beside the disc."""
         # The distance from the axis, not the cosine, which float32 cannot tell from 1.
         away = direction - self._axis[:, None]
         inside = dot(away, away) <= 2 * self._one_less_cos

@@ -22,6 +22,7 @@ from neurolens.render.mesh import vertex_normals
 from neurolens.render.shapes import MeshSettings
 
 LARGEST_FILE = 500_000_000  # bytes
+FARTHEST_M = 1e9  # squares and products of lengths stay far from the limits of float32
 _LARGEST_HEADER = 100_000
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _OBJ_LINES = {
@@ -63,6 +64,8 @@ def read_mesh(scene: Path, field: str, settings: MeshSettings) -> TriangleSet:
     angle = math.radians(settings.rotate_y_deg)
     turn = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
     placed = settings.scale * mesh.vertices @ turn.T + np.array(settings.translate_m)
+    if not np.all(np.abs(placed) <= FARTHEST_M):
+        raise InputError(scene, f"{field}.vertices_m", "(too far)", f"points within {FARTHEST_M:g} m in the scene")
     return TriangleSet(placed, mesh.faces, mesh.uv, _normals(mesh, settings.smooth, turn))
 
 
@@ -102,6 +105,8 @@ def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
     if kind not in (".obj", ".ply"):
         raise InputError(scene, field, str(path), "a mesh file that ends in .obj or .ply")
     try:
+        if not path.is_file():
+            raise InputError(scene, field, str(path), "a mesh file that exists")
         size = path.stat().st_size
         if size > LARGEST_FILE:
             raise InputError(scene, field, str(path), f"a file of at most {LARGEST_FILE} bytes")

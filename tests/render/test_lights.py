@@ -155,6 +155,13 @@ def test_an_environment_lies_where_it_is_said_to_lie(panorama: Path) -> None:
         assert below < 0.1
 
 
+def test_a_room_keeps_points_outside_out_and_shines_by_those_inside() -> None:
+    room = {"min_m": [-1, -1, -1], "max_m": [1, 1, 1], "material": "grey"}
+    for place, shines in (([0.0, 0.9, 0.0], True), ([0.0, 1.1, 0.0], False)):
+        made = world(materials=MATERIALS, rooms=[room], points=[{"position_m": place, "intensity": [1, 1, 1]}])
+        assert bool(radiance(made, [0, 0, 3], [0, -0.9, -0.9], samples=64, max_depth=1).all()) == shines
+
+
 def test_a_room_keeps_the_sky_out(panorama: Path) -> None:
     room = {"min_m": [-1, -1, -1], "max_m": [1, 1, 1], "material": "grey"}
     made = world(materials=MATERIALS, environment={"file": str(panorama)}, rooms=[room])

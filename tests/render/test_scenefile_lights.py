@@ -75,6 +75,7 @@ SKY = {"sun_elevation_deg": 30}
         ({"materials": {"m": GLASS | {"transmittance": [1, 0, 1], "transmittance_depth_m": 1}}}, "transmittance"),
         ({"materials": {"m": GLASS | {"transmittance": [1, 1, 1], "transmittance_depth_m": 0}}}, "depth_m"),
         ({"materials": {"m": diffuse(1, 1, 1) | {"transmittance": [1, 1, 1]}}}, "transmittance.*left out"),
+        ({"meshes": [MESH | {"scale": 1e300}]}, r"meshes\[0\].vertices_m.*within 1e.09 m"),
         ({"meshes": [MESH | {"material": "tiles"}]}, "image texture without size_m"),
         ({"meshes": [MESH | {"material": "photo"}]}, "texture coordinates"),
         ({"spheres": [SPHERE]}, r"camera.position_m.*outside spheres\[0\]"),
