@@ -25,7 +25,7 @@ def add_parser(kinds: Any) -> None:
     parser = kinds.add_parser("mitsuba", help="speed of the renderer beside Mitsuba 3", description=_DESCRIPTION)
     parser.add_argument("--size", metavar="PIXELS", type=whole(16, 2048), default=256, help="side (default: 256)")
     parser.add_argument("--samples", metavar="N", type=whole(1, 4096), default=16, help="a pixel (default: 16)")
-    parser.add_argument("--repeats", metavar="N", type=whole(1, 100), default=7, help="default: 7")
+    parser.add_argument("--repeats", metavar="N", type=whole(1, 100), default=5, help="default: 5")
     parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=2, help="of all (default: 2)")
     parser.add_argument("--out", metavar="DIR", type=Path, help="folder for the tables (default: experiments/results)")
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")

@@ -2,7 +2,7 @@
 
 In spectral variants a ray carries four wavelengths. Where the camera's rays hardly depend on the wavelength they are
 Mitsuba's own four, each with its weight (hero wavelengths, Wilkie et al. 2014); a lens that disperses gives all four
-lanes the wavelength of the first, for one ray is of one wavelength. RGB variants: see `wavelengths`.
+lanes the same wavelength, for one ray is of one. See `wavelengths` for how that is drawn, and for RGB variants.
 
 Weights are ours: a uniform environment of radiance 1 gives 1 on the axis, and falls off towards the edge as the lens
 vignettes. Scalar variants ask for one ray at a time, which takes a model about a millisecond: for tests.
@@ -18,10 +18,10 @@ import numpy as np
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.errors import InputError
-from neurolens.mitsuba.arrays import matrix, rows, vector
+from neurolens.mitsuba.arrays import matrix, number, rows, vector
 from neurolens.mitsuba.library import libraries, require_mitsuba
 from neurolens.mitsuba.rays import FilmRays, LocalRays
-from neurolens.mitsuba.wavelengths import ChannelWavelengths, extra_sample
+from neurolens.mitsuba.wavelengths import ChannelWavelengths, wavelength_samples
 from neurolens.render.film import PixelGrid
 from neurolens.render.filmsettings import FilmSettings
 from neurolens.render.masks import make_aperture
@@ -139,6 +139,8 @@ def _sample_ray_differential(
     position, aperture = samples[:2], samples[2:]
     ray = dr.zeros(mi.RayDifferential3f)
     if mi.is_spectral:
+        if not self.hero:
+            sample1 = number(wavelength_samples(position, aperture))
         wavelengths, worth = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
         if not self.hero:
             wavelengths, worth = type(wavelengths)(wavelengths[0]), mi.Spectrum(worth[0])
@@ -174,6 +176,6 @@ def _channels(self: Any, position: FloatArray, aperture: FloatArray) -> tuple[Lo
         middle = np.full(position.shape[1], _MIDDLE_NM, np.float32)
         local = self.rays.sample(position, aperture, middle)
         return local, np.tile(local.weight, (3, 1))
-    wavelength_nm, worth = self.channels.draw(extra_sample(position, aperture))
+    wavelength_nm, worth = self.channels.draw(wavelength_samples(position, aperture))
     local = self.rays.sample(position, aperture, wavelength_nm)
     return local, worth * local.weight

@@ -13,7 +13,7 @@ from neurolens.errors import InputError, NeurolensError
 from neurolens.mitsuba import load_scene
 from neurolens.mitsuba.rays import BATCH, FilmRays
 from neurolens.mitsuba.scenes import our_scene
-from neurolens.mitsuba.wavelengths import ChannelWavelengths, extra_sample
+from neurolens.mitsuba.wavelengths import ChannelWavelengths, wavelength_samples
 from neurolens.render.film import PixelGrid
 from neurolens.render.spectrum import SpectralRange
 
@@ -94,15 +94,25 @@ def test_fringes_take_the_colour_of_our_film() -> None:
         assert np.abs(seen - exact).max() < 0.2
 
 
-def test_the_extra_number_is_uniform_and_new() -> None:
+def test_wavelengths_of_a_pixel_are_spread_evenly() -> None:
     random = np.random.default_rng(1)
-    position, aperture = random.random((2, 2, 1 << 16), dtype=np.float32)
-    number = extra_sample(position, aperture)
-    assert 0 <= number.min() and number.max() < 1
-    counts = np.histogram(number, 64, (0, 1))[0]
-    assert ((counts - 1024) ** 2 / 1024).sum() < 110  # chi squared of 63 degrees of freedom, 0.9998
-    for row in (*position, *aperture):
-        assert abs(np.corrcoef(row, number)[0, 1]) < 0.02
+    position, aperture = random.random((2, 2, 1 << 12), dtype=np.float32)
+    sample = wavelength_samples(position, aperture)
+    assert 0 <= sample.min() and sample.max() < 1
+    for count in (8, 16, 64):
+        rows = np.sort(sample.reshape(-1, count), axis=1)
+        gaps = np.diff(rows, axis=1, append=rows[:, :1] + 1)
+        assert gaps.max() < 2.7 / count  # random numbers leave gaps of about ln(n) / n and far more
+
+
+def test_a_wavefront_of_one_draws_uniform_numbers() -> None:
+    random = np.random.default_rng(2)
+    points = random.random((4096, 4, 1), dtype=np.float32)
+    number = np.array([wavelength_samples(p[:2], p[2:])[0] for p in points])
+    counts = np.histogram(number, 16, (0, 1))[0]
+    assert ((counts - 256) ** 2 / 256).sum() < 40  # chi squared of 15 degrees of freedom, 0.9995
+    for row in points[..., 0].T:
+        assert abs(np.corrcoef(row, number)[0, 1]) < 0.06
 
 
 def test_without_mitsuba_one_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
