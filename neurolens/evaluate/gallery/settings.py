@@ -57,7 +57,7 @@ class Panel:
     blade_curvature: float | None = None
     aperture_mask: Path | None = None
     model: Path | None = None
-    fit: ModelSettings = ModelSettings(terms=100)
+    fit: ModelSettings = ModelSettings(terms=64)
     options: dict[str, float] | None = None
 
     def __post_init__(self) -> None:
