@@ -23,14 +23,14 @@ Light tracing measures the same integral from the other end:
 
     integral of film value over the film = integral of W L cos(theta_P) over dA_P, mean over the pupil samples,
 
-where dA_P (m^2) is a patch of the scene that sends radiance L at the angle theta_P to its normal. Lenses keep etendue, so
+where dA_P (m^2) is a patch of the scene that sends radiance L at the angle theta_P to its normal. Lenses keep etendue:
 
     W = T A' cos(theta') / (d^2 E0):
 
 A' (mm^2) is the inverse density of the point on the lens's front at which the pupil sample aims, theta' the angle there
-to the normal, d (m) the distance between the two. Ideal lenses, thin and thick, image planes to planes and cannot keep it
-(theirs are the angles of tan, not of sin): W is then w times the film's area for an area square to the ray, so that both
-directions give the same picture. W has the unit mm^2 / m^2. For points drawn with the density p per m^2, add
+to the normal, d (m) the distance between the two. Ideal lenses, thin and thick, image planes to planes and cannot keep
+it: their W is w times the film's area for an area square to the ray, so that both directions give the same picture. W
+has the unit mm^2 / m^2. For points drawn with the density p per m^2, add
 W L cos(theta_P) / (p N a) to the pixel of area a (mm^2) that holds the film point, for each of N points.
 
 Status. Every ray has one (`neurolens.status`); what did not pass has weight 0 and finite numbers elsewhere, and so have

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from neurolens import status as st
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.exact_pupils import OUTLINE, pupil_named
-from neurolens.cameras.front_disc import FrontDisc, front_disc
+from neurolens.cameras.front_aim import FrontAim, front_aim
 from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_search import COARSE, FINE
@@ -90,7 +90,7 @@ class ExactCamera:
         if pupil != OUTLINE:
             self.film.pupil = pupil_named(pupil, self.lens, self.film.outline, float(film_z))
         self._light_nm = used
-        self._front: FrontDisc | None = None
+        self._front: FrontAim | None = None
         data = first_order(self.lens)
         self.settings: dict[str, Any] = {
             "camera": "exact",
@@ -125,7 +125,7 @@ class ExactCamera:
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Film points of scene points [3, N] in m, traced through points of the front surface chosen by `pupil`."""
         if self._front is None:
-            self._front = front_disc(self.film, self.film_mm, self._light_nm, self.lens.surfaces[0])
+            self._front = front_aim(self.film, self.film_mm, self._light_nm, self.lens.surfaces[0])
         film_z = self.film.film_z_mm
         aim = self._front.aim(1e3 * point_m.astype(np.float64) + [[0], [0], [film_z]], pupil)
         # Light starts a millimetre before the surface, so that this is still ahead; nonsense misses it.

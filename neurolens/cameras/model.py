@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from neurolens import status as st
 from neurolens.apertures import Aperture
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
-from neurolens.cameras.front_disc import FrontDisc, front_disc
+from neurolens.cameras.front_aim import FrontAim, front_aim
 from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.onnxderivatives import OnnxDerivatives
 from neurolens.cameras.onnxinverse import OnnxInverse, load_inverse
@@ -73,7 +73,7 @@ class OnnxCamera:
         lens, domain = card["lens"], card["domain"]
         self.model = model
         self._derivatives: OnnxDerivatives | None = None
-        self._inverse: tuple[OnnxInverse, FrontDisc] | None = None
+        self._inverse: tuple[OnnxInverse, FrontAim] | None = None
         self.name = str(lens.get("name", model.path.stem))
         self.film_mm = check_film(film_mm)
         low, high = (float(v) for v in domain["wavelength_nm"])
@@ -144,8 +144,8 @@ class OnnxCamera:
             weight = np.maximum(out.transmittance, 0) * aim.area / (self.film.exposure * squared)
         return arrived(out.rays[:2].astype(np.float64), origin, point_m, weight, status)
 
-    def _inverse_map(self) -> tuple[OnnxInverse, FrontDisc]:
-        """The inverse map and the disc to aim at, found once."""
+    def _inverse_map(self) -> tuple[OnnxInverse, FrontAim]:
+        """The inverse map and where to aim at, found once."""
         if self._inverse is None:
             if self.model.axes:
                 raise InputError(self.model.path, "inverse", "(a model of many states)", "a model of one state")
@@ -153,7 +153,7 @@ class OnnxCamera:
                 inverse = load_inverse(self.model.path, self.model.card["lens"]["sha256"])
             except ModelError as error:
                 raise InputError(self.model.path, "inverse", f"({error})", "a model exported with --inverse") from error
-            self._inverse = inverse, front_disc(self.film, self.film_mm, self._light_nm, inverse.front)
+            self._inverse = inverse, front_aim(self.film, self.film_mm, self._light_nm, inverse.front)
         return self._inverse
 
     def for_worker(self) -> OnnxCamera:
