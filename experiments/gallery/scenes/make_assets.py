@@ -15,7 +15,7 @@ def wheel(side: int = 900, rims: int = 9, spokes: int = 40) -> np.ndarray:
     """Dark rims and spokes on white, [H, W] from 0 to 1."""
     y, x = np.mgrid[0 : side * FINE, 0 : side * FINE].astype(np.float32) / (side * FINE / 2) - 1
     r, turn = np.hypot(x, y), np.arctan2(y, x) * spokes / (2 * np.pi)
-    width = 0.009  # half of a line, radius 1
+    width = 0.006  # half of a line, radius 1
     rim = np.abs(r * rims - np.rint(r * rims)) < width * rims
     spoke = np.abs(turn - np.rint(turn)) * 2 * np.pi * r / spokes < width
     dark = (rim & (r > 0.5 / rims) | spoke & (r > 3 / rims)) & (r < 1 + width)

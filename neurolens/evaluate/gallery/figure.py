@@ -21,7 +21,8 @@ from neurolens.files import atomic_path
 
 DPI = 100  # a picture of 240 pixels is 2.4 inches wide: one pixel of it, one of the figure
 MOST_BYTES = 150_000
-_LEFT, _GAP, _HEAD, _FOOT, _BAR, _LABEL = 0.52, 0.1, 0.62, 0.34, 0.86, 0.2  # inches
+_SCALE_COLOURS = 20
+_LEFT, _GAP, _HEAD, _FOOT, _BAR, _LABEL = 0.52, 0.1, 0.62, 0.34, 0.98, 0.2  # inches
 
 
 @dataclass(frozen=True)
@@ -140,17 +141,29 @@ def _rounded_up(value: float) -> float:
     return next(step * power for step in (1, 2, 5, 10) if step * power >= max(value, 1e-6) * (1 - 1e-9))
 
 
+def _scale_colours() -> list[int]:
+    """R, G, B of the scale of the difference and of white, one after the other."""
+    from matplotlib import colormaps
+
+    scale = 255 * colormaps["magma"](np.linspace(0, 1, _SCALE_COLOURS - 1))[:, :3]
+    return [*(int(v) for v in scale.round().ravel()), 255, 255, 255]  # and the page's white
+
+
 def _save_small(figure: Any, path: Path) -> None:
-    """Write the figure with as many colours, from 256 to 16, as keep the file small."""
+    """Write the figure with as many colours, from 256 to 32, as keep the file small."""
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=DPI, facecolor="white", format="png")
     picture = Pictures.open(drawn).convert("RGB")
-    for colours in (256, 128, 64, 48, 32, 24, 16):
+    for colours in (256, 128, 64, 48, 32):
         packed = io.BytesIO()
-        picture.quantize(colours, dither=Pictures.Dither.NONE).save(packed, "PNG", optimize=True)
+        # The pictures would crowd out the scale of the difference, which must stay what the bar says.
+        palette = Pictures.new("P", (1, 1))
+        own = picture.quantize(colours - _SCALE_COLOURS).getpalette() or []
+        palette.putpalette([*own[: 3 * (colours - _SCALE_COLOURS)], *_scale_colours()])
+        picture.quantize(palette=palette, dither=Pictures.Dither.NONE).save(packed, "PNG", optimize=True)
         if packed.tell() <= MOST_BYTES:
             with atomic_path(path) as temporary:
                 temporary.write_bytes(packed.getvalue())
             return
-    size = f"{packed.tell()} bytes at 16 colours"
+    size = f"{packed.tell()} bytes at 32 colours"
     raise InputError(path, "size", f"({size})", f"at most {MOST_BYTES} bytes: smaller or fewer pictures")

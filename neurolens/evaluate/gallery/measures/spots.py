@@ -108,7 +108,7 @@ def _crossings(camera: Camera, film: Floats, depth_m: float, wavelength_nm: floa
     pupil = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
     count = pupil.shape[1]
     points = np.repeat(film[:, None], count, axis=1).astype(np.float32)
-    rays = camera.sample(points, pupil, np.full(count, wavelength_nm, np.float32))
+    rays = camera.sample(points, pupil.astype(np.float32), np.full(count, wavelength_nm, np.float32))
     weight = rays.weight.astype(np.float64)
     origin, direction = rays.origin_m.astype(np.float64), rays.direction.astype(np.float64)
     ahead = (weight > 0) & (direction[2] < 0)
