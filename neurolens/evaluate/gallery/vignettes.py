@@ -16,25 +16,18 @@ Array = NDArray[np.float64]
 
 NEAR_CORNER = 0.95  # of the way to the film's corner, where falloff is matched and measured
 _SQUARE = 64  # pupil samples a side
-_WAVELENGTHS = (450.0, 550.0, 650.0)
 
 
 def illumination(camera: Camera, radii_mm: Array, azimuth_deg: float = 33.7) -> Array:
-    """Mean weight of the rays of film points [N] mm from the centre: the picture of a white card, without noise.
-
-    Of lenses that bend the wavelengths apart, the mean over three of them.
-    """
+    """Mean weight of the rays of film points [N] mm from the centre at 550 nm: a white card without noise."""
     middle = ((np.arange(_SQUARE) + 0.5) / _SQUARE).astype(np.float32)
     square = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
     where = np.array([math.cos(math.radians(azimuth_deg)), math.sin(math.radians(azimuth_deg))])
-    found = []
+    wavelength, found = np.full(square.shape[1], 550.0, np.float32), []
     for radius in radii_mm:
         film = np.repeat((where * radius)[:, None], square.shape[1], axis=1).astype(np.float32)
-        weights = []
-        for wavelength in _WAVELENGTHS if camera.dispersive else _WAVELENGTHS[1:2]:
-            rays = camera.sample(film, square, np.full(square.shape[1], wavelength, np.float32))
-            weights.append(np.where(rays.status == st.PASSED, rays.weight, 0).mean(dtype=np.float64))
-        found.append(np.mean(weights))
+        rays = camera.sample(film, square, wavelength)
+        found.append(np.where(rays.status == st.PASSED, rays.weight, 0).mean(dtype=np.float64))
     return np.array(found)
 
 

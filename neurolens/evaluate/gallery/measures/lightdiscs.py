@@ -25,7 +25,8 @@ _STEPS = 4  # of Newton's method, which stops moving after three
 _FOUND_MM = 2e-3  # a film point that the last step moved by less
 _FAR_MM = 100.0  # no step is longer: rays that are lost must not carry the film point to infinity
 _COARSE = 24  # film points a side of the search for a start
-_FEW = 7  # of the pupil's points one in so many finds the disc; sharing no factor with the points of a row
+_FEW = 7  # of the pupil's points one in so many finds the disc
+_R2 = (0.7548776662466927, 0.5698402909980532)  # 1 / g and 1 / g^2 with g^3 = g + 1
 _MARGIN = 1.1  # of the pupil's box, for rims that cut it differently across the disc
 
 
@@ -92,13 +93,13 @@ class LightDisc:
 
 
 def light_disc(
-    camera: Camera, light_m: tuple[float, float, float], *, side: int = 96, wavelength_nm: float = 550.0
+    camera: Camera, light_m: tuple[float, float, float], *, count: int = 6000, wavelength_nm: float = 550.0
 ) -> LightDisc:
     """The disc of a point of light.
 
     Args:
         light_m: where it is, camera frame: film centre at the origin, looking along -z, y up.
-        side: the pupil is sampled at side x side points.
+        count: of pupil points, the additive recurrence R2 (Roberts 2018), whose edges no grid lines up with.
 
     The flux through a pupil point is the ray's weight over |d miss / d film|, miss being by how much the ray of a film
     point passes the light: a point of light is a delta function of it.
@@ -108,15 +109,14 @@ def light_disc(
     """
     target = np.asarray(light_m, np.float64)
     across = _across(target)
-    middle = ((np.arange(side) + 0.5) / side).astype(np.float32)
-    square = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
+    square = ((0.5 + np.outer(_R2, np.arange(count))) % 1).astype(np.float32)
     films = np.repeat(_nearest(camera, target, across, wavelength_nm)[:, None], square.shape[1], axis=1)
     miss_of = partial(_miss, target, across)
     if isinstance(camera, ExactCamera | OnnxCamera):
         # A few rays find the disc, so that all others are sent through the pupil that all of the disc sees.
-        few = np.arange(0, square.shape[1], _FEW)
-        found, _ = _aim(_held_pupil(camera, films[:, few], square[:, few], wavelength_nm), films[:, few], miss_of)
-        films = found[:, np.arange(square.shape[1]) % found.shape[1]] if found.size else films
+        few = count // _FEW
+        found, _ = _aim(_held_pupil(camera, films[:, :few], square[:, :few], wavelength_nm), films[:, :few], miss_of)
+        films = found[:, np.arange(count) % found.shape[1]] if found.size else films
     found, flux = _aim(_held_pupil(camera, films, square, wavelength_nm), films, miss_of)
     if not found.size:
         raise InputError("light_disc", "light_m", light_m, "a light that the camera's film sees")

@@ -48,13 +48,13 @@ def blur_mm(camera: Camera, distance_m: float) -> float:
     """Diameter of the disc of a light on the axis, in mm of film; 0 for a pinhole without width."""
     if camera.name == "pinhole":
         return 0.0
-    return float(np.mean(light_disc(camera, (0.0, 0.0, -distance_m), side=48).widths_mm))
+    return float(np.mean(light_disc(camera, (0.0, 0.0, -distance_m), count=2500).widths_mm))
 
 
 def scale(camera: Camera, distance_m: float) -> float:
     """Size of the picture of a thing over its own, near the axis, by the centroids of two discs."""
     x = _OFF_AXIS * distance_m
-    places = [light_disc(camera, (u, 0.0, -distance_m), side=24).centre_mm[0] for u in (-x, x)]
+    places = [light_disc(camera, (u, 0.0, -distance_m), count=600).centre_mm[0] for u in (-x, x)]
     return float(abs(places[1] - places[0]) / (2e3 * x))
 
 
