@@ -185,5 +185,6 @@ def test_embree_and_the_tree_give_the_same_hits() -> None:
 
 
 def test_without_embree_the_tree_takes_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "embreex", None)  # makes an import fail
+    for name in ("embreex", "embreex.mesh_construction"):
+        monkeypatch.setitem(sys.modules, name, None)  # makes an import fail
     assert isinstance(make_mesh(3, np.eye(3), np.array([[0, 1, 2]])), Mesh)
