@@ -13,7 +13,6 @@ from neurolens.render.integrator import trace
 from neurolens.render.sampler import FILM, Sampler
 from neurolens.render.scenefile import load_scene
 from neurolens.render.spectrum import SpectralRange
-from neurolens.render.workers import camera_axes
 from neurolens.render.world import World
 
 SCENE = Path(__file__).parents[2] / "experiments" / "scenes" / "cornell.toml"
@@ -31,7 +30,8 @@ def test_cornell_box_agrees_with_mitsuba(nm: float) -> None:
     keys = sampler.keys(pixel, sample)
     points = PixelGrid(PIXELS, PIXELS, (25.0, 25.0)).film_points(pixel, sampler.draw2(keys, FILM))
     rays = Pinhole(35.0, (25.0, 25.0)).sample(points, points, np.full(count, nm, np.float32))
-    axes = camera_axes(settings)
+    axes = np.diag(np.float32([-1, 1, -1]))  # the camera looks along +z, up is +y
+    assert settings.up == (0, 1, 0) and settings.look_at_m[:2] == settings.position_m[:2]
     origin = axes @ rays.origin_m + np.float32(settings.position_m)[:, None]
     bins = np.zeros(count, np.intp)
     found = trace(world, sampler, keys, origin, axes @ rays.direction, np.ones(count, np.float32), bins, 40)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 from render_helpers import diffuse, world
 
-from neurolens.render.embree import EmbreeMesh
+from neurolens.render.embree import EmbreeMesh, make_mesh
 from neurolens.render.mesh import Mesh
 from neurolens.render.primitives import Rays
 
@@ -180,3 +182,9 @@ def test_embree_and_the_tree_give_the_same_hits() -> None:
     same = (tree == embree) & ((tree < 0) | np.isclose(a, b, rtol=1e-5, atol=1e-5))
     assert np.mean(~same) < 2e-3 and 0.2 < np.mean(tree >= 0) < 0.9
     assert np.all(b[embree < 0] == limit[embree < 0]) and np.all(b <= limit)
+
+
+def test_without_embree_the_tree_takes_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("embreex", "embreex.mesh_construction"):
+        monkeypatch.setitem(sys.modules, name, None)  # makes an import fail
+    assert isinstance(make_mesh(3, np.eye(3), np.array([[0, 1, 2]])), Mesh)
