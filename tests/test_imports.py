@@ -59,9 +59,10 @@ PACKAGES = {
 EXACT_CAMERA = {
     "neurolens.cameras.exact": ({"optics"}, {"torch"}),
     "neurolens.cameras.fusedexact": ({"optics"}, set()),
+    "neurolens.cameras.exact_pupils": ({"optics"}, set()),
     "neurolens.cameras.build": ({"optics"}, set()),
 }
-NEEDS_TORCH = {"neurolens.cameras.exact", "neurolens.cameras.fusedexact"}
+NEEDS_TORCH = {"neurolens.cameras.exact", "neurolens.cameras.exact_pupils", "neurolens.cameras.fusedexact"}
 
 
 def module_name(path: Path) -> str:

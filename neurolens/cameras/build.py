@@ -1,4 +1,12 @@
-"""A camera from what a command line names: a lens file, an exported model, "thin" or "pinhole".
+"""A camera from what a command line names.
+
+    pinhole, thin                       a point; a thin lens
+    fisheye-equidistant, -equisolid,    points with a fisheye projection
+      -stereographic, -orthographic
+    thick:LENS.toml                     principal planes and pupils of a lens file
+    LENS.toml                           the lens, traced exactly
+    MODEL.onnx                          an exported model of one
+    fused:LENS.toml, fused:MODEL.onnx   the same, compiled by the system's C compiler
 
 Only a lens file needs torch, which is imported when one is asked for.
 """
@@ -10,19 +18,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
 from neurolens.apertures import Aperture
 from neurolens.cameras.contract import Camera
+from neurolens.cameras.fisheye import PROJECTIONS, Fisheye, check_field
 from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.thick import ThickLens
 from neurolens.cameras.thin import ThinLens
+from neurolens.cameras.vignetting import Vignetted
 from neurolens.errors import InputError
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens
 
-IDEAL = ("thin", "pinhole")
+FISHEYES = tuple(f"fisheye-{name}" for name in PROJECTIONS)
+IDEAL = ("thin", "pinhole", *FISHEYES)
+THICK = "thick:"
 FUSED = "fused:"  # before a path: compiled by the system's C compiler
 _DARK_FILM = 1.25  # diagonal of the film over the image circle
-_EFL_MM, _THIN_F_NUMBER, _PINHOLE_F_NUMBER = 50.0, 4.0, 8.0
+_EFL_MM, _FISHEYE_EFL_MM, _THIN_F_NUMBER, _PINHOLE_F_NUMBER = 50.0, 14.0, 4.0, 8.0
 
 
 @dataclass(frozen=True)
@@ -32,15 +47,19 @@ class Shot:
     Attributes:
         film_mm: width and height of the film.
         focus_m: distance from the film to the object in focus, inf allowed.
-        f_number: None: the widest stop of a lens or model; f/4 for the thin lens, nominally f/8 for the pinhole.
-        efl_mm: None: a lens file as tabled; 50 mm for thin lens and pinhole. A model has its own.
+        f_number: None: the widest stop of a lens or model; f/4 for the thin lens, nominally f/8 for a point.
+        efl_mm: None: a lens file as tabled; 50 mm for thin lens and pinhole, 14 mm for a fisheye projection unless
+            `field_deg` rules it. A model has its own.
         zoom: state of a lens file by name, or a focal length in mm between its states; also of a model of a whole zoom.
-        field_deg: full field of view that the film's image circle shall see; sets the size of a lens file.
+        field_deg: full field of view that the film's image circle shall see; sets the size of a lens file. Of a fisheye
+            projection, what the circle within the film shall see: sets its focal length, and what lies beyond is dark.
         focus: how a lens file is focused: "film", "best" or "internal"; see `Lens.at`.
         aperture: shape of the stop's opening; None is that of the lens file, else round.
         clamp_f_number: an f-number wider than the lens opens becomes its widest; else it is an error of a model, and
             opens the stop of a lens file as far as the rims let light through.
         wavelength_nm: shortest and longest wavelength of the light.
+        pupil: how the pupil of an exact lens is sampled; see `exact_pupils.PUPILS`.
+        vignetting: what is left of it, "both", "natural", "optical" or "none"; see `neurolens.cameras.vignetting`.
     """
 
     film_mm: tuple[float, float]
@@ -53,6 +72,8 @@ class Shot:
     aperture: Aperture | None = None
     wavelength_nm: tuple[float, float] = (400.0, 700.0)
     clamp_f_number: bool = False
+    pupil: str = "outline"
+    vignetting: str = "both"
 
     def f_number_for(self, widest: float) -> float | None:
         """The f-number of a lens that opens to `widest`; None stands for its widest."""
@@ -64,35 +85,89 @@ def make_camera(spec: str | Path, shot: Shot) -> Camera:
     """The camera that `spec` names, set for a shot.
 
     Args:
-        spec: "thin", "pinhole", the path of a lens file (.toml) or of a model (.onnx); "fused:" and such a path runs it
-            compiled by the system's C compiler instead of in torch or onnxruntime.
+        spec: see the module.
 
     Raises:
         InputError: an unknown kind of camera, a missing file, a setting that this kind does not have or cannot reach.
         ModelError: a model that cannot be trusted.
         ModuleNotFoundError: a lens file without torch.
     """
-    if str(spec) in IDEAL:
-        return _ideal(str(spec), shot)
-    fused = str(spec).startswith(FUSED)
-    path = Path(str(spec).removeprefix(FUSED))
-    if path.suffix not in (".toml", ".onnx"):
-        expected = f"a lens file (.toml), a model (.onnx), {' or '.join(IDEAL)}"
-        raise InputError("camera", "--camera", str(spec), expected)
+    camera = _camera(str(spec), shot)
+    return camera if shot.vignetting == "both" else Vignetted(camera, shot.vignetting, shot.wavelength_nm)
+
+
+def _camera(spec: str, shot: Shot) -> Camera:
+    thick = spec.startswith(THICK)
+    fused = spec.startswith(FUSED)
+    path = Path(spec.removeprefix(THICK).removeprefix(FUSED))
+    exact = path.suffix == ".toml" and not thick
+    _refuse(
+        spec, "pupil", None if exact or shot.pupil == "outline" else shot.pupil, "left out: only a lens file has it"
+    )
+    if spec in IDEAL:
+        return _ideal(spec, shot)
+    if path.suffix not in (".toml", ".onnx") or (thick and path.suffix != ".toml"):
+        expected = f"a lens file (.toml), a model (.onnx), {FUSED} and either, {THICK}FILE.toml, {' or '.join(IDEAL)}"
+        raise InputError("camera", "--camera", spec, expected)
     if not path.is_file():
         raise InputError(path, "file", "(missing)", "a lens file" if path.suffix == ".toml" else "an ONNX model")
-    return _exact(path, shot, fused) if path.suffix == ".toml" else _model(path, shot, fused)
+    if thick:
+        return _thick(path, shot)
+    return _exact(path, shot, fused) if exact else _model(path, shot, fused)
 
 
 def _ideal(kind: str, shot: Shot) -> Camera:
     _refuse(kind, "zoom", shot.zoom, "left out: only a lens file has zoom states")
-    _refuse(kind, "field_deg", shot.field_deg, "left out: set efl_mm")
     _refuse(kind, "focus", None if shot.focus == "film" else shot.focus, "film: the others are for lens files")
+    if kind in FISHEYES:
+        return _fisheye(kind, shot)
+    _refuse(kind, "field_deg", shot.field_deg, "left out: set efl_mm")
     focal = _EFL_MM if shot.efl_mm is None else shot.efl_mm
     if kind == "thin":
         return ThinLens(focal, shot.f_number or _THIN_F_NUMBER, shot.focus_m, shot.film_mm, aperture=shot.aperture)
     _refuse(kind, "aperture", shot.aperture and shot.aperture.settings(), "left out: this pinhole is a point")
     return Pinhole(focal, shot.film_mm, shot.f_number or _PINHOLE_F_NUMBER)
+
+
+def _fisheye(kind: str, shot: Shot) -> Camera:
+    _refuse(kind, "aperture", shot.aperture and shot.aperture.settings(), "left out: this camera is a point")
+    projection = kind.removeprefix("fisheye-")
+    focal = _FISHEYE_EFL_MM if shot.efl_mm is None else shot.efl_mm
+    if shot.field_deg is not None:
+        _refuse(kind, "efl_mm", shot.efl_mm, "left out: the field sets it")
+        edge = float(PROJECTIONS[projection].radius(np.array(check_field(projection, shot.field_deg))))
+        focal = min(shot.film_mm) / 2 / edge
+    f_number = shot.f_number or _PINHOLE_F_NUMBER
+    return Fisheye(projection, focal, shot.film_mm, field_deg=shot.field_deg, f_number=f_number)
+
+
+def _thick(path: Path, shot: Shot) -> Camera:
+    from neurolens.optics.lensfile import read_lens
+    from neurolens.optics.paraxial import first_order
+
+    lens = read_lens(path).at(focal_length_mm=shot.efl_mm, field_deg=shot.field_deg, zoom=shot.zoom)
+    f_number = shot.f_number_for(first_order(lens).f_number)
+    lens = lens.at(f_number=f_number, focus_m=shot.focus_m, focus=shot.focus)
+    if lens.anamorphic:
+        raise InputError(
+            path, "surfaces", "(cylinders)", "a lens that is round about its axis: it has two focal lengths"
+        )
+    data = first_order(lens)
+    assert lens.film_z_mm is not None  # `at` places the film
+    camera = ThickLens(
+        data.efl_mm,
+        data.f_number,
+        shot.focus_m,
+        shot.film_mm,
+        principal_z_mm=(data.front_principal_z_mm, data.rear_principal_z_mm),
+        entrance_pupil_z_mm=data.entrance_pupil_z_mm,
+        film_at_mm=lens.film_z_mm,
+        aperture=shot.aperture or lens.aperture,
+        name=f"{lens.name}, thick",
+    )
+    lens_facts = {"id": lens.lens_id, "name": lens.name, "sha256": lens.sha256}
+    camera.settings |= {"lens": lens_facts, "zoom": shot.zoom, "focusing": shot.focus, "derived": lens.derived}
+    return camera
 
 
 def _exact(path: Path, shot: Shot, fused: bool) -> Camera:
@@ -114,6 +189,7 @@ def _exact(path: Path, shot: Shot, fused: bool) -> Camera:
         f_number=f_number,
         wavelength_nm=shot.wavelength_nm,
         focus=shot.focus,
+        pupil=shot.pupil,
     )
     camera.settings |= {"zoom": shot.zoom, "notes": [*doubts(check_lens(tabled)), *_dark_film(lens, shot.film_mm)]}
     return camera

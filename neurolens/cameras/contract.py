@@ -1,4 +1,42 @@
-"""The one contract between cameras and the renderer: film and pupil sample, wavelength in; scene ray out."""
+"""The one contract between cameras and the renderer.
+
+Forwards, for path tracing: film point, pupil sample and wavelength in; scene ray, weight and status out, and on request
+how the ray moves with the film point. Backwards, for light tracing: scene point, pupil sample and wavelength in; film
+point, weight and status out. The renderer knows no other camera than this.
+
+Frames. Film points are millimetres in the lens frame: origin on the axis, x right, y up as the camera looks, so that
+the picture on the film stands on its head; its writer turns it by 180 degrees. Scene-side rays and points are metres in
+the camera frame: origin at the film's centre, the camera looks along -z, y up, x right.
+
+Weights. The film value is E(film point) / E0: irradiance over the exposure on the axis in uniform surroundings of
+radiance 1, both as the lens would give them. A ray of a film point through a point of a plane at axial distance Z that
+was sampled uniformly on the area A weighs
+
+    w = T A cos^4(theta) / (Z^2 E0),    E0 = integral of T cos(theta) over solid angle on the axis,
+
+with transmittance T and the film-side angle theta to the axis (Kolb et al. 1995, eq. 3). So the film value is the mean
+of weight times radiance over the pupil samples, and every camera, whatever its f-number, shows white surroundings as 1
+on the axis; off it as natural and optical vignetting leave them (`neurolens.cameras.vignetting` switches these off).
+Cameras that are points (pinhole, fisheye projections) are the limit of a small hole.
+
+Light tracing measures the same integral from the other end:
+
+    integral of film value over the film = integral of W L cos(theta_P) over dA_P, mean over the pupil samples,
+
+where dA_P (m^2) is a patch of the scene that sends radiance L at the angle theta_P to its normal. Lenses keep etendue:
+
+    W = T A' cos(theta') / (d^2 E0):
+
+A' (mm^2) is the inverse density of the point on the lens's front at which the pupil sample aims, theta' the angle there
+to the normal, d (m) the distance between the two. Ideal lenses, thin and thick, image planes to planes and cannot keep
+it: their W is w times the film's area for an area square to the ray, so that both directions give the same picture. W
+has the unit mm^2 / m^2. For points drawn with the density p per m^2, add
+W L cos(theta_P) / (p N a) to the pixel of area a (mm^2) that holds the film point, for each of N points.
+
+Status. Every ray has one (`neurolens.status`); what did not pass has weight 0 and finite numbers elsewhere, and so have
+film or scene points that are not finite. Nothing in a ray raises; shapes and domains of settings do, when a camera is
+made (`InputError`). A batch may be empty, and of any size that memory holds.
+"""
 
 from __future__ import annotations
 
@@ -44,6 +82,25 @@ class CameraRays:
     differentials: RayDifferentials | None = None
 
 
+@dataclass(frozen=True)
+class FilmPoints:
+    """Where light of scene points arrives: the camera rays that lead to them.
+
+    Attributes:
+        film_mm: [2, N] float32, lens frame; may lie beyond the edges of the film. 0 where nothing arrives.
+        origin_m, direction: [3, N] float32, camera frame, as in `CameraRays`: the ray from the lens to the scene point.
+            Whatever stands between the two shades the point.
+        weight: [N] float32, W of the module in mm^2 / m^2; 0 where nothing arrives.
+        status: [N] int32, see `neurolens.status`.
+    """
+
+    film_mm: FloatArray
+    origin_m: FloatArray
+    direction: FloatArray
+    weight: FloatArray
+    status: NDArray[np.int32]
+
+
 class Camera(Protocol):
     """What the renderer knows of a camera.
 
@@ -75,6 +132,32 @@ class DifferentialCamera(Camera, Protocol):
 
         Raises:
             InputError: an exported model without derivatives.
+        """
+        ...
+
+
+class LightCamera(Camera, Protocol):
+    """A camera that finds the film points of scene points; all cameras of this package do."""
+
+    def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
+        """Film points for scene points [3, N] in m (camera frame), pupil samples [2, N] and wavelengths [N] in nm.
+
+        The pupil sample chooses the point on the front of the lens at which the scene point's light is aimed; it is not
+        the sample for which `sample` returns the same ray.
+
+        Raises:
+            InputError: an exported model without the inverse map of scene rays beside it.
+        """
+        ...
+
+
+class NaturalCamera(Camera, Protocol):
+    """A camera that tells natural vignetting from the rest; all cameras of this package do."""
+
+    def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
+        """The part [N] of the weights of `sample` that is the cos^4 law (of a fisheye projection, its own law).
+
+        For every ray, passed or not; what is left of a weight after division is area and transmittance.
         """
         ...
 

@@ -11,17 +11,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neurolens.cameras.contract import CameraRays, FloatArray
+from neurolens import status as st
+from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
+from neurolens.cameras.exact_pupils import OUTLINE, pupil_named
+from neurolens.cameras.front_disc import FrontDisc, front_disc
 from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_search import COARSE, FINE
-from neurolens.cameras.sampling import check_film, positive
+from neurolens.cameras.sampling import arrived, check_film, positive
 from neurolens.optics.differentials import film_tangents, trace_differentials
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
 from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds, symmetric_about_axis
-from neurolens.optics.trace import trace
+from neurolens.optics.trace import Rays, trace
 
 
 class ExactCamera:
@@ -37,9 +40,11 @@ class ExactCamera:
         focus: how the lens is focused; see `Lens.at`.
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
+        pupil: how the pupil is sampled, one of `exact_pupils.PUPILS`. All give the same picture in expectation; fewer
+            rays pass through any but the outline, by which the others are widened where they would lose light.
 
     Raises:
-        InputError: a focus nearer than four focal lengths, a lens that no ray passes.
+        InputError: a focus nearer than four focal lengths, a lens that no ray passes, an unknown pupil.
     """
 
     def __init__(
@@ -53,6 +58,7 @@ class ExactCamera:
         dtype: Literal["float32", "float64"] = "float32",
         bounds: PupilBounds | None = None,
         focus: Focus = "film",
+        pupil: str = OUTLINE,
     ) -> None:
         self._pid = os.getpid()
         self.film_mm = check_film(film_mm)
@@ -76,6 +82,10 @@ class ExactCamera:
         self._pupil_z_mm = bounds.pupil_z_mm
         self._dtype = torch.float32 if dtype == "float32" else torch.float64
         self.film = LensFilm(PupilTable.of(asdict(bounds)), float(film_z), used, self._scene, self._passes, detail)
+        if pupil != OUTLINE:
+            self.film.pupil = pupil_named(pupil, self.lens, self.film.outline, float(film_z))
+        self._light_nm = used
+        self._front: FrontDisc | None = None
         data = first_order(self.lens)
         self.settings: dict[str, Any] = {
             "camera": "exact",
@@ -91,6 +101,7 @@ class ExactCamera:
             "rims": lens.rims,
             "aperture": self.lens.aperture and self.lens.aperture.settings(),
             "dtype": dtype,
+            "pupil": pupil,
         }
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
@@ -100,6 +111,35 @@ class ExactCamera:
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `sample`, with the differentials of the rays, carried through every surface."""
         return self.film.sample(film_mm, pupil, wavelength_nm, self._with_differentials)
+
+    def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
+        """cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
+        return self.film.natural(film_mm, pupil, wavelength_nm)
+
+    def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
+        """Film points of scene points [3, N] in m, traced through points of the front surface chosen by `pupil`."""
+        if self._front is None:
+            self._front = front_disc(self.film, self.film_mm, self._light_nm, self.lens.surfaces[0])
+        film_z = self.film.film_z_mm
+        aim = self._front.aim(1e3 * point_m.astype(np.float64) + [[0], [0], [film_z]], pupil)
+        # Light starts a millimetre before the surface, so that this is still ahead; nonsense misses it.
+        rays = np.nan_to_num(np.concatenate([aim.position + aim.direction, -aim.direction]), posinf=0, neginf=0)
+        with torch.no_grad():
+            done = trace(
+                self.lens,
+                Rays(*torch.from_numpy(rays).to(self._dtype)),
+                torch.from_numpy(np.ascontiguousarray(wavelength_nm)).to(self._dtype),
+                towards="film",
+                transmittance=True,
+            )
+        assert done.transmittance is not None
+        x, y, z, dx, dy, dz, through = (c.double().numpy() for c in (*done.rays, done.transmittance))
+        origin = 1e-3 * (aim.position - [[0], [0], [film_z]])
+        with np.errstate(all="ignore"):
+            film = np.stack([x, y]) + (film_z - z) / dz * np.stack([dx, dy])
+            weight = through * aim.area / (self.film.exposure * ((point_m - origin) ** 2).sum(0))
+        status = np.where(aim.status == st.PASSED, done.status.numpy(), aim.status)
+        return arrived(film, origin, point_m, weight, status)
 
     def for_worker(self) -> ExactCamera:
         """This camera, in a render worker. A forked process must not enter torch's thread pool: it never returns."""

@@ -6,7 +6,7 @@ One code for both, so that they send the same rays for the same random numbers.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,11 @@ from neurolens import status as st
 from neurolens.cameras.contract import CameraRays, FloatArray, RayDifferentials
 from neurolens.cameras.pupil_boxes import Passes, PupilTable
 from neurolens.cameras.pupil_search import FINE, Detail, outline_of
+from neurolens.cameras.sampling import stratified
 from neurolens.errors import InputError
 
-# Points a side of the quadrature of the exposure on the axis, and wavelengths.
-_QUADRATURE, _WAVELENGTHS = 256, 3
+# Points a side of the quadrature of the exposure on the axis.
+_QUADRATURE = 256
 
 
 class SceneRays(NamedTuple):
@@ -37,6 +38,16 @@ class SceneRays(NamedTuple):
 SceneFunction = Callable[[FloatArray, FloatArray, FloatArray], SceneRays]
 
 
+class Pupil(Protocol):
+    """Where rays are sent through; a `PupilOutline`, or another shape that holds it."""
+
+    def sample(
+        self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Pupil points [2, N] in mm and the inverse of their densities [N] in mm^2; see `PupilOutline.sample`."""
+        ...
+
+
 class LensFilm:
     """Film and pupil of a lens at one focus and stop: from film points and random numbers to weighted rays.
 
@@ -51,6 +62,7 @@ class LensFilm:
 
     Attributes:
         outline: the pupil of every film radius, searched for when this is made (0.1 to 0.5 s).
+        pupil: the shape that is sampled: the outline, or one put in its place that holds it.
 
     Raises:
         InputError: no ray passes from the film's centre.
@@ -71,6 +83,7 @@ class LensFilm:
         if outline is None:
             raise InputError("camera", "f_number, focus_m", "(no ray passes)", "a lens that light can pass")
         self.outline = outline
+        self.pupil: Pupil = outline
         self.exposure = 1.0
         self.exposure = self._exposure_on_axis(wavelength_nm)
 
@@ -82,7 +95,7 @@ class LensFilm:
         `scene` stands in for the lens's own function, for one that gives more (`SceneRays.d_film`).
         """
         scene = scene or self.scene
-        pupil, area = self.outline.sample(film_mm, square, wavelength_nm)
+        pupil, area = self.pupil.sample(film_mm, square, wavelength_nm)
         lit = area > 0
         if lit.all():
             return self._rays(scene, film_mm, pupil, area, wavelength_nm)
@@ -114,8 +127,7 @@ class LensFilm:
         """Rays of lit film points [2, N] through pupil points [2, N] of the densities 1 / area [N]."""
         out = scene(film, pupil, wavelength_nm)
         # w = T A cos^4 / Z^2, over the exposure on the axis.
-        slope = (pupil - film) * np.float32(1 / self.distance_mm)
-        cos2 = 1 / (1 + np.einsum("in,in->n", slope, slope))
+        cos2 = self._cos2(film, pupil)
         scale = np.float32(1 / (self.distance_mm**2 * self.exposure))
         weight = np.maximum(out.transmittance, 0) * area * cos2 * cos2 * scale
         weight = np.where(out.status == st.PASSED, weight, np.float32(0))
@@ -127,18 +139,20 @@ class LensFilm:
         direction = np.ascontiguousarray(out.scene_ray[3:])
         return CameraRays(origin, direction, weight.astype(np.float32), out.status.astype(np.int32), moves)
 
+    def natural(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
+        """cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
+        return np.square(self._cos2(film_mm, self.pupil.sample(film_mm, square, wavelength_nm)[0]))
+
+    def _cos2(self, film: FloatArray, pupil: FloatArray) -> FloatArray:
+        slope = (pupil - film) * np.float32(1 / self.distance_mm)
+        cos2: FloatArray = 1 / (1 + np.einsum("in,in->n", slope, slope))
+        return cos2
+
     def _exposure_on_axis(self, wavelength_nm: tuple[float, float]) -> float:
-        """Integral of T cos over solid angle at the film's centre, mean over the wavelengths: midpoint rule."""
-        middle = ((np.arange(_QUADRATURE) + 0.5) / _QUADRATURE).astype(np.float32)
-        square = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
-        film = np.zeros_like(square)
-        low, high = wavelength_nm
-        used = low + (high - low) * (np.arange(_WAVELENGTHS) + 0.5) / _WAVELENGTHS if low < high else [low]
-        means = [
-            self.sample(film, square, np.full(square.shape[1], w, np.float32)).weight.mean(dtype=np.float64)
-            for w in used
-        ]
-        exposure = float(np.mean(means))
+        """Integral of T cos over solid angle at the film's centre, mean over the wavelengths."""
+        square, wavelength = stratified(_QUADRATURE, wavelength_nm)
+        weight = self.sample(np.zeros_like(square), square, wavelength).weight
+        exposure = float(weight.mean(dtype=np.float64))
         if not exposure > 0:
             raise InputError("camera", "f_number, focus_m", "(no ray passes on the axis)", "a lens that light can pass")
         return exposure

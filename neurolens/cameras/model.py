@@ -13,14 +13,16 @@ from numpy.typing import NDArray
 
 from neurolens import status as st
 from neurolens.apertures import Aperture
-from neurolens.cameras.contract import CameraRays, FloatArray
+from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
+from neurolens.cameras.front_disc import FrontDisc, front_disc
 from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.onnxderivatives import OnnxDerivatives
+from neurolens.cameras.onnxinverse import OnnxInverse, load_inverse
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.pupil_boxes import PupilTable
-from neurolens.cameras.sampling import check_film, positive
+from neurolens.cameras.sampling import arrived, check_film, positive
 from neurolens.cameras.states import state_for
-from neurolens.errors import InputError
+from neurolens.errors import InputError, ModelError
 from neurolens.focus import film_z_mm
 from neurolens.modelfile import DOMAIN_SLACK
 
@@ -28,6 +30,8 @@ __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 
 # Parts of the card that the metadata of pictures leave out.
 _NOT_KEPT = ("reference", "units", "frame", "status_codes", "states")
+# How far the squared length of a direction may be from 1: where a poor network decodes none, the ray is no ray.
+_UNIT_SLACK = 1e-3
 _NOMINAL = 1.02  # f-numbers are engraved rounded: up to this much wider than the widest stop means the widest stop
 
 
@@ -67,6 +71,7 @@ class OnnxCamera:
         lens, domain = card["lens"], card["domain"]
         self.model = model
         self._derivatives: OnnxDerivatives | None = None
+        self._inverse: tuple[OnnxInverse, FrontDisc] | None = None
         self.name = str(lens.get("name", model.path.stem))
         self.film_mm = check_film(film_mm)
         low, high = (float(v) for v in domain["wavelength_nm"])
@@ -76,6 +81,7 @@ class OnnxCamera:
         # Glass takes more of some wavelengths than of others: exposure is for those that the light has.
         light = (low, high) if wavelength_nm is None else wavelength_nm
         used = (min(max(low, light[0]), high), max(min(high, light[1]), low))
+        self._light_nm = used
         film_z = _film_z(model, self.focus_m)
         stop = _stop_radius(model, f_number)
         round_stop = ModelScene(model, film_z, stop)
@@ -111,10 +117,47 @@ class OnnxCamera:
         whole = partial(self.film.scene.with_differentials, self._derivatives)
         return self.film.sample(film_mm, pupil, wavelength_nm, whole)
 
+    def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
+        """cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
+        return self.film.natural(film_mm, pupil, wavelength_nm)
+
+    def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
+        """Film points of scene points [3, N] in m through points of the front surface chosen by `pupil`.
+
+        By the inverse map of scene rays, NAME.scene.onnx beside the model; what it does not find is NO_SOLUTION.
+
+        Raises:
+            InputError: no such file, or a model of many states, whose inverse is not exported.
+        """
+        inverse, front = self._inverse_map()
+        scene = self.film.scene
+        assert isinstance(scene, ModelScene)
+        aim = front.aim(1e3 * point_m.astype(np.float64) + [[0], [0], [scene.film_z_mm]], pupil)
+        out = inverse.from_scene(aim.position, aim.direction, wavelength_nm, scene.film_z_mm, scene.stop_radius_mm)
+        status = np.where(aim.status == st.PASSED, scene.stopped(out.status, out.stop_xy_mm), aim.status)
+        origin = 1e-3 * (aim.position - [[0], [0], [scene.film_z_mm]])
+        squared = ((point_m - origin) ** 2).sum(0)
+        with np.errstate(all="ignore"):
+            weight = np.maximum(out.transmittance, 0) * aim.area / (self.film.exposure * squared)
+        return arrived(out.rays[:2].astype(np.float64), origin, point_m, weight, status)
+
+    def _inverse_map(self) -> tuple[OnnxInverse, FrontDisc]:
+        """The inverse map and the disc to aim at, found once."""
+        if self._inverse is None:
+            if self.model.axes:
+                raise InputError(self.model.path, "inverse", "(a model of many states)", "a model of one state")
+            try:
+                inverse = load_inverse(self.model.path, self.model.card["lens"]["sha256"])
+            except ModelError as error:
+                raise InputError(self.model.path, "inverse", f"({error})", "a model exported with --inverse") from error
+            self._inverse = inverse, front_disc(self.film, self.film_mm, self._light_nm, inverse.front)
+        return self._inverse
+
     def for_worker(self) -> OnnxCamera:
         """The same camera with a session of its own, for another process or thread."""
         other = copy(self)
         other.model, other.film, other._derivatives = self.model.reopened(), copy(self.film), None
+        other._inverse = None
         assert isinstance(self.film.scene, ModelScene)
         other.film.scene = replace(self.film.scene, model=other.model)
         return other
@@ -131,12 +174,20 @@ class ModelScene:
 
     def __call__(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SceneRays:
         out = self.model.rays(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm)
+        d = out.scene_ray[3:]
+        bad = ~(np.abs(np.einsum("in,in->n", d, d) - np.float32(1)) <= np.float32(_UNIT_SLACK))
+        status = out.status
+        if bad.any():  # rays that do not pass need have no direction
+            status = np.where(bad & (status == st.PASSED), np.int32(st.OUTSIDE_DOMAIN), status)
+        return SceneRays(out.scene_ray, out.transmittance, self.stopped(status, out.stop_xy_mm))
+
+    def stopped(self, status: NDArray[np.int32], stop_xy_mm: FloatArray) -> NDArray[np.int32]:
+        """Status [N] with that of the stop's shape, where rays cross the stop at [2, N] mm."""
         if self.aperture is None:
-            return SceneRays(out.scene_ray, out.transmittance, out.status)
-        inside = self.aperture.inside(out.stop_xy_mm[0], out.stop_xy_mm[1], self.stop_radius_mm)
+            return status
+        inside = self.aperture.inside(stop_xy_mm[0], stop_xy_mm[1], self.stop_radius_mm)
         stopped = np.int32(st.blocked(int(self.model.card["lens"].get("stop_surface", 0)), st.RIM))
-        status = np.where(inside | (out.status != st.PASSED), out.status, stopped)
-        return SceneRays(out.scene_ray, out.transmittance, status)
+        return np.where(inside | (status != st.PASSED), status, stopped)
 
     def with_differentials(
         self, derivatives: OnnxDerivatives, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray

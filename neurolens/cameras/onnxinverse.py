@@ -89,10 +89,8 @@ class OnnxInverse:
             InputError: arrays of other shapes, or no file of this map.
         """
         origin, d, wavelength = _arrays(origin_mm, 3, direction, 3, wavelength_nm)
-        facts = self._map("scene")[1]["inverse"]
-        front = facts["front"]
-        shape = None if front is None else SimpleNamespace(**front)
-        x, y = meet_front(shape, *origin, *d)
+        front = self.front
+        x, y = meet_front(front, *origin, *d)
         with np.errstate(all="ignore"):
             sine = np.hypot(d[0], d[1])
             if front is None:  # first order: slopes
@@ -105,6 +103,16 @@ class OnnxInverse:
         out = self._run("scene", np.stack([x, y, v[0], v[1], wavelength[0]]), film_z_mm, stop_radius_mm)
         with np.errstate(all="ignore"):  # area of direction vectors to solid angle
             return out._replace(density=(out.density / solid).astype(np.float32))
+
+    @property
+    def front(self) -> Any:
+        """Shape of the surface on which scene rays are taken (`frontsurface.Shape`); None for the plane z = 0.
+
+        Raises:
+            InputError: no file of the map of scene rays.
+        """
+        shape = self._map("scene")[1]["inverse"]["front"]
+        return None if shape is None else SimpleNamespace(**shape)
 
     def _map(self, name: str) -> tuple[Any, dict[str, Any]]:
         if name not in self._maps:

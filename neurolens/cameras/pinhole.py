@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from neurolens.cameras.contract import CameraRays, FloatArray, towards
-from neurolens.cameras.sampling import check_film, positive
+from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray, towards
+from neurolens.cameras.sampling import ahead, arrived, check_film, positive, sound
 
 
 class Pinhole:
@@ -49,11 +49,12 @@ class Pinhole:
         direction = np.empty((3, count), np.float32)
         np.divide(film_mm, np.float32(-self.focal_mm), out=direction[:2])
         direction[2] = -1.0
-        cos2 = 1.0 / (1.0 + direction[0] ** 2 + direction[1] ** 2)
-        direction *= np.sqrt(cos2)
+        with np.errstate(over="ignore", invalid="ignore"):
+            cos2 = 1.0 / (1.0 + direction[0] ** 2 + direction[1] ** 2)
+            direction *= np.sqrt(cos2)
         origin = np.zeros((3, count), np.float32)
         origin[2] = -1e-3 * self.focal_mm
-        return CameraRays(origin, direction, (cos2 * cos2).astype(np.float32), np.zeros(count, np.int32))
+        return sound(CameraRays(origin, direction, (cos2 * cos2).astype(np.float32), np.zeros(count, np.int32)), cos2)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `sample`, with the differentials of the rays, all of which start at the hole."""
@@ -61,3 +62,18 @@ class Pinhole:
         slope = np.zeros((3, 2, film_mm.shape[1]), np.float32)
         slope[0, 0] = slope[1, 1] = -1 / self.focal_mm
         return replace(rays, differentials=towards(rays.direction / -rays.direction[2], slope, rays.origin_m))
+
+    def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
+        """The whole weight: a point has no vignetting but the cosine's."""
+        return self.sample(film_mm, pupil, wavelength_nm).weight
+
+    def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
+        """Film points of scene points [3, N] in m through the hole; pupil and wavelength change nothing."""
+        origin = np.array([[0.0], [0.0], [-1e-3 * self.focal_mm]]) + np.zeros((1, point_m.shape[1]))
+        with np.errstate(all="ignore"):
+            way = point_m - origin
+            squared = np.einsum("in,in->n", way, way)
+            film = self.focal_mm * way[:2] / way[2]
+            # A' / E0 of a small hole is the square of its distance from the film.
+            weight = self.focal_mm**2 * -way[2] / squared**1.5
+        return arrived(film, origin, point_m, weight, ahead(-way[2]))

@@ -155,5 +155,6 @@ def turned(along: FloatArray, across: FloatArray, film_mm: FloatArray, radius: F
     """Points [2, N] of film points on +x, turned to the azimuth of the film points [2, N] at the radii given."""
     on_axis = radius == 0
     scale = np.float32(1) / np.where(on_axis, np.float32(1), radius)
-    cos, sin = film_mm[0] * scale + on_axis, film_mm[1] * scale
+    with np.errstate(invalid="ignore"):  # infinite film points, which carry no area
+        cos, sin = film_mm[0] * scale + on_axis, film_mm[1] * scale
     return np.stack([along * cos - across * sin, along * sin + across * cos])

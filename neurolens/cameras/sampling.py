@@ -1,13 +1,17 @@
-"""What the cameras share: the map from the unit square to a disk, and checks of their arguments."""
+"""What the cameras share: the map from the unit square to a disk, rays that stay finite, checks of arguments."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from neurolens.cameras.contract import FloatArray
+from neurolens import status as st
+from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 from neurolens.errors import InputError
+
+_AHEAD = np.array([[0], [0], [-1]], np.float32)
 
 
 def concentric_disk(square: FloatArray) -> FloatArray:
@@ -26,6 +30,64 @@ def concentric_disk(square: FloatArray) -> FloatArray:
     angle /= np.where(radius == 0, np.float32(1), radius)
     cos, sin = np.cos(angle), np.sin(angle)
     return np.stack([radius * np.where(swap, sin, cos), radius * np.where(swap, cos, sin)])
+
+
+def stratified(side: int, wavelength_nm: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
+    """Points [2, side^2] of the unit square and wavelengths [side^2] in nm for quadratures; always the same.
+
+    At random in their cells: midpoints would all lie inside the edge of a pupil's outline, beyond which a thousandth of
+    the rays is blocked.
+    """
+    rng, count = np.random.default_rng(0), side * side
+    cell = np.stack(np.meshgrid(np.arange(side), np.arange(side))).reshape(2, -1)
+    square = np.minimum((cell + rng.random(cell.shape)) / side, 1 - 2.0**-24).astype(np.float32)
+    share = rng.permutation((np.arange(count) + rng.random(count)) / count)
+    return square, (wavelength_nm[0] + (wavelength_nm[1] - wavelength_nm[0]) * share).astype(np.float32)
+
+
+def sound(rays: CameraRays, cos2: FloatArray) -> CameraRays:
+    """The rays, those of film points that are not finite (or beyond float32) dark and straight ahead.
+
+    `cos2` [N]: a squared cosine of each ray, which is above 0 for sound ones and NaN or 0 for others.
+    """
+    if cos2.min(initial=1) > 0:  # false for NaN
+        return rays
+    good = cos2 > 0
+    return CameraRays(
+        np.where(good, rays.origin_m, np.float32(0)),
+        np.where(good, rays.direction, _AHEAD),
+        np.where(good, rays.weight, np.float32(0)),
+        np.where(good, rays.status, np.int32(st.OUTSIDE_DOMAIN)),
+    )
+
+
+def arrived(
+    film_mm: NDArray[np.float64],
+    origin_m: NDArray[np.float64],
+    point_m: FloatArray,
+    weight: NDArray[np.float64],
+    status: NDArray[np.int32],
+) -> FilmPoints:
+    """Film points [2, N] with what leads to them; dark, and finite, where the status or a number forbids them."""
+    way = point_m - origin_m
+    with np.errstate(all="ignore"):
+        direction = (way / np.sqrt(np.einsum("in,in->n", way, way))).astype(np.float32)
+        film, origin, weight = film_mm.astype(np.float32), origin_m.astype(np.float32), weight.astype(np.float32)
+    finite = np.isfinite(np.concatenate([film, origin, direction, weight[None]])).all(0)
+    good = finite & (status == st.PASSED)
+    return FilmPoints(
+        np.where(good, film, np.float32(0)),
+        np.where(good, origin, np.float32(0)),
+        np.where(good, direction, _AHEAD),
+        np.where(good, weight, np.float32(0)),
+        np.where(finite | (status != st.PASSED), status, st.OUTSIDE_DOMAIN).astype(np.int32),
+    )
+
+
+def ahead(depth: NDArray[np.float64]) -> NDArray[np.int32]:
+    """Status of scene points at depths [N] before a lens: those beside or behind it miss it, NaN is outside."""
+    behind = np.where(depth <= 0, st.blocked(0, st.MISSED), st.OUTSIDE_DOMAIN)
+    return np.where(depth > 0, st.PASSED, behind).astype(np.int32)
 
 
 def positive(field: str, value: float, *, infinite: bool = False) -> float:

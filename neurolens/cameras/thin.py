@@ -10,8 +10,8 @@ import numpy as np
 
 from neurolens import status as st
 from neurolens.apertures import Aperture
-from neurolens.cameras.contract import CameraRays, FloatArray, towards
-from neurolens.cameras.sampling import check_film, concentric_disk, positive
+from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray, towards
+from neurolens.cameras.sampling import ahead, arrived, check_film, concentric_disk, positive, sound, stratified
 from neurolens.focus import film_z_mm
 
 _QUADRATURE = 256  # points a side
@@ -63,9 +63,8 @@ class ThinLens:
         # On-axis integral of cos over solid angle, pi R^2 / (R^2 + s'^2), and the part of it that a shape lets through.
         self._exposure, self._part = 1.0 + (self.radius_mm / self.image_distance_mm) ** 2, 1.0
         if aperture is not None:
-            middle = ((np.arange(_QUADRATURE) + 0.5) / _QUADRATURE).astype(np.float32)
-            square = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
-            self._part = float(self.sample(np.zeros_like(square), square, square[0]).weight.mean(dtype=np.float64))
+            square, wavelength = stratified(_QUADRATURE, (550.0, 550.0))
+            self._part = float(self.sample(np.zeros_like(square), square, wavelength).weight.mean(dtype=np.float64))
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Rays for film points [2, N] in mm and pupil samples [2, N]; the wavelength changes nothing."""
@@ -79,21 +78,22 @@ class ThinLens:
         direction = np.empty((3, count), np.float32)
         direction[:2] = -film_mm / behind - lens / in_front
         direction[2] = -1.0
-        direction /= np.sqrt(np.einsum("in,in->n", direction, direction))
+        with np.errstate(over="ignore", invalid="ignore"):
+            direction /= np.sqrt(np.einsum("in,in->n", direction, direction))
+            # w = A cos^4 / s'^2 over the exposure on the axis.
+            tangent = (lens - film_mm) / behind
+            cos2 = 1.0 / (1.0 + np.einsum("in,in->n", tangent, tangent))
 
         origin = np.empty((3, count), np.float32)
         np.multiply(lens, np.float32(1e-3), out=origin[:2])
         origin[2] = -1e-3 * behind
 
-        # w = A cos^4 / s'^2 over the exposure on the axis.
-        tangent = (lens - film_mm) / behind
-        cos2 = 1.0 / (1.0 + np.einsum("in,in->n", tangent, tangent))
         weight = cos2 * cos2 * np.float32(self._exposure / self._part)
         if self.aperture is None:
-            return CameraRays(origin, direction, weight, np.zeros(count, np.int32))
+            return sound(CameraRays(origin, direction, weight, np.zeros(count, np.int32)), cos2)
         inside = self.aperture.inside(lens[0], lens[1], self.radius_mm)
         status = np.where(inside, st.PASSED, st.blocked(0, st.RIM)).astype(np.int32)
-        return CameraRays(origin, direction, np.where(inside, weight, np.float32(0)), status)
+        return sound(CameraRays(origin, direction, np.where(inside, weight, np.float32(0)), status), cos2)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `sample`, with the differentials of the rays, which turn about their points on the lens."""
@@ -101,3 +101,28 @@ class ThinLens:
         slope = np.zeros((3, 2, film_mm.shape[1]), np.float32)
         slope[0, 0] = slope[1, 1] = -1 / self.image_distance_mm
         return replace(rays, differentials=towards(rays.direction / -rays.direction[2], slope, rays.origin_m))
+
+    def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
+        """cos^4 of the angles between the axis and the rays from lens to film."""
+        tangent = (concentric_disk(pupil) * np.float32(self.radius_mm) - film_mm) / np.float32(self.image_distance_mm)
+        return np.square(1.0 / (1.0 + np.einsum("in,in->n", tangent, tangent))).astype(np.float32)
+
+    def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
+        """Film points of scene points [3, N] in m through points of the lens chosen by `pupil`."""
+        lens = concentric_disk(pupil).astype(np.float64) * self.radius_mm
+        behind, in_front = self.image_distance_mm, 1e3 * self.focus_m - self.image_distance_mm
+        origin = np.concatenate([1e-3 * lens, np.full((1, lens.shape[1]), -1e-3 * behind)])
+        with np.errstate(all="ignore"):
+            depth = -1e-3 * behind - point_m[2].astype(np.float64)
+            slope = (point_m[:2] - origin[:2]) / depth
+            # The inverse of `sample`: the slope of the ray gives the film point.
+            film = -behind * (slope + lens / in_front)
+            # The weight of `sample`, times mm^2 of film for each m^2 of a plane square to the ray.
+            tangent2 = (((lens - film) / behind) ** 2).sum(0)
+            weight = self._exposure / self._part / (1 + tangent2) ** 2 * (behind / depth) ** 2
+            weight *= np.sqrt(1 + (slope**2).sum(0))
+        status = ahead(depth)
+        if self.aperture is not None:
+            inside = self.aperture.inside(lens[0], lens[1], self.radius_mm)
+            status = np.where(inside | (status != st.PASSED), status, st.blocked(0, st.RIM)).astype(np.int32)
+        return arrived(film, origin, point_m, weight, status)

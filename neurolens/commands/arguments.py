@@ -85,6 +85,39 @@ def whole(least: int, most: int | None = None) -> Callable[[str], int]:
     return convert
 
 
+# Kept here too, for help needs no camera; a test holds it against `cameras.exact_pupils` and `cameras.vignetting`.
+PUPILS = ("outline", "rear-rim", "exit-pupil", "wu", "pixel-disc", "pixel-ellipse", "boxes", "ellipses")
+VIGNETTINGS = ("both", "natural", "optical", "none")
+CAMERAS_HELP = """\
+cameras:
+  LENS.toml                    the lens, traced exactly, every ray through every surface
+  MODEL.onnx                   an exported model of a lens
+  fused:LENS.toml, fused:MODEL.onnx
+                               the same, compiled by the system's C compiler: many times as fast
+  thick:LENS.toml              its principal planes and pupils: ideal imaging, no rims
+  thin, pinhole                a thin lens; a point
+  fisheye-equidistant, fisheye-equisolid, fisheye-stereographic, fisheye-orthographic
+                               points with these projections; --field sets the picture's circle"""
+
+
+def add_camera(parser: argparse.ArgumentParser) -> None:
+    """Add --camera, --pupil and --vignetting."""
+    parser.add_argument(
+        "--camera", metavar="CAMERA", required=True,
+        help="lens file (.toml, traced exactly), model (.onnx), fused: before either, thick:LENS.toml, thin, "
+        "pinhole or fisheye-PROJECTION",
+    )  # fmt: skip
+    parser.add_argument(
+        "--pupil", choices=PUPILS, default="outline",
+        help="how the pupil of an exact lens is sampled: its outline, or a shape of the literature that holds it; the "
+        "same picture, with fewer rays that pass (default: outline)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--vignetting", choices=VIGNETTINGS, default="both",
+        help="what is left of it: both; natural, the cos^4 law; optical, the effective aperture; none (default: both)",
+    )  # fmt: skip
+
+
 def add_lens_state(parser: argparse.ArgumentParser, defaults: dict[str, str]) -> None:
     """Add --efl, --field, --zoom, --f-number, --focus, --focusing and the stop's shape.
 

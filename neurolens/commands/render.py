@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
-from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between, whole
+from neurolens.commands.arguments import CAMERAS_HELP, add_camera, add_json, add_lens_state, aperture_of, between, whole
 from neurolens.commands.output import print_json
 from neurolens.commands.render_files import (
     Files,
@@ -38,8 +38,8 @@ a PNG preview beside it. The settings, the camera and the card of a model are ke
 metadata, attribute "neurolens", as JSON.
 
 The same seed gives the same picture, whatever the number of threads; all cameras share its
-random numbers. A model (.onnx), the thin lens and the pinhole need no torch; a lens file
-(.toml) is traced exactly and does (extra "train").
+random numbers. A model (.onnx), the thin lens and the points need no torch; a lens file
+(.toml) does (extra "train").
 
 The preview follows the render. Ctrl-C (and SIGTERM) writes the picture so far; the same command
 then goes on from OUT.exr.part and ends with the same picture, bit for bit."""
@@ -59,13 +59,10 @@ def add_parser(subparsers: Any) -> None:
     """Add the command to the command line."""
     parser = subparsers.add_parser(
         "render", help="render a scene through a lens, a model, a thin lens or a pinhole",
-        description=_DESCRIPTION, epilog=_EPILOG,
+        description=_DESCRIPTION, epilog=f"{CAMERAS_HELP}\n\n{_EPILOG}",
     )  # fmt: skip
     parser.add_argument("scene", metavar="SCENE", type=Path, help="scene file (.toml)")
-    parser.add_argument(
-        "--camera", metavar="CAMERA", required=True,
-        help="lens file (.toml, traced exactly), model (.onnx), thin or pinhole",
-    )  # fmt: skip
+    add_camera(parser)
     parser.add_argument(
         "-o", "--out", metavar="OUT.exr", type=Path, required=True, help="picture to write; the preview is OUT.png"
     )
@@ -100,7 +97,7 @@ def add_parser(subparsers: Any) -> None:
     add_lens_state(
         parser,
         {
-            "efl": "as tabled; 50 for thin and pinhole; a model has its own",
+            "efl": "as tabled; 50 for thin and pinhole, 14 for fisheyes; a model has its own",
             "f_number": "the scene's, or the widest that the lens opens to; 4 for thin",
             "focus": "the scene's",
         },
@@ -222,6 +219,8 @@ def shot_of(settings: CameraSettings, args: argparse.Namespace, aperture: Apertu
         wavelength_nm=settings.wavelengths_nm,
         # A scene's f-number is for any lens; one that is asked for must be had.
         clamp_f_number=args.f_number is None,
+        pupil=args.pupil,
+        vignetting=args.vignetting,
     )
 
 
