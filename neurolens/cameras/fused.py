@@ -19,6 +19,7 @@ from neurolens.cameras.fusedsource import FILM_X_Y, Setting, camera_source
 from neurolens.cameras.graphprogram import program_of
 from neurolens.cameras.lens_film import LensFilm
 from neurolens.cameras.model import ModelScene, OnnxCamera
+from neurolens.errors import InputError
 from neurolens.programs.compiler import load_compiled
 from neurolens.programs.contract import SCENE_RAY
 from neurolens.programs.expressions import Program
@@ -36,7 +37,7 @@ class FusedFilm:
         stop_surface: of the lens, for the status of rays that the shape blocks.
 
     Raises:
-        InputError: no C compiler, or one that fails.
+        InputError: no C compiler, or one that fails; a pupil that is not sampled by its outline.
     """
 
     def __init__(
@@ -47,6 +48,8 @@ class FusedFilm:
         aperture: Aperture | None = None,
         stop_surface: int = 0,
     ) -> None:
+        if film.pupil is not film.outline:
+            raise InputError("camera", "pupil", "(another)", "outline: the only one that fused cameras sample")
         self._program = program.in_order_of_need()
         self._aperture, self._stop_radius_mm = aperture, stop_radius_mm
         self._stopped = np.int32(st.blocked(stop_surface, st.RIM))
@@ -126,10 +129,6 @@ class FusedCamera(OnnxCamera):
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `sample`, with the differentials of the rays, which come from the same pass."""
         return self._fused.sample(film_mm, pupil, wavelength_nm, True)
-
-    def for_worker(self) -> FusedCamera:
-        """This camera: nothing in it is a thread's own."""
-        return self
 
 
 def _tables(film: LensFilm) -> tuple[FloatArray, FloatArray]:

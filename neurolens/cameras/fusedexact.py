@@ -40,10 +40,6 @@ class FusedExactCamera(ExactCamera):
         """As `sample`, with the differentials of the rays, which come from the same pass."""
         return self._fused.sample(film_mm, pupil, wavelength_nm, True)
 
-    def for_worker(self) -> FusedExactCamera:
-        """This camera: nothing in it is a thread's own."""
-        return self
-
 
 def _check(lens: Lens) -> None:
     for k, s in enumerate(lens.surfaces):

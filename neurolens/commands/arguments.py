@@ -92,6 +92,8 @@ CAMERAS_HELP = """\
 cameras:
   LENS.toml                    the lens, traced exactly, every ray through every surface
   MODEL.onnx                   an exported model of a lens
+  fused:LENS.toml, fused:MODEL.onnx
+                               the same, compiled by the system's C compiler: many times as fast
   thick:LENS.toml              its principal planes and pupils: ideal imaging, no rims
   thin, pinhole                a thin lens; a point
   fisheye-equidistant, fisheye-equisolid, fisheye-stereographic, fisheye-orthographic
@@ -102,7 +104,8 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
     """Add --camera, --pupil and --vignetting."""
     parser.add_argument(
         "--camera", metavar="CAMERA", required=True,
-        help="lens file (.toml, traced exactly), model (.onnx), thick:LENS.toml, thin, pinhole or fisheye-PROJECTION",
+        help="lens file (.toml, traced exactly), model (.onnx), fused: before either, thick:LENS.toml, thin, "
+        "pinhole or fisheye-PROJECTION",
     )  # fmt: skip
     parser.add_argument(
         "--pupil", choices=PUPILS, default="outline",

@@ -33,6 +33,7 @@ from neurolens.surrogates.precision import store_weights
 
 ROOT = Path(__file__).parents[2]
 FILM = (36.0, 24.0)
+BAND = np.abs(np.add.outer(np.arange(64), -np.arange(64))) < 16  # about half of the stop
 Numbers = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -130,9 +131,7 @@ def test_arrays_of_other_layouts_and_shapes() -> None:
             fused.sample(*bad)
 
 
-@pytest.mark.parametrize(
-    "aperture", [Aperture(blades=5, rotation_deg=20), Aperture(mask=BAND)]
-)
+@pytest.mark.parametrize("aperture", [Aperture(blades=5, rotation_deg=20), Aperture(mask=BAND)])
 def test_blades_and_masks(aperture: Aperture) -> None:
     plain, fused = pair(5.6, aperture)
     given = numbers(20_000, seed=3)
