@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
+import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
 from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between, positive, whole
@@ -14,6 +16,9 @@ from neurolens.commands.render import film_size
 from neurolens.commands.render_files import Files
 from neurolens.evaluate.records import plain
 from neurolens.progress import Progress, duration
+
+if TYPE_CHECKING:
+    from neurolens.cameras.build import Shot
 
 _DESCRIPTION = """\
 Render a scene of Mitsuba 3 (.xml, or its own cornell-box) with its integrator and its film, through
@@ -68,29 +73,17 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Render, write both pictures, say how it went."""
-    import time
-
     preview = Files.of(args.out).preview
-    from neurolens.cameras.build import Shot, make_camera
+    from neurolens.cameras.build import make_camera
     from neurolens.mitsuba import load_scene, render
     from neurolens.mitsuba.library import libraries
-    from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM
     from neurolens.render.exr import write_exr, write_png
 
     scene = load_scene(args.scene, args.variant)
     width, height = (int(v) for v in scene.sensors()[0].film().size())
-    shot = Shot(
-        film_mm=args.film or (FILM_WIDTH_MM, FILM_WIDTH_MM * height / width),
-        focus_m=math.inf if args.focus is None else args.focus,
-        f_number=args.f_number,
-        efl_mm=args.efl,
-        zoom=args.zoom,
-        field_deg=args.field,
-        focus=args.focusing,
-        aperture=aperture_of(args),
-        wavelength_nm=LIGHT_NM,
-    )
-    camera = make_camera(args.camera, shot)
+    camera = make_camera(args.camera, _shot(args, height / width))
+    for note in camera.settings.get("notes", ()):
+        print(f"neurolens: warning: {note}", file=sys.stderr)
     began = time.perf_counter()
     with Progress(quiet=args.quiet).stage(f"render {args.scene}, {camera.name}") as report:
         picture = render(
@@ -119,3 +112,21 @@ def run(args: argparse.Namespace) -> int:
             f"{args.scene} through {camera.name}: {width} x {height} in {took} ({mi.variant()})\n{args.out}\n{preview}"
         )
     return 0
+
+
+def _shot(args: argparse.Namespace, shape: float) -> Shot:
+    """What the command line sets, on a film for a picture of `shape`, its height over its width."""
+    from neurolens.cameras.build import Shot
+    from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM
+
+    return Shot(
+        film_mm=args.film or (FILM_WIDTH_MM, FILM_WIDTH_MM * shape),
+        focus_m=math.inf if args.focus is None else args.focus,
+        f_number=args.f_number,
+        efl_mm=args.efl,
+        zoom=args.zoom,
+        field_deg=args.field,
+        focus=args.focusing,
+        aperture=aperture_of(args),
+        wavelength_nm=LIGHT_NM,
+    )

@@ -1,4 +1,4 @@
-"""Wavelengths of rays where the renderer carries RGB: one a ray, and what it is worth to each channel.
+"""Wavelengths of rays through a lens that disperses: one a ray, and what it is worth where the renderer carries RGB.
 
 A path of an RGB renderer carries three numbers, not a wavelength; a lens that disperses needs one. Each ray takes a
 wavelength, drawn by the film's response, and its channel c is weighted by
