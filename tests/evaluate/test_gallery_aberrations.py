@@ -71,8 +71,9 @@ def test_core_and_rim_of_a_light_change_places_through_focus() -> None:
             found[panel.label, column] = light_profile(View(larger, camera, column, rgb))["core_over_rim"]
     assert found["focus 0.8 m", "exact"] < 0.85
     assert found["focus 1.4 m", "exact"] > 2
+    # An even disc, but for the penumbra of a light that is no point and the noise of few samples.
     for focus in ("0.8", "1.4"):
-        assert found[f"focus {focus} m", "thin"] == pytest.approx(1, abs=0.25)
+        assert 0.8 < found[f"focus {focus} m", "thin"] < 1.5
 
 
 # Small fields, where the third order rules.
@@ -163,7 +164,7 @@ def test_red_and_blue_fringes_change_sides_with_the_film() -> None:
         assert found[offset]["thin"]["red_minus_blue_um"] == 0
     shifts = [found[-2.0][column]["red_minus_blue_um"] for column in ("exact", "surrogate")]
     assert shifts[1] == pytest.approx(shifts[0], abs=0.5)
-    # Foci lie s'^2 / f (n_blue - n_red) / (n - 1) apart; the film beyond both takes discs of s / (2 N') of their distance.
+    # Foci lie s'^2 / f (n_blue - n_red) / (n - 1) apart; on a film beyond both, discs differ by that over the f-number.
     glass = taken.lens.surfaces[1]
     blue, line_d, red = (float(index_of(glass, nm)) for nm in (450.0, LINE_D_NM, 650.0))
     efl = first_order(taken.lens).efl_mm

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -84,10 +84,14 @@ def check(effect: Effect) -> None:
 
 
 def fingerprint_of(effect: Effect, samples: int | None) -> str:
-    """A hash of everything that a figure depends on: the files named, the versions, the samples asked for."""
-    found = hashlib.sha256(json.dumps([SCHEMA, versions(), samples], sort_keys=True).encode())
+    """A hash of everything that a figure depends on: files and pictures named, settings, versions, samples asked for."""
+    fits = [asdict(panel.fit) for panel in effect.panel]  # where the file says nothing, the defaults of this version
+    found = hashlib.sha256(json.dumps([SCHEMA, versions(), samples, fits], sort_keys=True).encode())
     for file in [effect.path, *(file for panel in effect.panel for file in panel.files())]:
         found.update(file.read_bytes())
+    for scene in dict.fromkeys(panel.scene for panel in effect.panel):
+        for image in load_scene(scene).images.values():
+            found.update(image.tobytes())
     return found.hexdigest()[:16]
 
 

@@ -60,7 +60,7 @@ class Panel:
     aperture_mask: Path | None = None
     model: Path | None = None
     vignetting: Vignetting = "both"
-    fit: ModelSettings = ModelSettings(terms=100)
+    fit: ModelSettings = ModelSettings(terms=64)
     options: dict[str, float] | None = None
 
     def __post_init__(self) -> None:
