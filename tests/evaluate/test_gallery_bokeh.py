@@ -54,7 +54,7 @@ def camera(kind: str, stop: str = "round", f_number: float = 2.0302) -> ExactCam
 @cache
 def disc(kind: str, stop: str, place: str, f_number: float = 2.0302) -> LightDisc:
     taken = camera(kind, stop, f_number)
-    share, distance = {"far": (0, FAR_M), "near": (0, NEAR_M), "half": (0.45, FAR_M), "edge": (0.87, FAR_M)}[place]
+    share, distance = {"far": (0, FAR_M), "near": (0, NEAR_M), "half": (0.48, FAR_M), "edge": (0.93, FAR_M)}[place]
     return light_disc(taken, bokeh.light_towards(taken, share, distance), count=3000)
 
 
@@ -79,7 +79,7 @@ def test_the_disc_found_backwards_is_that_of_light_traced_forwards(place: str) -
     side = 200
     middle = ((np.arange(side) + 0.5) / side).astype(np.float32)
     pupil = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
-    light = np.array(bokeh.light_towards(taken, 0.87 if place == "edge" else 0, FAR_M), np.float32)
+    light = np.array(bokeh.light_towards(taken, 0.93 if place == "edge" else 0, FAR_M), np.float32)
     out = taken.to_film(np.repeat(light[:, None], side**2, axis=1), pupil, np.full(side**2, 550, np.float32))
     lit = out.status == st.PASSED
     forwards = LightDisc(out.film_mm[:, lit].astype(float), out.weight[lit].astype(float) / side**2)

@@ -10,6 +10,7 @@ from neurolens.cameras.contract import Camera
 from neurolens.evaluate.gallery.measures.lightdiscs import LightDisc, light_disc
 from neurolens.evaluate.gallery.measures.view import View
 
+EDGE = 0.8  # of the way to the film's corner: a disc there still lies on the film as a whole
 _CELLS = 24  # a side of the grid on which two discs are laid over each other
 _SQUARE = 128  # pupil samples a side of a passage rate
 
@@ -21,7 +22,7 @@ def stop_shape(view: View) -> dict[str, float]:
     """
     far_m, near_m = view.shot.panel.option("far_m", 12.0), view.shot.panel.option("near_m", 0.62)
     far, near = (light_disc(view.camera, (0.0, 0.0, -d)) for d in (far_m, near_m))
-    edge = light_disc(view.camera, light_towards(view.camera, 0.87, far_m))
+    edge = light_disc(view.camera, light_towards(view.camera, EDGE, far_m))
     shape = view.shot.lens.aperture
     return {
         "passage_percent": 100 * passage(view.camera),
@@ -42,7 +43,7 @@ def cats_eye(view: View) -> dict[str, float]:
     far_m = view.shot.panel.option("far_m", 12.0)
     middle = light_disc(view.camera, (0.0, 0.0, -far_m))
     found = {}
-    for name, share in (("half way", 0.45), ("near the corner", 0.87)):
+    for name, share in (("half way", EDGE / 2), ("near the corner", EDGE)):
         disc = light_disc(view.camera, light_towards(view.camera, share, far_m))
         place = f"_{name}".replace(" ", "_")
         found[f"axis_ratio{place}"] = disc.axes_mm[1] / disc.axes_mm[0]
@@ -112,7 +113,8 @@ def _shape(disc: LightDisc, sign: int) -> NDArray[np.bool_]:
 
 
 def light_towards(camera: Camera, share: float, distance_m: float) -> tuple[float, float, float]:
-    """A point at a distance whose picture lies about `share` of the way from the film's centre to its corner."""
-    behind = float(camera.settings["efl_mm"])
+    """A point at a distance whose disc lies about `share` of the way from the film's centre to its corner."""
+    efl, focus_m = float(camera.settings["efl_mm"]), camera.settings["focus_m"]
+    behind = efl if focus_m is None else efl / (1 - efl / (1e3 * focus_m - efl))  # of the film, to first order
     scale = share * (1e3 * distance_m - behind) / behind / 2 * 1e-3
     return camera.film_mm[0] * scale, camera.film_mm[1] * scale, -distance_m
