@@ -29,7 +29,8 @@ def exact_program(lens: Lens, pupil_z_mm: float, wavelength_nm: tuple[float, flo
         whole: with stop, rims and transmittance; else the ray alone, and whether it gets through.
 
     Raises:
-        InputError: aspheres, cylinders or layers of coatings.
+        InputError: aspheres or cylinders. Coatings and absorption are not followed; who needs them must refuse
+            such lenses.
     """
     odd = [k for k, s in enumerate(lens.surfaces) if s.asphere or s.cylinder or float(s.conic)]
     if odd:

@@ -4,7 +4,7 @@ All cameras see the same 20 degrees at f/4, focused at 5 m: the film grows with 
 for all, for ideal cameras could share a path between four. Renders run in turn, camera after camera, in one process on
 one thread, and the whole round again; a figure is the best of the rounds, ratios are of one run.
 
-Source: Willi 2021, "Multi-lens cameras in appleseed".
+Source of the tables: Willi 2021 (multi-lens cameras in appleseed).
 """
 
 from __future__ import annotations

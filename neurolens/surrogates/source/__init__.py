@@ -1,1 +1,1 @@
-"""Surrogates, and the exact lens, as C and GLSL."""
+"""Surrogates as programs, and as C and GLSL."""
