@@ -154,13 +154,16 @@ def _save_small(figure: Any, path: Path) -> None:
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=DPI, facecolor="white", format="png")
     picture = Pictures.open(drawn).convert("RGB")
+    page = Pictures.fromarray((np.asarray(picture) == 255).all(axis=2))
     for colours in (256, 128, 64, 48, 32):
         packed = io.BytesIO()
         # The pictures would crowd out the scale of the difference, which must stay what the bar says.
         palette = Pictures.new("P", (1, 1))
         own = picture.quantize(colours - _SCALE_COLOURS).getpalette() or []
         palette.putpalette([*own[: 3 * (colours - _SCALE_COLOURS)], *_scale_colours()])
-        picture.quantize(palette=palette, dither=Pictures.Dither.NONE).save(packed, "PNG", optimize=True)
+        few = picture.quantize(palette=palette, dither=Pictures.Dither.NONE)
+        few.paste(colours - 1, mask=page)  # the library finds near colours only
+        few.save(packed, "PNG", optimize=True)
         if packed.tell() <= MOST_BYTES:
             with atomic_path(path) as temporary:
                 temporary.write_bytes(packed.getvalue())

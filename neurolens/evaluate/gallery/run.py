@@ -84,7 +84,7 @@ def check(effect: Effect) -> None:
 
 
 def fingerprint_of(effect: Effect, samples: int | None) -> str:
-    """A hash of everything that a figure depends on: files and pictures named, settings, versions, samples asked for."""
+    """A hash of everything that a figure depends on: files and pictures named, settings, versions, samples."""
     fits = [asdict(panel.fit) for panel in effect.panel]  # where the file says nothing, the defaults of this version
     found = hashlib.sha256(json.dumps([SCHEMA, versions(), samples, fits], sort_keys=True).encode())
     for file in [effect.path, *(file for panel in effect.panel for file in panel.files())]:
