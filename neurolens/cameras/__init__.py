@@ -1,1 +1,1 @@
-"""Cameras: pinhole, thin lens, exact lens and exported model behind one contract."""
+"""Cameras: pinhole, fisheye projections, thin and thick lens, exact lens and exported model behind one contract."""

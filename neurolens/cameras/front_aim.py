@@ -96,18 +96,8 @@ class FrontAim:
 
 
 def front_aim(film: LensFilm, film_mm: tuple[float, float], wavelength_nm: tuple[float, float], shape: Any) -> FrontAim:
-    """The boxes that the light of a film crosses, from camera rays, half of them at the edges of film and pupils."""
-    rng = np.random.default_rng(0)
-    half = np.array(film_mm)[:, None] / 2
-    place, square = (2 * rng.random((2, _RAYS)) - 1) * half, rng.random((2, _RAYS), np.float32)
-    edge = np.arange(0, _RAYS, 2)
-    square[edge // 2 % 2, edge] = np.where(edge // 4 % 2, np.float32(1e-4), np.float32(1 - 1e-4))
-    corner = edge[edge % 16 == 0]
-    place[:, corner] /= np.abs(place[:, corner] / half).max(0)
-    place *= np.minimum(0.9999 * film.outline.film_radius_mm / np.hypot(*place), 1)
-    points, wavelength = place.astype(np.float32), rng.uniform(*wavelength_nm, _RAYS).astype(np.float32)
-    rays = film.scene(points, film.outline.sample(points, square, wavelength)[0], wavelength)
-    scene = rays.scene_ray[:, rays.status == st.PASSED].astype(np.float64)
+    """The boxes that the light of a film crosses; `shape` is that of the front surface, None the plane z = 0."""
+    scene = _leaving(film, film_mm, wavelength_nm)
     x, y = meet_front(shape, *scene)
     side = np.hypot(scene[3], scene[4])
     angle = np.arctan2(side, -scene[5])
@@ -130,6 +120,22 @@ def front_aim(film: LensFilm, film_mm: tuple[float, float], wavelength_nm: tuple
     far = float(table[3].max())
     depth = 0.0 if shape is None else float(np.nan_to_num(sag_and_slope(shape, np.array([far]), np.zeros(1))[0])[0])
     return FrontAim(shape, end, table, math.hypot(far, depth))
+
+
+def _leaving(film: LensFilm, film_mm: tuple[float, float], wavelength_nm: tuple[float, float]) -> Array:
+    """Scene rays [6, N] of a film, mm: half of those sent at the edges of pupils, some from those of the film."""
+    rng = np.random.default_rng(0)
+    half = np.array(film_mm)[:, None] / 2
+    place, square = (2 * rng.random((2, _RAYS)) - 1) * half, rng.random((2, _RAYS), np.float32)
+    edge = np.arange(0, _RAYS, 2)
+    square[edge // 2 % 2, edge] = np.where(edge // 4 % 2, np.float32(1e-4), np.float32(1 - 1e-4))
+    corner = edge[edge % 16 == 0]
+    place[:, corner] /= np.abs(place[:, corner] / half).max(0)
+    place *= np.minimum(0.9999 * film.outline.film_radius_mm / np.hypot(*place), 1)
+    points, wavelength = place.astype(np.float32), rng.uniform(*wavelength_nm, _RAYS).astype(np.float32)
+    rays = film.scene(points, film.outline.sample(points, square, wavelength)[0], wavelength)
+    leaving: Array = rays.scene_ray[:, rays.status == st.PASSED].astype(np.float64)
+    return leaving
 
 
 def _joined(columns: Array, bins: int) -> Array:

@@ -32,6 +32,7 @@ __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 _NOT_KEPT = ("reference", "units", "frame", "status_codes", "states")
 # How far the squared length of a direction may be from 1: where a poor network decodes none, the ray is no ray.
 _UNIT_SLACK = 1e-3
+_NO_RAY = np.array([[0], [0], [0], [0], [0], [-1]], np.float32)
 _NOMINAL = 1.02  # f-numbers are engraved rounded: up to this much wider than the widest stop means the widest stop
 
 
@@ -177,12 +178,13 @@ class _Scene:
 
     def __call__(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SceneRays:
         out = self.model.rays(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm)
-        d = out.scene_ray[3:]
-        bad = ~(np.abs(np.einsum("in,in->n", d, d) - np.float32(1)) <= np.float32(_UNIT_SLACK))
-        status = out.status
-        if bad.any():  # rays that do not pass need have no direction
-            status = np.where(bad & (status == st.PASSED), np.int32(st.OUTSIDE_DOMAIN), status)
-        return SceneRays(out.scene_ray, out.transmittance, self.stopped(status, out.stop_xy_mm))
+        status, ray = out.status, out.scene_ray
+        squared = np.einsum("in,in->n", ray[3:], ray[3:])
+        if not (squared.min(initial=1) >= 1 - _UNIT_SLACK and squared.max(initial=1) <= 1 + _UNIT_SLACK):
+            unit = np.abs(squared - 1) <= _UNIT_SLACK  # false for NaN
+            status = np.where(unit | (status != st.PASSED), status, np.int32(st.OUTSIDE_DOMAIN))
+            ray = np.where(unit, ray, _NO_RAY)
+        return SceneRays(ray, out.transmittance, self.stopped(status, out.stop_xy_mm))
 
     def stopped(self, status: NDArray[np.int32], stop_xy_mm: FloatArray) -> NDArray[np.int32]:
         """Status [N] with that of the stop's shape, where rays cross the stop at [2, N] mm."""
