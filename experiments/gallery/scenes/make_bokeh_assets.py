@@ -194,7 +194,12 @@ def main() -> None:
             one_line(camera(1.6, (4.8, 3.2), 2.4, "the middle of the film of an anamorphic lens")),
         ),
     }
-    stage = camera(1.4, (24.0, 16.0), 2.0, "for 35 to 75 mm").split("\n[environment]")[0] + "\n" + STREET + signs()
+    stage = (
+        one_line(camera(1.4, (24.0, 16.0), 2.0, "for 35 to 75 mm")).split("\n[environment]")[0]
+        + "\n"
+        + STREET
+        + signs()
+    )
     note = made + "signs 1.0 to 2.0 m before the film, 1.4 m in focus.\n"
     (TARGET / "signs.toml").write_text(note + stage.replace("samples = 256", "samples = 64"), encoding="utf-8")
     for name, (note, balls, rest) in scenes.items():
