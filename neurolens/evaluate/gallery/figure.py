@@ -20,7 +20,7 @@ from neurolens.evaluate.plots.style import new_figure, style
 from neurolens.files import atomic_path
 
 DPI = 100  # a picture of 240 pixels is 2.4 inches wide: one pixel of it, one of the figure
-MOST_BYTES = 150_000
+MOST_BYTES = 250_000
 _SCALE_COLOURS = 20
 _LEFT, _GAP, _HEAD, _FOOT, _BAR, _LABEL = 0.52, 0.1, 0.62, 0.34, 0.98, 0.2  # inches
 
@@ -150,23 +150,28 @@ def _scale_colours() -> list[int]:
 
 
 def _save_small(figure: Any, path: Path) -> None:
-    """Write the figure with as many colours, from 256 to 32, as keep the file small."""
+    """Write the figure in all its colours, or where that is too large with as many, from 256 to 32, as keep it small."""
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=DPI, facecolor="white", format="png")
     picture = Pictures.open(drawn).convert("RGB")
-    page = Pictures.fromarray((np.asarray(picture) == 255).all(axis=2))
-    for colours in (256, 128, 64, 48, 32):
+    for colours in (None, 256, 128, 64, 48, 32):
         packed = io.BytesIO()
-        # The pictures would crowd out the scale of the difference, which must stay what the bar says.
-        palette = Pictures.new("P", (1, 1))
-        own = picture.quantize(colours - _SCALE_COLOURS).getpalette() or []
-        palette.putpalette([*own[: 3 * (colours - _SCALE_COLOURS)], *_scale_colours()])
-        few = picture.quantize(palette=palette, dither=Pictures.Dither.NONE)
-        few.paste(colours - 1, mask=page)  # the library finds near colours only
-        few.save(packed, "PNG", optimize=True)
+        (picture if colours is None else _reduced(picture, colours)).save(packed, "PNG", optimize=True)
         if packed.tell() <= MOST_BYTES:
             with atomic_path(path) as temporary:
                 temporary.write_bytes(packed.getvalue())
             return
     size = f"{packed.tell()} bytes at 32 colours"
     raise InputError(path, "size", f"({size})", f"at most {MOST_BYTES} bytes: smaller or fewer pictures")
+
+
+def _reduced(picture: Any, colours: int) -> Any:
+    """A picture of so many colours."""
+    # The pictures would crowd out the scale of the difference, which must stay what the bar says.
+    palette = Pictures.new("P", (1, 1))
+    own = picture.quantize(colours - _SCALE_COLOURS).getpalette() or []
+    palette.putpalette([*own[: 3 * (colours - _SCALE_COLOURS)], *_scale_colours()])
+    few = picture.quantize(palette=palette, dither=Pictures.Dither.NONE)
+    page = Pictures.fromarray((np.asarray(picture) == 255).all(axis=2))
+    few.paste(colours - 1, mask=page)  # the library finds near colours only
+    return few
