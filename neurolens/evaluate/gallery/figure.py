@@ -150,7 +150,7 @@ def _scale_colours() -> list[int]:
 
 
 def _save_small(figure: Any, path: Path) -> None:
-    """Write the figure in all its colours, or where that is too large with as many, from 256 to 32, as keep it small."""
+    """Write the figure in all its colours, or where that is too large with as many as keep it small, 256 to 32."""
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=DPI, facecolor="white", format="png")
     picture = Pictures.open(drawn).convert("RGB")
