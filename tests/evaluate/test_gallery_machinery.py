@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from gallery_shots import GALLERY, ROOT, shipped, shot
 
+from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.thin import ThinLens
 from neurolens.cli import main
 from neurolens.errors import InputError
@@ -164,3 +166,19 @@ def test_an_effect_becomes_a_figure_numbers_and_a_page_and_is_not_done_twice(
     assert fingerprint_of(read_effect(path), 4) != first["fingerprint"] == fingerprint_of(read_effect(path), None)
     path.write_text(path.read_text(encoding="utf-8").replace('"two"', '"three"'), encoding="utf-8")
     assert fingerprint_of(read_effect(path), None) != first["fingerprint"]
+
+
+def test_a_shot_moves_the_film_of_a_thin_lens_and_of_no_pinhole() -> None:
+    moved = Shot(film_mm=(36.0, 24.0), focus_m=2.0, film_offset_mm=0.7)
+    camera = make_camera("thin", moved)
+    assert isinstance(camera, ThinLens)
+    still = make_camera("thin", replace(moved, film_offset_mm=0.0))
+    assert isinstance(still, ThinLens)
+    assert camera.image_distance_mm == pytest.approx(still.image_distance_mm + 0.7)
+    with pytest.raises(InputError, match="film_offset_mm"):
+        make_camera("pinhole", moved)
+    with pytest.raises(InputError, match="film_offset_mm"):  # beyond the lens
+        make_camera("thin", replace(moved, film_offset_mm=-60.0))
+    beyond = shot("laikin_double_gauss_50", focus_m=2.0, film_offset_mm=-3.0, model=".ols-60")
+    with pytest.raises(InputError, match="film_offset_mm"):  # before the film of infinity
+        surrogate_camera(beyond, shipped(beyond))
