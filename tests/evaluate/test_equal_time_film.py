@@ -84,7 +84,8 @@ def test_another_pupil_outline_is_no_error_of_the_rays(singlet: ExactCamera) -> 
     other: Any = copy(singlet)
     other.film = copy(singlet.film)
     outline = singlet.film.outline
-    other.film.outline = replace(outline, x=np.float32(0.9) * outline.x, y=np.float32(0.9) * outline.y)
+    narrower = replace(outline, x=np.float32(0.9) * outline.x, y=np.float32(0.9) * outline.y)
+    other.film.outline = other.film.pupil = narrower
     point, light = np.full((2, 1), 0.3, np.float32), np.full(1, 550, np.float32)
     moved = other.sample(point, point, light).origin_m - singlet.sample(point, point, light).origin_m
     assert np.abs(moved).max() > 1e-5  # metres: it is another pupil

@@ -93,7 +93,7 @@ def on_pupil_of(exact: DifferentialCamera, camera: Camera) -> DifferentialCamera
         return exact
     turned: Any = copy(exact)
     turned.film = copy(own)
-    turned.film.outline = other.outline
+    turned.film.outline, turned.film.pupil = other.outline, other.pupil
     found: DifferentialCamera = turned
     return found
 
