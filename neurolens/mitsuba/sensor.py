@@ -93,9 +93,9 @@ def _camera_of(props: Any, shape: float) -> Camera:
     name = props.get("camera", None)
     if not isinstance(name, str):
         raise InputError(PLUGIN, "camera", "(missing)", "a model (.onnx), a lens file (.toml), thin or pinhole")
-    blades = (props.get(k, None) for k in ("blades", "blade_rotation_deg", "blade_curvature"))
-    mask = props.get("aperture_mask", None)
-    aperture = make_aperture(*blades, _found(mask) if isinstance(mask, str) else mask)
+    names = ("blades", "blade_rotation_deg", "blade_curvature", "aperture_mask")
+    blades, rotation, curvature, mask = (props.get(k, None) for k in names)
+    aperture = make_aperture(blades, rotation, curvature, _found(mask) if isinstance(mask, str) else mask)
     shot = Shot(
         film_mm=(width_mm, height_mm),
         focus_m=_number_of(props, "focus_m", math.inf),
