@@ -100,7 +100,7 @@ def make_camera(spec: str | Path, shot: Shot) -> Camera:
 
 def _camera(spec: str, shot: Shot) -> Camera:
     thick, fused = spec.startswith(THICK), spec.startswith(FUSED)
-    path = Path(spec.removeprefix(THICK).removeprefix(FUSED))
+    path = Path(spec.removeprefix(THICK if thick else FUSED))
     exact = path.suffix == ".toml" and not thick
     only = "left out: only a lens file that is traced as it is has it"
     _refuse(spec, "pupil", None if (exact and not fused) or shot.pupil == "outline" else shot.pupil, only)

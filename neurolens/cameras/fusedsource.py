@@ -121,7 +121,7 @@ APART void pupil_points(
     }}
 }}
 
-/* Weights from the transmittance; metres in the camera's frame; what is dark, or does not pass, weighs nothing. */
+/* Weights from the transmittance; metres in the camera's frame; what does not pass weighs nothing and looks ahead. */
 APART void finish(
     int count, const setting *s, const float *LENS_RESTRICT fx, const float *LENS_RESTRICT fy,
     const float *LENS_RESTRICT px, const float *LENS_RESTRICT py, const float *LENS_RESTRICT area,
@@ -134,14 +134,16 @@ APART void finish(
         const float tx = (px[i] - fx[i]) * per_distance, ty = (py[i] - fy[i]) * per_distance;
         const float cos2 = 1.0f / (1.0f + (tx * tx + ty * ty));
         const float w = up(weight[i], 0.0f) * area[i] * cos2 * cos2 * scale;
-        weight[i] = area[i] > 0.0f && status[i] == {passed} ? w : 0.0f;
         status[i] = area[i] > 0.0f ? status[i] : {outside};
-        x[i] = area[i] > 0.0f ? x[i] * 1e-3f : 0.0f;
-        y[i] = area[i] > 0.0f ? y[i] * 1e-3f : 0.0f;
-        z[i] = area[i] > 0.0f ? z[i] * 1e-3f - film_z_m : 0.0f;
-        dx[i] = area[i] > 0.0f ? dx[i] : 0.0f;
-        dy[i] = area[i] > 0.0f ? dy[i] : 0.0f;
-        dz[i] = area[i] > 0.0f ? dz[i] : -1.0f;
+        /* What is lost on its way may be NaN. */
+        const int lit = status[i] == {passed};
+        weight[i] = lit ? w : 0.0f;
+        x[i] = lit ? x[i] * 1e-3f : 0.0f;
+        y[i] = lit ? y[i] * 1e-3f : 0.0f;
+        z[i] = lit ? z[i] * 1e-3f - film_z_m : 0.0f;
+        dx[i] = lit ? dx[i] : 0.0f;
+        dy[i] = lit ? dy[i] : 0.0f;
+        dz[i] = lit ? dz[i] : -1.0f;
     }}
 }}
 
@@ -163,14 +165,14 @@ void neurolens_camera(
 {moves}    }}
 }}
 """
-# Where nothing arrives there is no ray that could move; origins go by the metre.
+# What does not pass is no ray that could move; origins go by the metre.
 _MOVES = """\
-        for (int k = 0; k < 12; k++) {
+        for (int k = 0; k < 12; k++) {{
             float *m = moves + k * count + at;
             const float unit = k < 6 ? 1e-3f : 1.0f;
             for (int i = 0; i < n; i++)
-                m[i] = area[i] > 0.0f ? m[i] * unit : 0.0f;
-        }
+                m[i] = status[at + i] == {passed} ? m[i] * unit : 0.0f;
+        }}
 """
 _ROOT = """
 LENS_INLINE float lens_root(float x)
@@ -200,6 +202,6 @@ def camera_source(program: Program, passed: int, outside: int) -> str:
     rows = [derivative(output, by) for output in SCENE_RAY for by in FILM_X_Y]
     given |= {row: f"moves + {k} * count + at" for k, row in enumerate(rows)}
     names = ("n", *(given[i] for i in (*signature.per_ray, *signature.per_call, *signature.outputs, STATUS)))
-    moves = _MOVES if rows[0] in signature.outputs else ""
+    moves = _MOVES.format(passed=passed) if rows[0] in signature.outputs else ""
     body = _TEXT.format(block=BLOCK, passed=passed, outside=outside, call=", ".join(names), moves=moves)
     return "#include <math.h>\n" + write_c(program, _NAME, ["A fused camera's lens."]) + _ROOT + body

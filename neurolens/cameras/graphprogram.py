@@ -7,6 +7,7 @@ torch and no onnx.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -54,9 +55,15 @@ def program_of(path: str | Path, data: bytes, state: Sequence[float] = ()) -> Pr
     known["state"] = np.array(state, np.float32)
     writer = _Writer(program)
     for node in nodes:
-        if len(program.steps) > MAX_STEPS:
+        given = [known[name] for name in node.inputs]
+        if max(len(program.steps), *(a.size for a in given)) > MAX_STEPS:
             raise InputError(path, "graph", f"(more than {MAX_STEPS} steps)", "a smaller model for a fused camera")
-        made = writer.made(path, node, [known[name] for name in node.inputs])
+        try:
+            made = writer.made(path, node, given)
+        except InputError:
+            raise
+        except (ValueError, IndexError, TypeError) as error:
+            raise InputError(path, "graph", f"(operator {node.kind}: {error})", "one that works ray by ray") from error
         known.update(zip(node.outputs, made, strict=True))
     names = (*SCENE_RAY, TRANSMITTANCE, *STOP, STATUS)
     columns = [known[name].reshape(-1) for name in ("scene_ray", "transmittance", "stop_xy_mm", "status")]
@@ -135,6 +142,7 @@ class _Writer:
         return found
 
     def _each(self, operation: Callable[..., Expr], *given: Array) -> Array:
+        _check_room(math.prod(np.broadcast_shapes(*(a.shape for a in given))))
         arrays = np.broadcast_arrays(*(self._expressions(a) for a in given))
         found = np.empty(arrays[0].shape, object)
         for place in np.ndindex(found.shape):
@@ -163,6 +171,7 @@ class _Writer:
 
     def _product(self, weight: Array, value: Array, bias: Array | None = None) -> Array:
         """weight [R, M] times value [M, 1], plus bias; each of the M is spent on every row at once, to be done with."""
+        _check_room(len(weight) * value.size)
         w, v = self._expressions(weight), self._expressions(value)
         total = np.empty((len(w), v.shape[1]), object)
         total[...] = self.program.literal(0.0)
@@ -172,6 +181,12 @@ class _Writer:
             for row, column in np.ndindex(total.shape):
                 total[row, column] = self.program.fma(w[row, k], v[k, column], total[row, column])
         return total
+
+
+def _check_room(steps: int) -> None:
+    """Before memory is taken: a few numbers can ask for as many steps as the product of their counts."""
+    if steps > MAX_STEPS:
+        raise ValueError(f"{steps} steps, expected at most {MAX_STEPS}")
 
 
 def _constant(kind: str, axis: int, given: list[Array]) -> Array:

@@ -132,15 +132,16 @@ class _Table:
             inner = np.fmax(np.float32(1) - np.hypot(film_mm[0], film_mm[1]) / np.float32(self.end), np.float32(0))
         place = np.float32(rows - 1) * (np.float32(1) - np.sqrt(inner))
         row = np.minimum(place.astype(np.intp), rows - 2)
-        step = place - row
+        step = place - row.astype(np.float32)
         if columns == 2:
             return table[row, 0] + step * (table[row + 1, 0] - table[row, 0])
         turn = np.nan_to_num(np.arctan2(film_mm[1], film_mm[0])) * np.float32((columns - 1) / (2 * math.pi))
         turn = np.where(turn < 0, turn + np.float32(columns - 1), turn)
         column = np.minimum(turn.astype(np.intp), columns - 2)
-        across = turn - column
+        across = turn - column.astype(np.float32)
         low, high = ((1 - across) * table[r, column] + across * table[r, column + 1] for r in (row, row + 1))
-        return (low + step * (high - low)).astype(np.float32)
+        found: FloatArray = low + step * (high - low)
+        return found
 
     def _means(self, camera: Any, radius: Array, angle: Array, side: int) -> tuple[Array, Array]:
         """V and <T> A at film points (radius, angle) [M]: one wavelength a sample."""

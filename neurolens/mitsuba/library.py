@@ -37,22 +37,20 @@ def require_mitsuba(variant: str | None = None) -> Any:
     known = [v for v in mi.variants() if v.endswith(("_rgb", "_spectral"))]
     if wanted not in known:
         raise InputError("mitsuba", "variant", wanted, f"one of: {', '.join(known)}")
-    if mi.variant() != wanted:
-        mi.set_variant(wanted)
-    if not wanted.startswith("scalar"):
-        _check_compiler(wanted)
+    try:
+        if mi.variant() != wanted:
+            mi.set_variant(wanted)
+        if not wanted.startswith("scalar"):
+            _compile(wanted)
+    except Exception as error:  # the library's own kinds
+        reason = " ".join(str(error).split())[:200]
+        needed = "libLLVM" if wanted.startswith("llvm") else "CUDA"
+        raise NeurolensError(f"mitsuba variant {wanted}: no {needed} ({reason}); a scalar variant needs none") from None
     return mi
 
 
 @cache
-def _check_compiler(variant: str) -> None:
-    """Compile one small kernel: a missing LLVM or CUDA shows only when the first is made."""
+def _compile(variant: str) -> None:
+    """One small kernel: a missing LLVM shows only when the first is made."""
     mi, dr = libraries()
-    try:
-        dr.eval(mi.Float(dr.arange(mi.UInt32, 2)) + 1)
-    except Exception as error:  # the library's own kinds
-        reason = " ".join(str(error).split())[:200]
-        needed = "libLLVM" if variant.startswith("llvm") else "CUDA"
-        raise NeurolensError(
-            f"mitsuba variant {variant}: no {needed} ({reason}); a scalar variant needs none"
-        ) from None
+    dr.eval(mi.Float(dr.arange(mi.UInt32, 2)) + 1)

@@ -54,7 +54,7 @@ def load_scene(scene: str | Path | Mapping[str, Any], variant: str | None = None
 
     Raises:
         NeurolensError: no Mitsuba, no LLVM; a scene that Mitsuba refuses, in its words.
-        InputError: no such file, or one of another format.
+        InputError: no such file, or one of another format; a scene without a sensor or an integrator.
     """
     mi = require_mitsuba(variant)
     register()
@@ -76,6 +76,9 @@ def load_scene(scene: str | Path | Mapping[str, Any], variant: str | None = None
         raise NeurolensError(f"mitsuba scene {name}: {reason}") from error
     if not isinstance(loaded, mi.Scene):
         raise InputError(name, "type", type(loaded).__name__, "a scene")
+    for part, there in (("sensor", loaded.sensors()), ("integrator", loaded.integrator())):
+        if not there:
+            raise InputError(name, part, "(missing)", "a scene that has one")
     return loaded
 
 

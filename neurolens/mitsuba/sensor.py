@@ -63,7 +63,7 @@ def _initialise(self: Any, props: Any, camera: Camera | None = None) -> None:
     (width, height), crop, offset = (tuple(map(int, of())) for of in (film.size, film.crop_size, film.crop_offset))
     if camera is None:
         camera = _camera_of(props, height / width)
-    units = float(props.get("units_per_m", 1.0))
+    units = _number_of(props, "units_per_m", 1.0)
     if not 0 < units < math.inf:
         raise InputError(PLUGIN, "units_per_m", units, "a finite number above 0")
     _check_rigid(self.world_transform())
@@ -88,17 +88,17 @@ def _camera_of(props: Any, shape: float) -> Camera:
     Raises:
         InputError, ModelError: as `make_camera`.
     """
-    width_mm = float(props.get("film_width_mm", FILM_WIDTH_MM))
-    height_mm = float(props.get("film_height_mm", width_mm * shape))
+    width_mm = _number_of(props, "film_width_mm", FILM_WIDTH_MM)
+    height_mm = _number_of(props, "film_height_mm", width_mm * shape)
     name = props.get("camera", None)
     if not isinstance(name, str):
         raise InputError(PLUGIN, "camera", "(missing)", "a model (.onnx), a lens file (.toml), thin or pinhole")
-    aperture = make_aperture(
-        *(props.get(k, None) for k in ("blades", "blade_rotation_deg", "blade_curvature", "aperture_mask"))
-    )
+    names = ("blades", "blade_rotation_deg", "blade_curvature", "aperture_mask")
+    blades, rotation, curvature, mask = (props.get(k, None) for k in names)
+    aperture = make_aperture(blades, rotation, curvature, _found(mask) if isinstance(mask, str) else mask)
     shot = Shot(
         film_mm=(width_mm, height_mm),
-        focus_m=float(props.get("focus_m", math.inf)),
+        focus_m=_number_of(props, "focus_m", math.inf),
         f_number=props.get("f_number", None),
         efl_mm=props.get("efl_mm", None),
         zoom=props.get("zoom", None),
@@ -106,6 +106,14 @@ def _camera_of(props: Any, shape: float) -> Camera:
         wavelength_nm=LIGHT_NM,
     )
     return make_camera(_found(name), shot)
+
+
+def _number_of(props: Any, name: str, default: float) -> float:
+    value = props.get(name, default)
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(PLUGIN, name, value, "a number") from None
 
 
 def _found(name: str) -> str:

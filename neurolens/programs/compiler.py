@@ -43,34 +43,46 @@ def compile_c(source: str, library: Path, flags: tuple[str, ...] = FLAGS) -> str
     Raises:
         InputError: there is no compiler, or it fails; the message says how.
     """
-    command = [find_compiler(), *flags, "-shared", "-fPIC", "-x", "c", "-", "-o", str(library), "-lm"]
-    try:
-        done = subprocess.run(command, input=source, capture_output=True, text=True, timeout=_SECONDS, check=False)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise InputError(command[0], "compile", f"({error})", "a C compiler that works") from error
-    if done.returncode:
-        said = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr[:200] or "no word")
-        raise InputError(command[0], "compile", f"({said[:200]})", "a C compiler that knows C99")
+    compiler = find_compiler()
+    done = _run([compiler, *flags, "-shared", "-fPIC", "-x", "c", "-", "-o", str(library), "-lm"], source)
+    if done.returncode or not library.is_file():
+        said = " ".join(next((line for line in done.stderr.splitlines() if "error" in line), done.stderr).split())
+        raise InputError(compiler, "compile", f"({said[:200] or 'no word'})", "a C compiler that knows C99")
     return done.stderr
+
+
+def _run(command: list[str], text: str = "") -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(
+            command, input=text, capture_output=True, text=True, errors="replace", timeout=_SECONDS, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        said = f"no end after {_SECONDS} s" if isinstance(error, subprocess.TimeoutExpired) else error
+        raise InputError(command[0], "compile", f"({said})", "a C compiler that works") from error
 
 
 def load_compiled(source: str) -> ctypes.CDLL:
     """The library of a source: compiled once for this machine, then taken from the folder.
 
     The folder is `neurolens` in $XDG_CACHE_HOME or ~/.cache; where that is not this user's alone, a temporary one that
-    goes with the process.
+    goes with the process. A library of another user, or a damaged one, is made anew.
 
     Raises:
-        InputError: as `compile_c`.
+        InputError: as `compile_c`; a library that cannot be loaded.
     """
     folder = _folder()
     library = folder / f"{_key(source)}.so"
-    if not library.is_file():
-        with atomic_path(library) as temporary:
-            compile_c(source, temporary, FLAGS)
-            temporary.chmod(0o700)
-        _forget_oldest(folder)
-    return ctypes.CDLL(str(library))
+    with suppress(OSError):  # not there, or damaged
+        if _mine(library.lstat()):
+            return ctypes.CDLL(str(library))
+    with atomic_path(library) as temporary:
+        compile_c(source, temporary, FLAGS)
+        temporary.chmod(0o700)
+    _forget_oldest(folder)
+    try:
+        return ctypes.CDLL(str(library))
+    except OSError as error:
+        raise InputError(library, "load", f"({error})", "code for this machine, and a disk that may hold it") from error
 
 
 def _key(source: str) -> str:
@@ -81,7 +93,7 @@ def _key(source: str) -> str:
 
 @cache
 def _compiler_and_processor(compiler: str) -> str:
-    asked = subprocess.run([compiler, "--version"], capture_output=True, text=True, timeout=_SECONDS, check=False)
+    asked = _run([compiler, "--version"])
     processor = platform.processor()
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()

@@ -169,11 +169,22 @@ def test_the_exact_lens() -> None:
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * np.abs(b).max())
 
 
+def test_rays_that_are_lost_on_their_way_stay_finite() -> None:
+    lens = read_lens(lens_models.LENSES / "thorlabs_lb1471_biconvex_50.toml").with_aperture(Aperture(blades=6))
+    fused = FusedExactCamera(lens, film_mm=FILM, focus_m=3.0)
+    given = np.zeros((2, 3), np.float32), np.full((2, 3), 0.3, np.float32), np.float32([math.nan, 0.0, 550.0])
+    found = fused.sample_differentials(*given)
+    assert found.differentials is not None and (found.status[:2] != st.PASSED).all() and found.status[2] == st.PASSED
+    numbers = (found.origin_m, found.direction, found.differentials.origin_m, found.differentials.direction)
+    assert all(np.isfinite(a).all() for a in numbers) and (found.weight > 0).tolist() == [False, False, True]
+
+
 def test_lenses_that_a_c_tracer_does_not_know() -> None:
     for name, said in (("phone_lens_6", "spheres"), ("cooke_triplet_50", "absorbs")):
         with pytest.raises(InputError, match=said):
             make_camera(f"fused:{lens_models.LENSES / name}.toml", Shot((4.0, 3.0), math.inf))
-    for spec in ("fused:thin", "fused:", "fused:nothing.onnx"):
+    twice = f"thick:fused:{lens_models.LENSES / 'phone_lens_6'}.toml"
+    for spec in ("fused:thin", "fused:", "fused:nothing.onnx", twice):
         with pytest.raises(InputError):
             make_camera(spec, Shot(FILM, 2.0))
 
@@ -219,6 +230,21 @@ def test_an_operator_without_a_fused_form(tmp_path: Path) -> None:
     next(n for n in proto.graph.node if n.op_type == "Tanh").op_type = "Sin"
     with pytest.raises(InputError, match="Sin"):
         program_of(tmp_path / "model.onnx", proto.SerializeToString())
+
+
+def test_graphs_that_ask_for_too_much(tmp_path: Path) -> None:
+    """A few numbers that meet as rows and columns, and a shape that only fits as many rays as the check has."""
+    helper, tensor = onnx.helper, onnx.numpy_helper.from_array
+    row, column = (tensor(np.ones(s, np.float32), n) for s, n in (((1, 5000), "row"), ((5000, 1), "column")))
+    shape = tensor(np.array([1, 16400]), "shape")
+    for node, constants in (
+        (helper.make_node("Mul", ["row", "column"], ["x"]), [row, column]),
+        (helper.make_node("MatMul", ["column", "row"], ["x"]), [row, column]),
+        (helper.make_node("Reshape", ["film_z_mm", "shape"], ["x"]), [shape]),
+    ):
+        graph = helper.make_graph([node], "g", [], [], constants)
+        with pytest.raises(InputError, match="graph"):
+            program_of(tmp_path / "model.onnx", helper.make_model(graph).SerializeToString())
 
 
 def test_workers_share_one_library() -> None:

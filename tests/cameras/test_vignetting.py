@@ -88,7 +88,7 @@ def test_points_that_are_none_are_dark() -> None:
     film = np.array([[math.nan, math.inf, 0.0], [0.0, 0.0, 0.0]], np.float32)
     for kind in ("thin", "fisheye-orthographic"):
         rays = without(kind, "none").sample(film, np.full((2, 3), 0.3, np.float32), np.full(3, 550, np.float32))
-        assert rays.weight.tolist()[:2] == [0, 0] and rays.weight[2] > 0
+        assert rays.weight.tolist()[:2] == [0, 0] and rays.weight[2] > 0 and rays.weight.dtype == np.float32
         assert rays.status.tolist() == [st.OUTSIDE_DOMAIN, st.OUTSIDE_DOMAIN, st.PASSED]
 
 

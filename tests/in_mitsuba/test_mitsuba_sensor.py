@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.pinhole import Pinhole
@@ -202,7 +203,11 @@ def test_a_scene_file_names_its_camera(tmp_path: Path) -> None:
     mi = variant("llvm_ad_rgb")
     file = tmp_path / "scene.xml"
     shutil.copy(MODEL, tmp_path / "lens.onnx")  # found beside the scene
-    file.write_text(XML.format(width=12, more="", camera="lens.onnx"))
+    Image.new("L", (8, 8), 255).save(tmp_path / "open.png")  # and so is its mask
+    mask = '<string name="aperture_mask" value="open.png"/>'
+    file.write_text(
+        XML.replace('<integer name="blades" value="6"/>', mask).format(width=12, more="", camera="lens.onnx")
+    )
     picture = np.array(mi.render(load_scene(file), spp=64))
     assert picture.shape == (4, 8, 3)
     np.testing.assert_allclose(picture[1:3, 2:6].mean(), 1, atol=0.1)
@@ -231,6 +236,7 @@ def test_the_command_renders_a_scene_file(tmp_path: Path, capsys: pytest.Capture
         ('<float name="film_height_mm" value="12"/>', "expected the shape of the film, 12 x 12 mm"),
         ('<transform name="to_world"><scale value="2"/></transform>', "to_world: got .*set units_per_m"),
         ('<string name="zoom" value="35"/>', "zoom: got '35'"),
+        ('<string name="film_height_mm" value="high"/>', "film_height_mm: got 'high', expected a number"),
     ],
 )
 def test_mistakes_in_a_scene_are_one_line(tmp_path: Path, more: str, words: str) -> None:
@@ -248,6 +254,9 @@ def test_other_mistakes(tmp_path: Path, lens: Camera) -> None:
         load_scene(tmp_path / "none.xml")
     with pytest.raises(InputError, match="variant: got 'scalar_mono'"):
         require_mitsuba("scalar_mono")
+    for part in ("sensor", "integrator"):
+        with pytest.raises(InputError, match=rf"{part}: got \(missing\)"):
+            load_scene({k: v for k, v in furnace(mi, 4).items() if k != part})
     scene = load_scene(furnace(mi, 4))
     with pytest.raises(InputError, match="spp: got 0"):
         render(scene, lens, spp=0)

@@ -45,6 +45,30 @@ def test_a_folder_open_to_others_is_not_used(tmp_path: Path) -> None:
     assert not list(folder.iterdir())
 
 
+def test_libraries_that_are_damaged_or_of_others_are_made_anew(tmp_path: Path) -> None:
+    compiler.load_compiled(SOURCE)
+    (library,) = (tmp_path / "neurolens").glob("*.so")
+    kept, good = tmp_path / "kept.so", library.read_bytes()
+    library.unlink()  # in use: a new file, not new bytes
+    library.write_bytes(good[:100])
+    assert compiler.load_compiled(SOURCE).answer() == 42
+    kept.write_bytes(good)
+    library.unlink()
+    library.symlink_to(kept)
+    assert compiler.load_compiled(SOURCE).answer() == 42 and not library.is_symlink()
+
+
+@pytest.mark.parametrize("text", ["not a program", "#!/bin/sh\nexit 0\n", "#!/bin/sh\nprintf '\\377' >&2\nexit 1\n"])
+def test_what_is_no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, text: str) -> None:
+    odd = tmp_path / "odd"
+    odd.write_text(text)
+    odd.chmod(0o700)
+    monkeypatch.setenv("CC", str(odd))
+    with pytest.raises(InputError, match="a C compiler"):
+        compiler.load_compiled(SOURCE)
+    assert not list((tmp_path / "neurolens").iterdir())
+
+
 def test_no_compiler_and_one_that_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="error"):
         compiler.load_compiled("this is no C\n")
