@@ -10,7 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from neurolens.render.checks import Vector, require, require_emission, require_finite, require_positive
+from neurolens.render.checks import (
+    Vector,
+    require,
+    require_emission,
+    require_finite,
+    require_place,
+    require_positive,
+)
 
 
 @dataclass(frozen=True)
@@ -22,7 +29,7 @@ class PointLight:
     illuminant: str = "D65"
 
     def __post_init__(self) -> None:
-        require_finite("position_m", self.position_m)
+        require_place("position_m", self.position_m)
         _require_light("intensity", self.intensity)
 
 
@@ -42,8 +49,8 @@ class SpotLight:
     illuminant: str = "D65"
 
     def __post_init__(self) -> None:
-        require_finite("position_m", self.position_m)
-        require_finite("look_at_m", self.look_at_m)
+        require_place("position_m", self.position_m)
+        require_place("look_at_m", self.look_at_m)
         require(self.position_m != self.look_at_m, "look_at_m", self.look_at_m, "a point other than position_m")
         _require_light("intensity", self.intensity)
         require(0.1 <= self.outer_deg <= 90, "outer_deg", self.outer_deg, "a half angle from 0.1 to 90 degrees")

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.errors import InputError
+from neurolens.render.checks import FARTHEST_M
 from neurolens.render.mesh import vertex_normals
 from neurolens.render.shapes import MeshSettings
 
 LARGEST_FILE = 500_000_000  # bytes
-FARTHEST_M = 1e9  # squares and products of lengths stay far from the limits of float32
 _LARGEST_HEADER = 100_000
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _OBJ_LINES = {
