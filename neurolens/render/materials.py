@@ -50,12 +50,8 @@ def mirror_direction(direction: FloatArray, normal: FloatArray) -> FloatArray:
 
 def sine2(a: FloatArray, b: FloatArray) -> FloatArray:
     """Squared sine [N] of the angle between unit vectors [3, N], exact for small ones, too."""
-    result: FloatArray = np.float32(0)
-    for j, k in ((1, 2), (2, 0), (0, 1)):
-        across = a[j] * b[k]
-        across -= a[k] * b[j]
-        across *= across
-        result = result + across
+    x, y, z = (a[j] * b[k] - a[k] * b[j] for j, k in ((1, 2), (2, 0), (0, 1)))
+    result: FloatArray = x * x + y * y + z * z
     return result
 
 

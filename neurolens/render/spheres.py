@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,8 +27,9 @@ class Spheres:
 
     def __init__(self, first: int, centres: NDArray[np.float64], radii: NDArray[np.float64]) -> None:
         self.first, self.count = first, len(radii)
-        self._kind = np.float64 if radii.max() > _LARGE_M else np.float32
-        self._centre, self._radius = centres.T.astype(self._kind), radii.astype(self._kind)
+        self._kind: type[np.floating[Any]] = np.float64 if radii.max() > _LARGE_M else np.float32
+        self._centre: Any = centres.T.astype(self._kind)
+        self._radius: Any = radii.astype(self._kind)
         # A hair of 2e-6 of the squared distances covers the rounding of the products.
         slack, ones = 2e-6, np.ones(self.count)
         constant = radii**2 - (1 - slack) * np.sum(centres**2, axis=1)
@@ -60,7 +63,7 @@ class Spheres:
         The discriminant comes from the distance between centre and ray, which stays exact in float32 for a small
         sphere far away (Haines et al. 2019, "Precision improvements for ray/sphere intersection").
         """
-        direction = rays.direction.take(ray, axis=1).astype(self._kind, copy=False)
+        direction: Any = rays.direction.take(ray, axis=1).astype(self._kind, copy=False)
         if self._kind is np.float64:
             direction /= np.sqrt(dot(direction, direction))
         to_centre = self._centre.take(number, axis=1) - rays.origin.take(ray, axis=1)

@@ -126,6 +126,17 @@ def test_bad_environments_are_named(shape: tuple[int, int], value: float, messag
         scene_from_tables({"camera": CAMERA, "environment": {"file": "a.exr"}}, tmp_path / "s.toml")
 
 
+def test_grey_pictures_of_16_bits_are_as_bright_as_those_of_8(tmp_path: Path) -> None:
+    grey = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    Image.fromarray(grey).save(tmp_path / "8.png")
+    Image.fromarray(grey.astype(np.uint16) * 257).save(tmp_path / "16.png")
+    Image.fromarray(grey.astype(np.float32)).save(tmp_path / "32.tiff")
+    few, many = (pictures.read_picture(tmp_path, "file", tmp_path / name) for name in ("8.png", "16.png"))
+    assert few.shape == (16, 16, 3) and few.max() == 1 and np.allclose(few, many, atol=1e-6)
+    with pytest.raises(InputError, match="8 or 16 bits"):
+        pictures.read_picture(tmp_path, "file", tmp_path / "32.tiff")
+
+
 def test_broken_and_large_environments_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(name: str, message: str) -> None:
         with pytest.raises(InputError, match=f"environment.file.*{message}"):
