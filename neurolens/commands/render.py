@@ -156,9 +156,11 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.render.film import PixelGrid
     from neurolens.render.illuminants import check_name
     from neurolens.render.renderer import render
+    from neurolens.render.scenechecks import files_named
     from neurolens.render.scenefile import load_scene
 
     scene = load_scene(args.scene)
+    files.spare(args.scene.parent / name for name in files_named(scene.settings))
     settings, film = scene.settings.camera, film_of(scene.settings.film, args)
     if args.white_balance is not None:
         check_name(args.scene, "--white-balance", args.white_balance, scene.illuminants)

@@ -160,7 +160,7 @@ def _checked_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[s
 def _check_indices(scene: Path, field: str, corners: list[str], counts: dict[str, int]) -> None:
     """Refuse a corner of a face that refers to something that does not come before it, and corners of unlike forms."""
     if len({tuple(map(bool, corner.split("/"))) for corner in corners}) > 1:  # the loader would take one for another
-        raise InputError(scene, field, " ".join(corners)[:60], "corners that are all of the same form, as in 1/1 2/2 3/3")
+        raise InputError(scene, field, " ".join(corners)[:60], "corners of the same form, as in 1/1 2/2 3/3")
     for corner in corners:
         for index, kind in zip(corner.split("/"), ("v", "vt", "vn"), strict=False):
             if index and int(index) > counts[kind]:

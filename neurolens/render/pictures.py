@@ -38,7 +38,8 @@ def _encoded(scene: Path, field: str, path: Path, picture: Image.Image) -> Float
         return np.stack([grey] * 3, axis=-1)
     if picture.mode in ("I", "F"):
         raise InputError(scene, field, str(path), "a picture of 8 or 16 bits a channel")
-    return np.asarray(picture.convert("RGB"), np.float32) / 255
+    colours: FloatArray = np.asarray(picture.convert("RGB"), np.float32) / np.float32(255)
+    return colours
 
 
 def read_environment(scene: Path, field: str, path: Path) -> FloatArray:
