@@ -11,8 +11,9 @@ from neurolens.render.checks import (
     Vector,
     length,
     require,
+    require_angle,
+    require_direction,
     require_emission,
-    require_finite,
     require_place,
     require_positive,
     require_size,
@@ -29,8 +30,7 @@ class Plane:
 
     def __post_init__(self) -> None:
         require_place("point_m", self.point_m)
-        require_finite("normal", self.normal)
-        require(length(self.normal) > 0, "normal", self.normal, "a direction")
+        require_direction("normal", self.normal)
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,7 @@ class Disc:
 
     def __post_init__(self) -> None:
         require_place("centre_m", self.centre_m)
-        require_finite("normal", self.normal)
-        require(length(self.normal) > 0, "normal", self.normal, "a direction")
+        require_direction("normal", self.normal)
         require_size("radius_m", self.radius_m)
         _check_light(self.material, self.emission)
 
@@ -166,5 +165,5 @@ class MeshSettings:
         ok = inline if self.file is None else not any_inline
         require(ok, "file", self.file or "(missing)", "either file, or vertices_m and faces")
         require_positive("scale", self.scale)
-        require_finite("rotate_y_deg", (self.rotate_y_deg,))
+        require_angle("rotate_y_deg", self.rotate_y_deg)
         require_place("translate_m", self.translate_m)
