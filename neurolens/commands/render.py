@@ -68,8 +68,7 @@ def add_parser(subparsers: Any) -> None:
         "-o", "--out", metavar="OUT.exr", type=Path, required=True, help="picture to write; the preview is OUT.png"
     )
     picture = parser.add_argument_group("picture")
-    count = whole(1, 1 << 20)
-    picture.add_argument("--samples", metavar="N", type=count, help="samples a pixel (default: the scene's)")
+    picture.add_argument("--samples", metavar="N", type=whole(1, 2**20), help="samples a pixel (default: the scene's)")
     picture.add_argument(
         "--width", metavar="PIXELS", type=whole(1, 16384),
         help="width (default: the scene's, or from --height and the film's shape)",
