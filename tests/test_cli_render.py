@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import failure, run_json
+from PIL import Image
 
 from neurolens.render.exr import read_exr, read_layers, write_exr
 
@@ -175,3 +176,14 @@ def test_a_picture_beyond_memory_is_one_line(
         assert "64, 36" in (line := failure(capsys, *common)) and "2231 pixels" in line
     monkeypatch.setattr("neurolens.render.sums.mmap.mmap", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOMEM, "")))
     assert "out of memory" in failure(capsys, *common)
+
+
+def test_a_texture_with_the_name_of_the_preview_is_not_written_over(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Image.new("RGB", (4, 2), "white").save(tmp_path / "ball.png")
+    scene.write_text(SCENE.replace("colour = [1.0, 1.0, 1.0]", 'file = "ball.png"'))
+    before = (tmp_path / "ball.png").read_bytes()
+    said = failure(capsys, "render", scene, "--camera", "pinhole", "--quiet", "-o", tmp_path / "ball.exr")
+    assert "--out" in said and "ball.png" in said and (tmp_path / "ball.png").read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.png", "ball.toml"]

@@ -68,8 +68,7 @@ def add_parser(subparsers: Any) -> None:
         "-o", "--out", metavar="OUT.exr", type=Path, required=True, help="picture to write; the preview is OUT.png"
     )
     picture = parser.add_argument_group("picture")
-    count = whole(1, 1 << 20)
-    picture.add_argument("--samples", metavar="N", type=count, help="samples a pixel (default: the scene's)")
+    picture.add_argument("--samples", metavar="N", type=whole(1, 2**20), help="samples a pixel (default: the scene's)")
     picture.add_argument(
         "--width", metavar="PIXELS", type=whole(1, 16384),
         help="width (default: the scene's, or from --height and the film's shape)",
@@ -156,9 +155,11 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.render.film import PixelGrid
     from neurolens.render.illuminants import check_name
     from neurolens.render.renderer import render
+    from neurolens.render.scenechecks import files_named
     from neurolens.render.scenefile import load_scene
 
     scene = load_scene(args.scene)
+    files.spare(args.scene.parent / name for name in files_named(scene.settings))
     settings, film = scene.settings.camera, film_of(scene.settings.film, args)
     if args.white_balance is not None:
         check_name(args.scene, "--white-balance", args.white_balance, scene.illuminants)

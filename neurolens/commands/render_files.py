@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -65,6 +65,17 @@ class Files:
         for path in (files.out, files.preview, files.checkpoint):
             check_writable(path)
         return files
+
+    def spare(self, inputs: Iterable[Path]) -> None:
+        """Refuse to write over what the render reads, such as a texture beside the scene that has the preview's name.
+
+        Raises:
+            InputError: one of `inputs` would be lost.
+        """
+        for read in inputs:
+            for written in (self.out, self.preview, self.checkpoint):
+                if written.exists() and read.exists() and written.samefile(read):
+                    raise InputError(self.out, "--out", written.name, f"another name: the scene reads {read}")
 
     def kept(self) -> str:
         """What a render that ended early can go on from."""

@@ -8,6 +8,10 @@ from neurolens.errors import InputError
 
 Vector = tuple[float, float, float]
 BLACK: Vector = (0.0, 0.0, 0.0)
+# Squares and products stay far from the limits of float32.
+SMALLEST_M, FARTHEST_M = 1e-9, 1e9
+BRIGHTEST = 1e18
+MOST_DEG = 36000.0
 
 
 def require(ok: bool, field: str, value: object, expected: str) -> None:
@@ -15,8 +19,21 @@ def require(ok: bool, field: str, value: object, expected: str) -> None:
         raise InputError("scene", field, value, expected)
 
 
-def require_finite(field: str, value: tuple[float, ...]) -> None:
-    require(all(math.isfinite(x) for x in value), field, value, "finite numbers")
+def require_angle(field: str, value: float) -> None:
+    require(abs(value) <= MOST_DEG, field, value, f"degrees, at most {MOST_DEG:g} either way")
+
+
+def require_direction(field: str, value: Vector) -> None:
+    ok = all(abs(x) <= FARTHEST_M for x in value) and length(value) >= SMALLEST_M
+    require(ok, field, value, f"a direction, between {SMALLEST_M:g} and {FARTHEST_M:g} long")
+
+
+def require_place(field: str, value: Vector) -> None:
+    require(all(abs(x) <= FARTHEST_M for x in value), field, value, f"three numbers within {FARTHEST_M:g} m")
+
+
+def require_size(field: str, value: float) -> None:
+    require(SMALLEST_M <= value <= FARTHEST_M, field, value, f"a length from {SMALLEST_M:g} to {FARTHEST_M:g} m")
 
 
 def require_positive(field: str, value: float) -> None:
@@ -28,7 +45,7 @@ def require_reflectance(field: str, value: Vector) -> None:
 
 
 def require_emission(field: str, value: Vector) -> None:
-    require(all(0 <= x < math.inf for x in value), field, value, "three finite numbers, 0 or more")
+    require(all(0 <= x <= BRIGHTEST for x in value), field, value, f"three numbers from 0 to {BRIGHTEST:g}")
 
 
 def length(vector: Vector) -> float:

@@ -10,7 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from neurolens.render.checks import Vector, require, require_emission, require_finite, require_positive
+from neurolens.render.checks import (
+    BRIGHTEST,
+    Vector,
+    require,
+    require_angle,
+    require_emission,
+    require_place,
+)
 
 
 @dataclass(frozen=True)
@@ -22,7 +29,7 @@ class PointLight:
     illuminant: str = "D65"
 
     def __post_init__(self) -> None:
-        require_finite("position_m", self.position_m)
+        require_place("position_m", self.position_m)
         _require_light("intensity", self.intensity)
 
 
@@ -42,8 +49,8 @@ class SpotLight:
     illuminant: str = "D65"
 
     def __post_init__(self) -> None:
-        require_finite("position_m", self.position_m)
-        require_finite("look_at_m", self.look_at_m)
+        require_place("position_m", self.position_m)
+        require_place("look_at_m", self.look_at_m)
         require(self.position_m != self.look_at_m, "look_at_m", self.look_at_m, "a point other than position_m")
         _require_light("intensity", self.intensity)
         require(0.1 <= self.outer_deg <= 90, "outer_deg", self.outer_deg, "a half angle from 0.1 to 90 degrees")
@@ -88,8 +95,8 @@ class Environment:
         if self.file is None:
             require(self.scale == 1, "scale", self.scale, "left out: it multiplies a picture")
             require(self.rotate_y_deg == 0, "rotate_y_deg", self.rotate_y_deg, "left out: it turns a picture")
-        require_positive("scale", self.scale)
-        require_finite("rotate_y_deg", (self.rotate_y_deg,))
+        require(0 < self.scale <= BRIGHTEST, "scale", self.scale, f"a number above 0, at most {BRIGHTEST:g}")
+        require_angle("rotate_y_deg", self.rotate_y_deg)
 
 
 @dataclass(frozen=True)
@@ -112,6 +119,7 @@ class Sky:
     def __post_init__(self) -> None:
         elevation = self.sun_elevation_deg
         require(0 <= elevation <= 90, "sun_elevation_deg", elevation, "a number from 0 (horizon) to 90 (zenith)")
-        require_finite("sun_azimuth_deg", (self.sun_azimuth_deg,))
+        require_angle("sun_azimuth_deg", self.sun_azimuth_deg)
         require(2 <= self.turbidity <= 10, "turbidity", self.turbidity, "a number from 2 to 10")
-        require_positive("white_kcd_per_m2", self.white_kcd_per_m2)
+        white = self.white_kcd_per_m2
+        require(1e-6 <= white <= 1e6, "white_kcd_per_m2", white, "a number from 1e-06 to 1e+06")

@@ -48,6 +48,13 @@ def mirror_direction(direction: FloatArray, normal: FloatArray) -> FloatArray:
     return result
 
 
+def sine2(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Squared sine [N] of the angle between unit vectors [3, N], exact for small ones, too."""
+    x, y, z = (a[j] * b[k] - a[k] * b[j] for j, k in ((1, 2), (2, 0), (0, 1)))
+    result: FloatArray = x * x + y * y + z * z
+    return result
+
+
 class GlossyLobes:
     """A GGX coat over a Lambert base, seen from one direction: what it scatters, and directions to sample.
 
@@ -98,7 +105,8 @@ class GlossyLobes:
         half /= np.sqrt(np.maximum(dot(half, half), np.float32(1e-12)))
         cos_half = dot(self._normal, half)
         alpha2 = self._alpha * self._alpha
-        spread = cos_half * cos_half * (alpha2 - 1) + 1
+        # The squared sine by the cross product: 1 - cos^2 is lost in float32 where the lobe is narrow.
+        spread = cos_half * cos_half * alpha2 + sine2(self._normal, half)
         peak = alpha2 / (_PI * spread * spread)
         lambda_out, lambda_in = smith(cos_out, alpha2), smith(np.maximum(cos_in, np.float32(1e-6)), alpha2)
         common = peak / (4 * cos_out)

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.errors import InputError
+from neurolens.render.checks import FARTHEST_M
 from neurolens.render.mesh import vertex_normals
 from neurolens.render.shapes import MeshSettings
 
 LARGEST_FILE = 500_000_000  # bytes
-FARTHEST_M = 1e9  # squares and products of lengths stay far from the limits of float32
 _LARGEST_HEADER = 100_000
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _OBJ_LINES = {
@@ -137,7 +137,7 @@ def _checked_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[s
     """
     try:
         # A line may go on after a backslash.
-        text = content.decode("utf-8").replace("\\\r\n", " ").replace("\\\n", " ")
+        text = content.decode("utf-8-sig").replace("\\\r\n", " ").replace("\\\n", " ")
     except UnicodeDecodeError as error:
         raise InputError(scene, field, str(path), f"a text file ({error})") from None
     lines, triangles = [""], 0
@@ -158,7 +158,9 @@ def _checked_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[s
 
 
 def _check_indices(scene: Path, field: str, corners: list[str], counts: dict[str, int]) -> None:
-    """Refuse a corner of a face that refers to something that does not come before it."""
+    """Refuse a corner of a face that refers to something that does not come before it, and corners of unlike forms."""
+    if len({tuple(map(bool, corner.split("/"))) for corner in corners}) > 1:  # the loader would take one for another
+        raise InputError(scene, field, " ".join(corners)[:60], "corners of the same form, as in 1/1 2/2 3/3")
     for corner in corners:
         for index, kind in zip(corner.split("/"), ("v", "vt", "vn"), strict=False):
             if index and int(index) > counts[kind]:

@@ -24,11 +24,22 @@ def read_picture(scene: Path, field: str, path: Path, most: int = LARGEST_PICTUR
         with Image.open(path) as picture:
             if max(picture.size) > most:
                 raise InputError(scene, field, str(path), f"a picture of at most {most} pixels a side")
-            return srgb_to_linear(np.asarray(picture.convert("RGB"), np.float32) / 255)
+            return srgb_to_linear(_encoded(scene, field, path, picture))
     except FileNotFoundError:
         raise InputError(scene, field, str(path), "a picture that exists") from None
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(scene, field, str(path), f"a readable picture ({error})") from None
+
+
+def _encoded(scene: Path, field: str, path: Path, picture: Image.Image) -> FloatArray:
+    """Values [H, W, 3] from 0 to 1 of an 8-bit picture, or a grey one of 16 bits, which Pillow would clip to 8."""
+    if picture.mode.startswith("I;16"):
+        grey: FloatArray = np.asarray(picture, np.float32) / np.float32(65535)
+        return np.stack([grey] * 3, axis=-1)
+    if picture.mode in ("I", "F"):
+        raise InputError(scene, field, str(path), "a picture of 8 or 16 bits a channel")
+    colours: FloatArray = np.asarray(picture.convert("RGB"), np.float32) / np.float32(255)
+    return colours
 
 
 def read_environment(scene: Path, field: str, path: Path) -> FloatArray:

@@ -25,6 +25,7 @@ from neurolens.render.sampler import PathKeys, Sampler
 from neurolens.render.world import GLASS, GLOSSY, MIRROR, World
 
 _ONE_OVER_PI = np.float32(1 / np.pi)
+_STEP_M = np.float32(1e-4)
 SPECULAR = np.float32(np.inf)  # density of a direction that has no choice
 
 
@@ -102,7 +103,7 @@ class Vertex:
         self.facing, self.shading = normal, shading
         # How far to step off the surface, m: the rounding of a hit grows with the distance travelled.
         self._reach = distance * np.float32(1e-6)
-        self._reach += np.float32(1e-4)
+        self._reach += _STEP_M
 
         self.base = world.reflectance(surface[:mirror], point[:, :mirror], paths.bins[:mirror])
         if rough > glossy:
@@ -122,7 +123,7 @@ class Vertex:
         inside = np.flatnonzero(~self.outside[self.glass])
         rows = inside + self.glass.start
         absorbed = self.world.palette.look_up(self.world.absorption_row.take(surface[inside]), self.paths.bins[rows])
-        absorbed *= -distance[inside]
+        absorbed *= -(distance[inside] + _STEP_M)  # the ray set out that far from where it entered
         self.paths.throughput[..., rows] *= np.exp(absorbed)
 
     def start(self, side: FloatArray | None = None) -> FloatArray:

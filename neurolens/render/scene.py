@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from neurolens.render.checks import BLACK, Vector, length, require, require_finite, require_positive
+from neurolens.render.checks import BLACK, Vector, length, require, require_place, require_positive
 from neurolens.render.filmsettings import FilmSettings
 from neurolens.render.illuminants import IlluminantSettings
 from neurolens.render.lightsettings import Environment, PointLight, Sky, SpotLight
@@ -50,7 +50,7 @@ class CameraSettings:
 
     def __post_init__(self) -> None:
         for field in ("position_m", "look_at_m", "up"):
-            require_finite(field, getattr(self, field))
+            require_place(field, getattr(self, field))
         axis = tuple(b - a for a, b in zip(self.position_m, self.look_at_m, strict=True))
         require(length(axis) > 0, "look_at_m", self.look_at_m, "a point other than position_m")  # type: ignore[arg-type]
         across = _cross(axis, self.up)  # type: ignore[arg-type]

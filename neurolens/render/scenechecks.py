@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,18 @@ def _check_texture(
             raise InputError(path, field, material.texture, "a mesh file with texture coordinates, or no texture")
     elif kind not in ("quads", "discs") and texture.kind == "image" and texture.size_m is None:
         raise InputError(path, f"textures.{material.texture}.size_m", "(missing)", "width, height in m")
+
+
+def files_named(tables: Any) -> Iterator[Path]:
+    """Every file that a scene's tables name, as it is written there."""
+    if isinstance(tables, Path):
+        yield tables
+    elif is_dataclass(tables):
+        for field in fields(tables):
+            yield from files_named(getattr(tables, field.name))
+    elif isinstance(tables, (Mapping, tuple)):
+        for item in tables.values() if isinstance(tables, Mapping) else tables:
+            yield from files_named(item)
 
 
 def check_camera(path: Path, settings: SceneSettings, triangles: Sequence[TriangleSet]) -> None:

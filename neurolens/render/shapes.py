@@ -7,12 +7,16 @@ from pathlib import Path
 
 from neurolens.render.checks import (
     BLACK,
+    SMALLEST_M,
     Vector,
     length,
     require,
+    require_angle,
+    require_direction,
     require_emission,
-    require_finite,
+    require_place,
     require_positive,
+    require_size,
 )
 
 
@@ -25,9 +29,8 @@ class Plane:
     material: str
 
     def __post_init__(self) -> None:
-        require_finite("point_m", self.point_m)
-        require_finite("normal", self.normal)
-        require(length(self.normal) > 0, "normal", self.normal, "a direction")
+        require_place("point_m", self.point_m)
+        require_direction("normal", self.normal)
 
 
 @dataclass(frozen=True)
@@ -47,11 +50,12 @@ class Quad:
 
     def __post_init__(self) -> None:
         for field in ("corner_m", "edge_u_m", "edge_v_m"):
-            require_finite(field, getattr(self, field))
+            require_place(field, getattr(self, field))
         u, v = length(self.edge_u_m), length(self.edge_v_m)
-        require(u > 0, "edge_u_m", self.edge_u_m, "an edge longer than 0")
+        require(u >= SMALLEST_M, "edge_u_m", self.edge_u_m, f"an edge of at least {SMALLEST_M:g} m")
         cosine = sum(a * b for a, b in zip(self.edge_u_m, self.edge_v_m, strict=True))
-        require(v > 0 and abs(cosine) <= 1e-5 * u * v, "edge_v_m", self.edge_v_m, "an edge perpendicular to edge_u_m")
+        right = v >= SMALLEST_M and abs(cosine) <= 1e-5 * u * v
+        require(right, "edge_v_m", self.edge_v_m, "an edge perpendicular to edge_u_m")
         _check_light(self.material, self.emission)
 
 
@@ -67,10 +71,9 @@ class Disc:
     illuminant: str = "D65"
 
     def __post_init__(self) -> None:
-        require_finite("centre_m", self.centre_m)
-        require_finite("normal", self.normal)
-        require(length(self.normal) > 0, "normal", self.normal, "a direction")
-        require_positive("radius_m", self.radius_m)
+        require_place("centre_m", self.centre_m)
+        require_direction("normal", self.normal)
+        require_size("radius_m", self.radius_m)
         _check_light(self.material, self.emission)
 
 
@@ -85,8 +88,8 @@ class Sphere:
     illuminant: str = "D65"
 
     def __post_init__(self) -> None:
-        require_finite("centre_m", self.centre_m)
-        require_positive("radius_m", self.radius_m)
+        require_place("centre_m", self.centre_m)
+        require_size("radius_m", self.radius_m)
         _check_light(self.material, self.emission)
 
 
@@ -134,8 +137,8 @@ class Room:
 
 
 def _check_corners(low: Vector, high: Vector) -> None:
-    require_finite("min_m", low)
-    require_finite("max_m", high)
+    require_place("min_m", low)
+    require_place("max_m", high)
     require(all(a < b for a, b in zip(low, high, strict=True)), "max_m", high, "above min_m in x, y and z")
 
 
@@ -162,5 +165,5 @@ class MeshSettings:
         ok = inline if self.file is None else not any_inline
         require(ok, "file", self.file or "(missing)", "either file, or vertices_m and faces")
         require_positive("scale", self.scale)
-        require_finite("rotate_y_deg", (self.rotate_y_deg,))
-        require_finite("translate_m", self.translate_m)
+        require_angle("rotate_y_deg", self.rotate_y_deg)
+        require_place("translate_m", self.translate_m)

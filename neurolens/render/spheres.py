@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
 from neurolens.render.primitives import NEAREST, IntArray, Rays, dot
+
+_LARGE_M = 1000.0  # the rounding of float32 puts the surface of larger spheres behind the rays that leave it
 
 
 class Spheres:
@@ -23,8 +27,9 @@ class Spheres:
 
     def __init__(self, first: int, centres: NDArray[np.float64], radii: NDArray[np.float64]) -> None:
         self.first, self.count = first, len(radii)
-        self._centre = centres.T.astype(np.float32)
-        self._radius = radii.astype(np.float32)
+        self._kind: type[np.floating[Any]] = np.float64 if radii.max() > _LARGE_M else np.float32
+        self._centre: Any = centres.T.astype(self._kind)
+        self._radius: Any = radii.astype(self._kind)
         # A hair of 2e-6 of the squared distances covers the rounding of the products.
         slack, ones = 2e-6, np.ones(self.count)
         constant = radii**2 - (1 - slack) * np.sum(centres**2, axis=1)
@@ -58,7 +63,9 @@ class Spheres:
         The discriminant comes from the distance between centre and ray, which stays exact in float32 for a small
         sphere far away (Haines et al. 2019, "Precision improvements for ray/sphere intersection").
         """
-        direction = rays.direction.take(ray, axis=1)
+        direction: Any = rays.direction.take(ray, axis=1).astype(self._kind, copy=False)
+        if self._kind is np.float64:
+            direction /= np.sqrt(dot(direction, direction))
         to_centre = self._centre.take(number, axis=1) - rays.origin.take(ray, axis=1)
         radius = self._radius.take(number)
         middle = dot(to_centre, direction)
@@ -69,7 +76,7 @@ class Spheres:
         distance = middle - half
         np.copyto(distance, middle + half, where=distance < NEAREST)
         hit = np.flatnonzero((half2 > 0) & (distance > NEAREST) & (distance < best.take(ray)))
-        ray, distance = ray[hit], distance[hit]
+        ray, distance = ray[hit], distance[hit].astype(np.float32, copy=False)
         np.minimum.at(best, ray, distance)
         won = distance == best.take(ray)
         found[ray[won]] = self.first + number[hit[won]]

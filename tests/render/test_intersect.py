@@ -143,6 +143,21 @@ def test_small_sphere_far_away_is_hit_within_its_radius() -> None:
     assert np.all(hit[np.abs(offset) < 0.0099]) and not np.any(hit[np.abs(offset) > 0.0101])
 
 
+@pytest.mark.parametrize("radius_m", [1e3, 1e5, 6.4e6])
+def test_the_ground_of_a_planet_is_where_it_is(radius_m: float) -> None:
+    # In float32 the surface of a large sphere is metres thick, and swallows rays that leave it.
+    made = world(spheres=[{"centre_m": [0, -radius_m, 0], "radius_m": radius_m, "emission": [1, 1, 1]}])
+    direction = RANDOM.normal(size=(3, 1000)).astype(np.float32)
+    direction[1] = np.abs(direction[1]) + 1e-2
+    direction /= np.linalg.norm(direction, axis=0)
+    origin = np.repeat(np.float32([[0.0], [1e-3], [0.0]]), 1000, axis=1)
+    assert not np.isfinite(made.nearest(Rays.of(origin, direction))[0]).any()
+    steep = direction[1] > 0.5
+    origin[1] = 0.5
+    distance, _ = made.nearest(Rays.of(origin[:, steep], -direction[:, steep]))
+    assert np.allclose(distance, 0.5 / direction[1, steep], rtol=1e-3)
+
+
 def test_smooth_normals_follow_the_curve() -> None:
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)

@@ -105,6 +105,18 @@ def test_variance_falls_as_one_over_the_number_of_samples() -> None:
     assert -1.6 < slope < -0.93
 
 
+@pytest.mark.parametrize("thickness_m", [2e-4, 1e-3, 0.1])
+def test_a_thin_pane_absorbs_as_much_as_its_thickness_says(thickness_m: float) -> None:
+    # Index near 1: nothing is reflected. Half of the light is left after the thickness.
+    glass = {"kind": "glass", "n_d": 1.0001, "transmittance": [0.5] * 3, "transmittance_depth_m": thickness_m}
+    made = world(
+        materials={"g": glass},
+        boxes=[{"min_m": [-1, -1, -thickness_m], "max_m": [1, 1, 0], "material": "g"}],
+        environment={"colour": [1, 1, 1]},
+    )
+    assert np.allclose(radiance(made, [0, 0, 1], [0, 0, 0], samples=64), 0.5, rtol=0.01)
+
+
 @pytest.mark.parametrize("lanes", [1, 4])
 def test_glass_absorbs_by_beer_and_lambert(lanes: int) -> None:
     glass = {"kind": "glass", "n_d": 1.5, "transmittance": [0.5, 0.5, 0.5], "transmittance_depth_m": 0.1}

@@ -76,6 +76,32 @@ def test_glossy_scattering_is_reciprocal() -> None:
     assert np.allclose(forth / b[2], back / a[2], rtol=1e-3)
 
 
+@pytest.mark.parametrize("degrees", [5, 45, 80])
+def test_narrowest_highlight_is_as_dense_as_ggx_says_whatever_the_normal(degrees: float) -> None:
+    # Tilted normals have rounding in all components; 1 - cos^2 of the half vector would drown in it.
+    normal = unit(np.array([[0.3], [-0.8], [0.52]]))
+    out = normal * math.cos(math.radians(degrees)) + unit(np.cross(normal, [[1], [0.2], [0.1]], axis=0)) * math.sin(
+        math.radians(degrees)
+    )
+    alpha = 0.02**2
+    lobes = glossy(np.repeat(np.float32(normal), 20_000, 1), np.repeat(np.float32(out), 20_000, 1), 0.0, 1.0, alpha)
+    inward = lobes.sample(RANDOM.random((2, 20_000), np.float32), np.zeros(20_000, np.float32))
+    value, density = lobes.evaluate(inward)
+    assert np.all(np.isfinite(value / density))
+    half = unit(np.float64(inward) + np.float32(out))
+    tan2 = np.sum(np.cross(half, normal, axis=0) ** 2, axis=0) / np.sum(half * normal, axis=0) ** 2
+    cos_out = math.cos(math.radians(degrees))
+    peak = alpha**2 / (math.pi * np.sum(half * normal, axis=0) ** 4 * (alpha**2 + tan2) ** 2)
+    expected = peak / (4 * cos_out) * 2 / (1 + math.sqrt(1 + (alpha * math.tan(math.radians(degrees))) ** 2))
+    # Far out, where a millionth of the peak is left, the rest of the lobes shows.
+    near = expected > 1e-4 * expected.max()
+    assert near.mean() > 0.9 and np.all(np.abs(density / expected - 1)[near] < 5e-3)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=0)
+
+
 def test_fresnel_known_values() -> None:
     index = np.float32([1.5] * 3)
     cosines = np.float32([1.0, math.cos(math.atan(1.5)), 1e-4])

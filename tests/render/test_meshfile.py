@@ -61,7 +61,7 @@ def test_every_format_gives_the_same_solid(form: str, tmp_path: Path) -> None:
 def test_nothing_is_merged_or_mended(tmp_path: Path) -> None:
     # Two triangles in one place, one of them the other way round, and two vertices in one place.
     path = tmp_path / "a.obj"
-    path.write_text("\tv 0 0 0 # origin\nv 1 0 0\nv  0 1 0\n v 0 1 0\nf 1 2 3\n f\t1 4 2\n")
+    path.write_text("\ufeffv 0 0 0 # origin\nv 1 0 0\nv  0 1 0\n v 0 1 0\nf 1 2 3\n f\t1 4 2\n", "utf-8")
     mesh = read_file(HERE, "file", path)
     assert len(mesh.faces) == 2 and enclosed(TriangleSet(mesh.vertices + [0, 0, 1], mesh.faces)) == pytest.approx(0)
 
@@ -141,6 +141,7 @@ def test_normals_of_the_file_are_used_and_turned(smooth: bool | None, tilted: bo
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "line 4.*'9'.*v from 1 to 3"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/2\n", "line 5.*'3/2'.*vt from 1 to 1"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 2//1 3//1\n", "line 4.*vn from 1 to 0"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nf 2/1 3 4\n", "line 6.*corners of the same form"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "degenerate"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1e400 0\nf 1 2 3\n", "finite"),
         ("a.obj", b"\xff\xfe\x00v", "text file"),

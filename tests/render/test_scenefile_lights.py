@@ -39,6 +39,8 @@ SKY = {"sun_elevation_deg": 30}
         ({"points": [POINT | {"intensity": [1, -1, 0]}]}, "intensity"),
         ({"points": [POINT | {"intensity": [1, float("inf"), 0]}]}, "intensity"),
         ({"points": [POINT | {"position_m": [0, float("inf"), 0]}]}, "position_m"),
+        ({"points": [POINT | {"position_m": [0, 1e10, 0]}]}, r"position_m.*within 1e\+09 m"),
+        ({"points": [POINT | {"intensity": [1e39, 1, 1]}]}, r"intensity.*0 to 1e\+18"),
         ({"points": [POINT, POINT | {"illuminant": "moon"}]}, r"points\[1\].illuminant.*D65"),
         ({"points": [POINT | {"emission": [1, 1, 1]}]}, r"points\[0\].emission.*unknown key"),
         ({"spots": [SPOT | {"look_at_m": [0, 2, 0]}]}, r"spots\[0\].look_at_m"),
@@ -47,6 +49,10 @@ SKY = {"sun_elevation_deg": 30}
         ({"spots": [SPOT | {"illuminant": "30 K"}]}, r"spots\[0\].illuminant"),
         ({"discs": [DISC | {"normal": [0, 0, 0]}]}, r"discs\[0\].normal"),
         ({"discs": [DISC | {"radius_m": -1}]}, r"discs\[0\].radius_m"),
+        ({"spheres": [SPHERE | {"radius_m": 1e-40}]}, r"spheres\[0\].radius_m.*1e-09 to 1e\+09"),
+        ({"spheres": [SPHERE | {"radius_m": float("nan")}]}, r"spheres\[0\].radius_m"),
+        ({"boxes": [{"min_m": [-1e30, 0, 0], "max_m": [1, 1, 1], "material": "m"}]}, r"boxes\[0\].min_m"),
+        ({"environment": {"colour": [1e39, 1, 1]}}, "environment.colour"),
         ({"discs": [DISC | {"material": "n"}]}, r"discs\[0\].material.*one of: m"),
         ({"discs": [DISC | {"emission": [1, 1, 1], "illuminant": "FL2"}]}, r"discs\[0\].illuminant"),
         ({"discs": [{k: v for k, v in DISC.items() if k != "material"}]}, "material"),
@@ -56,6 +62,11 @@ SKY = {"sun_elevation_deg": 30}
         ({"sky": SKY | {"turbidity": 1}}, "sky.turbidity.*2 to 10"),
         ({"sky": SKY | {"sun_azimuth_deg": float("inf")}}, "sky.sun_azimuth_deg"),
         ({"sky": SKY | {"white_kcd_per_m2": 0}}, "sky.white_kcd_per_m2"),
+        ({"sky": SKY | {"sun_azimuth_deg": 1e300}}, "sky.sun_azimuth_deg.*36000"),
+        ({"discs": [DISC | {"normal": [0, 1e200, 0]}]}, r"discs\[0\].normal.*a direction"),
+        ({"materials": {"m": GLASS | {"transmittance": [1, 1, 1], "transmittance_depth_m": 1e-300}}}, "a length from"),
+        ({"environment": {"file": "a.png", "rotate_y_deg": 1e300}}, "environment.rotate_y_deg"),
+        ({"environment": {"file": "a.png", "scale": 1e300}}, "environment.scale"),
         ({"sky": SKY, "environment": {"colour": [1, 1, 1]}}, "either sky or environment"),
         ({"environment": {}}, "environment.*one of: colour"),
         ({"environment": {"file": "a.png", "colour": [1, 1, 1]}}, "environment.*several"),
@@ -118,6 +129,17 @@ def test_bad_environments_are_named(shape: tuple[int, int], value: float, messag
     _write_exr(tmp_path / "a.exr", pixels)
     with pytest.raises(InputError, match=f"environment.file.*{message}"):
         scene_from_tables({"camera": CAMERA, "environment": {"file": "a.exr"}}, tmp_path / "s.toml")
+
+
+def test_grey_pictures_of_16_bits_are_as_bright_as_those_of_8(tmp_path: Path) -> None:
+    grey = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    Image.fromarray(grey).save(tmp_path / "8.png")
+    Image.fromarray(grey.astype(np.uint16) * 257).save(tmp_path / "16.png")
+    Image.fromarray(grey.astype(np.float32)).save(tmp_path / "32.tiff")
+    few, many = (pictures.read_picture(tmp_path, "file", tmp_path / name) for name in ("8.png", "16.png"))
+    assert few.shape == (16, 16, 3) and few.max() == 1 and np.allclose(few, many, atol=1e-6)
+    with pytest.raises(InputError, match="8 or 16 bits"):
+        pictures.read_picture(tmp_path, "file", tmp_path / "32.tiff")
 
 
 def test_broken_and_large_environments_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
