@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from neurolens.surrogates.bases import invariant_exponents, raw_exponents, solve, vector_columns, vector_gram
 from neurolens.surrogates.cores import monomials
-from neurolens.surrogates.fits.selection import Sweep, forward, matching_pursuit, replace_terms
+from neurolens.surrogates.fits.selection import SPANNED, Sweep, backward, forward, matching_pursuit, replace_terms
 from neurolens.surrogates.lightfield import LightField
 
 Floats = NDArray[np.float64]
@@ -120,6 +120,45 @@ def test_dependent_columns_are_not_chosen() -> None:
         assert np.linalg.matrix_rank(columns[sweep.chosen]) == 6
         replace_terms(sweep)
         assert np.linalg.matrix_rank(columns[sweep.chosen]) == 6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nearly_parallel_variables_do_not_spoil_the_table(seed: int) -> None:
+    """Columns that pass one by one, and together leave nothing but rounding of each other (Berk 1977).
+
+    The residual told must be that of the chosen columns: planes of the light field are compared by it.
+    """
+    r = 2 * torch.rand((4, 400), generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1
+    p, u = r[:2] / 1.5, (r[:2] + 0.03 * r[2:]) / 1.5
+    rays = LightField(p, u, torch.zeros(400, dtype=torch.float64))
+    features = monomials(rays.invariants(), invariant_exponents(5, dispersive=False))
+    outputs = r[2:] / (1 + (p * p).sum(0)).sqrt() + p * torch.exp(-(r[2:] ** 2).sum(0))
+    columns, wanted = vector_columns(features, rays).numpy(), outputs.reshape(1, -1).numpy()
+    unit = columns / np.linalg.norm(columns, axis=1, keepdims=True)
+    found = []
+    for terms in (10, 20, 40):
+        sweep = Sweep(*vector_gram(features, rays, outputs[None]), (wanted**2).sum(1))
+        for choose in (lambda s, t: forward(s, t + t // 2), backward, lambda s, t: replace_terms(s)):
+            choose(sweep, terms)
+            exact = residual(unit, wanted, sweep.chosen)
+            assert sweep.residual == pytest.approx(exact, rel=5e-3)
+            # By QR, what is left of each column beside the others.
+            inverse = np.linalg.inv(np.linalg.qr(unit[sweep.chosen].T).R)
+            assert 1 / (inverse**2).sum(1).max() > 0.5 * SPANNED
+        found.append(exact)
+    assert found == sorted(found, reverse=True)
+
+
+def test_a_copy_of_a_chosen_column_is_not_taken_in() -> None:
+    rng = np.random.default_rng(0)
+    base = rng.normal(size=(3, 100))
+    sweep = sweep_of(np.vstack([base, 2 * base[:1], np.zeros((1, 100))]), rng.normal(size=(2, 100)))
+    for k in range(5):
+        sweep.add(k)
+    assert sweep.chosen == [0, 1, 2]
+    before = sweep.residual
+    sweep.drop(3)
+    assert sweep.chosen == [0, 1, 2] and sweep.residual == before
 
 
 def test_omp_looks_at_correlation_and_ols_at_what_is_left() -> None:

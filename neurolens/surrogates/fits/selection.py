@@ -19,6 +19,12 @@ Rule = Literal["omp", "ols"]
 
 # A candidate of which less than this share is left after orthogonalisation is a combination of the chosen ones.
 DEPENDENT = 1e-11
+# Nor may a candidate leave less than this share of any chosen column. The test above looks at a column as it comes in;
+# later ones take from it too, and together may leave nothing but rounding (Berk 1977, "Tolerance and Condition in
+# Regression Computations"; Frane 1977, "A Note on Checking Tolerance in Matrix Inversion and Regression").
+SPANNED = 1e-12
+# A share of this size is rounding of the Gram matrix, about fifty units in the last place.
+_NOTHING = 1e-14
 
 
 class Sweep:
@@ -43,16 +49,28 @@ class Sweep:
         return float(np.trace(self._table[self.count :, self.count :]))
 
     def add(self, k: int) -> None:
-        self._sweep(k, 1.0)
-        self.chosen.append(k)
+        """Take a column in, unless nothing but rounding is left of it."""
+        if self._table[k, k] > _NOTHING:
+            self._sweep(k, 1.0)
+            self.chosen.append(k)
 
     def drop(self, k: int) -> None:
-        self._sweep(k, -1.0)
+        """Take a column out, if it is in."""
+        if k not in self.chosen:
+            return
         self.chosen.remove(k)
+        if self._table[k, k] < -0.999:
+            self._sweep(k, -1.0)
+        else:  # more than all of it would be left: rounding has spoilt the pivot
+            self.refresh()
 
     def refresh(self) -> None:
         """Sweep the chosen columns again from the start, which clears the rounding of many updates."""
-        chosen, self.chosen, self._table = self.chosen, [], self._start.copy()
+        self.restart(self.chosen)
+
+    def restart(self, chosen: list[int]) -> None:
+        """Sweep these columns into the table as it was at the start."""
+        self.chosen, self._table = [], self._start.copy()
         for k in chosen:
             self.add(k)
 
@@ -62,14 +80,27 @@ class Sweep:
         correlation = (self._table[: self.count, self.count :] ** 2).sum(1)
         usable = left > DEPENDENT
         usable[self.chosen] = False
+        usable[usable] = self._spare(np.flatnonzero(usable))
         gain = correlation / np.where(usable, left, 1.0) if rule == "ols" else correlation
         return np.where(usable, gain, -1.0)
+
+    def _spare(self, candidates: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Which candidates [C] leave every chosen column a share of at least `SPANNED`."""
+        t, chosen = self._table, self.chosen
+        if not chosen:
+            return np.ones(len(candidates), dtype=np.bool_)
+        # A sweep adds to the inverse of what is left of each chosen column.
+        grown = t[np.ix_(chosen, candidates)]
+        grown *= grown
+        grown /= np.diag(t)[candidates]
+        grown -= np.diag(t)[chosen, None]
+        return np.asarray(grown.max(0) <= 1 / SPANNED)
 
     def costs(self) -> Floats:
         """[len(chosen)] how much the residual would grow without each chosen column."""
         t, chosen = self._table, self.chosen
-        # The pivot of a column swept in is -1 / (what is left of it beside the others).
-        return (t[chosen, self.count :] ** 2).sum(1) / np.maximum(-t[chosen, chosen], 1e-300)
+        # The pivot of a column swept in is -1 / (what is left of it beside the others), which is at most all of it.
+        return (t[chosen, self.count :] ** 2).sum(1) / np.maximum(-t[chosen, chosen], 0.999)
 
     def _sweep(self, k: int, sign: float) -> None:
         t = self._table
@@ -127,7 +158,7 @@ def replace_terms(sweep: Sweep, passes: int = 10, among: list[int] | None = None
         allowed[among] = True
     exchanged = 0
     for _ in range(passes):
-        before = exchanged
+        before, known, residual = exchanged, list(sweep.chosen), sweep.residual
         for k in list(sweep.chosen):
             with_k = sweep.residual
             sweep.drop(k)
@@ -141,6 +172,10 @@ def replace_terms(sweep: Sweep, passes: int = 10, among: list[int] | None = None
             sweep.add(best)
             exchanged += best != k
         sweep.refresh()
+        # Exchanges for gains within the rounding may add up to a loss.
+        if sweep.residual > residual:
+            sweep.restart(known)
+            return before
         if exchanged == before:
             break
     return exchanged
