@@ -152,7 +152,7 @@ class LightCamera(Camera, Protocol):
 
 
 class NaturalCamera(Camera, Protocol):
-    """A camera that tells natural vignetting from the rest; all cameras of this package do."""
+    """A camera that tells natural vignetting from the rest; all cameras of this package do but `Vignetted`."""
 
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
         """The part [N] of the weights of `sample` that is the cos^4 law (of a fisheye projection, its own law).

@@ -6,6 +6,7 @@ import ctypes
 import hashlib
 import os
 import platform
+import shlex
 import shutil
 import stat
 import subprocess
@@ -25,16 +26,31 @@ _KEPT = 64  # libraries of 50 to 200 kB
 
 
 def find_compiler() -> str:
-    """A C compiler: $CC, else cc, gcc or clang.
+    """A C compiler: $CC, which may have arguments ("ccache gcc"), else cc, gcc or clang.
 
     Raises:
-        InputError: none is there.
+        InputError: none is there, or $CC names none.
     """
-    for name in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
-        found = shutil.which(name) if name else None
+    asked = os.environ.get("CC", "").strip()
+    if asked:
+        if shutil.which(_words(asked)[0]) is None:
+            raise InputError("compiler", "CC", asked, "a C compiler that is there, or nothing: cc, gcc or clang")
+        return asked
+    for name in ("cc", "gcc", "clang"):
+        found = shutil.which(name)
         if found:
             return found
     raise InputError("compiler", "CC", "(none found)", "a C compiler: $CC, cc, gcc or clang")
+
+
+def _words(compiler: str) -> list[str]:
+    """The command of a compiler; a path with spaces that is there is one word."""
+    if shutil.which(compiler):
+        return [compiler]
+    try:
+        return shlex.split(compiler)
+    except ValueError as error:
+        raise InputError("compiler", "CC", compiler, f"a command ({error})") from None
 
 
 def compile_c(source: str, library: Path, flags: tuple[str, ...] = FLAGS) -> str:
@@ -44,7 +60,7 @@ def compile_c(source: str, library: Path, flags: tuple[str, ...] = FLAGS) -> str
         InputError: there is no compiler, or it fails; the message says how.
     """
     compiler = find_compiler()
-    done = _run([compiler, *flags, "-shared", "-fPIC", "-x", "c", "-", "-o", str(library), "-lm"], source)
+    done = _run([*_words(compiler), *flags, "-shared", "-fPIC", "-x", "c", "-", "-o", str(library), "-lm"], source)
     if done.returncode or not library.is_file():
         said = " ".join(next((line for line in done.stderr.splitlines() if "error" in line), done.stderr).split())
         raise InputError(compiler, "compile", f"({said[:200] or 'no word'})", "a C compiler that knows C99")
@@ -93,7 +109,7 @@ def _key(source: str) -> str:
 
 @cache
 def _compiler_and_processor(compiler: str) -> str:
-    asked = _run([compiler, "--version"])
+    asked = _run([*_words(compiler), "--version"])
     processor = platform.processor()
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()

@@ -77,3 +77,12 @@ def test_no_compiler_and_one_that_fails(monkeypatch: pytest.MonkeyPatch, tmp_pat
     monkeypatch.setenv("CC", "")
     with pytest.raises(InputError, match="a C compiler"):
         compiler.load_compiled(SOURCE)
+
+
+def test_a_compiler_may_have_arguments_and_must_be_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", f"{compiler.find_compiler()} -DANSWER=43")
+    assert compiler.load_compiled(SOURCE.replace("42", "ANSWER")).answer() == 43
+    for missing in ("no-such-compiler", "'unclosed"):
+        monkeypatch.setenv("CC", missing)
+        with pytest.raises(InputError, match="CC"):
+            compiler.load_compiled(SOURCE)
