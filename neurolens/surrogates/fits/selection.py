@@ -78,23 +78,21 @@ class Sweep:
         """[M] gain of every candidate: squared correlation with the residual ("omp") or its true fall ("ols")."""
         left = np.diag(self._table)[: self.count]
         correlation = (self._table[: self.count, self.count :] ** 2).sum(1)
-        usable = left > DEPENDENT
+        usable = left > np.maximum(DEPENDENT, self._needed())
         usable[self.chosen] = False
-        usable[usable] = self._spare(np.flatnonzero(usable))
         gain = correlation / np.where(usable, left, 1.0) if rule == "ols" else correlation
         return np.where(usable, gain, -1.0)
 
-    def _spare(self, candidates: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Which candidates [C] leave every chosen column a share of at least `SPANNED`."""
-        t, chosen = self._table, self.chosen
-        if not chosen:
-            return np.ones(len(candidates), dtype=np.bool_)
-        # A sweep adds to the inverse of what is left of each chosen column.
-        grown = t[np.ix_(chosen, candidates)]
-        grown *= grown
-        grown /= np.diag(t)[candidates]
-        grown -= np.diag(t)[chosen, None]
-        return np.asarray(grown.max(0) <= 1 / SPANNED)
+    def _needed(self) -> Floats | float:
+        """[M] what must be left of each candidate for every chosen column to keep a share of `SPANNED` beside it."""
+        if not self.chosen:
+            return 0.0
+        # Sweeping k in adds table[j, k]^2 / left[k] to the inverse of what is left of j, which is -table[j, j].
+        spare = np.maximum(1 / SPANNED + np.diag(self._table)[self.chosen], 1e-30)
+        across = self._table[self.chosen, : self.count]
+        across *= across
+        across /= spare[:, None]
+        return np.asarray(across.max(0))
 
     def costs(self) -> Floats:
         """[len(chosen)] how much the residual would grow without each chosen column."""
