@@ -45,6 +45,14 @@ def prepared(name: str = "laikin_double_gauss_50") -> Prepared:
 
 
 @cache
+def anamorphic() -> Prepared:
+    """Pairs of a lens with cylinders, focused at infinity: the search for its pupil takes seconds."""
+    lens = read_lens(LENSES / "cooke_anamorphic_42.toml").at()
+    domain = domain_of(lens, film_radius_mm=10.0, focus_m=(math.inf, math.inf))
+    return prepare(make_pairs(lens, domain, PairSettings(5000, 3000, 5000)))
+
+
+@cache
 def model(kind: str) -> LensModel:
     """One of `KINDS`: each kind of core, first order, and a lens that sees beyond 75 degrees."""
     if kind == "invariants":

@@ -177,7 +177,7 @@ def test_anamorphic_outlines_lose_no_light_between_the_azimuths_they_are_sought_
     lens = lens_models.lens(name)
     film_mm = (20.0, 15.0)
     exact = ExactCamera(lens, film_mm=film_mm, focus_m=3.0)
-    outline, side = exact.film.outline, 96
+    outline, side = exact.film.outline, 64
     wide = replace(outline, x=np.float32(1.5) * outline.x, y=np.float32(1.5) * outline.y)
     square = stratified(side)
     beyond = np.abs(2 * square - 1).max(0) > 1 / 1.5

@@ -48,7 +48,7 @@ height = 18
 samples = 4
 [scene_domain]
 scene = "ROOT/experiments/scenes/grid.toml"
-model = { method = "ols", terms = 24 }
+model = { method = "ols", terms = 24, planes = false }
 """
 
 

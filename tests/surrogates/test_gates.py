@@ -86,7 +86,7 @@ def test_where_no_ray_is_lost_there_are_rims_alone() -> None:
 @pytest.mark.parametrize(
     ("settings", "most"),
     [
-        (ModelSettings("ols", terms=60), 0.005),
+        (ModelSettings("ols", terms=60, planes=False), 0.005),
         (ModelSettings("dense", basis="raw", degree=4), 0.03),
         (ModelSettings("mlp", units=12, steps=15), 0.03),
         (ModelSettings("thick"), 0.06),

@@ -16,16 +16,14 @@ from neurolens import status as st
 from neurolens.errors import InputError
 from neurolens.evaluate.benches.compiled_source import FLAGS, CompiledSource, find_compiler
 from neurolens.evaluate.speed import Unavailable
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.programs.c import literal
 from neurolens.programs.expressions import Program
 from neurolens.programs.tanh import add_tanh
 from neurolens.surrogates.card import card_of
-from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
-from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
+from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel, Prediction
-from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.source.fused import ALL, RAY_ONLY, SCENE_RAY, Fixed, Parts, fused_program
 from neurolens.surrogates.source.writer import export_source
 from neurolens.surrogates.specialise import Fix, fixed_models
@@ -44,11 +42,8 @@ def model_of(kind: str) -> LensModel:
 
 @pytest.mark.slow
 def test_a_lens_with_cylinders() -> None:
-    lens = read_lens(lens_models.LENSES / "cooke_anamorphic_42.toml").at()
-    domain = domain_of(lens, film_radius_mm=10.0, focus_m=(math.inf, math.inf))
-    known = prepare(make_pairs(lens, domain, PairSettings(3000, 1000, 3000)))
-    model = fit_model(known, ModelSettings(terms=48, degree=4))
-    film_z, stop = domain.film_z_mm[0], domain.stop_radius_mm
+    model = fit_model(lens_models.anamorphic(), ModelSettings(terms=48, degree=4, planes=False))
+    film_z, stop = model.domain.film_z_mm[0], model.domain.stop_radius_mm
     rays = rays_of(model, COUNT, seed=3)
     found = built(fused_program([model])).rays({**rays, "film_z_mm": film_z, "stop_radius_mm": stop})
     agree(model, found, predict(model, rays, film_z, stop), edge_distance(model, rays, film_z, stop))
