@@ -24,8 +24,7 @@ FILM = (36.0, 24.0)
 @cache
 def camera(kind: str, focus_m: float = 2.0, f_number: float | None = None) -> Camera:
     if kind == "exact":
-        bounds = lens_models.domain().bounds
-        return ExactCamera(lens_models.lens(), film_mm=FILM, focus_m=focus_m, f_number=f_number, bounds=bounds)
+        return lens_models.exact_camera(focus_m, f_number)
     if kind == "exact, own bounds":
         return ExactCamera(lens_models.lens(), film_mm=FILM, focus_m=focus_m, f_number=f_number)
     if kind == "thin":
