@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+from contextlib import redirect_stdout
+from functools import cache
+from io import StringIO
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +18,15 @@ def run_json(capsys: pytest.CaptureFixture[str], *args: object) -> dict[str, Any
     """Run a command with --json and parse all of its stdout."""
     assert main([*map(str, args), "--json"]) == 0
     data: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return data
+
+
+@cache
+def described(path: Path) -> dict[str, Any]:
+    """What `neurolens lens PATH --json` prints, run once however many tests read it; not to be changed."""
+    with redirect_stdout(StringIO()) as out:
+        assert main(["lens", str(path), "--json"]) == 0
+    data: dict[str, Any] = json.loads(out.getvalue())
     return data
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from neurolens.cameras.exact import ExactCamera
 from neurolens.errors import NeurolensWarning
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
@@ -38,6 +39,12 @@ def domain(name: str = "laikin_double_gauss_50") -> Domain:
 
 
 @cache
+def exact_camera(focus_m: float, f_number: float | None) -> ExactCamera:
+    """The traced lens on 36 x 24 mm, in the bounds of `domain`: the search for its outline takes a second."""
+    return ExactCamera(lens(), film_mm=(36.0, 24.0), focus_m=focus_m, f_number=f_number, bounds=domain().bounds)
+
+
+@cache
 def prepared(name: str = "laikin_double_gauss_50") -> Prepared:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NeurolensWarning)
@@ -45,14 +52,24 @@ def prepared(name: str = "laikin_double_gauss_50") -> Prepared:
 
 
 @cache
+def anamorphic() -> Prepared:
+    """Pairs of a lens with cylinders, focused at infinity: the search for its pupil takes seconds."""
+    lens = read_lens(LENSES / "cooke_anamorphic_42.toml").at()
+    domain = domain_of(lens, film_radius_mm=10.0, focus_m=(math.inf, math.inf))
+    return prepare(make_pairs(lens, domain, PairSettings(5000, 3000, 5000)))
+
+
+@cache
 def model(kind: str) -> LensModel:
-    """One of `KINDS`: each kind of core, first order, and a lens that sees beyond 75 degrees."""
+    """One of `KINDS`: each kind of core, first order, a lens that sees beyond 75 degrees; or "zones" of the film."""
     if kind == "invariants":
         return fit_model(prepared(), ModelSettings("dense", degree=4))
     if kind == "raw":
         return fit_model(prepared(), ModelSettings("dense", basis="raw", degree=3))
     if kind == "thick":
         return fit_model(prepared(), ModelSettings("thick"))
+    if kind == "zones":
+        return fit_model(prepared(), ModelSettings("ols", terms=16, partitions=2, planes=False))
     if kind == "fisheye":
         return fit_model(prepared("muller_fisheye_100"), ModelSettings("dense", degree=4))
     return _network(prepared(), 12)

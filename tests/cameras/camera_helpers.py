@@ -12,7 +12,6 @@ import numpy as np
 import torch
 
 from neurolens.cameras.build import Shot, make_camera
-from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.vignetting import Vignetted
 from neurolens.optics.radiometry import FilmLight, film_light
@@ -30,8 +29,7 @@ _MODELS = {"polynomial": "ols-60", "network": "mlp-16x2"}
 def camera(kind: str, focus_m: float = 2.0, f_number: float | None = 4.0) -> Any:
     """A camera of a 50 mm lens (14 mm for a fisheye projection) on `FILM`."""
     if kind == "exact":
-        bounds = lens_models.domain().bounds
-        return ExactCamera(lens_models.lens(), film_mm=FILM, focus_m=focus_m, f_number=f_number, bounds=bounds)
+        return lens_models.exact_camera(focus_m, f_number)
     if kind == "exact64":  # the same outline, not searched again
         double = copy(camera("exact", focus_m, f_number))
         double._dtype, double.film = torch.float64, copy(double.film)

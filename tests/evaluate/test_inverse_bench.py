@@ -14,7 +14,7 @@ LENSES = Path(__file__).parents[2] / "lenses"
 
 @pytest.mark.slow
 def test_a_lens_is_measured_and_its_record_read_back(tmp_path: Path) -> None:
-    record = measure_lens(LENSES / "cooke_triplet_50.toml", BenchSettings(rays=2000, uniform=500))
+    record = measure_lens(LENSES / "cooke_triplet_50.toml", BenchSettings(rays=2000, uniform=500, terms=24))
     for dtype in ("float64", "float32"):
         assert record["ours"][dtype]["stop"]["converged"] == record["ours"][dtype]["scene"]["converged"] == 1
     uniform = record["uniform"]

@@ -136,7 +136,8 @@ def test_an_entry_is_fitted_checked_and_timed(tmp_path: Path) -> None:
     (tmp_path / "list.toml").write_text(
         "compile_exact = false\n[pairs]\ntrain = 3000\nheld_out = 3000\nrim = 3000\n"
         f'[[entry]]\nlens = {{ file = "{LENSES}/cooke_triplet_50.toml" }}\n'
-        "models = [{ terms = 12, degree = 4 }, { terms = 20, degree = 5 }]\nbest = true\n"
+        "models = [{ terms = 12, degree = 4, planes = false }, { terms = 20, degree = 5, planes = false }]\n"
+        "best = true\n"
     )
     command = ["bench", "models", "--list", str(tmp_path / "list.toml"), "--out", str(tmp_path / "out"), "--quiet"]
     assert main(command) == 0

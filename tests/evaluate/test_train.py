@@ -36,7 +36,8 @@ terms = 24
 [[model]]
 method = "mlp"
 units = 8
-seconds = 2
+steps = 20
+seconds = 60
 [evaluation]
 vignetting_rays = 20000
 rounds = 1
@@ -48,7 +49,7 @@ height = 18
 samples = 4
 [scene_domain]
 scene = "ROOT/experiments/scenes/grid.toml"
-model = { method = "ols", terms = 24 }
+model = { method = "ols", terms = 24, planes = false }
 """
 
 
@@ -104,7 +105,7 @@ def test_less_to_model_is_modelled_better(run: tuple[Path, dict]) -> None:
 def test_a_model_file_that_was_changed_is_fitted_again(tmp_path: Path) -> None:
     lens = f'lens.file="{ROOT}/lenses/thorlabs_lb1471_biconvex_50.toml"'
     small = ("pairs.train=1000", "pairs.held_out=500", "pairs.rim=500", "evaluation.vignetting_rays=2000")
-    (tmp_path / "a.toml").write_text('title = "a"\n[lens]\nfile = "a"\n[[model]]\nterms = 6\n')
+    (tmp_path / "a.toml").write_text('title = "a"\n[lens]\nfile = "a"\n[[model]]\nterms = 6\nplanes = false\n')
     settings = read_experiment(tmp_path / "a.toml", [lens, *small, "lens.f_number=8", "domain.film_radius_mm=21"])
     lens_ = settings.lens.read()
     prepared = prepare(make_pairs(lens_, settings.domain_of(lens_), settings.pairs))

@@ -76,7 +76,10 @@ def test_a_table_of_something_else_is_not_written_over(tmp_path: Path, capsys: p
 
 
 @pytest.mark.slow
-def test_the_command_writes_rows_and_keeps_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_rows_and_keeps_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("neurolens.evaluate.benches.vignetting.MODEL", ModelSettings("ols", terms=24, planes=False))
     (tmp_path / "vignetting.json").write_text('[{"lens": "other", "domain": "infinity", "failed": "not round"}]')
     command = ["bench", "vignetting", "--only", "petzval", "--domain", "infinity", "--rays", "4000", "--quiet"]
     assert main([*command, "--out", str(tmp_path)]) == 0

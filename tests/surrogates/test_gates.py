@@ -86,7 +86,7 @@ def test_where_no_ray_is_lost_there_are_rims_alone() -> None:
 @pytest.mark.parametrize(
     ("settings", "most"),
     [
-        (ModelSettings("ols", terms=60), 0.005),
+        (ModelSettings("ols", terms=60, planes=False), 0.005),
         (ModelSettings("dense", basis="raw", degree=4), 0.03),
         (ModelSettings("mlp", units=12, steps=15), 0.03),
         (ModelSettings("thick"), 0.06),
@@ -103,14 +103,14 @@ def test_lost_rays_no_longer_pass(name: str, settings: ModelSettings, most: floa
 
 
 def test_zones_have_the_gates_too() -> None:
-    model = fit_model(prepared("singlet"), ModelSettings("ols", terms=30, partitions=2))
+    model = fit_model(prepared("singlet"), ModelSettings("ols", terms=30, partitions=2, planes=False))
     assert false_passes(model, fresh("singlet")) < 0.006
 
 
 @pytest.mark.parametrize("name", ["singlet", "hemisphere"])
 def test_the_graph_tells_the_same(name: str, tmp_path: Path) -> None:
     """Status for status, reasons included, where several gates lie on one surface."""
-    model = fit_model(prepared(name), ModelSettings("ols", terms=40))
+    model = fit_model(prepared(name), ModelSettings("ols", terms=40, planes=False))
     session = onnxruntime.InferenceSession(str(export_onnx(model, tmp_path / "m.onnx")))
     inputs = fresh(name).inputs
     film_z, stop = (np.float32([v]) for v in (model.domain.film_z_mm[0], model.domain.stop_radius_mm))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from lens_models import anamorphic
 
 from neurolens import status as st
 from neurolens.cameras.model import load_model
@@ -17,29 +17,25 @@ from neurolens.errors import InputError
 from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.vignetting import vignetting_errors
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
-from neurolens.surrogates.domain import domain_of, sample_domain
-from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
+from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model
 from neurolens.surrogates.fits.mirror import mirror_exponents
 from neurolens.surrogates.inversion.derivatives import slopes_of
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.onnx.export import export_onnx
-from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 pytestmark = pytest.mark.slow
-LENS = Path(__file__).parents[2] / "lenses" / "cooke_anamorphic_42.toml"
 
 
 @pytest.fixture(scope="module")
-def lens() -> Lens:
-    return read_lens(LENS).at()
+def prepared() -> Prepared:
+    return anamorphic()
 
 
 @pytest.fixture(scope="module")
-def prepared(lens: Lens) -> Prepared:
-    domain = domain_of(lens, film_radius_mm=10.0, focus_m=(math.inf, math.inf))
-    return prepare(make_pairs(lens, domain, PairSettings(5000, 3000, 5000)))
+def lens(prepared: Prepared) -> Lens:
+    return prepared.pairs.lens
 
 
 @pytest.fixture(scope="module")

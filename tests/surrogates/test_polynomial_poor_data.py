@@ -122,9 +122,9 @@ def direction_rms(settings: ModelSettings) -> float:
 
 @pytest.mark.slow
 def test_every_part_of_the_fit_is_worth_something() -> None:
-    whole = direction_rms(ModelSettings(terms=40))
+    whole = direction_rms(ModelSettings(terms=24))
     for name in ("planes not searched", "forward selection alone", "matching pursuit", "raw monomials"):
-        assert whole < 0.8 * direction_rms(ablated(ModelSettings(terms=40), name)), name
+        assert whole < 0.8 * direction_rms(ablated(ModelSettings(terms=24), name)), name
 
 
 def test_transmittance_terms_follow_absorption() -> None:

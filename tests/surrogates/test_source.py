@@ -16,16 +16,14 @@ from neurolens import status as st
 from neurolens.errors import InputError
 from neurolens.evaluate.benches.compiled_source import FLAGS, CompiledSource, find_compiler
 from neurolens.evaluate.speed import Unavailable
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.programs.c import literal
 from neurolens.programs.expressions import Program
 from neurolens.programs.tanh import add_tanh
 from neurolens.surrogates.card import card_of
-from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
-from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
+from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel, Prediction
-from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.source.fused import ALL, RAY_ONLY, SCENE_RAY, Fixed, Parts, fused_program
 from neurolens.surrogates.source.writer import export_source
 from neurolens.surrogates.specialise import Fix, fixed_models
@@ -35,20 +33,10 @@ KINDS = (*lens_models.KINDS, "zones")
 COLUMNS = ("film_x_mm", "film_y_mm", "pupil_x_mm", "pupil_y_mm", "wavelength_nm")
 
 
-@cache
-def model_of(kind: str) -> LensModel:
-    if kind == "zones":
-        return fit_model(lens_models.prepared(), ModelSettings("ols", terms=16, partitions=2))
-    return lens_models.model(kind)
-
-
 @pytest.mark.slow
 def test_a_lens_with_cylinders() -> None:
-    lens = read_lens(lens_models.LENSES / "cooke_anamorphic_42.toml").at()
-    domain = domain_of(lens, film_radius_mm=10.0, focus_m=(math.inf, math.inf))
-    known = prepare(make_pairs(lens, domain, PairSettings(3000, 1000, 3000)))
-    model = fit_model(known, ModelSettings(terms=48, degree=4))
-    film_z, stop = domain.film_z_mm[0], domain.stop_radius_mm
+    model = fit_model(lens_models.anamorphic(), ModelSettings(terms=48, degree=4, planes=False))
+    film_z, stop = model.domain.film_z_mm[0], model.domain.stop_radius_mm
     rays = rays_of(model, COUNT, seed=3)
     found = built(fused_program([model])).rays({**rays, "film_z_mm": film_z, "stop_radius_mm": stop})
     agree(model, found, predict(model, rays, film_z, stop), edge_distance(model, rays, film_z, stop))
@@ -57,7 +45,7 @@ def test_a_lens_with_cylinders() -> None:
 @cache
 def compiled(kind: str) -> CompiledSource:
     # Quick to compile; that -O3 gives the same is a test of its own.
-    return built(fused_program([model_of(kind)]), "-O1")
+    return built(fused_program([lens_models.model(kind)]), "-O1")
 
 
 def built(program: Program, level: str = "-O1") -> CompiledSource:
@@ -111,7 +99,7 @@ def agree(model: LensModel, found: dict[str, np.ndarray], expected: Prediction, 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_c_agrees_with_the_model(kind: str) -> None:
-    model = model_of(kind)
+    model = lens_models.model(kind)
     d = model.domain
     rays = rays_of(model, COUNT, seed=3)
     for film_z, stop in ((d.film_z_mm[0], d.stop_radius_mm), (d.film_z_mm[1], 0.5 * d.stop_radius_mm)):
@@ -120,7 +108,7 @@ def test_c_agrees_with_the_model(kind: str) -> None:
 
 
 def test_the_compiler_makes_vectors_and_loses_nothing() -> None:
-    model = model_of("invariants")
+    model = lens_models.model("invariants")
     program = fused_program([model])
     rays = {**rays_of(model, 4099, seed=5), "film_z_mm": model.domain.film_z_mm[0], "stop_radius_mm": 4.0}
     slow, fast = built(program).rays(rays), CompiledSource(program, FLAGS).rays(rays)
@@ -133,7 +121,7 @@ def test_the_compiler_makes_vectors_and_loses_nothing() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_nothing_outside_the_domain_passes(kind: str) -> None:
-    model = model_of(kind)
+    model = lens_models.model(kind)
     d, rng = model.domain, np.random.default_rng(7)
     rays = rays_of(model, COUNT, seed=4)
     strange = np.array(
@@ -158,7 +146,7 @@ def test_nothing_outside_the_domain_passes(kind: str) -> None:
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 0.0, -1.0, 1e30, 1e-42])
 @pytest.mark.parametrize("which", ["film_z_mm", "stop_radius_mm"])
 def test_calls_outside_the_domain(which: str, bad: float) -> None:
-    model = model_of("invariants")
+    model = lens_models.model("invariants")
     given = {"film_z_mm": model.domain.film_z_mm[0], "stop_radius_mm": model.domain.stop_radius_mm, which: bad}
     found = compiled("invariants").rays({**rays_of(model, 1000, seed=5), **given})
     # A stop that is shut is inside the domain: it blocks.
@@ -169,7 +157,7 @@ def test_calls_outside_the_domain(which: str, bad: float) -> None:
 
 @pytest.mark.parametrize("kind", ["invariants", "network", "raw", "zones"])
 def test_wavelengths_film_and_stop_fixed(kind: str) -> None:
-    model = model_of(kind)
+    model = lens_models.model(kind)
     waves, d = (450.0, 550.0, 650.0), model.domain
     film_z, stop = float(np.mean(d.film_z_mm)), 0.5 * d.stop_radius_mm
     models = fixed_models(model, Fix(waves, film_z, stop))
@@ -192,7 +180,7 @@ def test_wavelengths_film_and_stop_fixed(kind: str) -> None:
 
 
 def test_only_what_is_wanted() -> None:
-    model = model_of("invariants")
+    model = lens_models.model("invariants")
     rays = {**rays_of(model, 5000, seed=6), "film_z_mm": model.domain.film_z_mm[0], "stop_radius_mm": 5.0}
     ray, whole = built(fused_program([model], RAY_ONLY)), compiled("invariants").rays(rays)
     found = ray.rays(rays)
@@ -205,7 +193,7 @@ def test_only_what_is_wanted() -> None:
 
 
 def test_fixed_values_outside_the_domain_are_refused() -> None:
-    model = model_of("invariants")
+    model = lens_models.model("invariants")
     for fix, field in (
         (Fix(film_z_mm=1.0), "film_z"),
         (Fix(stop_radius_mm=99.0), "stop"),
@@ -238,7 +226,7 @@ def test_literals_keep_every_bit() -> None:
 
 
 def test_the_card_stands_on_top(tmp_path: Path) -> None:
-    model = model_of("invariants")
+    model = lens_models.model("invariants")
     card = card_of(model, {"rms_um": 1.25})
     card["lens"]["source"] = "A book */ #include <stdlib.h>\nand a second line"
     text = export_source([model], tmp_path / "lens.h", "c", card).path.read_text(encoding="utf-8")

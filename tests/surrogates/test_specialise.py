@@ -13,7 +13,6 @@ import torch
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.errors import InputError
 from neurolens.surrogates.domain import FilmRays, sample_domain
-from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.specialise import at_wavelength
 
@@ -44,7 +43,7 @@ def test_one_wavelength(kind: str, wavelength_nm: float, tmp_path: Path) -> None
 
 
 def test_zones_keep_their_places() -> None:
-    model = fit_model(lens_models.prepared(), ModelSettings("ols", terms=16, partitions=2))
+    model = lens_models.model("zones")
     rays = lens_models.prepared().pairs.held_out.inputs
     rays = replace(rays, wavelength_nm=torch.full_like(rays.wavelength_nm, 500.0))
     for a, b in zip(model.predict(rays).rays, at_wavelength(model, 500.0).predict(rays).rays, strict=True):

@@ -17,8 +17,6 @@ import torch
 from neurolens.errors import ModelError
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.surrogates.cores import Partitioned
-from neurolens.surrogates.fit import ModelSettings, fit_model
-from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.source.fused import fused_program
 from neurolens.surrogates.stored import load_fitted, model_to_text
@@ -33,15 +31,9 @@ def tensors(core: Any) -> list[torch.Tensor]:
     return [getattr(core, "ab", getattr(core, "components", None)), core.scalars]
 
 
-def model_of(kind: str) -> LensModel:
-    if kind == "zones":
-        return fit_model(lens_models.prepared(), ModelSettings("ols", terms=16, partitions=2))
-    return lens_models.model(kind)
-
-
 @pytest.mark.parametrize("kind", [*lens_models.KINDS, "zones"])
 def test_round_trip_is_exact_in_float32(kind: str, tmp_path: Path) -> None:
-    model = model_of(kind)
+    model = lens_models.model(kind)
     path = export_onnx(model, tmp_path / "model.onnx", {})
     read = load_fitted(path)
     for a, b in zip(tensors(model.core), tensors(read.core), strict=True):
