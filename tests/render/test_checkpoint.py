@@ -6,6 +6,7 @@ import io
 import json
 import os
 import resource
+import sys
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -168,6 +169,20 @@ def test_a_checkpoint_of_another_render_is_refused_and_what_differs_is_named(tmp
             kept_render(part, **change)
         assert str(refused.value).startswith(str(part)) and "--restart" in str(refused.value)
     assert part.read_bytes() == before
+
+
+def test_meshes_traced_by_something_else_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("embreex", reason="embreex is not installed")
+    triangle = {"vertices_m": [[-1, -1, -2], [1, -1, -2], [0, 1, -2]], "faces": [[0, 1, 2]], "material": "m"}
+    with_mesh = scene(environment=WHITE, materials={"m": diffuse(1, 1, 1)}, meshes=[triangle])
+    part, bare = tmp_path / "a.exr.part", tmp_path / "b.exr.part"
+    kept_render(part, scene=with_mesh)
+    kept_render(bare)
+    for name in ("embreex", "embreex.mesh_construction"):
+        monkeypatch.setitem(sys.modules, name, None)  # makes an import fail
+    with pytest.raises(InputError, match="meshes traced by: got 'Embree', expected 'the built-in tree' as asked now"):
+        kept_render(part, scene=with_mesh)
+    kept_render(bare)  # without meshes it is no matter
 
 
 def test_the_digest_of_a_scene_sees_every_part_and_nothing_else() -> None:
