@@ -154,17 +154,49 @@ def test_a_picture_that_cannot_be_written_keeps_the_render_and_the_older_picture
     def full(path: Path, *_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
-    with monkeypatch.context() as patch:
-        patch.setattr("neurolens.render.exr.write_exr", full)
-        line = failure(capsys, *common, "--keep-checkpoint")
-    assert line == (
-        f"neurolens: {out}: No space left on device; the render is kept: the same command goes on from {out}.part"
-    )
-    assert np.all(read_exr(out)[0] == 7)
+    # There is no checkpoint yet, then there is one that no other can take the place of: it has everything.
+    for writers in (["exr.write_exr"], ["exr.write_exr", "watch.write_checkpoint"]):
+        with monkeypatch.context() as patch:
+            for writer in writers:
+                patch.setattr(f"neurolens.render.{writer}", full)
+            line = failure(capsys, *common)
+        assert line == (
+            f"neurolens: {out}: No space left on device; the render is kept: the same command goes on from {out}.part"
+        )
+        assert np.all(read_exr(out)[0] == 7)
     data = run_json(capsys, *common)
     assert data["complete"] and read_exr(out)[0].shape == (36, 64, 3) and sorted(os.listdir(tmp_path)) == [
         "a.exr", "a.png", "ball.toml",
     ]  # fmt: skip
+
+
+def test_a_disk_without_room_for_picture_and_checkpoint_is_told_as_it_is(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "a.exr"
+
+    def full(path: Path, *_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    common = ("render", scene, "--camera", "thin", "--quiet", "-o", out, "--threads", 1)
+    run_json(capsys, *common, "--keep-checkpoint")
+    for writer in ("exr.write_exr", "watch.write_checkpoint"):
+        monkeypatch.setattr(f"neurolens.render.{writer}", full)
+
+    def said() -> str:
+        assert main([*map(str, common), "--samples", "32"]) == 2
+        return capsys.readouterr().err.splitlines()[-1]
+
+    why = f"({out}.part: No space left on device)"
+    assert said() == (
+        f"neurolens: {out}: No space left on device; only a part of the render is kept {why}: "
+        f"the same command goes on from {out}.part"
+    )
+    (tmp_path / "a.exr.part").unlink()
+    assert said() == (
+        f"neurolens: {out}: No space left on device; the render is lost, for the checkpoint cannot be written "
+        f"either {why}"
+    )
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.png", "a.exr.part"])

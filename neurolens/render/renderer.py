@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -35,11 +36,14 @@ class RenderResult:
             camera_fraction (their ratio), dropped_samples (not finite; they count as black). Seconds and dropped
             samples count those before a checkpoint, too.
         layers: what the picture says of its own pixels.
+        save: writes the checkpoint that the watch names, for one who cannot write the picture; raises OSError or
+            NeurolensError. None without a watch that names one.
     """
 
     rgb: FloatArray
     stats: dict[str, Any]
     layers: Layers
+    save: Callable[[], None] | None = None
 
 
 def render(
@@ -104,7 +108,10 @@ def render(
         seconds = keeper.seconds
     keeper.finish()
     rgb, layers = develop(job)
-    return RenderResult(rgb, {"scene": scene.name, "threads": threads, **_stats(job, film, seed, seconds)}, layers)
+    stats = {"scene": scene.name, "threads": threads, **_stats(job, film, seed, seconds)}
+    # Else a result would keep the film's sums in memory.
+    save = keeper.save if watch is not None and watch.checkpoint is not None else None
+    return RenderResult(rgb, stats, layers, save)
 
 
 def _stats(job: Job, film: FilmSettings, seed: int, seconds: float) -> dict[str, Any]:
