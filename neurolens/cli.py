@@ -5,6 +5,7 @@ Errors are one line and exit code 2.
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 import warnings
@@ -13,7 +14,6 @@ from contextlib import contextmanager
 from typing import Any
 
 from neurolens import __version__
-from neurolens.commands import analyse, bench, convert, evaluate, export, gallery, glass, lens, mitsuba, render, train
 from neurolens.commands.arguments import Parser
 from neurolens.errors import NeurolensError, NeurolensWarning
 
@@ -36,7 +36,24 @@ Each command explains itself: neurolens COMMAND --help"""
 
 
 def build_parser() -> Parser:
-    """The whole command line."""
+    """The whole command line.
+
+    Commands are imported here, so that `main` hears an interrupt while they are being read.
+    """
+    from neurolens.commands import (
+        analyse,
+        bench,
+        convert,
+        evaluate,
+        export,
+        gallery,
+        glass,
+        lens,
+        mitsuba,
+        render,
+        train,
+    )
+
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
@@ -47,8 +64,9 @@ def build_parser() -> Parser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code; a wrong command line exits with code 2 as argparse does."""
-    args = build_parser().parse_args(argv)
+    args = argparse.Namespace(kept="nothing was done")
     try:
+        args = build_parser().parse_args(argv)
         with _plain_warnings():
             code: int = args.run(args)
         sys.stdout.flush()

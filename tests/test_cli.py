@@ -320,6 +320,21 @@ def test_an_interrupt_says_what_is_kept(
     assert not list(tmp_path.glob("*.exr"))
 
 
+@pytest.mark.parametrize("begin", ["from neurolens.cli import main; main()", "import neurolens.__main__"])
+def test_an_interrupt_while_the_packages_are_read_is_one_line(begin: str) -> None:
+    code = (
+        "import sys\n"
+        "class Interrupt:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'neurolens.commands.lens': raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Interrupt())\n"
+        f"{begin.replace('main()', 'sys.exit(main())')}"
+    )
+    found = python(code, "lens", "--help")
+    assert (found.returncode, found.stdout) == (130, "")
+    assert found.stderr.strip() == "neurolens: interrupted; nothing was done"
+
+
 def test_a_full_disk_is_one_line(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -328,7 +343,8 @@ def test_a_full_disk_is_one_line(
 
     monkeypatch.setattr("neurolens.render.exr.write_exr", full)
     line = failure(capsys, "render", scene, "--camera", "thin", "-o", tmp_path / "a.exr", "--quiet")
-    assert line == "neurolens: No space left on device"
+    kept = f"the render is kept: the same command goes on from {tmp_path / 'a.exr'}.part"
+    assert line == f"neurolens: No space left on device; {kept}"
 
 
 def python(code: str, *args: object) -> subprocess.CompletedProcess[str]:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,9 @@ import pytest
 from command_line import failure, run_json
 from PIL import Image
 
+from neurolens.cameras.contract import CameraRays
+from neurolens.cameras.thin import ThinLens
+from neurolens.cli import main
 from neurolens.render.exr import read_exr, read_layers, write_exr
 
 SCENE = """\
@@ -121,6 +125,25 @@ def test_layers_are_chosen_and_explained(scene: Path, tmp_path: Path, capsys: py
     assert np.all(read_layers(out)["samples"] == 16)
 
 
+def test_samples_that_are_not_finite_are_one_warning(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = ThinLens.sample
+
+    def sample(self: ThinLens, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
+        rays = usual(self, film_mm, pupil, wavelength_nm)
+        return replace(rays, weight=np.where(film_mm[0] > 0, rays.weight, np.float32(np.inf)))
+
+    monkeypatch.setattr(ThinLens, "sample", sample)
+    out = tmp_path / "a.exr"
+    assert main(["render", str(scene), "--camera", "thin", "--quiet", "-o", str(out)]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    half = 64 * 36 * 16 // 2
+    assert lines == [f"neurolens: warning: {half} of {2 * half} samples were not finite and count as black"]
+    picture, told = read_exr(out)
+    assert np.all(np.isfinite(picture)) and told["render"]["dropped_samples"] == half
+
+
 def test_a_picture_that_cannot_be_written_keeps_the_render_and_the_older_picture(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -131,17 +154,49 @@ def test_a_picture_that_cannot_be_written_keeps_the_render_and_the_older_picture
     def full(path: Path, *_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
-    with monkeypatch.context() as patch:
-        patch.setattr("neurolens.render.exr.write_exr", full)
-        line = failure(capsys, *common, "--keep-checkpoint")
-    assert line == (
-        f"neurolens: {out}: No space left on device; the render is kept: the same command goes on from {out}.part"
-    )
-    assert np.all(read_exr(out)[0] == 7)
+    # There is no checkpoint yet, then there is one that no other can take the place of: it has everything.
+    for writers in (["exr.write_exr"], ["exr.write_exr", "watch.write_checkpoint"]):
+        with monkeypatch.context() as patch:
+            for writer in writers:
+                patch.setattr(f"neurolens.render.{writer}", full)
+            line = failure(capsys, *common)
+        assert line == (
+            f"neurolens: {out}: No space left on device; the render is kept: the same command goes on from {out}.part"
+        )
+        assert np.all(read_exr(out)[0] == 7)
     data = run_json(capsys, *common)
     assert data["complete"] and read_exr(out)[0].shape == (36, 64, 3) and sorted(os.listdir(tmp_path)) == [
         "a.exr", "a.png", "ball.toml",
     ]  # fmt: skip
+
+
+def test_a_disk_without_room_for_picture_and_checkpoint_is_told_as_it_is(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "a.exr"
+
+    def full(path: Path, *_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    common = ("render", scene, "--camera", "thin", "--quiet", "-o", out, "--threads", 1)
+    run_json(capsys, *common, "--keep-checkpoint")
+    for writer in ("exr.write_exr", "watch.write_checkpoint"):
+        monkeypatch.setattr(f"neurolens.render.{writer}", full)
+
+    def said() -> str:
+        assert main([*map(str, common), "--samples", "32"]) == 2
+        return capsys.readouterr().err.splitlines()[-1]
+
+    why = f"({out}.part: No space left on device)"
+    assert said() == (
+        f"neurolens: {out}: No space left on device; only a part of the render is kept {why}: "
+        f"the same command goes on from {out}.part"
+    )
+    (tmp_path / "a.exr.part").unlink()
+    assert said() == (
+        f"neurolens: {out}: No space left on device; the render is lost, for the checkpoint cannot be written "
+        f"either {why}"
+    )
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.png", "a.exr.part"])
@@ -173,7 +228,7 @@ def test_a_picture_beyond_memory_is_one_line(
     common = ("render", scene, "--camera", "thin", "--quiet", "-o", tmp_path / "a.exr")
     with monkeypatch.context() as patch:
         patch.setattr("neurolens.render.sums.os.sysconf", lambda _: 590)
-        assert "64, 36" in (line := failure(capsys, *common)) and "2231 pixels" in line
+        assert "64, 36" in (line := failure(capsys, *common)) and "2122 pixels" in line
     monkeypatch.setattr("neurolens.render.sums.mmap.mmap", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOMEM, "")))
     assert "out of memory" in failure(capsys, *common)
 

@@ -196,6 +196,8 @@ def _deliver(
         return stopping.say(args.kept)
     metadata = {"version": __version__, "scene": str(args.scene), "camera": plain(camera.settings)}
     write_pictures(files, result, metadata, film, args)
+    if dropped := result.stats["dropped_samples"]:
+        warn(f"{dropped} of {result.stats['paths']} samples were not finite and count as black")
     if not result.stats["complete"]:
         return stopping.say(f"{so_far(result, files)}; {files.kept()}")
     if not args.keep_checkpoint:

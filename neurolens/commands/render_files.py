@@ -154,11 +154,10 @@ def watch_of(args: argparse.Namespace, files: Files, stop: Callable[[], bool]) -
 def write_pictures(
     files: Files, result: RenderResult, metadata: dict[str, Any], film: FilmSettings, args: argparse.Namespace
 ) -> None:
-    """Write EXR and PNG.
+    """Write EXR and PNG; where they cannot be written, the checkpoint.
 
     Raises:
-        NeurolensError: they cannot be written, and the checkpoint has the whole render.
-        OSError: they cannot be written.
+        NeurolensError: they cannot be written; it says what there is to go on from.
     """
     from neurolens.render.colour import COLOUR_SPACES
     from neurolens.render.develop import MEANING
@@ -174,10 +173,31 @@ def write_pictures(
         write_exr(files.out, result.rgb, half=args.half, metadata=told, space=space, layers=layers)
         write_png(files.preview, result.rgb, args.exposure)
     except (OSError, NeurolensError) as error:
-        if not files.checkpoint.exists():
-            raise
-        said = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else error
-        raise NeurolensError(f"{said}; the render is kept: {files.kept()}") from None
+        raise NeurolensError(f"{_said(error)}; {_rescued(files, result)}") from None
+
+
+def _rescued(files: Files, result: RenderResult) -> str:
+    """Save a render whose picture cannot be written; what there is to go on from.
+
+    A checkpoint takes more than the picture (64 bytes a pixel), but the place may be full only for a moment, or it is
+    the picture itself that is refused.
+    """
+    try:
+        assert result.save is not None
+        result.save()
+    except (OSError, NeurolensError, MemoryError) as error:
+        if files.checkpoint.exists():
+            return f"only a part of the render is kept ({_said(error)}): {files.kept()}"
+        return f"the render is lost, for the checkpoint cannot be written either ({_said(error)})"
+    return f"the render is kept: {files.kept()}"
+
+
+def _said(error: BaseException) -> str:
+    """What went wrong, and with which file."""
+    if not isinstance(error, OSError):
+        return str(error) or type(error).__name__
+    place = "" if error.filename is None else f"{error.filename}: "
+    return f"{place}{error.strerror or error}"
 
 
 def so_far(result: RenderResult, files: Files) -> str:

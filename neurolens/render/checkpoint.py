@@ -23,7 +23,7 @@ from neurolens.files import atomic_path
 from neurolens.render.identity import NOTHING, difference
 from neurolens.render.sums import Film, Tiling
 
-_FORMAT = 1
+_FORMAT = 2
 _ABOUT, _SUMS, _DONE = "about.json", "sums.npy", "done.npy"
 SPENT = ("seconds", "camera_thread_seconds", "thread_seconds")
 _LARGEST_ABOUT = 8 << 20

@@ -6,6 +6,7 @@ Without it, the tree of `neurolens.render.mesh` does the same. Hits agree within
 from __future__ import annotations
 
 from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,20 @@ def make_mesh(first: int, vertices: NDArray[np.float64], faces: NDArray[np.int64
         return Mesh(first, vertices, faces)
 
 
+def tracer() -> str:
+    """What `make_mesh` makes meshes hit with: their hits differ by rounding."""
+    try:
+        _library()
+    except ImportError:
+        return "the built-in tree"
+    return "Embree"
+
+
+def _library() -> tuple[Any, Any]:
+    """The parts of embreex; by name, as nothing is known of their types."""
+    return import_module("embreex.mesh_construction"), import_module("embreex.rtcore_scene")
+
+
 class EmbreeMesh:
     """Triangles in an Embree scene; triangle k is surface `first` + k.
 
@@ -38,8 +53,7 @@ class EmbreeMesh:
     """
 
     def __init__(self, first: int, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
-        # By name, as nothing is known of their types.
-        mesh_construction, rtcore_scene = (import_module(f"embreex.{n}") for n in ("mesh_construction", "rtcore_scene"))
+        mesh_construction, rtcore_scene = _library()
         self.first, self.count = first, len(faces)
         corners = np.ascontiguousarray(vertices[faces], np.float32)
         # Robust: watertight at the edges that triangles share.

@@ -151,7 +151,7 @@ class SkyLight:
 
 
 class SunLight:
-    """The sun's disc, if the scene has a sky with a sun."""
+    """The sun's disc, as far as it is above the horizon, if the scene has a sky with a sun."""
 
     sizeless = False
 
@@ -176,7 +176,7 @@ class SunLight:
         """See `LightGroup`."""
         axis = np.repeat(self._axis[:, None], len(number), axis=1)
         direction, _ = in_cone(axis, np.full(len(number), self._one_less_cos), square)
-        solid = np.full(len(number), np.float32(2 * math.pi) * self._one_less_cos, np.float32)
+        solid = np.where(direction[1] >= 0, np.float32(2 * math.pi) * self._one_less_cos, np.float32(0))
         return direction, np.full(len(number), np.inf, np.float32), solid
 
     def pdf(self, number: Numbers, point: FloatArray, distance: FloatArray, cosine: FloatArray) -> FloatArray:
@@ -184,8 +184,8 @@ class SunLight:
         return np.zeros_like(distance)
 
     def far_pdf(self, direction: FloatArray) -> FloatArray:
-        """Density [N] per solid angle with which `sample` takes directions [3, N]; 0 beside the disc."""
+        """Density [N] per solid angle with which `sample` takes directions [3, N]; 0 where no disc is seen."""
         # The distance from the axis, not the cosine, which float32 cannot tell from 1.
         away = direction - self._axis[:, None]
-        inside = dot(away, away) <= 2 * self._one_less_cos
+        inside = (dot(away, away) <= 2 * self._one_less_cos) & (direction[1] >= 0)
         return np.where(inside, 1 / (np.float32(2 * math.pi) * self._one_less_cos), np.float32(0))

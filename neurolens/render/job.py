@@ -18,10 +18,12 @@ from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler
 from neurolens.render.scatter import lit
 from neurolens.render.scene import CameraSettings
 from neurolens.render.scenefile import Scene
-from neurolens.render.sums import COLUMNS, DEPTH, HITS, LUMINANCE2, PASSED, RGB, Film, Tiling, shared
+from neurolens.render.sums import COLUMNS, DEPTH, DROPPED, HITS, LUMINANCE2, PASSED, RGB, Film, Tiling, shared
 from neurolens.render.wavelengths import LANES, mode_for, spectral_range
 from neurolens.render.world import World
 
+# Of a sample's luminance; sums of colours up to a million times as bright stay within float32.
+_BRIGHTEST_SAMPLE = 1e30
 CAMERA_BATCH = 8192  # rays a call: a network keeps more numbers a ray than the tracer
 
 
@@ -110,11 +112,20 @@ class Job:
         return sums, answered - asked
 
     def _sum_light(self, sums: NDArray[np.float64], value: FloatArray, bins: Index, shape: tuple[int, int]) -> None:
-        """Colour, and the squared luminance of each sample, whose paths are together."""
+        """Colour, and the squared luminance of each sample, whose paths are together.
+
+        Paths whose light is not finite, or beyond any sum, are counted and add nothing: one would spoil its pixel and
+        with it the whole file.
+        """
         value = value.reshape(-1, len(bins))
+        luminance = np.einsum("ln,ln->n", self._luminance.take(bins, axis=-1), value)
+        dropped = ~(np.abs(luminance) <= _BRIGHTEST_SAMPLE)
+        if dropped.any():
+            value, luminance = np.where(dropped, np.float32(0), value), np.where(dropped, np.float32(0), luminance)
+        sums[:, DROPPED] = np.count_nonzero(dropped.reshape(shape), axis=1)
+        luminance = luminance.reshape(shape)
         colour = self._response.take(bins, axis=-1).reshape(-1, 3, *shape)
         sums[:, RGB] = np.einsum("lcps,lps->pc", colour, value.reshape(-1, *shape))
-        luminance = np.einsum("ln,ln->n", self._luminance.take(bins, axis=-1), value).reshape(shape)
         if self.paths_a_sample > 1:
             luminance = np.add.reduceat(luminance, np.arange(0, shape[1], self.paths_a_sample), axis=1)
         sums[:, LUMINANCE2] = np.einsum("ps,ps->p", luminance, luminance, dtype=np.float64)
@@ -133,6 +144,7 @@ class Job:
         with np.errstate(over="ignore", invalid="ignore"):  # rays that do not pass hold anything
             depth = away @ (origin - self._position[:, None])
             depth += distance * (away @ direction)
+        hit &= np.isfinite(depth)
         sums[:, DEPTH] = np.where(hit, depth, np.float32(0)).reshape(shape).sum(axis=1, dtype=np.float64)
         sums[:, HITS] = np.count_nonzero(hit.reshape(shape), axis=1)
 

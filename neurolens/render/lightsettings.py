@@ -19,6 +19,8 @@ from neurolens.render.checks import (
     require_place,
 )
 
+_NARROWEST_DEG = 0.01  # of the falloff of a spot
+
 
 @dataclass(frozen=True)
 class PointLight:
@@ -54,8 +56,10 @@ class SpotLight:
         require(self.position_m != self.look_at_m, "look_at_m", self.look_at_m, "a point other than position_m")
         _require_light("intensity", self.intensity)
         require(0.1 <= self.outer_deg <= 90, "outer_deg", self.outer_deg, "a half angle from 0.1 to 90 degrees")
-        ok = 0 <= self.inner_deg < self.outer_deg
-        require(ok, "inner_deg", self.inner_deg, "a half angle from 0 to below outer_deg")
+        # Nearer, their cosines would differ by the rounding of float32 or not at all.
+        ok = 0 <= self.inner_deg <= self.outer_deg - _NARROWEST_DEG + 1e-9
+        expected = f"a half angle from 0 to {_NARROWEST_DEG:g} below outer_deg"
+        require(ok, "inner_deg", self.inner_deg, expected)
 
 
 def _require_light(field: str, value: Vector) -> None:

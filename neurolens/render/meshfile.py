@@ -25,11 +25,15 @@ from neurolens.render.shapes import MeshSettings
 LARGEST_FILE = 500_000_000  # bytes
 _LARGEST_HEADER = 100_000
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_INDEX = r"-?[1-9]\d*"
 _OBJ_LINES = {
     "v": (re.compile(rf"v(?: {_NUMBER}){{3,7}}"), "v X Y Z"),
     "vt": (re.compile(rf"vt(?: {_NUMBER}){{2,3}}"), "vt U V"),
     "vn": (re.compile(rf"vn(?: {_NUMBER}){{3}}"), "vn X Y Z"),
-    "f": (re.compile(r"f(?: [1-9]\d*(?:/(?:[1-9]\d*)?(?:/[1-9]\d*)?)?){3,}"), "f I J K, counted from 1"),
+    "f": (
+        re.compile(rf"f(?: {_INDEX}(?:/(?:{_INDEX})?(?:/{_INDEX})?)?){{3,}}"),
+        "f I J K, counted from 1, or back from -1",
+    ),
 }
 
 
@@ -132,14 +136,15 @@ def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
 def _checked_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[str, int]:
     """The vertices and faces of an OBJ file, line by line in one form, and the number of triangles.
 
+    Indices are counted from 1, also those that the file counts back from the line before: -1 is the last one so far.
+
     The loader passes over lines that it does not understand; here they are refused. So are indices beyond the
     lines before, which it takes for texture coordinates or normals that are not there.
     """
-    try:
-        # A line may go on after a backslash.
-        text = content.decode("utf-8-sig").replace("\\\r\n", " ").replace("\\\n", " ")
-    except UnicodeDecodeError as error:
-        raise InputError(scene, field, str(path), f"a text file ({error})") from None
+    if b"\0" in content:
+        raise InputError(scene, field, str(path), "a text file, without zero bytes")
+    # Only comments and names can hold more than ASCII, in any encoding. A line may go on after a backslash.
+    text = content.decode("utf-8-sig", "replace").replace("\\\r\n", " ").replace("\\\n", " ")
     lines, triangles = [""], 0
     counts = dict.fromkeys(_OBJ_LINES, 0)
     for number, line in enumerate(text.splitlines(), 1):
@@ -153,18 +158,30 @@ def _checked_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[s
         counts[words[0]] += 1
         if words[0] == "f":
             triangles += len(words) - 3
-            _check_indices(scene, f"{field} {path.name}, line {number}", words[1:], counts)
+            corners = _counted_from_one(scene, f"{field} {path.name}, line {number}", words[1:], counts)
+            lines[-1] = f"f {' '.join(corners)}"
     return "\n".join(lines) + "\n", triangles
 
 
-def _check_indices(scene: Path, field: str, corners: list[str], counts: dict[str, int]) -> None:
-    """Refuse a corner of a face that refers to something that does not come before it, and corners of unlike forms."""
+def _counted_from_one(scene: Path, field: str, corners: list[str], counts: dict[str, int]) -> list[str]:
+    """Corners of a face with all indices counted from 1.
+
+    Refused are corners that refer to something that does not come before them, and corners of unlike forms.
+    """
     if len({tuple(map(bool, corner.split("/"))) for corner in corners}) > 1:  # the loader would take one for another
         raise InputError(scene, field, " ".join(corners)[:60], "corners of the same form, as in 1/1 2/2 3/3")
+    counted = []
     for corner in corners:
-        for index, kind in zip(corner.split("/"), ("v", "vt", "vn"), strict=False):
-            if index and int(index) > counts[kind]:
+        indices = corner.split("/")
+        for k, (index, kind) in enumerate(zip(indices, ("v", "vt", "vn"), strict=False)):
+            if not index:
+                continue
+            number = int(index) + (counts[kind] + 1 if index.startswith("-") else 0)
+            if not 1 <= number <= counts[kind]:
                 raise InputError(scene, field, corner, f"{kind} from 1 to {counts[kind]}, the lines before")
+            indices[k] = str(number)
+        counted.append("/".join(indices))
+    return counted
 
 
 def _promised_faces(scene: Path, field: str, path: Path, content: bytes) -> int:

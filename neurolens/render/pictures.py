@@ -9,6 +9,7 @@ from PIL import Image
 
 from neurolens.cameras.contract import FloatArray
 from neurolens.errors import InputError
+from neurolens.render.checks import BRIGHTEST
 from neurolens.render.spectrum import srgb_to_linear
 
 LARGEST_PICTURE, LARGEST_ENVIRONMENT = 8192, 4096  # pixels a side
@@ -42,12 +43,12 @@ def _encoded(scene: Path, field: str, path: Path, picture: Image.Image) -> Float
     return colours
 
 
-def read_environment(scene: Path, field: str, path: Path) -> FloatArray:
-    """Linear sRGB [H, W, 3] of an equirectangular picture, OpenEXR or whatever Pillow reads.
+def read_environment(scene: Path, field: str, path: Path, scale: float = 1.0) -> FloatArray:
+    """Linear sRGB [H, W, 3] of an equirectangular picture, OpenEXR or whatever Pillow reads; not yet times `scale`.
 
     Raises:
         InputError: as `read_picture`; also a picture that is not twice as wide as high, values that are negative or not
-            finite, and black all over.
+            finite or brighter than an emission may be, and black all over.
     """
     exr = path.suffix.lower() == ".exr"
     picture = _read_exr(scene, field, path) if exr else read_picture(scene, field, path, LARGEST_ENVIRONMENT)
@@ -56,6 +57,9 @@ def read_environment(scene: Path, field: str, path: Path) -> FloatArray:
         raise InputError(scene, field, f"({width} x {height} pixels)", "an equirectangular picture, 2 : 1")
     if not np.all((picture >= 0) & np.isfinite(picture)):
         raise InputError(scene, field, str(path), "a picture of finite values, 0 or more")
+    if float(picture.max()) * scale > BRIGHTEST:
+        expected = f"a picture whose values times scale are at most {BRIGHTEST:g}"
+        raise InputError(scene, field, f"({float(picture.max()):g} times {scale:g})", expected)
     if not picture.any():
         raise InputError(scene, field, str(path), "a picture that is not black all over")
     return picture

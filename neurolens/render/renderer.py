@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -17,7 +18,7 @@ from neurolens.render.identity import identity
 from neurolens.render.illuminants import check_name
 from neurolens.render.job import Job
 from neurolens.render.scenefile import Scene
-from neurolens.render.sums import PASSED, check_memory
+from neurolens.render.sums import DROPPED, PASSED, check_memory
 from neurolens.render.watch import Keeper, Progress, Watch
 from neurolens.render.workers import run
 
@@ -32,13 +33,17 @@ class RenderResult:
         rgb: [H, W, 3] float32 linear sRGB; a uniform environment of radiance 1 gives 1 on the axis.
         stats: JSON-able; settings, complete, samples_done (mean a pixel), seconds, paths, mpaths_per_s,
             passed_fraction, thread_seconds (summed over the workers), camera_thread_seconds (of these, in the camera),
-            camera_fraction (their ratio). Seconds count those before a checkpoint, too.
+            camera_fraction (their ratio), dropped_samples (not finite; they count as black). Seconds and dropped
+            samples count those before a checkpoint, too.
         layers: what the picture says of its own pixels.
+        save: writes the checkpoint that the watch names, for one who cannot write the picture; raises OSError or
+            NeurolensError. None without a watch that names one.
     """
 
     rgb: FloatArray
     stats: dict[str, Any]
     layers: Layers
+    save: Callable[[], None] | None = None
 
 
 def render(
@@ -61,7 +66,7 @@ def render(
     The result depends on the seed, not on the number of threads, nor on whether it was interrupted and went on from a
     checkpoint: bit for bit, on one machine with one set of packages. Cameras share all random numbers. Samples are
     taken in the order of the Sobol' sequence, so that more can be added to those that a checkpoint has. Memory: the
-    film's sums, picture and layers, 156 bytes a pixel at most, and for each worker what one tile takes, whatever the
+    film's sums, picture and layers, 164 bytes a pixel at most, and for each worker what one tile takes, whatever the
     size of the picture.
 
     Args:
@@ -103,7 +108,10 @@ def render(
         seconds = keeper.seconds
     keeper.finish()
     rgb, layers = develop(job)
-    return RenderResult(rgb, {"scene": scene.name, "threads": threads, **_stats(job, film, seed, seconds)}, layers)
+    stats = {"scene": scene.name, "threads": threads, **_stats(job, film, seed, seconds)}
+    # Else a result would keep the film's sums in memory.
+    save = keeper.save if watch is not None and watch.checkpoint is not None else None
+    return RenderResult(rgb, stats, layers, save)
 
 
 def _stats(job: Job, film: FilmSettings, seed: int, seconds: float) -> dict[str, Any]:
@@ -129,6 +137,7 @@ def _stats(job: Job, film: FilmSettings, seed: int, seconds: float) -> dict[str,
         "paths": paths,
         "mpaths_per_s": paths / seconds * 1e-6,
         "passed_fraction": float(job.film.sums[:, PASSED].sum()) / max(paths, 1),
+        "dropped_samples": int(job.film.sums[:, DROPPED].sum()),
         "thread_seconds": thread_s,
         "camera_thread_seconds": camera_s,
         "camera_fraction": camera_s / max(thread_s, 1e-12),

@@ -75,7 +75,7 @@ def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> 
         for name, texture in (settings.textures or {}).items()
         if texture.file is not None
     }
-    around = settings.environment.file
+    around, scale = settings.environment.file, settings.environment.scale
     return Scene(
         path.stem,
         settings,
@@ -84,7 +84,7 @@ def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> 
         _aperture(path, settings.camera),
         _illuminants(path, settings),
         _reflectances(path, settings),
-        None if around is None else read_environment(path, "environment.file", path.parent / around),
+        None if around is None else read_environment(path, "environment.file", path.parent / around, scale),
     )
 
 

@@ -21,8 +21,8 @@ SAMPLES_A_PASS = 16
 CHUNK_BYTES = 16 << 20  # of the sums that are copied at a time
 
 # Columns of the sums: linear sRGB; squared luminance of independent samples; depth in m over the samples that hit
-# something, and how many those are; samples whose camera ray passed.
-RGB, LUMINANCE2, DEPTH, HITS, PASSED, COLUMNS = slice(0, 3), 3, 4, 5, 6, 7
+# something, and how many those are; samples whose camera ray passed; samples that were not finite and add no light.
+RGB, LUMINANCE2, DEPTH, HITS, PASSED, DROPPED, COLUMNS = slice(0, 3), 3, 4, 5, 6, 7, 8
 # Of a render in the main process: the sums, and at the end picture and layers, in the writer's order too.
 BYTES_A_PIXEL = 8 * COLUMNS + 100
 _LONGEST_WAIT_S = 5.0

@@ -68,6 +68,7 @@ class Keeper:
             self._earlier_s, self._written = spent["seconds"], True
             job.seconds[:] = spent["camera_thread_seconds"], spent["thread_seconds"]
         self.resumed = job.film.fraction
+        self._kept = self.resumed if self._written else 0.0
         self._began = time.perf_counter()
         self._preview_at = self._began + watch.preview_s
         self._checkpoint_at = self._began + watch.checkpoint_s
@@ -94,13 +95,16 @@ class Keeper:
         return self._watch.stop()
 
     def save(self) -> None:
-        """Write the checkpoint, where there is one to write and something to keep."""
-        if self._watch.checkpoint is None or not self._job.film.done.any():
+        """Write the checkpoint, where there is one to write and something to keep that it has not yet."""
+        fraction = self._job.film.fraction
+        if self._watch.checkpoint is None or not fraction:
             return
+        if self._kept == fraction and self._watch.checkpoint.exists():
+            return  # a disk may have no room for another
         camera, every = (float(s) for s in self._job.seconds)
         spent = {"seconds": self.seconds, "camera_thread_seconds": camera, "thread_seconds": every}
         write_checkpoint(self._watch.checkpoint, self._job.film, self._identity, spent)
-        self._written = True
+        self._written, self._kept = True, fraction
 
     def finish(self) -> None:
         """Keep a render that stopped; one that is complete only where a checkpoint would else tell of less of it."""

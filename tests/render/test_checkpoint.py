@@ -6,10 +6,11 @@ import io
 import json
 import os
 import resource
+import sys
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,7 @@ def test_what_a_failed_render_had_goes_on_to_the_same_picture(first: int, then: 
     with pytest.raises(NeurolensError, match=r"no more film.*kept in .*a\.exr\.part"):
         render(lit_scene(), camera, threads=first, watch=Watch(checkpoint=part), **options)
     with np.load(part, allow_pickle=False) as kept:
-        assert 14 * 2 <= kept["done"].sum() < 14 * 3 and kept["sums"].shape == (36 * 24, 7)
+        assert 14 * 2 <= kept["done"].sum() < 14 * 3 and kept["sums"].shape == (36 * 24, 8)
     camera.mended = True
     reports: list[float] = []
     watch = Watch(checkpoint=part)
@@ -170,6 +171,51 @@ def test_a_checkpoint_of_another_render_is_refused_and_what_differs_is_named(tmp
     assert part.read_bytes() == before
 
 
+class Spoilt(ThinLens):
+    """Some rays weigh what no number can, among them the last that a float can hold."""
+
+    def __init__(self, *given: Any, spoilt: bool = True) -> None:
+        super().__init__(*given)
+        self.spoilt = spoilt
+
+    def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
+        rays = super().sample(film_mm, pupil, wavelength_nm)
+        which = (pupil[0] < 0.2) & (pupil[1] < 0.2)
+        values = np.array([np.nan, np.inf, 3e38, 0.0], np.float32)[np.arange(len(which)) % 4 if self.spoilt else 3]
+        weight = np.where(which, values, rays.weight)
+        return replace(rays, weight=weight.astype(np.float32))
+
+
+@pytest.mark.parametrize("mode", ["one", "hero", "lanes"])
+def test_samples_that_are_not_finite_are_dropped_counted_and_remembered(mode: Any, tmp_path: Path) -> None:
+    part, camera = tmp_path / "a.exr.part", Spoilt(50.0, 2.0, 3.0, FILM)
+    film = FilmSettings(wavelengths=mode)
+    bright = scene(environment={"colour": [1e4, 1e4, 1e4]})
+    for samples in (16, 32):  # the second goes on from the first
+        found = kept_render(part, scene=bright, camera=camera, film=film, samples=samples)
+    # They count as black: the same picture as where their rays do not pass.
+    black = render(bright, Spoilt(50.0, 2.0, 3.0, FILM, spoilt=False), samples=32, threads=1, film=film, **SIZE)
+    assert np.all(np.isfinite(found.rgb)) and np.all(np.isfinite(found.layers.variance))
+    assert black.stats["dropped_samples"] == 0 and np.array_equal(found.rgb, black.rgb)
+    spoilt = (found.stats["passed_fraction"] - black.stats["passed_fraction"]) * 32 * 36 * 24
+    assert found.stats["dropped_samples"] == round(spoilt) > 100
+    assert np.array_equal(found.layers.variance, black.layers.variance)
+
+
+def test_meshes_traced_by_something_else_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("embreex", reason="embreex is not installed")
+    triangle = {"vertices_m": [[-1, -1, -2], [1, -1, -2], [0, 1, -2]], "faces": [[0, 1, 2]], "material": "m"}
+    with_mesh = scene(environment=WHITE, materials={"m": diffuse(1, 1, 1)}, meshes=[triangle])
+    part, bare = tmp_path / "a.exr.part", tmp_path / "b.exr.part"
+    kept_render(part, scene=with_mesh)
+    kept_render(bare)
+    for name in ("embreex", "embreex.mesh_construction"):
+        monkeypatch.setitem(sys.modules, name, None)  # makes an import fail
+    with pytest.raises(InputError, match="meshes traced by: got 'Embree', expected 'the built-in tree' as asked now"):
+        kept_render(part, scene=with_mesh)
+    kept_render(bare)  # without meshes it is no matter
+
+
 def test_the_digest_of_a_scene_sees_every_part_and_nothing_else() -> None:
     assert digest(lit_scene()) == digest(lit_scene()) != digest(lit_scene(0.7000001))
     pairs: list[tuple[Any, Any]] = [
@@ -216,16 +262,16 @@ WRONG: dict[str, Callable[[Path], Any]] = {
     "compressed": lambda p: rewritten(p, lambda _: None, zipfile.ZIP_DEFLATED),
     "a member more": lambda p: rewritten(p, lambda m: m.update(x=b"")),
     "a member less": lambda p: rewritten(p, lambda m: m.pop("done.npy")),
-    "shorter sums": lambda p: rewritten(p, array("sums.npy", np.zeros((36 * 24 - 1, 7)))),
-    "sums of another shape": lambda p: rewritten(p, array("sums.npy", np.zeros((7, 36 * 24)))),
-    "sums of another type": lambda p: rewritten(p, array("sums.npy", np.zeros((36 * 24, 7), np.int64))),
+    "shorter sums": lambda p: rewritten(p, array("sums.npy", np.zeros((36 * 24 - 1, 8)))),
+    "sums of another shape": lambda p: rewritten(p, array("sums.npy", np.zeros((8, 36 * 24)))),
+    "sums of another type": lambda p: rewritten(p, array("sums.npy", np.zeros((36 * 24, 8), np.int64))),
     "pickled": lambda p: rewritten(p, array("done.npy", np.array([print], object), allow_pickle=True)),
     "too many passes": lambda p: rewritten(p, array("done.npy", np.array([2**60]))),
     "fewer than no passes": lambda p: rewritten(p, array("done.npy", np.array([-1]))),
     "no JSON": lambda p: rewritten(p, lambda m: m.update({"about.json": b"{"})),
     "deep JSON": lambda p: rewritten(p, lambda m: m.update({"about.json": b"[" * 100_000})),
     "a list": lambda p: rewritten(p, lambda m: m.update({"about.json": b"[1]"})),
-    "another format": lambda p: rewritten(p, about(format=2)),
+    "another format": lambda p: rewritten(p, about(format=3)),
     "huge number of samples": lambda p: rewritten(p, about(samples=10**30)),
     "samples in words": lambda p: rewritten(p, about(samples="many")),
     "impossible time": lambda p: rewritten(p, about(spent={"seconds": float("inf")})),

@@ -66,6 +66,24 @@ def test_nothing_is_merged_or_mended(tmp_path: Path) -> None:
     assert len(mesh.faces) == 2 and enclosed(TriangleSet(mesh.vertices + [0, 0, 1], mesh.faces)) == pytest.approx(0)
 
 
+def test_indices_are_counted_back_and_comments_may_be_latin_1(tmp_path: Path) -> None:
+    absolute, relative = tmp_path / "a.obj", tmp_path / "b.obj"
+    head, tail = b"# caf\xe9\ng K\xf6rper\n", b"v 0 0 1\nvt 1 1\nf %s %s %s\n"
+    corners = b"v 0 0 0\nvt 0 0\nv 1 0 0\nvt 1 0\nv 0 1 0\nvt 0 1\nvn 0 0 1\n# \xff\nf %s %s %s # \xe9\n"
+    absolute.write_bytes(head + corners % (b"1/1/1", b"2/2/1", b"3/3/1") + tail % (b"2/2/1", b"3/3/1", b"4/4/1"))
+    relative.write_bytes(
+        head + corners % (b"-3/-3/-1", b"-2/-2/-1", b"-1/-1/-1") + tail % (b"-3/-3/1", b"3/-2/-1", b"-1/4/-1")
+    )
+    one, other = (read_file(HERE, "file", path) for path in (absolute, relative))
+    assert len(one.faces) == 2 and one.uv is not None and other.uv is not None
+    assert np.array_equal(one.vertices[one.faces], other.vertices[other.faces])
+    assert np.array_equal(one.uv[one.faces], other.uv[other.faces])
+    bare = tmp_path / "c.obj"
+    bare.write_bytes(b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\n")
+    mesh = read_file(HERE, "file", bare)
+    assert np.array_equal(mesh.vertices[mesh.faces[0]], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+
+
 def test_texture_coordinates_and_normals_of_parts_and_polygons(tmp_path: Path) -> None:
     path = tmp_path / "a.obj"
     path.write_text(
@@ -136,7 +154,8 @@ def test_normals_of_the_file_are_used_and_turned(smooth: bool | None, tilted: bo
         ("a.obj", b"v 0 0 nan\n", "line 1.*v X Y Z"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\n", "line 4.*f I J K"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "line 4.*counted from 1"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -3\n", "line 4.*counted from 1"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -4\n", "line 4.*'-4'.*v from 1 to 3"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//-1 2//-1 3//-1\n", "line 4.*vn from 1 to 0"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 b 3\n", "line 4.*f I J K"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "line 4.*'9'.*v from 1 to 3"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/2\n", "line 5.*'3/2'.*vt from 1 to 1"),

@@ -259,7 +259,7 @@ def test_errors_are_clear(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"samples": 1 << 40}, "samples.*at most 1048576"),
         ({"threads": 0}, "threads"),
         ({"width": 20}, "width x height"),
-        ({"width": 3_000_000, "height": 2_000_000}, "width x height.*156 bytes"),
+        ({"width": 3_000_000, "height": 2_000_000}, "width x height.*164 bytes"),
     ):
         with pytest.raises(InputError, match=field):
             render(made, Pinhole(50.0, FILM), **(small | change))

@@ -46,6 +46,7 @@ SKY = {"sun_elevation_deg": 30}
         ({"spots": [SPOT | {"look_at_m": [0, 2, 0]}]}, r"spots\[0\].look_at_m"),
         ({"spots": [SPOT | {"outer_deg": 120}]}, r"spots\[0\].outer_deg.*0.1 to 90"),
         ({"spots": [SPOT | {"inner_deg": 30}]}, r"spots\[0\].inner_deg.*below outer_deg"),
+        ({"spots": [SPOT | {"outer_deg": 30, "inner_deg": 29.995}]}, r"spots\[0\].inner_deg.*0.01 below outer_deg"),
         ({"spots": [SPOT | {"illuminant": "30 K"}]}, r"spots\[0\].illuminant"),
         ({"discs": [DISC | {"normal": [0, 0, 0]}]}, r"discs\[0\].normal"),
         ({"discs": [DISC | {"radius_m": -1}]}, r"discs\[0\].radius_m"),
@@ -122,13 +123,20 @@ def test_only_closed_meshes_that_face_outwards_are_solid() -> None:
 
 @pytest.mark.parametrize(
     ("shape", "value", "message"),
-    [((4, 4), 1.0, "2 : 1"), ((4, 8), -1.0, "0 or more"), ((4, 8), np.nan, "0 or more"), ((4, 8), 0.0, "black")],
+    [
+        ((4, 4), 1.0, "2 : 1"),
+        ((4, 8), -1.0, "0 or more"),
+        ((4, 8), np.nan, "0 or more"),
+        ((4, 8), np.inf, "0 or more"),
+        ((4, 8), 0.6e18, r"times scale are at most 1e\+18"),
+        ((4, 8), 0.0, "black"),
+    ],
 )
 def test_bad_environments_are_named(shape: tuple[int, int], value: float, message: str, tmp_path: Path) -> None:
     pixels = np.full((*shape, 3), value, np.float32)
     _write_exr(tmp_path / "a.exr", pixels)
     with pytest.raises(InputError, match=f"environment.file.*{message}"):
-        scene_from_tables({"camera": CAMERA, "environment": {"file": "a.exr"}}, tmp_path / "s.toml")
+        scene_from_tables({"camera": CAMERA, "environment": {"file": "a.exr", "scale": 2.0}}, tmp_path / "s.toml")
 
 
 def test_grey_pictures_of_16_bits_are_as_bright_as_those_of_8(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from render_helpers import diffuse, radiance, scene, world
 
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.render.colour import SRGB
+from neurolens.render.environment import SunLight
 from neurolens.render.filmsettings import FilmSettings
 from neurolens.render.lightsettings import Sky
 from neurolens.render.renderer import render
@@ -94,6 +95,25 @@ def test_the_sun_lights_as_its_disc_shines_and_is_seen_where_it_stands() -> None
         return float(np.interp(650, nm, values) / np.interp(450, nm, values))
 
     assert redness(2.0) > 3 * redness(60.0)
+
+
+@pytest.mark.parametrize("elevation", [0.0, 0.1, 0.3])
+def test_of_a_sun_on_the_horizon_only_what_is_above_it_shines(elevation: float) -> None:
+    made, without = (world(sky={"sun_elevation_deg": elevation, "sun": sun}) for sun in (True, False))
+    axis = sun_direction(Sky(elevation))
+    for up in (0.2, -0.2):
+        towards = list(axis + [0, math.radians(up), 0])
+        disc, glow = (radiance(w, [0, 0, 0], towards, samples=16).mean() for w in (made, without))
+        assert disc > glow if elevation + up > 0 else disc == 0
+    # Aimed at is the part of the disc above the horizon, a segment of a circle.
+    light, square = SunLight(Sky(elevation)), np.random.default_rng(0).random((2, 20000), np.float32)
+    direction, _, solid = light.sample(np.zeros(20000, np.intp), np.zeros((3, 20000), np.float32), square)
+    height = min(elevation / (0.533 / 2), 1.0)
+    share = (math.acos(-height) + height * math.sqrt(1 - height**2)) / math.pi
+    whole = 2 * math.pi * (1 - math.cos(math.radians(0.533 / 2)))
+    assert solid.mean() == pytest.approx(share * whole, rel=0.02)
+    lit = solid > 0
+    assert np.all(direction[1, lit] >= 0) and not light.far_pdf(direction[:, ~lit]).any()
 
 
 def test_colour_and_brightness_of_the_sky() -> None:
