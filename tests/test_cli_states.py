@@ -17,7 +17,7 @@ from neurolens.render.exr import read_exr, write_exr
 LENSES = Path(__file__).parents[1] / "lenses"
 SINGLET, PHONE = LENSES / "thorlabs_lb1471_biconvex_50.toml", LENSES / "phone_lens_6.toml"
 ANAMORPHIC, NIKON = LENSES / "cooke_anamorphic_42.toml", LENSES / "nikon_zoom_70_200.toml"
-SONNAR, TRIPLET = LENSES / "sony_sonnar_55.toml", LENSES / "cooke_triplet_50.toml"
+TAJIMA, TRIPLET = LENSES / "tajima_retrofocus_24.toml", LENSES / "cooke_triplet_50.toml"
 SCENE = """\
 [camera]
 position_m = [0.0, 0.0, 2.0]
@@ -41,9 +41,9 @@ def scene(tmp_path: Path) -> Path:
 
 
 def test_a_focus_state_is_focused_at_its_object(capsys: pytest.CaptureFixture[str]) -> None:
-    """1630.4 mm before the front vertex, and the film so far behind it; farther as the lens is larger."""
-    near = run_json(capsys, "lens", SONNAR, "--zoom", "1.7m")
-    assert near["focus_m"] == pytest.approx((1630.4 + near["film_z_mm"]) / 1000)
+    """207.03 mm before the front vertex, and the film so far behind it; farther as the lens is larger."""
+    near = run_json(capsys, "lens", TAJIMA, "--zoom", "0.3m")
+    assert near["focus_m"] == pytest.approx((207.03 + near["film_z_mm"]) / 1000)
     small = run_json(capsys, "lens", NIKON, "--zoom", "135mm near")
     assert small["focus_m"] == pytest.approx((750.55 + small["film_z_mm"]) / 1000)
     large = run_json(capsys, "lens", NIKON, "--zoom", "135mm near", "--efl", 200)

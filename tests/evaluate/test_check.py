@@ -86,7 +86,7 @@ def test_an_error_that_few_rays_decide_is_found_again_on_others() -> None:
     pairs = make_pairs(lens(), domain(), PairSettings(train=1, held_out=RAYS // 2, rim=1, seed=3))
     few = fresh_rays(lens(), domain(), pairs.held_out, count=2 * RAYS, seed=55)
     rms = []
-    for seed in (4, 5, 6, 7):
+    for seed in (4, 5, 6):
         many = with_more(few, 100 * seed)
         model_.card = {**known.card, "errors": measure_on(many, model_)}  # type: ignore[arg-type]
         figures, promises = check_model(model_, lens(), rays=RAYS // 2, seed=seed)  # type: ignore[arg-type]

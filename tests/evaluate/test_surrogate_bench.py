@@ -125,18 +125,23 @@ def test_other_settings_and_lost_files_are_made_again(
     monkeypatch.setattr(surrogate_bench, "fit_model", fit)
     one = replace(ROWS[1], settings=replace(ROWS[1].settings, planes=False))
     untimed = replace(SETTINGS, rounds=0, pairs=PairSettings(500, 300, 500), vignetting_rays=2000)
-    run(tmp_path, (one,), untimed)
-    run(tmp_path, (one,), untimed)
+    bench = Bench(LensChoice(LENSES / "cooke_triplet_50.toml"), untimed, tmp_path)  # one, so that rays are traced once
+
+    def go(row: Row, **options: Any) -> list[dict[str, Any]]:
+        return run_bench([bench], (row,), progress=Progress(quiet=True), **options)["cooke_triplet_50"]
+
+    go(one)
+    go(one)
     assert fitted == ["ols-12"]
     (tmp_path / "models" / "cooke_triplet_50" / "ols-12.onnx").unlink()
-    run(tmp_path, (one,), untimed)
-    run(tmp_path, (one,), untimed, again=True)
+    go(one)
+    go(one, again=True)
     (tmp_path / "records" / "cooke_triplet_50" / "ols-12.json").write_text("{")
-    run(tmp_path, (one,), untimed)
+    go(one)
     assert len(fitted) == 4
     accident = replace(one, settings=replace(one.settings, degree=3))
-    assert run(tmp_path, (accident,), untimed)[0]["failed"] == "ZeroDivisionError: by accident"
-    run(tmp_path, (accident,), untimed)
+    assert go(accident)[0]["failed"] == "ZeroDivisionError: by accident"
+    go(accident)
     assert len(fitted) == 6  # tried again
 
 
