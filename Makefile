@@ -29,8 +29,9 @@ export MPLBACKEND ?= Agg
 demo: $(INSTALLED)
 	$(BIN)/neurolens train experiments/quickstart.toml
 
+# Two processes of one thread each: torch's threads only wait for each other in small tests.
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -q --durations=10
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile --durations=10
 	$(MAKE) --no-print-directory lint
 
 bench: $(INSTALLED)
