@@ -213,13 +213,15 @@ def test_aiming_at_lights_changes_the_noise_and_not_the_mean(floor: str) -> None
     ]
     panel = {"corner_m": [-0.5, 1.5, -0.5], "edge_u_m": [1, 0, 0], "edge_v_m": [0, 0, 1], "emission": [1, 2, 3]}
     plane = FLOOR | {"material": floor}
-    made = world(materials=MATERIALS, environment=WHITE, planes=[plane], spheres=lamps, quads=[panel])
-    aimed = radiance(made, [0, 1, 3], [0.1, 0, 0], samples=16384, max_depth=3)
-    found = radiance(made, [0, 1, 3], [0.1, 0, 0], samples=65536, max_depth=3, aim=False, seed=1)
-    assert aimed.std() < 0.75 * found.std()
-    tolerance = 4 * math.hypot(aimed.std() / 128, found.std() / 256)
-    assert tolerance < 0.03 * aimed.mean()
-    assert abs(aimed.mean() - found.mean()) < tolerance
+    # White surroundings are found by scattering alone, in both: their noise would hide that of the lamps.
+    for around, noise, error in (({"environment": WHITE}, 1.0, 0.03), ({}, 0.3, 0.05)):
+        made = world(materials=MATERIALS, planes=[plane], spheres=lamps, quads=[panel], **around)
+        aimed = radiance(made, [0, 1, 3], [0.1, 0, 0], samples=16384, max_depth=3)
+        found = radiance(made, [0, 1, 3], [0.1, 0, 0], samples=65536, max_depth=3, aim=False, seed=1)
+        assert aimed.std() < noise * found.std()
+        tolerance = 4 * math.hypot(aimed.std() / 128, found.std() / 256)
+        assert tolerance < error * aimed.mean()
+        assert abs(aimed.mean() - found.mean()) < tolerance
 
 
 def test_light_is_seen_in_a_mirror_and_through_glass() -> None:
