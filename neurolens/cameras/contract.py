@@ -47,6 +47,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float32]
+# A network in numpy or onnxruntime keeps hundreds of numbers a ray between its steps: more rays would leave the cache.
+RAYS_A_CALL = 8192
+MANY_RAYS_A_CALL = 32768  # for cameras that keep next to nothing, where a call costs as much as a thousand rays
 
 
 @dataclass(frozen=True)
@@ -110,6 +113,7 @@ class Camera(Protocol):
         wavelength_nm: range of wavelengths accepted, None for any.
         dispersive: whether rays depend on the wavelength.
         achromatic: optional, true where neither rays nor weights depend on the wavelength.
+        rays_a_call: optional, how many rays at once suit it best; `RAYS_A_CALL` where it says nothing.
         settings: JSON-able description (focal length, f-number, focus, model card), kept in the picture's metadata.
     """
 

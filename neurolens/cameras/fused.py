@@ -14,27 +14,35 @@ from numpy.typing import NDArray
 
 from neurolens import status as st
 from neurolens.apertures import Aperture
-from neurolens.cameras.contract import CameraRays, FloatArray, RayDifferentials
-from neurolens.cameras.fusedsource import FILM_X_Y, Setting, camera_source
+from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FloatArray, RayDifferentials
+from neurolens.cameras.fusedsource import Setting, camera_source
 from neurolens.cameras.graphprogram import program_of
 from neurolens.cameras.lens_film import LensFilm
 from neurolens.cameras.model import ModelScene, OnnxCamera
 from neurolens.errors import InputError
 from neurolens.programs.compiler import load_compiled
-from neurolens.programs.contract import SCENE_RAY
+from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH, derivative
 from neurolens.programs.expressions import Program
+from neurolens.programs.loworder import FILM_X_Y, with_low_order_derivatives
 from neurolens.programs.tangents import with_derivatives
+
+_SAMPLES = 4096  # rays that low-order derivatives are fitted to
 
 
 class FusedFilm:
     """A lens's film and pupil, and the lens itself as a program, as one compiled function.
 
+    Differentials are polynomials fitted to those of the program, within `loworder.WORST` of them, or else the program's
+    own, which cost as much as its rays.
+
     Args:
         film: of the same lens, focus and stop.
         program: inputs and outputs of `programs.contract`.
         stop_radius_mm: of the round stop that the program knows.
+        film_mm: width and height of the film whose rays differentials are fitted to.
         aperture: the shape of the opening, tested on the rays' crossings with the stop; None is round.
         stop_surface: of the lens, for the status of rays that the shape blocks.
+        low_order: differentials within `loworder.WORST` will do, for those of the program cost as much as its rays.
 
     Raises:
         InputError: no C compiler, or one that fails; a pupil that is not sampled by its outline.
@@ -45,6 +53,7 @@ class FusedFilm:
         film: LensFilm,
         program: Program,
         stop_radius_mm: float,
+        film_mm: tuple[float, float],
         aperture: Aperture | None = None,
         stop_surface: int = 0,
     ) -> None:
@@ -53,6 +62,7 @@ class FusedFilm:
         self._program = program.in_order_of_need()
         self._aperture, self._stop_radius_mm = aperture, stop_radius_mm
         self._stopped = np.int32(st.blocked(stop_surface, st.RIM))
+        self._outline, self._film_mm = film.outline, film_mm
         self._edges, self._centres = _tables(film)
         outline = film.outline
         waves = [w**-2 for w in outline.wavelength_nm]
@@ -72,6 +82,7 @@ class FusedFilm:
         )
         self._rays: Any = _compiled(self._program)
         self._rays_and_moves: Any = None
+        self.moves_error: float | None = None
 
     def sample(
         self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, differentials: bool = False
@@ -100,18 +111,41 @@ class FusedFilm:
         if not differentials:
             return self._rays
         if self._rays_and_moves is None:
-            self._rays_and_moves = _compiled(with_derivatives(self._program, SCENE_RAY, FILM_X_Y))
+            self._rays_and_moves = _compiled(self._program_with_moves())
         return self._rays_and_moves
+
+    def _program_with_moves(self) -> Program:
+        """With differentials, points in metres."""
+        fitted = with_low_order_derivatives(self._program, self._samples())
+        self.moves_error = None if fitted is None else fitted.error
+        program = with_derivatives(self._program, SCENE_RAY, FILM_X_Y) if fitted is None else fitted.program
+        for name in (derivative(output, by) for output in SCENE_RAY[:3] for by in FILM_X_Y):
+            program.outputs[name] = program.outputs[name] * 1e-3
+        return program
+
+    def _samples(self) -> dict[str, FloatArray]:
+        """Inputs of the program for rays all over film, pupil and wavelengths."""
+        rng, outline = np.random.default_rng(0), self._outline
+        film = (rng.random((2, _SAMPLES)) - 0.5) * np.array(self._film_mm)[:, None]
+        film *= np.minimum(1, 0.99 * outline.film_radius_mm / np.hypot(*film))
+        wavelength = rng.uniform(outline.wavelength_nm[0], outline.wavelength_nm[-1], _SAMPLES).astype(np.float32)
+        film, square = film.astype(np.float32), rng.random((2, _SAMPLES), np.float32)
+        given = dict(zip(RAY, (*film, *outline.sample(film, square, wavelength)[0]), strict=True))
+        per_call = {FILM_Z: self._setting.film_z_mm, STOP_RADIUS: self._setting.stop_radius_mm}
+        return given | {WAVELENGTH: wavelength} | {name: np.float32(value) for name, value in per_call.items()}
 
 
 class FusedCamera(OnnxCamera):
     """An exported model as a compiled camera: the rays of `OnnxCamera` to rounding, at a fraction of its cost.
 
-    Args and attributes are those of `OnnxCamera`; differentials need no model exported with derivatives.
+    Args and attributes are those of `OnnxCamera`. Differentials (see `FusedFilm`) need no model exported with
+    derivatives.
 
     Raises:
         InputError: as `OnnxCamera`; no C compiler; a model of operators that have no such form.
     """
+
+    rays_a_call = MANY_RAYS_A_CALL
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -119,7 +153,7 @@ class FusedCamera(OnnxCamera):
         scene = self.film.scene
         assert isinstance(scene, ModelScene)
         surface = int(self.model.card["lens"].get("stop_surface", 0))
-        self._fused = FusedFilm(self.film, program, scene.stop_radius_mm, scene.aperture, surface)
+        self._fused = FusedFilm(self.film, program, scene.stop_radius_mm, self.film_mm, scene.aperture, surface)
         self.settings |= {"runtime": "fused"}
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
@@ -129,6 +163,11 @@ class FusedCamera(OnnxCamera):
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `sample`, with the differentials of the rays, which come from the same pass."""
         return self._fused.sample(film_mm, pupil, wavelength_nm, True)
+
+    @property
+    def differentials_error(self) -> float | None:
+        """RMS error of fitted differentials over their size; None where not fitted, or not asked for yet."""
+        return self._fused.moves_error
 
 
 def _tables(film: LensFilm) -> tuple[FloatArray, FloatArray]:

@@ -1,10 +1,10 @@
-"""The exact lens as a compiled C camera: every surface, in one call, with the differentials carried along."""
+"""The exact lens as a compiled C camera: every surface, in one call."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from neurolens.cameras.contract import CameraRays, FloatArray
+from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FloatArray
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.fused import FusedFilm
 from neurolens.errors import InputError
@@ -16,11 +16,13 @@ from neurolens.optics.traceprogram import exact_program
 class FusedExactCamera(ExactCamera):
     """A prescription of bare spheres and planes as a compiled camera: the rays of `ExactCamera` to rounding.
 
-    Args and attributes are those of `ExactCamera`, whose `dtype` is float32 here.
+    Args and attributes are those of `ExactCamera`, whose `dtype` is float32 here; for differentials see `FusedFilm`.
 
     Raises:
         InputError: as `ExactCamera`; no C compiler; aspheres, cylinders, coatings or glass that absorbs.
     """
+
+    rays_a_call = MANY_RAYS_A_CALL
 
     def __init__(self, lens: Lens, **kwargs: Any) -> None:
         exact_program(lens, 0.0, (LINE_D_NM, LINE_D_NM))  # refuses what it does not know, before the pupil is sought
@@ -29,7 +31,7 @@ class FusedExactCamera(ExactCamera):
         waves = self.wavelength_nm or (LINE_D_NM, LINE_D_NM)
         program = exact_program(self.lens, self._pupil_z_mm, waves)
         stop, surface = float(self.lens.stop_radius_mm), self.lens.stop_index
-        self._fused = FusedFilm(self.film, program, stop, self.lens.aperture, surface)
+        self._fused = FusedFilm(self.film, program, stop, self.film_mm, self.lens.aperture, surface)
         self.settings |= {"runtime": "fused"}
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
@@ -39,6 +41,11 @@ class FusedExactCamera(ExactCamera):
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `sample`, with the differentials of the rays, which come from the same pass."""
         return self._fused.sample(film_mm, pupil, wavelength_nm, True)
+
+    @property
+    def differentials_error(self) -> float | None:
+        """RMS error of fitted differentials over their size; None where not fitted, or not asked for yet."""
+        return self._fused.moves_error
 
 
 def _check(lens: Lens) -> None:

@@ -21,10 +21,10 @@ from neurolens.programs.contract import (
     derivative,
 )
 from neurolens.programs.expressions import Program
+from neurolens.programs.loworder import FILM_X_Y
 
 BLOCK = 256  # rays: their numbers between the stages fit the first cache
 _NAME = "lens"
-FILM_X_Y = RAY[:2]
 
 
 class Setting(ctypes.Structure):
@@ -147,7 +147,7 @@ APART void finish(
     }}
 }}
 
-/* film, square, stop [2, count]; origin, direction [3, count]; moves: derivatives of both, [2, 3, 2, count]. */
+/* film, square, stop [2, count]; origin, direction [3, count]; moves: derivatives of both, [2, 3, 2, count], metres. */
 void neurolens_camera(
     size_t count, const setting *s, const float *film, const float *square, const float *wavelength,
     float *origin, float *direction, float *weight, int *status, float *stop, float *moves)
@@ -165,13 +165,15 @@ void neurolens_camera(
 {moves}    }}
 }}
 """
-# What does not pass is no ray that could move; origins go by the metre.
+# What does not pass is no ray that could move; most blocks have none of these.
 _MOVES = """\
-        for (int k = 0; k < 12; k++) {{
+        int lost = 0;
+        for (int i = 0; i < n; i++)
+            lost |= status[at + i] != {passed};
+        for (int k = 0; lost && k < 12; k++) {{
             float *m = moves + k * count + at;
-            const float unit = k < 6 ? 1e-3f : 1.0f;
             for (int i = 0; i < n; i++)
-                m[i] = status[at + i] == {passed} ? m[i] * unit : 0.0f;
+                m[i] = status[at + i] == {passed} ? m[i] : 0.0f;
         }}
 """
 _ROOT = """

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray, towards
+from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray, towards
 from neurolens.cameras.sampling import ahead, arrived, check_film, positive, sound
 
 
@@ -29,6 +29,7 @@ class Pinhole:
     name = "pinhole"
     dispersive = False
     achromatic = True
+    rays_a_call = MANY_RAYS_A_CALL
     wavelength_nm: tuple[float, float] | None = None
 
     def __init__(self, focal_mm: float, film_mm: tuple[float, float] = (36.0, 24.0), f_number: float = 8.0) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from neurolens import status as st
 from neurolens.apertures import Aperture
-from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray, towards
+from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray, towards
 from neurolens.cameras.sampling import ahead, arrived, check_film, concentric_disk, positive, sound, stratified
 from neurolens.focus import film_z_mm
 
@@ -35,6 +35,7 @@ class ThinLens:
     name = "thin"
     dispersive = False
     achromatic = True
+    rays_a_call = MANY_RAYS_A_CALL
     wavelength_nm: tuple[float, float] | None = None
 
     def __init__(

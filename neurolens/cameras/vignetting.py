@@ -25,7 +25,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
+from neurolens.cameras.contract import RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.sampling import stratified
 from neurolens.errors import InputError
 
@@ -61,6 +61,7 @@ class Vignetted:
         self.camera, self.vignetting = camera, vignetting
         self.name, self.film_mm, self.wavelength_nm = camera.name, camera.film_mm, camera.wavelength_nm
         self.dispersive, self.achromatic = camera.dispersive, getattr(camera, "achromatic", False)
+        self.rays_a_call = getattr(camera, "rays_a_call", RAYS_A_CALL)
         self.settings: dict[str, Any] = {**camera.settings, "vignetting": vignetting}
         self._table = _Table(camera, wavelength_nm)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.cameras.contract import Camera, CameraRays, FloatArray
+from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
 from neurolens.render.colour import SRGB, balance
 from neurolens.render.film import PixelGrid
 from neurolens.render.filmsettings import FilmSettings
@@ -24,7 +24,6 @@ from neurolens.render.world import World
 
 # Of a sample's luminance; sums of colours up to a million times as bright stay within float32.
 _BRIGHTEST_SAMPLE = 1e30
-CAMERA_BATCH = 8192  # rays a call: a network keeps more numbers a ray than the tracer
 
 
 def camera_axes(settings: CameraSettings) -> FloatArray:
@@ -174,8 +173,9 @@ class Job:
         count = len(wavelength_nm)
         origin, direction = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
         weight = np.empty(count, np.float32)
-        for start in range(0, count, CAMERA_BATCH):
-            part = slice(start, start + CAMERA_BATCH)
+        at_once = getattr(self.camera, "rays_a_call", RAYS_A_CALL)
+        for start in range(0, count, at_once):
+            part = slice(start, start + at_once)
             inputs = (film_mm[:, part], pupil[:, part], wavelength_nm[part])
             rays = sample(*(np.ascontiguousarray(x) for x in inputs))
             np.add(self._axes @ rays.origin_m, self._position[:, None], out=origin[:, part])

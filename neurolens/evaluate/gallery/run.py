@@ -142,7 +142,7 @@ def _views(
         film = replace(shot.scene.settings.film, wavelengths="one" if camera.dispersive else "hero")
         done = render(
             shot.scene,
-            Window(camera, window),
+            Window(camera_of(column, shot, surrogate, compiled=True), window),
             width=panel.width,
             height=height_of(panel, window),
             samples=samples or panel.samples,
