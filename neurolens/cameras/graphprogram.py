@@ -7,6 +7,7 @@ torch and no onnx.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -33,6 +34,7 @@ from neurolens.programs.tanh import add_tanh
 
 # Objects are expressions, numbers constants.
 Array = NDArray[Any]
+_ROWS = 8  # of a product at a time, of 16 registers; fewer would wait for one another
 MAX_STEPS = 200_000  # the largest models that ship take 3000; a compiler needs a minute for 20,000
 
 
@@ -170,16 +172,21 @@ class _Writer:
         return found
 
     def _product(self, weight: Array, value: Array, bias: Array | None = None) -> Array:
-        """weight [R, M] times value [M, 1], plus bias; each of the M is spent on every row at once, to be done with."""
+        """weight [R, M] times value [M, 1], plus bias, by groups of rows whose sums fit the registers.
+
+        Each of the M is spent on every row of a group at once.
+        """
         _check_room(len(weight) * value.size)
         w, v = self._expressions(weight), self._expressions(value)
         total = np.empty((len(w), v.shape[1]), object)
         total[...] = self.program.literal(0.0)
         if bias is not None:
             total = np.array(np.broadcast_to(self._expressions(bias), total.shape))
-        for k in range(w.shape[1]):
-            for row, column in np.ndindex(total.shape):
-                total[row, column] = self.program.fma(w[row, k], v[k, column], total[row, column])
+        groups = max(1, round(len(w) / _ROWS))
+        for rows in np.array_split(np.arange(len(w)), groups):
+            for k in range(w.shape[1]):
+                for row, column in itertools.product(rows, range(v.shape[1])):
+                    total[row, column] = self.program.fma(w[row, k], v[k, column], total[row, column])
         return total
 
 

@@ -65,6 +65,18 @@ _SQRT = """
 #endif
 }}
 """
+# As whole numbers, which order as the sizes of floats do: compilers make branches of two comparisons of floats.
+_CLAMP = """
+{macro}_INLINE float {name}_clamp(float x, float limit)
+{{
+    union {{ float f; unsigned u; }} a, b;
+    a.f = x;
+    b.f = limit;
+    const unsigned sign = a.u & 0x80000000u, size = a.u & 0x7fffffffu;
+    a.u = (size < b.u ? size : b.u) | sign;
+    return a.f;
+}}
+"""
 
 
 @dataclass(frozen=True)
@@ -113,7 +125,9 @@ def write_c(program: Program, name: str, comment: Sequence[str]) -> str:
     live = program.live()
     if any(program.steps[k].kind == "sqrt" for k in live):
         text += _SQRT.format(name=name, macro=macro)
-    writer = Writer(program, f"{name}_sqrt", f"{macro}_FMA")
+    if any(program.steps[k].kind == "clamp" for k in live):
+        text += _CLAMP.format(name=name, macro=macro)
+    writer = Writer(program, f"{name}_sqrt", f"{macro}_FMA", clamp=f"{name}_clamp")
     body = [f"    const float t{k} = {writer.step(program.steps[k])};" for k in live if not _input(program, k)]
     results = [f"    ray.{o} = {writer.value(program.outputs[o].argument)};" for o in signature.outputs]
     results.append(f"    ray.status = (int){writer.value(program.outputs['status'].argument)};")
@@ -163,15 +177,15 @@ class Writer:
     """Steps as expressions of C, and of GLSL, which has the same ones.
 
     Args:
-        sqrt, fma: functions of those; without the latter a product and a sum are written.
+        sqrt, fma, clamp: functions of those; without one its operations are written.
         place: of the table's coefficient {}.
 
     Attributes:
         table: coefficients that differ between tables, each a row of one value a table, in the order of their use.
     """
 
-    def __init__(self, program: Program, sqrt: str, fma: str = "", place: str = "c[{}]") -> None:
-        self.program, self.sqrt, self.fma, self.place = program, sqrt, fma, place
+    def __init__(self, program: Program, sqrt: str, fma: str = "", place: str = "c[{}]", clamp: str = "") -> None:
+        self.program, self.sqrt, self.fma, self.place, self.clamp = program, sqrt, fma, place, clamp
         self.table: list[tuple[float, ...]] = []
 
     def value(self, argument: Argument) -> str:
@@ -194,6 +208,9 @@ class Writer:
         if step.kind in ("max", "min"):
             a, b = given
             return f"{a} {'>' if step.kind == 'max' else '<'} {b} ? {a} : {b}"
+        if step.kind == "clamp":
+            x, limit = given
+            return f"{self.clamp}({x}, {limit})" if self.clamp else f"max(min({x}, {limit}), -{limit})"
         if step.kind == "neg":
             return f"-({given[0]})"
         if step.kind == "sqrt":

@@ -15,8 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.errors import InputError
 
-# select(a, b, x, y) is x where a <= b, else y; so NaN in a or b gives y.
-KINDS = {"neg": 1, "add": 2, "sub": 2, "mul": 2, "div": 2, "sqrt": 1, "max": 2, "min": 2, "fma": 3, "select": 4}
+# select(a, b, x, y) is x where a <= b, else y; so NaN in a or b gives y. clamp(x, limit) is x within -limit and limit,
+# at the one on its side beyond; NaN becomes one of the two.
+KINDS = {
+    "neg": 1, "add": 2, "sub": 2, "mul": 2, "div": 2, "sqrt": 1, "max": 2, "min": 2, "clamp": 2, "fma": 3, "select": 4,
+}  # fmt: skip
 
 Literal = tuple[float, ...]
 Argument = int | Literal  # the number of an earlier step, or a literal
@@ -72,6 +75,7 @@ _FOLDED: dict[str, Callable[..., Any]] = {
     "sqrt": np.sqrt,
     "max": np.maximum,
     "min": np.minimum,
+    "clamp": lambda x, limit: np.where(np.abs(x) < limit, x, np.copysign(limit, x)),
     "fma": lambda a, b, c: a * b + c,
     "select": lambda a, b, x, y: np.where(a <= b, x, y),
 }

@@ -1,7 +1,7 @@
 """Derivatives of a lens's program as sparse polynomials of low order, for ray differentials.
 
-A ray differential says how wide a pixel's footprint is, to choose the texels that it averages: a few percent do. Carried
-through a surrogate, derivatives double its work; as polynomials of some ten terms each they are a few products.
+A ray differential says how wide a pixel's footprint is, to choose the texels that it averages: a few percent do.
+Carried through a surrogate, derivatives double its work; as polynomials of some ten terms each they are a few products.
 """
 
 from __future__ import annotations
@@ -56,13 +56,7 @@ def with_low_order_derivatives(program: Program, samples: Mapping[str, NDArray[n
     if passed.sum() < _FEWEST:
         return None
     found = program.in_order_of_need()
-    variables = [np.asarray(samples[name], np.float64)[passed] for name in RAY]
-    inputs = [found.input(name) for name in RAY]
-    if any(step.kind == "input" and step.name == WAVELENGTH for step in program.steps):
-        wave = (1000 / np.asarray(samples[WAVELENGTH], np.float64)[passed]) ** 2
-        variables.append(wave - wave.mean())
-        inverse = found.literal(1000.0) / found.input(WAVELENGTH)
-        inputs.append(found.fma(inverse, inverse, -float(wave.mean())))
+    variables, inputs = _variables(found, samples, passed)
     monomials = _monomials(len(variables))
     one = np.ones(int(passed.sum()))
     columns = np.stack([np.prod([one, *(variables[k] for k in m)], axis=0) for m in monomials])
@@ -80,6 +74,20 @@ def with_low_order_derivatives(program: Program, samples: Mapping[str, NDArray[n
             terms += len(chosen)
         errors.append(float(np.sqrt(np.mean((left**2).sum(axis=0) / np.maximum(size, 1e-30) ** 2))))
     return LowOrder(found, max(errors), terms) if max(errors) <= WORST else None
+
+
+def _variables(
+    program: Program, samples: Mapping[str, NDArray[np.float32]], passed: NDArray[np.bool_]
+) -> tuple[list[Array], list[Expr]]:
+    """Film and pupil point, and 1 / wavelength^2 from its mean where the program knows the wavelength."""
+    values = [np.asarray(samples[name], np.float64)[passed] for name in RAY]
+    inputs = [program.input(name) for name in RAY]
+    if any(step.kind == "input" and step.name == WAVELENGTH for step in program.steps):
+        wave = (1000 / np.asarray(samples[WAVELENGTH], np.float64)[passed]) ** 2
+        values.append(wave - wave.mean())
+        inverse = program.literal(1000.0) / program.input(WAVELENGTH)
+        inputs.append(program.fma(inverse, inverse, -float(wave.mean())))
+    return values, inputs
 
 
 def _monomials(count: int) -> list[Monomial]:
@@ -103,7 +111,11 @@ def _pursue(columns: Array, wanted: Array, good: float) -> tuple[list[int], Arra
 
 
 def _sum(
-    program: Program, monomials: Sequence[Monomial], weights: Array, inputs: Sequence[Expr], powers: dict[Monomial, Expr]
+    program: Program,
+    monomials: Sequence[Monomial],
+    weights: Array,
+    inputs: Sequence[Expr],
+    powers: dict[Monomial, Expr],
 ) -> Expr:
     """Weighted sum of monomials; their products are shared between outputs."""
 

@@ -75,6 +75,7 @@ _RULES = {
     "sqrt": lambda p, y, v, d: d[0] * (p.literal(0.5) / y),
     "max": lambda p, y, v, d: p.select(v[0], v[1], d[1], d[0]),
     "min": lambda p, y, v, d: p.select(v[0], v[1], d[0], d[1]),
+    "clamp": lambda p, y, v, d: p.select(v[0], v[1], p.select(-v[1], v[0], d[0], 0.0), 0.0),
     "fma": lambda p, y, v, d: _product(p, v[0], v[1], d[0], d[1], d[2]),
     "select": lambda p, y, v, d: p.select(v[0], v[1], d[2], d[3]),
 }

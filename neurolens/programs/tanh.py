@@ -17,7 +17,7 @@ def add_tanh(program: Program, values: Sequence[Expr]) -> list[Expr]:
     """tanh of every value."""
     found = []
     for value in values:
-        x = program.op("max", program.op("min", value, LIMIT), -LIMIT)
+        x = program.op("clamp", value, LIMIT)
         t = x * x
         y = x * program.horner(t, NUMERATOR) / program.horner(t, DENOMINATOR)
         if isinstance(y.argument, int):

@@ -55,6 +55,20 @@ def dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return out
 
 
+def _parts(vector: NDArray[np.float64]) -> list[tuple[int, np.float32]]:
+    """Components that are not 0, with their axes: walls mostly have one."""
+    return [(k, np.float32(v)) for k, v in enumerate(vector) if v]
+
+
+def _sum(parts: list[tuple[int, np.float32]], rows: FloatArray) -> FloatArray:
+    """Dot products [N] of a vector, as its parts, with vectors [3, N]."""
+    axis, value = parts[0]
+    out: FloatArray = rows[axis] * value
+    for axis, value in parts[1:]:
+        out += rows[axis] * value
+    return out
+
+
 def _keep(ok: NDArray[np.bool_], distance: FloatArray, surface: int, best: FloatArray, found: IntArray) -> None:
     """Write hits where `ok`, unless there are none."""
     if ok.any():
@@ -123,23 +137,23 @@ class Quad:
     ) -> None:
         self.first = first
         normal = np.cross(edge_u, edge_v)
-        self._normal = (normal / np.linalg.norm(normal)).astype(np.float32)
+        self._normal = _parts(normal / np.linalg.norm(normal))
         self._offset = np.float32(corner @ normal / np.linalg.norm(normal))
-        self._across = [(e / (e @ e)).astype(np.float32) for e in (edge_u, edge_v)]
+        self._across = [_parts(e / (e @ e)) for e in (edge_u, edge_v)]
         self._start = [np.float32(corner @ e / (e @ e)) for e in (edge_u, edge_v)]
 
     def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
         """See `Primitive`."""
-        distance = self._offset - dot(self._normal, rays.origin)
-        distance /= dot(self._normal, rays.direction) + _TINY
+        distance = self._offset - _sum(self._normal, rays.origin)
+        distance /= _sum(self._normal, rays.direction) + _TINY
         ok = distance > NEAREST
         ok &= distance < best
         if not ok.any():
             return
         for across, start in zip(self._across, self._start, strict=True):
-            along = dot(across, rays.direction)
+            along = _sum(across, rays.direction)
             along *= distance
-            along += dot(across, rays.origin)
+            along += _sum(across, rays.origin)
             along -= start
             ok &= along > 0
             ok &= along < 1

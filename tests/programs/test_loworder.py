@@ -19,7 +19,7 @@ def samples(count: int = COUNT, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def lens(bend: float = 0.0, lost_below_mm: float = -99.0) -> Program:
-    """x = fx px^2 / 100 + fx v, dx = fx + bend (fx / (fx + 10.5)), y and dy the linear ones of fy; the rest constant."""
+    """x = fx px^2 / 100 + fx v, dx = fx + bend (fx / (fx + 10.5)), y and dy linear, the rest constant."""
     p = Program()
     fx, fy, px, _ = (p.input(name) for name in RAY)
     v = p.literal(1000.0) / p.input(WAVELENGTH)

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
+import ctypes
+from pathlib import Path
 
+import numpy as np
+import pytest
+
+from neurolens.errors import InputError
+from neurolens.programs.c import write_c
+from neurolens.programs.compiler import compile_c
 from neurolens.programs.contract import derivative
 from neurolens.programs.expressions import Program
 from neurolens.programs.tangents import with_derivatives
@@ -21,6 +28,7 @@ def program() -> Program:
         "ratio": p.fma(x, y, p.op("sqrt", x * y)) / (x + 1.0),
         "choice": p.select(x, y, x * x, y * 5.0),
         "largest": p.op("max", x * 2.0, p.op("min", y, x)),
+        "held": p.op("clamp", x - y, 0.5) * y,
         "tanh": add_tanh(p, [x * y])[0],
         "constant": p.literal(4.0),
     }
@@ -36,6 +44,7 @@ def test_derivatives_are_those_of_the_closed_forms() -> None:
         "ratio": ((Y + Y / (2 * root)) / above - (X * Y + root) / above**2, (X + X / (2 * root)) / above),
         "choice": (np.where(X <= Y, 2 * X, 0), np.where(X <= Y, 0, 5)),
         "largest": (2 + 0 * X, 0 * X),
+        "held": (np.where(np.abs(X - Y) < 0.5, Y, 0), np.where(np.abs(X - Y) < 0.5, X - 2 * Y, np.sign(X - Y) * 0.5)),
         "tanh": (Y * slope, X * slope),
         "constant": (0 * X, 0 * X),
     }
@@ -57,3 +66,31 @@ def test_every_step_comes_after_what_it_takes() -> None:
     ordered = with_derivatives(program().in_order_of_need(), ["ratio", "tanh"], ("x", "y"))
     for k, step in enumerate(ordered.steps):
         assert all(a < k for a in step.arguments if isinstance(a, int))
+
+
+def test_clamp_and_tanh_of_any_float_as_c_and_by_steps(tmp_path: Path) -> None:
+    p = Program()
+    x = p.input("x")
+    p.outputs = {"held": p.op("clamp", x, 2.5), "tanh": add_tanh(p, [x])[0], "status": p.literal(0.0)}
+    some = np.float32([0, 1e-40, 1e-20, 2.4999998, 2.5, 2.5000002, 9.02, 30, 3e38, np.inf, np.nan])
+    given = np.concatenate([some, -some, np.linspace(-12, 12, 4001, dtype=np.float32)])
+    wanted = p.evaluate({"x": given})
+    number = ~np.isnan(given)
+    np.testing.assert_array_equal(wanted["held"][number], np.clip(given[number], -2.5, 2.5))
+    np.testing.assert_allclose(wanted["tanh"][number], np.tanh(given[number].astype(float)), rtol=5e-7, atol=0)
+    assert np.array_equal(np.abs(wanted["held"][~number]), [2.5, 2.5])
+    try:
+        compile_c(write_c(p, "f", []) + _CALL, tmp_path / "f.so")
+    except InputError as reason:
+        pytest.skip(f"nothing is compiled here: {reason}")
+    held, tanh = np.empty_like(given), np.empty_like(given)
+    call = ctypes.CDLL(str(tmp_path / "f.so")).call
+    call(ctypes.c_size_t(given.size), *(ctypes.c_void_p(a.ctypes.data) for a in (given, held, tanh)))
+    assert np.array_equal(held[number], wanted["held"][number]) and np.array_equal(np.abs(held[~number]), [2.5, 2.5])
+    np.testing.assert_allclose(tanh, wanted["tanh"], rtol=3e-7, atol=0)
+
+
+_CALL = """
+void call(size_t n, const float *x, float *held, float *tanh_x)
+{ for (size_t i = 0; i < n; i++) { const f_ray r = f(x[i]); held[i] = r.held; tanh_x[i] = r.tanh; } }
+"""

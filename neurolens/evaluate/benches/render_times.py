@@ -18,7 +18,7 @@ import numpy as np
 
 from neurolens.apertures import Aperture
 from neurolens.cameras.build import FUSED, Shot, make_camera
-from neurolens.cameras.contract import Camera
+from neurolens.cameras.contract import RAYS_A_CALL, Camera
 from neurolens.errors import InputError
 from neurolens.render.filmsettings import FilmSettings
 from neurolens.render.renderer import render
@@ -46,7 +46,7 @@ LENSES = (
 _QUICK = (2, 14, 40)
 _FILM = (0.36, 0.2025)  # of the focal length
 _FOCUS_M, _F_NUMBER = 5.0, 4.0
-_BATCH, _ALONE_ROUNDS, _SLOW_S = 8192, 15, 0.1
+_ALONE_ROUNDS, _SLOW_S = 15, 0.1
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,7 @@ class Subject:
         refractions: of the lens, None for an ideal camera. kind: one of `KINDS`, or an ideal camera.
         camera: None where it cannot be made, `reason` says why. made_s: to make it, compiling included.
         ns, ns_moves: of a ray without and with differentials, camera alone, best of the rounds.
+        moves_error: of differentials that are fitted, see `FusedFilm`.
     """
 
     lens: str
@@ -77,6 +78,7 @@ class Subject:
     made_s: float = 0.0
     ns: float | None = None
     ns_moves: float | None = None
+    moves_error: float | None = None
 
     @property
     def name(self) -> str:
@@ -124,6 +126,7 @@ def make_subjects(root: Path, quick: bool, report: Callable[[float], None]) -> l
         try:
             subject.camera = make_camera(spec, _shot(efl, spec))
             _differentials(subject.camera, 1)
+            subject.moves_error = getattr(subject.camera, "differentials_error", None)
         except InputError as error:
             subject.reason = str(error)
         subject.made_s = time.perf_counter() - began
@@ -158,23 +161,24 @@ def _inputs(camera: Camera, count: int) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 def time_alone(subjects: Sequence[Subject], report: Callable[[float], None]) -> None:
     """Nanoseconds a ray of every camera by itself, with and without differentials, in turn."""
-    calls: list[tuple[Subject, str, Callable[[], object]]] = []
+    calls: list[tuple[Subject, str, int, Callable[[], object]]] = []
     for s in subjects:
         if s.camera is not None:
-            film, square, wavelength = _inputs(s.camera, _BATCH)
+            count = getattr(s.camera, "rays_a_call", RAYS_A_CALL)
+            film, square, wavelength = _inputs(s.camera, count)
             sample = s.camera.sample
-            calls.append((s, "ns", lambda f=sample, a=(film, square, wavelength): f(*a)))  # type: ignore[misc]
-            moves = _differentials(s.camera, _BATCH)
+            calls.append((s, "ns", count, lambda f=sample, a=(film, square, wavelength): f(*a)))  # type: ignore[misc]
+            moves = _differentials(s.camera, count)
             if moves is not None:
-                calls.append((s, "ns_moves", moves))
+                calls.append((s, "ns_moves", count, moves))
     for k in range(_ALONE_ROUNDS):
-        for s, what, call in calls:
+        for s, what, count, call in calls:
             known: float | None = getattr(s, what)
-            if known is not None and known * _BATCH > _SLOW_S * 1e9:
+            if known is not None and known * count > _SLOW_S * 1e9:
                 continue  # a tenth of a second a call is measured well enough by one
             began = time.perf_counter()
             call()
-            taken = (time.perf_counter() - began) / _BATCH * 1e9
+            taken = (time.perf_counter() - began) / count * 1e9
             setattr(s, what, taken if known is None else min(known, taken))
         report((k + 1) / _ALONE_ROUNDS)
 

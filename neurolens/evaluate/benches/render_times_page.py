@@ -37,7 +37,7 @@ as C and compiled, with the pupil, weights and status around it in one call, as 
 (`--camera fused:FILE`); polynomials are `ols-64` of models/, networks `mlp-16x2`. Overhead is the time above the
 pinhole's, as a share of the pinhole's render, per refraction. Camera is the share of a render's time that its camera
 takes. Blocked rays cost no path: a lens that loses light renders faster for it. Differentials are computed and handed
-on; nothing uses them."""
+on; nothing uses them. Those of compiled cameras are polynomials of low order, whose RMS error stands beside them."""
 
 
 @dataclass
@@ -199,11 +199,12 @@ def _camera_table(found: Found) -> str:
         row, more = found.row(s, "cheap"), found.row(s, "cheap", True)
         both = [None if r is None else f"{min(r.camera_s) / r.paths * 1e9:.3g}" for r in (row, more)]
         passed, made = None if row is None else _percent(row.passed), f"{s.made_s:.2g}"
-        known = [s.name, s.refractions, ns, moves, *both, _percent(_moves_share(found, s)), passed, made]
+        known = [s.name, s.refractions, ns, moves, *both, _percent(_moves_share(found, s))]
+        known += [_percent(s.moves_error), passed, made]
         rows.append(known)
     head = (
         "camera|refractions|ns a ray, alone|with differentials|ns a ray in the cheap render|with differentials|"
-        "differentials add|rays that pass|made in s"
+        "differentials add|their error|rays that pass|made in s"
     )
     missing = [f"{s.name}: {s.reason}." for s in found.subjects if s.reason]
     return "\n\n".join([_table(head, rows), *missing])
