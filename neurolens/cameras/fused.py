@@ -18,7 +18,7 @@ from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FloatArray,
 from neurolens.cameras.fusedsource import Setting, camera_source
 from neurolens.cameras.graphprogram import program_of
 from neurolens.cameras.lens_film import LensFilm
-from neurolens.cameras.model import ModelScene, OnnxCamera
+from neurolens.cameras.model import UNIT_SLACK, ModelScene, OnnxCamera
 from neurolens.errors import InputError
 from neurolens.programs.compiler import load_compiled
 from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH, derivative
@@ -180,7 +180,7 @@ def _tables(film: LensFilm) -> tuple[FloatArray, FloatArray]:
 
 
 def _compiled(program: Program) -> Any:
-    function = load_compiled(camera_source(program, st.PASSED, st.OUTSIDE_DOMAIN)).neurolens_camera
+    function = load_compiled(camera_source(program, st.PASSED, st.OUTSIDE_DOMAIN, UNIT_SLACK)).neurolens_camera
     function.argtypes, function.restype = [ctypes.c_size_t] + [ctypes.c_void_p] * 10, None
     return function
 

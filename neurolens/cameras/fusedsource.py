@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 
-from neurolens.programs.c import Signature, write_c
+from neurolens.programs.c import Signature, literal, write_c
 from neurolens.programs.contract import (
     FILM_Z,
     RAY,
@@ -134,8 +134,11 @@ APART void finish(
         const float tx = (px[i] - fx[i]) * per_distance, ty = (py[i] - fy[i]) * per_distance;
         const float cos2 = 1.0f / (1.0f + (tx * tx + ty * ty));
         const float w = up(weight[i], 0.0f) * area[i] * cos2 * cos2 * scale;
+        /* Where a poor network decodes no direction, the ray is no ray. What is lost on its way may be NaN. */
+        const float square = dx[i] * dx[i] + dy[i] * dy[i] + dz[i] * dz[i];
+        const int ray = (square >= {shortest}) & (square <= {longest});
         status[i] = area[i] > 0.0f ? status[i] : {outside};
-        /* What is lost on its way may be NaN. */
+        status[i] = ray || status[i] != {passed} ? status[i] : {outside};
         const int lit = status[i] == {passed};
         weight[i] = lit ? w : 0.0f;
         x[i] = lit ? x[i] * 1e-3f : 0.0f;
@@ -188,11 +191,12 @@ LENS_INLINE float lens_root(float x)
 """
 
 
-def camera_source(program: Program, passed: int, outside: int) -> str:
+def camera_source(program: Program, passed: int, outside: int, slack: float) -> str:
     """The C text of a camera whose lens is a program, with derivatives where the program has them.
 
     Args:
         passed, outside: the status of rays that pass, and of film points that nothing reaches.
+        slack: how far the squared length of a direction may be from 1.
     """
     signature = Signature.of(program, _NAME)
     given = {
@@ -205,5 +209,6 @@ def camera_source(program: Program, passed: int, outside: int) -> str:
     given |= {row: f"moves + {k} * count + at" for k, row in enumerate(rows)}
     names = ("n", *(given[i] for i in (*signature.per_ray, *signature.per_call, *signature.outputs, STATUS)))
     moves = _MOVES.format(passed=passed) if rows[0] in signature.outputs else ""
-    body = _TEXT.format(block=BLOCK, passed=passed, outside=outside, call=", ".join(names), moves=moves)
+    lengths = {"shortest": literal(1 - slack), "longest": literal(1 + slack)}
+    body = _TEXT.format(block=BLOCK, passed=passed, outside=outside, call=", ".join(names), moves=moves, **lengths)
     return "#include <math.h>\n" + write_c(program, _NAME, ["A fused camera's lens."]) + _ROOT + body

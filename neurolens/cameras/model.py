@@ -31,7 +31,7 @@ __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 # Parts of the card that the metadata of pictures leave out.
 _NOT_KEPT = ("reference", "units", "frame", "status_codes", "states")
 # How far the squared length of a direction may be from 1: where a poor network decodes none, the ray is no ray.
-_UNIT_SLACK = 1e-3
+UNIT_SLACK = 1e-3
 _NO_RAY = np.array([[0], [0], [0], [0], [0], [-1]], np.float32)
 _NOMINAL = 1.02  # f-numbers are engraved rounded: up to this much wider than the widest stop means the widest stop
 
@@ -180,8 +180,8 @@ class ModelScene:
         out = self.model.rays(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm)
         status, ray = out.status, out.scene_ray
         squared = np.einsum("in,in->n", ray[3:], ray[3:])
-        if not (squared.min(initial=1) >= 1 - _UNIT_SLACK and squared.max(initial=1) <= 1 + _UNIT_SLACK):
-            unit = np.abs(squared - 1) <= _UNIT_SLACK  # false for NaN
+        if not (squared.min(initial=1) >= 1 - UNIT_SLACK and squared.max(initial=1) <= 1 + UNIT_SLACK):
+            unit = np.abs(squared - 1) <= UNIT_SLACK  # false for NaN
             status = np.where(unit | (status != st.PASSED), status, np.int32(st.OUTSIDE_DOMAIN))
             ray = np.where(unit, ray, _NO_RAY)
         return SceneRays(ray, out.transmittance, self.stopped(status, out.stop_xy_mm))

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import lens_models
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 
 from neurolens import status as st
 from neurolens.apertures import Aperture
+from neurolens.cameras import fused as fused_module
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.exact import ExactCamera
@@ -26,6 +28,7 @@ from neurolens.errors import InputError
 from neurolens.optics.lensfile import read_lens
 from neurolens.programs import compiler, loworder
 from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
+from neurolens.programs.expressions import Program
 from neurolens.render.renderer import render
 from neurolens.render.scenefile import load_scene
 from neurolens.surrogates.onnx.export import export_onnx
@@ -195,6 +198,28 @@ def test_rays_that_are_lost_on_their_way_stay_finite() -> None:
     assert found.differentials is not None and (found.status[:2] != st.PASSED).all() and found.status[2] == st.PASSED
     numbers = (found.origin_m, found.direction, found.differentials.origin_m, found.differentials.direction)
     assert all(np.isfinite(a).all() for a in numbers) and (found.weight > 0).tolist() == [False, False, True]
+
+
+def test_directions_of_another_length_pass_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a poor network makes of a few rays, here of those of half the film."""
+
+    def spoilt(*args: Any) -> Program:
+        program = program_of(*args)
+        left = program.select(program.input(RAY[0]), 0.0, 0.0, 1.0)
+        program.outputs["dz"] = program.outputs["dz"] / left  # infinite there
+        return program
+
+    _, whole = pair()
+    monkeypatch.setattr(fused_module, "program_of", spoilt)
+    half = FusedCamera(load_model(model_file()), film_mm=FILM, focus_m=2.0)
+    given = numbers(4000, seed=2)
+    wanted, found = whole.sample(*given), half.sample(*given)
+    left, passed = given[0][0] <= 0, wanted.status == st.PASSED
+    assert passed[left].any() and passed[~left].any()
+    assert (found.status[left & passed] == st.OUTSIDE_DOMAIN).all() and not found.weight[left].any()
+    assert (found.direction[:, left].T == (0, 0, -1)).all()
+    assert np.array_equal(found.status[~left], wanted.status[~left])
+    assert np.array_equal(found.weight[~left] > 0, wanted.weight[~left] > 0)
 
 
 def test_lenses_that_a_c_tracer_does_not_know() -> None:
