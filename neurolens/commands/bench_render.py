@@ -34,6 +34,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.evaluate.benches import render_times as bench
     from neurolens.evaluate.benches.render_times_page import Found, write
     from neurolens.evaluate.benches.render_times_plot import draw
+    from neurolens.evaluate.benches.render_times_shapes import time_shapes
     from neurolens.evaluate.project import project_root
     from neurolens.progress import Progress
 
@@ -53,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         found.rows = bench.time_renders(found.subjects, scenes, found.size, report)
     write(found, out)
     with progress.stage("stop shapes") as report:
-        found.shapes = bench.time_shapes(root, scenes["cheap"], found.size, report)
+        found.shapes = time_shapes(root, scenes["cheap"], found.size, report)
     draw(found, out / "render_times.png")
     print(write(found, out))
     return 0

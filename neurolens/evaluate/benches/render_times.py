@@ -31,7 +31,9 @@ FUSED_MODELS = ("polynomial, C", "network, C")
 KINDS = (TORCH, EXACT_C, *GRAPHS, *FUSED_MODELS)
 _FILES = dict(zip((*GRAPHS, *FUSED_MODELS), ("ols-64", "mlp-16x2") * 2, strict=True))
 # Scenes of rising cost: one bounce off a wall; small lights, three; meshes, gloss, glass, six.
-SCENES = {"cheap": "grid", "middle": "lights", "dear": "room"}
+CHEAP = "cheap"
+SCENES = {CHEAP: "grid", "middle": "lights", "dear": "room"}
+CHEAP_ROUNDS = 4  # times the rounds of the other scenes: there the camera counts most, and a render is short
 # Refractions, name, file of lenses/, focal length in mm.
 LENSES = (
     (2, "biconvex", "thorlabs_lb1471_biconvex_50", 49.83),
@@ -98,17 +100,6 @@ class Timed:
     paths: int = 0
 
 
-@dataclass
-class Shape:
-    """A shape of the biconvex lens's stop: area over that of the round one, rays that pass, seconds of every round."""
-
-    name: str
-    aperture: Aperture | None
-    area: float
-    passed: float = 0.0
-    seconds: list[float] = field(default_factory=list)
-
-
 def make_subjects(root: Path, quick: bool, report: Callable[[float], None]) -> list[Subject]:
     """All cameras; one that this machine cannot make says why."""
     specs: list[tuple[Subject, str, float]] = [
@@ -124,17 +115,18 @@ def make_subjects(root: Path, quick: bool, report: Callable[[float], None]) -> l
     for k, (subject, spec, efl) in enumerate(specs):
         began = time.perf_counter()
         try:
-            subject.camera = make_camera(spec, _shot(efl, spec))
+            subject.camera = make_camera(spec, shot(efl, spec))
             _differentials(subject.camera, 1)
             subject.moves_error = getattr(subject.camera, "differentials_error", None)
         except InputError as error:
-            subject.reason = str(error)
+            subject.reason = str(error).replace(f"{root}/", "")
         subject.made_s = time.perf_counter() - began
         report((k + 1) / len(specs))
     return [subject for subject, _, _ in specs]
 
 
-def _shot(efl: float, spec: str, aperture: Aperture | None = None) -> Shot:
+def shot(efl: float, spec: str, aperture: Aperture | None = None) -> Shot:
+    """What every camera is set to."""
     f_number = None if spec == "pinhole" else _F_NUMBER
     return Shot((_FILM[0] * efl, _FILM[1] * efl), _FOCUS_M, f_number, aperture=aperture)
 
@@ -195,63 +187,29 @@ def time_renders(
     """Every camera in every scene; in the cheap one also with differentials, where they take no minute."""
     rows = []
     for cost in scenes:
-        rows += [Timed(s, cost, False) for s in subjects if s.camera is not None]
-        if cost == "cheap":
-            slow = {TORCH, *GRAPHS}
-            rows += [Timed(s, cost, True) for s in subjects if s.ns_moves is not None and s.kind not in slow]
-    for k in range(size.rounds):
+        for s in subjects:
+            if s.camera is not None:
+                rows.append(Timed(s, cost, False))
+                if cost == CHEAP and s.ns_moves is not None and s.kind not in {TORCH, *GRAPHS}:
+                    rows.append(Timed(s, cost, True))  # right after, for their ratio
+    rounds = {cost: size.rounds * (CHEAP_ROUNDS if cost == CHEAP else 1) for cost in scenes}
+    for k in range(max(rounds.values())):
         for i, row in enumerate(rows):
-            assert row.subject.camera is not None
-            stats = _render(scenes[row.scene], row.subject.camera, size, row.differentials)
-            row.seconds.append(stats["seconds"])
-            row.camera_s.append(stats["camera_thread_seconds"])
-            row.passed, row.paths = stats["passed_fraction"], int(stats["paths"])
-            report((k + (i + 1) / len(rows)) / size.rounds)
+            if k < rounds[row.scene]:
+                assert row.subject.camera is not None
+                stats = one_render(scenes[row.scene], row.subject.camera, size, row.differentials)
+                row.seconds.append(stats["seconds"])
+                row.camera_s.append(stats["camera_thread_seconds"])
+                row.passed, row.paths = stats["passed_fraction"], int(stats["paths"])
+            report((k + (i + 1) / len(rows)) / max(rounds.values()))
     return rows
 
 
-def _render(scene: Scene, camera: Camera, size: Size, differentials: bool = False) -> dict[str, float]:
+def one_render(scene: Scene, camera: Camera, size: Size, differentials: bool = False) -> dict[str, float]:
+    """Statistics of one render."""
     film = FilmSettings(wavelengths="one")
     done = render(
         scene, camera, width=size.width, height=size.height, samples=size.samples, seed=1, threads=1, film=film,
         differentials=differentials,
     )  # fmt: skip
     return done.stats
-
-
-def shapes() -> list[Shape]:
-    """The round stop, 5 and 50 straight edges, a star and a heart, with their areas over the circle's."""
-    found = [Shape("round", None, 1.0)]
-    for n in (5, 50):
-        found.append(Shape(f"{n} edges", Aperture(blades=n), n / 2 * np.sin(2 * np.pi / n) / np.pi))
-    side = (np.arange(1024) + 0.5) / 512 - 1
-    x, y = np.meshgrid(side, -side)
-    # A star of five points whose inner corners lie at 0.48 of the radius; a heart, (x^2 + y^2 - 1)^3 <= x^2 y^3.
-    part = np.mod(np.arctan2(x, y) + np.pi / 5, 2 * np.pi / 5) - np.pi / 5
-    across, along = np.hypot(x, y) * np.abs(np.sin(part)), np.hypot(x, y) * np.cos(part)
-    inner = 0.48 * np.array([np.sin(np.pi / 5), np.cos(np.pi / 5)])
-    star = along <= 1 - across * (1 - inner[1]) / inner[0]
-    u, v = 1.5 * x, 1.5 * y + 0.1
-    heart = (u * u + v * v - 1) ** 3 <= u * u * v**3
-    disc = x * x + y * y <= 1
-    for name, mask in (("star", star), ("heart", heart)):
-        found.append(Shape(name, Aperture(mask=mask & disc), float((mask & disc).sum() / disc.sum())))
-    return found
-
-
-def time_shapes(root: Path, scene: Scene, size: Size, report: Callable[[float], None]) -> list[Shape]:
-    """The biconvex lens, compiled, with every shape of its stop."""
-    _, _, stem, efl = LENSES[0]
-    spec = f"{FUSED}{root / 'lenses' / f'{stem}.toml'}"
-    found = shapes()
-    try:
-        cameras = [make_camera(spec, _shot(efl, spec, shape.aperture)) for shape in found]
-    except InputError:
-        return []
-    for k in range(size.rounds):
-        for shape, camera in zip(found, cameras, strict=True):
-            stats = _render(scene, camera, size)
-            shape.seconds.append(stats["seconds"])
-            shape.passed = stats["passed_fraction"]
-        report((k + 1) / size.rounds)
-    return found
