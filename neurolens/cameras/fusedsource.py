@@ -66,6 +66,17 @@ typedef struct {{ float x, y, dx, dy; }} edge;
 
 LENS_INLINE float up(float a, float b) {{ return a > b ? a : b; }}
 
+/* Choices by bits: of choices between floats compilers make branches, and of these masked stores, which are slow. */
+LENS_INLINE unsigned all_if(int truth) {{ return truth ? ~0u : 0u; }}
+
+LENS_INLINE float kept(float x, unsigned mask, unsigned otherwise)
+{{
+    union {{ float f; unsigned u; }} a;
+    a.f = x;
+    a.u = (a.u & mask) | (otherwise & ~mask);
+    return a.f;
+}}
+
 /* Points of the pupil for numbers u, v of the unit square, and the pupil's area, 0 where nothing passes. */
 APART void pupil_points(
     int count, const setting *s, const float *LENS_RESTRICT fx, const float *LENS_RESTRICT fy,
@@ -136,17 +147,18 @@ APART void finish(
         const float w = up(weight[i], 0.0f) * area[i] * cos2 * cos2 * scale;
         /* Where a poor network decodes no direction, the ray is no ray. What is lost on its way may be NaN. */
         const float square = dx[i] * dx[i] + dy[i] * dy[i] + dz[i] * dz[i];
-        const int ray = (square >= {shortest}) & (square <= {longest});
-        status[i] = area[i] > 0.0f ? status[i] : {outside};
-        status[i] = ray || status[i] != {passed} ? status[i] : {outside};
-        const int lit = status[i] == {passed};
-        weight[i] = lit ? w : 0.0f;
-        x[i] = lit ? x[i] * 1e-3f : 0.0f;
-        y[i] = lit ? y[i] * 1e-3f : 0.0f;
-        z[i] = lit ? z[i] * 1e-3f - film_z_m : 0.0f;
-        dx[i] = lit ? dx[i] : 0.0f;
-        dy[i] = lit ? dy[i] : 0.0f;
-        dz[i] = lit ? dz[i] : -1.0f;
+        const unsigned shown = all_if(area[i] > 0.0f);
+        const unsigned unit = all_if(square >= {shortest}) & all_if(square <= {longest});
+        const unsigned passed = shown & unit & all_if(status[i] == {passed});
+        const unsigned lost = shown & all_if(status[i] != {passed});
+        status[i] = (int)((passed & {passed}u) | (lost & (unsigned)status[i]) | (~passed & ~lost & {outside}u));
+        weight[i] = kept(w, passed, 0u);
+        x[i] = kept(x[i] * 1e-3f, passed, 0u);
+        y[i] = kept(y[i] * 1e-3f, passed, 0u);
+        z[i] = kept(z[i] * 1e-3f - film_z_m, passed, 0u);
+        dx[i] = kept(dx[i], passed, 0u);
+        dy[i] = kept(dy[i], passed, 0u);
+        dz[i] = kept(dz[i], passed, 0xbf800000u); /* -1 */
     }}
 }}
 
