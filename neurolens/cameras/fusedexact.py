@@ -14,18 +14,17 @@ from neurolens.optics.traceprogram import exact_program
 
 
 class FusedExactCamera(ExactCamera):
-    """A prescription of bare spheres and planes as a compiled camera: the rays of `ExactCamera` to rounding.
+    """A prescription without coatings and absorption as a compiled camera: the rays of `ExactCamera` to rounding.
 
     Args and attributes are those of `ExactCamera`, whose `dtype` is float32 here; for differentials see `FusedFilm`.
 
     Raises:
-        InputError: as `ExactCamera`; no C compiler; aspheres, cylinders, coatings or glass that absorbs.
+        InputError: as `ExactCamera`; no C compiler; coatings or glass that absorbs.
     """
 
     rays_a_call = MANY_RAYS_A_CALL
 
     def __init__(self, lens: Lens, **kwargs: Any) -> None:
-        exact_program(lens, 0.0, (LINE_D_NM, LINE_D_NM))  # refuses what it does not know, before the pupil is sought
         _check(lens)
         super().__init__(lens, **kwargs)
         waves = self.wavelength_nm or (LINE_D_NM, LINE_D_NM)

@@ -114,7 +114,7 @@ def _meet_asphere(
     (implicit function theorem), so that gradients cost no memory for iterations.
     """
     p = (r.dx, r.dy, r.dz)
-    (c, cz), steps = _start(surface)
+    (c, cz), steps = start_of(surface)
     with torch.no_grad():
         held = Rays(*(v.detach() for v in r))
         held_m, held_p = (m[0].detach(), m[1].detach(), m[2].detach()), (held.dx, held.dy, held.dz)
@@ -147,7 +147,7 @@ def _meet_asphere(
 
 
 @torch.compiler.assume_constant_result
-def _start(surface: Surface) -> tuple[tuple[float, float], int]:
+def start_of(surface: Surface) -> tuple[tuple[float, float], int]:
     """The conic c h^2 + cz z^2 = 2 z nearest to an asphere inside its rim, as (c, cz), and the steps it needs."""
     asphere = tuple((p, _number(a)) for p, a in surface.asphere)
     return _fitted(_number(surface.curvature), _number(surface.conic), asphere, surface.semi_diameter_mm)

@@ -1,8 +1,9 @@
 """The exact tracer as a program of float steps, from which C is written: the best that tracing can do.
 
-A surrogate is only worth what it saves over this one. Spherical and plane surfaces, stop, rims, missed surfaces, total
+A surrogate is only worth what it saves over this one. Surfaces of every shape, stop, rims, missed surfaces, total
 reflection, dispersion; transmittance of bare surfaces (Fresnel, unpolarised, averaged at each surface) and of coated
-ones as if they were bare: no lens is slower for its coatings here. Ray tracing after Feder, J. Opt. Soc. Am. 41 (1951).
+ones as if they were bare: no lens is slower for its coatings here. Ray tracing after Feder, J. Opt. Soc. Am. 41 (1951);
+conics, cylinders and aspheres in `traceshapes`.
 """
 
 from __future__ import annotations
@@ -10,9 +11,10 @@ from __future__ import annotations
 import numpy as np
 
 from neurolens import status as st
-from neurolens.errors import InputError
 from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.shapes import is_plain
+from neurolens.optics.traceshapes import Vector, meet_shape
 from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STATUS, STOP, STOP_RADIUS, TRANSMITTANCE, WAVELENGTH
 from neurolens.programs.expressions import Expr, Program
 
@@ -28,13 +30,8 @@ def exact_program(lens: Lens, pupil_z_mm: float, wavelength_nm: tuple[float, flo
         pupil_z_mm: plane of the pupil points. wavelength_nm: range in which the indices hold to float32's last bit.
         whole: with stop, rims and transmittance; else the ray alone, and whether it gets through.
 
-    Raises:
-        InputError: aspheres or cylinders. Coatings and absorption are not followed; who needs them must refuse
-            such lenses.
+    Coatings and absorption are not followed; who needs them must refuse such lenses.
     """
-    odd = [k for k, s in enumerate(lens.surfaces) if s.asphere or s.cylinder or float(s.conic)]
-    if odd:
-        raise InputError(lens.path, f"surface {odd[0]}", "(asphere or cylinder)", "spheres and planes, for a C tracer")
     return _Tracing(lens, pupil_z_mm, wavelength_nm, whole).program
 
 
@@ -65,7 +62,7 @@ class _Tracing:
         square = p.fma(dx, dx, p.fma(dy, dy, dz * dz))
         scale = p.literal(1.0) / p.op("sqrt", square)
         self.d = [dx * scale, dy * scale, dz * scale]
-        self.x = [fx, fy, z]
+        self.x: Vector = (fx, fy, z)
 
     def _index(self, k: int) -> Expr:
         """Of the medium before surface k, as light comes from the scene."""
@@ -98,7 +95,7 @@ class _Tracing:
         vertex = 0.0
         for k in range(len(lens.surfaces) - 1, -1, -1):
             here = float(lens.vertices_mm[k])
-            self.x[2] = self.x[2] + (vertex - here)
+            self.x = (*self.x[:2], self.x[2] + (vertex - here))
             vertex = here
             self._surface(k, lens.surfaces[k])
         for name, value in zip(SCENE_RAY, (*self.x, *self.d), strict=True):
@@ -115,20 +112,15 @@ class _Tracing:
     def _surface(self, k: int, s: Surface) -> None:
         p, (x, y, z), (dx, dy, dz) = self.program, self.x, self.d
         c = float(s.curvature)
-        # The point nearest to the vertex, then along the ray to the sphere (Feder's e, M1 and L).
+        # The point nearest to the vertex, then along the ray to the surface (Feder's e, M1 and L).
         e = -p.fma(x, dx, p.fma(y, dy, z * dz))
-        mx, my, mz = p.fma(e, dx, x), p.fma(e, dy, y), p.fma(e, dz, z)
-        if c:
-            m2 = p.fma(mx, mx, p.fma(my, my, mz * mz))
-            f = p.fma(m2, c, mz * -2.0)
-            q2 = p.fma(f, -c, dz * dz)
-            self._test(q2, k, st.MISSED)
-            q = p.op("sqrt", q2)  # |cosine| of the angle of incidence
-            way = f / (dz - q)  # towards -z
+        nearest = p.fma(e, dx, x), p.fma(e, dy, y), p.fma(e, dz, z)
+        normal = None
+        if not is_plain(s):
+            self.x, normal, q, tests = meet_shape(p, nearest, (dx, dy, dz), s)
+            self.lost += [(*pair, st.blocked(k, st.MISSED)) for pair in tests]
         else:
-            q = -dz
-            way = -(mz / dz)
-        self.x = [p.fma(way, dx, mx), p.fma(way, dy, my), p.fma(way, dz, mz)]
+            q = self._meet_sphere(nearest, k, c)
         x, y, z = self.x
         if s.stop:
             self.at_stop = (x, y)
@@ -142,15 +134,33 @@ class _Tracing:
         cos2 = p.fma(ratio * ratio, p.fma(q, q, -1.0), 1.0)
         self._test(cos2, k, st.TOTAL_REFLECTION)
         cos = p.op("sqrt", cos2)
-        # Unit normal towards the film: (-c x, -c y, 1 - c z).
         g = cos - ratio * q
-        self.d = [
-            p.fma(g * c, x, ratio * dx),
-            p.fma(g * c, y, ratio * dy),
-            p.fma(ratio, dz, p.fma(g * c, z, -g)),
-        ]
+        if normal is not None:
+            self.d = [p.fma(-g, n, ratio * d) for n, d in zip(normal, self.d, strict=True)]
+        else:  # of a sphere, the unit normal towards the film is (-c x, -c y, 1 - c z)
+            self.d = [
+                p.fma(g * c, x, ratio * dx),
+                p.fma(g * c, y, ratio * dy),
+                p.fma(ratio, dz, p.fma(g * c, z, -g)),
+            ]
         if self.whole:
             self._fresnel(q, cos, before, after)
+
+    def _meet_sphere(self, nearest: Vector, k: int, c: float) -> Expr:
+        """Go to surface k, a sphere or a plane; returns the cosine of incidence."""
+        p, (mx, my, mz), (dx, dy, dz) = self.program, nearest, self.d
+        if c:
+            m2 = p.fma(mx, mx, p.fma(my, my, mz * mz))
+            f = p.fma(m2, c, mz * -2.0)
+            q2 = p.fma(f, -c, dz * dz)
+            self._test(q2, k, st.MISSED)
+            q = p.op("sqrt", q2)
+            way = f / (dz - q)  # towards -z
+        else:
+            q = -dz
+            way = -(mz / dz)
+        self.x = (p.fma(way, dx, mx), p.fma(way, dy, my), p.fma(way, dz, mz))
+        return q
 
     def _test(self, square: Expr, k: int, reason: int) -> None:
         """Lost where what stands under a root is not positive; NaN too."""

@@ -190,6 +190,18 @@ def test_the_exact_lens() -> None:
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * np.abs(b).max())
 
 
+@pytest.mark.parametrize("name", ["canon_aspheric_50", "schneider_anamorphic_31"])
+def test_aspheres_and_cylinders(name: str) -> None:
+    plain, fused = (
+        make_camera(f"{before}{lens_models.LENSES / name}.toml", Shot((20.0, 14.0), 4.0)) for before in ("", "fused:")
+    )
+    film, square, _ = numbers(4000, 7, (20.0, 14.0))
+    given = film, square, np.linspace(400, 700, 4000, dtype=np.float32)
+    wanted = plain.sample(*given)
+    agree(fused.sample(*given), wanted, differ=1e-3, metres=5e-7, unit=1e-5)
+    assert (wanted.status == st.PASSED).mean() > 0.3
+
+
 def test_rays_that_are_lost_on_their_way_stay_finite() -> None:
     lens = read_lens(lens_models.LENSES / "thorlabs_lb1471_biconvex_50.toml").with_aperture(Aperture(blades=6))
     fused = FusedExactCamera(lens, film_mm=FILM, focus_m=3.0)
@@ -223,9 +235,8 @@ def test_directions_of_another_length_pass_nothing(monkeypatch: pytest.MonkeyPat
 
 
 def test_lenses_that_a_c_tracer_does_not_know() -> None:
-    for name, said in (("phone_lens_6", "spheres"), ("cooke_triplet_50", "absorbs")):
-        with pytest.raises(InputError, match=said):
-            make_camera(f"fused:{lens_models.LENSES / name}.toml", Shot((4.0, 3.0), math.inf))
+    with pytest.raises(InputError, match="absorbs"):
+        make_camera(f"fused:{lens_models.LENSES / 'cooke_triplet_50'}.toml", Shot((4.0, 3.0), math.inf))
     twice = f"thick:fused:{lens_models.LENSES / 'phone_lens_6'}.toml"
     for spec in ("fused:thin", "fused:", "fused:nothing.onnx", twice):
         with pytest.raises(InputError):

@@ -18,7 +18,6 @@ from neurolens.evaluate.benches.fused import fused_candidate
 from neurolens.evaluate.benches.fused_page import goals, write
 from neurolens.evaluate.benches.fused_speed import Row, ray_candidate, selected
 from neurolens.evaluate.speed import Unavailable, race
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
 from neurolens.optics.traceprogram import exact_program
@@ -45,12 +44,6 @@ def test_the_exact_program_is_the_exact_trace() -> None:
     assert np.abs(found["transmittance"] - exact.transmittance.numpy())[passed].max() < 1e-5
     alone = exact_program(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=False).evaluate(inputs)
     assert np.array_equal(alone["dx"][passed], found["dx"][passed]) and "transmittance" not in alone
-
-
-def test_aspheres_are_not_for_the_exact_program() -> None:
-    lens = read_lens(lens_models.LENSES / "phone_lens_6.toml")
-    with pytest.raises(InputError, match="spheres"):
-        exact_program(lens, 0.0, (400.0, 700.0))
 
 
 def test_candidates_time_models_and_files() -> None:

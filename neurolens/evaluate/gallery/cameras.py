@@ -133,7 +133,7 @@ def camera_of(column: str, shot: Shot, surrogate: Surrogate | None, compiled: bo
     """
     camera = None
     if compiled and column in _COMPILED:
-        with suppress(InputError):  # a lens with aspheres or absorbing glass, or no compiler
+        with suppress(InputError):  # coatings, absorbing glass, or no compiler
             camera = _COMPILED[column](shot, surrogate)
     if camera is None:
         camera = CAMERAS[column](shot, surrogate)
