@@ -94,13 +94,11 @@ class FusedFilm:
             raise ValueError(f"film {film.shape}, square {square.shape}, wavelengths {wavelength.shape}")
         origin, direction = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
         weight, status = np.empty(count, np.float32), np.empty(count, np.int32)
-        stop = np.empty((2, count), np.float32)
+        stop = np.empty((2, count), np.float32) if self._aperture is not None else None
         moves = np.empty((2, 3, 2, count), np.float32) if differentials else None
-        arrays = [film, square, wavelength, origin, direction, weight, status, stop]
-        self._call(moves is not None)(
-            count, ctypes.byref(self._setting), *map(_address, arrays), None if moves is None else _address(moves)
-        )
-        if self._aperture is not None:
+        arrays = [film, square, wavelength, origin, direction, weight, status, stop, moves]
+        self._call(moves is not None)(count, ctypes.byref(self._setting), *map(_address, arrays))
+        if self._aperture is not None and stop is not None:
             inside = self._aperture.inside(stop[0], stop[1], self._stop_radius_mm)
             shut = ~inside & (status == st.PASSED)
             weight[shut], status[shut] = 0, self._stopped
@@ -185,5 +183,5 @@ def _compiled(program: Program) -> Any:
     return function
 
 
-def _address(array: NDArray[Any]) -> int:
-    return int(array.__array_interface__["data"][0])
+def _address(array: NDArray[Any] | None) -> int | None:
+    return None if array is None else int(array.__array_interface__["data"][0])

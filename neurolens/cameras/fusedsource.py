@@ -162,7 +162,8 @@ APART void finish(
     }}
 }}
 
-/* film, square, stop [2, count]; origin, direction [3, count]; moves: derivatives of both, [2, 3, 2, count], metres. */
+/* film, square, stop [2, count], the last or NULL; origin, direction [3, count]; moves: derivatives of both, metres,
+   [2, 3, 2, count]. */
 void neurolens_camera(
     size_t count, const setting *s, const float *film, const float *square, const float *wavelength,
     float *origin, float *direction, float *weight, int *status, float *stop, float *moves)
@@ -170,7 +171,8 @@ void neurolens_camera(
     (void)moves;
     for (size_t at = 0; at < count; at += BLOCK) {{
         const int n = count - at < BLOCK ? (int)(count - at) : BLOCK;
-        float px[BLOCK], py[BLOCK], area[BLOCK];
+        float px[BLOCK], py[BLOCK], area[BLOCK], unasked[2][BLOCK];
+        float *stop_x = stop ? stop + at : unasked[0], *stop_y = stop ? stop + count + at : unasked[1];
         const float *fx = film + at, *fy = fx + count;
         float *x = origin + at, *y = x + count, *z = y + count;
         float *dx = direction + at, *dy = dx + count, *dz = dy + count;
@@ -215,7 +217,7 @@ def camera_source(program: Program, passed: int, outside: int, slack: float) -> 
         RAY[0]: "fx", RAY[1]: "fy", RAY[2]: "px", RAY[3]: "py", WAVELENGTH: "wavelength + at",
         FILM_Z: "s->film_z_mm", STOP_RADIUS: "s->stop_radius_mm",
         **dict(zip(SCENE_RAY, ("x", "y", "z", "dx", "dy", "dz"), strict=True)),
-        TRANSMITTANCE: "weight + at", STOP[0]: "stop + at", STOP[1]: "stop + count + at", STATUS: "status + at",
+        TRANSMITTANCE: "weight + at", STOP[0]: "stop_x", STOP[1]: "stop_y", STATUS: "status + at",
     }  # fmt: skip
     rows = [derivative(output, by) for output in SCENE_RAY for by in FILM_X_Y]
     given |= {row: f"moves + {k} * count + at" for k, row in enumerate(rows)}
