@@ -71,7 +71,8 @@ class PupilOutline:
         along = np.float32(2) - a * scale * (np.float32(2) - height * scale)
         segments = self.x.shape[2] - 1
         along *= np.float32(segments / 4)
-        edge = np.minimum(along.astype(np.intp), segments - 1)
+        with np.errstate(invalid="ignore"):  # NaN is in no segment: any will do
+            edge = np.clip(along.astype(np.intp), 0, segments - 1)
         along -= edge
         x, y, dx, dy = self._edge(row * segments + edge, step, wavelength_nm)
         area = x * dy

@@ -101,11 +101,15 @@ cameras:
 
 
 def add_camera(parser: argparse.ArgumentParser) -> None:
-    """Add --camera, --pupil and --vignetting."""
+    """Add --camera, --film-offset, --pupil and --vignetting."""
     parser.add_argument(
         "--camera", metavar="CAMERA", required=True,
         help="lens file (.toml, traced exactly), model (.onnx), fused: before either, thick:LENS.toml, thin, "
         "pinhole or fisheye-PROJECTION",
+    )  # fmt: skip
+    parser.add_argument(
+        "--film-offset", metavar="MM", type=between(-1e3, 1e3, "mm"), default=0.0,
+        help="move the film away from the lens after focusing (default: 0)",
     )  # fmt: skip
     parser.add_argument(
         "--pupil", choices=PUPILS, default="outline",

@@ -226,6 +226,7 @@ def shot_of(settings: CameraSettings, args: argparse.Namespace, aperture: Apertu
         wavelength_nm=settings.wavelengths_nm,
         # A scene's f-number is for any lens; one that is asked for must be had.
         clamp_f_number=args.f_number is None,
+        film_offset_mm=args.film_offset,
         pupil=args.pupil,
         vignetting=args.vignetting,
     )

@@ -36,6 +36,17 @@ def test_the_field_of_a_fisheye_is_a_circle(tmp_path: Path) -> None:
     assert (picture[:, :1] == 0).all() and picture[3:5, 4:8].mean() == pytest.approx(1, abs=0.03)
 
 
+def test_the_film_moves_away_from_the_lens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # Irradiance through a thin lens goes with the inverse square of its distance to the film; exposure is for the film
+    # where it stands, so it is the angles that tell: the field of 36 mm shrinks, and so does what cos^4 takes.
+    near, far = (white(tmp_path, "thin", "--vignetting", "natural", "--film-offset", mm) for mm in ("0", "40"))
+    corner, place = (near[0, 0] / near[3:5, 5:7].mean((0, 1))).mean(), (far[0, 0] / far[3:5, 5:7].mean((0, 1))).mean()
+    assert place > corner + 0.04
+    out = ("-o", str(tmp_path / "b.exr"), "--quiet")
+    assert main(["render", str(SCENE), "--camera", "pinhole", "--film-offset", "1", *out]) != 0
+    assert "film_offset_mm" in capsys.readouterr().err and not (tmp_path / "b.exr").exists()
+
+
 def test_options_of_other_cameras_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = ("-o", str(tmp_path / "a.exr"), "--quiet")
     assert main(["render", str(SCENE), "--camera", "thin", "--pupil", "boxes", *out]) != 0

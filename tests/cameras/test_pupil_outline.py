@@ -167,3 +167,14 @@ def test_outlines_turn_with_the_film_point() -> None:
         expected = np.stack([c * straight[0][0] - s * straight[0][1], s * straight[0][0] + c * straight[0][1]])
         assert np.abs(turned[0] - expected).max() < 1e-4
         assert turned[1] == pytest.approx(straight[1], rel=1e-4)
+
+
+def test_numbers_outside_the_square_raise_nothing() -> None:
+    outline = found(disc, 10.0, VISIBLE)
+    strange = np.float32([math.nan, math.inf, -math.inf, -3.0, 7.0, 1.0])
+    square = np.stack([strange, np.full_like(strange, 0.5)])
+    film, wavelength = np.full((2, 6), 1.0, np.float32), np.full(6, 550, np.float32)
+    for given in (square, square[::-1]):
+        with np.errstate(all="ignore"):
+            points, area = outline.sample(film, np.ascontiguousarray(given), wavelength)
+        assert points.shape == (2, 6) and np.isnan(points[:, 0]).all() and np.isfinite(area).all()
