@@ -162,6 +162,10 @@ class FusedCamera(OnnxCamera):
         """As `sample`, with the differentials of the rays, which come from the same pass."""
         return self._fused.sample(film_mm, pupil, wavelength_nm, True)
 
+    def for_worker(self) -> FusedCamera:
+        """This camera: compiled code needs no session of its own."""
+        return self
+
     @property
     def differentials_error(self) -> float | None:
         """RMS error of fitted differentials over their size; None where not fitted, or not asked for yet."""

@@ -41,11 +41,12 @@ def scene_cameras(lens: Lens, domain: Domain, models: Mapping[str, Path], shot: 
     film = (shot.film_width_mm, shot.film_height_mm)
     data = first_order(lens)
     f_number = max(shot.f_number or data.f_number, data.f_number)
-    cameras: dict[str, Camera] = {
-        EXACT: ExactCamera(lens, film_mm=film, focus_m=shot.focus_m, f_number=f_number, bounds=domain.bounds)
-    }
+    # The same light for all: exposures are for it.
+    real: dict[str, Any] = {"film_mm": film, "focus_m": shot.focus_m, "f_number": f_number}
+    real["wavelength_nm"] = shot.wavelengths_nm
+    cameras: dict[str, Camera] = {EXACT: ExactCamera(lens, bounds=domain.bounds, **real)}
     for name, file in models.items():
-        cameras[name] = OnnxCamera(load_model(file), film_mm=film, focus_m=shot.focus_m, f_number=f_number)
+        cameras[name] = OnnxCamera(load_model(file), **real)
     cameras["thin lens"] = ThinLens(data.efl_mm, f_number, shot.focus_m, film)
     cameras["pinhole"] = Pinhole(data.efl_mm, film, f_number)
     return cameras

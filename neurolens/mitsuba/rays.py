@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from neurolens.cameras.contract import Camera, FloatArray
+from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.render.film import PixelGrid
 
-BATCH = 8192  # rays a call of the camera, as in our renderer
+BATCH = RAYS_A_CALL  # of the camera
 _TURNED = np.array([[-1], [1], [-1]], np.float32)  # half a turn about y
 
 

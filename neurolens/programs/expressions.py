@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.errors import InputError
 
 # select(a, b, x, y) is x where a <= b, else y; so NaN in a or b gives y. clamp(x, limit) is x within -limit and limit,
-# at the one on its side beyond; NaN becomes one of the two.
+# at the one on its side beyond; NaN becomes one of the two (not in GLSL). Its limit is a number above 0.
 KINDS = {
     "neg": 1, "add": 2, "sub": 2, "mul": 2, "div": 2, "sqrt": 1, "max": 2, "min": 2, "clamp": 2, "fma": 3, "select": 4,
 }  # fmt: skip
@@ -117,6 +117,8 @@ class Program:
     def op(self, kind: str, *values: Number) -> Expr:
         """Append an operation, or what it comes to: equal steps are shared, and literals folded in float64."""
         given = [self.expr(v) for v in values]
+        if kind == "clamp" and (given[1].literal is None or min(given[1].literal) <= 0):
+            raise ValueError("clamp: expected a limit that is a number above 0")
         simple = self._simplified(kind, given)
         return simple if simple is not None else self._append(Step(kind, tuple(e.argument for e in given)))
 

@@ -24,6 +24,7 @@ _DEGREE, _DEGREE_WAVE = 4, 2  # of film and pupil point; of what may be multipli
 _STOP, _MOST_TERMS = 0.005, 16  # error at which an output has enough, as a share of its group's; terms of an output
 WORST = 0.03  # RMS error, as a share of a derivative, above which there is no such program
 _FEWEST = 500  # rays that pass, to fit to
+_ONE_WAVELENGTH = 1e-3  # relative spread of 1 / wavelength^2 below which it is one
 _GROUPS = (SCENE_RAY[:3], SCENE_RAY[3:])  # point and direction: each has one scale
 Monomial = tuple[int, ...]  # numbers of the variables in it, ascending
 
@@ -61,19 +62,32 @@ def with_low_order_derivatives(program: Program, samples: Mapping[str, NDArray[n
     one = np.ones(int(passed.sum()))
     columns = np.stack([np.prod([one, *(variables[k] for k in m)], axis=0) for m in monomials])
     powers: dict[Monomial, Expr] = {}
-    errors, terms = [], 0
+    terms = 0
     for group in _GROUPS:
-        names = [derivative(output, by) for output in group for by in FILM_X_Y]
-        wanted = np.stack([np.broadcast_to(exact[name], passed.shape)[passed] for name in names]).astype(np.float64)
-        size = np.sqrt((wanted**2).sum(axis=0))
-        left = wanted.copy()
-        for k, name in enumerate(names):
-            chosen, weights = _pursue(columns, wanted[k], _STOP * float(np.sqrt(np.mean(size**2) / len(names))))
-            left[k] -= weights @ columns[chosen]
+        wanted = _matrices(exact, group, passed)
+        enough = _STOP * float(np.sqrt(np.mean(np.square(wanted))))
+        for name, row in zip(_names(group), wanted, strict=True):
+            chosen, weights = _pursue(columns, row, enough)
             found.outputs[name] = _sum(found, [monomials[c] for c in chosen], weights, inputs, powers)
             terms += len(chosen)
-        errors.append(float(np.sqrt(np.mean((left**2).sum(axis=0) / np.maximum(size, 1e-30) ** 2))))
-    return LowOrder(found, max(errors), terms) if max(errors) <= WORST else None
+    fitted = found.evaluate(samples)  # in float32, as it will be used
+    error = max(_error(_matrices(fitted, g, passed), _matrices(exact, g, passed)) for g in _GROUPS)
+    return LowOrder(found, error, terms) if error <= WORST else None
+
+
+def _names(group: Sequence[str]) -> list[str]:
+    return [derivative(output, by) for output in group for by in FILM_X_Y]
+
+
+def _matrices(results: Mapping[str, NDArray[np.float32]], group: Sequence[str], passed: NDArray[np.bool_]) -> Array:
+    """Derivatives [6, M] of a group's three outputs, of the rays that pass."""
+    return np.stack([np.broadcast_to(results[name], passed.shape)[passed] for name in _names(group)]).astype(np.float64)
+
+
+def _error(found: Array, wanted: Array) -> float:
+    """RMS over rays of the relative error in the Frobenius norm."""
+    size = np.maximum(np.linalg.norm(wanted, axis=0), 1e-30)
+    return float(np.sqrt(np.mean((np.linalg.norm(found - wanted, axis=0) / size) ** 2)))
 
 
 def _variables(
@@ -84,9 +98,10 @@ def _variables(
     inputs = [program.input(name) for name in RAY]
     if any(step.kind == "input" and step.name == WAVELENGTH for step in program.steps):
         wave = (1000 / np.asarray(samples[WAVELENGTH], np.float64)[passed]) ** 2
-        values.append(wave - wave.mean())
-        inverse = program.literal(1000.0) / program.input(WAVELENGTH)
-        inputs.append(program.fma(inverse, inverse, -float(wave.mean())))
+        if np.ptp(wave) > _ONE_WAVELENGTH * wave.mean():  # else a constant, which there is already
+            values.append(wave - wave.mean())
+            inverse = program.literal(1000.0) / program.input(WAVELENGTH)
+            inputs.append(program.fma(inverse, inverse, -float(wave.mean())))
     return values, inputs
 
 

@@ -212,13 +212,16 @@ def test_rays_that_are_lost_on_their_way_stay_finite() -> None:
     assert all(np.isfinite(a).all() for a in numbers) and (found.weight > 0).tolist() == [False, False, True]
 
 
-def test_directions_of_another_length_pass_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("length", [0.0, 0.9, 1.01, math.inf, math.nan])
+def test_directions_of_another_length_pass_nothing(length: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a poor network makes of a few rays, here of those of half the film."""
 
     def spoilt(*args: Any) -> Program:
         program = program_of(*args)
-        left = program.select(program.input(RAY[0]), 0.0, 0.0, 1.0)
-        program.outputs["dz"] = program.outputs["dz"] / left  # infinite there
+        zero = program.select(program.input(RAY[0]), 0.0, 0.0, 1.0)
+        strange = zero / zero if math.isnan(length) else program.literal(1.0) / zero
+        factor = strange if not math.isfinite(length) else program.select(zero, 0.0, length, 1.0)
+        program.outputs |= {name: program.outputs[name] * factor for name in SCENE_RAY[3:]}
         return program
 
     _, whole = pair()

@@ -56,10 +56,10 @@ def test_overhead_is_per_refraction() -> None:
 
 def test_page_and_csv(tmp_path: Path) -> None:
     measured = found(0.1, 0.2, 3.0)
-    measured.subjects.append(Subject("asphere", 4, EXACT_C, reason="spheres only"))
+    measured.subjects.append(Subject("asphere", 4, EXACT_C, reason="coated"))
     text = write(measured, tmp_path)
     assert text == (tmp_path / "README.md").read_text(encoding="utf-8")
-    assert "2.300 (4.600)" in text and "asphere, exact, C: spheres only." in text and "missed" in text
+    assert "2.300 (4.600)" in text and "asphere, exact, C: coated." in text and "missed" in text
     rows = list(csv.DictReader((tmp_path / "render_times.csv").open(encoding="utf-8")))
     assert len(rows) == 5 and float(rows[0]["seconds_min"]) == 2.0 and float(rows[0]["seconds_median"]) == 4.0
 

@@ -46,6 +46,21 @@ def test_a_lens_of_low_order_is_met() -> None:
     assert found.terms <= 8
 
 
+@pytest.mark.parametrize("nm", [403.0, 505.0, 550.0, 587.5618, 699.0])
+def test_light_of_one_wavelength(nm: float) -> None:
+    """Its variable is a constant to rounding, and must not pass for another."""
+    given = {name: values for name, values in samples().items() if name != WAVELENGTH}
+    for count in (1500, 1777, COUNT):
+        some = {name: values[:count] for name, values in given.items()}
+        some[WAVELENGTH] = np.full(count, nm, np.float32)
+        found = with_low_order_derivatives(lens(), some)
+        assert found is not None and found.error < 1e-5
+        values = found.program.evaluate(some)
+        wanted = some[RAY[2]] ** 2 * 0.01 + (1000 / nm) ** 2
+        np.testing.assert_allclose(values[derivative("x_mm", RAY[0])], wanted, rtol=2e-5)
+        np.testing.assert_allclose(values[derivative("dx", RAY[0])], 1, rtol=1e-5)
+
+
 def test_a_stronger_lens_says_its_error_or_is_refused() -> None:
     found = with_low_order_derivatives(lens(bend=0.02), samples())
     assert found is not None and 1e-4 < found.error < WORST
@@ -58,6 +73,6 @@ def test_too_few_rays_are_no_fit(count: int) -> None:
 
 
 def test_rays_that_do_not_pass_are_no_part_of_the_fit() -> None:
-    """Below 0 the strong term is lost: what is left of it is gentle."""
+    """Those below 2 mm are lost: what is left of the strong term is gentle."""
     half, whole = (with_low_order_derivatives(lens(1.0, low), samples(8000)) for low in (2.0, -99.0))
     assert whole is None and half is not None

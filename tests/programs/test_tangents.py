@@ -94,3 +94,10 @@ _CALL = """
 void call(size_t n, const float *x, float *held, float *tanh_x)
 { for (size_t i = 0; i < n; i++) { const f_ray r = f(x[i]); held[i] = r.held; tanh_x[i] = r.tanh; } }
 """
+
+
+def test_clamp_has_a_number_above_0() -> None:
+    p = Program()
+    for limit in (p.input("y"), 0.0, -2.0):
+        with pytest.raises(ValueError, match="above 0"):
+            p.op("clamp", p.input("x"), limit)

@@ -165,11 +165,8 @@ def ray_candidate(name: str, file: Path) -> Candidate:
 
 def _add_exact(add: Callable[..., None], lens: Lens, domain: Domain, torch_compiled: bool) -> None:
     for work in ("ray", "whole"):
-        try:
-            program = exact_program(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=work == "whole")
-            add("exact C", work, program_candidate("", program, domain), program)
-        except InputError:
-            pass
+        program = exact_program(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=work == "whole")
+        add("exact C", work, program_candidate("", program, domain), program)
         if torch_compiled:
             add("exact torch", work, exact_candidates(lens, domain, transmittance=work == "whole")[1])
 

@@ -111,7 +111,7 @@ CAMERAS: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
     "pinhole": pinhole_camera,
     "post": post_processed,
 }
-# The same as compiled code: two to ten times as fast, but not for every lens, nor on every machine.
+# The same as compiled code: many times as fast, but not for every lens, nor on every machine.
 _COMPILED: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
     "exact": partial(exact_camera, kind=FusedExactCamera),
     "surrogate": partial(surrogate_camera, kind=FusedCamera),
