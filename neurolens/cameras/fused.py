@@ -21,9 +21,9 @@ from neurolens.cameras.lens_film import LensFilm
 from neurolens.cameras.model import UNIT_SLACK, ModelScene, OnnxCamera
 from neurolens.errors import InputError
 from neurolens.programs.compiler import load_compiled
-from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH, derivative
+from neurolens.programs.contract import FILM_X_Y, FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH, derivative
 from neurolens.programs.expressions import Program
-from neurolens.programs.loworder import FILM_X_Y, with_low_order_derivatives
+from neurolens.programs.loworder import with_low_order_derivatives
 from neurolens.programs.tangents import with_derivatives
 
 _SAMPLES = 4096  # rays that low-order derivatives are fitted to
@@ -42,7 +42,10 @@ class FusedFilm:
         film_mm: width and height of the film whose rays differentials are fitted to.
         aperture: the shape of the opening, tested on the rays' crossings with the stop; None is round.
         stop_surface: of the lens, for the status of rays that the shape blocks.
-        low_order: differentials within `loworder.WORST` will do, for those of the program cost as much as its rays.
+
+    Attributes:
+        moves_error: RMS error of fitted differentials over their size; None where they are the program's own, or were
+            not asked for yet.
 
     Raises:
         InputError: no C compiler, or one that fails; a pupil that is not sampled by its outline.
@@ -168,7 +171,7 @@ class FusedCamera(OnnxCamera):
 
     @property
     def differentials_error(self) -> float | None:
-        """RMS error of fitted differentials over their size; None where not fitted, or not asked for yet."""
+        """See `FusedFilm.moves_error`."""
         return self._fused.moves_error
 
 

@@ -43,7 +43,7 @@ class FusedExactCamera(ExactCamera):
 
     @property
     def differentials_error(self) -> float | None:
-        """RMS error of fitted differentials over their size; None where not fitted, or not asked for yet."""
+        """See `FusedFilm.moves_error`."""
         return self._fused.moves_error
 
 

@@ -10,6 +10,7 @@ import ctypes
 
 from neurolens.programs.c import Signature, literal, write_c
 from neurolens.programs.contract import (
+    FILM_X_Y,
     FILM_Z,
     RAY,
     SCENE_RAY,
@@ -21,7 +22,6 @@ from neurolens.programs.contract import (
     derivative,
 )
 from neurolens.programs.expressions import Program
-from neurolens.programs.loworder import FILM_X_Y
 
 BLOCK = 256  # rays: their numbers between the stages fit the first cache
 _NAME = "lens"

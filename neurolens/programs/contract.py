@@ -4,6 +4,7 @@ from __future__ import annotations
 
 # Per ray.
 RAY = ("film_x_mm", "film_y_mm", "pupil_x_mm", "pupil_y_mm")
+FILM_X_Y = RAY[:2]
 WAVELENGTH = "wavelength_nm"
 # For a whole call.
 FILM_Z, STOP_RADIUS = "film_z_mm", "stop_radius_mm"

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens import status as st
-from neurolens.programs.contract import RAY, SCENE_RAY, STATUS, WAVELENGTH, derivative
+from neurolens.programs.contract import FILM_X_Y, RAY, SCENE_RAY, STATUS, WAVELENGTH, derivative
 from neurolens.programs.expressions import Expr, Program
 from neurolens.programs.tangents import with_derivatives
 
 Array = NDArray[np.float64]
-FILM_X_Y = RAY[:2]
 _DEGREE, _DEGREE_WAVE = 4, 2  # of film and pupil point; of what may be multiplied by the wavelength's variable
 _STOP, _MOST_TERMS = 0.005, 16  # error at which an output has enough, as a share of its group's; terms of an output
 WORST = 0.03  # RMS error, as a share of a derivative, above which there is no such program
@@ -111,7 +110,10 @@ def _monomials(count: int) -> list[Monomial]:
 
 
 def _pursue(columns: Array, wanted: Array, good: float) -> tuple[list[int], Array]:
-    """Rows of `columns` [M, N] and their weights, whose sum comes within `good` (RMS) of `wanted` [N]."""
+    """Rows of `columns` [M, N] and their weights, whose sum comes within `good` (RMS) of `wanted` [N].
+
+    A plain pursuit of a few dozen columns: those of `surrogates.fits` need torch, and a render with a model does not.
+    """
     size = np.maximum(np.linalg.norm(columns, axis=1), 1e-30)
     chosen: list[int] = []
     weights, left = np.zeros(0), wanted
