@@ -31,15 +31,15 @@ from optiland.materials import IdealMaterial
 from optiland.optic import Optic
 from optiland.rays import RealRays
 
+from neurolens.base.files import atomic_write_text
+from neurolens.base.progress import Progress
 from neurolens.evaluate.benches.trace_speed import film_rays, with_aspheres
 from neurolens.evaluate.benches.trace_speed_page import machine
 from neurolens.evaluate.speed import Call, Candidate, Race, race
-from neurolens.files import atomic_write_text
 from neurolens.optics import glass
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays, compile_trace, trace
-from neurolens.progress import Progress
 from neurolens.surrogates.domain import FilmRays
 
 ROOT = Path(__file__).resolve().parents[1]

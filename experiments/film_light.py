@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from neurolens.errors import NeurolensWarning
+from neurolens.base.errors import NeurolensWarning
+from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.plots.radiometry import film_light_picture, white_card_picture
-from neurolens.files import atomic_write_text
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.radiometry import film_light
 

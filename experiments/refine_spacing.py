@@ -24,7 +24,7 @@ from neurolens import __version__
 from neurolens.analysis.bundles import bundle
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.plot_style import heading, new_figure, save, style, wavelength_colour
-from neurolens.files import atomic_write_text
+from neurolens.base.files import atomic_write_text
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays

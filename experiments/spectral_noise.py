@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from neurolens.base.errors import NeurolensWarning
+from neurolens.base.files import atomic_write_text
 from neurolens.cameras.build import Shot, make_camera
-from neurolens.errors import NeurolensWarning
-from neurolens.files import atomic_write_text
 from neurolens.render.colour import SRGB
 from neurolens.render.filmsettings import FilmSettings
 from neurolens.render.renderer import RenderResult, render

@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
+from neurolens.base.errors import NeurolensWarning
+from neurolens.base.files import atomic_write_text
 from neurolens.cameras.build import Shot, make_camera
-from neurolens.errors import NeurolensWarning
-from neurolens.files import atomic_write_text
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.radiometry import film_light, white_card
 from neurolens.render.exr import write_png

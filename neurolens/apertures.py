@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 
 MIN_BLADES, MAX_BLADES = 3, 100
 MAX_MASK = 4096

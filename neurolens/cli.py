@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from neurolens import __version__
+from neurolens.base.errors import NeurolensError, NeurolensWarning
 from neurolens.commands.arguments import Parser
-from neurolens.errors import NeurolensError, NeurolensWarning
 
 # Packages of the extra that a base install lacks.
 _TRAIN_PACKAGES = {"torch", "sklearn", "onnx", "matplotlib", "flip_evaluator", "mpmath"}

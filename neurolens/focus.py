@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 
 
 def film_z_mm(

@@ -11,8 +11,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from neurolens.base.errors import NeurolensWarning
 from neurolens.cameras.exact import ExactCamera
-from neurolens.errors import NeurolensWarning
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.cores import Network

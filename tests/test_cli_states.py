@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from command_line import described, failure, run_json
 
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path, check_writable
 from neurolens.cli import main
-from neurolens.errors import InputError
-from neurolens.files import atomic_path, check_writable
 from neurolens.render.exr import read_exr, write_exr
 
 LENSES = Path(__file__).parents[1] / "lenses"

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neurolens.config import apply_overrides, from_dict, read_config, to_dict, to_toml
-from neurolens.errors import InputError
+from neurolens.base.config import apply_overrides, from_dict, read_config, to_dict, to_toml
+from neurolens.base.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from neurolens.files import atomic_path, atomic_write_text
+from neurolens.base.files import atomic_path, atomic_write_text
 
 
 def test_writes_and_replaces(tmp_path: Path) -> None:

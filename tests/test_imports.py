@@ -1,6 +1,6 @@
 """The folders are layers: imports go one way, a render needs no torch, and modules stay short enough to read.
 
-base (errors, status, files, tomlfile, config, progress, focus, modelfile, programs)
+base (with focus, modelfile, programs)
 base <- optics <- surrogates <- evaluate <- commands <- cli
         optics <- analysis   <- evaluate
      <- cameras <- render    <- evaluate
@@ -21,12 +21,7 @@ MODULES = sorted((ROOT / "neurolens").rglob("*.py"))
 MAX_LINES = 300
 
 BASE = {
-    "errors",
-    "status",
-    "files",
-    "tomlfile",
-    "config",
-    "progress",
+    "base",
     "focus",
     "modelfile",
     "apertures",

@@ -6,7 +6,7 @@ import io
 
 import pytest
 
-from neurolens.progress import Progress, duration
+from neurolens.base.progress import Progress, duration
 
 
 class Clock:

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neurolens import status as st
 from neurolens.analysis.aim import Aim
 from neurolens.analysis.fields import DEFAULT_NM, Scene, on_plane
 from neurolens.analysis.patterns import Pattern, hexapolar
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.optics import apertures
 from neurolens.optics.media import media
 from neurolens.optics.surfaces import Rays

@@ -11,7 +11,7 @@ from neurolens.analysis.bundles import bundle
 from neurolens.analysis.fields import DEFAULT_NM, Scene
 from neurolens.analysis.patterns import points
 from neurolens.analysis.results import Array, Result
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.paraxial import is_pinhole
 
 LINE_G_NM = 435.8343  # mercury, the usual fourth line

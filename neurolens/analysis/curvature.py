@@ -16,7 +16,7 @@ from neurolens.analysis.fields import Scene
 from neurolens.analysis.patterns import points
 from neurolens.analysis.results import Array, Result
 from neurolens.analysis.seidel import petzval_curvature
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import is_pinhole
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from neurolens.analysis.results import Array
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.aiming import Axis, aim_at_stop, without_rims
 from neurolens.optics.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
 from neurolens.optics.paraxial import FirstOrder, first_order

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, new_figure, save, style
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 
 Points = NDArray[np.float64]
 Surface = Mapping[str, Any]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from neurolens.errors import NeurolensError
-from neurolens.files import atomic_path
+from neurolens.base.errors import NeurolensError
+from neurolens.base.files import atomic_path
 
 # Okabe and Ito's colours, told apart by colour-blind readers too.
 FIELD_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#7f7f7f")

@@ -21,7 +21,7 @@ from neurolens.analysis.patterns import grid, hexapolar
 from neurolens.analysis.results import Array, Result
 from neurolens.analysis.spots import working_f_number
 from neurolens.analysis.wavefront import cosines, path_to_chief_mm
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.paraxial import is_pinhole
 
 _BINS, _POINTS = 49, 97  # of the geometric and the diffraction image, odd: one on the centre

@@ -15,7 +15,7 @@ import numpy as np
 
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.results import Array, Result
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, index_of
 from neurolens.optics.paraxial import is_pinhole
 from neurolens.optics.prescription import Lens, Surface

@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.states import check_states
-from neurolens.errors import InputError, ModelError
 
 
 def is_number(value: Any) -> bool:

@@ -33,7 +33,7 @@ it: their W is w times the film's area for an area square to the ray, so that bo
 has the unit mm^2 / m^2. For points drawn with the density p per m^2, add
 W L cos(theta_P) / (p N a) to the pixel of area a (mm^2) that holds the film point, for each of N points.
 
-Status. Every ray has one (`neurolens.status`); what did not pass has weight 0 and finite numbers elsewhere, and so have
+Status. Every ray has one (`base.status`); what did not pass has weight 0 and finite numbers elsewhere, and so have
 film or scene points that are not finite. Nothing in a ray raises; shapes and domains of settings do, when a camera is
 made (`InputError`). A batch may be empty, and of any size that memory holds.
 """
@@ -74,7 +74,7 @@ class CameraRays:
         direction: [3, N] float32, unit vectors.
         weight: [N] float32. The film value is the mean of weight times radiance over the pupil samples; a uniform
             environment of radiance 1 gives 1 on the axis for every camera. 0 where the ray did not pass.
-        status: [N] int32, see `neurolens.status`.
+        status: [N] int32, see `neurolens.base.status`.
         differentials: of the rays, from `DifferentialCamera.sample_differentials` only.
     """
 
@@ -94,7 +94,7 @@ class FilmPoints:
         origin_m, direction: [3, N] float32, camera frame, as in `CameraRays`: the ray from the lens to the scene point.
             Whatever stands between the two shades the point.
         weight: [N] float32, W of the module in mm^2 / m^2; 0 where nothing arrives.
-        status: [N] int32, see `neurolens.status`.
+        status: [N] int32, see `neurolens.base.status`.
     """
 
     film_mm: FloatArray

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.exact_pupils import OUTLINE, pupil_named
 from neurolens.cameras.front_aim import FrontAim, front_aim

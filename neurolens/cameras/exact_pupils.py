@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.errors import InputError
 from neurolens.optics import pupil_methods as known
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupil_methods import RadialPupil

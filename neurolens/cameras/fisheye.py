@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray, RayDifferentials
 from neurolens.cameras.sampling import arrived, check_film, positive
-from neurolens.errors import InputError
 
 Array = NDArray[Any]
 Function = Callable[[Array], Array]

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lens_film import LensFilm
 from neurolens.frontsurface import Shape, meet_front, sag_and_slope

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FloatArray
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.fused import FusedFilm
-from neurolens.errors import InputError
 from neurolens.optics.glass import LINE_D_NM, absorption_of
 from neurolens.optics.prescription import Lens
 from neurolens.optics.traceprogram import exact_program

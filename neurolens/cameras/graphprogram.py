@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.onnxfile import constants_and_nodes
 from neurolens.cameras.onnxshapes import Node
-from neurolens.errors import InputError
 from neurolens.programs.contract import (
     FILM_Z,
     RAY,

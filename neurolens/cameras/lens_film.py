@@ -11,12 +11,12 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.cameras.contract import CameraRays, FloatArray, RayDifferentials
 from neurolens.cameras.pupil_boxes import Passes, PupilTable
 from neurolens.cameras.pupil_search import FINE, Detail, outline_of
 from neurolens.cameras.sampling import stratified
-from neurolens.errors import InputError
 
 # Points a side of the quadrature of the exposure on the axis.
 _QUADRATURE = 256

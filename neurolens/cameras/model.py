@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens import status as st
 from neurolens.apertures import Aperture
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
 from neurolens.cameras.lens_film import LensFilm, SceneRays
@@ -22,7 +23,6 @@ from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.sampling import arrived, check_film, positive
 from neurolens.cameras.states import state_for
-from neurolens.errors import InputError, ModelError
 from neurolens.focus import film_z_mm
 from neurolens.modelfile import DOMAIN_SLACK
 

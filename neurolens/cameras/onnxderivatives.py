@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.onnxlens import DERIVATIVES, INPUTS, OUTPUTS, LensRays, OnnxLens
 from neurolens.cameras.onnxsession import open_session, run_session
-from neurolens.errors import InputError, ModelError
 
 # Rays a call: these graphs have more rows than those without derivatives.
 BATCH = 8192

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base.errors import ModelError
 from neurolens.cameras.onnxshapes import BROADCAST, ELEMENTWISE, RAYS, SHAPED, Node, Shape, check_shapes
 from neurolens.cameras.protobuf import Fields, as_text, fields_of, integers, message, one, text, walk
-from neurolens.errors import ModelError
 from neurolens.modelfile import CARD_KEY, CARD_KIND, CARD_SCHEMA
 
 MAX_BYTES = 64 * 2**20

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.cardcheck import check_card, is_number
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.onnxfile import read_checked
 from neurolens.cameras.onnxlens import OUTPUTS
 from neurolens.cameras.onnxsession import open_session, run_session
-from neurolens.errors import InputError, ModelError
 from neurolens.frontsurface import meet_front
 
 # Rays a call: the Newton steps have more rows than a model.

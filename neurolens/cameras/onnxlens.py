@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.cardcheck import check_card
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.onnxfile import read_checked, without_outputs
 from neurolens.cameras.onnxsession import open_session, run_session
 from neurolens.cameras.states import STATE, axes_of, card_at, default_state, state_numbers
-from neurolens.errors import InputError, ModelError
 
 INPUTS = {"rays": ("tensor(float)", 5, None), "film_z_mm": ("tensor(float)", 1), "stop_radius_mm": ("tensor(float)", 1)}
 OUTPUTS = {
@@ -36,7 +36,7 @@ class LensRays(NamedTuple):
     """What a model gives for N rays; lens frame, mm. Rays mean something where status is 0.
 
     scene_ray [6, N] float32 (x, y, z, unit direction), transmittance [N], stop_xy_mm [2, N] (crossing with the stop),
-    status [N] int32 (see `neurolens.status`).
+    status [N] int32 (see `neurolens.base.status`).
     """
 
     scene_ray: FloatArray

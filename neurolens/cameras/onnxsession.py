@@ -10,7 +10,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from neurolens.errors import ModelError
+from neurolens.base.errors import ModelError
 
 
 def open_session(

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.pupil_outline import turned
-from neurolens.errors import InputError
 
 # Lattice on a row's box when the bounds are tightened; along and across (one half).
 _LATTICE = (96, 48)

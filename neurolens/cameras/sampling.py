@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
-from neurolens.errors import InputError
 
 _AHEAD = np.array([[0], [0], [-1]], np.float32)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from neurolens.axes import Axis, product, weights
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.statetable import mix_domain, mix_lens
 
 STATE = "state"

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from neurolens import status as st
 from neurolens.apertures import Aperture
+from neurolens.base import status as st
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray, towards
 from neurolens.cameras.sampling import ahead, arrived, check_film, concentric_disk, positive, sound, stratified
 from neurolens.focus import film_z_mm

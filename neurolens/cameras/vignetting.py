@@ -25,9 +25,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.contract import RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.sampling import stratified
-from neurolens.errors import InputError
 
 Vignetting = Literal["both", "natural", "optical", "none"]
 VIGNETTINGS: tuple[str, ...] = get_args(Vignetting)

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from neurolens.base.errors import InputError
 from neurolens.commands import analyse_text as text
 from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between, focus_of
 from neurolens.commands.output import print_json
-from neurolens.errors import InputError
 
 if TYPE_CHECKING:
     from neurolens.analysis.fields import Scene

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neurolens.errors import NeurolensWarning
+from neurolens.base.errors import NeurolensWarning
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens

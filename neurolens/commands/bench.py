@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.errors import InputError
 from neurolens.commands import (
     bench_equal_time,
     bench_fused,
@@ -19,7 +20,6 @@ from neurolens.commands import (
     bench_zoom,
 )
 from neurolens.commands.arguments import Parser, whole
-from neurolens.errors import InputError
 
 _DESCRIPTION = """\
 Measure the exact tracer and surrogates on this machine and write tables.
@@ -96,11 +96,11 @@ def _add_out(parser: argparse.ArgumentParser) -> None:
 
 def run_trace(args: argparse.Namespace) -> int:
     """Time the tracer, lens by lens; the table is written after each."""
+    from neurolens.base.progress import Progress
     from neurolens.evaluate.benches.trace_memory import SIZES, Unmeasured, memory_of
     from neurolens.evaluate.benches.trace_speed import MAIN, chosen_lenses, selected, time_lens, with_aspheres
     from neurolens.evaluate.benches.trace_speed_page import Found, page, write
     from neurolens.evaluate.project import project_root
-    from neurolens.progress import Progress
 
     _quiet_glasses()
     root = project_root()
@@ -134,7 +134,7 @@ def _quiet_glasses() -> None:
     """No word on glasses of unknown dispersion: it changes nothing here."""
     import warnings
 
-    from neurolens.errors import NeurolensWarning
+    from neurolens.base.errors import NeurolensWarning
 
     warnings.simplefilter("ignore", NeurolensWarning)
 
@@ -147,11 +147,11 @@ def run_extremes(args: argparse.Namespace) -> int:
     """Measure every case; 1 where something happened that never may."""
     import json
 
+    from neurolens.base.files import atomic_write_text
+    from neurolens.base.progress import Progress
     from neurolens.evaluate.benches import extremes
     from neurolens.evaluate.benches.extreme_cases import all_cases
     from neurolens.evaluate.project import project_root
-    from neurolens.files import atomic_write_text
-    from neurolens.progress import Progress
 
     _quiet_glasses()
     root = project_root()
@@ -175,10 +175,10 @@ def run_extremes(args: argparse.Namespace) -> int:
 
 def run_pupils(args: argparse.Namespace) -> int:
     """Measure every case of the theses and draw three."""
+    from neurolens.base.progress import Progress
     from neurolens.evaluate.benches import passage, passage_page
     from neurolens.evaluate.benches.passage_cases import CASES, DRAWN
     from neurolens.evaluate.project import project_root
-    from neurolens.progress import Progress
 
     _quiet_glasses()
     root = project_root()

@@ -39,9 +39,9 @@ def add_parser(kinds: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure scene by scene; the page is written after each."""
+    from neurolens.base.progress import Progress
     from neurolens.evaluate.benches import equal_time, equal_time_page
     from neurolens.evaluate.project import project_root
-    from neurolens.progress import Progress
 
     root = project_root()
     counts = equal_time.QUICK if args.quick else equal_time.Counts()

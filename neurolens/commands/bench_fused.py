@@ -31,12 +31,12 @@ def run(args: argparse.Namespace) -> int:
     """Measure lens by lens; the table is written after each."""
     import warnings
 
-    from neurolens.errors import NeurolensWarning
+    from neurolens.base.errors import NeurolensWarning
+    from neurolens.base.progress import Progress
     from neurolens.evaluate.benches.compiled_source import find_compiler
     from neurolens.evaluate.benches.fused_page import earlier, write
     from neurolens.evaluate.benches.fused_speed import measure, selected
     from neurolens.evaluate.project import project_root
-    from neurolens.progress import Progress
 
     warnings.simplefilter("ignore", NeurolensWarning)
     find_compiler()

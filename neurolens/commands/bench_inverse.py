@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.errors import InputError
 from neurolens.commands.arguments import whole
-from neurolens.errors import InputError
 
 _DESCRIPTION = """\
 Fit a model and its inverse maps to every lens file and count the rays that three Newton steps do not
@@ -29,9 +29,9 @@ def add_parser(kinds: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure what is missing, and write the tables after each lens."""
+    from neurolens.base.progress import Progress
     from neurolens.evaluate.benches.inverse import BenchSettings, measure_lens, page, read_records, write_records
     from neurolens.evaluate.project import project_root
-    from neurolens.progress import Progress
 
     root = project_root()
     files = [f for f in sorted((root / "lenses").glob("*.toml")) if args.only in f.stem]

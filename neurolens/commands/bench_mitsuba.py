@@ -34,11 +34,11 @@ def add_parser(kinds: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, writing the page after each part."""
-    from neurolens.errors import NeurolensError
+    from neurolens.base.errors import NeurolensError
+    from neurolens.base.progress import Progress
     from neurolens.evaluate.benches.mitsuba_speed import Settings
     from neurolens.evaluate.benches.mitsuba_speed_page import Found, page, write
     from neurolens.evaluate.project import project_root
-    from neurolens.progress import Progress
 
     root = project_root()
     out = args.out or root / "experiments" / "results"

@@ -27,10 +27,10 @@ def add_parser(kinds: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make what is missing; 1 where something failed."""
+    from neurolens.base.progress import Progress
     from neurolens.evaluate.benches.make_models import make_models
     from neurolens.evaluate.benches.models_list import chosen, read_list
     from neurolens.evaluate.project import project_root
-    from neurolens.progress import Progress
 
     library = read_list(args.list or project_root() / "experiments" / "models.toml")
     entries = chosen(library, args.lenses)

@@ -30,13 +30,13 @@ def run(args: argparse.Namespace) -> int:
 
     import torch
 
-    from neurolens.errors import NeurolensWarning
+    from neurolens.base.errors import NeurolensWarning
+    from neurolens.base.progress import Progress
     from neurolens.evaluate.benches import render_times as bench
     from neurolens.evaluate.benches.render_times_page import Found, write
     from neurolens.evaluate.benches.render_times_plot import draw
     from neurolens.evaluate.benches.render_times_shapes import time_shapes
     from neurolens.evaluate.project import project_root
-    from neurolens.progress import Progress
 
     warnings.simplefilter("ignore", NeurolensWarning)
     torch.set_num_threads(1)

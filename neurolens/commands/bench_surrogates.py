@@ -10,8 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neurolens.base.errors import InputError
 from neurolens.commands.arguments import whole
-from neurolens.errors import InputError
 
 if TYPE_CHECKING:
     from neurolens.evaluate.benches.surrogates import BenchSettings
@@ -66,14 +66,14 @@ def add_parser(kinds: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make what is missing, and write the pages after every lens."""
+    from neurolens.base.files import atomic_write_text
+    from neurolens.base.progress import Progress
     from neurolens.evaluate.benches.surrogate_methods import chosen_rows
     from neurolens.evaluate.benches.surrogate_page import NOTES, summary_page, write_lens
     from neurolens.evaluate.benches.surrogates import Bench, run_bench
     from neurolens.evaluate.experiment import LensChoice
     from neurolens.evaluate.records import plain
     from neurolens.evaluate.train import versions
-    from neurolens.files import atomic_write_text
-    from neurolens.progress import Progress
 
     rows, settings, out = chosen_rows(args.methods), _settings(args), args.out
     files = _lens_files(args)

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.errors import InputError
 from neurolens.commands.arguments import whole
-from neurolens.errors import InputError
 
 _DESCRIPTION = """\
 False passes and false blocks of one surrogate a lens: open, closed by two and four stops, and with
@@ -42,11 +42,11 @@ def add_parsers(kinds: Any) -> None:
 
 def run_vignetting(args: argparse.Namespace) -> int:
     """Measure the lenses, draw four of them."""
+    from neurolens.base.progress import Progress
     from neurolens.evaluate.benches import vignetting as vignetting_bench
     from neurolens.evaluate.benches.library import lens_files, read_quietly
     from neurolens.evaluate.plots.vignetting import cats_eyes
     from neurolens.evaluate.project import project_root
-    from neurolens.progress import Progress
 
     root = project_root()
     folder, out = args.lenses or root / "lenses", args.out or root / "experiments" / "results"
@@ -66,9 +66,9 @@ def run_vignetting(args: argparse.Namespace) -> int:
 
 def run_outside(args: argparse.Namespace) -> int:
     """Send random numbers; 1 where a promise is broken."""
+    from neurolens.base.progress import Progress
     from neurolens.cameras.onnxlens import load_model
     from neurolens.evaluate.benches.outside import send
-    from neurolens.progress import Progress
 
     broken = 0
     for path in args.models:

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.errors import InputError
 from neurolens.commands.arguments import whole
-from neurolens.errors import InputError
 
 _DESCRIPTION = """\
 Fit one model for the whole range of each zoom of the library, for internal focus, and for both, and
@@ -30,9 +30,9 @@ def add_parser(kinds: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure what is missing, and write the table after each case."""
+    from neurolens.base.progress import Progress
     from neurolens.evaluate.benches.states import CASES, measure_case, page, read_records, write_records
     from neurolens.evaluate.project import project_root
-    from neurolens.progress import Progress
     from neurolens.surrogates.threads import pinned_threads
 
     known = {c.name: c for c in CASES}

@@ -10,10 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.files import atomic_path
 from neurolens.commands.arguments import add_json, between, positive
 from neurolens.commands.output import number, print_json
-from neurolens.errors import InputError, NeurolensWarning
-from neurolens.files import atomic_path
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens

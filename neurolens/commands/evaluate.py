@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_json, whole
 from neurolens.commands.output import number, print_json, table
-from neurolens.progress import Progress
 
 if TYPE_CHECKING:
     from neurolens.cameras.model import OnnxLens

@@ -7,10 +7,10 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path, check_writable
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import print_json
-from neurolens.errors import InputError
-from neurolens.files import atomic_path, check_writable
 
 if TYPE_CHECKING:
     from neurolens.surrogates.model import LensModel

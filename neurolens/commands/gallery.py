@@ -41,11 +41,11 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Render and measure the effects asked for, then write the page of all that are there."""
+    from neurolens.base.progress import Progress
     from neurolens.evaluate.gallery.page import quantity_name, write_page
     from neurolens.evaluate.gallery.run import check, finished, run_effect
     from neurolens.evaluate.gallery.settings import find_effects, read_effect
     from neurolens.evaluate.project import project_root
-    from neurolens.progress import Progress
 
     root = project_root()
     folder = args.effects_in or root / "experiments" / "gallery"

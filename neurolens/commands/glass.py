@@ -7,9 +7,9 @@ import math
 import re
 from typing import TYPE_CHECKING, Any
 
+from neurolens.base.errors import InputError
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import number, print_json, table
-from neurolens.errors import InputError
 
 if TYPE_CHECKING:
     from neurolens.optics.dispersion import Glass

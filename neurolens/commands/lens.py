@@ -9,11 +9,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.commands import lens_list, lens_rims
 from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, focus_of, given_options
 from neurolens.commands.lens_text import lens_text
 from neurolens.commands.output import print_json
-from neurolens.errors import InputError, NeurolensWarning
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens

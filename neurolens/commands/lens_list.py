@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.errors import InputError
 from neurolens.commands.output import number, print_json, table
-from neurolens.errors import InputError
 
 WORD = "list"
 HEADER = ("lens", "name", "EFL mm", "f/", "half field", "refr.", "asph.", "cyl.", "states", "rims", "verdict")

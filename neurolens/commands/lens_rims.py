@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neurolens.base.errors import InputError
 from neurolens.commands.arguments import between
 from neurolens.commands.output import print_json, table
-from neurolens.errors import InputError
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens

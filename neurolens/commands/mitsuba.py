@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
+from neurolens.base.progress import Progress, duration
 from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between, positive, whole
 from neurolens.commands.output import print_json
 from neurolens.commands.render import film_size
 from neurolens.commands.render_files import Files
 from neurolens.evaluate.records import plain
-from neurolens.progress import Progress, duration
 
 if TYPE_CHECKING:
     from neurolens.cameras.build import Shot

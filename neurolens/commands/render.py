@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
+from neurolens.base.errors import NeurolensError
+from neurolens.base.progress import Progress
 from neurolens.commands.arguments import CAMERAS_HELP, add_camera, add_json, add_lens_state, aperture_of, between, whole
 from neurolens.commands.output import print_json
 from neurolens.commands.render_files import (
@@ -21,9 +23,7 @@ from neurolens.commands.render_files import (
     watch_of,
     write_pictures,
 )
-from neurolens.errors import NeurolensError
 from neurolens.evaluate.records import plain
-from neurolens.progress import Progress
 from neurolens.render.filmsettings import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS, FilmSettings
 
 if TYPE_CHECKING:

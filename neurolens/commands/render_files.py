@@ -13,11 +13,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.files import check_writable
+from neurolens.base.progress import duration
 from neurolens.commands.arguments import positive
-from neurolens.errors import InputError, NeurolensError
 from neurolens.evaluate.records import plain
-from neurolens.files import check_writable
-from neurolens.progress import duration
 
 if TYPE_CHECKING:
     from neurolens.render.filmsettings import FilmSettings

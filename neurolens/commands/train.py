@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.errors import InputError
+from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import number, print_json, table
-from neurolens.errors import InputError
-from neurolens.progress import Progress
 
 _DESCRIPTION = """\
 Run an experiment: trace ray pairs of the lens, fit the surrogates, export them as ONNX,

@@ -17,14 +17,14 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.files import atomic_write_text
 from neurolens.cameras.model import load_model
-from neurolens.errors import InputError, NeurolensError
 from neurolens.evaluate.benches.floors import Floor, check_floors, floor_table
 from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
 from neurolens.evaluate.project import project_root
 from neurolens.evaluate.speed import Race, race
 from neurolens.evaluate.speed_table import COMPILED, markdown, notes, table_rows
-from neurolens.files import atomic_write_text
 from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.domain import Domain
 

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 import neurolens
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.cameras.model import OnnxLens
-from neurolens.errors import InputError, NeurolensWarning
 from neurolens.evaluate.fresh import (
     STOPS,
     ZONED,

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import torch
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.evaluate.layout import refractions
 from neurolens.optics.glass import glass_of, table_notes
 from neurolens.optics.internal import at_infinity

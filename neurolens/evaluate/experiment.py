@@ -1,4 +1,4 @@
-"""An experiment: one TOML file, one run. Strict dataclasses; see `neurolens.config` for what is read and refused."""
+"""An experiment: one TOML file, one run. Strict dataclasses; see `base.config` for what is read and refused."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from neurolens.config import from_dict, read_config
-from neurolens.errors import InputError, NeurolensWarning
-from neurolens.files import atomic_write_text
+from neurolens.base.config import from_dict, read_config
+from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.files import atomic_write_text
 from neurolens.optics.glass import glass_of
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
@@ -289,7 +289,7 @@ def keep_lens(experiment: Experiment, folder: Path) -> None:
 
 def default_experiment(lens_file: str | Path, overrides: Sequence[str] = ()) -> Experiment:
     """What `neurolens train --lens FILE` runs: a good polynomial and a network, no renders."""
-    from neurolens.config import apply_overrides
+    from neurolens.base.config import apply_overrides
 
     tables = {
         "title": f"Models of {Path(lens_file).stem}",

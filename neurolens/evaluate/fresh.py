@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.evaluate.rays import EachRay, each_ray, ray_figures
 from neurolens.evaluate.vignetting import NEAR_RIM, ZONES, deciding_rim_ratio, false_shares
 from neurolens.optics.prescription import Lens

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.candidates import model_candidate
@@ -17,7 +18,6 @@ from neurolens.evaluate.measure import fit_and_measure
 from neurolens.evaluate.speed import Candidate, race
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.progress import Progress
 from neurolens.render.job import camera_axes
 from neurolens.render.primitives import Rays
 from neurolens.render.scenefile import Scene, load_scene

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neurolens.errors import InputError, NeurolensError
+from neurolens.base.errors import InputError, NeurolensError
 
 Image = NDArray[np.float64]
 

@@ -14,14 +14,14 @@ import numpy as np
 import torch
 
 from neurolens import __version__
+from neurolens.base.files import atomic_write_text
+from neurolens.base.progress import Report
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.evaluate import fresh
 from neurolens.evaluate.fresh import FreshRays, fresh_rays, with_more
 from neurolens.evaluate.rays import PIXELS_ACROSS, ray_errors
-from neurolens.files import atomic_write_text
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
-from neurolens.progress import Report
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model
 from neurolens.surrogates.fits import checkpoint

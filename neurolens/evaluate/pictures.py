@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.progress import Report
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
@@ -17,7 +18,6 @@ from neurolens.evaluate.image import compare, error_maps
 from neurolens.evaluate.plots import image_caption, side_by_side
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.progress import Report
 from neurolens.render.exr import write_exr, write_png
 from neurolens.render.renderer import render
 from neurolens.render.scene import CameraSettings

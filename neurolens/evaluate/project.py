@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 
 
 def project_root() -> Path:

@@ -16,8 +16,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.evaluate.film_equivalent import film_equivalent_mm, focused_vergence
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, image_radius_mm

@@ -13,8 +13,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
-from neurolens.errors import InputError
-from neurolens.files import atomic_write_text
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_write_text
 
 SCHEMA_VERSION = 1
 FAMILIES = ("paraxial", "dense", "omp", "ols", "adaptive", "mlp")

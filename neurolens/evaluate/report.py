@@ -10,10 +10,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.markup import DASH, facts, figure_grid, page, section, show, table, text
 from neurolens.evaluate.records import check_results, number, pareto_front
-from neurolens.files import atomic_write_text
 
 Record = Mapping[str, Any]
 _CLOSE_UM = 2.0  # a model within this RMS error counts as close in the headline: half a fine pixel

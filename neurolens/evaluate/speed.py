@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
-from neurolens.errors import InputError, NeurolensError
+from neurolens.base.errors import InputError, NeurolensError
 from neurolens.evaluate.records import ExactRecord, Timing
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
 from neurolens.surrogates.threads import pinned_threads

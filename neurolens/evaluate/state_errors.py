@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from neurolens.axes import Axis
+from neurolens.base.errors import InputError
 from neurolens.cameras.model import OnnxLens
-from neurolens.errors import InputError
 from neurolens.evaluate.check import Promise, find_lens, share_promise
 from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import ray_errors

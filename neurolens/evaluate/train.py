@@ -13,9 +13,11 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.config import to_dict, to_toml
+from neurolens.base.errors import NeurolensWarning
+from neurolens.base.files import atomic_write_text
+from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
-from neurolens.config import to_dict, to_toml
-from neurolens.errors import NeurolensWarning
 from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
 from neurolens.evaluate.experiment import Experiment, keep_lens, relative_to
 from neurolens.evaluate.fresh import MORE
@@ -31,10 +33,8 @@ from neurolens.evaluate.records import break_even_rays, write_results
 from neurolens.evaluate.report import write_report
 from neurolens.evaluate.speed import Race, race
 from neurolens.evaluate.train_states import run_states
-from neurolens.files import atomic_write_text
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.progress import Progress
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.fit import NETWORKS, Prepared, prepare
 from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs

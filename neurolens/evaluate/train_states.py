@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from neurolens import __version__
+from neurolens.base.config import to_dict, to_toml
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_write_text
+from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
-from neurolens.config import to_dict, to_toml
-from neurolens.errors import InputError
 from neurolens.evaluate.candidates import model_candidate
 from neurolens.evaluate.experiment import Experiment, keep_lens, relative_to
 from neurolens.evaluate.measure import known_record, note_record
@@ -23,8 +25,6 @@ from neurolens.evaluate.plots.states import states_plot
 from neurolens.evaluate.records import plain
 from neurolens.evaluate.speed import race
 from neurolens.evaluate.state_errors import card_errors, errors_at, random_states
-from neurolens.files import atomic_write_text
-from neurolens.progress import Progress
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.onnx.states import export_states

@@ -6,7 +6,7 @@ import importlib
 from functools import cache
 from typing import Any
 
-from neurolens.errors import InputError, NeurolensError
+from neurolens.base.errors import InputError, NeurolensError
 
 DEFAULT_VARIANT = "llvm_ad_spectral"
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.errors import InputError, NeurolensError
 from neurolens.mitsuba.arrays import matrix
 from neurolens.mitsuba.library import require_mitsuba
 from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM, PLUGIN, register

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.mitsuba.arrays import matrix
 from neurolens.render.scenefile import Scene, scene_from_tables
 from neurolens.render.spectrum import table

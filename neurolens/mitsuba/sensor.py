@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.errors import InputError
 from neurolens.mitsuba.arrays import matrix, number, rows, vector
 from neurolens.mitsuba.library import libraries, require_mitsuba
 from neurolens.mitsuba.rays import FilmRays, LocalRays

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.clearance import check_clearance, surface_sag_mm
 from neurolens.optics.prescription import Configuration, Lens, Surface
 

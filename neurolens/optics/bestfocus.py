@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics import paraxial
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens

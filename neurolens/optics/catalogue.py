@@ -14,7 +14,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.dispersion import Glass
 
 # A name that several makers use is that of the first one here.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.prescription import Surface
 
 TOUCH_MM = 1e-6  # edge contact is common in patents; only rounding is forgiven

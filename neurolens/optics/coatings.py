@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.prescription import Coating
 from neurolens.optics.thinfilm import (
     Amplitudes,

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics import glass
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays

@@ -9,7 +9,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from neurolens.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics import catalogue
 from neurolens.optics.dispersion import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
 from neurolens.optics.prescription import Surface

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics import paraxial
 from neurolens.optics.interpolate import monotone
 from neurolens.optics.prescription import Configuration, Lens

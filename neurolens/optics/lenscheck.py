@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.optics.aiming import aim_at_stop
 from neurolens.optics.clearance import surface_sag_mm
 from neurolens.optics.lightcheck import axial_beam, axial_blur_mm, corner_illumination, film_edge_mm

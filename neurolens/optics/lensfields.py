@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 
 MAX_INDEX = 4.5  # germanium, the densest lens material there is, has 4.0
 

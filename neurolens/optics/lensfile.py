@@ -58,12 +58,12 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.apertures import Aperture
-from neurolens.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.tomlfile import read_toml, reject_unknown
 from neurolens.optics.clearance import check_clearance
 from neurolens.optics.lensfields import half_field, number, text
 from neurolens.optics.lensrows import read_surfaces, unused_coatings
 from neurolens.optics.prescription import Configuration, Lens
-from neurolens.tomlfile import read_toml, reject_unknown
 
 SCHEMA = 1
 LENS_KEYS = (

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
+from neurolens.base.tomlfile import reject_unknown
 from neurolens.optics.glass import check_against_table
 from neurolens.optics.lensfields import index, number, text
 from neurolens.optics.prescription import Coating, Surface
-from neurolens.tomlfile import reject_unknown
 
 MAX_SURFACES = 500
 MAX_LAYERS = 200

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neurolens.errors import InputError
-from neurolens.files import atomic_write_text
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_write_text
+from neurolens.base.tomlfile import format_value
 from neurolens.optics.lensfile import SCHEMA
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.tomlfile import format_value
 
 ROWS_COMMENT = """\
 # From the scene to the film, numbered from 0. radius_mm is positive when the centre of curvature lies towards the film;

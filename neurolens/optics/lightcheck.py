@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.optics.aiming import aim_at_stop
 from neurolens.optics.clearance import end_mm
 from neurolens.optics.paraxial import first_order

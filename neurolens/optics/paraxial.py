@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from neurolens import focus
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.glass import LINE_D_NM, index_of
 from neurolens.optics.prescription import Lens
 

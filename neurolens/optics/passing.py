@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.optics import apertures
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens, Surface

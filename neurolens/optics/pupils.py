@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.clearance import end_mm, surface_sag_mm
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens

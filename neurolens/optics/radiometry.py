@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.aiming import without_rims
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.aiming import aim_at_stop, without_rims
 from neurolens.optics.clearance import end_mm, neighbours, surface_sag_mm
 from neurolens.optics.paraxial import first_order, stop_radius_mm

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.prescription import Configuration, Lens, Surface
 
 

@@ -11,8 +11,8 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.optics import glass, thinfilm
 from neurolens.optics.media import absorption_per_mm, media
 from neurolens.optics.passing import Mode, along_axis, bend, check_rays, meet, sound_wavelength, start, unit

@@ -8,7 +8,7 @@ from typing import get_args
 
 import torch
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics import paraxial
 from neurolens.optics.aiming import aim_at_stop
 from neurolens.optics.bestfocus import best_focus_z_mm

@@ -8,7 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from neurolens import status as st
+from neurolens.base import status as st
 
 
 def positive(value: Tensor, sense: int = 1, *, spend: bool = False) -> Tensor:
@@ -54,7 +54,7 @@ class Survival(Protocol):
         """`value` [N] of the rays that go on, `otherwise` for the others, even where it is NaN."""
 
     def status(self) -> Tensor:
-        """Status of every ray, [N] int32; see `neurolens.status`."""
+        """Status of every ray, [N] int32; see `neurolens.base.status`."""
 
 
 class Labels:

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.optics import glass
 from neurolens.optics.media import media
 from neurolens.optics.passing import Mode, along_axis, bend, check_rays, meet, sound_wavelength, start, unit
@@ -51,7 +51,7 @@ class Traced(NamedTuple):
         rays: point on the last surface met (lens frame, mm) and unit direction after it. Rays that missed a surface or
             were totally reflected are replaced by a finite ray along the axis; rays that only a rim stops go on, so
             that their crossings can be learnt from.
-        status: [N] int32, see `neurolens.status`.
+        status: [N] int32, see `neurolens.base.status`.
         transmittance: [N], power of unpolarised light that arrives: of surfaces (by default the product of
             (Ts + Tp) / 2) and of absorption in the glass; None when not asked for.
         crossings: surface index to `Crossing`, for the surfaces asked for.

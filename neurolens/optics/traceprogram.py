@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.shapes import is_plain

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics import paraxial
 from neurolens.optics.clearance import check_clearance
 from neurolens.optics.internal import gaps_mm, infinity_states

@@ -15,8 +15,8 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-from neurolens.errors import InputError
-from neurolens.files import atomic_path
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path
 
 # -march=native takes what the machine has; the others let square roots and divisions become vectors, also where only
 # one side of a choice needs them. NaN and infinity stay what they are.

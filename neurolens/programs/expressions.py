@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 
 # select(a, b, x, y) is x where a <= b, else y; so NaN in a or b gives y. clamp(x, limit) is x within -limit and limit,
 # at the one on its side beyond; NaN becomes one of the two (not in GLSL). Its limit is a number above 0.

@@ -13,7 +13,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.programs.contract import FILM_X_Y, RAY, SCENE_RAY, STATUS, WAVELENGTH, derivative
 from neurolens.programs.expressions import Expr, Program
 from neurolens.programs.tangents import with_derivatives

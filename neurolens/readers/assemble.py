@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics import catalogue, paraxial, rims
 from neurolens.optics.clearance import check_clearance
 from neurolens.optics.dispersion import Glass

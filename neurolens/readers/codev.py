@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.lensrows import MAX_SURFACES
 from neurolens.optics.prescription import Lens
 from neurolens.readers.codev_file import File, draft_of

@@ -7,7 +7,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.prescription import Surface
 from neurolens.readers.assemble import UNKNOWN
 from neurolens.readers.codev_shapes import Block, shape_of

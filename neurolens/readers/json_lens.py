@@ -15,7 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
+from neurolens.base.tomlfile import reject_unknown
 from neurolens.optics.lensfields import number, text
 from neurolens.optics.lensrows import MAX_SURFACES
 from neurolens.optics.prescription import Lens, Surface
@@ -25,7 +26,6 @@ from neurolens.readers.json_others import read_others
 from neurolens.readers.json_stated import check_computed, image_and_field, stated_efl
 from neurolens.readers.json_states import read_states
 from neurolens.readers.source import decode, read_bytes, warn
-from neurolens.tomlfile import reject_unknown
 
 KEYS = (
     *("name", "designer", "source", "efl_mm", "f_number", "field_or_image_circle", "notes", "computed_at_nd"),

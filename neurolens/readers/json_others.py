@@ -12,13 +12,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
+from neurolens.base.tomlfile import reject_unknown
 from neurolens.optics.lensfields import number
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.readers.assemble import first_order, named_glass
 from neurolens.readers.draft import Draft, Given, Row, lens_of
 from neurolens.readers.source import warn
-from neurolens.tomlfile import reject_unknown
 
 _DEEPLENS = (
     *("info", "foclen", "fnum", "r_sensor", "d_sensor", "sensor_size", "sensor_res", "hfov", "fov", "float_hfov"),

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Literal
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics import paraxial
 from neurolens.optics.prescription import Lens
 from neurolens.readers.assemble import is_anamorphic

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
+from neurolens.base.tomlfile import reject_unknown
 from neurolens.optics.lensfields import number, text
 from neurolens.optics.prescription import Configuration, Lens
 from neurolens.readers.assemble import check_states, first_order, moved
 from neurolens.readers.source import warn
-from neurolens.tomlfile import reject_unknown
 
 KEYS = (
     *("name", "efl_mm", "efl_y_mm", "efl_x_mm", "f_number", "object_distance_mm", "magnification"),

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.lensrows import MAX_SURFACES
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.readers.assemble import UNKNOWN, named_glass

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from neurolens.errors import InputError, NeurolensWarning
-from neurolens.tomlfile import suggestion
+from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.tomlfile import suggestion
 
 MAX_BYTES = 4_000_000  # the longest real lens files, with tolerances and merit function, stay below 1 MB
 MAX_LINES = 100_000

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.lensrows import MAX_SURFACES
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.readers.draft import Draft, Given, Row, lens_of

@@ -11,7 +11,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.lensrows import MAX_SURFACES
 from neurolens.optics.prescription import Lens
 from neurolens.readers import zemax_words as words

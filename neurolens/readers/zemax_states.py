@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.readers.draft import State
 from neurolens.readers.source import Line
 from neurolens.readers.zemax_shapes import Block, thickness

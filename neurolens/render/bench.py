@@ -11,8 +11,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.thin import ThinLens
-from neurolens.errors import InputError, NeurolensError
 from neurolens.render.renderer import render
 from neurolens.render.scenefile import load_scene
 from neurolens.render.wavelengths import LANES

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.errors import InputError, NeurolensError
+from neurolens.base.errors import InputError, NeurolensError
 from neurolens.render.embree import EmbreeMesh
 from neurolens.render.mesh import Mesh
 from neurolens.render.primitives import Primitive, Rays

@@ -18,8 +18,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.errors import InputError
-from neurolens.files import atomic_path
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path
 from neurolens.render.identity import NOTHING, difference
 from neurolens.render.sums import Film, Tiling
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 
 Vector = tuple[float, float, float]
 BLACK: Vector = (0.0, 0.0, 0.0)

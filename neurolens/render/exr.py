@@ -16,9 +16,9 @@ import OpenEXR
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path
 from neurolens.cameras.contract import FloatArray
-from neurolens.errors import InputError
-from neurolens.files import atomic_path
 from neurolens.render.colour import SRGB, ColourSpace, conversion
 from neurolens.render.spectrum import linear_to_srgb
 

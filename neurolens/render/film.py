@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.contract import FloatArray
-from neurolens.errors import InputError
 
 # A picture whose pixels are this much out of square is a mistake, not a choice.
 _ASPECT_TOLERANCE = 0.02

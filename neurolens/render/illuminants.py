@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
+from neurolens.base.tomlfile import suggestion
 from neurolens.render.checks import require
 from neurolens.render.spectrum import table
-from neurolens.tomlfile import suggestion
 
 Spectrum = tuple[NDArray[np.float64], NDArray[np.float64]]  # wavelengths in nm, increasing, and values there
 

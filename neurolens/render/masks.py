@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from neurolens.apertures import MAX_MASK, THRESHOLD, Aperture
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 
 
 def make_aperture(

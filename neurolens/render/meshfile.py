@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.render.checks import FARTHEST_M
 from neurolens.render.mesh import vertex_normals
 from neurolens.render.shapes import MeshSettings

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.contract import FloatArray
-from neurolens.errors import InputError
 from neurolens.render.checks import BRIGHTEST
 from neurolens.render.spectrum import srgb_to_linear
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.errors import InputError, NeurolensError
 from neurolens.render.develop import Layers, develop
 from neurolens.render.film import PixelGrid
 from neurolens.render.filmsettings import FilmSettings

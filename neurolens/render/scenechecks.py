@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
+from neurolens.base.tomlfile import suggestion
 from neurolens.render.materialsettings import Material, Texture
 from neurolens.render.meshfile import TriangleSet
 from neurolens.render.scene import SceneSettings
-from neurolens.tomlfile import suggestion
 
 _SHAPES = ("planes", "quads", "discs", "spheres", "boxes", "rooms", "meshes")
 _WALLS = ("left", "right", "floor", "ceiling", "far", "near")

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from neurolens.apertures import Aperture
+from neurolens.base.config import from_dict
+from neurolens.base.errors import InputError
+from neurolens.base.tomlfile import read_toml
 from neurolens.cameras.contract import FloatArray
-from neurolens.config import from_dict
-from neurolens.errors import InputError
 from neurolens.render.illuminants import (
     IlluminantSettings,
     Spectrum,
@@ -27,7 +28,6 @@ from neurolens.render.meshfile import TriangleSet, read_mesh
 from neurolens.render.pictures import read_environment, read_picture
 from neurolens.render.scene import CameraSettings, SceneSettings
 from neurolens.render.scenechecks import check_camera, check_references
-from neurolens.tomlfile import read_toml
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.errors import NeurolensError
 from neurolens.cameras.contract import FloatArray
-from neurolens.errors import NeurolensError
 from neurolens.render.checkpoint import read_checkpoint, write_checkpoint
 from neurolens.render.develop import develop
 from neurolens.render.job import Job

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
-from neurolens.errors import InputError
 from neurolens.render.checks import Vector
 from neurolens.render.directions import centres
 from neurolens.render.film import PixelGrid

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from neurolens.errors import NeurolensError
+from neurolens.base.errors import NeurolensError
 from neurolens.render.job import Job
 from neurolens.render.sums import fork_context
 

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 import neurolens
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.modelfile import CARD_KIND, CARD_SCHEMA
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics import paraxial
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order

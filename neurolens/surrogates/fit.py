@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Literal, cast, get_args
 
-from neurolens import status as st
-from neurolens.errors import InputError, NeurolensWarning
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.surrogates.cores import Basis, RawPolynomial
 from neurolens.surrogates.fits.checkpoint import of_zone, spent_s
 from neurolens.surrogates.fits.mirror import fit_mirror

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import PairSet, RayPairs, join_pairs, reached

@@ -12,8 +12,8 @@ from typing import Any, Literal, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays

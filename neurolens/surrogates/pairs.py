@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.errors import InputError
-from neurolens.files import atomic_path
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import Rays, trace

@@ -16,8 +16,8 @@ import onnxruntime
 from numpy.typing import NDArray
 from onnx import GraphProto, ModelProto, NodeProto, TensorProto, checker, helper, numpy_helper
 
-from neurolens.errors import InputError
-from neurolens.files import atomic_path
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.surrogates.card import card_to_json
 

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.optics.glass import inverse_square_um
 from neurolens.surrogates.cores import InvariantPolynomial, MirrorPolynomial, Network, Partitioned, RawPolynomial

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens.errors import InputError, ModelError
+from neurolens.base.errors import InputError, ModelError
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.optics.prescription import Coating, Lens, Surface
 from neurolens.surrogates.cores import InvariantPolynomial, MirrorPolynomial, Network, Partitioned, RawPolynomial

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import torch
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 
 
 @contextmanager

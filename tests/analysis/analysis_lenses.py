@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from neurolens.analysis.fields import Scene
-from neurolens.errors import NeurolensWarning
+from neurolens.base.errors import NeurolensWarning
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 

@@ -19,7 +19,7 @@ from neurolens.analysis.fields import Scene
 from neurolens.analysis.patterns import points
 from neurolens.analysis.seidel import seidel
 from neurolens.analysis.wavefront import wavefront
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.aiming import without_rims
 from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Lens, Surface

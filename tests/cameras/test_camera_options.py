@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from camera_helpers import GAUSS, ROOT, camera, film_rays
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.cli import main
 from neurolens.render.exr import read_exr
 

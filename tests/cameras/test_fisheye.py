@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from camera_helpers import differences
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.fisheye import PROJECTIONS, Fisheye
-from neurolens.errors import InputError
 
 FOCAL = 10.0
 # Film radius in focal lengths, angle in degrees.

@@ -14,8 +14,9 @@ import numpy as np
 import onnx
 import pytest
 
-from neurolens import status as st
 from neurolens.apertures import Aperture
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.cameras import fused as fused_module
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import CameraRays
@@ -24,7 +25,6 @@ from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.fusedexact import FusedExactCamera
 from neurolens.cameras.graphprogram import program_of
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.errors import InputError
 from neurolens.optics.lensfile import read_lens
 from neurolens.programs import compiler, loworder
 from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH

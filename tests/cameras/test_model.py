@@ -15,10 +15,10 @@ import onnx
 import pytest
 from onnx import ModelProto, TensorProto, helper, numpy_helper
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras import onnxfile
 from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
-from neurolens.errors import InputError, ModelError
 
 ROOT = Path(__file__).parents[2]
 

@@ -11,15 +11,15 @@ import lens_models
 import numpy as np
 import pytest
 
-from neurolens import status as st
 from neurolens.apertures import Aperture
+from neurolens.base import status as st
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.radiometry import film_light
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 ROOT = Path(__file__).parents[2]
 FILM = (36.0, 24.0)
 # Lens, focal length, f-number, least share of rays that pass.

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.sampling import concentric_disk
 from neurolens.cameras.thin import ThinLens
-from neurolens.errors import InputError
 from neurolens.focus import film_z_mm
 
 

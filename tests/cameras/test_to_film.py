@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from camera_helpers import FILM, FISHEYES, GAUSS, camera, film_rays, jittered, tabled
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.thin import ThinLens
-from neurolens.errors import InputError
 from neurolens.surrogates.inversion.fit import fit_inverse
 from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.onnx.inverse import export_inverse

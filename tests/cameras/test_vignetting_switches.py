@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from camera_helpers import FILM, RADII, camera, film_rays, film_value, light, tabled
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.vignetting import VIGNETTINGS, Vignetted
-from neurolens.errors import InputError
 
 KINDS = ("pinhole", "thin", "thick", "exact", "network", "fisheye-equidistant", "fisheye-orthographic")
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from camera_helpers import FILM, FISHEYES, KINDS, RADII, camera, film_value, jittered, light
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.fisheye import PROJECTIONS
 from neurolens.cameras.thick import ThickLens

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from neurolens.errors import NeurolensWarning
+from neurolens.base.errors import NeurolensWarning
 from neurolens.evaluate.gallery.cameras import CAMERAS
 from neurolens.evaluate.gallery.lenses import Shot, Surrogate, shot_of, surrogate_of
 from neurolens.evaluate.gallery.measures import MEASURES

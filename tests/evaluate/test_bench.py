@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from neurolens import cli
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.evaluate.bench import Outcome, hold_to_promises, main, read_index, verdict
 from neurolens.evaluate.benches.floors import Floor, floor_table
 from neurolens.evaluate.speed import Race

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.cli import main
-from neurolens.errors import InputError
 from neurolens.evaluate.benches import equal_time, equal_time_page, equal_time_renders
 from neurolens.evaluate.benches.equal_time import CameraResult, Counts, Rendered, SceneResult, camera_result
 from neurolens.evaluate.benches.equal_time_film import FilmMap

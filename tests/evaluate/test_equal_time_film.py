@@ -11,11 +11,11 @@ import lens_models
 import numpy as np
 import pytest
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.thin import ThinLens
-from neurolens.errors import InputError
 from neurolens.evaluate.benches.equal_time_film import FilmMap, film_map
 from neurolens.optics.lensfile import read_lens
 

@@ -12,14 +12,14 @@ import pytest
 import torch
 
 from neurolens import cli
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.evaluate.benches import extreme_cases as cases
 from neurolens.evaluate.benches.extremes import Row, both_precisions, failures, measure, page
 from neurolens.evaluate.benches.reference import trace_reference
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = Path(__file__).parents[2] / "lenses"
 COUNT = 300
 ALL = [

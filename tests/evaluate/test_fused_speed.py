@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
-from neurolens.errors import InputError
 from neurolens.evaluate.benches.compiled_source import CompiledSource, find_compiler
 from neurolens.evaluate.benches.fused import fused_candidate
 from neurolens.evaluate.benches.fused_page import goals, write

@@ -11,12 +11,12 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from neurolens import status as st
 from neurolens.apertures import Aperture
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.thin import ThinLens
-from neurolens.errors import InputError
 from neurolens.evaluate.gallery.measures import bokeh
 from neurolens.evaluate.gallery.measures.lightdiscs import LightDisc, light_disc
 from neurolens.optics.lensfile import read_lens

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.model import load_model
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.cameras.vignetting import Vignetted
-from neurolens.errors import InputError
 from neurolens.evaluate.gallery.cameras import CAMERAS
 from neurolens.evaluate.gallery.lenses import shot_of
 from neurolens.evaluate.gallery.measures import MEASURES

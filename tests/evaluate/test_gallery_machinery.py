@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from gallery_shots import GALLERY, ROOT, shipped, shot
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.thin import ThinLens
 from neurolens.cli import main
-from neurolens.errors import InputError
 from neurolens.evaluate.gallery.cameras import Window, exact_camera, surrogate_camera
 from neurolens.evaluate.gallery.figure import MOST_BYTES
 from neurolens.evaluate.gallery.lenses import fitted, widened

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from neurolens.errors import InputError, NeurolensError
+from neurolens.base.errors import InputError, NeurolensError
 from neurolens.evaluate import image
 from neurolens.evaluate.image import ImageSettings
 

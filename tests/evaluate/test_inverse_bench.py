@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.evaluate.benches.inverse import BenchSettings, measure_lens, page, read_records, write_records
 
 LENSES = Path(__file__).parents[2] / "lenses"

@@ -9,15 +9,15 @@ from typing import Any
 import pytest
 from lens_models import LENSES
 
+from neurolens.base.config import from_dict
+from neurolens.base.errors import InputError
+from neurolens.base.progress import Progress
 from neurolens.cli import main
-from neurolens.config import from_dict
-from neurolens.errors import InputError
 from neurolens.evaluate.bench import read_index
 from neurolens.evaluate.benches import make_models, models_index
 from neurolens.evaluate.benches.make_models import fingerprint
 from neurolens.evaluate.benches.models_list import Entry, Library, chosen, read_list
 from neurolens.evaluate.measure import Measured
-from neurolens.progress import Progress
 from neurolens.surrogates.fit import ModelSettings
 
 QUIET = Progress(quiet=True)

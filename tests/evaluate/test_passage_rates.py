@@ -12,7 +12,7 @@ from neurolens import cli
 from neurolens.evaluate.benches import passage, passage_page
 from neurolens.evaluate.benches.passage_cases import CASES, DRAWN, TABLE_5_3, Case
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = Path(__file__).parents[2] / "lenses"
 SAMPLES = 2**13
 

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from neurolens.analysis import plot_layout
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.evaluate import plots
 from neurolens.evaluate.plots import style
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.evaluate.film_equivalent import focused_vergence, local_jacobian, pupil_middle
 from neurolens.evaluate.rays import angles_deg, frame_width_mm, pupil_disc_share, ray_errors
 from neurolens.optics.lensfile import read_lens
@@ -23,7 +23,7 @@ from neurolens.surrogates.domain import Domain, FilmRays, domain_of
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, trace_pairs
 
 LENSES = Path(__file__).parents[2] / "lenses"
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 
 
 def lens_and_domain(

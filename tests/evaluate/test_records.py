@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.evaluate import records
 from neurolens.evaluate.records import break_even_rays, pareto_front
 

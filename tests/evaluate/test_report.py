@@ -9,7 +9,7 @@ from urllib.parse import unquote
 
 import pytest
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.evaluate.markup import DASH, local_url, show
 from neurolens.evaluate.report import write_report
 

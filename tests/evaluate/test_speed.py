@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
-from neurolens.errors import InputError
 from neurolens.evaluate.candidates import camera_candidate, exact_candidates
 from neurolens.evaluate.speed import (
     Call,

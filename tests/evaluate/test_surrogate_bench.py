@@ -11,14 +11,14 @@ from typing import Any
 import pytest
 from lens_models import LENSES
 
+from neurolens.base.errors import InputError
+from neurolens.base.progress import Progress
 from neurolens.cli import main
-from neurolens.errors import InputError
 from neurolens.evaluate.benches import surrogates as surrogate_bench
 from neurolens.evaluate.benches.surrogate_methods import Row, all_rows, chosen_rows
 from neurolens.evaluate.benches.surrogate_page import lens_page, summary_page, write_lens
 from neurolens.evaluate.benches.surrogates import Bench, BenchSettings, run_bench
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
-from neurolens.progress import Progress
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
 

@@ -27,7 +27,7 @@ from neurolens.evaluate.candidates import COMPILED_BATCHES
 from neurolens.evaluate.layout import refractions
 from neurolens.optics.trace import trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 FOLDER = Path(__file__).parents[2] / "lenses"
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
-from neurolens.errors import InputError, NeurolensWarning
 from neurolens.evaluate.experiment import default_experiment, read_experiment
 from neurolens.evaluate.measure import Measured, fit_and_measure
 from neurolens.evaluate.train import _say_what_is_poor, run_experiment
-from neurolens.progress import Progress
 from neurolens.surrogates.fit import ModelSettings, prepare
 from neurolens.surrogates.pairs import make_pairs
 

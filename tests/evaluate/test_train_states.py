@@ -9,8 +9,8 @@ from pathlib import Path
 import lens_models
 import pytest
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.onnxlens import load_model
-from neurolens.errors import InputError
 from neurolens.evaluate.benches.states import CASES, page
 from neurolens.evaluate.experiment import default_experiment
 from neurolens.evaluate.train_states import fit_and_measure_states, state_settings

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.evaluate.vignetting import deciding_rim_ratio, relative_illumination, stopped_down, vignetting_errors
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
 from neurolens.evaluate.benches import outside

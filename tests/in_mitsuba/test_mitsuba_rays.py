@@ -7,9 +7,9 @@ import sys
 import numpy as np
 import pytest
 
+from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
-from neurolens.errors import InputError, NeurolensError
 from neurolens.mitsuba import load_scene
 from neurolens.mitsuba.rays import BATCH, FilmRays
 from neurolens.mitsuba.scenes import our_scene

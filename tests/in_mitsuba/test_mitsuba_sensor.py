@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.cli import main
-from neurolens.errors import InputError, NeurolensError
 from neurolens.mitsuba import camera, load_scene, register, render, require_mitsuba
 from neurolens.mitsuba.scenes import our_scene, with_our_spectra
 from neurolens.render.exr import read_exr

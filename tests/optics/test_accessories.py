@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.cameras.exact import ExactCamera
-from neurolens.errors import InputError
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.paraxial import first_order
@@ -79,7 +79,7 @@ def test_filters_renumber_states(tmp_path: Path) -> None:
         assert replace(read_lens(tmp_path / "filtered.toml"), path=filtered.path) == filtered
 
 
-@pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+@pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 @pytest.mark.parametrize("rear", [True, False])
 def test_a_lens_with_a_filter_focuses_inside_as_before(rear: bool) -> None:
     for name in ("sony_sonnar_55", "tajima_retrofocus_24"):

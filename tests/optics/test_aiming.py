@@ -13,7 +13,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = Path(__file__).parents[2] / "lenses"
 INF = math.inf
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from neurolens.apertures import Aperture
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics import apertures
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import write_lens

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from neurolens.base.errors import InputError
 from neurolens.cli import main
-from neurolens.errors import InputError
 from neurolens.optics import catalogue
 from neurolens.optics.dispersion import LINE_C_NM, LINE_D_NM, LINE_F_NM
 

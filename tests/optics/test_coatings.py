@@ -11,7 +11,7 @@ import tmm
 import torch
 from torch import Tensor
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics import coatings
 from neurolens.optics.thinfilm import Layers, amplitudes, powers, reflectance, transmittance
 

@@ -9,7 +9,7 @@ import torch
 from lens_models import LENSES
 from torch import Tensor
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.differentials import film_tangents, trace_differentials
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
@@ -18,7 +18,7 @@ from neurolens.optics.pupils import camera_rays
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 
 
 def asphere() -> Lens:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neurolens.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics import catalogue
 from neurolens.optics.glass import (
     LINE_C_NM,

@@ -16,7 +16,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.trace import CHUNK, Rays, Traced, trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 FOLDER = Path(__file__).parents[2] / "lenses"
 NAMES = ["laikin_double_gauss_50", "canon_aspheric_50", "schneider_anamorphic_31", "shimizu_fisheye_220"]
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here: nothing was run on one")

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.evaluate.benches.bundles import from_film, from_scene, generator, moved, unit
 from neurolens.optics import glass
 from neurolens.optics.coatings import design, reflectance
@@ -19,7 +19,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays, Towards, trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 FOLDER = Path(__file__).parents[2] / "lenses"
 LENSES = sorted(path.stem for path in FOLDER.glob("*.toml"))
 FISHEYES = [name for name in LENSES if "fisheye" in name]

@@ -13,7 +13,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lightcheck import axial_beam, axial_blur_mm, corner_illumination, film_edge_mm
 from neurolens.optics.prescription import Lens, Surface
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = Path(__file__).parents[2] / "lenses"
 INF = math.inf
 

@@ -8,7 +8,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = Path(__file__).parents[2] / "lenses"
 # Stated focal length in mm; number of refracting surfaces.
 STATED = {

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neurolens.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics.clearance import sag_mm
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import format_lens, write_lens
@@ -277,7 +277,7 @@ def test_known_dispersion_is_no_warning(tmp_path: Path) -> None:
 
 # Round trip
 @pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
-@pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+@pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 def test_every_shipped_lens_reads_and_comes_back_exactly(path: Path, tmp_path: Path) -> None:
     lens = read_lens(path)
     assert lens.source and lens.lens_id == path.stem

@@ -20,7 +20,7 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.optics.trace import trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = sorted((Path(__file__).parents[2] / "lenses").glob("*.toml"))
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "lenses"
 # What is wrong with a table that ships, in words of the reason; every other lens is in order.

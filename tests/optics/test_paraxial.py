@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import film_z_mm, first_order, stop_radius_mm
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays, trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = sorted((Path(__file__).parents[2] / "lenses").glob("*.toml"))
 INF = math.inf
 

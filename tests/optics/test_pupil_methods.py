@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupil_methods import (
@@ -25,7 +25,7 @@ from neurolens.optics.pupil_methods import (
 )
 from neurolens.optics.radiometry import film_light
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = Path(__file__).parents[2] / "lenses"
 FILM_RADIUS = 18.0
 METHODS: dict[str, Callable[[Lens, float], RadialPupil]] = {

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
@@ -17,7 +17,7 @@ from neurolens.optics.pupils import camera_rays, image_radius_mm, pupil_bounds, 
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = sorted((Path(__file__).parents[2] / "lenses").glob("*.toml"))
 
 

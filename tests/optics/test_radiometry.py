@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from neurolens.apertures import Aperture
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.accessories import pinhole, with_hood
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.radiometry import FilmLight, disc_irradiance, film_light, white_card
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = Path(__file__).parents[2] / "lenses"
 
 

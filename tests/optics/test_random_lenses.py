@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as hs
 from random_lenses import lenses
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.evaluate.benches.bundles import disc, unit
 from neurolens.evaluate.benches.extreme_cases import Case
 from neurolens.evaluate.benches.extremes import measure

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.aiming import aim_at_stop
 from neurolens.optics.clearance import check_clearance
 from neurolens.optics.lensfile import read_lens
@@ -18,7 +18,7 @@ from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.rims import RimRule, derive_rims, half_field_deg
 from neurolens.optics.trace import trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = Path(__file__).parents[2] / "lenses"
 INF = math.inf
 

@@ -11,8 +11,8 @@ import pytest
 import test_oracle as oracle
 import torch
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.optics.prescription import Coating, Lens, Surface
 from neurolens.optics.sequence import Followed, follow, ghost
 from neurolens.optics.trace import Rays, trace

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.optics import shapes
 from neurolens.optics.clearance import surface_sag_mm
 from neurolens.optics.paraxial import first_order

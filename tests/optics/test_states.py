@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.bestfocus import axial_rays, best_focus_z_mm
 from neurolens.optics.breathing import breathing, field_change
 from neurolens.optics.clearance import check_clearance
@@ -22,7 +22,7 @@ from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Coating, Lens, Surface
 from neurolens.optics.trace import Rays, trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = Path(__file__).parents[2] / "lenses"
 ZOOMS = ("ogawa_zoom_70_200", "nikon_zoom_70_200", "nikon_zoom_14_24", "nikon_zoom_80_200", "itoh_zoom_100_146")
 INTERNAL = ("nikon_zoom_70_200", "nikon_zoom_14_24", "sony_sonnar_55", "tajima_retrofocus_24")

@@ -11,14 +11,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.optics.trace import CHUNK, Rays, compile_trace, trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = sorted((Path(__file__).parents[2] / "lenses").glob("*.toml"))
 INF = math.inf
 WIDE = 1000.0

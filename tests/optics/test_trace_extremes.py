@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as hs
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.errors import InputError, NeurolensWarning
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays, trace

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays, trace
 from neurolens.optics.traceprogram import exact_program

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.programs import compiler
 
 SOURCE = "int answer(void) { return 42; }\n"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.programs.c import write_c
 from neurolens.programs.compiler import compile_c
 from neurolens.programs.contract import derivative

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 from lens_formats import WRITERS, plain
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.readers.any_format import read_any
 from neurolens.readers.source import MAX_BYTES
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 GAUSS = plain(read_lens(Path(__file__).parents[2] / "lenses" / "laikin_double_gauss_50.toml"))
 CONSTANT = replace(GAUSS, surfaces=tuple(replace(s, V_d=None) for s in GAUSS.surfaces))
 TEXTS = {suffix: write(CONSTANT if suffix in (".len", ".dat", ".txt") else GAUSS) for suffix, write in WRITERS.items()}

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from neurolens.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics import catalogue
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.readers.codev import read_seq
 from neurolens.readers.draft import Given
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 
 TEXT = """\
 RDM;LEN       "VERSION: 11.2 SR1       LENS VERSION: 84       Creation Date: 28-May-2019"

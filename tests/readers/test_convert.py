@@ -14,7 +14,7 @@ from neurolens.cli import main
 from neurolens.optics.lensfile import read_lens
 from neurolens.readers.any_format import read_any
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = sorted((Path(__file__).parents[2] / "lenses").glob("*.toml"))
 TABLE = "# Singlet\n0 4.0 0 10\n50 5.0 1.5 20\n-50.0 0 1 20\n"
 

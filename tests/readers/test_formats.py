@@ -15,7 +15,7 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.trace import Rays, trace
 from neurolens.readers.any_format import read_any
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = sorted((Path(__file__).parents[2] / "lenses").glob("*.toml"))
 NO_DISPERSION = (".len", ".dat", ".txt")
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from neurolens.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.readers.draft import Given
 from neurolens.readers.json_lens import read_json_lens
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 SHARED = sorted((Path(__file__).parents[3] / "shared" / "data" / "lenses").glob("*.json"))
 
 

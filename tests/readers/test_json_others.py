@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from neurolens.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics.paraxial import first_order
 from neurolens.readers.any_format import read_any
 
@@ -28,7 +28,7 @@ ISET: dict[str, Any] = {
         {"radius": 0, "thickness": 0, "ior": 1, "semi_aperture": 9.0},
     ],
 }
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 
 
 def written(folder: Path, data: Any) -> Path:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from neurolens.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics import catalogue
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -15,7 +15,7 @@ from neurolens.readers.draft import Given
 from neurolens.readers.oslo import read_len
 from neurolens.readers.tables import read_table
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 
 # A biconvex singlet of R = 50 mm, 5 mm thick, n = 1.5, behind a stop: EFL by the lensmaker's formula.
 TABLE = """\

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 from render_helpers import WHITE, diffuse, scene
 
+from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
-from neurolens.errors import InputError, NeurolensError
 from neurolens.render.filmsettings import FilmSettings
 from neurolens.render.identity import digest
 from neurolens.render.renderer import RenderResult, render

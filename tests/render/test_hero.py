@@ -11,10 +11,10 @@ import pytest
 from PIL import Image
 from render_helpers import WHITE, diffuse, scene
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.errors import InputError
 from neurolens.render.film import PixelGrid
 from neurolens.render.filmsettings import FilmSettings
 from neurolens.render.renderer import render

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from render_helpers import WHITE, diffuse, scene
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.errors import InputError
 from neurolens.render.colour import SRGB
 from neurolens.render.filmsettings import FilmSettings
 from neurolens.render.illuminants import illuminant, planck

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from render_helpers import diffuse, radiance, scene, world
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.render import meshfile
 from neurolens.render.meshfile import TriangleSet, read_file
 from neurolens.render.primitives import Rays

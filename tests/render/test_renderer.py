@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from render_helpers import WHITE, diffuse, scene
 
+from neurolens.base.errors import InputError, ModelError, NeurolensError
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
-from neurolens.errors import InputError, ModelError, NeurolensError
 from neurolens.render import bench
 from neurolens.render.renderer import render
 from neurolens.render.sums import Film, Tiling

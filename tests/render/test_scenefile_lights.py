@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from render_helpers import CAMERA, diffuse, radiance, scene, world
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.render import pictures
 from neurolens.render.scenechecks import encloses
 from neurolens.render.scenefile import scene_from_tables

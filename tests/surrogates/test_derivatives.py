@@ -10,7 +10,7 @@ import torch
 from lens_models import KINDS, model, prepared
 from torch import Tensor
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.optics.differentials import film_tangents, trace_differentials
 from neurolens.optics.pupil_rays import camera_rays
 from neurolens.surrogates.cores import MirrorPolynomial, Partitioned

@@ -14,9 +14,9 @@ import onnxruntime
 import pytest
 import torch
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import load_model
-from neurolens.errors import InputError, ModelError
 from neurolens.modelfile import CARD_KEY
 from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.card import card_of, card_to_json

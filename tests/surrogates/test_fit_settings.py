@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.surrogates.bases import invariant_exponents, raw_exponents
 from neurolens.surrogates.fit import ModelSettings
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from lens_models import prepared
 
-from neurolens.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.surrogates import fit
 from neurolens.surrogates.card import card_of
 from neurolens.surrogates.fit import ModelSettings, fit_model

@@ -13,8 +13,8 @@ import onnxruntime
 import pytest
 import torch
 
-from neurolens import status as st
-from neurolens.errors import InputError, NeurolensWarning
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain

@@ -12,8 +12,8 @@ import torch
 from lens_models import prepared
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model

@@ -11,9 +11,9 @@ import pytest
 import torch
 from lens_models import anamorphic
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
-from neurolens.errors import InputError
 from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.vignetting import vignetting_errors

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.cores import Network
 from neurolens.surrogates.domain import domain_of, sample_domain
@@ -100,7 +100,7 @@ def test_the_seed_decides_every_bit_on_any_number_of_threads(singlet):
     assert not torch.equal(first, _weights(fit_network(*singlet, units=4, steps=6, seed=6)))
 
 
-@pytest.mark.filterwarnings("ignore::neurolens.errors.NeurolensWarning")
+@pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 def test_a_lens_without_dispersion_ignores_the_wavelength():
     pairs, encoding, gates = _setup("muller_fisheye_100.toml")
     network = fit_network(pairs, encoding, gates, units=6, layers=1, steps=20)

@@ -14,14 +14,14 @@ import torch
 from lens_models import prepared
 from onnx import ModelProto
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.onnxderivatives import OnnxDerivatives
 from neurolens.cameras.onnxinverse import load_inverse
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
-from neurolens.errors import InputError, ModelError
 from neurolens.modelfile import CARD_KEY
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model

@@ -12,8 +12,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import stop_radius_mm
 from neurolens.optics.pupils import camera_rays

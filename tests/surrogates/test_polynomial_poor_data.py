@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.cores import InvariantPolynomial
 from neurolens.surrogates.domain import domain_of, sample_domain

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from neurolens import status as st
-from neurolens.errors import InputError, NeurolensWarning
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.evaluate.vignetting import vignetting_errors
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface

@@ -12,8 +12,8 @@ import torch
 from lens_models import prepared
 from onnx import TensorProto, helper, numpy_helper
 
+from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import load_model
-from neurolens.errors import InputError, ModelError
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.onnx.export import export_onnx

@@ -9,8 +9,8 @@ import pytest
 import torch
 from lens_models import prepared
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
-from neurolens.errors import InputError
 from neurolens.surrogates.cores import Partitioned
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.evaluate.benches.compiled_source import FLAGS, CompiledSource, find_compiler
 from neurolens.evaluate.speed import Unavailable
 from neurolens.optics.paraxial import first_order

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.optics.paraxial import first_order
 from neurolens.programs.c import Signature
 from neurolens.programs.expressions import Program

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.errors import InputError
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.specialise import at_wavelength

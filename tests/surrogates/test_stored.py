@@ -14,7 +14,7 @@ import onnx
 import pytest
 import torch
 
-from neurolens.errors import ModelError
+from neurolens.base.errors import ModelError
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.surrogates.cores import Partitioned
 from neurolens.surrogates.onnx.export import export_onnx

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.evaluate.speed import Call, Unavailable
 from neurolens.programs import compiler
 from neurolens.programs.c import Signature, write_c

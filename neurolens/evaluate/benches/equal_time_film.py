@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera, CameraRays, DifferentialCamera, FloatArray
 from neurolens.cameras.lens_film import LensFilm
-from neurolens.errors import InputError
 
 FloatArray64 = NDArray[np.float64]
 _BATCH = 8192

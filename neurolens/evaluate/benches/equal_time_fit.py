@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 
 FloatArray = NDArray[np.float64]
 

@@ -11,13 +11,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.benches.equal_time import MEASURES, CameraResult, SceneResult
 from neurolens.evaluate.benches.equal_time_cameras import EXACT, EXACTS, LENS
 from neurolens.evaluate.benches.equal_time_fit import Estimate, crossover_s, log_interpolate
 from neurolens.evaluate.benches.equal_time_pictures import draw, um_text
 from neurolens.evaluate.benches.trace_speed_page import machine
 from neurolens.evaluate.records import plain
-from neurolens.files import atomic_write_text
 
 _INTRO = """\
 # Equal time and equal samples

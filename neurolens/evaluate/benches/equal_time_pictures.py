@@ -7,11 +7,11 @@ from pathlib import Path
 
 from PIL import Image
 
+from neurolens.base.files import atomic_path
 from neurolens.evaluate.benches.equal_time import MEASURES, CameraResult, SceneResult
 from neurolens.evaluate.benches.equal_time_cameras import EXACT
 from neurolens.evaluate.plots.equal_time import Panel, error_over_time_plot, film_maps_plot
 from neurolens.evaluate.plots.image import side_by_side
-from neurolens.files import atomic_path
 
 _MOST_BYTES = 150_000  # of a picture
 _TITLES = {"mse": "RMSE (linear radiance)", "rel_mse": "relative RMSE (share of 1)"}

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import neurolens
+from neurolens.base.files import atomic_path
+from neurolens.base.tomlfile import read_toml
 from neurolens.cameras.contract import Camera
 from neurolens.evaluate.records import plain
-from neurolens.files import atomic_path
 from neurolens.render.filmsettings import FilmSettings
 from neurolens.render.renderer import render
 from neurolens.render.scenefile import Scene
-from neurolens.tomlfile import read_toml
 
 _SOURCES = ("cameras", "optics", "programs", "render")  # folders of the package that a picture depends on
 

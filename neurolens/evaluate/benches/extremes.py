@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.evaluate.benches.extreme_cases import Case
 from neurolens.evaluate.benches.reference import trace_reference
 from neurolens.optics import glass

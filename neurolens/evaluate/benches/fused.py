@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.errors import ModelError
+from neurolens.base.errors import ModelError
 from neurolens.evaluate.benches.compiled_source import CompiledSource, find_compiler
 from neurolens.evaluate.speed import Call, Candidate, Unavailable
 from neurolens.programs.expressions import Program

@@ -9,9 +9,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.benches.fused_speed import WAVELENGTH_NM, WITHIN_UM, Row
 from neurolens.evaluate.benches.trace_speed_page import machine
-from neurolens.files import atomic_write_text
 from neurolens.programs.compiler import FLAGS
 
 _NOTES = """\

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxsession import open_session
-from neurolens.errors import InputError
 from neurolens.evaluate.benches.fused import fused_candidate, program_candidate
 from neurolens.evaluate.candidates import exact_candidates, model_candidate
 from neurolens.evaluate.experiment import LensChoice

@@ -17,11 +17,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.errors import InputError, NeurolensWarning
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.experiment import LensChoice
 from neurolens.evaluate.records import kept_rows
-from neurolens.files import atomic_write_text
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays

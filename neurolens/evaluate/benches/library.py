@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.analysis.layout import refractions
-from neurolens.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.optics.lenscheck import Check, check_lens, doubts, verdict
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lightcheck import film_edge_mm

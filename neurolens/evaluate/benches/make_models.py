@@ -18,8 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from neurolens import __version__
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.base.files import atomic_path
+from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
-from neurolens.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.evaluate.bench import read_index
 from neurolens.evaluate.benches.make_state_models import make_state_entry
 from neurolens.evaluate.benches.models_index import write_index
@@ -30,10 +32,8 @@ from neurolens.evaluate.measure import Measured, fit_and_measure, shared_rays
 from neurolens.evaluate.project import project_root
 from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
 from neurolens.evaluate.speed import race
-from neurolens.files import atomic_path
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
-from neurolens.progress import Progress
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.fit import NETWORKS, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs

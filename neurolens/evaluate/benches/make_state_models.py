@@ -8,16 +8,16 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.errors import NeurolensWarning
+from neurolens.base.files import atomic_path
+from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
-from neurolens.errors import NeurolensWarning
 from neurolens.evaluate.benches.models_list import Entry, Library
 from neurolens.evaluate.candidates import model_candidate
 from neurolens.evaluate.experiment import Experiment
 from neurolens.evaluate.speed import race
 from neurolens.evaluate.state_errors import check_states
 from neurolens.evaluate.train_states import fit_and_measure_states, state_settings
-from neurolens.files import atomic_path
-from neurolens.progress import Progress
 from neurolens.surrogates.domain import Domain
 
 _CHECKED = 4  # states at which a card is checked on fresh rays

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from neurolens.base.errors import NeurolensError
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.errors import NeurolensError
 from neurolens.mitsuba import camera, load_scene, render, require_mitsuba
 from neurolens.mitsuba.library import libraries
 from neurolens.mitsuba.scenes import our_scene, with_our_spectra

@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from neurolens.errors import NeurolensError
+from neurolens.base.errors import NeurolensError
 from neurolens.evaluate.benches.mitsuba_speed_profile import thin_camera
 from neurolens.render.renderer import render
 from neurolens.render.scenefile import load_scene

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.benches.mitsuba_speed import Settings
 from neurolens.evaluate.benches.mitsuba_speed_profile import STAGES
 from neurolens.evaluate.records import plain
-from neurolens.files import atomic_write_text
 
 NAME = "render_speed"
 

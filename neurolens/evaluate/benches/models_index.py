@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.train import versions
-from neurolens.files import atomic_write_text
 
 _HEAD = """# Models that ship
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from neurolens.config import read_config
-from neurolens.errors import InputError
+from neurolens.base.config import read_config
+from neurolens.base.errors import InputError
 from neurolens.evaluate.benches.library import lens_files
 from neurolens.evaluate.experiment import DomainChoice, LensChoice, check_names
 from neurolens.surrogates.fit import ModelSettings

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.cameras.onnxlens import OnnxLens
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.surrogates.model import ANY_WAVELENGTH_NM

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from neurolens.base.files import atomic_write_text
 from neurolens.cameras.exact import ExactCamera
 from neurolens.evaluate.benches.passage import FILM_MM, METHODS, OURS, Passage
 from neurolens.evaluate.plots.style import FAINT, FIELD_COLOURS, INK, new_figure, save, style
-from neurolens.files import atomic_write_text
 
 _INTRO = """\
 # Share of rays that pass

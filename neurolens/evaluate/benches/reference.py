@@ -13,7 +13,7 @@ from typing import Any
 
 from mpmath import mp, mpf, sqrt
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.optics.prescription import Lens, Surface
 
 DIGITS = 50
@@ -41,7 +41,7 @@ def trace_reference(lens: Lens, ray: Sequence[float], media: Sequence[float], to
         media: refractive indices from the scene (air) to the film: one more than there are surfaces.
         towards: "scene" or "film", as for `trace`.
 
-    The tests at each surface are those of `neurolens.status`: met, inside the rim, not totally reflected.
+    The tests at each surface are those of `neurolens.base.status`: met, inside the rim, not totally reflected.
     """
     with mp.workdps(DIGITS):
         sense = 1 if towards == "film" else -1

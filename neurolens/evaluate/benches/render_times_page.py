@@ -10,6 +10,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.benches.render_times import (
     CHEAP,
     CHEAP_ROUNDS,
@@ -27,7 +28,6 @@ from neurolens.evaluate.benches.render_times import (
 )
 from neurolens.evaluate.benches.render_times_shapes import Shape
 from neurolens.evaluate.benches.trace_speed_page import machine
-from neurolens.files import atomic_write_text
 
 ABOVE_THIN, MOVES, PER_REFRACTION = 0.05, 0.30, 0.10  # the goals, as shares
 _NOTES = """\

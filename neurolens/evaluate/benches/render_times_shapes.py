@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from neurolens.apertures import Aperture
+from neurolens.base.errors import InputError
 from neurolens.cameras.build import FUSED, make_camera
-from neurolens.errors import InputError
 from neurolens.evaluate.benches.render_times import LENSES, Size, one_render, shot
 from neurolens.render.scenefile import Scene
 

@@ -14,14 +14,14 @@ from typing import Any
 
 from neurolens import __version__
 from neurolens.axes import Axis
+from neurolens.base.files import atomic_write_text
+from neurolens.base.progress import Report
 from neurolens.evaluate.experiment import near_limit_m, wavelengths_nm
 from neurolens.evaluate.plots.states import panels_plot
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.records import kept_rows
 from neurolens.evaluate.train_states import fit_and_measure_states
-from neurolens.files import atomic_write_text
 from neurolens.optics.lensfile import read_lens
-from neurolens.progress import Report
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.states.fit import StateSettings

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import get_args
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.fits.ablations import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
 from neurolens.surrogates.precision import Precision

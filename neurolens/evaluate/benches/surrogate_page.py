@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.benches.surrogate_methods import GROUPS
 from neurolens.evaluate.plots.surrogates import trade_plot
 from neurolens.evaluate.records import number
-from neurolens.files import atomic_write_text
 
 Record = Mapping[str, Any]
 

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.progress import Report
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.benches.fused import fused_candidate
 from neurolens.evaluate.candidates import exact_candidates, model_candidate
 from neurolens.evaluate.records import break_even_rays
 from neurolens.evaluate.speed import Race, race
 from neurolens.optics.prescription import Lens
-from neurolens.progress import Report
 from neurolens.surrogates.domain import Domain
 
 EXACT = ("exact eager", "exact compiled")

@@ -18,8 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from neurolens import __version__
+from neurolens.base.errors import NeurolensError, NeurolensWarning
+from neurolens.base.files import atomic_write_text
+from neurolens.base.progress import Progress, Report
 from neurolens.cameras.model import load_model
-from neurolens.errors import NeurolensError, NeurolensWarning
 from neurolens.evaluate.benches.surrogate_methods import Row
 from neurolens.evaluate.benches.surrogate_times import race_models, times_of
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
@@ -27,10 +29,8 @@ from neurolens.evaluate.fresh import FreshRays, measure
 from neurolens.evaluate.measure import onnx_predictor, shared_rays
 from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
 from neurolens.evaluate.records import plain
-from neurolens.files import atomic_write_text
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
-from neurolens.progress import Progress, Report
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.fit import NETWORKS, Prepared, fit_model, prepare
 from neurolens.surrogates.model import LensModel

@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from neurolens.errors import NeurolensError
+from neurolens.base.errors import NeurolensError
 from neurolens.evaluate.benches.trace_speed import film_rays, launched
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.trace import Rays, trace

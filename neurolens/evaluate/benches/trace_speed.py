@@ -15,8 +15,8 @@ from typing import Any
 
 import torch
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.evaluate.candidates import COMPILED_BATCHES, EAGER_BATCHES
 from neurolens.evaluate.layout import refractions
 from neurolens.evaluate.speed import POOL, Call, Candidate, Race, Unavailable, race

@@ -14,8 +14,8 @@ import numpy
 import torch
 
 from neurolens import __version__
+from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.benches.trace_speed import goals
-from neurolens.files import atomic_write_text
 
 NOTES = """\
 Rays made beforehand: film points over the image circle, aimed at the rear rim, 400 to 700 nm, a wavelength each;

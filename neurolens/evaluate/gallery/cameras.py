@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.fused import FusedCamera
@@ -18,7 +19,6 @@ from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.cameras.vignetting import Vignetted
-from neurolens.errors import InputError
 from neurolens.evaluate.gallery.lenses import Shot, Surrogate
 from neurolens.evaluate.gallery.vignettes import PostProcessed
 from neurolens.optics.paraxial import first_order

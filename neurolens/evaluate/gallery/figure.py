@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from PIL import Image as Pictures
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path
 from neurolens.evaluate.gallery.cameras import TITLES
 from neurolens.evaluate.gallery.measures.view import luminance
 from neurolens.evaluate.image import Image, to_srgb
 from neurolens.evaluate.plots.style import new_figure, style
-from neurolens.files import atomic_path
 
 DPI = 100  # a picture of 240 pixels is 2.4 inches wide: one pixel of it, one of the figure
 MOST_BYTES = 250_000

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from neurolens import __version__
+from neurolens.base.errors import NeurolensWarning
+from neurolens.base.progress import Report
 from neurolens.cameras.model import load_model
-from neurolens.errors import NeurolensWarning
 from neurolens.evaluate.gallery.settings import Panel
 from neurolens.evaluate.measure import fit_and_measure, known_record
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import film_z_mm, first_order
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.progress import Report
 from neurolens.render.masks import make_aperture
 from neurolens.render.scenefile import Scene
 from neurolens.surrogates.domain import Domain, domain_of

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.gallery.cameras import TITLES
-from neurolens.files import atomic_write_text
 
 _HEAD = """\
 # What real lenses do

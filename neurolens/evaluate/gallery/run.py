@@ -10,7 +10,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_write_text
+from neurolens.base.progress import Progress, Report
 from neurolens.evaluate.gallery.cameras import CAMERAS, Window, camera_of
 from neurolens.evaluate.gallery.figure import Row, difference_of, draw, exposure_of
 from neurolens.evaluate.gallery.lenses import Shot, Surrogate, same_state, shot_of, surrogate_of
@@ -18,8 +20,6 @@ from neurolens.evaluate.gallery.measures import MEASURES
 from neurolens.evaluate.gallery.measures.view import View
 from neurolens.evaluate.gallery.settings import Effect, Panel
 from neurolens.evaluate.train import versions
-from neurolens.files import atomic_write_text
-from neurolens.progress import Progress, Report
 from neurolens.render.renderer import render
 from neurolens.render.scenefile import load_scene
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from neurolens.base.config import from_dict
+from neurolens.base.errors import InputError
+from neurolens.base.tomlfile import read_toml, suggestion
 from neurolens.cameras.vignetting import Vignetting
-from neurolens.config import from_dict
-from neurolens.errors import InputError
 from neurolens.surrogates.fit import ModelSettings
-from neurolens.tomlfile import read_toml, suggestion
 
 COLUMNS = ("exact", "surrogate", "thin")
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 
 Array = NDArray[np.float64]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.evaluate.plots.style import FIELD_COLOURS, new_figure, plain_log_ticks, save, style
 from neurolens.optics.breathing import Breath, breathing, field_change
 from neurolens.optics.internal import focus_states, nearest_focus_m

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from neurolens.analysis.plot_style import heading
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.evaluate.plots.style import (
     FAINT,
     INK,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.evaluate.image import checked_image, to_srgb
 from neurolens.evaluate.plots.style import new_figure, save, style
 

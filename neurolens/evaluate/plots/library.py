@@ -17,7 +17,7 @@ from neurolens.analysis.plot_layout import (
     z_range,
 )
 from neurolens.analysis.plot_style import FAINT, new_figure, save, style
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 
 _COLUMNS = 6
 _CELL_IN = (2.6, 2.0)  # width and height of one section with its title

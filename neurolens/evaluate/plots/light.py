@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.evaluate.plots.style import FIELD_COLOURS, INK, new_figure, save, style
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.evaluate.benches.vignetting import OPENINGS
 from neurolens.evaluate.plots.style import FIELD_COLOURS, INK, new_figure, save, style
 from neurolens.surrogates.domain import FilmRays

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens.files import atomic_path
+from neurolens.base.files import atomic_path
 
 SCHEMA = 1
 EVERY_S = 3.0

@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.cores import InvariantPolynomial, Network
 from neurolens.surrogates.domain import Domain

@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.surrogates.cores import InvariantPolynomial, Network, Partitioned, RawPolynomial
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.pairs import PairSet, RayPairs

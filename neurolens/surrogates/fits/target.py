@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
-from neurolens.errors import NeurolensWarning
+from neurolens.base.errors import NeurolensWarning
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import RayPairs
 from neurolens.surrogates.targets import film_equivalent, targets_of

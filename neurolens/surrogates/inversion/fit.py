@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.inversion.guess import fit_guess

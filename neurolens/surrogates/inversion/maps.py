@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.frontsurface import meet_front
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.domain import FilmRays
@@ -35,7 +35,7 @@ class StopRays(NamedTuple):
 
     Attributes:
         rays: with the pupil points found.
-        prediction: of the model for those rays. Its status is that of `neurolens.status`, NO_SOLUTION among them.
+        prediction: of the model for those rays. Its status is that of `neurolens.base.status`, NO_SOLUTION among them.
         density: |d stop / d pupil|: area on the stop per area on the pupil plane, the film point held. A stop point
             drawn with density q per mm^2 is a pupil point drawn with density q times this.
         residual: distance between the point asked for and where the ray crosses the stop, in stop radii.

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from neurolens import status as st
-from neurolens.errors import InputError
-from neurolens.files import atomic_path
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.surrogates.card import card_of, card_to_json
 from neurolens.surrogates.domain import sample_domain

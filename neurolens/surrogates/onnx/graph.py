@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from onnx import ModelProto, NodeProto, TensorProto, checker, helper, numpy_helper
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 
 # Opset 17 and IR 8 are read by every onnxruntime since 1.12.
 OPSET, IR_VERSION = 17, 8

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens import status as st
-from neurolens.files import atomic_path
+from neurolens.base import status as st
+from neurolens.base.files import atomic_path
 from neurolens.modelfile import CARD_KEY
 from neurolens.surrogates.card import card_of, card_to_json
 from neurolens.surrogates.inversion.guess import Guess

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.lightfield import Encoding

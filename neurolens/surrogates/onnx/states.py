@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from onnx import NodeProto
 
 from neurolens.axes import Axis
-from neurolens.errors import InputError
-from neurolens.files import atomic_path
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path
 from neurolens.modelfile import CARD_KEY
 from neurolens.optics.internal import at_infinity
 from neurolens.optics.paraxial import first_order

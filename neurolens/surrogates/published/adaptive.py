@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.surrogates.cores import RawPolynomial
 from neurolens.surrogates.fits.growth import grow
 from neurolens.surrogates.pairs import PairSet

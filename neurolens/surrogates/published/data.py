@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.surrogates.bases import raw_exponents
 from neurolens.surrogates.cores import RawPolynomial, monomials
 from neurolens.surrogates.fit import Prepared

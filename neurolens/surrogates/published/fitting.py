@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.surrogates.fit import ModelSettings, Prepared
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import Core, Gate

@@ -23,8 +23,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.lightfield import LightField, angle_vector
 from neurolens.surrogates.model import Gate

@@ -22,8 +22,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurolens import status as st
-from neurolens.errors import InputError
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.surrogates.cores import monomials
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.lightfield import LightField, angle_vector

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Rays

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import neurolens
-from neurolens.errors import InputError
-from neurolens.files import atomic_write_text
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_write_text
 from neurolens.programs.c import Signature, write_c
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.source.fused import ALL, FREE, Fixed, Parts, fused_program

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from neurolens import axes as ax
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.surrogates.bases import Exponents, invariant_exponents, monomials, solve, vector_columns, vector_gram
 from neurolens.surrogates.cores import InvariantPolynomial
 from neurolens.surrogates.fit import prepare

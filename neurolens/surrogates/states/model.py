@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from neurolens import axes as ax
-from neurolens.errors import InputError
+from neurolens.base.errors import InputError
 from neurolens.statetable import mix_domain
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.lightfield import Encoding

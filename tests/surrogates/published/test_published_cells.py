@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from neurolens import status as st
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
-from neurolens.errors import InputError
 from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import ray_errors
 from neurolens.surrogates.cores import RawPolynomial

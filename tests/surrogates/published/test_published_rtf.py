@@ -14,7 +14,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as some
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import ray_errors

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
-from neurolens.errors import InputError
 from neurolens.evaluate.measure import onnx_predictor
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens, Surface

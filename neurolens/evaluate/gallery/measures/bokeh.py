@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens import status as st
+from neurolens.base import status as st
 from neurolens.cameras.contract import Camera
 from neurolens.evaluate.gallery.measures.lightdiscs import LightDisc, light_disc
 from neurolens.evaluate.gallery.measures.view import View

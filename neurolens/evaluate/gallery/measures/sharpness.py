@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.thin import ThinLens
-from neurolens.errors import InputError
 from neurolens.evaluate.gallery.measures.lightdiscs import light_disc
 from neurolens.evaluate.gallery.measures.view import View
 from neurolens.optics.paraxial import first_order

@@ -17,8 +17,8 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from neurolens.errors import InputError
-from neurolens.tomlfile import format_toml, read_toml, reject_unknown
+from neurolens.base.errors import InputError
+from neurolens.base.tomlfile import format_toml, read_toml, reject_unknown
 
 T = TypeVar("T")
 _NAMES = {

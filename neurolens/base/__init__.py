@@ -1,0 +1,1 @@
+"""Small foundations that everything may import: errors, ray status, files, settings, progress."""
