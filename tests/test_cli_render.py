@@ -21,7 +21,7 @@ from PIL import Image
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.thin import ThinLens
 from neurolens.cli import main
-from neurolens.render.exr import read_exr, read_layers, write_exr
+from neurolens.render.pictures import read_exr, read_layers, write_exr
 
 SCENE = """\
 [camera]
@@ -227,9 +227,9 @@ def test_a_picture_beyond_memory_is_one_line(
 ) -> None:
     common = ("render", scene, "--camera", "thin", "--quiet", "-o", tmp_path / "a.exr")
     with monkeypatch.context() as patch:
-        patch.setattr("neurolens.render.sums.os.sysconf", lambda _: 590)
+        patch.setattr("neurolens.render.film.os.sysconf", lambda _: 590)
         assert "64, 36" in (line := failure(capsys, *common)) and "2122 pixels" in line
-    monkeypatch.setattr("neurolens.render.sums.mmap.mmap", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOMEM, "")))
+    monkeypatch.setattr("neurolens.render.film.mmap.mmap", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOMEM, "")))
     assert "out of memory" in failure(capsys, *common)
 
 

@@ -81,7 +81,7 @@ def _scenes(root: Path, found: Any, report: Callable[[float], None]) -> None:
     """Each scene: timed with all threads, then profiled with one."""
     from neurolens.evaluate.benches.mitsuba_speed_profile import profile, thin_camera
     from neurolens.render.renderer import render
-    from neurolens.render.scenefile import load_scene
+    from neurolens.render.scene import load_scene
 
     files = [file for name in SCENES if (file := root / "experiments" / "scenes" / f"{name}.toml").is_file()]
     repeats = min(found.settings.repeats, 5)

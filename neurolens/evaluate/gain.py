@@ -20,7 +20,7 @@ from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.render.job import camera_axes
 from neurolens.render.primitives import Rays
-from neurolens.render.scenefile import Scene, load_scene
+from neurolens.render.scene import Scene, load_scene
 from neurolens.render.spectrum import SpectralRange
 from neurolens.render.world import World
 from neurolens.surrogates.domain import Domain, domain_from_camera

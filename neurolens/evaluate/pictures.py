@@ -18,10 +18,9 @@ from neurolens.evaluate.image import compare, error_maps
 from neurolens.evaluate.plots import image_caption, side_by_side
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.render.exr import write_exr, write_png
+from neurolens.render.pictures import write_exr, write_png
 from neurolens.render.renderer import render
-from neurolens.render.scene import CameraSettings
-from neurolens.render.scenefile import Scene, load_scene
+from neurolens.render.scene import CameraSettings, Scene, load_scene
 from neurolens.surrogates.domain import Domain
 
 EXACT = "exact"

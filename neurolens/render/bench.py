@@ -14,7 +14,7 @@ from pathlib import Path
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.thin import ThinLens
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import load_scene
 from neurolens.render.wavelengths import LANES
 
 

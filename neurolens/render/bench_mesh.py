@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, NeurolensError
-from neurolens.render.embree import EmbreeMesh
-from neurolens.render.mesh import Mesh
+from neurolens.render.mesh import EmbreeMesh, Mesh
 from neurolens.render.primitives import Primitive, Rays
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import load_scene
 
 _BATCH = 32768
 _MAKERS: dict[str, Callable[..., Primitive]] = {"tree": Mesh, "embree": EmbreeMesh}

@@ -1,24 +1,34 @@
-"""One render made ready: scene, camera and film, and how one pass of one tile is rendered."""
+"""One render: scene, camera and film made ready, how one pass of one tile is rendered, and the film developed."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
 from neurolens.render.colour import SRGB, balance
-from neurolens.render.film import PixelGrid
-from neurolens.render.filmsettings import FilmSettings
-from neurolens.render.integrator import trace
-from neurolens.render.palette import Index
+from neurolens.render.film import (
+    COLUMNS,
+    DEPTH,
+    DROPPED,
+    HITS,
+    LUMINANCE2,
+    PASSED,
+    RGB,
+    Film,
+    FilmSettings,
+    PixelGrid,
+    Tiling,
+    shared,
+)
+from neurolens.render.integrator import lit, trace
 from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler
-from neurolens.render.scatter import lit
-from neurolens.render.scene import CameraSettings
-from neurolens.render.scenefile import Scene
-from neurolens.render.sums import COLUMNS, DEPTH, DROPPED, HITS, LUMINANCE2, PASSED, RGB, Film, Tiling, shared
+from neurolens.render.scene import CameraSettings, Scene
+from neurolens.render.spectrum import Index
 from neurolens.render.wavelengths import LANES, mode_for, spectral_range
 from neurolens.render.world import World
 
@@ -197,3 +207,64 @@ def _turned(hue: FloatArray, by: FloatArray | np.float32) -> FloatArray:
     turned = hue + by
     turned -= turned >= 1
     return turned
+
+
+# Of the layers, for the metadata of a picture.
+MEANING = {
+    "samples": "samples in the pixel",
+    "variance": "of the pixel's luminance (linear sRGB), from its samples as if they were independent",
+    "depth": "channel Z: m along the optical axis from the film's plane to the first surface, mean; inf: none",
+    "blocked": "share of the samples whose camera ray did not pass",
+}
+
+
+@dataclass(frozen=True)
+class Layers:
+    """What a picture says of its own pixels, [H, W] float32 each.
+
+    Attributes:
+        samples: samples in the pixel, 0 where nothing is done yet.
+        variance: of the pixel's luminance (of linear sRGB after the white balance), estimated from its samples as if
+            they were independent: the sample variance over their number. That of low-discrepancy samples is lower.
+            Infinite below two samples. With wavelength lanes four paths count as one sample.
+        depth: distance in m along the optical axis from the film's plane to the first surface, the mean over samples
+            that hit one: what is in focus is at `focus_m`. Infinite where none did.
+        blocked: share of the samples whose camera ray did not pass the lens.
+    """
+
+    samples: FloatArray
+    variance: FloatArray
+    depth: FloatArray
+    blocked: FloatArray
+
+
+def develop(job: Job) -> tuple[FloatArray, Layers]:
+    """Picture [H, W, 3] float32 linear sRGB and its layers; each tile is divided by the samples that it has.
+
+    It may be called while the workers go on.
+    """
+    tiling, grid = job.tiling, job.grid
+    rgb = np.zeros((tiling.pixels, 3), np.float32)
+    planes = np.zeros((4, tiling.pixels), np.float32)
+    for first, stop in tiling.chunks():
+        sums, done = job.film.copy(first, stop)
+        part = tiling.pixels_of(first, stop)
+        samples = np.repeat(tiling.samples_done(done), tiling.tile)[: len(sums)]
+        colour = sums[:, RGB] / np.maximum(samples, 1)[:, None]
+        rgb[part] = colour if job.neutral else colour @ job.balance.T
+        planes[:, part] = _layers(job, sums, samples)
+    shape = (grid.height, grid.width)
+    return rgb.reshape(*shape, 3), Layers(*(plane.reshape(shape) for plane in planes))
+
+
+def _layers(job: Job, sums: NDArray[np.float64], samples: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Samples, variance, depth and blocked share [4, n]."""
+    total = sums[:, RGB] @ job.luminance_row
+    groups = -(-samples // job.paths_a_sample)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Of the sum over independent samples, then of the mean over paths.
+        spread = np.maximum(sums[:, LUMINANCE2] - total**2 / groups, 0) * groups / (groups - 1)
+        variance = np.where(groups > 1, spread / samples.astype(np.float64) ** 2, np.inf)
+        depth = np.where(sums[:, HITS] > 0, sums[:, DEPTH] / sums[:, HITS], np.inf)
+        blocked = np.where(samples > 0, 1 - sums[:, PASSED] / samples, 0.0)
+    return np.stack([samples, variance, depth, blocked])

@@ -3,15 +3,21 @@
 Nodes have 16 children and leaves 8 triangles: few levels, and at each level one dense test of every (ray, node) pair
 against 16 boxes or 8 triangles, which is what numpy does fast. Triangles carry the three planes of Havel and Herout
 2010, "Yet faster ray-triangle intersection".
+
+Where the Python binding of Embree is installed (`pip install neurolens[embree]`), Embree takes the place of the tree.
+Hits agree within the rounding of float32.
 """
 
 from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.primitives import NEAREST, IntArray, Rays, slabs
+from neurolens.render.primitives import NEAREST, IntArray, Primitive, Rays, slabs
 
 _BRANCHES, _LEAF = 16, 8
 _PAIRS_AT_ONCE = 4096  # keeps the [pairs, 8] temporaries inside the L2 cache
@@ -102,7 +108,6 @@ class Mesh:
         return number
 
     def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
-        """See `Primitive`."""
         entry, exit_ = slabs(rays, self._low, self._high)
         np.minimum(exit_, best, out=exit_)
         np.maximum(entry, NEAREST, out=entry)
@@ -182,3 +187,73 @@ def triangle_planes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     across_b, across_c = np.cross(edge_c, normal) / area2, np.cross(normal, edge_b) / area2
     rows = [np.column_stack([n, -np.sum(n * a, axis=1)]) for n in (unit, across_b, across_c)]
     return np.stack(rows, axis=1)
+
+
+_STEP = np.float32(1e-5)  # m by which a ray starts again that met the surface that it leaves
+
+
+def make_mesh(first: int, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Primitive:
+    """Triangles to hit, through Embree if it is installed; arguments as for `Mesh`."""
+    try:
+        return EmbreeMesh(first, vertices, faces)
+    except ImportError:
+        return Mesh(first, vertices, faces)
+
+
+def tracer() -> str:
+    """What `make_mesh` makes meshes hit with: their hits differ by rounding."""
+    try:
+        _library()
+    except ImportError:
+        return "the built-in tree"
+    return "Embree"
+
+
+def _library() -> tuple[Any, Any]:
+    """The parts of embreex; by name, as nothing is known of their types."""
+    return import_module("embreex.mesh_construction"), import_module("embreex.rtcore_scene")
+
+
+class EmbreeMesh:
+    """Triangles in an Embree scene; triangle k is surface `first` + k.
+
+    Args:
+        first: number of the first triangle's surface.
+        vertices: [V, 3] in metres.
+        faces: [T, 3].
+
+    Raises:
+        ImportError: embreex is not installed.
+    """
+
+    def __init__(self, first: int, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
+        mesh_construction, rtcore_scene = _library()
+        self.first, self.count = first, len(faces)
+        corners = np.ascontiguousarray(vertices[faces], np.float32)
+        # Robust: watertight at the edges that triangles share.
+        self._scene = rtcore_scene.EmbreeScene(robust=True)
+        self._triangles = mesh_construction.TriangleMesh(self._scene, corners)
+        self._low, self._high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+
+    def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
+        entry, exit_ = slabs(rays, self._low, self._high)
+        np.minimum(exit_, best, out=exit_)
+        np.maximum(entry, NEAREST, out=entry)
+        # The box is flat where the mesh is: a hair of slack keeps what lies in it.
+        ray = np.flatnonzero(entry * np.float32(1 - 1e-5) <= exit_)
+        start = rays.origin.take(ray, axis=1)
+        moved = np.zeros(len(ray), np.float32)
+        while ray.size:
+            direction = rays.direction.take(ray, axis=1)
+            reach = np.minimum(best.take(ray) - moved, np.float32(1e30))
+            hit = self._scene.run(
+                np.ascontiguousarray(start.T), np.ascontiguousarray(direction.T), dists=reach, output=True
+            )
+            met = np.flatnonzero(hit["primID"] >= 0)
+            distance = hit["tfar"][met] + moved[met]
+            ok = (distance > NEAREST) & (distance < best[ray[met]])
+            best[ray[met[ok]]] = distance[ok]
+            found[ray[met[ok]]] = self.first + hit["primID"][met[ok]]
+            again = met[distance <= NEAREST]
+            ray, moved = ray[again], moved[again] + _STEP
+            start = start.take(again, axis=1) + direction.take(again, axis=1) * _STEP

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.render.checks import FARTHEST_M
 from neurolens.render.mesh import vertex_normals
-from neurolens.render.shapes import MeshSettings
+from neurolens.render.scenetables import FARTHEST_M, MeshSettings
 
 LARGEST_FILE = 500_000_000  # bytes
 _LARGEST_HEADER = 100_000
@@ -220,3 +219,30 @@ def _triangles(loaded: dict[str, Any]) -> TriangleSet:
     uv, normals = getattr(loaded.get("visual"), "uv", None), loaded.get("vertex_normals")
     extra = [None if x is None or len(x) != len(vertices) else np.asarray(x, np.float64) for x in (uv, normals)]
     return TriangleSet(vertices, faces.reshape(-1, 3), *extra)
+
+
+def encloses(mesh: TriangleSet, point: NDArray[np.float64]) -> bool:
+    """Whether a point [3] lies inside a closed mesh whose triangles face outwards.
+
+    By the winding number, the sum of the solid angles of the triangles over 4 pi (van Oosterom and Strackee 1983): 1
+    inside, 0 outside. A room, whose triangles face inwards, has -1; for an open mesh it means nothing.
+    """
+    corners = mesh.vertices[mesh.faces]
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    if not np.all((point > low) & (point < high)) or not _is_closed(corners):
+        return False
+    a, b, c = np.moveaxis(corners - point, 1, 0)
+    la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+    volume = np.sum(a * np.cross(b, c), axis=1)
+    ab, bc, ca = (np.sum(x * y, axis=1) for x, y in ((a, b), (b, c), (c, a)))
+    solid = 2 * np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb)
+    return bool(solid.sum() / (4 * np.pi) > 0.5)
+
+
+def _is_closed(corners: NDArray[np.float64]) -> bool:
+    """Whether each edge of triangles [T, 3, 3] runs as often one way as the other, by position."""
+    _, number = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    faces = number.reshape(-1, 3)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    forth, back = (np.unique(pair, axis=0, return_counts=True) for pair in (edges, edges[:, ::-1]))
+    return forth[0].shape == back[0].shape and all(np.array_equal(x, y) for x, y in zip(forth, back, strict=True))

@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
-from neurolens.render.checks import Vector
 from neurolens.render.directions import centres
-from neurolens.render.film import PixelGrid
-from neurolens.render.filmsettings import FilmSettings, WavelengthMode
+from neurolens.render.environment import sun_spectrum, total_spectrum
+from neurolens.render.film import FilmSettings, PixelGrid, WavelengthMode
 from neurolens.render.illuminants import illuminant
-from neurolens.render.scenefile import Scene
-from neurolens.render.sky import sun_spectrum, total_spectrum
+from neurolens.render.scene import Scene
+from neurolens.render.scenetables import Vector
 from neurolens.render.spectrum import FloatArray64, SpectralRange
 
 LANES = 4  # wavelengths of a hero path, and paths that share their random numbers

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from neurolens.base.errors import NeurolensError
+from neurolens.render.film import fork_context
 from neurolens.render.job import Job
-from neurolens.render.sums import fork_context
 
 FORKS = sys.platform.startswith("linux")
 _POLL_S, _PATIENCE_S = 0.05, 5.0

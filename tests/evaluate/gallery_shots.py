@@ -14,7 +14,7 @@ from neurolens.evaluate.gallery.lenses import Shot, Surrogate, shot_of, surrogat
 from neurolens.evaluate.gallery.measures import MEASURES
 from neurolens.evaluate.gallery.measures.view import View
 from neurolens.evaluate.gallery.settings import Panel
-from neurolens.render.scenefile import scene_from_tables
+from neurolens.render.scene import scene_from_tables
 
 ROOT = Path(__file__).parents[2]
 GALLERY = ROOT / "experiments" / "gallery"

@@ -27,9 +27,8 @@ from neurolens.evaluate.benches.equal_time_fit import (
     squared_error,
     weights,
 )
-from neurolens.render.filmsettings import FilmSettings
-from neurolens.render.scene import CameraSettings
-from neurolens.render.scenefile import load_scene
+from neurolens.render.film import FilmSettings
+from neurolens.render.scene import CameraSettings, load_scene
 
 SHAPE = (12, 20, 3)
 Picture = NDArray[np.float64]

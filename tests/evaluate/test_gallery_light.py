@@ -26,7 +26,7 @@ from neurolens.evaluate.gallery.run import check
 from neurolens.evaluate.gallery.settings import read_effect
 from neurolens.evaluate.gallery.vignettes import PostProcessed, illumination, post_process, strength_for
 from neurolens.optics.lensfile import read_lens
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import load_scene
 
 ROOT = Path(__file__).parents[2]
 GALLERY = ROOT / "experiments" / "gallery"

@@ -10,7 +10,7 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.benches.mitsuba_speed import Row, Settings, film_mm, record
 from neurolens.evaluate.benches.mitsuba_speed_page import Found, page
 from neurolens.evaluate.benches.mitsuba_speed_profile import STAGES, profile
-from neurolens.render.scenefile import scene_from_tables
+from neurolens.render.scene import scene_from_tables
 
 SETTINGS = Settings(size=100, samples=4, threads=2, repeats=3)
 

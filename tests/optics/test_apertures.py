@@ -17,7 +17,7 @@ from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.optics.trace import Rays, trace
-from neurolens.render.masks import make_aperture, read_mask
+from neurolens.render.pictures import make_aperture, read_mask
 
 LENSES = Path(__file__).parents[2] / "lenses"
 STAR = np.array([[0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 1, 0, 1, 0]])

@@ -8,7 +8,7 @@ import numpy as np
 
 from neurolens.render.integrator import trace
 from neurolens.render.sampler import Sampler
-from neurolens.render.scenefile import Scene, scene_from_tables
+from neurolens.render.scene import Scene, scene_from_tables
 from neurolens.render.spectrum import SpectralRange
 from neurolens.render.world import World
 

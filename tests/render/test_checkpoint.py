@@ -22,10 +22,9 @@ from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
-from neurolens.render.filmsettings import FilmSettings
-from neurolens.render.identity import digest
-from neurolens.render.renderer import RenderResult, render
-from neurolens.render.watch import Watch
+from neurolens.render.checkpoint import digest
+from neurolens.render.film import FilmSettings
+from neurolens.render.renderer import RenderResult, Watch, render
 
 FILM = (36.0, 24.0)
 SIZE: dict[str, Any] = {"width": 36, "height": 24}
@@ -56,7 +55,7 @@ def same(one: RenderResult, other: RenderResult) -> bool:
 
 @pytest.fixture
 def small_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", PATHS_A_PASS)
+    monkeypatch.setattr("neurolens.render.film.BATCH", PATHS_A_PASS)
 
 
 @pytest.mark.usefixtures("small_tiles")

@@ -11,7 +11,7 @@ import pytest
 
 from neurolens.cli import main
 from neurolens.render.colour import ACESCG, BRADFORD, COLOUR_SPACES, SRGB, adaptation, balance, conversion, xyz_of
-from neurolens.render.exr import read_exr, write_exr
+from neurolens.render.pictures import read_exr, write_exr
 
 
 def test_matrices_of_the_standards() -> None:

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from neurolens.base.errors import InputError
-from neurolens.render.exr import read_exr, read_layers, write_exr, write_png
+from neurolens.render.pictures import read_exr, read_layers, write_exr, write_png
 
 PICTURE = np.random.default_rng(0).random((5, 7, 3), np.float32) * 10
 

@@ -15,10 +15,9 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.render.film import PixelGrid
-from neurolens.render.filmsettings import FilmSettings
+from neurolens.render.film import FilmSettings, PixelGrid
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import Scene
+from neurolens.render.scene import Scene
 from neurolens.render.spectrum import SpectralRange
 from neurolens.render.wavelengths import dispersion_px, mode_for
 
@@ -162,7 +161,7 @@ def test_one_wavelength_of_light_makes_the_same_grey_with_four_lanes() -> None:
 
 @pytest.mark.parametrize("mode", ["hero", "lanes"])
 def test_workers_do_not_change_the_picture(mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 256)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 256)
     film = FilmSettings(wavelengths=mode)  # type: ignore[arg-type]
     made = room(tmp_path, "flint")
     one, two = (

@@ -12,11 +12,11 @@ from render_helpers import WHITE, diffuse, scene
 from neurolens.base.errors import InputError
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.render.colour import SRGB
-from neurolens.render.filmsettings import FilmSettings
-from neurolens.render.illuminants import illuminant, planck
+from neurolens.render.film import FilmSettings
+from neurolens.render.illuminants import illuminant, planck, table
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import load_scene
-from neurolens.render.spectrum import SpectralRange, table
+from neurolens.render.scene import load_scene
+from neurolens.render.spectrum import SpectralRange
 
 FILM = (36.0, 24.0)
 CAMERA = Pinhole(400.0, FILM)

@@ -13,13 +13,9 @@ from render_helpers import WHITE, diffuse, scene
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
-from neurolens.render.develop import develop
-from neurolens.render.film import PixelGrid
-from neurolens.render.filmsettings import FilmSettings
-from neurolens.render.job import Job
-from neurolens.render.renderer import render
-from neurolens.render.sums import BYTES_A_PIXEL, COLUMNS
-from neurolens.render.watch import Watch
+from neurolens.render.film import BYTES_A_PIXEL, COLUMNS, FilmSettings, PixelGrid
+from neurolens.render.job import Job, develop
+from neurolens.render.renderer import Watch, render
 
 FILM = (36.0, 24.0)
 # One wavelength: the film is grey, and light of radiance 1 gives 1 whatever the sample.
@@ -104,7 +100,7 @@ def some_job(width: int, height: int, samples: int = 40) -> Job:
 
 
 def test_a_picture_on_its_way_is_divided_by_what_each_tile_has(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 16 * 100)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 16 * 100)
     job = some_job(36, 24)
     assert (job.tiling.tiles, job.tiling.passes) == (9, 3)
     for tile, passes in ((0, 3), (1, 1), (8, 2)):
@@ -127,18 +123,18 @@ def peak_bytes(act: Any) -> int:
 
 
 def test_a_worker_holds_a_tile_and_the_picture_156_bytes_a_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 16 * 256)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 16 * 256)
     small, large = some_job(48, 32), some_job(960, 640)
     assert large.film.sums.nbytes == 960 * 640 * 8 * COLUMNS
     tiles = [peak_bytes(lambda job=job: job.render_tile(job.camera, 3, 1)) for job in (small, large)]
     assert tiles[1] < 1.05 * tiles[0]
-    monkeypatch.setattr("neurolens.render.sums.CHUNK_BYTES", 1 << 20)
+    monkeypatch.setattr("neurolens.render.film.CHUNK_BYTES", 1 << 20)
     assert peak_bytes(lambda: develop(large)) < (BYTES_A_PIXEL - 8 * COLUMNS) * 960 * 640
 
 
 def test_previews_come_while_the_render_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """So many samples take longer than the first preview, which is white where there is anything."""
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 16 * 100)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 16 * 100)
     shown: list[Any] = []
     watch = Watch(preview=shown.append, preview_s=0, stop=lambda: len(shown) > 1)
     made = scene(GREY, environment=WHITE)

@@ -17,9 +17,8 @@ from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.render import bench
-from neurolens.render.renderer import render
-from neurolens.render.sums import Film, Tiling
-from neurolens.render.watch import Watch
+from neurolens.render.film import Film, Tiling
+from neurolens.render.renderer import Watch, render
 
 FILM = (36.0, 24.0)
 LETTER_F = ["#####", "#....", "####.", "#....", "#....", "#...."]
@@ -86,7 +85,7 @@ def lit_scene() -> Any:
 
 
 def test_workers_do_not_change_the_picture_and_seeds_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 1024)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 1024)
     made, camera = lit_scene(), ThinLens(50.0, 2.0, 3.0, FILM)
     options: dict[str, Any] = {"width": 36, "height": 24, "samples": 40}
     one = render(made, camera, threads=1, **options)
@@ -180,7 +179,7 @@ class Raising(Pinhole):
     ],
 )
 def test_what_a_worker_raises_is_one_line(error: Exception, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 64)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 64)
     camera = Raising(50.0, FILM)
     camera.error = error
     with pytest.raises(NeurolensError) as failed:
@@ -201,7 +200,7 @@ class Killed(Pinhole):
 def test_a_killed_worker_ends_the_render_and_what_was_done_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 64)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 64)
     part, camera = tmp_path / "a.exr.part", Killed(50.0, FILM)
     options: dict[str, Any] = {"width": 36, "height": 24, "samples": 40, "threads": 2}
     with pytest.raises(NeurolensError, match=r"killed \(signal 9: did the memory run out\?\).* kept in .*a\.exr\.part"):
@@ -212,7 +211,7 @@ def test_a_killed_worker_ends_the_render_and_what_was_done_is_kept(
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system does not pin processes")
 def test_workers_are_pinned_where_there_is_one_for_each_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 256)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 256)
     free = os.sched_getaffinity(0)
 
     class Telling(Pinhole):
@@ -228,7 +227,7 @@ def test_workers_are_pinned_where_there_is_one_for_each_core(tmp_path: Path, mon
 
 
 def test_a_film_that_a_dead_worker_holds_is_an_error_not_a_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums._LONGEST_WAIT_S", 0.01)
+    monkeypatch.setattr("neurolens.render.film._LONGEST_WAIT_S", 0.01)
     film = Film(Tiling.of(100, 16))
     film.lock.acquire()
     with pytest.raises(NeurolensError, match="killed while it wrote"):
@@ -247,7 +246,7 @@ class Reopened(Pinhole):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_each_worker_opens_its_own_camera(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 256)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 256)
     made = scene(environment=WHITE)
     assert render(made, Reopened(50.0, FILM), width=36, height=24, samples=1, threads=threads).rgb.any()
 
@@ -267,7 +266,7 @@ def test_errors_are_clear(monkeypatch: pytest.MonkeyPatch) -> None:
         render(made, Prism(50.0, FILM), **small)
     narrow = scene({"wavelengths_nm": [460, 640]}, environment=WHITE)
     assert render(narrow, Prism(50.0, FILM), **small).rgb.shape == (24, 36, 3)
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 64)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 64)
     with pytest.raises(NeurolensError, match=r"^a render worker failed: RuntimeError: no rays today \(.*\.py:\d+\)$"):
         render(made, Broken(50.0, FILM), threads=2, **small)
 

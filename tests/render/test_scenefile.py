@@ -15,7 +15,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import load_scene
 
 SCENES = Path(__file__).parent.parent.parent / "experiments" / "scenes"
 MATERIALS = {

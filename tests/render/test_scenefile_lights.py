@@ -13,8 +13,8 @@ from render_helpers import CAMERA, diffuse, radiance, scene, world
 
 from neurolens.base.errors import InputError
 from neurolens.render import pictures
-from neurolens.render.scenechecks import encloses
-from neurolens.render.scenefile import scene_from_tables
+from neurolens.render.meshfile import encloses
+from neurolens.render.scene import scene_from_tables
 
 POINT = {"position_m": [0, 2, 0], "intensity": [1, 1, 1]}
 SPOT = POINT | {"look_at_m": [0, 0, 0], "outer_deg": 30}

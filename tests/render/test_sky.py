@@ -10,12 +10,20 @@ from render_helpers import diffuse, radiance, scene, world
 
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.render.colour import SRGB
-from neurolens.render.environment import SunLight
-from neurolens.render.filmsettings import FilmSettings
-from neurolens.render.lightsettings import Sky
+from neurolens.render.environment import (
+    SunLight,
+    daylight_table,
+    daylight_weights,
+    sky_colour,
+    sun_direction,
+    sun_spectrum,
+    zenith,
+)
+from neurolens.render.film import FilmSettings
+from neurolens.render.illuminants import table
 from neurolens.render.renderer import render
-from neurolens.render.sky import daylight_table, daylight_weights, sky_colour, sun_direction, sun_spectrum, zenith
-from neurolens.render.spectrum import SpectralRange, table
+from neurolens.render.scenetables import Sky
+from neurolens.render.spectrum import SpectralRange
 from neurolens.render.wavelengths import expected_light
 
 FLOOR = {"point_m": [0, 0, 0], "normal": [0, 1, 0], "material": "white"}

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from neurolens.render.spectrum import SpectralRange, linear_to_srgb, srgb_to_linear
+from neurolens.render.colour import linear_to_srgb, srgb_to_linear
+from neurolens.render.spectrum import SpectralRange
 
 
 @pytest.mark.parametrize("limits", [(380, 780), (400, 700), (450, 650)])

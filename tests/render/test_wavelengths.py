@@ -7,9 +7,10 @@ import pytest
 from render_helpers import WHITE, diffuse, scene
 
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.render.filmsettings import FilmSettings
+from neurolens.render.film import FilmSettings
+from neurolens.render.illuminants import table
 from neurolens.render.renderer import render
-from neurolens.render.spectrum import SpectralRange, table
+from neurolens.render.spectrum import SpectralRange
 from neurolens.render.wavelengths import expected_light, spectral_range
 
 FLAT = (table("wavelength_nm"), np.ones(81))

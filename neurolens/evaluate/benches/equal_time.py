@@ -29,8 +29,7 @@ from neurolens.evaluate.benches.equal_time_fit import (
 )
 from neurolens.evaluate.benches.equal_time_renders import Shelf, shelf
 from neurolens.evaluate.image import DEFAULT, flip, flip_map
-from neurolens.render.scene import CameraSettings
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import CameraSettings, load_scene
 
 SCENES = ("grid", "lights", "room")
 # Weight of a squared error: that of the RMSE, and of the relative MSE.

@@ -18,9 +18,9 @@ from neurolens.base.files import atomic_path
 from neurolens.base.tomlfile import read_toml
 from neurolens.cameras.contract import Camera
 from neurolens.evaluate.records import plain
-from neurolens.render.filmsettings import FilmSettings
+from neurolens.render.film import FilmSettings
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import Scene
+from neurolens.render.scene import Scene
 
 _SOURCES = ("cameras", "optics", "programs", "render")  # folders of the package that a picture depends on
 

@@ -23,9 +23,9 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.mitsuba import camera, load_scene, render, require_mitsuba
 from neurolens.mitsuba.library import libraries
 from neurolens.mitsuba.scenes import our_scene, with_our_spectra
-from neurolens.render.filmsettings import FilmSettings
+from neurolens.render.film import FilmSettings
 from neurolens.render.renderer import render as our_render
-from neurolens.render.scenefile import Scene
+from neurolens.render.scene import Scene
 
 FOCAL_MM = 50.0
 FOCUS_M, F_NUMBER = 3.9, 2.0

@@ -16,7 +16,7 @@ from typing import Any
 from neurolens.base.errors import NeurolensError
 from neurolens.evaluate.benches.mitsuba_speed_profile import thin_camera
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import load_scene
 
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 

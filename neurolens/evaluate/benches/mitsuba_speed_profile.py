@@ -12,7 +12,7 @@ import neurolens
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.thin import ThinLens
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import Scene
+from neurolens.render.scene import Scene
 
 STAGES = ("camera", "intersection", "lights", "shading", "random numbers", "integrator", "film, set-up")
 _ROOT = str(Path(neurolens.__file__).parent)

@@ -12,7 +12,7 @@ from neurolens.apertures import Aperture
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import FUSED, make_camera
 from neurolens.evaluate.benches.render_times import LENSES, Size, one_render, shot
-from neurolens.render.scenefile import Scene
+from neurolens.render.scene import Scene
 
 
 @dataclass

@@ -21,7 +21,7 @@ from neurolens.evaluate.gallery.measures.view import View
 from neurolens.evaluate.gallery.settings import Effect, Panel
 from neurolens.evaluate.train import versions
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import load_scene
 
 SCHEMA = 1
 
