@@ -155,7 +155,7 @@ def test_a_picture_that_cannot_be_written_keeps_the_render_and_the_older_picture
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
     # There is no checkpoint yet, then there is one that no other can take the place of: it has everything.
-    for writers in (["exr.write_exr"], ["exr.write_exr", "watch.write_checkpoint"]):
+    for writers in (["pictures.write_exr"], ["pictures.write_exr", "renderer.write_checkpoint"]):
         with monkeypatch.context() as patch:
             for writer in writers:
                 patch.setattr(f"neurolens.render.{writer}", full)
@@ -180,7 +180,7 @@ def test_a_disk_without_room_for_picture_and_checkpoint_is_told_as_it_is(
 
     common = ("render", scene, "--camera", "thin", "--quiet", "-o", out, "--threads", 1)
     run_json(capsys, *common, "--keep-checkpoint")
-    for writer in ("exr.write_exr", "watch.write_checkpoint"):
+    for writer in ("pictures.write_exr", "renderer.write_checkpoint"):
         monkeypatch.setattr(f"neurolens.render.{writer}", full)
 
     def said() -> str:

@@ -47,8 +47,7 @@ def cosine_direction(normal: FloatArray, square: FloatArray) -> tuple[FloatArray
 def one_less_cosine(sin2: FloatArray) -> FloatArray:
     """1 - cos of the half angle of a cone, from its squared sine, without loss for narrow cones."""
     sin2 = np.minimum(sin2, np.float32(1))
-    result: FloatArray = sin2 / (1 + np.sqrt(1 - sin2))
-    return result
+    return sin2 / (1 + np.sqrt(1 - sin2))
 
 
 def in_cone(axis: FloatArray, one_less_cos: FloatArray, square: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -73,8 +72,7 @@ def cell_of(direction: FloatArray, height: int, width: int, turn: float = 0.0) -
     down = np.arccos(np.clip(direction[1], -1, 1)) / _PI
     column = np.minimum((across * np.float32(width)).astype(np.intp), width - 1)
     row = np.minimum((down * np.float32(height)).astype(np.intp), height - 1)
-    result: NDArray[np.intp] = row * width + column
-    return result
+    return row * width + column
 
 
 def centres(height: int, width: int) -> FloatArray:

@@ -15,13 +15,8 @@ from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
 from neurolens.render import sampler as dims
-from neurolens.render.materials import (
-    GlossyLobes,
-    cosine_direction,
-    fresnel_dielectric,
-    glass_direction,
-    mirror_direction,
-)
+from neurolens.render.directions import cosine_direction
+from neurolens.render.materials import GlossyLobes, fresnel_dielectric, glass_direction
 from neurolens.render.primitives import Rays, dot
 from neurolens.render.sampler import PathKeys, Sampler
 from neurolens.render.spectrum import Index
@@ -181,7 +176,8 @@ def scatter(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int) -> Pat
         density[: vertex.rough] = _scatter_rough(vertex, sampler, keys, first, direction)
     if vertex.mirror.stop > vertex.mirror.start:
         m = vertex.mirror
-        direction[:, m] = mirror_direction(paths.direction[:, m], vertex.shading[:, m])
+        travel, normal = paths.direction[:, m], vertex.shading[:, m]
+        direction[:, m] = travel - normal * (2 * dot(travel, normal))
         paths.throughput[..., m] *= vertex.base[..., m]
     side = None
     if vertex.glass.stop > vertex.glass.start:

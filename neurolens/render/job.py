@@ -49,6 +49,7 @@ class Job:
     """One render: the scene made ready, and memory shared by the workers.
 
     Attributes:
+        scene, camera, grid, seed, max_depth, settings, differentials: as asked for; settings are those of the film.
         mode: how wavelengths are taken. balance: matrix [3, 3] on the film's linear sRGB that makes the light of the
             white balance neutral; where there is none, `neutral`. luminance_row: [3], of the film's sRGB after that.
         paths_a_sample: lanes of a sample; film: see `Film`.
@@ -64,24 +65,25 @@ class Job:
         samples: int,
         seed: int,
         max_depth: int,
-        film: FilmSettings,
+        settings: FilmSettings,
         differentials: bool = False,
     ) -> None:
-        settings = scene.settings.camera
-        self.mode = mode_for(camera, grid, settings.wavelengths_nm, film)
-        self.camera, self.grid, self.max_depth, self.differentials = camera, grid, max_depth, differentials
-        self.spectral = spectral_range(scene, camera, film, LANES if self.mode == "hero" else 1)
+        self.scene, self.camera, self.grid = scene, camera, grid
+        self.seed, self.max_depth, self.settings, self.differentials = seed, max_depth, settings, differentials
+        pose = scene.settings.camera
+        self.mode = mode_for(camera, grid, pose.wavelengths_nm, settings)
+        self.spectral = spectral_range(scene, camera, settings, LANES if self.mode == "hero" else 1)
         self.world = World(scene, self.spectral)
-        self.balance = np.eye(3)
-        self.neutral = film.white_balance is None or not self.spectral.colours
-        if film.white_balance is not None and not self.neutral:
-            self.balance = balance(self.spectral.film_rgb(self.world.palette.illuminant(film.white_balance)))
+        white = settings.white_balance if self.spectral.colours else None
+        self.neutral, self.balance = white is None, np.eye(3)
+        if white is not None:
+            self.balance = balance(self.spectral.film_rgb(self.world.palette.illuminant(white)))
         response = self.spectral.rotated(self.spectral.response)
         self._response = response.reshape(-1, 3, self.spectral.bins)  # [lanes, 3, bins]
         self.luminance_row = SRGB.to_xyz[1] @ self.balance
         self._luminance = np.einsum("c,lcb->lb", self.luminance_row, self._response).astype(np.float32)
         self.sampler = Sampler(samples, seed)
-        self._axes, self._position = camera_axes(settings), np.array(settings.position_m, np.float32)
+        self._axes, self._position = camera_axes(pose), np.array(pose.position_m, np.float32)
         # Paths of one sample: four lanes share their random numbers, and are independent of the others only together.
         self.paths_a_sample = LANES if self.mode == "lanes" else 1
         self.tiling = Tiling.of(grid.width * grid.height, samples)
@@ -114,7 +116,7 @@ class Job:
         shape = (len(pixels), len(indices))
         sums = np.empty((len(pixels), COLUMNS))
         self._sum_light(sums, value, bins, shape)
-        self._sum_depth(sums, origin, direction, distance, shape)
+        self._sum_depth(sums, origin, direction, distance)
         passed = np.zeros(len(hue), np.bool_)
         passed[lit(weight)] = True
         sums[:, PASSED] = np.count_nonzero(passed.reshape(shape), axis=1)
@@ -140,15 +142,10 @@ class Job:
         sums[:, LUMINANCE2] = np.einsum("ps,ps->p", luminance, luminance, dtype=np.float64)
 
     def _sum_depth(
-        self,
-        sums: NDArray[np.float64],
-        origin: FloatArray,
-        direction: FloatArray,
-        distance: FloatArray,
-        shape: tuple[int, int],
+        self, sums: NDArray[np.float64], origin: FloatArray, direction: FloatArray, distance: FloatArray
     ) -> None:
         """Distance along the optical axis from the film's plane to what camera rays hit first."""
-        hit = np.isfinite(distance)
+        hit, shape = np.isfinite(distance), (len(sums), -1)
         away = -self._axes[:, 2]
         with np.errstate(over="ignore", invalid="ignore"):  # rays that do not pass hold anything
             depth = away @ (origin - self._position[:, None])

@@ -180,8 +180,7 @@ class FlatLights(LightGroup):
         return direction, distance, np.maximum(inverse_pdf, np.float32(0), out=inverse_pdf)
 
     def pdf(self, number: Numbers, point: FloatArray, distance: FloatArray, cosine: FloatArray) -> FloatArray:
-        result: FloatArray = distance * distance / (self._area.take(number) * cosine)
-        return result
+        return distance * distance / (self._area.take(number) * cosine)
 
 
 class SphereLights(LightGroup):
@@ -210,8 +209,7 @@ class SphereLights(LightGroup):
 
     def pdf(self, number: Numbers, point: FloatArray, distance: FloatArray, cosine: FloatArray) -> FloatArray:
         away = self._centre.take(number, axis=1) - point
-        result: FloatArray = np.float32(1) / (TWO_PI * one_less_cosine(self._radius2.take(number) / dot(away, away)))
-        return result
+        return np.float32(1) / (TWO_PI * one_less_cosine(self._radius2.take(number) / dot(away, away)))
 
 
 class PointLights(LightGroup):
@@ -244,8 +242,7 @@ class PointLights(LightGroup):
         """Share [N] of the intensity that leaves in unit directions [3, N]."""
         cosine = dot(self._axis.take(number, axis=1), away)
         t = np.clip((cosine - self._start.take(number)) * self._per_width.take(number), 0, 1)
-        result: FloatArray = t * t * (3 - 2 * t)
-        return result
+        return t * t * (3 - 2 * t)
 
     def sample(self, number: Numbers, point: FloatArray, square: FloatArray) -> Aimed:
         direction = self._position.take(number, axis=1) - point

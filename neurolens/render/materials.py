@@ -40,8 +40,7 @@ def fifth_power(cosine: FloatArray) -> FloatArray:
     """(1 - cos)^5 [N]."""
     grazing = np.clip(1 - cosine, 0, 1)
     squared = grazing * grazing
-    result: FloatArray = squared * squared * grazing
-    return result
+    return squared * squared * grazing
 
 
 def visible_normal(out: FloatArray, alpha: FloatArray, square: FloatArray) -> FloatArray:
@@ -108,17 +107,10 @@ def _albedos(alpha: float) -> list[tuple[NDArray[np.float64], NDArray[np.float64
     return [(cosine, whole), (cosine, power)]
 
 
-def mirror_direction(direction: FloatArray, normal: FloatArray) -> FloatArray:
-    """Reflection [3, N] of travel directions [3, N]."""
-    result: FloatArray = direction - normal * (2 * dot(direction, normal))
-    return result
-
-
 def sine2(a: FloatArray, b: FloatArray) -> FloatArray:
     """Squared sine [N] of the angle between unit vectors [3, N], exact for small ones, too."""
     x, y, z = (a[j] * b[k] - a[k] * b[j] for j, k in ((1, 2), (2, 0), (0, 1)))
-    result: FloatArray = x * x + y * y + z * z
-    return result
+    return x * x + y * y + z * z
 
 
 class GlossyLobes:

@@ -7,7 +7,8 @@ float64 and int32; `write_exr` takes care of all three. What a scene names is bo
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from neurolens.render.scenetables import BRIGHTEST
 METADATA_KEY = "neurolens"
 _HALF_MAX = 65504.0
 _COLOURS = "RGB"
+LARGEST_PICTURE, LARGEST_ENVIRONMENT = 8192, 4096  # pixels a side
 _DEPTH = "Z"  # the name that other programs know
 
 
@@ -55,17 +57,13 @@ def write_exr(
             metadata that is not JSON, no such folder, a place that cannot be written.
     """
     path = Path(path)
-    picture = np.asarray(rgb)
-    if picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
-        raise InputError(path, "rgb shape", picture.shape, "[height, width, 3]")
+    picture = _shaped(path, np.asarray(rgb))
     if picture.dtype.kind not in "fiub":
         raise InputError(path, "rgb type", str(picture.dtype), "real numbers")
-    with np.errstate(over="ignore"):
-        picture = picture.astype(np.float32, copy=False) if space is SRGB else _in_space(picture, space)
-    if not np.all(np.isfinite(picture)):
-        raise InputError(
-            path, "rgb", f"({int(np.sum(~np.isfinite(picture)))} values not finite)", "finite float32 values"
-        )
+    with np.errstate(over="ignore", invalid="ignore"):
+        picture = (picture if space is SRGB else picture @ conversion(SRGB, space).T).astype(np.float32, copy=False)
+    if bad := int(np.sum(~np.isfinite(picture))):
+        raise InputError(path, "rgb", f"({bad} values not finite)", "finite float32 values")
     try:
         text = json.dumps(metadata or {}, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -91,6 +89,12 @@ def write_exr(
             raise InputError(path, "file", f"({said})", "a place that can be written") from None
 
 
+def _shaped(path: str | Path, picture: NDArray[Any]) -> NDArray[Any]:
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
+        raise InputError(path, "rgb shape", picture.shape, "[height, width, 3]")
+    return picture
+
+
 def _layer_channels(path: Path, layers: Mapping[str, ArrayLike], shape: tuple[int, ...]) -> dict[str, FloatArray]:
     channels = {}
     for name, values in layers.items():
@@ -103,12 +107,6 @@ def _layer_channels(path: Path, layers: Mapping[str, ArrayLike], shape: tuple[in
     return channels
 
 
-def _in_space(picture: NDArray[Any], space: ColourSpace) -> FloatArray:
-    """Linear sRGB [H, W, 3] in another space."""
-    with np.errstate(invalid="ignore"):
-        return (picture @ conversion(SRGB, space).T).astype(np.float32)
-
-
 def read_exr(path: str | Path) -> tuple[FloatArray, dict[str, Any]]:
     """A picture [H, W, 3] float32, in the colour space that it was written in, and its metadata, {} without ours.
 
@@ -116,14 +114,11 @@ def read_exr(path: str | Path) -> tuple[FloatArray, dict[str, Any]]:
         InputError: missing, no OpenEXR file, truncated, or without channels R, G and B.
     """
     planes, text = _read_channels(Path(path))
-    missing = [name for name in _COLOURS if name not in planes]
-    if missing:
-        raise InputError(path, "channels", sorted(planes), "R, G and B")
+    picture = _colours(planes, path, "channels")
     try:
-        metadata = json.loads(text)
+        return picture, json.loads(text)
     except ValueError:
         raise InputError(path, METADATA_KEY, text, "JSON text") from None
-    return np.stack([planes[name] for name in _COLOURS], axis=-1), metadata
 
 
 def read_layers(path: str | Path) -> dict[str, FloatArray]:
@@ -136,17 +131,37 @@ def read_layers(path: str | Path) -> dict[str, FloatArray]:
     return {"depth" if name == _DEPTH else name: plane for name, plane in planes.items() if name not in _COLOURS}
 
 
-def _read_channels(path: Path) -> tuple[dict[str, FloatArray], str]:
-    """All channels as float32, and the text of our metadata."""
+def _colours(planes: Mapping[str, FloatArray], file: str | Path, field: str) -> FloatArray:
+    if not planes.keys() >= set(_COLOURS):
+        raise InputError(file, field, f"(channels {', '.join(sorted(planes))})", "channels R, G and B")
+    return np.stack([planes[name] for name in _COLOURS], axis=-1)
+
+
+def _read_channels(
+    path: Path, place: tuple[str | Path, str] | None = None, most: int | None = None
+) -> tuple[dict[str, FloatArray], str]:
+    """All channels as float32, and the text of our metadata.
+
+    Args:
+        place: file and field that name the picture, if there are others than the picture itself. most: pixels a side.
+    """
+    file, field = place or (path, "file")
+    name = str(path) if place else "(missing)"
     if not path.is_file():
-        raise InputError(path, "file", "(missing)", "an OpenEXR file")
+        raise InputError(file, field, name, "an OpenEXR file that exists")
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            part = file.parts[0]
+        with OpenEXR.File(str(path), header_only=True) as header:
+            low, high = header.header()["dataWindow"]
+        if most is not None and max(high[k] - low[k] + 1 for k in range(2)) > most:
+            raise InputError(file, field, name, f"a picture of at most {most} pixels a side")
+        with OpenEXR.File(str(path), separate_channels=True) as whole:
+            part = whole.parts[0]
             planes = {name: np.array(channel.pixels, np.float32) for name, channel in part.channels.items()}
             return planes, part.header.get(METADATA_KEY, "{}")
+    except InputError:
+        raise
     except Exception as error:  # the library raises bare RuntimeError, ValueError and its own
-        raise InputError(path, "file", f"({error})", "a whole OpenEXR file") from None
+        raise InputError(file, field, name if place else f"({error})", f"a whole OpenEXR file ({error})") from None
 
 
 def write_png(path: str | Path, rgb: ArrayLike, exposure: float = 0.0) -> None:
@@ -155,43 +170,41 @@ def write_png(path: str | Path, rgb: ArrayLike, exposure: float = 0.0) -> None:
     Raises:
         InputError: another shape.
     """
-    picture = np.asarray(rgb, np.float32)
-    if picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
-        raise InputError(path, "rgb shape", picture.shape, "[height, width, 3]")
+    picture = _shaped(path, np.asarray(rgb, np.float32))
     encoded = np.rint(255 * linear_to_srgb(picture * np.float32(2.0**exposure))).astype(np.uint8)
     with atomic_path(path) as temporary:
         Image.fromarray(encoded).save(temporary)
 
 
-LARGEST_PICTURE, LARGEST_ENVIRONMENT = 8192, 4096  # pixels a side
+@contextmanager
+def _opened(file: str | Path, field: str, path: Path, most: int) -> Iterator[Image.Image]:
+    """A picture of at most `most` pixels a side; mistakes name file and field."""
+    try:
+        with Image.open(path) as picture:
+            if max(picture.size) > most:
+                raise InputError(file, field, str(path), f"a picture of at most {most} pixels a side")
+            yield picture
+    except FileNotFoundError:
+        raise InputError(file, field, str(path), "a picture that exists") from None
+    except InputError:
+        raise
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise InputError(file, field, str(path), f"a readable picture ({error})") from None
 
 
 def read_picture(scene: Path, field: str, path: Path, most: int = LARGEST_PICTURE) -> FloatArray:
-    """Linear RGB [H, W, 3] of an sRGB picture.
+    """Linear RGB [H, W, 3] of an sRGB picture: of 8 bits, or a grey one of 16 bits, which Pillow would clip to 8.
 
     Raises:
         InputError: names scene file, field and picture, which is missing, too large or broken.
     """
-    try:
-        with Image.open(path) as picture:
-            if max(picture.size) > most:
-                raise InputError(scene, field, str(path), f"a picture of at most {most} pixels a side")
-            return srgb_to_linear(_encoded(scene, field, path, picture))
-    except FileNotFoundError:
-        raise InputError(scene, field, str(path), "a picture that exists") from None
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(scene, field, str(path), f"a readable picture ({error})") from None
-
-
-def _encoded(scene: Path, field: str, path: Path, picture: Image.Image) -> FloatArray:
-    """Values [H, W, 3] from 0 to 1 of an 8-bit picture, or a grey one of 16 bits, which Pillow would clip to 8."""
-    if picture.mode.startswith("I;16"):
-        grey: FloatArray = np.asarray(picture, np.float32) / np.float32(65535)
-        return np.stack([grey] * 3, axis=-1)
-    if picture.mode in ("I", "F"):
-        raise InputError(scene, field, str(path), "a picture of 8 or 16 bits a channel")
-    colours: FloatArray = np.asarray(picture.convert("RGB"), np.float32) / np.float32(255)
-    return colours
+    with _opened(scene, field, path, most) as picture:
+        if picture.mode.startswith("I;16"):
+            grey: FloatArray = np.asarray(picture, np.float32) / np.float32(65535)
+            return srgb_to_linear(np.stack([grey] * 3, axis=-1))
+        if picture.mode in ("I", "F"):
+            raise InputError(scene, field, str(path), "a picture of 8 or 16 bits a channel")
+        return srgb_to_linear(np.asarray(picture.convert("RGB"), np.float32) / np.float32(255))
 
 
 def read_environment(scene: Path, field: str, path: Path, scale: float = 1.0) -> FloatArray:
@@ -201,8 +214,10 @@ def read_environment(scene: Path, field: str, path: Path, scale: float = 1.0) ->
         InputError: as `read_picture`; also a picture that is not twice as wide as high, values that are negative or not
             finite or brighter than an emission may be, and black all over.
     """
-    exr = path.suffix.lower() == ".exr"
-    picture = _read_exr(scene, field, path) if exr else read_picture(scene, field, path, LARGEST_ENVIRONMENT)
+    if path.suffix.lower() == ".exr":
+        picture = _colours(_read_channels(path, (scene, field), LARGEST_ENVIRONMENT)[0], scene, field)
+    else:
+        picture = read_picture(scene, field, path, LARGEST_ENVIRONMENT)
     height, width = picture.shape[:2]
     if width != 2 * height:
         raise InputError(scene, field, f"({width} x {height} pixels)", "an equirectangular picture, 2 : 1")
@@ -214,27 +229,6 @@ def read_environment(scene: Path, field: str, path: Path, scale: float = 1.0) ->
     if not picture.any():
         raise InputError(scene, field, str(path), "a picture that is not black all over")
     return picture
-
-
-def _read_exr(scene: Path, field: str, path: Path) -> FloatArray:
-    import OpenEXR
-
-    try:
-        if not path.is_file():
-            raise InputError(scene, field, str(path), "a picture that exists")
-        with OpenEXR.File(str(path), header_only=True) as file:
-            low, high = file.header()["dataWindow"]
-        if max(high[k] - low[k] + 1 for k in range(2)) > LARGEST_ENVIRONMENT:
-            raise InputError(scene, field, str(path), f"a picture of at most {LARGEST_ENVIRONMENT} pixels a side")
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    except InputError:
-        raise
-    except Exception as error:  # the binding raises RuntimeError and others
-        raise InputError(scene, field, str(path), f"a readable OpenEXR file ({error})") from None
-    if not {"R", "G", "B"} <= channels.keys():
-        raise InputError(scene, field, f"(channels {', '.join(channels)})", "channels R, G and B")
-    return np.stack([channels[name] for name in "RGB"], axis=-1)
 
 
 def make_aperture(
@@ -268,17 +262,8 @@ def read_mask(path: str | Path) -> NDArray[np.bool_]:
     Raises:
         InputError: a picture that is missing, cannot be read, is too large, or dark all over.
     """
-    try:
-        with Image.open(path) as picture:
-            if max(picture.size) > MAX_MASK:
-                raise InputError(path, "mask", picture.size, f"a picture of at most {MAX_MASK} pixels a side")
-            grey = np.asarray(picture.convert("LA"), np.float32) / 255
-    except FileNotFoundError:
-        raise InputError(path, "mask", "(missing)", "a picture") from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(path, "mask", f"({error})", "a picture that can be read") from None
+    with _opened("aperture", "mask", Path(path), MAX_MASK) as picture:
+        grey = np.asarray(picture.convert("LA"), np.float32) / 255
     opening = grey[..., 0] * grey[..., 1] >= THRESHOLD
     if not opening.any():
         raise InputError(path, "mask", "(dark everywhere)", "an opening brighter than half")

@@ -1,7 +1,7 @@
 """Analytic shapes: where rays of a batch meet them.
 
 Each shape improves, in place, the nearest hit known so far: `best` [N] float32 distances in metres and `found` [N]
-int32 surface numbers. A shape owns `count` surface numbers from `first` on. Arithmetic stays in a few arrays the size
+int32 surface numbers. A shape owns surface numbers from `first` on. Arithmetic stays in a few arrays the size
 of the batch, which live in the cache; tests are ordered so that the cheap rejection of a whole batch comes first.
 """
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from neurolens.cameras.contract import FloatArray
 
 IntArray = NDArray[np.int32]
+FloatArray64 = NDArray[np.float64]
 _TINY = np.float32(1e-20)
 NEAREST = np.float32(1e-6)  # hits closer than this, in metres, are the surface that a ray leaves
 
@@ -40,7 +41,6 @@ class Primitive(Protocol):
     """A shape that rays can hit."""
 
     first: int
-    count: int
 
     def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
         """Where this shape is hit nearer than `best`, write distance and surface number."""
@@ -55,7 +55,7 @@ def dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return out
 
 
-def _parts(vector: NDArray[np.float64]) -> list[tuple[int, np.float32]]:
+def _parts(vector: FloatArray64) -> list[tuple[int, np.float32]]:
     """Components that are not 0, with their axes: walls mostly have one."""
     return [(k, np.float32(v)) for k, v in enumerate(vector) if v]
 
@@ -79,27 +79,42 @@ def _keep(ok: NDArray[np.bool_], distance: FloatArray, surface: int, best: Float
 class Plane:
     """An infinite plane through `point` with unit `normal`."""
 
-    count = 1
-
-    def __init__(self, first: int, point: NDArray[np.float64], normal: NDArray[np.float64]) -> None:
+    def __init__(self, first: int, point: FloatArray64, normal: FloatArray64) -> None:
         self.first = first
-        self._normal = normal.astype(np.float32)
-        self._offset = np.float32(point @ normal)
+        self._normal, self._offset = _parts(normal), np.float32(point @ normal)
+        self._edges: list[tuple[list[tuple[int, np.float32]], np.float32]] = []
 
     def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
-        distance = self._offset - dot(self._normal, rays.origin)
-        distance /= dot(self._normal, rays.direction) + _TINY
+        distance = self._offset - _sum(self._normal, rays.origin)
+        distance /= _sum(self._normal, rays.direction) + _TINY
         ok = distance > NEAREST
         ok &= distance < best
+        if not ok.any():
+            return
+        for across, start in self._edges:
+            along = _sum(across, rays.direction)
+            along *= distance
+            along += _sum(across, rays.origin)
+            along -= start
+            ok &= along > 0
+            ok &= along < 1
         _keep(ok, distance, self.first, best, found)
+
+
+class Quad(Plane):
+    """A rectangle of any orientation: `corner` and two perpendicular edges."""
+
+    def __init__(self, first: int, corner: FloatArray64, edge_u: FloatArray64, edge_v: FloatArray64) -> None:
+        normal = np.cross(edge_u, edge_v)
+        super().__init__(first, corner, normal / np.linalg.norm(normal))
+        self._offset = np.float32(corner @ normal / np.linalg.norm(normal))  # rounded once less than the plane's
+        self._edges = [(_parts(e / (e @ e)), np.float32(corner @ e / (e @ e))) for e in (edge_u, edge_v)]
 
 
 class AxisQuad:
     """A rectangle perpendicular to an axis: the common case, at half the cost of `Quad`."""
 
-    count = 1
-
-    def __init__(self, first: int, corner: NDArray[np.float64], far_corner: NDArray[np.float64], axis: int) -> None:
+    def __init__(self, first: int, corner: FloatArray64, far_corner: FloatArray64, axis: int) -> None:
         self.first = first
         self._axis = axis
         self._others = [k for k in range(3) if k != axis]
@@ -120,44 +135,10 @@ class AxisQuad:
         _keep(ok, distance, self.first, best, found)
 
 
-class Quad:
-    """A rectangle of any orientation: `corner` and two perpendicular edges."""
-
-    count = 1
-
-    def __init__(
-        self, first: int, corner: NDArray[np.float64], edge_u: NDArray[np.float64], edge_v: NDArray[np.float64]
-    ) -> None:
-        self.first = first
-        normal = np.cross(edge_u, edge_v)
-        self._normal = _parts(normal / np.linalg.norm(normal))
-        self._offset = np.float32(corner @ normal / np.linalg.norm(normal))
-        self._across = [_parts(e / (e @ e)) for e in (edge_u, edge_v)]
-        self._start = [np.float32(corner @ e / (e @ e)) for e in (edge_u, edge_v)]
-
-    def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
-        distance = self._offset - _sum(self._normal, rays.origin)
-        distance /= _sum(self._normal, rays.direction) + _TINY
-        ok = distance > NEAREST
-        ok &= distance < best
-        if not ok.any():
-            return
-        for across, start in zip(self._across, self._start, strict=True):
-            along = _sum(across, rays.direction)
-            along *= distance
-            along += _sum(across, rays.origin)
-            along -= start
-            ok &= along > 0
-            ok &= along < 1
-        _keep(ok, distance, self.first, best, found)
-
-
 class Disc:
     """A flat disc about `centre` with unit `normal`."""
 
-    count = 1
-
-    def __init__(self, first: int, centre: NDArray[np.float64], normal: NDArray[np.float64], radius: float) -> None:
+    def __init__(self, first: int, centre: FloatArray64, normal: FloatArray64, radius: float) -> None:
         self.first = first
         self._centre, self._normal = centre.astype(np.float32)[:, None], normal.astype(np.float32)
         self._radius2 = np.float32(radius**2)
@@ -182,9 +163,7 @@ class Box:
     a wall of the room that it photographs.
     """
 
-    count = 6
-
-    def __init__(self, first: int, low: NDArray[np.float64], high: NDArray[np.float64], room: bool) -> None:
+    def __init__(self, first: int, low: FloatArray64, high: FloatArray64, room: bool) -> None:
         self.first = first
         self.room = room
         self.low, self.high = low.astype(np.float32), high.astype(np.float32)
@@ -245,18 +224,18 @@ class Spheres:
         centres: [S, 3] m. radii: [S] m.
     """
 
-    def __init__(self, first: int, centres: NDArray[np.float64], radii: NDArray[np.float64]) -> None:
-        self.first, self.count = first, len(radii)
+    def __init__(self, first: int, centres: FloatArray64, radii: FloatArray64) -> None:
+        self.first = first
         self._kind: type[np.floating[Any]] = np.float64 if radii.max() > _LARGE_M else np.float32
         self._centre: Any = centres.T.astype(self._kind)
         self._radius: Any = radii.astype(self._kind)
         # A hair of 2e-6 of the squared distances covers the rounding of the products.
-        slack, ones = 2e-6, np.ones(self.count)
+        slack, ones = 2e-6, np.ones(len(radii))
         constant = radii**2 - (1 - slack) * np.sum(centres**2, axis=1)
         self._along = np.column_stack([centres, -ones]).astype(np.float32)
         self._rest = np.column_stack([2 * centres, constant, (slack - 1) * ones]).astype(np.float32)
         # As many rays as keep the product so small that BLAS does not start threads of its own.
-        self._rays_at_once = int(np.clip(200_000 // (5 * self.count), 64, 4096))
+        self._rays_at_once = int(np.clip(200_000 // (5 * len(radii)), 64, 4096))
 
     def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
         origin, direction = rays.origin, rays.direction

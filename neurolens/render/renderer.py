@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +22,7 @@ from neurolens.render.workers import run
 Progress = Callable[[float, float], None]
 # Previews and checkpoints wait so many times as long as the last one took: they cost a twentieth of one core at most.
 _REST = 20.0
-
-
-def _never() -> bool:
-    return False
-
-
-def _silent(_: str) -> None:
-    return None
+_MOST_SAMPLES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -54,8 +46,8 @@ class Watch:
     checkpoint_s: float = 30.0
     restart: bool = False
     keep: bool = False
-    stop: Callable[[], bool] = _never
-    note: Callable[[str], None] = _silent
+    stop: Callable[[], bool] = lambda: False
+    note: Callable[[str], None] = lambda _: None
 
 
 class Keeper:
@@ -65,9 +57,9 @@ class Keeper:
         resumed: share of the work that was done before.
     """
 
-    def __init__(self, job: Job, watch: Watch, identity: Callable[[], dict[str, Any]], progress: Progress | None):
+    def __init__(self, job: Job, watch: Watch, progress: Progress | None) -> None:
         self._job, self._watch, self._progress = job, watch, progress
-        self._identity = identity() if watch.checkpoint is not None else {}
+        self._identity = identity(job) if watch.checkpoint is not None else {}
         self._earlier_s, self._written = 0.0, False
         if watch.checkpoint is not None and watch.checkpoint.exists() and not watch.restart:
             spent = read_checkpoint(watch.checkpoint, job.film, self._identity)
@@ -87,18 +79,15 @@ class Keeper:
 
     def __call__(self) -> bool:
         """What is due; True where the render shall stop."""
-        self._report()
-        now = time.perf_counter()
-        if self._watch.preview is not None and now >= self._preview_at and self._job.film.done.any():
-            self._try("preview", self._preview)
-            done = time.perf_counter()
-            self._preview_at = done + max(self._watch.preview_s, _REST * (done - now))
-        now = time.perf_counter()
-        if self._watch.checkpoint is not None and now >= self._checkpoint_at:
-            self._try("checkpoint", self.save)
-            done = time.perf_counter()
-            self._checkpoint_at = done + max(self._watch.checkpoint_s, _REST * (done - now))
-        return self._watch.stop()
+        watch, fraction, now = self._watch, self._job.film.fraction, time.perf_counter()
+        if self._progress is not None and fraction > self.resumed:
+            pace = (now - self._began) / (fraction - self.resumed)
+            self._progress(fraction, pace * (1 - fraction))
+        if (preview := watch.preview) is not None and now >= self._preview_at and fraction:
+            self._preview_at = self._try("preview", lambda: preview(develop(self._job)[0]), watch.preview_s)
+        if watch.checkpoint is not None and now >= self._checkpoint_at:
+            self._checkpoint_at = self._try("checkpoint", self.save, watch.checkpoint_s)
+        return watch.stop()
 
     def save(self) -> None:
         """Write the checkpoint, where there is one to write and something to keep that it has not yet."""
@@ -124,18 +113,9 @@ class Keeper:
             return error
         return NeurolensError(f"{error}; what was done is kept in {self._watch.checkpoint}: the same command goes on")
 
-    def _report(self) -> None:
-        fraction = self._job.film.fraction
-        if self._progress is not None and fraction > self.resumed:
-            pace = (time.perf_counter() - self._began) / (fraction - self.resumed)
-            self._progress(fraction, pace * (1 - fraction))
-
-    def _preview(self) -> None:
-        assert self._watch.preview is not None
-        self._watch.preview(develop(self._job)[0])
-
-    def _try(self, what: str, act: Callable[[], None]) -> None:
-        """Do what the render can do without; the first failure of a kind is told."""
+    def _try(self, what: str, act: Callable[[], None], pause_s: float = 0.0) -> float:
+        """Do what the render can do without, and say when next; the first failure of a kind is told."""
+        began = time.perf_counter()
         try:
             act()
         except (OSError, NeurolensError, MemoryError) as error:
@@ -144,9 +124,8 @@ class Keeper:
                 place = getattr(error, "filename", None)
                 said = getattr(error, "strerror", None) or str(error) or type(error).__name__
                 self._watch.note(f"{what} not written: {f'{place}: ' if place else ''}{said}")
-
-
-_MOST_SAMPLES = 1 << 20
+        done = time.perf_counter()
+        return done + max(pause_s, _REST * (done - began))
 
 
 @dataclass(frozen=True)
@@ -218,8 +197,7 @@ def render(
     if differentials:
         _check_differentials(camera)
     job = Job(scene, camera, grid, samples, seed, max_depth, film, differentials)
-    named = partial(identity, scene, camera, grid, seed, max_depth, film, differentials)
-    keeper = Keeper(job, watch or Watch(), named, progress)
+    keeper = Keeper(job, watch or Watch(), progress)
     try:
         idle = watch is None and progress is None
         run(job, min(threads, job.tiling.tiles), None if idle else keeper)
@@ -232,13 +210,13 @@ def render(
         seconds = keeper.seconds
     keeper.finish()
     rgb, layers = develop(job)
-    stats = {"scene": scene.name, "threads": threads, **_stats(job, film, seed, seconds)}
+    stats = {"scene": scene.name, "threads": threads, **_stats(job, seconds)}
     # Else a result would keep the film's sums in memory.
     save = keeper.save if watch is not None and watch.checkpoint is not None else None
     return RenderResult(rgb, stats, layers, save)
 
 
-def _stats(job: Job, film: FilmSettings, seed: int, seconds: float) -> dict[str, Any]:
+def _stats(job: Job, seconds: float) -> dict[str, Any]:
     grid, tiling = job.grid, job.tiling
     pixels = np.minimum(tiling.tile, tiling.pixels - tiling.tile * np.arange(tiling.tiles))
     paths = int(np.sum(pixels * tiling.samples_done(job.film.done)))
@@ -250,12 +228,12 @@ def _stats(job: Job, film: FilmSettings, seed: int, seconds: float) -> dict[str,
         "samples": tiling.samples,
         "samples_done": paths / tiling.pixels,
         "complete": job.film.fraction == 1,
-        "seed": seed,
+        "seed": job.seed,
         "max_depth": job.max_depth,
         "wavelengths_nm": [job.spectral.low_nm, job.spectral.high_nm],
         "wavelengths": job.mode,
-        "wavelength_sampling": film.wavelength_sampling,
-        "white_balance": film.white_balance,
+        "wavelength_sampling": job.settings.wavelength_sampling,
+        "white_balance": job.settings.white_balance,
         "differentials": job.differentials,
         "seconds": seconds,
         "paths": paths,

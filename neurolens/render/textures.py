@@ -131,5 +131,4 @@ class TextureTable:
         column = ((u - np.floor(u)) * width).astype(np.intp)
         row = ((1 - (v - np.floor(v))) * height).astype(np.intp)
         rgb = image[np.minimum(row, height - 1), np.minimum(column, width - 1)]
-        result: FloatArray = np.einsum("nc,...cn->...n", rgb, self._basis.take(bins, axis=-1))
-        return result
+        return np.einsum("nc,...cn->...n", rgb, self._basis.take(bins, axis=-1))

@@ -325,5 +325,4 @@ class World:
     def _rivals(self, light: int, pdf: FloatArray, density: FloatArray) -> FloatArray:
         """1 over the weight [N] of scattering by the power heuristic."""
         ratio = pdf * self.lights.probability[light] / density
-        result: FloatArray = 1 + ratio * ratio
-        return result
+        return 1 + ratio * ratio

@@ -132,7 +132,7 @@ def test_the_stop_s_shape_by_blades_or_by_a_picture_beside_the_scene(tmp_path: P
         ({"blades": 2}, "blades"),
         ({"blade_curvature": 0.5}, "blades"),
         ({"blades": 5, "aperture_mask": "stop.png"}, "not both"),
-        ({"aperture_mask": "none.png"}, "missing"),
+        ({"aperture_mask": "none.png"}, "exists"),
     ):
         with pytest.raises(InputError, match=expected) as caught:
             scene(change)
