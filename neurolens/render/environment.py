@@ -51,15 +51,11 @@ _PEREZ = {
 # Rows T^2, T, 1; columns theta_s^3, theta_s^2, theta_s, 1.
 _ZENITH = {
     "x": (
-        (0.00166, -0.00375, 0.00209, 0.0),
+        (0.00166, -0.00375, 0.00209, 0),
         (-0.02903, 0.06377, -0.03202, 0.00394),
         (0.11693, -0.21196, 0.06052, 0.25886),
     ),
-    "y": (
-        (0.00275, -0.00610, 0.00317, 0.0),
-        (-0.04214, 0.08970, -0.04153, 0.00516),
-        (0.15346, -0.26756, 0.06670, 0.26688),
-    ),
+    "y": ((0.00275, -0.0061, 0.00317, 0), (-0.04214, 0.0897, -0.04153, 0.00516), (0.15346, -0.26756, 0.0667, 0.26688)),
 }
 
 
@@ -119,8 +115,8 @@ def total_spectrum(sky: Sky, direction: FloatArray) -> tuple[FloatArray64, NDArr
     return nm, np.asarray(np.maximum(spectra.mean(axis=1) @ components, 0))
 
 
-class Surroundings:
-    """Light from infinitely far away.
+class Surroundings(LightGroup):
+    """Light from infinitely far away: one light to aim at, if there are weights.
 
     Args:
         rows: of the palette, three spectra, or the one of a single colour.
@@ -138,8 +134,9 @@ class Surroundings:
         turn: float = 0.0,
     ) -> None:
         self._palette, self._rows, self._coefficients = palette, rows, coefficients
-        self.table = None if weights is None or not weights.any() else DirectionTable(weights, turn)
-        self.dark = self.table is None and not palette.means(rows[:1]).any()
+        self._table = None if weights is None or not weights.any() else DirectionTable(weights, turn)
+        self.count = 0 if self._table is None else 1
+        self.dark = self._table is None and not palette.means(rows[:1]).any()
 
     def radiance(self, direction: FloatArray, bins: Index) -> FloatArray:
         """Radiance [..., N] along unit directions [3, N] at wavelength bins [N]."""
@@ -148,6 +145,21 @@ class Surroundings:
             return spectra[0]
         share = self._coefficients(direction)
         return np.maximum(sum(c * s for c, s in zip(share, spectra, strict=True)), np.float32(0))
+
+    def importance(self, target_m: Vector) -> NDArray[np.float64]:
+        # Half of the light of all directions, of three colours.
+        return np.array([1.5 * self._table.total] if self._table else [])
+
+    def sample(self, number: Numbers, point: FloatArray, square: FloatArray) -> Aimed:
+        assert self._table is not None
+        direction, density = self._table.sample(square)
+        inverse: FloatArray = np.reciprocal(np.maximum(density, np.float32(1e-20)))
+        return direction, np.full(len(number), np.inf, np.float32), inverse
+
+    def far_pdf(self, direction: FloatArray) -> FloatArray:
+        """Density [N] per solid angle with which `sample` takes directions [3, N]."""
+        assert self._table is not None
+        return self._table.pdf(direction)
 
 
 def make_surroundings(
@@ -206,29 +218,6 @@ def _clear_sky(sky: Sky, palette: Palette) -> Surroundings:
         return weights.astype(np.float32)
 
     return Surroundings(palette, rows, coefficients, _weights(palette, rows, coefficients, _TABLE))
-
-
-class SkyLight(LightGroup):
-    """The surroundings as a light to aim at, if they have a table."""
-
-    def __init__(self, surroundings: Surroundings) -> None:
-        self._table = surroundings.table
-        self.count = 0 if self._table is None else 1
-
-    def importance(self, target_m: Vector) -> NDArray[np.float64]:
-        # Half of the light of all directions, of three colours.
-        return np.array([1.5 * self._table.total] if self._table else [])
-
-    def sample(self, number: Numbers, point: FloatArray, square: FloatArray) -> Aimed:
-        assert self._table is not None
-        direction, density = self._table.sample(square)
-        inverse: FloatArray = np.reciprocal(np.maximum(density, np.float32(1e-20)))
-        return direction, np.full(len(number), np.inf, np.float32), inverse
-
-    def far_pdf(self, direction: FloatArray) -> FloatArray:
-        """Density [N] per solid angle with which `sample` takes directions [3, N]."""
-        assert self._table is not None
-        return self._table.pdf(direction)
 
 
 class SunLight(LightGroup):

@@ -17,30 +17,12 @@ from neurolens.base.config import from_dict
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import read_toml, suggestion
 from neurolens.cameras.contract import FloatArray
+from neurolens.render import scenetables as tables
 from neurolens.render.film import FilmSettings
 from neurolens.render.illuminants import Spectrum, check_name, check_spectrum, illuminant, read_spectrum
 from neurolens.render.meshfile import TriangleSet, encloses, read_mesh
 from neurolens.render.pictures import make_aperture, read_environment, read_picture
-from neurolens.render.scenetables import (
-    BLACK,
-    Box,
-    Checked,
-    Disc,
-    Environment,
-    Material,
-    MeasuredSpectrum,
-    MeshSettings,
-    Plane,
-    PointLight,
-    Quad,
-    Room,
-    Sky,
-    Sphere,
-    SpotLight,
-    Texture,
-    Vector,
-    require,
-)
+from neurolens.render.scenetables import BLACK, Checked, Material, MeasuredSpectrum, Texture, Vector, require
 
 _SHAPES = ("planes", "quads", "discs", "spheres", "boxes", "rooms", "meshes")
 _WALLS = ("left", "right", "floor", "ceiling", "far", "near")
@@ -93,23 +75,23 @@ class SceneSettings:
     camera: CameraSettings
     film: FilmSettings = FilmSettings()
     illuminants: dict[str, MeasuredSpectrum] | None = None
-    environment: Environment = Environment(colour=BLACK)
-    sky: Sky | None = None
+    environment: tables.Environment = tables.Environment(colour=BLACK)
+    sky: tables.Sky | None = None
     reflectances: dict[str, MeasuredSpectrum] | None = None
     textures: dict[str, Texture] | None = None
     materials: dict[str, Material] | None = None
-    planes: tuple[Plane, ...] = ()
-    quads: tuple[Quad, ...] = ()
-    discs: tuple[Disc, ...] = ()
-    spheres: tuple[Sphere, ...] = ()
-    boxes: tuple[Box, ...] = ()
-    rooms: tuple[Room, ...] = ()
-    meshes: tuple[MeshSettings, ...] = ()
-    points: tuple[PointLight, ...] = ()
-    spots: tuple[SpotLight, ...] = ()
+    planes: tuple[tables.Plane, ...] = ()
+    quads: tuple[tables.Quad, ...] = ()
+    discs: tuple[tables.Disc, ...] = ()
+    spheres: tuple[tables.Sphere, ...] = ()
+    boxes: tuple[tables.Box, ...] = ()
+    rooms: tuple[tables.Room, ...] = ()
+    meshes: tuple[tables.MeshSettings, ...] = ()
+    points: tuple[tables.PointLight, ...] = ()
+    spots: tuple[tables.SpotLight, ...] = ()
 
     def __post_init__(self) -> None:
-        dark = self.sky is None or self.environment == Environment(colour=BLACK)
+        dark = self.sky is None or self.environment == tables.Environment(colour=BLACK)
         require(dark, "sky", "(given)", "either sky or environment")
 
 

@@ -18,7 +18,7 @@ from neurolens.render.colour import SRGB
 from neurolens.render.illuminants import FloatArray64, Spectrum, daylight_table, illuminant, table
 from neurolens.render.scenetables import Vector
 
-FRAUNHOFER_NM = {"d": 587.5618, "F": 486.1327, "C": 656.2725}
+_DFC_NM = 587.5618, 486.1327, 656.2725  # Fraunhofer lines d, F and C
 # Beyond this the three responses are so alike over the range that separating them would only amplify noise.
 _LARGEST_CONDITION = 30.0
 _DEFENSIVE = 0.1  # share of the wavelengths that is spread evenly, whatever the importance says
@@ -50,12 +50,7 @@ class SpectralRange:
     """
 
     def __init__(
-        self,
-        low_nm: float,
-        high_nm: float,
-        bins: int = 256,
-        light: tuple[FloatArray64, FloatArray64] | None = None,
-        lanes: int = 1,
+        self, low_nm: float, high_nm: float, bins: int = 256, light: Spectrum | None = None, lanes: int = 1
     ) -> None:
         self.low_nm, self.high_nm = low_nm, high_nm
         self.bins, self.lanes = bins, lanes
@@ -154,9 +149,9 @@ class SpectralRange:
         """Index [bins], Cauchy's A + B / lambda^2 through n_d and n_F - n_C = (n_d - 1) / V_d; constant without V_d."""
         if v_d is None:
             return np.full(self.bins, n_d, np.float32)
-        inverse = {line: 1 / nm**2 for line, nm in FRAUNHOFER_NM.items()}
-        b = (n_d - 1) / v_d / (inverse["F"] - inverse["C"])
-        return (n_d + b * (self.centres_nm**-2.0 - inverse["d"])).astype(np.float32)
+        d, f, c = (1 / nm**2 for nm in _DFC_NM)
+        b = (n_d - 1) / v_d / (f - c)
+        return (n_d + b * (self.centres_nm**-2.0 - d)).astype(np.float32)
 
 
 Index = NDArray[np.intp]
@@ -166,12 +161,9 @@ class Palette:
     """Spectra [rows, bins], looked up by row and wavelength bin; colours that occur twice share a row."""
 
     def __init__(
-        self,
-        spectral: SpectralRange,
-        measured: Mapping[str, Spectrum] | None = None,
-        reflectances: Mapping[str, Spectrum] | None = None,
+        self, spectral: SpectralRange, measured: Mapping[str, Spectrum], reflectances: Mapping[str, Spectrum]
     ) -> None:
-        self._spectral, self._measured, self._reflectances = spectral, measured or {}, reflectances or {}
+        self._spectral, self._measured, self._reflectances = spectral, measured, reflectances
         self._rows: list[FloatArray] = []
         self._numbers: dict[object, int] = {}
         self._flat: FloatArray = np.zeros(0, np.float32)

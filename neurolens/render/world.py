@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
 from neurolens.render import textures
-from neurolens.render.environment import SkyLight, SunLight, make_surroundings
+from neurolens.render.environment import SunLight, make_surroundings
 from neurolens.render.lights import FlatLights, Lights, LightSamples, PointLights, SphereLights
 from neurolens.render.materials import CoatTable
 from neurolens.render.mesh import make_mesh, triangle_planes
@@ -41,15 +41,6 @@ class Surfaces:
     emitter: Emitter | None = None
 
 
-@dataclass(frozen=True)
-class SmoothMesh:
-    """A mesh with interpolated normals: its first surface, planes [T, 3, 4] and corners' normals [T, 3, 3]."""
-
-    first: int
-    planes: FloatArray
-    normals: FloatArray
-
-
 def _unit(vector: Vector) -> NDArray[np.float64]:
     return np.array(vector) / np.linalg.norm(vector)
 
@@ -59,7 +50,8 @@ class Assembly:
 
     Attributes:
         primitives: to hit. surfaces: in order of their numbers. boxes: whose faces are told apart after a hit.
-        smooth: meshes with interpolated normals. first_sphere: number of the first sphere's surface.
+        smooth: of meshes with interpolated normals the first surface, planes [T, 3, 4] and corners' normals [T, 3, 3].
+        first_sphere: number of the first sphere's surface.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -67,7 +59,7 @@ class Assembly:
         self.primitives: list[Primitive] = []
         self.surfaces: list[Surfaces] = []
         self.boxes: list[Box] = []
-        self.smooth: list[SmoothMesh] = []
+        self.smooth: list[tuple[int, FloatArray, FloatArray]] = []
         self._count = 0
         self._add_flat()
         self._add_boxes()
@@ -137,7 +129,7 @@ class Assembly:
             self._add(planes[:, 0, :3], mesh.material, frames)
             if triangles.normals is not None:
                 corners = triangles.normals[triangles.faces].astype(np.float32)
-                self.smooth.append(SmoothMesh(first, planes.astype(np.float32), corners))
+                self.smooth.append((first, planes.astype(np.float32), corners))
 
 
 class World:
@@ -214,8 +206,8 @@ class World:
         discs = [disc for disc in settings.discs if any(disc.emission)]
         spheres = [sphere for sphere in settings.spheres if any(sphere.emission)]
         points = [*settings.points, *settings.spots]
-        self._surroundings = make_surroundings(settings.environment, settings.sky, self.scene.environment, self.palette)
-        self._sky, self._sun = SkyLight(self._surroundings), SunLight(settings.sky)
+        self._sky = make_surroundings(settings.environment, settings.sky, self.scene.environment, self.palette)
+        self._sun = SunLight(settings.sky)
         sizeless = PointLights(settings.points, settings.spots)
         groups = (FlatLights(quads, discs), SphereLights(spheres), sizeless, self._sun, self._sky)
         self.lights = Lights(groups, settings.camera.look_at_m)
@@ -235,7 +227,7 @@ class World:
         self._sky_number = len(rows) if self._sky.count else -1
         self._sun_number = len(rows) - 1 if self._sun.count else -1
         self.light_emission_row = np.array([*rows, 0], np.intp)
-        self.dark = self._surroundings.dark and not self._sun.count
+        self.dark = self._sky.dark and not self._sun.count
 
     def _never_shades(self, shape: Primitive) -> bool:
         """Whether no shadow ray can be blocked: the walls of a room around every light, as walls let light in."""
@@ -278,15 +270,15 @@ class World:
             local *= self._spheres[3].take(number)
             normal[:, rows] = local
         shading = normal
-        for mesh in self._smooth:
-            rows = np.flatnonzero((surface >= mesh.first) & (surface < mesh.first + len(mesh.planes)))
+        for first, planes, normals in self._smooth:
+            rows = np.flatnonzero((surface >= first) & (surface < first + len(planes)))
             if rows.size:
                 shading = normal.copy() if shading is normal else shading
-                triangle = surface[rows] - mesh.first
+                triangle = surface[rows] - first
                 at = np.vstack([point.take(rows, axis=1), np.ones(len(rows), np.float32)])
-                u, v = np.einsum("tij,jt->it", mesh.planes[triangle, 1:], at)
+                u, v = np.einsum("tij,jt->it", planes[triangle, 1:], at)
                 weights = np.stack([1 - u - v, u, v])
-                blended = np.einsum("it,tij->jt", weights, mesh.normals[triangle])
+                blended = np.einsum("it,tij->jt", weights, normals[triangle])
                 shading[:, rows] = blended / np.sqrt(np.maximum(np.sum(blended**2, axis=0), 1e-12))
         return normal, shading
 
@@ -302,7 +294,7 @@ class World:
         emitted = self.palette.look_up(self.light_emission_row.take(light), bins)
         if self._sky_number >= 0:
             far = np.flatnonzero(light == self._sky_number)
-            emitted[..., far] = self._surroundings.radiance(aimed.direction.take(rows[far], axis=1), bins[far])
+            emitted[..., far] = self._sky.radiance(aimed.direction.take(rows[far], axis=1), bins[far])
         return emitted
 
     def environment(self, direction: FloatArray, bins: Index, density: FloatArray | None = None) -> FloatArray:
@@ -310,7 +302,7 @@ class World:
 
         With `density` [N], with which scattering chose them, each part is weighted against aiming at it.
         """
-        light = self._surroundings.radiance(direction, bins)
+        light = self._sky.radiance(direction, bins)
         if self._sky_number >= 0 and density is not None:
             light /= self._rivals(self._sky_number, self._sky.far_pdf(direction), density)
         if self._sun_number >= 0:
