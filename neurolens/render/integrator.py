@@ -306,13 +306,7 @@ def _add_environment(world: World, paths: Paths, found: NDArray[np.int32], aim: 
 
 
 def _add_emission(
-    world: World,
-    paths: Paths,
-    surface: Index,
-    point: FloatArray,
-    distance: FloatArray,
-    aim: bool,
-    radiance: FloatArray,
+    world: World, paths: Paths, surface: Index, point: FloatArray, distance: FloatArray, aim: bool, radiance: FloatArray
 ) -> None:
     """Light from paths that run into a light, weighted against aiming at it."""
     if world.lights.black:
