@@ -17,8 +17,8 @@ from neurolens.analysis.fields import DEFAULT_NM, Scene, on_plane
 from neurolens.analysis.patterns import Pattern, hexapolar
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.optics import apertures
-from neurolens.optics.media import media
+from neurolens.optics.apertures import inside_on_tensors
+from neurolens.optics.passing import media
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
@@ -151,4 +151,4 @@ def _inside_stop(scene: Scene, pattern: Pattern) -> Tensor:
     if scene.lens.aperture is None:
         return torch.ones_like(t, dtype=torch.bool)
     x, y = (-t, s) if scene.axis == "x" else (s, -t)
-    return apertures.inside(scene.lens.aperture, x, y, 1.0)
+    return inside_on_tensors(scene.lens.aperture, x, y, 1.0)

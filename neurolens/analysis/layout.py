@@ -6,13 +6,13 @@ import math
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from neurolens.analysis.bundles import bundle
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.patterns import Pattern, fan
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.sag import sag_mm
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
@@ -66,22 +66,13 @@ def refractions(lens: Lens) -> int:
     return sum(a != b for a, b in zip(before, before[1:], strict=False))
 
 
-def sag_mm(surface: Surface, height: Tensor, axis: str) -> Tensor:
-    """Depth of a surface behind its vertex at heights along one transverse axis, mm; held where its conic ends."""
-    if surface.cylinder not in (None, axis):
-        return torch.zeros_like(height)
-    c = float(surface.curvature)
-    square = height * height
-    root = torch.sqrt((1 - (1 + float(surface.conic)) * c * c * square).clamp_min(0.0))
-    return c * square / (1 + root) + sum(float(a) * height.abs() ** p for p, a in surface.asphere)
-
-
 def _profile(s: Surface, vertex_mm: float, axis: str) -> list[list[float]] | None:
     """Points [65] of (z, height) from rim to rim of a surface that is no sphere; None for spheres and planes."""
     if not (s.conic or s.asphere or s.cylinder) or math.isinf(s.semi_diameter_mm):
         return None
     height = torch.linspace(-s.semi_diameter_mm, s.semi_diameter_mm, 65, dtype=torch.float64)
-    found: list[list[float]] = torch.stack([vertex_mm + sag_mm(s, height, axis), height], 1).tolist()
+    place = (height, torch.zeros_like(height)) if axis == "x" else (torch.zeros_like(height), height)
+    found: list[list[float]] = torch.stack([vertex_mm + sag_mm(s, *place, held=True), height], 1).tolist()
     return found
 
 

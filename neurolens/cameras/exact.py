@@ -19,12 +19,11 @@ from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_search import COARSE, FINE
 from neurolens.cameras.sampling import arrived, check_film, positive
-from neurolens.optics.differentials import film_tangents, trace_differentials
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
 from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds, symmetric_about_axis
-from neurolens.optics.trace import Rays, trace
+from neurolens.optics.trace import Rays, film_tangents, trace, trace_differentials
 
 
 class ExactCamera:

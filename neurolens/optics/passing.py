@@ -1,4 +1,4 @@
-"""One surface passed: met, tested, refracted; and how rays start and what becomes of those that are lost."""
+"""The media between surfaces, and one surface passed: met, tested, refracted; how rays start and how they are lost."""
 
 from __future__ import annotations
 
@@ -10,21 +10,62 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.optics import apertures
+from neurolens.optics import glass
+from neurolens.optics.apertures import inside_on_tensors
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.shapes import intersect_shape, is_plain
 from neurolens.optics.surfaces import (
+    AIR,
+    Counts,
     Hit,
+    Labels,
     Medium,
     Rays,
+    Survival,
+    also,
+    at_most,
     intersect_plane,
     intersect_sphere,
+    medium,
     nearest_approach,
+    positive,
     refract,
     times,
 )
-from neurolens.optics.survival import Counts, Labels, Survival, also, at_most, positive
+
+
+def media(lens: Lens, wavelength_nm: Tensor | float) -> list[Medium]:
+    """Media from the scene to the film; media(...)[k] lies before surface k. The same object where it does not change.
+
+    `wavelength_nm` is a number or a tensor [N]; a dispersive medium has the shape of the wavelength.
+    """
+    known: dict[Any, Medium] = {_medium_key(None): AIR}
+    found = [AIR]
+    for s in lens.surfaces:
+        key = _medium_key(s)
+        if key not in known:
+            known[key] = medium(glass.index_of(s, wavelength_nm))
+        found.append(known[key])
+    return found
+
+
+def absorption_per_mm(lens: Lens, wavelength_nm: Tensor | float) -> list[Any]:
+    """Napierian absorption of the media from the scene to the film, in 1/mm; None where there is none."""
+    return [None, *(_absorption(s, wavelength_nm) for s in lens.surfaces)]
+
+
+def _absorption(s: Surface, wavelength_nm: Tensor | float) -> Any:
+    if s.glass is None and not s.absorption_per_mm:
+        return None
+    return glass.absorption_of(s, wavelength_nm)
+
+
+def _medium_key(s: Surface | None) -> Any:
+    if s is None or (s.glass is None and s.V_d is None and not isinstance(s.n_d, Tensor) and s.n_d == 1):
+        return "air"
+    return (s.glass, None if s.glass else (id(s.n_d) if isinstance(s.n_d, Tensor) else float(s.n_d), s.V_d))
+
 
 # How far the squared length of a direction may be from 1; float32 rounding is a thousandth of this.
 UNIT_SLACK = 1e-3
@@ -135,7 +176,7 @@ def meet(lens: Lens, k: int, r: Rays, before: Medium, entering: bool, mode: Mode
             tests.end(distance2 < math.inf)
         tests.require(at_most(distance2, surface.semi_diameter_mm**2, spend=mode.spend), k, st.RIM)
     if lens.aperture is not None and surface.stop:
-        tests.require(apertures.inside(lens.aperture, hit.x, hit.y, lens.stop_radius_mm), k, st.RIM)
+        tests.require(inside_on_tensors(lens.aperture, hit.x, hit.y, lens.stop_radius_mm), k, st.RIM)
     return hit
 
 

@@ -11,7 +11,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal
 
-from neurolens.apertures import Aperture
+from neurolens.optics.apertures import Aperture
 
 Focus = Literal["film", "best", "internal"]
 
@@ -200,7 +200,7 @@ class Lens:
             field_deg: full field of view at infinity focus that the image circle shall see: the lens is rescaled, the
                 image circle stays (by the traced chief ray, along x; distortion included).
             zoom: name of a state of the file, or a focal length in mm between those of its states, as a number or its
-                text (`neurolens.optics.zoom`; marked in `derived`).
+                text (`neurolens.optics.states`; marked in `derived`).
             focus: "film" moves the film as the paraxial image does; "best" to the least RMS spot of the axial point at
                 the d line; "internal" moves the groups as the file's focus states do, film fixed.
 

@@ -16,9 +16,9 @@ import torch
 
 from neurolens.base.errors import InputError
 from neurolens.optics.aiming import aim_at_stop, without_rims
-from neurolens.optics.clearance import end_mm, neighbours, surface_sag_mm
 from neurolens.optics.paraxial import first_order, stop_radius_mm
 from neurolens.optics.prescription import Configuration, Lens, Surface
+from neurolens.optics.sag import end_mm, neighbours, sag_mm
 from neurolens.optics.trace import trace
 
 _FIELDS = 17  # from the axis to the edge; rims are widest at one of the ends, but for an oddity in between
@@ -184,7 +184,7 @@ def _which_to_trim(before: Surface, after: Surface, k: int, k_after: int, h: flo
     """Of two surfaces that meet at height h, the one whose flat, ground from there outwards, clears the other."""
 
     def slope(s: Surface) -> float:
-        return surface_sag_mm(s, h, 0.0) - surface_sag_mm(s, 0.99 * h, 0.0)
+        return sag_mm(s, h, 0.0) - sag_mm(s, 0.99 * h, 0.0)
 
     if slope(after) >= 0:
         return (k,)
@@ -195,7 +195,7 @@ def _meeting_height(before: Surface, after: Surface, gap: float, limit: float) -
     """Distance from the axis, up to `limit`, at which two surfaces first meet, mm."""
 
     def clear(h: float) -> bool:
-        return gap + surface_sag_mm(after, h, 0.0) - surface_sag_mm(before, h, 0.0) >= 0
+        return gap + sag_mm(after, h, 0.0) - sag_mm(before, h, 0.0) >= 0
 
     low = 0.0
     for i in range(1, _STEPS + 1):

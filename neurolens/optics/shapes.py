@@ -16,10 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neurolens.optics.clearance import surface_sag_mm
 from neurolens.optics.prescription import Surface
-from neurolens.optics.surfaces import Hit, Medium, Rays, nearest_approach, root, times
-from neurolens.optics.survival import also, at_most, choose, positive
+from neurolens.optics.sag import sag_mm
+from neurolens.optics.surfaces import Hit, Medium, Rays, also, at_most, choose, nearest_approach, positive, root, times
 
 Vector = tuple[Tensor, Tensor, Tensor]
 
@@ -165,7 +164,7 @@ def _fitted(
         return (curvature, curvature * (1 + conic)), STEPS[-1][1]
     radius_mm = 1 / curvature if curvature else math.inf
     same = Surface(radius_mm, 0.0, 2 * rim_mm, conic=conic, asphere=asphere)
-    points = [(h, surface_sag_mm(same, h, 0.0)) for h in (rim_mm * i / 24 for i in range(1, 25))]
+    points = [(h, sag_mm(same, h, 0.0)) for h in (rim_mm * i / 24 for i in range(1, 25))]
     points = [(h, z) for h, z in points if math.isfinite(z)]
     # Linear least squares for c and cz: each point's error is that of its height along the axis, times 2.
     hh, hz, zz = (sum(h ** (4 - 2 * k) * z ** (2 * k) for h, z in points) for k in range(3))

@@ -9,12 +9,11 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.optics import catalogue, paraxial, rims
-from neurolens.optics.clearance import check_clearance
-from neurolens.optics.dispersion import Glass
-from neurolens.optics.lensfields import MAX_INDEX
-from neurolens.optics.lensrows import MAX_POWER, MAX_SURFACES
+from neurolens.optics.catalogue import Glass
+from neurolens.optics.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
 from neurolens.optics.paraxial import FirstOrder
 from neurolens.optics.prescription import Configuration, Lens, Surface
+from neurolens.optics.sag import check_clearance
 from neurolens.readers.source import warn
 
 # A diameter that the file does not give, until `finish` has found it.

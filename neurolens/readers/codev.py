@@ -9,7 +9,7 @@ import math
 from pathlib import Path
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensrows import MAX_SURFACES
+from neurolens.optics.lensfile import MAX_SURFACES
 from neurolens.optics.prescription import Lens
 from neurolens.readers.codev_file import File, draft_of
 from neurolens.readers.codev_shapes import LETTERS, NONE_BUT_0, Block

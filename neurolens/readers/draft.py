@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensrows import MAX_SURFACES
+from neurolens.optics.lensfile import MAX_SURFACES
 from neurolens.optics.prescription import Configuration, Lens, Surface
 from neurolens.readers.assemble import check_states, finish, first_order, moved, smaller_stop, with_rims
 from neurolens.readers.source import unit_mm, warn

@@ -17,8 +17,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import reject_unknown
-from neurolens.optics.lensfields import number, text
-from neurolens.optics.lensrows import MAX_SURFACES
+from neurolens.optics.lensfile import MAX_SURFACES, number, text
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.readers.assemble import UNKNOWN, finish, same_glass
 from neurolens.readers.draft import Given

@@ -14,7 +14,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import reject_unknown
-from neurolens.optics.lensfields import number
+from neurolens.optics.lensfile import number
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.readers.assemble import first_order, named_glass
 from neurolens.readers.draft import Draft, Given, Row, lens_of

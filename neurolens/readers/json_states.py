@@ -9,7 +9,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import reject_unknown
-from neurolens.optics.lensfields import number, text
+from neurolens.optics.lensfile import number, text
 from neurolens.optics.prescription import Configuration, Lens
 from neurolens.readers.assemble import check_states, first_order, moved
 from neurolens.readers.source import warn

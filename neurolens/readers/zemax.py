@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensrows import MAX_SURFACES
+from neurolens.optics.lensfile import MAX_SURFACES
 from neurolens.optics.prescription import Lens
 from neurolens.readers import zemax_words as words
 from neurolens.readers.assemble import named_glass

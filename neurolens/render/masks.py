@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from neurolens.apertures import MAX_MASK, THRESHOLD, Aperture
 from neurolens.base.errors import InputError
+from neurolens.optics.apertures import MAX_MASK, THRESHOLD, Aperture
 
 
 def make_aperture(

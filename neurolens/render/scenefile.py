@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from neurolens.apertures import Aperture
 from neurolens.base.config import from_dict
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import read_toml
 from neurolens.cameras.contract import FloatArray
+from neurolens.optics.apertures import Aperture
 from neurolens.render.illuminants import (
     IlluminantSettings,
     Spectrum,

@@ -14,8 +14,8 @@ from neurolens.analysis.fields import Scene
 from neurolens.analysis.patterns import Pattern, fan, grid, hexapolar, points
 from neurolens.analysis.spots import working_f_number
 from neurolens.analysis.wavefront import wavefront
-from neurolens.apertures import Aperture
 from neurolens.base.errors import InputError
+from neurolens.optics.apertures import Aperture
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace

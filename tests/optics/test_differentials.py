@@ -10,13 +10,12 @@ from lens_models import LENSES
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.optics.differentials import film_tangents, trace_differentials
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.surfaces import Rays
-from neurolens.optics.trace import trace
+from neurolens.optics.trace import film_tangents, trace, trace_differentials
 
 pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 

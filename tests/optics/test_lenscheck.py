@@ -8,9 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from neurolens.optics.lenscheck import check_lens, doubts, verdict
+from neurolens.optics.lenscheck import (
+    axial_beam,
+    axial_blur_mm,
+    check_lens,
+    corner_illumination,
+    doubts,
+    film_edge_mm,
+    verdict,
+)
 from neurolens.optics.lensfile import read_lens
-from neurolens.optics.lightcheck import axial_beam, axial_blur_mm, corner_illumination, film_edge_mm
 from neurolens.optics.prescription import Lens, Surface
 
 pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")

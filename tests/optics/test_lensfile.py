@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.optics.clearance import sag_mm
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import format_lens, write_lens
 from neurolens.optics.prescription import Coating, Configuration, Lens, Surface
+from neurolens.optics.sag import sag_mm
 
 LENSES = sorted((Path(__file__).parents[2] / "lenses").glob("*.toml"))
 
@@ -212,7 +212,7 @@ def test_a_truncated_file_is_refused(tmp_path: Path, cut: int) -> None:
 
 # What must be accepted, though it looks like a mistake
 def test_surfaces_may_touch_at_the_rim(tmp_path: Path) -> None:
-    touching = repr(2 * sag_mm(50.0, 10.0))
+    touching = repr(2 * sag_mm(Surface(50.0, 0.0, 20.0), 10.0, 0.0))
     assert read_lens(write(tmp_path, replaced("thickness_mm = 6.0", f"thickness_mm = {touching}"))).surfaces
 
 
@@ -359,7 +359,7 @@ def test_any_figure_comes_back_bit_for_bit(
 @pytest.mark.parametrize("radius_mm", [12.0, -12.0, 300.0, -300.0])
 def test_sag_of_a_sphere(radius_mm: float) -> None:
     centre_to_rim = math.copysign(math.sqrt(radius_mm**2 - 81), radius_mm)
-    assert sag_mm(radius_mm, 9.0) == pytest.approx(radius_mm - centre_to_rim, rel=1e-12)
+    assert sag_mm(Surface(radius_mm, 0.0, 20.0), 9.0, 0.0) == pytest.approx(radius_mm - centre_to_rim, rel=1e-12)
 
 
 def test_an_asphere_may_not_cross_its_neighbour_between_axis_and_rim(tmp_path: Path) -> None:
@@ -380,5 +380,5 @@ def test_a_rim_beyond_the_end_of_a_conic(tmp_path: Path) -> None:
 
 
 def test_sag_of_a_plane_and_of_nearly_one() -> None:
-    assert sag_mm(math.inf, 9.0) == 0
-    assert sag_mm(1e9, 1.0) == pytest.approx(0.5e-9, rel=1e-12)
+    assert sag_mm(Surface(math.inf, 0.0, 20.0), 9.0, 0.0) == 0
+    assert sag_mm(Surface(1e9, 0.0, 20.0), 1.0, 0.0) == pytest.approx(0.5e-9, rel=1e-12)

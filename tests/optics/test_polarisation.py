@@ -12,8 +12,8 @@ import tmm
 import torch
 from torch import Tensor
 
-from neurolens.optics.polarisation import Step, polarised_fields, polarised_transmittance
-from neurolens.optics.thinfilm import Layers, powers, transmittance
+from neurolens.optics.coatings import Layers, powers, transmittance
+from neurolens.optics.transmission import Step, polarised_fields, polarised_transmittance
 
 ROOT = Path(__file__).parents[2]
 SHARED = ROOT.parent / "shared" / "data" / "oracle"

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neurolens.apertures import Aperture
 from neurolens.base.errors import InputError
 from neurolens.optics.accessories import pinhole, with_hood
+from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface

@@ -11,11 +11,11 @@ import torch
 
 from neurolens.base.errors import InputError
 from neurolens.optics.aiming import aim_at_stop
-from neurolens.optics.clearance import check_clearance
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.rims import RimRule, derive_rims, half_field_deg
+from neurolens.optics.sag import check_clearance
 from neurolens.optics.trace import trace
 
 pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")

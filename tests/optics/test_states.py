@@ -11,15 +11,21 @@ import pytest
 import torch
 
 from neurolens.base.errors import InputError
-from neurolens.optics.bestfocus import axial_rays, best_focus_z_mm
-from neurolens.optics.breathing import breathing, field_change
-from neurolens.optics.clearance import check_clearance
-from neurolens.optics.internal import focus_states, infinity_states, nearest_focus_m
-from neurolens.optics.interpolate import monotone
+from neurolens.optics.focusing import (
+    axial_rays,
+    best_focus_z_mm,
+    breathing,
+    field_change,
+    focus_states,
+    infinity_states,
+    monotone,
+    nearest_focus_m,
+)
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Coating, Lens, Surface
+from neurolens.optics.sag import check_clearance
 from neurolens.optics.trace import Rays, trace
 
 pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")

@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 from render_helpers import WHITE, diffuse, scene
 
-from neurolens.apertures import Aperture
 from neurolens.base.errors import InputError
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
+from neurolens.optics.apertures import Aperture
 from neurolens.render.renderer import render
 from neurolens.render.scenefile import load_scene
 

@@ -11,8 +11,8 @@ from lens_models import KINDS, model, prepared
 from torch import Tensor
 
 from neurolens.base import status as st
-from neurolens.optics.differentials import film_tangents, trace_differentials
-from neurolens.optics.pupil_rays import camera_rays
+from neurolens.optics.pupils import camera_rays
+from neurolens.optics.trace import film_tangents, trace_differentials
 from neurolens.surrogates.cores import MirrorPolynomial, Partitioned
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
