@@ -1,9 +1,9 @@
 """Prescriptions as JSON, in the form that ../shared/data/README.md defines: surfaces with full diameters in mm.
 
 A radius of 0 is a plane, an index of null is air, a last thickness of 0 or null stands for the computed back focus,
-`cyl-x` is a cylinder curved along x. States marked as interpolated by the transcriber are left out with a warning. The
-forms of DeepLens and ISET are read too (`json_others`).
-"""
+`cyl-x` is a cylinder curved along x. What the file states beside its table is checked against it: focal length and back
+focus, and the object's distance of every focus state. States marked as interpolated by the transcriber are left out
+with a warning. The forms of DeepLens and ISET are read too (`json_others`)."""
 
 from __future__ import annotations
 
@@ -13,18 +13,181 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import reject_unknown
+from neurolens.optics import paraxial
 from neurolens.optics.lensfile import MAX_SURFACES, number, text
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.readers.assemble import UNKNOWN, finish, same_glass
+from neurolens.optics.prescription import Configuration, Lens, Surface
+from neurolens.readers.assemble import UNKNOWN, check_states, finish, first_order, is_anamorphic, moved, same_glass
 from neurolens.readers.draft import Given
 from neurolens.readers.json_others import read_others
-from neurolens.readers.json_stated import check_computed, image_and_field, stated_efl
-from neurolens.readers.json_states import read_states
 from neurolens.readers.source import decode, read_bytes, warn
+
+COMPUTED_KEYS = ("efl_mm", "bfd_mm", "efl_y_mm", "efl_x_mm", "bfd_y_mm", "bfd_x_mm", "f_number_from_stop")
+AGREES = 1e-4  # relative: more than rounding of the printed figures, less than any wrong digit
+_NUMBER = r"([0-9]+(?:\.[0-9]+)?)"
+
+
+def stated_efl(lens: Lens, data: Mapping[str, Any]) -> Lens:
+    """The lens with the focal length that the file states: of several, those of an anamorphic lens by meridian, else
+    the first (the state that the table is in)."""
+    given = data.get("efl_mm")
+    values = [given] if not isinstance(given, list) else given
+    for value in values:
+        real = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value > 0
+        if value is not None and not real:
+            raise InputError(lens.path, "efl_mm", given, "a number above 0 in mm, a list of them, or null")
+    if not values or values[0] is None:
+        return lens
+    if is_anamorphic(lens) and len(values) == 2:
+        y = paraxial.first_order(lens, meridian="y").efl_mm
+        x = paraxial.first_order(lens, meridian="x").efl_mm
+        a, b = map(float, values)
+        straight = abs(math.log(a / abs(y))) + abs(math.log(b / abs(x)))
+        crossed = abs(math.log(b / abs(y))) + abs(math.log(a / abs(x)))
+        a, b = (a, b) if straight <= crossed else (b, a)
+        return replace(lens, stated_efl_mm=a, stated_efl_x_mm=b)
+    return replace(lens, stated_efl_mm=float(values[0]))
+
+
+def check_computed(lens: Lens, data: Mapping[str, Any]) -> None:
+    """Warn where focal length or back focus differ from those that the file says were computed from its table."""
+    given = data.get("computed_at_nd") or {}
+    if not isinstance(given, Mapping):
+        raise InputError(lens.path, "computed_at_nd", given, "an object with efl_mm and bfd_mm")
+    table = replace(lens, surfaces=tuple(replace(s, glass=None) for s in lens.surfaces))
+    axes: tuple[tuple[Literal["x", "y"], str], ...] = (("y", ""), ("y", "_y"), ("x", "_x"))
+    for axis, suffix in axes:
+        found = paraxial.first_order(table, meridian=axis)
+        for key, value in ((f"efl{suffix}_mm", found.efl_mm), (f"bfd{suffix}_mm", found.back_focus_mm)):
+            expected = given.get(key)
+            if isinstance(expected, int | float) and not abs(value - expected) <= AGREES * abs(found.efl_mm):
+                warn(lens.path, f"{key} computed from the table is {value:.6g}; the file says {expected:.6g}")
+
+
+def image_and_field(data: Mapping[str, Any], file: str) -> dict[str, Any]:
+    """`image_radius_mm` and `half_field_deg` from the free text of `field_or_image_circle`, where it is clear.
+
+    Understood: "image radius 21.6 mm", "image circle 43.2 mm", "38 deg half field", "+-20 deg", "180 deg full field",
+    "AOV 45.2 deg" (full; of several the first), and the keys fullFieldDeg and imageCircleMm. Else a warning.
+    """
+    text = data.get("field_or_image_circle")
+    found: dict[str, Any] = {"image_radius_mm": None, "half_field_deg": None}
+    if text is None or text == "":
+        return found
+    if not isinstance(text, str):
+        raise InputError(file, "field_or_image_circle", text, "a text or null")
+    for pattern, key, factor in (
+        (rf"image radius {_NUMBER} mm", "image_radius_mm", 1.0),
+        (rf"image height {_NUMBER} mm", "image_radius_mm", 1.0),
+        (rf"image circle {_NUMBER} mm", "image_radius_mm", 0.5),
+        (r'"imageCircleMm": *' + _NUMBER, "image_radius_mm", 0.5),
+        (rf"{_NUMBER} deg half field", "half_field_deg", 1.0),
+        (rf"\+-{_NUMBER} deg", "half_field_deg", 1.0),
+        (rf"{_NUMBER} deg full field", "half_field_deg", 0.5),
+        (rf"AOV {_NUMBER}", "half_field_deg", 0.5),
+        (r'"fullFieldDeg": *' + _NUMBER, "half_field_deg", 0.5),
+    ):
+        match = re.search(pattern, text)
+        if match and found[key] is None:
+            found[key] = float(match[1]) * factor
+    if found == {"image_radius_mm": None, "half_field_deg": None}:
+        warn(file, f"field_or_image_circle is not clear and left out: {json.dumps(text)}")
+    return found
+
+
+STATE_KEYS = (
+    *("name", "efl_mm", "efl_y_mm", "efl_x_mm", "f_number", "object_distance_mm", "magnification"),
+    *("thickness_overrides", "stop_diameter_mm", "interpolated_by_transcriber", "note"),
+)
+MAX_STATES = 200
+DOUBTFUL = 0.05  # relative difference of a stated object distance from the paraxial one that is worth a warning
+
+
+def read_states(lens: Lens, data: Mapping[str, Any]) -> Lens:
+    """The lens with the states of the file.
+
+    Raises:
+        InputError: an unknown key, a surface that does not exist, a value out of range, a name given twice, surfaces
+            that overlap in a state.
+    """
+    tables = _tables(data, lens.path)
+    states: list[Configuration] = []
+    for place, table in enumerate(tables):
+        where = f"configuration {place}, "
+        if not isinstance(table, Mapping):
+            raise InputError(lens.path, f"configuration {place}", table, "an object with thickness_overrides")
+        reject_unknown(lens.path, where, table, STATE_KEYS)
+        name = text(table, "name", lens.path, where)
+        if table.get("interpolated_by_transcriber"):
+            warn(lens.path, f'configuration "{name}" is left out: interpolated by the transcriber, not from the source')
+            continue
+        if name in [c.name for c in states]:
+            raise InputError(lens.path, f"{where}name", name, "a name that no other configuration has")
+        states.append(_state(lens, table, name))
+    whole = replace(lens, configurations=tuple(states))
+    check_states(whole)
+    return whole
+
+
+def _tables(data: Mapping[str, Any], file: str) -> list[Any]:
+    given = data.get("configurations")
+    if isinstance(given, Mapping):
+        reject_unknown(file, "configurations, ", given, ("configs",))
+        given = given.get("configs")
+    tables = [] if given is None else given
+    if not isinstance(tables, list) or len(tables) > MAX_STATES:
+        raise InputError(file, "configurations", given, f"null or a list of at most {MAX_STATES} states")
+    return tables
+
+
+def _state(lens: Lens, table: Mapping[str, Any], name: str) -> Configuration:
+    """One state; what the source leaves open (focal length, object distance) follows from its thicknesses."""
+    where = f'configuration "{name}", '
+    given: dict[str, float | None] = {
+        key: number(table, key, lens.path, where, above=0) if table.get(key) is not None else None
+        for key in ("efl_mm", "efl_y_mm", "f_number", "stop_diameter_mm")
+    }
+    efl_y, distance = given.pop("efl_y_mm"), table.get("object_distance_mm")
+    efl = given.pop("efl_mm") if given["efl_mm"] is not None else (given.pop("efl_mm"), efl_y)[1]
+    state = Configuration(name, efl, _thickness(lens, table, where), **given)
+    table_lens = moved(lens, state)
+    paraxial_mm = _object_distance_mm(table_lens)
+    if isinstance(distance, str):
+        if not (math.isfinite(paraxial_mm) and paraxial_mm > 0):
+            raise InputError(lens.path, f"{where}object_distance_mm", distance, "a distance in mm, or null")
+        warn(lens.path, f"{where}object_distance_mm {distance!r}: {paraxial_mm:.6g} mm follows from the thicknesses")
+        return replace(state, object_distance_mm=paraxial_mm)
+    if distance is not None:
+        stated = number(table, "object_distance_mm", lens.path, where, unit="mm", above=0)
+        if not abs(paraxial_mm / stated - 1) <= DOUBTFUL:
+            warn(lens.path, f"{where}object_distance_mm {stated:g} is stated; the thicknesses focus {paraxial_mm:.6g}")
+        return replace(state, object_distance_mm=stated)
+    return state if efl is not None else replace(state, efl_mm=first_order(table_lens).efl_mm)
+
+
+def _object_distance_mm(lens: Lens) -> float:
+    """Distance from the object in focus on the tabled film to the front vertex (Newton's x x' = -f^2)."""
+    data = first_order(lens)
+    beyond = float(lens.vertices_mm[-1]) - data.rear_focal_z_mm
+    return data.efl_mm**2 / beyond - data.front_focal_z_mm if beyond else math.inf
+
+
+def _thickness(lens: Lens, table: Mapping[str, Any], where: str) -> tuple[tuple[int, float], ...]:
+    given = table.get("thickness_overrides", "(missing)")
+    if not isinstance(given, Mapping):
+        raise InputError(lens.path, f"{where}thickness_overrides", given, 'an object such as {"5": 26.15}')
+    found = []
+    for key in given:
+        if not (key.isascii() and key.isdecimal() and len(key) < 5 and int(key) < len(lens.surfaces)):
+            expected = f"a surface number from 0 to {len(lens.surfaces) - 1}"
+            raise InputError(lens.path, f"{where}thickness_overrides", key, expected)
+        value = number(given, key, lens.path, f"{where}thickness_overrides, surface ", unit="mm")
+        found.append((int(key), value))
+    return tuple(sorted(found))
+
 
 KEYS = (
     *("name", "designer", "source", "efl_mm", "f_number", "field_or_image_circle", "notes", "computed_at_nd"),

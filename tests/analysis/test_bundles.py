@@ -9,9 +9,8 @@ import pytest
 import torch
 from analysis_lenses import INF, cartesian, library, scene, thin
 
-from neurolens.analysis.bundles import bundle
+from neurolens.analysis.bundles import Pattern, bundle, fan, grid, hexapolar, points
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.patterns import Pattern, fan, grid, hexapolar, points
 from neurolens.analysis.spots import working_f_number
 from neurolens.analysis.wavefront import wavefront
 from neurolens.base.errors import InputError
