@@ -50,11 +50,6 @@ class Colour(Result):
     line_nm: Array
     lateral_um: Array
 
-    @property
-    def focus_spread_mm(self) -> float:
-        """Greatest less least paraxial focus over the spectrum, mm."""
-        return float(np.ptp(self.focus_shift_mm[:, 0]))
-
 
 def colour(
     scene: Scene,
@@ -103,11 +98,6 @@ class Curvature(Result):
     sagittal_mm: Array
     petzval_mm: Array
     petzval_radius_mm: float
-
-    @property
-    def astigmatism_mm(self) -> Array:
-        """Tangential less sagittal focus, [F]."""
-        return self.tangential_mm - self.sagittal_mm
 
 
 def curvature(

@@ -162,11 +162,7 @@ class Fans(Result):
 
 
 def fans(
-    scene: Scene,
-    field_deg: Sequence[float] | None = None,
-    wavelength_nm: Sequence[float] = DEFAULT_NM,
-    *,
-    n: int = 65,
+    scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] = DEFAULT_NM, *, n: int = 65
 ) -> Fans:
     """Ray fans of fields (`Scene.default_fields` if not given) with n points along each line of the stop."""
     pattern = fan(n)

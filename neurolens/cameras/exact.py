@@ -22,7 +22,7 @@ from neurolens.cameras.sampling import arrived, check_film, positive
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
-from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds, symmetric_about_axis
+from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds
 from neurolens.optics.trace import Rays, film_tangents, trace, trace_differentials
 
 
@@ -75,7 +75,7 @@ class ExactCamera:
             film_z += film_offset_mm
             self.lens = replace(self.lens, film_z_mm=film_z)
         # A lens with cylinders is searched at many azimuths for one outline: coarser, for it fits none of them closely.
-        round_ = symmetric_about_axis(self.lens)
+        round_ = not self.lens.anamorphic
         detail = FINE if round_ else COARSE._replace(tighten=bounds is not None)
         if bounds is None:
             corner = math.hypot(*self.film_mm) / 2

@@ -199,12 +199,7 @@ def _responses(
 
 def _times(m: tuple[Any, ...], k: tuple[Any, ...]) -> tuple[Any, ...]:
     """Product of two matrices [[a, -i b], [-i c, d]] given as (a, b, c, d)."""
-    return (
-        m[0] * k[0] - m[1] * k[2],
-        m[0] * k[1] + m[1] * k[3],
-        m[2] * k[0] + m[3] * k[2],
-        m[3] * k[3] - m[2] * k[1],
-    )
+    return (m[0] * k[0] - m[1] * k[2], m[0] * k[1] + m[1] * k[3], m[2] * k[0] + m[3] * k[2], m[3] * k[3] - m[2] * k[1])
 
 
 def _response(
@@ -284,11 +279,7 @@ def quarter_wave(index: float = MAGNESIUM_FLUORIDE, at_nm: float = DESIGN_NM) ->
 
 
 def v_coat(
-    n_before: float,
-    n_after: float,
-    at_nm: float = DESIGN_NM,
-    outer: float | None = None,
-    inner: float | None = None,
+    n_before: float, n_after: float, at_nm: float = DESIGN_NM, outer: float | None = None, inner: float | None = None
 ) -> Coating:
     """Two films without any reflection at `at_nm` and normal incidence (Macleod, section 3.2: equations of tan^2).
 

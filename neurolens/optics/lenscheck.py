@@ -93,12 +93,9 @@ def verdict(checks: list[Check]) -> str:
 
 def in_state(lens: Lens, c: Configuration) -> Lens:
     """The table with the thicknesses, stop and stated figures of a zoom or focus state, film as tabled."""
-    moved = dict(c.thickness_mm)
-    rows = tuple(replace(s, thickness_mm=moved.get(k, s.thickness_mm)) for k, s in enumerate(lens.surfaces))
     same = c.efl_mm is not None and lens.stated_efl_mm is not None and c.efl_mm == lens.stated_efl_mm
     state = replace(
-        lens,
-        surfaces=rows,
+        lens.with_gaps(dict(c.thickness_mm)),
         stated_efl_mm=c.efl_mm,
         stated_efl_x_mm=None,  # a state names one focal length
         half_field_deg=c.half_field_deg or (None if lens.image_radius_mm else lens.half_field_deg),

@@ -51,11 +51,6 @@ def camera_rays(
     return Rays(film_x, film_y, start_z, x * scale, y * scale, (z * scale).expand_as(film_x))
 
 
-def symmetric_about_axis(lens: Lens) -> bool:
-    """Whether turning the lens about its axis changes nothing but the place of its blades: no surface is a cylinder."""
-    return all(s.cylinder is None for s in lens.surfaces)
-
-
 def passes_at_any_azimuth(
     lens: Lens,
     film_radius: Tensor,
@@ -77,7 +72,7 @@ def passes_at_any_azimuth(
     """
     lens = replace(lens, aperture=None)
     passed = torch.zeros_like(film_radius, dtype=torch.bool)
-    round_ = symmetric_about_axis(lens)
+    round_ = not lens.anamorphic
     low, high = (None, None) if round_ or film_mm is None else azimuths_on_film(film_radius, film_mm)
     planes = torch.as_tensor(film_z, dtype=film_radius.dtype).expand_as(film_radius)
     for group in ((0.0,),) if round_ else _GROUPS:
@@ -271,7 +266,7 @@ def pupil_bounds(
         InputError: when no ray passes from any film point.
     """
     plane = pupil_plane_z_mm(lens) if pupil_z_mm is None else pupil_z_mm
-    if not symmetric_about_axis(lens):
+    if lens.anamorphic:
         points = min(points, _AT_MANY_AZIMUTHS)
     wavelengths = sorted(set(wavelength_nm))
     data = first_order(lens)

@@ -122,11 +122,10 @@ def _states(lens: Lens) -> Iterator[Lens]:
 
 def _moved(lens: Lens, c: Configuration) -> Lens:
     """The table with the thicknesses, field and f-number of a state."""
-    moved = dict(c.thickness_mm)
-    rows = tuple(replace(s, thickness_mm=moved.get(k, s.thickness_mm)) for k, s in enumerate(lens.surfaces))
     # Without a field of its own a state has that of the image circle, where there is one.
     field = c.half_field_deg or (None if lens.image_radius_mm else lens.half_field_deg)
-    return replace(lens, surfaces=rows, half_field_deg=field, f_number=c.f_number or lens.f_number)
+    moved = lens.with_gaps(dict(c.thickness_mm))
+    return replace(moved, half_field_deg=field, f_number=c.f_number or lens.f_number)
 
 
 def _stop_of(lens: Lens, c: Configuration) -> float:

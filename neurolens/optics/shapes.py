@@ -98,14 +98,7 @@ def _meet_quadric(
 
 
 def _meet_asphere(
-    r: Rays,
-    m: Vector,
-    surface: Surface,
-    w: tuple[float, float],
-    sense: int,
-    before: Medium,
-    guard: bool,
-    spend: bool,
+    r: Rays, m: Vector, surface: Surface, w: tuple[float, float], sense: int, before: Medium, guard: bool, spend: bool
 ) -> Hit:
     """Iterate along the rays, from the conic that fits the asphere best.
 

@@ -11,7 +11,7 @@ needs no division by dz and gives the cosine of incidence for free; optical dire
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -45,29 +45,14 @@ def choose(test: Tensor, yes: Tensor, no: Tensor) -> Tensor:
     return torch.lerp(no, yes, test) if test.is_floating_point() else torch.where(test, yes, no)
 
 
-class Survival(Protocol):
+class Labels:
     """The tests at each surface (met, inside the rim, not totally reflected), in the order in which they are called.
 
-    A ray goes on until it misses a surface or is totally reflected. A rim alone lets it go on: its crossings are learnt
-    from.
+    The first failure rules. A ray goes on until it misses a surface or is totally reflected; one that a rim stops goes
+    on, too, since its crossings are learnt from. This form keeps one label a ray, written at its first failure: what a
+    compiler turns into few instructions in registers, and what gradients can be taken through. `Counts` has the same
+    methods.
     """
-
-    def require(self, passed: Tensor, surface: int, reason: int) -> None:
-        """Apply the next test; `passed` is [N], boolean or 1.0 and 0.0."""
-
-    def end(self, sound: Tensor) -> None:
-        """End rays that are not `sound` [N] boolean, whatever their status."""
-
-    def only(self, value: Tensor, otherwise: float) -> Tensor:
-        """`value` [N] of the rays that go on, `otherwise` for the others, even where it is NaN."""
-
-    def status(self) -> Tensor:
-        """Status of every ray, [N] int32; see `neurolens.base.status`."""
-
-
-class Labels:
-    """A label a ray, written at its first failure: what a compiler turns into few instructions in registers, and what
-    gradients can be taken through."""
 
     def __init__(self, sound: Tensor, otherwise: int) -> None:
         """Start with the rays that are `sound` [N] boolean; the others have the status `otherwise`."""
@@ -75,17 +60,21 @@ class Labels:
         self._goes_on = sound
 
     def require(self, passed: Tensor, surface: int, reason: int) -> None:
+        """Apply the next test; `passed` is [N], boolean (in `Counts` 1.0 and 0.0, too)."""
         self._status = torch.where(passed | (self._status != 0), self._status, st.blocked(surface, reason))
         if reason != st.RIM:
             self._goes_on = self._goes_on & passed
 
     def end(self, sound: Tensor) -> None:
+        """End rays that are not `sound` [N] boolean, whatever their status."""
         self._goes_on = self._goes_on & sound
 
     def only(self, value: Tensor, otherwise: float) -> Tensor:
+        """`value` [N] of the rays that go on, `otherwise` for the others, even where it is NaN."""
         return torch.where(self._goes_on, value, otherwise)
 
     def status(self) -> Tensor:
+        """Status of every ray, [N] int32; see `neurolens.base.status`."""
         return self._status
 
 
@@ -123,6 +112,9 @@ class Counts:
 
     def status(self) -> Tensor:
         return _table((*self._meanings, st.PASSED), self._count.device).index_select(0, self._count.int())
+
+
+Survival = Labels | Counts
 
 
 @lru_cache(maxsize=256)

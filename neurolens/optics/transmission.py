@@ -11,7 +11,7 @@ n2 cos t / (n1 cos i) at every surface it would not be.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -44,39 +44,6 @@ class Step(NamedTuple):
     layers: Layers = ()
     sense: int = 1
     reflected: bool = False
-
-
-class Fields(NamedTuple):
-    """Electric fields of two orthogonal linear polarisations, before and after the path.
-
-    Attributes:
-        entering: [2, 3, N] real: the two fields, x, y, z in the lens frame, unit vectors across the first direction
-            with entering[0] x entering[1] along it.
-        leaving: [2, 3, N] complex: what becomes of them; |leaving|^2 summed over x, y, z is transmitted power. Of any
-            other input the field is the same linear combination (Jones calculus).
-    """
-
-    entering: Tensor
-    leaving: Tensor
-
-
-def polarised_transmittance(steps: Sequence[Step], wavelength_nm: Any) -> Tensor:
-    """Power that unpolarised light transmits along the path, in [0, 1], [N]: the mean over two orthogonal inputs.
-
-    Args:
-        steps: surfaces in the order in which the light meets them, at least one; those that change nothing (a stop)
-            may be left out.
-        wavelength_nm: in vacuum, number or [N].
-
-    Differentiable; finite at normal incidence. 0 beyond a critical angle. Rays that carry NaN give NaN.
-    """
-    return power(_through(steps, wavelength_nm)[1])
-
-
-def polarised_fields(steps: Sequence[Step], wavelength_nm: Any) -> Fields:
-    """The fields that two orthogonal inputs leave with; arguments as for `polarised_transmittance`."""
-    entering, leaving = _through(steps, wavelength_nm)
-    return Fields(entering[0], torch.complex(leaving[0], leaving[1]))
 
 
 def unpolarised(direction: Vector) -> Tensor:
@@ -112,14 +79,6 @@ def power(field: Tensor) -> Tensor:
     return 0.5 * (field * field).sum((0, 1, 2))
 
 
-def _through(steps: Sequence[Step], wavelength_nm: Any) -> tuple[Tensor, Tensor]:
-    """Fields [2, 2, 3, N] before and after all steps."""
-    entering = leaving = unpolarised(steps[0].before)
-    for step in steps:
-        leaving = pass_surface(leaving, step, wavelength_nm)
-    return entering, leaving
-
-
 def _times(along: Tensor, real: Tensor, imaginary: Tensor) -> Tensor:
     """Complex product of components [2, 2, N] and an amplitude, as [2, 2, 1, N]."""
     re, im = along
@@ -150,19 +109,9 @@ def _stacked(vector: Vector) -> Tensor:
     return torch.stack(tuple(vector))
 
 
-class Passage(Protocol):
-    """Power carried along while rays are traced."""
-
-    def pass_surface(self, k: int, r: Rays, hit: Hit, bent: Rays, q: Tensor, before: Medium, after: Medium) -> None:
-        """Pass surface k: rays before it (in its frame), where they meet it, rays after it, n' cos t, the media."""
-
-    def arrived(self) -> Tensor:
-        """Power of unpolarised light that arrives, [N]; nonsense for rays that do not."""
-
-
 def passage(
     lens: Lens, wavelength_nm: Tensor | float, sense: int, wanted: bool | Literal["polarised"], like: Tensor
-) -> Passage | None:
+) -> _Averaged | _Polarised | None:
     """What follows the power of rays of the shape of `like`, or None where nobody asks for it."""
     if not wanted:
         return None
@@ -170,7 +119,11 @@ def passage(
 
 
 class _Absorbed:
-    """Absorption by Beer and Lambert's law; the surfaces are its children's."""
+    """Power carried along while rays are traced: absorption by Beer and Lambert's law; surfaces are its children's.
+
+    These have `pass_surface`, for surface k: rays before it (in its frame), where they meet it, rays after it,
+    n' cos t, the media; and `arrived`, the power of unpolarised light that arrives, [N], without meaning for rays that do not.
+    """
 
     def __init__(self, lens: Lens, wavelength_nm: Tensor | float, sense: int, like: Tensor) -> None:
         self._lens, self._wavelength_nm, self._sense = lens, wavelength_nm, sense

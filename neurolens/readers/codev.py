@@ -70,11 +70,7 @@ def draft_of(file: File) -> Draft:
         if block.solved and block is not middle[-1]:
             raise block.start.error("PIM", f"(on surface {k + 1})", "the last surface")
         surface = Surface(
-            thickness_mm=block.thickness,
-            diameter_mm=diameter,
-            stop=block.stop,
-            **shape_of(block),
-            **block.medium,
+            thickness_mm=block.thickness, diameter_mm=diameter, stop=block.stop, **shape_of(block), **block.medium
         )
         rows.append(Row(surface, aperture=not math.isnan(diameter)))
     angles, heights = (_edge(file, pairs) for pairs in ((("XAN", "YAN"),), (("XIM", "YIM"), ("XRI", "YRI"))))

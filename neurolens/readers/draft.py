@@ -9,7 +9,7 @@ from pathlib import Path
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_SURFACES
 from neurolens.optics.prescription import Configuration, Lens, Surface
-from neurolens.readers.assemble import check_states, finish, first_order, moved, smaller_stop, with_rims
+from neurolens.readers.assemble import check_states, finish, first_order, smaller_stop, with_rims
 from neurolens.readers.source import unit_mm, warn
 
 
@@ -155,7 +155,7 @@ def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
     if not state.film_given:
         thickness.pop(last, None)
     found = Configuration(state.name, None, tuple(sorted(thickness.items())))
-    there = moved(lens, found)
+    there = lens.with_gaps(dict(found.thickness_mm))
     data = first_order(there)
     opening, f_number = state.stop_diameter, state.f_number
     pupil = state.pupil

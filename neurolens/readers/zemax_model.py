@@ -105,10 +105,8 @@ def shape_of(block: Block) -> dict[str, Any]:
             shape = _round(block, tuple((2 * i, block.parameter(i)) for i in range(1, 9)))
         case "ODDASPHE":
             shape = _round(block, tuple((i, block.parameter(i)) for i in range(1, 9)))
-        case "TOROIDAL":
-            shape = _toroidal(block)
-        case "BICONICX":
-            shape = _biconic(block)
+        case "TOROIDAL" | "BICONICX":
+            shape = _crossed(block)
         case "COORDBRK":
             shape = _round(block, ())  # harmless where every tilt and decentre is 0, which is checked below
     for name, table in (("PARM", block.parameters), ("XDAT", block.extra)):
@@ -136,22 +134,10 @@ def _round(block: Block, terms: tuple[tuple[int, float], ...]) -> dict[str, Any]
     return {"radius_mm": _radius(block.curvature), "conic": conic, "asphere": asphere}
 
 
-def _toroidal(block: Block) -> dict[str, Any]:
-    turn = block.parameter(1)
-    if turn == 0 and block.curvature == 0:
-        return {"radius_mm": math.inf}
-    if turn == 0:
-        return {"radius_mm": _radius(block.curvature), "conic": block.conic, "cylinder": "y"}
-    if block.curvature == 0:
-        return {"radius_mm": turn, "cylinder": "x"}
-    if math.isclose(turn * block.curvature, 1.0, rel_tol=1e-12) and block.conic == 0:
-        return {"radius_mm": turn}
-    found = f"(radii {_radius(block.curvature):g} in y and {turn:g} in x)"
-    raise block.start.error("TOROIDAL", found, "a cylinder: one of the two radii infinite (a torus is not read)")
-
-
-def _biconic(block: Block) -> dict[str, Any]:
-    radius_x, conic_x = block.parameter(1), block.parameter(2)
+def _crossed(block: Block) -> dict[str, Any]:
+    """A toroidal or biconic surface that is a cylinder, or round; PARM 1 and 2 are radius and conic in x."""
+    biconic = block.kind == "BICONICX"
+    radius_x, conic_x = block.parameter(1), block.parameter(2) if biconic else 0.0
     if radius_x == 0 and block.curvature == 0:
         return {"radius_mm": math.inf}
     if radius_x == 0:
@@ -161,7 +147,8 @@ def _biconic(block: Block) -> dict[str, Any]:
     if math.isclose(radius_x * block.curvature, 1.0, rel_tol=1e-12) and conic_x == block.conic:
         return {"radius_mm": radius_x, "conic": conic_x}
     found = f"(radii {_radius(block.curvature):g} in y and {radius_x:g} in x)"
-    raise block.start.error("BICONICX", found, "a cylinder: one of the two radii infinite")
+    expected = "a cylinder: one of the two radii infinite" + ("" if biconic else " (a torus is not read)")
+    raise block.start.error(block.kind, found, expected)
 
 
 MAX_CONFIGURATIONS = 200

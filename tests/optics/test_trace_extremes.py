@@ -71,11 +71,7 @@ def test_wild_numbers_end_a_ray_and_never_leave_as_one(
 
 
 @given(
-    hs.lists(
-        hs.lists(hs.floats(width=32) | hs.floats(-50, 50), min_size=6, max_size=6),
-        min_size=1,
-        max_size=8,
-    ),
+    hs.lists(hs.lists(hs.floats(width=32) | hs.floats(-50, 50), min_size=6, max_size=6), min_size=1, max_size=8),
     hs.sampled_from(sorted(TABLES)),
     hs.sampled_from(["film", "scene"]),
     hs.booleans(),
