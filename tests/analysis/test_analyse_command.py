@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from shipped import LENSES
 
 from neurolens.analysis import layout, plot_style, plots
 from neurolens.cli import main
 from neurolens.commands.analyse import WHATS
 
-LENSES = Path(__file__).parents[2] / "lenses"
 TESSAR = LENSES / "brendel_tessar_100.toml"
 ANAMORPHIC = LENSES / "schneider_anamorphic_31.toml"
 

@@ -6,18 +6,15 @@ import math
 
 import pytest
 import torch
-from lens_models import LENSES
+from shipped import tabled
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import film_tangents, trace, trace_differentials
-
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 
 
 def asphere() -> Lens:
@@ -27,7 +24,7 @@ def asphere() -> Lens:
 
 def lenses() -> dict[str, Lens]:
     names = ("laikin_double_gauss_50", "muller_fisheye_100")
-    return {name: read_lens(LENSES / f"{name}.toml") for name in names} | {"asphere": asphere()}
+    return {name: tabled(name) for name in names} | {"asphere": asphere()}
 
 
 def film_rays(lens: Lens, fx: Tensor, fy: Tensor, px: Tensor, py: Tensor) -> tuple[Rays, Tensor]:
@@ -59,7 +56,7 @@ def test_equal_to_central_differences(name: str) -> None:
 
 
 def test_near_the_axis_of_a_focused_lens_the_direction_turns_by_one_over_the_focal_length() -> None:
-    lens = read_lens(LENSES / "laikin_double_gauss_50.toml").at()
+    lens = tabled("laikin_double_gauss_50").at()
     zero = torch.zeros(1, dtype=torch.float64)
     rays, distance = film_rays(lens, zero, zero, zero, zero)
     dx, dy = trace_differentials(lens, rays, film_tangents(rays, distance)).derivatives
@@ -85,7 +82,7 @@ def test_directions_stay_unit_vectors_and_lost_rays_have_no_derivative() -> None
 
 
 def test_float32_gives_the_same_to_rounding() -> None:
-    lens = read_lens(LENSES / "laikin_double_gauss_50.toml").at()
+    lens = tabled("laikin_double_gauss_50").at()
     points = [torch.linspace(-9, 9, 50, dtype=torch.float64) * k for k in (1.0, 0.5, 0.3, -0.4)]
     found = []
     for dtype in (torch.float64, torch.float32):

@@ -11,14 +11,13 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from shipped import PATHS
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import format_lens, write_lens
 from neurolens.optics.prescription import Coating, Configuration, Lens, Surface
 from neurolens.optics.sag import sag_mm
-
-LENSES = sorted((Path(__file__).parents[2] / "lenses").glob("*.toml"))
 
 # A cemented doublet, the stop, a meniscus; surfaces 0 to 5.
 GOOD = """
@@ -276,8 +275,7 @@ def test_known_dispersion_is_no_warning(tmp_path: Path) -> None:
 
 
 # Round trip
-@pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
-@pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
+@pytest.mark.parametrize("path", PATHS, ids=lambda p: p.stem)
 def test_every_shipped_lens_reads_and_comes_back_exactly(path: Path, tmp_path: Path) -> None:
     lens = read_lens(path)
     assert lens.source and lens.lens_id == path.stem

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from shipped import tabled
 
 from neurolens.base.errors import InputError
 from neurolens.optics.accessories import pinhole, with_hood
 from neurolens.optics.apertures import Aperture
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.radiometry import FilmLight, disc_irradiance, film_light, white_card
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-LENSES = Path(__file__).parents[2] / "lenses"
-
 
 def lens(name: str, **state: float) -> Lens:
-    return read_lens(LENSES / f"{name}.toml").at(**state)
+    return tabled(name).at(**state)
 
 
 def product(light: FilmLight) -> np.ndarray:

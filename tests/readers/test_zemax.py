@@ -16,8 +16,6 @@ from neurolens.optics.prescription import Lens
 from neurolens.readers.draft import Given
 from neurolens.readers.zemax import read_zmx
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-
 HEAD = """\
 VERS 140730 73 26155
 MODE SEQ
