@@ -23,7 +23,7 @@ from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
 from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds
-from neurolens.optics.trace import Rays, film_tangents, trace, trace_differentials
+from neurolens.optics.trace import Rays, film_derivatives, trace, trace_differentials
 
 
 class ExactCamera:
@@ -174,7 +174,7 @@ class ExactCamera:
         rays = camera_rays(fx, fy, film_z, px, py, self._pupil_z_mm)
         gap = film_z - self._pupil_z_mm
         distance = torch.sqrt((fx - px) ** 2 + (fy - py) ** 2 + gap * gap)
-        moves = trace_differentials(self.lens, rays, film_tangents(rays, distance), wavelength).derivatives
+        moves = trace_differentials(self.lens, rays, film_derivatives(rays, distance), wavelength).derivatives
         d_film = torch.stack([torch.stack(list(m)) for m in moves], 1).to(torch.float32).numpy()
         return self._scene(film, pupil, wavelength_nm)._replace(d_film=d_film)
 

@@ -181,7 +181,7 @@ def _read_only(mask: ArrayLike) -> NDArray[np.bool_]:
     """A mask as the dataclass keeps it.
 
     Raises:
-        InputError: it is not an array of two dimensions and a bearable size, or lets nothing through.
+        InputError: it is not an array of two dimensions within the limit of size, or passes no light.
     """
     given = np.asarray(mask)
     if given.ndim != 2 or not 1 <= min(given.shape) <= max(given.shape) <= MAX_MASK or given.dtype.kind not in "bfiu":

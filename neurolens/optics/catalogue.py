@@ -82,7 +82,7 @@ class Glass:
         return total
 
     def _bends(self) -> list[tuple[float, float]]:
-        """The broken line of the absorption as hinges: wavelength, and by how much the slope changes there.
+        """The broken line of the absorption as hinges: wavelength, and by how much the derivative changes there.
 
         Several times faster than a search in a table, and torch fuses it. Counted from the red end, where absorption
         is least, so that float32 does not lose it in the far larger values of the blue.

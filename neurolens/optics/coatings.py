@@ -226,7 +226,7 @@ def _always_propagates(index: Any, n_before: Any, n_after: Any) -> bool:
 
 
 def _propagating(q2: Tensor, phase_per_q: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """cos, sin / q and q sin of the phase q phase_per_q; finite nonsense where q2 <= 0."""
+    """cos, sin / q and q sin of the phase q phase_per_q; finite but without meaning where q2 <= 0."""
     q = torch.sqrt(torch.where(q2 > 0, q2, 1.0))
     phase = q * phase_per_q
     sine = torch.sin(phase)
@@ -253,7 +253,7 @@ def _propagating_or_evanescent(q2: Tensor, phase_per_q: Any) -> tuple[Tensor, Te
     return cosine, sine, q2 * sine, fade
 
 
-# Where a design is best over the visible if nobody says otherwise: the triple layer falls off faster towards violet.
+# Where a design is best over the visible by default: the triple layer falls off faster towards violet.
 DESIGN_NM = 550.0
 BROADBAND_NM = 510.0
 MAGNESIUM_FLUORIDE = 1.38

@@ -28,8 +28,8 @@ from neurolens.optics.trace import trace
 def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) -> list[float]:
     """Values at a place between rows of values: exactly the row at its own place, linear between two rows.
 
-    Piecewise cubic with the slopes of Fritsch and Butland (1984), "A method for constructing local monotone piecewise
-    cubic interpolants": between two rows a value stays between theirs, so that no gap can turn negative on the way.
+    Piecewise cubic with the derivatives of Fritsch and Butland (1984), "A method for constructing local monotone
+    piecewise cubic interpolants": between two rows a value stays between theirs, so that no gap can turn negative.
 
     Args:
         x: [R] ascending places. rows: [R][M] values. place: from x[0] to x[-1].
@@ -45,15 +45,15 @@ def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) 
         return list(rows[i + int(t)])
     found = []
     for values in zip(*rows, strict=True):
-        slope = _slopes(x, values)
+        d = _derivatives(x, values)
         low, high = values[i], values[i + 1]
-        bump = t * (1 - t) * ((1 - t) * (slope[i] * step - (high - low)) - t * (slope[i + 1] * step - (high - low)))
+        bump = t * (1 - t) * ((1 - t) * (d[i] * step - (high - low)) - t * (d[i + 1] * step - (high - low)))
         found.append(low + t * (high - low) + bump)
     return found
 
 
-def _slopes(x: Sequence[float], values: Sequence[float]) -> list[float]:
-    """Slope at every place: a weighted harmonic mean of those beside it, 0 at a turning point."""
+def _derivatives(x: Sequence[float], values: Sequence[float]) -> list[float]:
+    """Derivative at every place: a weighted harmonic mean of those beside it, 0 at a turning point."""
     steps = [b - a for a, b in zip(x, x[1:], strict=False)]
     secants = [(b - a) / h for a, b, h in zip(values, values[1:], steps, strict=False)]
     if len(secants) == 1:
@@ -66,12 +66,12 @@ def _slopes(x: Sequence[float], values: Sequence[float]) -> list[float]:
 
 
 def _end(steps: Sequence[float], secants: Sequence[float]) -> float:
-    """Slope at an end: of the parabola through three values, kept within what stays monotone."""
+    """Derivative at an end: of the parabola through three values, kept within what stays monotone."""
     (h0, h1), (d0, d1) = steps[:2], secants[:2]
-    slope = ((2 * h0 + h1) * d0 - h0 * d1) / (h0 + h1)
-    if slope * d0 <= 0:
+    derivative = ((2 * h0 + h1) * d0 - h0 * d1) / (h0 + h1)
+    if derivative * d0 <= 0:
         return 0.0
-    return 3 * d0 if d0 * d1 <= 0 and abs(slope) > 3 * abs(d0) else slope
+    return 3 * d0 if d0 * d1 <= 0 and abs(derivative) > 3 * abs(d0) else derivative
 
 
 SAME_MM = 0.005  # gaps of two states that differ by less are the same: sources give two decimals

@@ -29,7 +29,7 @@ F_NUMBER_TOLERANCE = 0.05
 BEAM_TOLERANCE = 0.03
 FIELD_TOLERANCE_DEG = 1.0
 BLUR_LIMIT = 0.003  # RMS radius over focal length; a good lens has 0.0001 to 0.0005
-SIMPLE = 2  # refractions up to which nobody expects a sharp image
+SIMPLE = 2  # refractions up to which blur is no sign of a mistake
 DARK = 0.02  # illumination of the corner, relative to the axis
 _TINY_MM = 1e-3
 
@@ -258,7 +258,7 @@ def axial_beam(lens: Lens) -> tuple[float, int | None]:
 def axial_blur_mm(lens: Lens) -> float:
     """RMS radius of the image of an axial point at infinity, in the plane where it is smallest.
 
-    Rays are even over the beam's cross-section; both coordinates count, so that an anamorphic lens out of step shows.
+    Rays are even over the beam's cross-section; both coordinates count, for an anamorphic lens may have two foci.
     """
     reach = min(lens.surfaces[0].semi_diameter_mm, 1.02 * axial_beam(lens)[0])
     side = torch.linspace(-reach, reach, 2 * _SPOT + 1, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""First-order (paraxial) data: focal length, principal planes, pupils, focus. Plain numbers, d line unless told."""
+"""First-order (paraxial) data: focal length, principal planes, pupils, focus. Plain numbers, d line by default."""
 
 from __future__ import annotations
 

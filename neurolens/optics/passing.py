@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,6 +21,7 @@ from neurolens.optics.surfaces import (
     Hit,
     Labels,
     Medium,
+    Mode,
     Rays,
     Survival,
     also,
@@ -72,20 +73,6 @@ UNIT_SLACK = 1e-3
 
 # Rim radius over radius of curvature from which on a sphere's rim is tested by its depth.
 DEEP = 0.25
-
-
-class Mode(NamedTuple):
-    """How to trace: direction of travel (+1 to the film), whether lost rays stay finite on the way, whether they are
-    put on the axis at once (for gradients)."""
-
-    sense: int
-    guard: bool
-    freeze: bool
-
-    @property
-    def spend(self) -> bool:
-        """Whether tests may overwrite the numbers they test: where nobody else needs them, outside a compiler."""
-        return not self.guard and not torch.compiler.is_compiling()
 
 
 def check_rays(rays: Rays, wavelength_nm: Tensor | float) -> None:
@@ -159,11 +146,11 @@ def meet(lens: Lens, k: int, r: Rays, before: Medium, entering: bool, mode: Mode
     surface = lens.surfaces[k]
     plane = _is_plane(surface)
     if plane:
-        hit = intersect_plane(r, mode.sense, mode.guard, mode.spend)
+        hit = intersect_plane(r, mode)
     elif is_plain(surface):
-        hit = intersect_sphere(r, surface.curvature, mode.sense, before, entering, mode.guard, mode.spend)
+        hit = intersect_sphere(r, surface.curvature, mode, before, entering)
     else:
-        hit = intersect_shape(r, surface, mode.sense, before, mode.guard, mode.spend)
+        hit = intersect_shape(r, surface, mode, before)
     tests.require(hit.met, k, st.MISSED)
     if _is_deep(surface):
         # By its depth: a point on the far half of the sphere may be near the axis, but there is no glass.
@@ -191,7 +178,7 @@ def bend(
     if before is after:
         return Rays(hit.x, hit.y, hit.z, r.dx, r.dy, r.dz), hit.q, hit.q2
     c = 0.0 if _is_plane(surface) else surface.curvature
-    bent, q, q2 = refract(r, hit, c, mode.sense, before, after, mode.guard)
+    bent, q, q2 = refract(r, hit, c, mode, before, after)
     if isinstance(before.n, Tensor) or before.n != 1:
         # From air nothing is totally reflected.
         tests.require(positive(q2, spend=mode.spend), k, st.TOTAL_REFLECTION)

@@ -65,7 +65,7 @@ def derive_rims(lens: Lens, rule: RimRule | None = None) -> tuple[Lens, list[Rim
     """The lens with derived rims (marked `rims = "derived"`) and stops, and how they compare with those it had.
 
     Raises:
-        InputError: a rule out of range, a lens whose field nobody states, a lens with cylinders, a field that no ray
+        InputError: a rule out of range, a lens without a stated field, a lens with cylinders, a field that no ray
             through the middle of the stop reaches.
     """
     rule = rule or RimRule()

@@ -1,4 +1,4 @@
-"""What a photographer changes, in this order: zoom, size, f-number, focus. `Lens.at` is the front door.
+"""What a photographer changes, in this order: zoom, size, f-number, focus. Called by `Lens.at`.
 
 Between the zoom states of the source, the places of all groups, measured from the film, are interpolated against log
 focal length; then the focal length and the image's place are made exact by moving the groups behind the first varying

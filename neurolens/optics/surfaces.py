@@ -23,7 +23,7 @@ def positive(value: Tensor, sense: int = 1, *, spend: bool = False) -> Tensor:
     """Whether value * sense > 0, [N]; NaN is not. With `spend` as 1.0 and 0.0 in the place of `value` itself.
 
     Comparisons that give truth values are not vectorised on CPUs and cost five times as much as those in place; only
-    for values that nobody needs afterwards, and never where gradients are wanted.
+    for values that are not used afterwards, and never where gradients are wanted.
     """
     if not spend:
         return value > 0 if sense > 0 else value < 0
@@ -134,6 +134,20 @@ class Rays(NamedTuple):
     dz: Tensor
 
 
+class Mode(NamedTuple):
+    """How to trace: direction of travel (+1 to the film), whether lost rays stay finite on the way, whether they are
+    put on the axis at once (for gradients)."""
+
+    sense: int
+    guard: bool
+    freeze: bool
+
+    @property
+    def spend(self) -> bool:
+        """Whether tests may overwrite the numbers they test: where they are not used again, outside a compiler."""
+        return not self.guard and not torch.compiler.is_compiling()
+
+
 class Medium(NamedTuple):
     """A refractive index with its square and the inverse of that: numbers, or tensors [N] where dispersive."""
 
@@ -179,7 +193,7 @@ def times(a: Tensor, k: Any) -> Tensor:
 
 
 def root(square: Tensor, guard: bool) -> Tensor:
-    """Square root; with `guard`, 1 instead of NaN (or of an infinite slope) where there is none."""
+    """Square root; with `guard`, 1 instead of NaN (or of an infinite derivative) where there is none."""
     if guard:
         return torch.sqrt(torch.where(square > 0, square, 1.0))
     if torch.compiler.is_compiling():
@@ -205,15 +219,13 @@ def _minus_curved(a: Tensor, f: Tensor, n2: Any, curvature: Any) -> Tensor:
     return plus_times(a, times(f, n2), -curvature)
 
 
-def intersect_sphere(
-    r: Rays, curvature: Any, sense: int, before: Medium, entering: bool, guard: bool, spend: bool
-) -> Hit:
+def intersect_sphere(r: Rays, curvature: Any, mode: Mode, before: Medium, entering: bool) -> Hit:
     """Meet a sphere of signed curvature (1/mm) at the root next to the vertex.
 
-    `entering` marks the first surface met, where rays may arrive at more than 90 degrees. `guard` keeps rays without a
-    meeting finite (for gradients and for crossings that are learnt from); without it they are NaN. `spend` is as in
-    `survival.positive`.
+    `entering` marks the first surface met, where rays may arrive at more than 90 degrees. Rays without a meeting are
+    NaN, but finite where the mode guards.
     """
+    sense, guard, spend = mode.sense, mode.guard, mode.spend
     mx, my, mz = nearest_approach(r, before.inverse_n2)
     m2 = (mx * mx).addcmul_(my, my).addcmul_(mz, mz)
     f = plus_times(m2 * curvature, mz, -2.0)
@@ -235,7 +247,7 @@ def intersect_sphere(
         t = f / denominator
         # One comparison: NaN from a negative square fails it too.
         met = positive(denominator, sense, spend=spend)
-    # In place where nobody needs the nearest approach any more: a third less memory to move.
+    # In place where the nearest approach is not used again: a third less memory to move.
     add = Tensor.addcmul_ if spend else torch.addcmul
     x, y, z = add(mx, t, r.dx), add(my, t, r.dy), add(mz, t, r.dz)
     if entering:
@@ -244,8 +256,9 @@ def intersect_sphere(
     return Hit(x, y, z, q, q2, met)
 
 
-def intersect_plane(r: Rays, sense: int, guard: bool, spend: bool) -> Hit:
-    """Meet the plane z = 0; a ray that does not travel along `sense` misses it. Arguments as for a sphere."""
+def intersect_plane(r: Rays, mode: Mode) -> Hit:
+    """Meet the plane z = 0; a ray that does not travel along `sense` misses it."""
+    sense, guard, spend = mode.sense, mode.guard, mode.spend
     q = r.dz * sense
     met = positive(q.clone() if spend else q, spend=spend)
     t = r.z / (torch.where(met, r.dz, float(sense)) if guard else r.dz)
@@ -255,15 +268,15 @@ def intersect_plane(r: Rays, sense: int, guard: bool, spend: bool) -> Hit:
 
 
 def refract(
-    r: Rays, hit: Hit, curvature: Any, sense: int, before: Medium, after: Medium, guard: bool
+    r: Rays, hit: Hit, curvature: Any, mode: Mode, before: Medium, after: Medium
 ) -> tuple[Rays, Tensor, Tensor]:
     """Snell's law: the tangential part of the optical direction cosines stays, the normal part follows their length.
 
     Returns the refracted rays (vertex frame), n' times the cosine of refraction [N], and the square of that before
     guarding, which is not positive where the ray is totally reflected.
     """
-    q2 = hit.q2 + (after.n2 - before.n2)
-    q = root(q2, guard)
+    sense, q2 = mode.sense, hit.q2 + (after.n2 - before.n2)
+    q = root(q2, mode.guard)
     bend = q - hit.q
     if hit.normal is not None:
         direction = (torch.addcmul(p, bend, n, value=sense) for p, n in zip(r[3:], hit.normal, strict=True))

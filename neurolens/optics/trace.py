@@ -234,7 +234,7 @@ class Differentials(NamedTuple):
 
     Attributes:
         traced: as `trace` gives it.
-        derivatives: for every tangent, the derivatives of the resulting ray: x, y, z (mm per unit of the tangent) and
+        derivatives: for every parameter, the derivatives of the resulting ray: x, y, z (mm per unit of it) and
             direction, each [N]; 0 for rays that do not go on. Points move on the last surface.
     """
 
@@ -245,7 +245,7 @@ class Differentials(NamedTuple):
 def trace_differentials(
     lens: Lens,
     rays: Rays,
-    tangents: Sequence[Rays],
+    derivatives: Sequence[Rays],
     wavelength_nm: Tensor | float = glass.LINE_D_NM,
     *,
     towards: Towards = "scene",
@@ -254,35 +254,37 @@ def trace_differentials(
 
     Args:
         lens, rays, wavelength_nm, towards: as for `trace`.
-        tangents: derivatives of the rays with respect to some parameters, one `Rays` each (components [N]), such as
-            those of `film_tangents`.
+        derivatives: of the rays with respect to some parameters, one `Rays` each (components [N]), such as
+            those of `film_derivatives`.
 
     Raises:
-        InputError: as `trace`, and a tangent whose components have not the shape and dtype of the rays.
+        InputError: as `trace`, and a derivative whose components have not the shape and dtype of the rays.
     """
-    for n, tangent in enumerate(tangents):
-        for name, c, r in zip(Rays._fields, tangent, rays, strict=True):
+    for n, derivative in enumerate(derivatives):
+        for name, c, r in zip(Rays._fields, derivative, rays, strict=True):
             if c.shape != r.shape or c.dtype != r.dtype:
                 found = f"({tuple(c.shape)}, {c.dtype})"
-                raise InputError("trace", f"tangents[{n}].{name}", found, f"like the rays: {tuple(r.shape)}, {r.dtype}")
-    traced, derivatives = None, []
-    for tangent in tangents:
+                raise InputError(
+                    "trace", f"derivatives[{n}].{name}", found, f"like the rays: {tuple(r.shape)}, {r.dtype}"
+                )
+    traced, carried = None, []
+    for derivative in derivatives:
         with forward_ad.dual_level():
             dual = Rays(
-                *(forward_ad.make_dual(r.contiguous(), t.contiguous()) for r, t in zip(rays, tangent, strict=True))
+                *(forward_ad.make_dual(r.contiguous(), t.contiguous()) for r, t in zip(rays, derivative, strict=True))
             )
             out = trace(lens, dual, wavelength_nm, towards=towards)
             parts = [forward_ad.unpack_dual(c) for c in out.rays]
-            slopes = (torch.zeros_like(p.primal) if p.tangent is None else p.tangent for p in parts)
+            moved = (torch.zeros_like(p.primal) if p.tangent is None else p.tangent for p in parts)
             # A lost ray was replaced by one along the axis, whose derivative is 0 already; others may carry NaN.
-            derivatives.append(Rays(*(torch.nan_to_num(s, 0.0, 0.0, 0.0) for s in slopes)))
+            carried.append(Rays(*(torch.nan_to_num(s, 0.0, 0.0, 0.0) for s in moved)))
             traced = out._replace(rays=Rays(*(p.primal for p in parts)))
     return Differentials(
-        trace(lens, rays, wavelength_nm, towards=towards) if traced is None else traced, tuple(derivatives)
+        trace(lens, rays, wavelength_nm, towards=towards) if traced is None else traced, tuple(carried)
     )
 
 
-def film_tangents(rays: Rays, distance_mm: Tensor | float) -> tuple[Rays, Rays]:
+def film_derivatives(rays: Rays, distance_mm: Tensor | float) -> tuple[Rays, Rays]:
     """Derivatives of camera rays with respect to the film point's x and y (mm), the pupil point held.
 
     Args:

@@ -112,7 +112,7 @@ def _stacked(vector: Vector) -> Tensor:
 def passage(
     lens: Lens, wavelength_nm: Tensor | float, sense: int, wanted: bool | Literal["polarised"], like: Tensor
 ) -> _Averaged | _Polarised | None:
-    """What follows the power of rays of the shape of `like`, or None where nobody asks for it."""
+    """What follows the power of rays of the shape of `like`, or None where it is not wanted."""
     if not wanted:
         return None
     return (_Polarised if wanted == "polarised" else _Averaged)(lens, wavelength_nm, sense, like)
@@ -122,7 +122,7 @@ class _Absorbed:
     """Power carried along while rays are traced: absorption by Beer and Lambert's law; surfaces are its children's.
 
     These have `pass_surface`, for surface k: rays before it (in its frame), where they meet it, rays after it,
-    n' cos t, the media; and `arrived`, the power of unpolarised light that arrives, [N], without meaning for rays that do not.
+    n' cos t, the media; and `arrived`, the power of unpolarised light that arrives, [N], without meaning for others.
     """
 
     def __init__(self, lens: Lens, wavelength_nm: Tensor | float, sense: int, like: Tensor) -> None:

@@ -142,7 +142,7 @@ def _stop_aperture(draft: Draft) -> float | None:
 
 
 def _states(draft: Draft) -> tuple[State, ...]:
-    """The states of the file; a lone table that is focused near becomes a focus state of its own."""
+    """The states of the file; a table without states that is focused near becomes a focus state of its own."""
     if not draft.states and math.isfinite(draft.object_distance):
         return (State("as filed", object_distance=draft.object_distance, film_given=draft.film_given),)
     return draft.states

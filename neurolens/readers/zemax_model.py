@@ -81,7 +81,7 @@ class Block:
 
 
 def thickness(line: Line, word: str, rest: list[str], *, is_object: bool) -> float:
-    """A thickness; that of the object may be infinite, in words or as a number beyond all measure."""
+    """A thickness; that of the object may be infinite, in words or as a number from 1e9."""
     if is_object and rest == ["INFINITY"]:
         return math.inf
     value = line.numbers(word, rest)[0]
