@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.apertures import Aperture
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FloatArray, RayDifferentials
@@ -20,6 +19,7 @@ from neurolens.cameras.fusedsource import Setting, camera_source
 from neurolens.cameras.graphprogram import program_of
 from neurolens.cameras.lens_film import LensFilm
 from neurolens.cameras.model import UNIT_SLACK, ModelScene, OnnxCamera
+from neurolens.optics.apertures import Aperture
 from neurolens.programs.compiler import load_compiled
 from neurolens.programs.contract import FILM_X_Y, FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH, derivative
 from neurolens.programs.expressions import Program

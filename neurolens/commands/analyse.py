@@ -175,29 +175,22 @@ def _trimmed(what: str, data: dict[str, Any], full: bool) -> dict[str, Any]:
 
 def _analysis(what: str) -> _Analysis:
     """Looked up by name; torch and matplotlib are loaded here, not when the command line starts."""
-    from neurolens.analysis import plot_curves as curves
-    from neurolens.analysis import plot_points
-    from neurolens.analysis.colour import colour
-    from neurolens.analysis.curvature import curvature
-    from neurolens.analysis.distortion import distortion
-    from neurolens.analysis.fans import fans
-    from neurolens.analysis.illumination import illumination
-    from neurolens.analysis.layout import layout_profile
-    from neurolens.analysis.mtf import mtf
-    from neurolens.analysis.plot_layout import lens_layout
-    from neurolens.analysis.psf import psf
+    from neurolens.analysis import plots
+    from neurolens.analysis.field_curves import colour, curvature, distortion, illumination
+    from neurolens.analysis.layout import layout_profile, lens_layout
     from neurolens.analysis.seidel import seidel
-    from neurolens.analysis.spots import spots
+    from neurolens.analysis.spots import fans, mtf, spots
+    from neurolens.analysis.wavefront import psf
 
     return {
         "layout": _Analysis(layout_profile, lens_layout, text.layout),
-        "spots": _Analysis(spots, plot_points.plot_spots, text.spots),
-        "fans": _Analysis(fans, plot_points.plot_fans, text.fans),
-        "colour": _Analysis(colour, curves.plot_colour, text.colour),
-        "curvature": _Analysis(curvature, curves.plot_curvature, text.curvature),
-        "distortion": _Analysis(distortion, curves.plot_distortion, text.distortion),
-        "vignetting": _Analysis(illumination, curves.plot_vignetting, text.vignetting),
-        "mtf": _Analysis(mtf, curves.plot_mtf, text.mtf),
-        "seidel": _Analysis(seidel, curves.plot_seidel, text.seidel),
-        "psf": _Analysis(psf, plot_points.plot_psf, text.psf),
+        "spots": _Analysis(spots, plots.plot_spots, text.spots),
+        "fans": _Analysis(fans, plots.plot_fans, text.fans),
+        "colour": _Analysis(colour, plots.plot_colour, text.colour),
+        "curvature": _Analysis(curvature, plots.plot_curvature, text.curvature),
+        "distortion": _Analysis(distortion, plots.plot_distortion, text.distortion),
+        "vignetting": _Analysis(illumination, plots.plot_vignetting, text.vignetting),
+        "mtf": _Analysis(mtf, plots.plot_mtf, text.mtf),
+        "seidel": _Analysis(seidel, plots.plot_seidel, text.seidel),
+        "psf": _Analysis(psf, plots.plot_psf, text.psf),
     }[what]

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
-    from neurolens.apertures import Aperture
+    from neurolens.optics.apertures import Aperture
     from neurolens.optics.prescription import Lens
 
 

@@ -27,9 +27,9 @@ from neurolens.evaluate.records import plain
 from neurolens.render.film import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS, FilmSettings
 
 if TYPE_CHECKING:
-    from neurolens.apertures import Aperture
     from neurolens.cameras.build import Shot
     from neurolens.cameras.contract import Camera
+    from neurolens.optics.apertures import Aperture
     from neurolens.render.renderer import RenderResult
     from neurolens.render.scene import CameraSettings
 

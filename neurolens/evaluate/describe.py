@@ -10,8 +10,8 @@ import torch
 
 from neurolens.base import status as st
 from neurolens.evaluate.layout import refractions
+from neurolens.optics.focusing import at_infinity
 from neurolens.optics.glass import glass_of, table_notes
-from neurolens.optics.internal import at_infinity
 from neurolens.optics.lenscheck import check_lens, doubts
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens

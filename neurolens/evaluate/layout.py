@@ -1,4 +1,4 @@
-"""The section of a lens with rays to the film of a domain, as the plain data that `plots.lens_layout` draws."""
+"""The section of a lens with rays to the film of a domain: plain data that `analysis.layout.lens_layout` draws."""
 
 from __future__ import annotations
 

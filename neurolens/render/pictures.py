@@ -17,10 +17,10 @@ import OpenEXR
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from neurolens.apertures import MAX_MASK, THRESHOLD, Aperture
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
 from neurolens.cameras.contract import FloatArray
+from neurolens.optics.apertures import MAX_MASK, THRESHOLD, Aperture
 from neurolens.render.colour import SRGB, ColourSpace, conversion, linear_to_srgb, srgb_to_linear
 from neurolens.render.scenetables import BRIGHTEST
 

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from neurolens.apertures import Aperture
 from neurolens.base.config import from_dict
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import read_toml, suggestion
 from neurolens.cameras.contract import FloatArray
+from neurolens.optics.apertures import Aperture
 from neurolens.render import scenetables as tables
 from neurolens.render.film import FilmSettings
 from neurolens.render.illuminants import Spectrum, check_name, check_spectrum, illuminant, read_spectrum
@@ -36,7 +36,7 @@ class CameraSettings(Checked):
         position_m: film-plane centre. look_at_m: a point on the optical axis. up: points to the picture's top.
         focus_m: distance from film to the object in focus. f_number: None leaves it to the lens.
         blades, blade_rotation_deg, blade_curvature, aperture_mask: shape of the stop's opening, see
-            `neurolens.apertures`; the mask is a picture beside the scene. Without them the lens's own, else round.
+            `optics.apertures`; the mask is a picture beside the scene. Without them the lens's own, else round.
         film_width_mm, film_height_mm: the part of the film that is used.
         wavelengths_nm: range of light. width, height: picture in pixels. samples: a pixel.
         max_depth: number of surfaces along a path at which light is scattered.

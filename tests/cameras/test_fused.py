@@ -14,7 +14,6 @@ import numpy as np
 import onnx
 import pytest
 
-from neurolens.apertures import Aperture
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras import fused as fused_module
@@ -25,6 +24,7 @@ from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.fusedexact import FusedExactCamera
 from neurolens.cameras.graphprogram import program_of
 from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.programs import compiler, loworder
 from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH

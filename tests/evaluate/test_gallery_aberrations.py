@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from gallery_shots import GALLERY, measured, shot
 
-from neurolens.analysis.curvature import curvature
-from neurolens.analysis.distortion import RECTILINEAR, distortion
+from neurolens.analysis.field_curves import RECTILINEAR, curvature, distortion
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.seidel import seidel
 from neurolens.cameras.thin import ThinLens

@@ -11,7 +11,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from neurolens.apertures import Aperture
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.exact import ExactCamera
@@ -19,6 +18,7 @@ from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.thin import ThinLens
 from neurolens.evaluate.gallery.measures import bokeh
 from neurolens.evaluate.gallery.measures.lightdiscs import LightDisc, light_disc
+from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.trace import Rays, trace
 from neurolens.render.pictures import make_aperture

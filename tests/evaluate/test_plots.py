@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from neurolens.analysis import plot_layout
+from neurolens.analysis import layout
 from neurolens.base.errors import InputError
 from neurolens.evaluate import plots
 from neurolens.evaluate.plots import style
@@ -53,7 +53,7 @@ def biconvex(**changes: Any) -> dict[str, Any]:
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Every figure made, so that a test can read its axes."""
     made: list[Any] = []
-    for name in ("neurolens.evaluate.plots.trade", "neurolens.evaluate.plots.image", "neurolens.analysis.plot_layout"):
+    for name in ("neurolens.evaluate.plots.trade", "neurolens.evaluate.plots.image", "neurolens.analysis.layout"):
         monkeypatch.setattr(f"{name}.new_figure", lambda *size: made.append(style.new_figure(*size)) or made[-1])
     return made
 
@@ -116,7 +116,7 @@ def test_lens_layout(profile: dict[str, Any], tmp_path: Path, figures: list[Any]
 
 @pytest.mark.parametrize(("radius", "h"), [(50.0, 12.0), (-30.0, 29.9), (math.inf, 7.0), (10.0, 10.0)])
 def test_an_arc_lies_on_its_sphere_up_to_the_rim(radius: float, h: float) -> None:
-    points = plot_layout.arc({"z_mm": 3.0, "radius_mm": radius, "semi_diameter_mm": h})
+    points = layout.arc({"z_mm": 3.0, "radius_mm": radius, "semi_diameter_mm": h})
     assert points[0, 1] == pytest.approx(-h) and points[-1, 1] == pytest.approx(h)
     if math.isfinite(radius):
         assert np.hypot(points[:, 0] - 3.0 - radius, points[:, 1]) == pytest.approx(abs(radius))
@@ -127,7 +127,7 @@ def test_an_arc_lies_on_its_sphere_up_to_the_rim(radius: float, h: float) -> Non
 
 def test_an_element_reaches_out_to_its_wider_rim() -> None:
     profile = biconvex()
-    outline = plot_layout.element_outline(*profile["surfaces"][:2])
+    outline = layout.element_outline(*profile["surfaces"][:2])
     assert np.abs(outline[:, 1]).max() == 12.0 and outline[:, 0].min() == 0.0 and outline[:, 0].max() == 6.0
 
 

@@ -11,10 +11,10 @@ import pytest
 from PIL import Image
 from render_helpers import CAMERA, WHITE, diffuse, radiance, scene, world
 
-from neurolens.apertures import Aperture
 from neurolens.base.errors import InputError
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
+from neurolens.optics.apertures import Aperture
 from neurolens.render import pictures
 from neurolens.render.meshfile import encloses
 from neurolens.render.renderer import render

@@ -9,9 +9,8 @@ from typing import Any
 
 from neurolens.analysis.layout import refractions
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.optics.lenscheck import Check, check_lens, doubts, verdict
+from neurolens.optics.lenscheck import Check, check_lens, doubts, film_edge_mm, verdict
 from neurolens.optics.lensfile import read_lens
-from neurolens.optics.lightcheck import film_edge_mm
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from neurolens.apertures import Aperture
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import FUSED, make_camera
 from neurolens.evaluate.benches.render_times import LENSES, Size, one_render, shot
+from neurolens.optics.apertures import Aperture
 from neurolens.render.scene import Scene
 
 

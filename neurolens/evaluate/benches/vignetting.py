@@ -19,12 +19,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neurolens.apertures import Aperture
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
 from neurolens.evaluate.vignetting import SEED, false_shares, relative_illumination
+from neurolens.optics.apertures import Aperture
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare

@@ -1,6 +1,6 @@
 """Every plot of the report in one place. Matplotlib is imported when one is drawn, not before."""
 
-from neurolens.analysis.plot_layout import lens_layout
+from neurolens.analysis.layout import lens_layout
 from neurolens.evaluate.plots.image import image_caption, side_by_side
 from neurolens.evaluate.plots.light import illumination_plot
 from neurolens.evaluate.plots.trade import error_against_coefficients_plot, pareto_plot

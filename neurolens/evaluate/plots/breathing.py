@@ -8,8 +8,7 @@ from pathlib import Path
 
 from neurolens.base.errors import InputError
 from neurolens.evaluate.plots.style import FIELD_COLOURS, new_figure, plain_log_ticks, save, style
-from neurolens.optics.breathing import Breath, breathing, field_change
-from neurolens.optics.internal import focus_states, nearest_focus_m
+from neurolens.optics.focusing import Breath, breathing, field_change, focus_states, nearest_focus_m
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
 

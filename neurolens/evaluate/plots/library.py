@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neurolens.analysis.plot_layout import (
+from neurolens.analysis.layout import (
     checked_rays,
     checked_surfaces,
     draw_film,
@@ -27,7 +27,7 @@ def sheet(profiles: Sequence[Mapping[str, Any]], path: str | Path) -> Path:
     """Draw lenses in section, light from left to right, each as large as its cell allows, axes of equal scale.
 
     Args:
-        profiles: as `plot_layout.lens_layout` takes them, with title and subtitle.
+        profiles: as `analysis.layout.lens_layout` takes them, with title and subtitle.
         path: PNG, PDF or SVG to write.
     Raises:
         InputError: no lens at all.

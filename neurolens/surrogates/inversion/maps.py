@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from neurolens.base import status as st
-from neurolens.frontsurface import meet_front
+from neurolens.optics.sag import meet_front
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.inversion.derivatives import direction_slopes, field_slopes, slopes_of

@@ -19,7 +19,7 @@ from neurolens.axes import Axis
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
 from neurolens.modelfile import CARD_KEY
-from neurolens.optics.internal import at_infinity
+from neurolens.optics.focusing import at_infinity
 from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.card import card_of, card_to_json, lens_facts, reference_rays
 from neurolens.surrogates.model import LensModel

@@ -9,11 +9,7 @@ from neurolens.base.errors import InputError
 
 
 def film_z_mm(
-    efl_mm: float,
-    front_principal_z_mm: float,
-    rear_principal_z_mm: float,
-    focus_m: float,
-    file: str | Path = "camera",
+    efl_mm: float, front_principal_z_mm: float, rear_principal_z_mm: float, focus_m: float, file: str | Path = "camera"
 ) -> float:
     """Film plane (mm, frame of the principal planes) that focuses an object `focus_m` metres from the film.
 
