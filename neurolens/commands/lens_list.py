@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the table; draw the sheet where asked."""
-    from neurolens.evaluate.benches.library import lens_files, library, sections
+    from neurolens.evaluate.library import lens_files, library, sections
 
     if args.layouts is not None and not args.layouts.parent.is_dir():
         raise InputError(args.layouts, "--layouts", str(args.layouts.parent), "a folder that exists")

@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the table of rims; write the lens with derived rims only where -o asks for it."""
-    from neurolens.evaluate.benches.library import read_quietly
+    from neurolens.evaluate.library import read_quietly
     from neurolens.optics.lenswriter import write_lens
     from neurolens.optics.rims import RimRule, derive_rims, half_field_deg
 

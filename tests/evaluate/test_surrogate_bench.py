@@ -14,11 +14,10 @@ from lens_models import LENSES
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.cli import main
-from neurolens.evaluate.benches import surrogates as surrogate_bench
-from neurolens.evaluate.benches.surrogate_methods import Row, all_rows, chosen_rows
-from neurolens.evaluate.benches.surrogate_page import lens_page, summary_page, write_lens
-from neurolens.evaluate.benches.surrogates import Bench, BenchSettings, run_bench
+from neurolens.evaluate import methods as surrogate_bench
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
+from neurolens.evaluate.methods import Bench, BenchSettings, Row, all_rows, chosen_rows, run_bench
+from neurolens.evaluate.methods_page import lens_page, summary_page, write_lens
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
 
@@ -191,8 +190,7 @@ def test_rows_by_name_group_and_method() -> None:
     ("args", "words"),
     [
         (["nonsense"], ["LENS", "nonsense"]),
-        (["--methods", "nonsense"], ["--methods", "nonsense"]),
-        (["cooke_triplet_50", "--library"], ["--library"]),
+        (["cooke_triplet_50", "--methods", "nonsense"], ["--methods", "nonsense"]),
         (["cooke_triplet_50", str(LENSES / "cooke_triplet_50.toml")], ["names differ"]),
     ],
 )

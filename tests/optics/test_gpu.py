@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neurolens.evaluate.benches.bundles import from_film, generator
+from experiments.extreme_cases import from_film, generator
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.trace import CHUNK, Rays, Traced, trace

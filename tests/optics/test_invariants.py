@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from experiments.extreme_cases import from_film, from_scene, generator, moved, unit
 from neurolens.base import status as st
-from neurolens.evaluate.benches.bundles import from_film, from_scene, generator, moved, unit
 from neurolens.optics import glass
 from neurolens.optics.coatings import design, reflectance
 from neurolens.optics.lensfile import read_lens

@@ -16,7 +16,6 @@ from neurolens.base.errors import InputError, ModelError, NeurolensError
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
-from neurolens.render import bench
 from neurolens.render.renderer import render
 from neurolens.render.sums import Film, Tiling
 from neurolens.render.watch import Watch
@@ -270,8 +269,3 @@ def test_errors_are_clear(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("neurolens.render.sums.BATCH", 64)
     with pytest.raises(NeurolensError, match=r"^a render worker failed: RuntimeError: no rays today \(.*\.py:\d+\)$"):
         render(made, Broken(50.0, FILM), threads=2, **small)
-
-
-def test_the_bench_says_one_line_of_a_missing_scene(capsys: pytest.CaptureFixture[str]) -> None:
-    assert bench.main(["nosuch.toml"]) == 2
-    assert "nosuch.toml" in capsys.readouterr().err

@@ -16,12 +16,12 @@ import onnx
 import pytest
 import torch
 
+from experiments import outside
 from neurolens.axes import Axis, product, weights
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import OnnxLens, load_model
-from neurolens.evaluate.benches import outside
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.state_errors import check_states, random_states, space_of_card
 from neurolens.evaluate.vignetting import vignetting_errors

@@ -1,0 +1,36 @@
+"""The benchmark of inverse maps: its records are read back, and its counts are what they say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from experiments.inverse import BenchSettings, measure_lens, page, read_records, write_records
+from neurolens.base.errors import InputError
+
+LENSES = Path(__file__).parents[2] / "lenses"
+
+
+@pytest.mark.slow
+def test_a_lens_is_measured_and_its_record_read_back(tmp_path: Path) -> None:
+    record = measure_lens(LENSES / "cooke_triplet_50.toml", BenchSettings(rays=2000, uniform=500, terms=24))
+    for dtype in ("float64", "float32"):
+        assert record["ours"][dtype]["stop"]["converged"] == record["ours"][dtype]["scene"]["converged"] == 1
+    uniform = record["uniform"]
+    shares = [uniform[k] for k in ("passed", "blocked", "outside", "unsolved")]
+    assert sum(shares) == pytest.approx(1) and uniform["missed"] <= uniform["unsolved"]
+    missed = list(record["published"]["scene"]["missed"].values())
+    assert missed == sorted(missed, reverse=True)  # more steps miss no more, where the map is tame
+    refused = {"lens": "other", "refused": "a reason"}
+    text = write_records([record, refused], tmp_path)
+    assert text == (tmp_path / "inverse.md").read_text() and "cooke_triplet_50" in text and "a reason" in text
+    assert read_records(tmp_path / "inverse.json") == {"cooke_triplet_50": record, "other": refused}
+
+
+def test_records_that_are_none_are_refused(tmp_path: Path) -> None:
+    assert read_records(tmp_path / "inverse.json") == {}
+    (tmp_path / "inverse.json").write_text("[]")
+    with pytest.raises(InputError, match="inverse"):
+        read_records(tmp_path / "inverse.json")
+    assert "Inverse maps" in page([])
