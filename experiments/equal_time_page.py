@@ -31,13 +31,13 @@ from experiments.equal_time import (
     scene_file,
 )
 from experiments.equal_time_errors import Estimate, crossover_s, log_interpolate
-from neurolens.analysis.plot_style import heading
+from neurolens.analysis.plot_style import FAINT, INK, heading, new_figure, plain_log_ticks, save, style
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import whole
-from neurolens.evaluate.plots.image import side_by_side
-from neurolens.evaluate.plots.style import FAINT, INK, family_colour, new_figure, plain_log_ticks, save, style
+from neurolens.evaluate.figures import side_by_side
+from neurolens.evaluate.plots import family_colour
 from neurolens.evaluate.records import plain
 
 _INTRO = """\
@@ -106,13 +106,13 @@ def _scene_text(result: SceneResult) -> str:
             f"## {stem}\n",
             f"Focused at {result.settings.focus_m:g} m, f/{result.f_number:.3g}."
             f" The reference's own noise: {noise:.3g}%; FLIP between its halves {result.flip_halves:.3g}.\n",
-            *_table(
+            lab.table(
                 ["camera", "bias paired %", "bias alone %", "variance a sample", "ms a sample", "efficiency 1/s"]
                 + [f"{name} ahead" for name in _exacts(result)],
                 [_law_cells(result, c) for c in result.cameras.values()],
             ),
             "",
-            *_table(
+            lab.table(
                 ["camera", f"{most} samples: error %", "FLIP", f"{seconds:.3g} s: samples", "error %", "FLIP"]
                 + ["FLIP paired", "film median", "film 99%"],
                 [_equal_cells(result, c, seconds) for c in result.cameras.values()],
@@ -121,10 +121,6 @@ def _scene_text(result: SceneResult) -> str:
             f"![FLIP maps]({stem}-flip.png)\n\n![Film-space error]({stem}-film.png)\n",
         ]
     )
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    return ["| " + " | ".join(cells) + " |" for cells in (head, ["---"] * len(head), *rows)]
 
 
 def _law_cells(result: SceneResult, camera: CameraResult) -> list[str]:

@@ -156,11 +156,6 @@ def failures(rows: Sequence[Row]) -> list[str]:
     return found
 
 
-def to_json(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """The rows as plain tables."""
-    return [asdict(r) for r in rows]
-
-
 _HEAD = "case|rays|pass|float32: mm|of the size|rad|status differs within|beyond|NaN|float64: mm|rad|status differs"
 _NOTES = """\
 Largest errors over the rays that pass. float32 is held against float64 on the same rays (rounded to float32 first):
@@ -193,12 +188,12 @@ def table(rows: Sequence[Row]) -> str:
     """The rows as tables in Markdown, one a group."""
     lines: list[str] = []
     for group in dict.fromkeys(r.group for r in rows):
-        lines += [f"\n## {group}\n", f"| {_HEAD.replace('|', ' | ')} |", "|---" * (_HEAD.count("|") + 1) + "|"]
+        cells = []
         for r in (r for r in rows if r.group == group):
-            shown = f"{r.position_mm:.1e} | {r.relative:.1e} | {r.angle_rad:.1e}"
-            counts = f"{r.within} | {r.beyond} | {r.not_finite}"
-            fine = f"{r.exact_mm:.1e} | {r.exact_rad:.1e} | {r.exact_status}"
-            lines.append(f"| {r.name} | {r.rays} | {r.passed} | {shown} | {counts} | {fine} |")
+            errors = [f"{v:.1e}" for v in (r.position_mm, r.relative, r.angle_rad)]
+            exact = [f"{r.exact_mm:.1e}", f"{r.exact_rad:.1e}", r.exact_status]
+            cells.append([r.name, r.rays, r.passed, *errors, r.within, r.beyond, r.not_finite, *exact])
+        lines += [f"\n## {group}\n", lab.table(_HEAD, cells)]
     return "\n".join(lines) + "\n"
 
 
@@ -380,7 +375,7 @@ def run(args: argparse.Namespace) -> int:
             report(len(done) / len(cases))
     bad = failures(done)
     text = page(done, bad)
-    lab.write_results(args.out, "extremes", text, to_json(done))
+    lab.write_results(args.out, "extremes", text, [asdict(row) for row in done])
     print(text)
     for line in bad:
         print(f"experiments: {line}", file=sys.stderr)

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from neurolens.analysis.plot_style import FIELD_COLOURS, INK, new_figure, save, style
 from neurolens.base.errors import NeurolensWarning
 from neurolens.base.files import atomic_write_text
-from neurolens.evaluate.plots.style import FIELD_COLOURS, INK, new_figure, save, style
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.radiometry import FilmLight, film_light, white_card
 
@@ -49,10 +49,6 @@ def main() -> None:
     atomic_write_text(OUT / "film_light.json", json.dumps({"film_radius_mm": radius.tolist(), "lenses": table}) + "\n")
     film_light_picture(lights, OUT / "film_light.png")
     white_card_picture(lights[CARD], (36.0, 24.0), f"White card, {CARD}", OUT / "white_card.png")
-
-
-if __name__ == "__main__":
-    main()
 
 
 _FACTORS = {
@@ -126,3 +122,7 @@ def _profile_on(axes: Any, radius: Any, values: Any, film_mm: tuple[float, float
     inside = radius <= width / 2
     axes.plot(radius[inside], (values[inside] - 0.5) * height, color=FIELD_COLOURS[3], lw=1.6)
     axes.set(xlim=(-width / 2, width / 2), ylim=(-height / 2, height / 2 * 1.12))
+
+
+if __name__ == "__main__":
+    main()

@@ -20,8 +20,6 @@ from typing import Any
 import numpy as np
 
 from experiments import lab
-from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxsession import open_session
@@ -33,8 +31,8 @@ from neurolens.evaluate.candidates import (
     model_candidate,
     program_candidate,
 )
+from neurolens.evaluate.describe import refractions
 from neurolens.evaluate.experiment import LensChoice
-from neurolens.evaluate.layout import refractions
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.speed import Call, Candidate, Race, race
 from neurolens.optics.prescription import Lens
@@ -103,18 +101,6 @@ class Row:
     reason: str | None = None
     speedup: dict[str, float] = field(default_factory=dict)
     load: float | None = None
-
-
-def selected(only: str) -> list[Case]:
-    """Cases whose file name holds a text.
-
-    Raises:
-        InputError: none does.
-    """
-    found = [c for c in CASES if only in c.file]
-    if not found:
-        raise InputError("bench fused", "--only", only, f"part of one of: {', '.join(c.file for c in CASES)}")
-    return found
 
 
 def small_enough(prepared: Prepared, choices: Sequence[ModelSettings]) -> tuple[LensModel, float]:
@@ -256,17 +242,10 @@ which it traces hundreds of millions of rays."""
 
 def write(rows: Sequence[Row], folder: Path, rounds: int) -> str:
     """Write fused_speed.md and fused_speed.json; returns the page."""
-    folder.mkdir(parents=True, exist_ok=True)
     text = page(rows, rounds)
-    data = {
-        "machine": lab.machine(),
-        "rounds": rounds,
-        "flags": FLAGS,
-        "goals": goals(rows),
-        "rows": [asdict(r) for r in rows],
-    }
-    atomic_write_text(folder / "fused_speed.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
-    atomic_write_text(folder / "fused_speed.md", text)
+    data = {"machine": lab.machine(), "rounds": rounds, "flags": FLAGS}
+    data |= {"goals": [g.to_dict() for g in goals(rows)], "rows": [asdict(r) for r in rows]}
+    lab.write_results(folder, "fused_speed", text, data)
     return text
 
 
@@ -280,13 +259,9 @@ def earlier(folder: Path, names: Collection[str]) -> list[Row]:
         return []
 
 
-def goals(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """What is asked of the fastest model within 1 um, against the rows: goal, wanted, measured, at_most, holds."""
-    found: list[dict[str, Any]] = []
-
-    def goal(text: str, wanted: float, measured: float | None, *, at_most: bool) -> None:
-        holds = None if measured is None else measured <= wanted if at_most else measured >= wanted
-        found.append({"goal": text, "wanted": wanted, "measured": measured, "at_most": at_most, "holds": holds})
+def goals(rows: Sequence[Row]) -> list[lab.Goal]:
+    """What is asked of the fastest model within 1 um, against the rows."""
+    found = []
 
     for words, ending, work, wanted in (
         ("fused", _FUSED, "ray", 6.0),
@@ -297,7 +272,8 @@ def goals(rows: Sequence[Row]) -> list[dict[str, Any]]:
         ("onnxruntime", _GRAPH, "whole", 40.0),
     ):
         row = _fastest(rows, 12, work, ending)
-        goal(f"ns per ray, 12 refractions, {words}, {work}", wanted, _ns(row), at_most=True)
+        ns = float(row.ns["min"]) if row is not None and row.ns else None
+        found.append(lab.Goal(f"ns per ray, 12 refractions, {words}, {work}", wanted, ns))
     for exact in ("exact C", "exact torch"):
         for count, ending, work, wanted in (
             (12, _FUSED, "ray", 5.0),
@@ -312,15 +288,12 @@ def goals(rows: Sequence[Row]) -> list[dict[str, Any]]:
             row = _fastest(rows, count, work, ending)
             kind = "onnxruntime" if ending == _GRAPH else "fused"
             ratio = None if row is None else row.speedup.get(exact)
-            goal(f"times as fast as {exact}, {count} refractions, {kind}, {work}", wanted, ratio, at_most=False)
+            text = f"times as fast as {exact}, {count} refractions, {kind}, {work}"
+            found.append(lab.Goal(text, wanted, ratio, at_least=True))
     return found
 
 
 _FUSED, _FOLDED, _GRAPH = ", C", ", one wavelength", ", onnxruntime"
-
-
-def _ns(row: Row | None) -> float | None:
-    return float(row.ns["min"]) if row is not None and row.ns else None
 
 
 def _fastest(rows: Sequence[Row], refractions: int, work: str, ending: str) -> Row | None:
@@ -332,11 +305,9 @@ def _fastest(rows: Sequence[Row], refractions: int, work: str, ending: str) -> R
 
 def page(rows: Sequence[Row], rounds: int) -> str:
     """The whole page."""
-    m = lab.machine()
     parts = ["# Fused models against the exact lens", "`python -m experiments fused`"]
     parts.append(_NOTES.format(rounds=rounds, flags=" ".join(FLAGS), wavelength=WAVELENGTH_NM))
-    parts.append(f"{m['processor']}, {m['cores']} cores; Python {m['python']}, torch {m['torch']}.{_busy(rows)}")
-    parts += [_goal_table(rows), _table(rows)]
+    parts += [lab.machine_line() + _busy(rows), lab.goal_table("goal", goals(rows)), _table(rows)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -352,29 +323,18 @@ def _busy(rows: Sequence[Row]) -> str:
     )
 
 
-def _goal_table(rows: Sequence[Row]) -> str:
-    lines = ["| goal | wanted | measured | |", "|---|---|---|---|"]
-    for g in goals(rows):
-        verdict = "not measured" if g["holds"] is None else "reached" if g["holds"] else "missed"
-        measured = "" if g["measured"] is None else f"{g['measured']:.3g}"
-        bound = "at most" if g["at_most"] else "at least"
-        lines.append(f"| {g['goal']} | {bound} {g['wanted']:g} | {measured} | {verdict} |")
-    return "\n".join(lines)
-
-
 def _table(rows: Sequence[Row]) -> str:
     head = (
         "lens|refractions|candidate|work|RMS um|coefficients|operations|bytes|ns per ray|over exact C|over exact torch"
     )
-    lines = ["| " + head.replace("|", " | ") + " |", "|---" * 11 + "|"]
+    lines = []
     for r in rows:
         ns = f"{r.ns['min']:.2f} ({r.ns['median']:.2f})" if r.ns else f"unavailable: {r.reason}"
         operations = "" if r.operations is None else f"{r.operations} ({r.roots})"
         ratios = [f"{r.speedup[k]:.2f}" if k in r.speedup else "" for k in ("exact C", "exact torch")]
-        cells = [r.lens, r.refractions, r.name, r.work, "" if r.rms_um is None else f"{r.rms_um:.2g}"]
-        cells += [r.coefficients or "", operations, r.bytes or "", ns, *ratios]
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(lines)
+        rms = None if r.rms_um is None else f"{r.rms_um:.2g}"
+        lines.append([r.lens, r.refractions, r.name, r.work, rms, r.coefficients, operations, r.bytes, ns, *ratios])
+    return lab.table(head, lines)
 
 
 ABOUT = """\
@@ -398,7 +358,7 @@ def run(args: argparse.Namespace) -> int:
     lab.quiet_glasses()
     find_compiler()
     rounds = args.rounds or (5 if args.quick else 20)
-    cases = selected(args.only)
+    cases = lab.chosen(CASES, lambda c: c.file, args.only, "fused")
     progress = Progress({c.file: 1.0 for c in cases}, quiet=args.quiet)
     rows, text = earlier(args.out, [Path(c.file).stem for c in cases]), ""
     for case in cases:

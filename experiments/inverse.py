@@ -7,7 +7,6 @@ steps, with the Jacobian of the polynomial. Both work on the same model, so that
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import warnings
 from collections.abc import Sequence
@@ -21,11 +20,9 @@ from torch import Tensor
 from experiments import lab
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import whole
 from neurolens.evaluate.experiment import LensChoice
-from neurolens.evaluate.records import kept_rows
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
@@ -170,22 +167,11 @@ def _reachable(inverse: InverseModel, rays: FilmRays, x: Tensor, y: Tensor) -> T
     return found
 
 
-def read_records(path: Path) -> dict[str, dict[str, Any]]:
-    """Records of an earlier run, by lens.
-
-    Raises:
-        InputError: as `kept_rows`.
-    """
-    return kept_rows(path, "lenses", "lens", "experiments inverse")
-
-
 def write_records(records: Sequence[dict[str, Any]], folder: Path) -> str:
     """Write inverse.json and inverse.md; returns the page."""
-    folder.mkdir(parents=True, exist_ok=True)
     rows = sorted(records, key=lambda r: str(r["lens"]))
-    atomic_write_text(folder / "inverse.json", json.dumps({"lenses": rows}, indent=1, allow_nan=False) + "\n")
     text = page(rows)
-    atomic_write_text(folder / "inverse.md", text)
+    lab.write_results(folder, "inverse", text, {"lenses": rows})
     return text
 
 
@@ -195,13 +181,14 @@ def page(records: Sequence[dict[str, Any]]) -> str:
     lines = [_INTRODUCTION.format(steps=STEPS, tolerance=TOLERANCE), ""]
     lines += [*_table(done, "stop"), "", *_table(done, "scene")]
     lines += ["", "## Stop points uniform over the stop", "", _UNIFORM, ""]
-    lines += ["| lens | passed | blocked | outside | no ray | missed | published: 3 | 5 | 10 | 20 | away |"]
-    lines += ["|---|---|---|---|---|---|---|---|---|---|---|"]
+    rows = []
     for r in done:
         u = r["uniform"]
         shares = [u[k] for k in ("passed", "blocked", "outside", "unsolved", "missed")]
         shares += [*u["published_missed"].values(), u["published_away"][str(max(PUBLISHED_STEPS))]]
-        lines.append(f"| {r['lens']} | {' | '.join(map(_percent, shares))} |")
+        rows.append([r["lens"], *map(_percent, shares)])
+    head = "lens|passed|blocked|outside|no ray|missed|published: 3|5|10|20|away"
+    lines.append(lab.table(head, rows))
     raw = [r for r in done if "raw" in r]
     lines += ["", *_raw_table(raw)] if raw else []
     refused = [f"- {r['lens']}: {r['refused']}" for r in records if "refused" in r]
@@ -230,29 +217,29 @@ Its polynomials are wilder off the data, and full steps from the first-order map
 
 
 def _raw_table(done: Sequence[dict[str, Any]]) -> list[str]:
-    lines = ["## A model of raw monomials", "", _RAW, ""]
-    lines += ["| lens | map | published: 3 | 5 | 10 | 20 | away | ours: 3 |", "|---|---|---|---|---|---|---|---|"]
+    rows = []
     for r in done:
         for which in ("stop", "scene"):
             p = r["raw"]["published"][which]
             shares = [*p["missed"].values(), p["away"][str(max(PUBLISHED_STEPS))]]
             shares.append(1 - r["raw"]["ours"][which]["converged"])
-            lines.append(f"| {r['lens']} | {which} | {' | '.join(map(_percent, shares))} |")
-    return lines
+            rows.append([r["lens"], which, *map(_percent, shares)])
+    table = lab.table("lens|map|published: 3|5|10|20|away|ours: 3", rows)
+    return ["## A model of raw monomials", "", _RAW, "", table]
 
 
 def _table(done: Sequence[dict[str, Any]], which: str) -> list[str]:
     title = {"stop": "Film point and stop point to ray", "scene": "Scene ray to film"}[which]
-    head = "| lens | rays | published: 3 | 5 | 10 | 20 | away | ours: 2 | 3 | 3, float32 | other | fit s |"
-    lines = [f"## {title}", "", head, "|---|---|---|---|---|---|---|---|---|---|---|---|"]
+    rows = []
     for r in done:
         p = r["published"][which]
         ours = [1 - r["two_steps"][which]["converged"]]
         ours += [1 - r["ours"][dtype][which]["converged"] for dtype in ("float64", "float32")]
         other = r["ours"]["float64"][which]["other"]
         cells = [*p["missed"].values(), p["away"][str(max(PUBLISHED_STEPS))], *ours, other]
-        lines.append(f"| {r['lens']} | {r['rays']} | {' | '.join(map(_percent, cells))} | {r['fit']['seconds']:.1f} |")
-    return lines
+        rows.append([r["lens"], r["rays"], *map(_percent, cells), f"{r['fit']['seconds']:.1f}"])
+    head = "lens|rays|published: 3|5|10|20|away|ours: 2|3|3, float32|other|fit s"
+    return [f"## {title}", "", lab.table(head, rows)]
 
 
 def _percent(share: float) -> str:
@@ -276,10 +263,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure what is missing, and write the tables after each lens."""
-    files = [f for f in sorted(lab.LENSES.glob("*.toml")) if args.only in f.stem]
-    if not files:
-        raise InputError("experiments inverse", "--only", args.only, "part of the name of a lens file")
-    records = read_records(args.out / "inverse.json")
+    files = lab.chosen(sorted(lab.LENSES.glob("*.toml")), lambda f: f.stem, args.only, "inverse")
+    records = lab.kept_rows(args.out / "inverse.json", "lenses", "lens", "experiments inverse")
     missing = [f for f in files if args.again or f.stem not in records]
     progress = Progress({f.stem: 20.0 for f in missing}, quiet=args.quiet)
     text = page(list(records.values()))

@@ -9,12 +9,13 @@ import platform
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from neurolens import __version__
-from neurolens.base.errors import NeurolensError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
 
 ROOT = Path(__file__).parents[1]
@@ -47,11 +48,82 @@ def write_results(folder: Path, name: str, page: str, data: Any) -> None:
     atomic_write_text(folder / f"{name}.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[Any]], align: str = "") -> str:
-    """A table in Markdown; "" for a cell that is None, `align` the line of dashes where it is not plain."""
-    lines = ["| " + " | ".join(header) + " |", align or "|---" * len(header) + "|"]
-    lines += ["| " + " | ".join("" if cell is None else str(cell) for cell in row) + " |" for row in rows]
-    return "\n".join(lines)
+def kept_rows(path: Path, listed: str, named: str, maker: str) -> dict[str, dict[str, Any]]:
+    """Rows of an earlier run of a benchmark, by name; none where there is no such file.
+
+    Args:
+        listed, named: keys of the list of rows, and of a row's name. maker: the command that writes the file.
+
+    Raises:
+        InputError: a file that holds something else.
+    """
+    if not path.is_file():
+        return {}
+    try:
+        return {str(row[named]): dict(row) for row in json.loads(path.read_text(encoding="utf-8"))[listed]}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(path, "file", f"({type(error).__name__})", f"records of {maker}") from error
+
+
+def table(header: str | Sequence[str], rows: Iterable[Sequence[Any]], missing: str = "") -> str:
+    """A table in Markdown; a header in one string is cut at "|", `missing` stands for cells that are None."""
+    heads = header.split("|") if isinstance(header, str) else list(header)
+    lines = [heads, ["---"] * len(heads), *([missing if c is None else str(c) for c in row] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A figure that is asked for; `worst` names the case that decides, where several are covered."""
+
+    text: str
+    wanted: float
+    measured: float | None
+    at_least: bool = False
+    worst: str = ""
+
+    @property
+    def verdict(self) -> str:
+        if self.measured is None:
+            return "not measured"
+        reached = self.measured >= self.wanted if self.at_least else self.measured <= self.wanted
+        return "reached" if reached else "missed"
+
+    @property
+    def bound(self) -> str:
+        return "at least" if self.at_least else "at most"
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self) | {"verdict": self.verdict}
+
+
+def goal_table(heading: str, goals: Iterable[Goal]) -> str:
+    """Goals as a table, and whether they are reached."""
+    rows = ([g.text, f"{g.bound} {g.wanted:g}", _three(g.measured), g.verdict] for g in goals)
+    return table([heading, "wanted", "measured", ""], rows)
+
+
+def _three(value: float | None) -> str:
+    return "" if value is None else f"{value:.3g}"
+
+
+def chosen(items: Sequence[T], name: Callable[[T], str], only: str, what: str) -> list[T]:
+    """Those whose name holds the text of --only.
+
+    Raises:
+        InputError: none does; `what` names the measurement.
+    """
+    found = [item for item in items if only in name(item)]
+    if not found:
+        known = ", ".join(dict.fromkeys(name(item) for item in items))
+        raise InputError(f"experiments {what}", "--only", only, f"part of one of: {known}")
+    return found
+
+
+def machine_line(before_versions: str = "") -> str:
+    """Processor, cores and versions in a line."""
+    m = machine()
+    return f"{m['processor']}, {m['cores']} cores{before_versions}; Python {m['python']}, torch {m['torch']}."
 
 
 def machine() -> dict[str, Any]:

@@ -28,12 +28,11 @@ from neurolens.base.files import atomic_path
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import exact_candidates, model_candidate
-from neurolens.evaluate.check import check_model
+from neurolens.evaluate.check import check_model, check_states
 from neurolens.evaluate.experiment import Experiment
 from neurolens.evaluate.measure import Measured, fit_and_measure, shared_rays
 from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
 from neurolens.evaluate.speed import race
-from neurolens.evaluate.state_errors import check_states
 from neurolens.evaluate.train_states import fit_and_measure_states, state_settings
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm

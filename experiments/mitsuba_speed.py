@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import argparse
 import cProfile
-import json
 import math
 import pstats
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -25,13 +24,12 @@ import numpy as np
 
 import neurolens
 from experiments import lab
+from experiments.renderer_speed import thin_camera
 from neurolens import mitsuba
 from neurolens.base.errors import NeurolensError
-from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.commands.arguments import whole
 from neurolens.evaluate.records import plain
 from neurolens.mitsuba import require_mitsuba
@@ -247,13 +245,6 @@ _HELPERS = {"dot", "take", "cut"}  # which count as part of those who call them
 Function = tuple[str, int, str]
 
 
-def thin_camera(scene: Scene) -> ThinLens:
-    """A 50 mm thin lens with the scene's focus and stop, as `experiments.renderer_speed` has it."""
-    settings = scene.settings.camera
-    film_mm = (settings.film_width_mm, settings.film_height_mm)
-    return ThinLens(50.0, settings.f_number or 2.8, settings.focus_m, film_mm)
-
-
 def profile(scene: Scene, camera: Camera, width: int, height: int, samples: int) -> dict[str, float]:
     """Share of the time of each of `STAGES` in a render by one worker, adding up to 1."""
     profiler = cProfile.Profile()
@@ -320,9 +311,6 @@ def memory_of(scene_file: str, width: int, samples: int) -> dict[str, Any]:
     return {"width": width, "height": height, "samples": samples, "growth_mb": grown / 1e6}
 
 
-NAME = "render_speed"
-
-
 @dataclass
 class Found:
     """What was measured: rows of `mitsuba_speed.record`, of scenes and of memory; `missing`: what was not, and why."""
@@ -367,14 +355,9 @@ def page(found: Found) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
 def _speed_table(rows: list[dict[str, Any]]) -> str:
     header = ("renderer", "a path carries", "camera", "Mpath/s, fastest", "median", "time", "mean R G B", "noise")
-    return _table(
+    return lab.table(
         header,
         [
             (
@@ -394,7 +377,7 @@ def _speed_table(rows: list[dict[str, Any]]) -> str:
 
 def _scene_table(rows: list[dict[str, Any]]) -> str:
     header = ("scene", "surfaces a path", "Mpath/s, fastest", "median", *(f"{stage} %" for stage in STAGES))
-    return _table(
+    return lab.table(
         header,
         [
             (
@@ -427,17 +410,14 @@ def _pixels(row: dict[str, Any]) -> int:
 
 def _memory_table(rows: list[dict[str, Any]]) -> str:
     cells = [(f"{r['width']} x {r['height']}", str(r["samples"]), f"{r['growth_mb']:.0f}") for r in rows]
-    return _table(("picture", "samples", "MB"), cells)
+    return lab.table(("picture", "samples", "MB"), cells)
 
 
 def write(found: Found, out: Path) -> str:
     """Write render_speed.md and .json into `out`; returns the page."""
     text = page(found)
-    out.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(out / f"{NAME}.md", text)
     data = {k: getattr(found, k) for k in ("versions", "rows", "scenes", "memory", "missing")}
-    data["settings"] = vars(found.settings)
-    atomic_write_text(out / f"{NAME}.json", json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
+    lab.write_results(out, "render_speed", text, plain(data | {"settings": vars(found.settings)}))
     return text
 
 

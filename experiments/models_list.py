@@ -11,8 +11,8 @@ from typing import Any
 from neurolens.base.config import read_config
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
+from neurolens.evaluate.describe import lens_files
 from neurolens.evaluate.experiment import DomainChoice, LensChoice, check_names
-from neurolens.evaluate.library import lens_files
 from neurolens.evaluate.train import versions
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings

@@ -195,11 +195,11 @@ def check_floors(root: Path, rounds: int = 20) -> list[Floor]:
 
 def floor_table(floors: Sequence[Floor]) -> str:
     """The floors as a table in Markdown."""
-    lines = ["| what | measured | floor | unit | verdict |", "|---|---|---|---|---|"]
+    rows = []
     for f in floors:
         shown = f"({f.reason})" if f.measured is None else f"{f.measured:.3g}"
-        lines.append(f"| {f.name} | {shown} | {f.floor:g} | {f.unit} | {f.verdict} |")
-    return "\n".join(lines) + "\n"
+        rows.append([f.name, shown, f"{f.floor:g}", f.unit, f.verdict])
+    return lab.table("what|measured|floor|unit|verdict", rows) + "\n"
 
 
 COMPILED, EAGER = "exact compiled", "exact eager"
@@ -232,20 +232,20 @@ def table_rows(state: str, timed: Race) -> list[dict[str, Any]]:
 
 def markdown(title: str, conditions: str, rows: Sequence[dict[str, Any]]) -> str:
     """A page with the rows as a table."""
-    columns = "lens|candidate|ns per ray, best|median|Mray/s|batch|threads|over compiled|over eager".split("|")
-    lines = ["| " + " | ".join(columns) + " |", "|---" * len(columns) + "|"]
+    lines: list[list[Any]] = []
     for row in rows:
         t = row["ns_per_ray"]
         if t is None:
-            lines.append(f"| {row['lens']} | {row['name']} | unavailable: {row['reason']} | | | | | | |")
+            lines.append([row["lens"], row["name"], f"unavailable: {row['reason']}", *[""] * 6])
             continue
-        figures = f"{t['min']:.1f} | {t['median']:.1f} | {1000 / t['min']:.1f} | {t['batch']} | {t['threads']}"
-        ratios = " | ".join(_ratio(row[key]) for key in ("speedup_over_compiled", "speedup_over_eager"))
-        lines.append(f"| {row['lens']} | {row['name']} | {figures} | {ratios} |")
+        figures = [f"{v:.1f}" for v in (t["min"], t["median"], 1000 / t["min"])]
+        ratios = [_ratio(row[key]) for key in ("speedup_over_compiled", "speedup_over_eager")]
+        lines.append([row["lens"], row["name"], *figures, t["batch"], t["threads"], *ratios])
     loads = [v for row in rows for v in row["load"] if v is not None]
     if loads:
         conditions += f" Load average of the machine meanwhile: up to {max(loads):.1f} on {os.cpu_count()} cores."
-    return f"# {title}\n\n{conditions}\n\n" + "\n".join(lines) + "\n"
+    head = "lens|candidate|ns per ray, best|median|Mray/s|batch|threads|over compiled|over eager"
+    return f"# {title}\n\n{conditions}\n\n{lab.table(head, lines)}\n"
 
 
 def _ratio(found: dict[str, float] | None) -> str:

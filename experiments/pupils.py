@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -16,14 +15,12 @@ from numpy.typing import NDArray
 from torch.quasirandom import SobolEngine
 
 from experiments import lab
-from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_write_text
+from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, new_figure, save, style
 from neurolens.base.progress import Progress
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.commands.arguments import whole
-from neurolens.evaluate.plots.style import FAINT, FIELD_COLOURS, INK, new_figure, save, style
 from neurolens.optics import pupil_methods as known
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
@@ -304,19 +301,20 @@ def page(passages: Sequence[Passage], pixel: Sequence[tuple[float, float, float]
     parts = [_INTRO.format(width=width, height=height, samples=samples)]
     head = ["lens", "f/", "dark %", *METHODS, "lost", "search s", "ns"]
     rows = [_row(p) for p in passages]
-    parts += [_table(head, rows), _METHODS]
+    parts += [lab.table(head, rows) + "\n", _METHODS]
     light = [[_name(p), f"{p.case.f_number:g}", *(f"{100 * p.rates[m].light:.1f}" for m in METHODS)] for p in passages]
-    parts += ["## Light found, percent\n", _table(["lens", "f/", *METHODS], light)]
+    parts += ["## Light found, percent\n", lab.table(["lens", "f/", *METHODS], light) + "\n"]
     sources = dict.fromkeys(f"- {_name(p)}: {p.case.source}." for p in passages if p.case.source)
     parts += ["Figures in brackets:\n", "\n".join(sources) + "\n"]
     if pixel:
         parts += [
             "## Closing the stop: Tessar 50 mm, one pixel, rear rim\n",
             "Pixel (128, 96) of 512 x 384 on 36 x 27 mm, d line; Steinert 2009, Table 5.3, in the second row.\n",
-            _table(
+            lab.table(
                 ["f/", *(f"{n:g}" for n, _, _ in pixel)],
                 [["ours", *(f"{a:.2f}" for _, a, _ in pixel)], ["theirs", *(f"{b:g}" for _, _, b in pixel)]],
-            ),
+            )
+            + "\n",
         ]
     return "\n".join(parts)
 
@@ -343,11 +341,6 @@ def _row(p: Passage) -> list[str]:
     ]
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)]) + "\n"
-
-
 def write(
     passages: Sequence[Passage],
     pixel: Sequence[tuple[float, float, float]],
@@ -357,11 +350,9 @@ def write(
     folder: Path,
 ) -> str:
     """Write passage.md, passage.json and passage.png (the cases shown, with their cameras); returns the page."""
-    folder.mkdir(parents=True, exist_ok=True)
     text = page(passages, pixel, samples)
-    atomic_write_text(folder / "passage.md", text)
     data = {"film_mm": FILM_MM, "samples": samples, "cases": [_json(p) for p in passages], "tessar_pixel": list(pixel)}
-    atomic_write_text(folder / "passage.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
+    lab.write_results(folder, "passage", text, data)
     with style():
         save(picture(shown, cameras), folder / "passage.png")
     return text
@@ -472,10 +463,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure every case of the theses and draw three."""
     lab.quiet_glasses()
-    cases = [case for case in CASES if args.only in case.lens]
-    if not cases:
-        known = ", ".join(dict.fromkeys(case.lens for case in CASES))
-        raise InputError("experiments pupils", "--only", args.only, f"part of one of: {known}")
+    cases = lab.chosen(CASES, lambda case: case.lens, args.only, "pupils")
     with Progress(quiet=args.quiet).stage("pupils") as report:
         done = []
         for case in cases:

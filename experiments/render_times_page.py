@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import torch
 
@@ -31,9 +30,9 @@ from experiments.render_times import (
     Subject,
     Timed,
 )
+from neurolens.analysis.plot_style import INK, new_figure, save, style
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
-from neurolens.evaluate.plots.style import INK, new_figure, save, style
 
 ABOVE_THIN, MOVES, PER_REFRACTION = 0.05, 0.30, 0.10  # the goals, as shares
 _NOTES = """\
@@ -70,28 +69,14 @@ class Found:
         return next((r for s in self.subjects if s.kind == kind and (r := self.row(s, scene))), None)
 
 
-@dataclass(frozen=True)
-class Goal:
-    """A goal and the worst case of what it covers."""
-
-    text: str
-    wanted: float
-    measured: float | None
-    worst: str
-
-    @property
-    def verdict(self) -> str:
-        return "not measured" if self.measured is None else "met" if self.measured <= self.wanted else "missed"
-
-
-def goals(found: Found) -> list[Goal]:
+def goals(found: Found) -> list[lab.Goal]:
     """The goals of the issue, in every scene, for every kind of camera; the worst lens counts."""
     result = []
 
     def add(text: str, wanted: float, shares: dict[str, float | None]) -> None:
         known = {name: v for name, v in shares.items() if v is not None}
         worst = max(known, key=lambda name: known[name], default="")
-        result.append(Goal(text, wanted, known.get(worst), worst))
+        result.append(lab.Goal(text, wanted, known.get(worst), worst=worst))
 
     for kind in (*FUSED_MODELS, *GRAPHS):
         for scene in SCENES:
@@ -145,37 +130,23 @@ def write(found: Found, out: Path) -> str:
 
 def page(found: Found) -> str:
     """All tables."""
-    m = lab.machine()
     parts = ["# Render time by camera", "`python -m experiments render`"]
     parts.append(_NOTES.format(**vars(found.size), **SCENES, more=CHEAP_ROUNDS))
-    parts.append(f"{m['processor']}, {m['cores']} cores, one of them used; Python {m['python']}, torch {m['torch']}.")
-    parts += ["## Goals", _goal_table(found)]
-    if any(r.seconds for r in found.rows):
+    parts.append(lab.machine_line(", one of them used"))
+    aims = [[g.text, f"at most {_percent(g.wanted)}", _percent(g.measured), g.worst, g.verdict] for g in goals(found)]
+    parts += ["## Goals", lab.table("goal|wanted|measured, worst lens|lens|", aims, "–")]
+    timed = {r.scene for r in found.rows if r.seconds}
+    if timed:
         parts.append("![Seconds over refractions](render_times.png)")
-        parts += [f"## Seconds, {scene}\n\n{_scene_table(found, scene)}" for scene in SCENES if _timed(found, scene)]
+        parts += [f"## Seconds, {scene}\n\n{_scene_table(found, scene)}" for scene in SCENES if scene in timed]
     parts += ["## Cameras by themselves", _camera_table(found)]
     if found.shapes:
         parts += ["## Shapes of the stop", _shape_table(found.shapes)]
     return "\n\n".join(parts) + "\n"
 
 
-def _timed(found: Found, scene: str) -> bool:
-    return any(r.scene == scene and r.seconds for r in found.rows)
-
-
-def _table(head: str, rows: Sequence[Sequence[Any]]) -> str:
-    count = head.count("|") + 1
-    lines = ["| " + head.replace("|", " | ") + " |", "|---" * count + "|"]
-    return "\n".join([*lines, *("| " + " | ".join("–" if c is None else str(c) for c in row) + " |" for row in rows)])
-
-
 def _percent(share: float | None) -> str | None:
     return None if share is None else f"{100 * share:.3g}%"
-
-
-def _goal_table(found: Found) -> str:
-    rows = [[g.text, f"at most {_percent(g.wanted)}", _percent(g.measured), g.worst, g.verdict] for g in goals(found)]
-    return _table("goal|wanted|measured, worst lens|lens|", rows)
 
 
 def _scene_table(found: Found, scene: str) -> str:
@@ -192,7 +163,7 @@ def _scene_table(found: Found, scene: str) -> str:
     legend = (
         "Seconds (median); overhead over the pinhole per refraction; share of the camera. Ideal cameras stand in the"
     )
-    return f"{legend}\nfirst column.\n\n{_table(head, rows)}"
+    return f"{legend}\nfirst column.\n\n{lab.table(head, rows, '–')}"
 
 
 def _cell(found: Found, subject: Subject, scene: str) -> str | None:
@@ -219,7 +190,7 @@ def _camera_table(found: Found) -> str:
         "differentials add|their error|rays that pass|made in s"
     )
     missing = [f"{s.name}: {s.reason}." for s in found.subjects if s.reason]
-    return "\n\n".join([_table(head, rows), *missing])
+    return "\n\n".join([lab.table(head, rows, "–"), *missing])
 
 
 def _shape_table(shapes: Sequence[Shape]) -> str:
@@ -229,7 +200,7 @@ def _shape_table(shapes: Sequence[Shape]) -> str:
         for s in shapes
     ]
     note = "Biconvex lens, C, cheap scene. Passage and time over the round stop's, area over the disc's."
-    return f"{note}\n\n{_table('stop|area|rays that pass|time', rows)}"
+    return f"{note}\n\n{lab.table('stop|area|rays that pass|time', rows, '–')}"
 
 
 def _csv(found: Found) -> str:

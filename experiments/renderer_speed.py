@@ -18,8 +18,15 @@ from neurolens.render.embree import EmbreeMesh
 from neurolens.render.mesh import Mesh
 from neurolens.render.primitives import Primitive, Rays
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scenefile import Scene, load_scene
 from neurolens.render.wavelengths import LANES
+
+
+def thin_camera(scene: Scene) -> ThinLens:
+    """A 50 mm thin lens with the scene's focus and stop."""
+    settings = scene.settings.camera
+    film_mm = (settings.film_width_mm, settings.film_height_mm)
+    return ThinLens(50.0, settings.f_number or 2.8, settings.focus_m, film_mm)
 
 
 def measure(
@@ -37,9 +44,7 @@ def measure(
     if repeats < 1:
         raise InputError("bench", "repeats", repeats, "an integer above 0")
     loaded = load_scene(scene)
-    settings = loaded.settings.camera
-    film_mm = (settings.film_width_mm, settings.film_height_mm)
-    camera = ThinLens(50.0, settings.f_number or 2.8, settings.focus_m, film_mm)
+    camera = thin_camera(loaded)
     stats = [
         render(loaded, camera, samples=samples, threads=threads, max_depth=depth, seed=k).stats for k in range(repeats)
     ]

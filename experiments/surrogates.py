@@ -7,7 +7,7 @@ import argparse
 from experiments import lab
 from neurolens.base.errors import InputError
 from neurolens.commands import bench
-from neurolens.evaluate.library import lens_files
+from neurolens.evaluate.describe import lens_files
 
 # A standard lens, a long zoom, one that is hard for its aperture, a fisheye, and one of steep aspheres.
 DEFAULT_LENSES = (

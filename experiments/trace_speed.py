@@ -8,10 +8,9 @@ turn, round after round (`speed.race`), so that ratios within a race are fair.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +18,10 @@ import torch
 
 from experiments import lab
 from neurolens.base import status as st
-from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import whole
 from neurolens.evaluate.candidates import COMPILED_BATCHES, EAGER_BATCHES
-from neurolens.evaluate.layout import refractions
+from neurolens.evaluate.describe import refractions
 from neurolens.evaluate.speed import POOL, Call, Candidate, Race, Unavailable, race
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
@@ -46,22 +43,6 @@ LENSES = {
 MAIN = 12  # the double Gauss on which the goals stand, with and without aspheres
 ASPHERIC_SURFACES = (0, 12)  # of that double Gauss: first and last, where aspheres are used
 DTYPES = (torch.float32, torch.float64)
-
-
-@dataclass(frozen=True)
-class Goal:
-    """A figure that the tracer is meant to reach: on one thread, 12 refractions."""
-
-    text: str
-    wanted: float
-    at_least: bool
-    measured: float | None
-
-    @property
-    def verdict(self) -> str:
-        if self.measured is None:
-            return "not measured"
-        return "reached" if (self.measured >= self.wanted) == self.at_least else "missed"
 
 
 def chosen_lenses(folder: Path) -> tuple[dict[int, Lens], list[str]]:
@@ -197,30 +178,17 @@ def _row(name: str, lens: Lens, timed: Race, passing: float) -> dict[str, Any]:
     return row
 
 
-def goals(rows: Sequence[dict[str, Any]]) -> list[Goal]:
+def goals(rows: Sequence[dict[str, Any]]) -> list[lab.Goal]:
     """What the tracer is meant to reach, against the rows of the main lens on one thread in float32."""
     main = [r for r in rows if r["threads"] == 1 and r["refractions"] == MAIN and r["dtype"] == "float32"]
     found = []
     for kind, wanted in (("eager", 10.0), ("compiled", 30.0)):
         best = [r["ns_min"] for r in main if r["kind"] == kind and not r["aspheres"] and "ns_min" in r]
-        found.append(Goal(f"Mray/s per core, {kind}", wanted, True, 1000 / min(best) if best else None))
+        found.append(lab.Goal(f"Mray/s per core, {kind}", wanted, 1000 / min(best) if best else None, at_least=True))
     for kind in ("eager", "compiled"):
         ratios = [r["over_spheres"]["min"] for r in main if r["kind"] == kind and r.get("over_spheres")]
-        found.append(Goal(f"times slower with two aspheres, {kind}", 1.7, False, min(ratios) if ratios else None))
+        found.append(lab.Goal(f"times slower with two aspheres, {kind}", 1.7, min(ratios) if ratios else None))
     return found
-
-
-def selected(lenses: dict[int, Lens], only: str) -> dict[int, Lens]:
-    """Those whose file name holds a text.
-
-    Raises:
-        InputError: none does.
-    """
-    left = {n: lens for n, lens in lenses.items() if only in Path(lens.path).stem}
-    if not left:
-        known = ", ".join(Path(lens.path).stem for lens in lenses.values())
-        raise InputError("bench trace", "--only", only, f"part of one of: {known}")
-    return left
 
 
 SIZES = (100_000, 1_000_000, 10_000_000)
@@ -279,23 +247,21 @@ class Found:
 
 def write(found: Found, folder: Path) -> None:
     """Write trace_speed.md and trace_speed.json, each whole or not at all."""
-    folder.mkdir(parents=True, exist_ok=True)
     data = {
         "machine": lab.machine(),
         "rounds": found.rounds,
         "rows": found.rows,
         "memory": found.memory,
-        "goals": [asdict(g) | {"verdict": g.verdict} for g in goals(found.rows)],
+        "goals": [g.to_dict() for g in goals(found.rows)],
         "missing": found.missing,
     }
-    atomic_write_text(folder / "trace_speed.json", json.dumps(data, indent=1) + "\n")
-    atomic_write_text(folder / "trace_speed.md", page(found))
+    lab.write_results(folder, "trace_speed", page(found), data)
 
 
 def page(found: Found) -> str:
     """The whole page."""
     parts = ["# The exact tracer", "`python -m experiments trace`", _conditions(found)]
-    parts += [goal_table(found.rows), speed_table(found.rows)]
+    parts += [lab.goal_table("goal (12 refractions, float32, one thread)", goals(found.rows)), speed_table(found.rows)]
     if found.memory:
         parts.append(memory_table(found.memory))
     if found.missing:
@@ -307,20 +273,7 @@ def _conditions(found: Found) -> str:
     m = lab.machine()
     loads = [v for row in found.rows for v in row["load"] if v is not None]
     busy = f" Load average meanwhile up to {max(loads):.1f}." if loads else ""
-    return (
-        NOTES.format(rounds=found.rounds)
-        + f"\n\n{m['processor']}, {m['cores']} cores, {m['vectors']}; Python {m['python']}, torch {m['torch']}.{busy}"
-    )
-
-
-def goal_table(rows: Sequence[dict[str, Any]]) -> str:
-    """The goals, and whether they are reached."""
-    lines = ["| goal (12 refractions, float32, one thread) | wanted | measured | |", "|---|---|---|---|"]
-    for g in goals(rows):
-        bound = "at least" if g.at_least else "at most"
-        measured = "" if g.measured is None else f"{g.measured:.3g}"
-        lines.append(f"| {g.text} | {bound} {g.wanted:g} | {measured} | {g.verdict} |")
-    return "\n".join(lines)
+    return f"{NOTES.format(rounds=found.rounds)}\n\n{lab.machine_line(', ' + m['vectors'])}{busy}"
 
 
 def speed_table(rows: Sequence[dict[str, Any]]) -> str:
@@ -328,21 +281,17 @@ def speed_table(rows: Sequence[dict[str, Any]]) -> str:
     kinds = [(kind, dtype) for dtype in ("float32", "float64") for kind in ("eager", "compiled")]
     kinds = [k for k in kinds if any((r["kind"], r["dtype"]) == k for r in rows)]
     columns = ["lens", "refractions", "aspheres", "cylinders", "threads", *(f"{k} {d}, Mray/s" for k, d in kinds), ""]
-    lines = ["| " + " | ".join(columns) + " |", "|---" * len(columns) + "|"]
+    lines = []
     groups: dict[tuple[Any, ...], dict[tuple[str, str], dict[str, Any]]] = {}
     for r in rows:
         key = (r["lens"], r["refractions"], r["aspheres"], r["cylinders"], r["threads"])
         groups.setdefault(key, {})[r["kind"], r["dtype"]] = r
     for key, cells in groups.items():
-        ratios = [f"{k} {cells[k, d]['over_spheres']['min']:.2f}" for k, d in kinds if _ratio(cells.get((k, d)))]
+        aspheric = [(k, c) for k, d in kinds if (c := cells.get((k, d))) and c.get("over_spheres")]
+        ratios = [f"{k} {c['over_spheres']['min']:.2f}" for k, c in aspheric]
         note = f"times as long as spheres: {', '.join(ratios)}" if ratios else ""
-        shown = [_speed(cells.get(k)) for k in kinds]
-        lines.append("| " + " | ".join([*map(str, key), *shown, note]) + " |")
-    return "\n".join(lines)
-
-
-def _ratio(row: dict[str, Any] | None) -> bool:
-    return row is not None and row.get("over_spheres") is not None
+        lines.append([*key, *(_speed(cells.get(k)) for k in kinds), note])
+    return lab.table(columns, lines)
 
 
 def _speed(row: dict[str, Any] | None) -> str:
@@ -353,15 +302,9 @@ def _speed(row: dict[str, Any] | None) -> str:
 
 def memory_table(memory: Sequence[dict[str, Any]]) -> str:
     """Memory beyond rays and results."""
-    lines = [
-        "Memory of one call of `trace` (12 refractions, float32, one thread), each size in a process of its own:",
-        "",
-        "| rays | results, MB | growth of resident memory, MB | tracing itself, MB |",
-        "|---|---|---|---|",
-    ]
-    for m in memory:
-        lines.append(f"| {m['rays']:,} | {m['results_mb']:.1f} | {m['growth_mb']:.1f} | {m['working_mb']:.1f} |")
-    return "\n".join(lines)
+    note = "Memory of one call of `trace` (12 refractions, float32, one thread), each size in a process of its own:"
+    rows = [[f"{m['rays']:,}", *(f"{m[key]:.1f}" for key in ("results_mb", "growth_mb", "working_mb"))] for m in memory]
+    return f"{note}\n\n{lab.table('rays|results, MB|growth of resident memory, MB|tracing itself, MB', rows)}"
 
 
 ABOUT = """\
@@ -386,7 +329,8 @@ def run(args: argparse.Namespace) -> int:
     """Time the tracer, lens by lens; the table is written after each."""
     lab.quiet_glasses()
     lenses, missing = chosen_lenses(lab.LENSES)
-    lenses = selected({MAIN: lenses[MAIN]} if args.quick else lenses, args.only)
+    lenses = {MAIN: lenses[MAIN]} if args.quick else lenses
+    lenses = {n: lenses[n] for n in lab.chosen(list(lenses), lambda n: Path(lenses[n].path).stem, args.only, "trace")}
     rounds = args.rounds or (5 if args.quick else 20)
     found = Found(rounds, missing=[] if args.quick or args.only else missing)
     threads = args.threads[:1] if args.quick else args.threads

@@ -22,15 +22,14 @@ import torch
 from torch import Tensor
 
 from experiments import lab
+from neurolens.analysis.plot_style import FIELD_COLOURS, INK, new_figure, save, style
 from neurolens.apertures import Aperture
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import whole
+from neurolens.evaluate.describe import lens_files, read_quietly
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
-from neurolens.evaluate.library import lens_files, read_quietly
-from neurolens.evaluate.plots.style import FIELD_COLOURS, INK, new_figure, save, style
 from neurolens.evaluate.vignetting import SEED, false_shares, relative_illumination
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
@@ -109,11 +108,7 @@ def measure(file: Path, domain: str, rays: int) -> dict[str, Any]:
 
 
 def measure_all(
-    files: Sequence[Path],
-    domains: Sequence[str],
-    rays: int,
-    folder: Path,
-    report: Callable[[float], None],
+    files: Sequence[Path], domains: Sequence[str], rays: int, folder: Path, report: Callable[[float], None]
 ) -> list[dict[str, Any]]:
     """Measure and write after every lens; rows of other lenses in the folder's vignetting.json stay.
 
@@ -130,12 +125,10 @@ def measure_all(
         expected = "rows of experiments vignetting"
         raise InputError(target, "file", f"({type(error).__name__})", expected) from error
     jobs = [(file, domain) for file in files for domain in domains]
-    folder.mkdir(parents=True, exist_ok=True)
     for i, (file, domain) in enumerate(jobs):
         rows[file.stem, domain] = measure(file, domain, rays)
         done = sorted(rows.values(), key=lambda r: (r["domain"], r["lens"]))
-        atomic_write_text(target, json.dumps(done, indent=1, allow_nan=False) + "\n")
-        atomic_write_text(folder / "vignetting.md", page(done))
+        lab.write_results(folder, "vignetting", page(done), done)
         report((i + 1) / len(jobs))
     return sorted(rows.values(), key=lambda r: (r["domain"], r["lens"]))
 
@@ -165,13 +158,12 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         if not mine:
             continue
         head = ["lens", *OPENINGS, "light", "passing", "gates", "terms", "s"]
-        lines = [f"## {title}\n", "| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
-        lines += [_line(r) for r in good]
+        lines = [_line(r) for r in good]
         for name, choose in (("**median**", statistics.median), ("**worst**", max)):
             if good:
                 lines.append(_summary(name, choose, good))
-        lines += [f"- {r['lens']}: {r['failed']}" for r in mine if "failed" in r]
-        parts.append("\n".join(lines) + "\n")
+        failed = [f"- {r['lens']}: {r['failed']}" for r in mine if "failed" in r]
+        parts.append("\n".join([f"## {title}\n", lab.table(head, lines), *failed]) + "\n")
     return "\n".join(parts)
 
 
@@ -179,21 +171,21 @@ def _percent(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.3f}"
 
 
-def _line(row: dict[str, Any]) -> str:
+def _line(row: dict[str, Any]) -> list[str]:
     pairs = [f"{_percent(o['false_pass'])} / {_percent(o['false_block'])}" for o in row["openings"].values()]
     light = _percent(row["illumination"]["max_difference"])
     rest = [f"{100 * row['passing_share']:.0f}%", str(row["gates"]), str(row["monomials"]), f"{row['seconds']:.1f}"]
-    return "| " + " | ".join([row["lens"], *pairs, light, *rest]) + " |"
+    return [row["lens"], *pairs, light, *rest]
 
 
-def _summary(name: str, choose: Callable[[list[float]], float], rows: Sequence[dict[str, Any]]) -> str:
+def _summary(name: str, choose: Callable[[list[float]], float], rows: Sequence[dict[str, Any]]) -> list[str]:
     cells = []
     for opening in OPENINGS:
         both = ([r["openings"][opening][k] for r in rows] for k in ("false_pass", "false_block"))
         known = ([v for v in values if v is not None] for values in both)  # None where no ray counts
         cells.append(" / ".join(_percent(choose(values) if values else None) for values in known))
     cells.append(_percent(choose([r["illumination"]["max_difference"] for r in rows])))
-    return "| " + " | ".join([name, *cells, "", "", "", ""]) + " |"
+    return [name, *cells, "", "", "", ""]
 
 
 _RADII = (0.0, 0.4, 0.7, 0.9, 1.0)  # shares of the film radius

@@ -6,7 +6,6 @@ One model a case, measured at random states against the exact lens, beside model
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,14 +16,11 @@ from experiments import lab
 from neurolens import __version__
 from neurolens.axes import Axis
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress, Report
 from neurolens.commands.arguments import whole
 from neurolens.evaluate.experiment import near_limit_m, wavelengths_nm
-from neurolens.evaluate.plots.states import panels_plot
 from neurolens.evaluate.rays import ray_errors
-from neurolens.evaluate.records import kept_rows
-from neurolens.evaluate.train_states import fit_and_measure_states
+from neurolens.evaluate.train_states import fit_and_measure_states, panels_plot
 from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
@@ -112,24 +108,14 @@ def _fixed(space: StateSpace, place: float) -> dict[str, float]:
     return {axis.name: value, "rms_um": errors["rms_um"], "direction_rms_deg": errors["direction_rms_deg"]}
 
 
-def read_records(file: Path) -> dict[str, dict[str, Any]]:
-    """Records of earlier runs, by case.
-
-    Raises:
-        InputError: as `kept_rows`.
-    """
-    return kept_rows(file, "cases", "case", "experiments zoom")
-
-
 def write_records(records: Mapping[str, Mapping[str, Any]], out: Path) -> str:
     """Write zoom.json, zoom.md and zoom.png; returns the page."""
     order = [c.name for c in CASES]
     rows = sorted(records.values(), key=lambda r: order.index(r["case"]) if r["case"] in order else len(order))
     out.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(out / "zoom.json", json.dumps({"cases": rows}, indent=1, allow_nan=False) + "\n")
     panels_plot([(r["case"], Axis.from_dict(r["axes"][0]), r["states"], r["fixed"]) for r in rows], out / "zoom.png")
     text = page(rows)
-    atomic_write_text(out / "zoom.md", text)
+    lab.write_results(out, "zoom", text, {"cases": rows})
     return text
 
 
@@ -210,7 +196,7 @@ def run(args: argparse.Namespace) -> int:
     if unknown:
         raise InputError("experiments zoom", "CASE", unknown[0], f"one of: {', '.join(known)}")
     args.models.mkdir(parents=True, exist_ok=True)
-    records = read_records(args.out / "zoom.json")
+    records = lab.kept_rows(args.out / "zoom.json", "cases", "case", "experiments zoom")
     missing = [known[n] for n in args.cases or known if args.again or n not in records]
     progress = Progress(dict.fromkeys((c.name for c in missing), 60.0), quiet=args.quiet)
     text = page(list(records.values()))

@@ -14,10 +14,10 @@ from PIL import Image as Pictures
 
 from experiments.gallery.cameras import TITLES
 from experiments.gallery.view import luminance
+from neurolens.analysis.plot_style import new_figure, style
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
 from neurolens.evaluate.image import Image, to_srgb
-from neurolens.evaluate.plots.style import new_figure, style
 
 DPI = 100  # a picture of 240 pixels is 2.4 inches wide: one pixel of it, one of the figure
 MOST_BYTES = 250_000

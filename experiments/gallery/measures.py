@@ -32,10 +32,7 @@ def falloff(view: View) -> dict[str, float]:
     """
     corner = view.shot.panel.option("edge_mm", math.hypot(*view.shot.film_mm) / 2)
     middle, half, edge = illumination(view.camera, np.array([0.0, 0.5, NEAR_CORNER]) * corner)
-    return {
-        "light_half_way_percent": 100 * half / middle,
-        "light_near_the_corner_percent": 100 * edge / middle,
-    }
+    return {"light_half_way_percent": 100 * half / middle, "light_near_the_corner_percent": 100 * edge / middle}
 
 
 def against_post(view: View) -> dict[str, float]:

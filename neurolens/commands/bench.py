@@ -128,7 +128,7 @@ def _lens_files(names: list[str]) -> list[Path]:
     Raises:
         InputError: no such file, or two of one name, whose records would be the same file.
     """
-    from neurolens.evaluate.project import project_root
+    from neurolens.evaluate.describe import project_root
 
     files = []
     for name in names:

@@ -242,12 +242,7 @@ def program_candidate(name: str, program: Program, domain: Domain, stop_radius_m
 
 
 def fused_candidate(
-    name: str,
-    model: LensModel | Sequence[LensModel] | Path,
-    domain: Domain,
-    *,
-    parts: Parts = ALL,
-    fixed: Fixed = FREE,
+    name: str, model: LensModel | Sequence[LensModel] | Path, domain: Domain, *, parts: Parts = ALL, fixed: Fixed = FREE
 ) -> Candidate | None:
     """A model, or that of an exported file, as compiled C; None where there is no compiler, or no form in C.
 

@@ -20,8 +20,7 @@ from neurolens.base.progress import Progress, Report
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import exact_candidates, fused_candidate, model_candidate
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
-from neurolens.evaluate.fresh import FreshRays, measure
-from neurolens.evaluate.measure import onnx_predictor, shared_rays
+from neurolens.evaluate.measure import FreshRays, measure, onnx_predictor, shared_rays
 from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
 from neurolens.evaluate.records import break_even_rays, plain
 from neurolens.evaluate.speed import Race, race

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from neurolens.analysis.plot_style import INK, new_figure, plain_log_ticks, save, style
 from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.methods import GROUPS
-from neurolens.evaluate.plots.style import INK, new_figure, place_labels, plain_log_ticks, save, style
+from neurolens.evaluate.plots import place_labels
 from neurolens.evaluate.records import number, pareto_front
 
 Record = Mapping[str, Any]
@@ -87,7 +88,7 @@ NOTES = (
 def lens_page(name: str, records: Sequence[Record], facts: str) -> str:
     """The table of one lens, group by group."""
     head = ["method", *(c.heading for c in COLUMNS)]
-    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    lines = _heading(head)
     for record in _ordered(records):
         if record["failed"]:
             lines.append(f"| {record['method']} | failed: {_cell(record['failed'])} |" + " |" * (len(head) - 2))
@@ -106,7 +107,7 @@ def summary_page(found: Mapping[str, Sequence[Record]], facts: str) -> str:
     every = [r for records in found.values() for r in records]
     methods = {r["method"]: r for r in _ordered(every)}
     head = ["method", "lenses", *(c.heading for c in SUMMED)]
-    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    lines = _heading(head)
     for method in methods:
         rows = [r for r in every if r["method"] == method]
         good = [r for r in rows if not r["failed"]]
@@ -131,6 +132,10 @@ def write_lens(name: str, records: Sequence[Record], facts: str, folder: Path) -
     atomic_write_text(folder / f"{name}.md", text)
 
 
+def _heading(cells: Sequence[str]) -> list[str]:
+    return ["| " + " | ".join(cells) + " |", "|---" * len(cells) + "|"]
+
+
 def _ordered(records: Sequence[Record]) -> list[Record]:
     """Group by group, in each as given."""
     return sorted(records, key=lambda r: list(GROUPS).index(r["group"]))
@@ -152,7 +157,7 @@ def _median_and_worst(column: Column, records: Sequence[Record]) -> str:
 
 def _by_lens(found: Mapping[str, Sequence[Record]], methods: Sequence[str]) -> list[str]:
     """Every lens by every method, the worst of the first method first."""
-    lines = ["| lens | " + " | ".join(methods) + " |", "|---" * (len(methods) + 1) + "|"]
+    lines = _heading(["lens", *methods])
     rows = {lens: {r["method"]: r for r in records if not r["failed"]} for lens, records in found.items()}
 
     def worst(lens: str) -> float:
@@ -175,7 +180,6 @@ def _cell(text: str) -> str:
     return text.replace("|", "/")
 
 
-surrogates_Record = Mapping[str, Any]
 _LOOK = {  # Okabe and Ito's colours; shapes tell the groups apart without them
     "paraxial": ("#7f7f7f", "D"),
     "published": ("#e69f00", "s"),
@@ -188,7 +192,7 @@ _ERRORS = {
 }
 
 
-def trade_plot(name: str, records: Sequence[surrogates_Record], exact: Sequence[surrogates_Record], path: Path) -> bool:
+def trade_plot(name: str, records: Sequence[Record], exact: Sequence[Record], path: Path) -> bool:
     """Draw both panels, logarithmic; hollow markers are fused C. Returns whether there was anything to draw.
 
     Exact tracers, which have no error, are lines at their time. The staircase is the front that nothing betters.
@@ -228,14 +232,12 @@ def trade_plot(name: str, records: Sequence[surrogates_Record], exact: Sequence[
     return True
 
 
-def _points(
-    records: Sequence[surrogates_Record], key: str, error: str
-) -> list[tuple[float, float, surrogates_Record, bool]]:
+def _points(records: Sequence[Record], key: str, error: str) -> list[tuple[float, float, Record, bool]]:
     fused = key.startswith("fused")
     return [(x, number(r, error) or 0.0, r, fused) for r in records if (x := number(r, key) or 0.0) > 0]
 
 
-def _panel(axes: Any, points: Sequence[tuple[float, float, surrogates_Record, bool]], label: str) -> None:
+def _panel(axes: Any, points: Sequence[tuple[float, float, Record, bool]], label: str) -> None:
     axes.set(xscale="log", yscale="log", xlabel=label)
     for group, (colour, marker) in _LOOK.items():
         for fused in (False, True):

@@ -180,23 +180,6 @@ def write_results(path: str | Path, results: Mapping[str, Any]) -> None:
     atomic_write_text(path, json.dumps(versioned, indent=1, allow_nan=False) + "\n")
 
 
-def kept_rows(path: Path, listed: str, named: str, maker: str) -> dict[str, dict[str, Any]]:
-    """Rows of an earlier run of a benchmark, by name; none where there is no such file.
-
-    Args:
-        listed, named: keys of the list of rows, and of a row's name. maker: the command that writes the file.
-
-    Raises:
-        InputError: a file that holds something else.
-    """
-    if not path.is_file():
-        return {}
-    try:
-        return {str(row[named]): dict(row) for row in json.loads(path.read_text(encoding="utf-8"))[listed]}
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(path, "file", f"({type(error).__name__})", f"records of {maker}") from error
-
-
 def plain(value: Any) -> Any:
     """`value` with only what JSON knows: scalars and arrays of numpy and torch as numbers and lists, paths as text.
 

@@ -7,7 +7,6 @@ film and over the domain's pupil disc, which is that of all passing rays enlarge
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -95,24 +94,6 @@ def vignetting_errors(
         "passing_share": float(right.double().mean()),
         "zones": zones,
     }
-
-
-def stopped_down(
-    lens: Lens,
-    domain: Domain,
-    predict: Callable[[FilmRays, float | None], Gated],
-    *,
-    stops: tuple[int, ...] = (0, 2, 4),
-    count: int = 300_000,
-    seed: int = SEED,
-) -> dict[str, dict[str, Any]]:
-    """`vignetting_errors` at full aperture and closed by whole stops, with the same fit; keys "full", "2_stops", ..."""
-    results = {}
-    for closed in stops:
-        radius = domain.stop_radius_mm / math.sqrt(2) ** closed
-        name = "full" if closed == 0 else f"{closed}_stops"
-        results[name] = vignetting_errors(lens, domain, predict, stop_radius_mm=radius, count=count, seed=seed)
-    return results
 
 
 def false_shares(exact_passes: Tensor, model_passes: Tensor) -> dict[str, float | None]:

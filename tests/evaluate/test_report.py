@@ -10,8 +10,7 @@ from urllib.parse import unquote
 import pytest
 
 from neurolens.base.errors import InputError
-from neurolens.evaluate.markup import DASH, local_url, show
-from neurolens.evaluate.report import write_report
+from neurolens.evaluate.report import DASH, local_url, show, write_report
 
 HOSTILE = "<script>alert('x')</script>\"&'"
 VOID = {"meta", "img", "br", "hr", "link", "input"}

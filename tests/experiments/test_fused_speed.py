@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.fused_speed import Row, goals, ray_candidate, selected, write
+from experiments.fused_speed import Row, earlier, goals, ray_candidate, write
 from neurolens.base import status as st
-from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import CompiledSource, find_compiler, fused_candidate
 from neurolens.evaluate.speed import Unavailable, race
@@ -79,19 +78,17 @@ def test_without_a_compiler_or_coefficients_there_is_no_candidate(
         CompiledSource(exact_program(lens_models.lens(), 0.0, (400.0, 700.0)))
 
 
-def test_goals_and_page(tmp_path: Path) -> None:
+def test_goals_and_kept_rows(tmp_path: Path) -> None:
     def row(name: str, work: str, ns: float, ratio: float, rms_um: float = 0.9) -> Row:
         times = {"min": ns, "median": ns, "threads": 1, "batch": 4096, "repeats": 5}
         return Row("gauss", 12, name, work, rms_um=rms_um, operations=100, roots=2, bytes=52, ns=times,
                    speedup={"exact C": ratio})  # fmt: skip
 
     rows = [row("a, C", "ray", 5.0, 6.0), row("b, C", "ray", 1.0, 99.0, rms_um=1.1), row("a, C", "whole", 13.0, 2.0)]
-    verdicts = {g["goal"]: (g["measured"], g["holds"]) for g in goals(rows)}
-    assert verdicts["ns per ray, 12 refractions, fused, ray"] == (5.0, True)  # the faster one is not within 1 um
-    assert verdicts["ns per ray, 12 refractions, fused, whole"] == (13.0, False)
-    assert verdicts["times as fast as exact C, 12 refractions, fused, whole"] == (2.0, False)
-    assert verdicts["times as fast as exact C, 33 refractions, fused, ray"] == (None, None)
-    text = write(rows, tmp_path, 5)
-    assert "missed" in text and "not measured" in text and (tmp_path / "fused_speed.json").is_file()
-    with pytest.raises(InputError, match="--only"):
-        selected("no such lens")
+    verdicts = {g.text: (g.measured, g.verdict) for g in goals(rows)}
+    assert verdicts["ns per ray, 12 refractions, fused, ray"] == (5.0, "reached")  # the faster one is not within 1 um
+    assert verdicts["ns per ray, 12 refractions, fused, whole"] == (13.0, "missed")
+    assert verdicts["times as fast as exact C, 12 refractions, fused, whole"] == (2.0, "missed")
+    assert verdicts["times as fast as exact C, 33 refractions, fused, ray"] == (None, "not measured")
+    write(rows, tmp_path, 5)
+    assert earlier(tmp_path, []) == rows and earlier(tmp_path, ["gauss"]) == []

@@ -120,8 +120,7 @@ def test_stopped_down_the_eyes_open() -> None:
 
 # One shape in the exact lens; the model, which shares the code that tests shapes, stands for the others.
 @pytest.mark.parametrize(
-    ("kind", "stop", "corners"),
-    [("exact", "6", 6), ("surrogate", "6", 6), ("thin", "4", 4), ("surrogate", "star", 5)],
+    ("kind", "stop", "corners"), [("exact", "6", 6), ("surrogate", "6", 6), ("thin", "4", 4), ("surrogate", "star", 5)]
 )
 def test_a_disc_has_the_corners_of_the_stop_and_its_area_passes(kind: str, stop: str, corners: int) -> None:
     """The area exactly of a thin lens; a real lens's stop is not evenly seen from the film, by some hundredths."""

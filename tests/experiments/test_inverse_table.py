@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.inverse import BenchSettings, measure_lens, page, read_records, write_records
-from neurolens.base.errors import InputError
+from experiments.inverse import BenchSettings, measure_lens, write_records
+from experiments.lab import kept_rows
 
 LENSES = Path(__file__).parents[2] / "lenses"
 
@@ -25,12 +25,7 @@ def test_a_lens_is_measured_and_its_record_read_back(tmp_path: Path) -> None:
     refused = {"lens": "other", "refused": "a reason"}
     text = write_records([record, refused], tmp_path)
     assert text == (tmp_path / "inverse.md").read_text() and "cooke_triplet_50" in text and "a reason" in text
-    assert read_records(tmp_path / "inverse.json") == {"cooke_triplet_50": record, "other": refused}
-
-
-def test_records_that_are_none_are_refused(tmp_path: Path) -> None:
-    assert read_records(tmp_path / "inverse.json") == {}
-    (tmp_path / "inverse.json").write_text("[]")
-    with pytest.raises(InputError, match="inverse"):
-        read_records(tmp_path / "inverse.json")
-    assert "Inverse maps" in page([])
+    assert kept_rows(tmp_path / "inverse.json", "lenses", "lens", "a command") == {
+        "cooke_triplet_50": record,
+        "other": refused,
+    }

@@ -1,8 +1,7 @@
-"""What `make bench` reads, promises and prints; no model and no clock is needed for that."""
+"""What `make bench` reads and promises; no model and no clock is needed for that."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -11,9 +10,7 @@ from experiments.__main__ import main
 from experiments.promises import (
     Floor,
     Outcome,
-    floor_table,
     hold_to_promises,
-    markdown,
     read_index,
     report_outcome,
     table_rows,
@@ -53,10 +50,6 @@ def test_without_the_compiled_tracer_promises_are_unchecked_and_say_why() -> Non
     rows = table_rows("lens", timed)
     assert rows[-1]["reason"] == "no C++ compiler"
     assert rows[-1]["ns_per_ray"] is None
-    text = markdown("Title", "Notes.", rows)
-    assert "unavailable: no C++ compiler" in text
-    assert text.count("\n| lens |") == len(rows) + 1  # the head is one of them
-    json.dumps(rows, allow_nan=False)
 
 
 def test_the_table_holds_best_median_and_both_ratios() -> None:
@@ -64,7 +57,6 @@ def test_the_table_holds_best_median_and_both_ratios() -> None:
     assert row["ns_per_ray"] == {"min": 15.0, "median": 15.75, "threads": 1, "batch": 4096, "repeats": 2}
     assert row["speedup_over_compiled"] == {"min": 2.0, "median": 2.0}
     assert row["speedup_over_eager"]["min"] == pytest.approx(200 / 15)
-    assert "| lens | a.onnx | 15.0 | 15.8 | 66.7 | 4096 | 1 | 2.00 (2.00) |" in markdown("T", "N", [row])
 
 
 @pytest.mark.parametrize(
@@ -92,17 +84,9 @@ def test_a_bad_index_is_one_clear_error(tmp_path: Path, text: str | None, capsys
     assert not (tmp_path / "out").exists()
 
 
-def test_a_speed_below_its_floor_fails(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_speed_below_its_floor_fails() -> None:
     good, bad = Floor("tracer", 6.0, 6.1, "Mray/s"), Floor("render", 1.0, 0.9, "Mpath/s")
     unknown = Floor("compiled", 20.0, None, "Mray/s", "no C++ compiler")
     assert report_outcome(Outcome(floors=[good, unknown])) == 0
     assert report_outcome(Outcome(floors=[good, bad])) == 1
-    assert "render: 0.9 Mpath/s, at least 1" in capsys.readouterr().err
-    rows = floor_table([good, bad, unknown]).splitlines()[2:]
-    assert [row.split("|")[-2].strip() for row in rows] == ["pass", "FAIL", "UNCHECKED"]
-    assert "no C++ compiler" in rows[2]
-
-
-def test_a_bench_that_could_check_nothing_says_so(capsys: pytest.CaptureFixture[str]) -> None:
-    assert report_outcome(Outcome(unchecked=["a.onnx: no C++ compiler"])) == 0
-    assert "UNCHECKED: no promise could be checked here (no C++ compiler)" in capsys.readouterr().err
+    assert [floor.verdict for floor in (good, bad, unknown)] == ["pass", "FAIL", "UNCHECKED"]

@@ -1,16 +1,13 @@
-"""Passage rates: ours above the literature's, theirs as the theses say, nothing lost; the page and its files."""
+"""Passage rates: ours above the literature's, theirs as the theses say, nothing lost."""
 
 from __future__ import annotations
 
-import json
 from functools import cache
 from pathlib import Path
 
 import pytest
 
 from experiments import pupils as passage
-from experiments import pupils as passage_page
-from experiments.__main__ import main
 from experiments.pupils import CASES, DRAWN, TABLE_5_3, Case
 
 pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
@@ -58,22 +55,6 @@ def test_pixel_of_table_5_3() -> None:
         list(zip(TABLE_5_3, rates, strict=True))[1:5], list(zip(TABLE_5_3, rates, strict=True))[2:6], strict=True
     ):
         assert later / rate == pytest.approx((n / m) ** 2, rel=0.1)
-
-
-def test_page_and_files(tmp_path: Path) -> None:
-    found = measured("brendel_tessar_100", 4.0)
-    cameras = [passage.camera_of(found.case, LENSES)]
-    text = passage_page.write([found], [(4.0, 36.4, 35.8)], [found], cameras, SAMPLES, tmp_path)
-    assert text == (tmp_path / "passage.md").read_text(encoding="utf-8")
-    assert "brendel tessar 50 mm" in text and "[34.2]" in text and "Steinert 2009" in text
-    data = json.loads((tmp_path / "passage.json").read_text(encoding="utf-8"))
-    assert data["cases"][0]["rates"][passage.OURS]["passed"] == found.rates[passage.OURS].passed
-    assert (tmp_path / "passage.png").stat().st_size > 10_000
-
-
-def test_a_lens_that_is_no_case(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["pupils", "--only", "nobody", "--quiet"]) != 0
-    assert "--only" in capsys.readouterr().err
 
 
 def test_a_lens_with_one_wavelength() -> None:

@@ -1,8 +1,7 @@
-"""What `neurolens bench trace` prepares and writes; no clock is judged."""
+"""What the bench of the tracer prepares; no clock is judged."""
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,18 +15,15 @@ from experiments.trace_speed import (
     ASPHERIC_SURFACES,
     LENSES,
     MAIN,
-    Found,
     chosen_lenses,
     film_rays,
     goals,
     launched,
     memory_of,
-    page,
     with_aspheres,
-    write,
 )
 from neurolens.evaluate.candidates import COMPILED_BATCHES
-from neurolens.evaluate.layout import refractions
+from neurolens.evaluate.describe import refractions
 from neurolens.optics.trace import trace
 
 pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
@@ -103,20 +99,6 @@ def test_goals_reached_missed_and_not_measured() -> None:
         "times slower with two aspheres, compiled": "not measured",
     }
     assert goals([]) and all(g.verdict == "not measured" for g in goals([]))
-
-
-def test_the_page_and_the_json_say_the_same(tmp_path: Path) -> None:
-    memory = [{"rays": 100_000, "results_mb": 2.8, "growth_mb": 3.5, "working_mb": 0.7}]
-    unavailable = timed("compiled", 1.0, dtype="float64", reason="no C++ compiler")
-    del unavailable["ns_min"]
-    found = Found(5, [*ROWS, unavailable], memory, ["57 refractions"])
-    write(found, tmp_path)
-    text = (tmp_path / "trace_speed.md").read_text()
-    assert text == page(found)
-    for piece in ("11.11 (10.10)", "no C++ compiler", "eager 1.67", "100,000", "57 refractions", "missed", "1 | 11.11"):
-        assert piece in text
-    data = json.loads((tmp_path / "trace_speed.json").read_text())
-    assert data["rows"][0]["ns_min"] == 90.0 and data["machine"]["cores"] >= 1
 
 
 @pytest.mark.slow
