@@ -1,4 +1,7 @@
-"""The cameras that `python -m experiments equal-time` compares, set as a scene asks."""
+"""Equal time and equal samples: what each camera's picture is worth after so many seconds, against the exact lens.
+
+Renders are kept, one file a render, named by everything that it depends on, so that a run may be resumed.
+"""
 
 from __future__ import annotations
 

@@ -313,7 +313,7 @@ def memory_of(scene_file: str, width: int, samples: int) -> dict[str, Any]:
 
 @dataclass
 class Found:
-    """What was measured: rows of `mitsuba_speed.record`, of scenes and of memory; `missing`: what was not, and why."""
+    """What was measured: rows of `record`, of scenes and of memory; `missing`: what was not, and why."""
 
     settings: Settings
     versions: dict[str, str]

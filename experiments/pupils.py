@@ -1,4 +1,4 @@
-"""The lenses on which passage rates are measured, and what the theses say of them or of the nearest that they used."""
+"""What share of the rays that a pupil sends pass the lens, method by method, beside the figures of the theses."""
 
 from __future__ import annotations
 

@@ -234,8 +234,7 @@ class Found:
     """What has been measured so far.
 
     Attributes:
-        rows: of `trace_speed.time_lens`.
-        memory: of `trace_memory.memory_of`.
+        rows: of `time_lens`. memory: of `memory_of`.
         missing: lenses without a file, and what could not be measured, in words.
     """
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.gallery.view import View
+from experiments.gallery.cameras import View
 from neurolens.cameras.contract import Camera
 
 _SIDE = 64  # pupil points a side

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.gallery.view import View
+from experiments.gallery.cameras import View
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image as Pictures
 
-from experiments.gallery.cameras import TITLES
-from experiments.gallery.view import luminance
+from experiments.gallery.cameras import TITLES, luminance
 from neurolens.analysis.plot_style import new_figure, style
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from experiments.gallery import aberrations, bokeh
 from experiments.gallery.bokeh import light_disc
-from experiments.gallery.cameras import NEAR_CORNER, illumination, post_process, strength_for
-from experiments.gallery.view import View
+from experiments.gallery.cameras import NEAR_CORNER, View, illumination, post_process, strength_for
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera

@@ -1,4 +1,4 @@
-"""Renders and measures the effects of the gallery; what an earlier run finished is kept."""
+"""Renders and measures the effects of the gallery, and writes their page; what an earlier run finished is kept."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from experiments.gallery.cameras import (
     TITLES,
     Shot,
     Surrogate,
+    View,
     Window,
     camera_of,
     same_state,
@@ -26,7 +27,6 @@ from experiments.gallery.cameras import (
 from experiments.gallery.figure import Row, difference_of, draw, exposure_of
 from experiments.gallery.measures import MEASURES
 from experiments.gallery.settings import Effect, Panel, find_effects, read_effect
-from experiments.gallery.view import View
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress, Report

@@ -1,4 +1,4 @@
-"""`neurolens lens FILE`: what a lens file holds, computed and drawn."""
+"""`neurolens lens FILE`: what a lens file holds, computed and drawn; a folder as a table; rims by a rule."""
 
 from __future__ import annotations
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 import neurolens
 from neurolens.axes import Axis
+from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.cameras.model import OnnxLens
 from neurolens.evaluate.measure import (
@@ -31,7 +32,7 @@ from neurolens.evaluate.measure import (
     zone_of,
 )
 from neurolens.evaluate.rays import EachRay, ray_errors
-from neurolens.evaluate.vignetting import ZONES, vignetting_errors
+from neurolens.evaluate.vignetting import ZONES, false_shares
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -87,7 +88,7 @@ def check_model(
             test what passes and what is blocked.
         seed: None takes one that is not the fit's.
 
-    Returns the figures (those of `fresh.Findings`, flat, with stopped_down, zones, rays and seed) and the promises of
+    Returns the figures (those of `measure.Findings`, flat, with stopped_down, zones, rays and seed) and the promises of
         the card: over the whole film, stopped down ("2_stops.false_pass") and of zones ("full.edge.rms_um").
 
     Warns:
@@ -285,14 +286,15 @@ def errors_at(model: OnnxLens, space: StateSpace, state: State, rays: int, seed:
     lens = lens.with_stop_radius(domain.stop_radius_mm)
     pairs = make_pairs(lens, domain, PairSettings(train=1, held_out=rays, rim=1, seed=seed))
     ray = ray_errors(lens, domain, pairs.held_out, predict)
-    share = vignetting_errors(lens, domain, predict, count=_VIGNETTING * rays, seed=seed)
+    fresh = fresh_rays(lens, domain, pairs.held_out, count=_VIGNETTING * rays, seed=seed)
+    share = false_shares(fresh.passes, predict(fresh.drawn, domain.stop_radius_mm).status == st.PASSED)
     figures = {**{k: ray[k] for k in RAY_KEYS}, **{k: share[k] for k in SHARES}}
     assert lens.film_z_mm is not None
     return {
         **dict(zip((a.name for a in model.axes), state, strict=True)),
         **{k: None if v is None or not math.isfinite(v) else v for k, v in figures.items()},
         "film_z_um": 1000 * (domain.film_z_mm[0] - lens.film_z_mm),
-        "passing_share": share["passing_share"],
+        "passing_share": float(fresh.passes.double().mean()),
     }
 
 

@@ -1,4 +1,4 @@
-"""A lens in figures: first-order data, film, field and how much light gets through, with units in the keys."""
+"""A lens in figures, a folder of lenses as a table, and their sections, with units in the keys."""
 
 from __future__ import annotations
 

@@ -141,7 +141,7 @@ class Findings:
 
 
 def measure(fresh: FreshRays, predict: Predict) -> Findings:
-    """Errors of one model; `predict` as `measure.onnx_predictor` gives it."""
+    """Errors of one model; `predict` as `onnx_predictor` gives it."""
     each = each_ray(fresh.lens, fresh.domain, fresh.held_out, predict)
     said = {s: predict(fresh.drawn, fresh.stop_radius_mm(s)).status == st.PASSED for s in STOPS}
     exact = {s: fresh.passes & (fresh.stop_square <= fresh.stop_radius_mm(s) ** 2) for s in STOPS}
@@ -223,6 +223,12 @@ class Measured:
     settings: ModelSettings
     file: Path
     record: dict[str, Any]
+
+    @property
+    def error(self) -> float:
+        """Film-equivalent RMS, or that of the angle where no ray is within 60 degrees."""
+        found = self.record.get("rms_um")
+        return float(found if found is not None else self.record.get("direction_rms_deg") or 1e9)
 
 
 def onnx_predictor(model: OnnxLens) -> Any:

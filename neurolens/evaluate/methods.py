@@ -1,4 +1,7 @@
-"""The rows of the benchmark of surrogates: first order, published methods, ours, and ablations of ours."""
+"""Every method on the same rays of a lens: the rows of `neurolens bench surrogates`, their records, errors and times.
+
+A record that is there, made by the same settings and version, is kept.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The look of the report's plots (`analysis.plot_style`), colours by family of models, and labels that keep clear."""
+"""The trade in pictures: error against time, and against coefficients; families' colours, labels that keep clear."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class ModelRecord(TypedDict, total=False):
     false_pass_near_rim: float | None  # within 2% of a rim; false_block_near_rim likewise
     false_block_near_rim: float | None
     stopped_down: dict[str, dict[str, float | None]]  # "2_stops", "4_stops" closed, same fit: false_pass, false_block
-    zones: dict[str, dict[str, dict[str, Any]]]  # "full", "2_stops" by zone of the film; see `fresh.Findings`
+    zones: dict[str, dict[str, dict[str, Any]]]  # "full", "2_stops" by zone of the film; see `measure.Findings`
     poor: list[str]  # what of these errors shows in a picture
     coefficients_per_vector: int | None  # A and B terms both count; a raw basis: all scalars of the vector
     parameters: int | None  # of the whole model: coefficients or weights, rims included

@@ -1,4 +1,6 @@
-"""Renders scenes through every camera of a run and compares the pictures with the exact lens's."""
+"""What an experiment does with scenes: renders through every camera, compared with the exact lens's, and the gain of a
+domain that holds only what one shot requires.
+"""
 
 from __future__ import annotations
 

@@ -198,14 +198,8 @@ def best_models(measured: Sequence[Measured]) -> tuple[str, ...]:
     for networks in (False, True):
         rows = [m for m in measured if (m.settings.method in NETWORKS) == networks and m.settings.family != "paraxial"]
         if rows:
-            names.append(min(rows, key=_error).settings.label)
+            names.append(min(rows, key=lambda m: m.error).settings.label)
     return tuple(names)
-
-
-def _error(m: Measured) -> float:
-    """Film-equivalent error, or the angle where no ray is within 60 degrees."""
-    value = m.record.get("rms_um")
-    return float(value if value is not None else m.record.get("direction_rms_deg") or 1e9)
 
 
 def _draw(

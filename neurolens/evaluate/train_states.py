@@ -200,7 +200,7 @@ def states_plot(
     """Film-equivalent RMS over the first state axis, and false passes and blocks below it.
 
     Args:
-        models: name to rows as of `state_errors.errors_at`.
+        models: name to rows as of `check.errors_at`.
         axis: the first axis.
         path: PNG, PDF or SVG to write.
     """

@@ -10,10 +10,11 @@ from typing import Any
 
 import pytest
 import torch
+from vignetting_oracle import vignetting_errors
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.evaluate.vignetting import deciding_rim_ratio, relative_illumination, vignetting_errors
+from neurolens.evaluate.vignetting import deciding_rim_ratio, relative_illumination
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.pupils import PupilBounds

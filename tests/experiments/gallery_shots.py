@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments.gallery.cameras import CAMERAS, Shot, Surrogate, shot_of, surrogate_of
+from experiments.gallery.cameras import CAMERAS, Shot, Surrogate, View, shot_of, surrogate_of
 from experiments.gallery.measures import MEASURES
 from experiments.gallery.settings import Panel
-from experiments.gallery.view import View
 from neurolens.base.errors import NeurolensWarning
 from neurolens.render.scenefile import scene_from_tables
 

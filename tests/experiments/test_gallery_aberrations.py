@@ -12,9 +12,8 @@ import pytest
 from gallery_shots import GALLERY, measured, shot
 
 from experiments.gallery.aberrations import light_profile, spot
-from experiments.gallery.cameras import Shot, Window, exact_camera, shot_of, thin_camera
+from experiments.gallery.cameras import Shot, View, Window, exact_camera, shot_of, thin_camera
 from experiments.gallery.settings import read_effect
-from experiments.gallery.view import View
 from neurolens.analysis.curvature import curvature
 from neurolens.analysis.distortion import RECTILINEAR, distortion
 from neurolens.analysis.fields import Scene

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.gallery.cameras import CAMERAS, PostProcessed, illumination, post_process, shot_of, strength_for
+from experiments.gallery.cameras import CAMERAS, PostProcessed, View, illumination, post_process, shot_of, strength_for
 from experiments.gallery.measures import MEASURES, PROJECTIONS, blur_mm, exposure, field_angles, paraxial_blur_mm, scale
 from experiments.gallery.run import check
 from experiments.gallery.settings import read_effect
-from experiments.gallery.view import View
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.model import load_model

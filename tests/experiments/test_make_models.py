@@ -10,10 +10,8 @@ import pytest
 from lens_models import LENSES
 
 from experiments import make_models
-from experiments import models_list as models_index
 from experiments.__main__ import main
-from experiments.make_models import fingerprint
-from experiments.models_list import Entry, Library, chosen, read_list
+from experiments.make_models import Entry, Library, chosen, fingerprint, read_list
 from experiments.promises import read_index
 from neurolens.base.config import from_dict
 from neurolens.base.errors import InputError
@@ -77,7 +75,7 @@ def test_a_list_holds_every_lens_of_its_folder_once(library: Library) -> None:
 
 
 def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, library: Library, made: dict[str, Any]) -> None:
-    models_index.write_index([row("one.old.onnx", "one", rms_um=9.0), row("gone.x.onnx", "gone")], {}, tmp_path)
+    make_models.write_index([row("one.old.onnx", "one", rms_um=9.0), row("gone.x.onnx", "gone")], {}, tmp_path)
     for name in ("one.old.onnx", "gone.x.onnx"):
         (tmp_path / name).write_bytes(b"")
     made["broken"]["one"] = KeyboardInterrupt()

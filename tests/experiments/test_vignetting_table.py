@@ -9,6 +9,7 @@ import lens_models
 import numpy as np
 import pytest
 import torch
+from vignetting_oracle import vignetting_errors
 
 from experiments import outside
 from experiments.__main__ import main
@@ -16,7 +17,7 @@ from experiments.vignetting import DOMAINS, OPENINGS, opening_errors, pupil_mask
 from neurolens.base import status as st
 from neurolens.cameras.onnxlens import load_model
 from neurolens.evaluate.experiment import LensChoice
-from neurolens.evaluate.vignetting import relative_illumination, vignetting_errors
+from neurolens.evaluate.vignetting import relative_illumination
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.onnx.export import export_onnx
