@@ -14,13 +14,14 @@ from typing import Any
 
 from experiments import lab
 from neurolens import __version__
+from neurolens.analysis.plot_style import FIELD_COLOURS, INK, new_figure, save, style
 from neurolens.axes import Axis
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress, Report
 from neurolens.commands.arguments import whole
 from neurolens.evaluate.experiment import near_limit_m, wavelengths_nm
 from neurolens.evaluate.rays import ray_errors
-from neurolens.evaluate.train_states import fit_and_measure_states, panels_plot
+from neurolens.evaluate.train_states import AXIS_LABELS, error_axes, error_line, fit_and_measure_states
 from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
@@ -165,6 +166,36 @@ def page(rows: Sequence[Mapping[str, Any]]) -> str:
         lines.append("| " + " | ".join(cells) + " |")
     states = max((len(r["states"]) for r in rows), default=0)
     return _HEAD.format(terms=TERMS, states=states) + "\n".join(lines) + "\n\n![error over the state](zoom.png)\n"
+
+
+Panel = tuple[str, Axis, Sequence[Mapping[str, Any]], Sequence[Mapping[str, Any]]]
+
+
+def panels_plot(panels: Sequence[Panel], path: str | Path) -> Path:
+    """A panel for each model: its error over the first state axis, and those of models fitted to one state each.
+
+    Args:
+        panels: title, first axis, rows of the model, rows of the others.
+        path: PNG, PDF or SVG to write.
+    """
+    columns = 2 if len(panels) > 1 else 1
+    with style():
+        rows = -(-len(panels) // columns)
+        figure = new_figure(5.2 * columns, 3.0 * rows)
+        places = figure.subplots(rows, columns, squeeze=False).ravel()
+        for place, (title, axis, states, fixed) in zip(places, panels, strict=False):
+            error_line(place, axis, states, FIELD_COLOURS[0], "one model of all states")
+            if fixed:
+                x = [r[axis.name] for r in fixed]
+                place.plot(x, [r["rms_um"] for r in fixed], "s", ms=5, mfc="none", color=INK, label="one state each")
+            error_axes(place, axis, [r["rms_um"] for r in (*states, *fixed)])
+            place.set_title(title, loc="left", fontsize="medium")
+            place.set_xlabel(AXIS_LABELS.get(axis.name, f"{axis.name} ({axis.unit})"))
+            place.set_ylabel("RMS (um)")
+            place.legend(loc="best", fontsize="small")
+        for place in places[len(panels) :]:
+            place.set_visible(False)
+        return save(figure, path)
 
 
 ABOUT = """\

@@ -1,6 +1,6 @@
 """The lens of a panel, exact and as a surrogate fitted once to all shots of one state; its cameras, and what they see.
 
-A surrogate serves all shots of one state of the lens; a window is a part of a camera's film, a view what a measure gets.
+One surrogate serves all shots of a state of the lens; a window is a part of a film, a view what a measure is given.
 """
 
 from __future__ import annotations

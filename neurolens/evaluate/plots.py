@@ -138,7 +138,6 @@ def error_against_coefficients_plot(
     records: Sequence[Record],
     path: str | Path,
     error: str = "rms_um",
-    targets: Sequence[tuple[float, float]] = (),
     title: str = "Error against coefficients",
 ) -> Path:
     """Error (log) against coefficients per vector output, a line for each family; models without such a count across.
@@ -147,7 +146,6 @@ def error_against_coefficients_plot(
         records: `records.ModelRecord`s; an MLP and the paraxial map count no coefficients: a dotted line each.
         path: PNG, PDF or SVG to write.
         error: the key on the y axis, of ERROR_LABELS.
-        targets: (coefficients, error) promised, drawn as hollow triangles: a model should lie below and to the left.
     Raises:
         InputError: an error key not known; no model has an error.
     """
@@ -159,11 +157,8 @@ def error_against_coefficients_plot(
         axes.set(yscale="log", xlabel="coefficients per vector output (count)", ylabel=ERROR_LABELS[error])
         points = [(_get(r, "coefficients_per_vector"), _get(r, error)) for r in counted]
         _plot_models(axes, counted, points)
-        if targets:
-            axes.plot(*zip(*targets, strict=True), "v", ms=9, mfc="none", mec=INK, mew=1.2, ls="none", label="target")
-        right = max([p[0] for p in points] + [t[0] for t in targets] + [1.0])
-        axes.set_xlim(0, right * 1.05)
-        _set_limits(axes, (), [_get(r, error) for r in shown] + [t[1] for t in targets], band=0.02)
+        axes.set_xlim(0, 1.05 * max([p[0] for p in points], default=1.0))
+        _set_limits(axes, (), [_get(r, error) for r in shown], band=0.02)
         lines = [r for r in shown if not number(r, "coefficients_per_vector")]
         _plot_lines_across(axes, lines, error)
         axes.grid(True, which="major")

