@@ -35,9 +35,9 @@ from neurolens.evaluate.records import plain
 from neurolens.mitsuba import require_mitsuba
 from neurolens.mitsuba.library import libraries
 from neurolens.mitsuba.scenes import our_scene, with_our_spectra
-from neurolens.render.filmsettings import FilmSettings
+from neurolens.render.film import FilmSettings
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import Scene, load_scene
+from neurolens.render.scene import Scene, load_scene
 
 FOCAL_MM = 50.0
 FOCUS_M, F_NUMBER = 3.9, 2.0
@@ -218,28 +218,28 @@ def record(row: Row, settings: Settings, base: Row) -> dict[str, Any]:
 
 STAGES = ("camera", "intersection", "lights", "shading", "random numbers", "integrator", "film, set-up")
 _ROOT = str(Path(neurolens.__file__).parent)
-# Part of the renderer to stage; the world's functions are told apart by name.
+# Module of the renderer to stage; some functions are told apart by name.
 _STAGE = {
     "primitives": "intersection",
-    "spheres": "intersection",
     "mesh": "intersection",
-    "embree": "intersection",
     "lights": "lights",
-    "arealights": "lights",
-    "pointlights": "lights",
     "environment": "lights",
-    "sky": "lights",
-    "scatter": "shading",
     "materials": "shading",
-    "coat": "shading",
     "directions": "shading",
-    "palette": "shading",
     "textures": "shading",
+    "world": "shading",
     "sampler": "random numbers",
     "integrator": "integrator",
 }
-_OF_THE_WORLD = {"nearest": "intersection", "visible": "intersection", "surfaces": "intersection"}
-_FUNCTIONS = {"aim_at_lights": "lights"}
+_FUNCTIONS = {
+    "world": dict.fromkeys(("nearest", "visible", "surfaces"), "intersection"),
+    "integrator": {
+        "aim_at_lights": "lights",
+        **dict.fromkeys(("lit", "deposit", "scatter", "_scatter_rough", "_scatter_glass"), "shading"),
+        **dict.fromkeys(("__init__", "_lobes", "_absorb", "start", "evaluate", "index"), "shading"),  # of a vertex
+    },
+    "spectrum": dict.fromkeys(("colour", "reflectance", "absorption", "light", "look_up", "_row", "freeze"), "shading"),
+}
 _HELPERS = {"dot", "take", "cut"}  # which count as part of those who call them
 
 Function = tuple[str, int, str]
@@ -291,9 +291,7 @@ def _stage_of(function: Function) -> str | None:
         return "camera"
     if part != "render":
         return STAGES[-1]
-    if module == "world":
-        return _OF_THE_WORLD.get(name, "shading")
-    return _FUNCTIONS.get(name) or _STAGE.get(module, STAGES[-1])
+    return _FUNCTIONS.get(module, {}).get(name) or _STAGE.get(module, STAGES[-1])
 
 
 def memory_of(scene_file: str, width: int, samples: int) -> dict[str, Any]:

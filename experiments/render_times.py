@@ -20,9 +20,9 @@ from neurolens.apertures import Aperture
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import FUSED, Shot, make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
-from neurolens.render.filmsettings import FilmSettings
+from neurolens.render.film import FilmSettings
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import Scene, load_scene
+from neurolens.render.scene import Scene, load_scene
 
 PINHOLE, THIN, STOP = "pinhole", "thin lens", "stop only"
 TORCH, EXACT_C = "exact, torch", "exact, C"

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.cameras.thin import ThinLens
 from neurolens.commands.arguments import whole
-from neurolens.render.embree import EmbreeMesh
-from neurolens.render.mesh import Mesh
+from neurolens.render.mesh import EmbreeMesh, Mesh
 from neurolens.render.primitives import Primitive, Rays
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import Scene, load_scene
+from neurolens.render.scene import Scene, load_scene
 from neurolens.render.wavelengths import LANES
 
 

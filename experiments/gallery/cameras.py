@@ -37,8 +37,8 @@ from neurolens.evaluate.measure import fit_and_measure, known_record
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import film_z_mm, first_order
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.render.masks import make_aperture
-from neurolens.render.scenefile import Scene
+from neurolens.render.pictures import make_aperture
+from neurolens.render.scene import Scene
 from neurolens.surrogates.domain import Domain, domain_of
 from neurolens.surrogates.fit import ModelSettings, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs

@@ -34,7 +34,7 @@ from neurolens.commands.arguments import add_json, whole
 from neurolens.commands.output import print_json, table
 from neurolens.evaluate.train import versions
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import load_scene
 
 SCHEMA = 1
 

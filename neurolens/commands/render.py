@@ -24,7 +24,7 @@ from neurolens.commands.render_files import (
     write_pictures,
 )
 from neurolens.evaluate.records import plain
-from neurolens.render.filmsettings import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS, FilmSettings
+from neurolens.render.film import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS, FilmSettings
 
 if TYPE_CHECKING:
     from neurolens.apertures import Aperture
@@ -155,8 +155,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.render.film import PixelGrid
     from neurolens.render.illuminants import check_name
     from neurolens.render.renderer import render
-    from neurolens.render.scenechecks import files_named
-    from neurolens.render.scenefile import load_scene
+    from neurolens.render.scene import files_named, load_scene
 
     scene = load_scene(args.scene)
     files.spare(args.scene.parent / name for name in files_named(scene.settings))

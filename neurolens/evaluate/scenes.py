@@ -25,12 +25,11 @@ from neurolens.evaluate.measure import fit_and_measure
 from neurolens.evaluate.speed import Candidate, race
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.render.exr import write_exr, write_png
 from neurolens.render.job import camera_axes
+from neurolens.render.pictures import write_exr, write_png
 from neurolens.render.primitives import Rays
 from neurolens.render.renderer import render
-from neurolens.render.scene import CameraSettings
-from neurolens.render.scenefile import Scene, load_scene
+from neurolens.render.scene import CameraSettings, Scene, load_scene
 from neurolens.render.spectrum import SpectralRange
 from neurolens.render.world import World
 from neurolens.surrogates.domain import Domain, domain_from_camera

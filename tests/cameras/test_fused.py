@@ -30,7 +30,7 @@ from neurolens.programs import compiler, loworder
 from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
 from neurolens.programs.expressions import Program
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import load_scene
 from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.precision import store_weights
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from neurolens.evaluate.scenes import nearest_depth_m
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import load_scene
 
 CAMERA = """
 [camera]

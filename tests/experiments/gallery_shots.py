@@ -12,7 +12,7 @@ from experiments.gallery.cameras import CAMERAS, Shot, Surrogate, View, shot_of,
 from experiments.gallery.measures import MEASURES
 from experiments.gallery.settings import Panel
 from neurolens.base.errors import NeurolensWarning
-from neurolens.render.scenefile import scene_from_tables
+from neurolens.render.scene import scene_from_tables
 
 ROOT = Path(__file__).parents[2]
 GALLERY = ROOT / "experiments" / "gallery"

@@ -27,9 +27,8 @@ from experiments.equal_time_errors import (
 from neurolens.base.errors import InputError
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
-from neurolens.render.filmsettings import FilmSettings
-from neurolens.render.scene import CameraSettings
-from neurolens.render.scenefile import load_scene
+from neurolens.render.film import FilmSettings
+from neurolens.render.scene import CameraSettings, load_scene
 
 SHAPE = (12, 20, 3)
 Picture = NDArray[np.float64]

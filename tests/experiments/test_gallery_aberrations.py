@@ -22,7 +22,7 @@ from neurolens.cameras.thin import ThinLens
 from neurolens.optics.glass import LINE_D_NM, index_of
 from neurolens.optics.paraxial import first_order
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import load_scene
 
 ALL = ("exact", "surrogate", "thin")
 

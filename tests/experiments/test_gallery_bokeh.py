@@ -21,7 +21,7 @@ from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.thin import ThinLens
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.trace import Rays, trace
-from neurolens.render.masks import make_aperture
+from neurolens.render.pictures import make_aperture
 
 ROOT = Path(__file__).parents[2]
 GALLERY = ROOT / "experiments" / "gallery"

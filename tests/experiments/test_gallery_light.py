@@ -21,7 +21,7 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.cameras.vignetting import Vignetted
 from neurolens.optics.lensfile import read_lens
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import load_scene
 
 ROOT = Path(__file__).parents[2]
 GALLERY = ROOT / "experiments" / "gallery"

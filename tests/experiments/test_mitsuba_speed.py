@@ -8,7 +8,7 @@ import pytest
 from experiments.mitsuba_speed import STAGES, Found, Row, Settings, film_mm, page, profile, record
 from neurolens.cameras.contract import CameraRays, FloatArray
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.render.scenefile import scene_from_tables
+from neurolens.render.scene import scene_from_tables
 
 SETTINGS = Settings(size=100, samples=4, threads=2, repeats=3)
 

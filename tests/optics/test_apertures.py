@@ -17,7 +17,7 @@ from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.optics.trace import Rays, trace
-from neurolens.render.masks import make_aperture, read_mask
+from neurolens.render.pictures import make_aperture, read_mask
 
 LENSES = Path(__file__).parents[2] / "lenses"
 STAR = np.array([[0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 1, 0, 1, 0]])
@@ -219,7 +219,7 @@ def test_bad_masks(tmp_path: Path) -> None:
     image.fromarray(np.ones((1, 4097), np.uint8)).save(tmp_path / "large.png")
     (tmp_path / "text.png").write_text("no picture")
     (tmp_path / "cut.png").write_bytes((tmp_path / "dark.png").read_bytes()[:40])
-    for file, expected in (("dark", "dark"), ("large", "4096"), ("text", "read"), ("cut", "read"), ("none", "missing")):
+    for file, expected in (("dark", "dark"), ("large", "4096"), ("text", "read"), ("cut", "read"), ("none", "exists")):
         with pytest.raises(InputError, match=expected):
             read_mask(tmp_path / f"{file}.png")
     with pytest.raises(InputError, match="not both"):
