@@ -171,10 +171,7 @@ def run(args: argparse.Namespace) -> int:
     camera = make_camera(args.camera, shot_of(settings, args, scene.aperture))
     for note in camera.settings.get("notes", ()):
         warn(note)
-    with (
-        Stopping() as stopping,
-        Progress(quiet=args.quiet).stage(f"render {scene.name}, {camera.name}") as report,
-    ):
+    with Stopping() as stopping, Progress(quiet=args.quiet).stage(f"render {scene.name}, {camera.name}") as report:
         result = render(
             scene, camera, width=width, height=height, samples=args.samples, seed=args.seed,
             threads=args.threads, max_depth=args.max_depth, film=film, progress=report,

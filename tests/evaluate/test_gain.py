@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from neurolens.evaluate.gain import nearest_depth_m
+from neurolens.evaluate.scenes import nearest_depth_m
 from neurolens.render.scene import load_scene
 
 CAMERA = """

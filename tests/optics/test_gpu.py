@@ -10,7 +10,7 @@ import pytest
 import torch
 from shipped import focused
 
-from neurolens.evaluate.benches.bundles import from_film, generator
+from experiments.extreme_cases import from_film, generator
 from neurolens.optics.prescription import Lens
 from neurolens.optics.trace import CHUNK, Rays, Traced, trace
 

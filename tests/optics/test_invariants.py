@@ -10,8 +10,8 @@ import torch
 from shipped import NAMES, focused
 from torch import Tensor
 
+from experiments.extreme_cases import from_film, from_scene, generator, unit
 from neurolens.base import status as st
-from neurolens.evaluate.benches.bundles import from_film, from_scene, generator, unit
 from neurolens.optics import glass
 from neurolens.optics.coatings import design, reflectance
 from neurolens.optics.prescription import Lens, Surface

@@ -16,7 +16,6 @@ from neurolens.base.errors import InputError, ModelError, NeurolensError
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
-from neurolens.render import bench
 from neurolens.render.film import Film, Tiling
 from neurolens.render.renderer import Watch, render
 
@@ -236,8 +235,3 @@ def test_errors_are_clear() -> None:
         render(made, Prism(50.0, FILM), **small)
     narrow = scene({"wavelengths_nm": [460, 640]}, environment=WHITE)
     assert render(narrow, Prism(50.0, FILM), **small).rgb.shape == (24, 36, 3)
-
-
-def test_the_bench_says_one_line_of_a_missing_scene(capsys: pytest.CaptureFixture[str]) -> None:
-    assert bench.main(["nosuch.toml"]) == 2
-    assert "nosuch.toml" in capsys.readouterr().err
