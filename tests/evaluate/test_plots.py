@@ -58,7 +58,7 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     for name in (
         "neurolens.evaluate.plots",
         "neurolens.evaluate.figures",
-        "neurolens.analysis.plot_layout",
+        "neurolens.analysis.layout",
     ):
         monkeypatch.setattr(f"{name}.new_figure", lambda *size: made.append(style.new_figure(*size)) or made[-1])
     return made
