@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neurolens.programs.contract import is_per_call
-from neurolens.programs.expressions import Argument, Program, Step
+from neurolens.graph.program import Argument, Program, Step, is_per_call
 
 _HEAD = """\
 /*
@@ -96,7 +95,8 @@ class Signature:
     @staticmethod
     def of(program: Program, name: str) -> Signature:
         """The inputs that a program names, in its order, and its outputs."""
-        inputs = [s.name for s in program.steps if s.kind == "input"]
+        steps = (program.steps[k] for k in program.live())
+        inputs = [s.name for s in steps if s.kind == "input"]
         outputs = [o for o in program.outputs if o != "status"]
         # What holds for a whole call goes last.
         ordered = [i for i in inputs if not is_per_call(i)] + [i for i in inputs if is_per_call(i)]

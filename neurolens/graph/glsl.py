@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from neurolens.programs.c import Signature, Writer, literal
-from neurolens.programs.expressions import Program
+from neurolens.graph.c import Signature, Writer, literal
+from neurolens.graph.program import Program
 
 _HEAD = """\
 /*

@@ -1,0 +1,228 @@
+"""Derivatives of graphs: forward-mode differentiation, one rule an operator.
+
+What values and derivatives have in common is done once (Griewank and Walther, "Evaluating Derivatives", 2008, chapter
+3): a polynomial's partial derivatives are further rows of the same polynomial, for they need (nearly) its monomials.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.graph.ir import Exponents, Graph, Node, Value, pruned
+from neurolens.graph.program import row_names
+
+Array = NDArray[np.float64]
+# A derivative along one direction; None where it is 0.
+Moved = Value | None
+
+
+def derivative(output: str, by: str) -> str:
+    """Name of the output that holds the derivatives of one output by one row of an input (`program.row_names`)."""
+    return f"{output}_by_{by}"
+
+
+def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tuple[str, int]]) -> Graph:
+    """The graph with outputs `derivative(output, row)`, of as many rows as the output, besides its own.
+
+    At a choice (select, max, min, clip) the derivative is that of what was chosen.
+
+    Args:
+        outputs: those to differentiate. inputs: names and rows of those to differentiate by.
+    """
+    g = Graph()
+    values: dict[int, Value] = {}  # by the old graph's numbers
+    known: list[dict[int, Value]] = [{} for _ in inputs]  # derivatives by the new graph's numbers, by direction
+    names: dict[tuple[str, int], str] = {}
+    for number, node in enumerate(graph.nodes):
+        x = [values[k] for k in node.inputs]
+        moves: list[list[Moved]] = [[direction.get(v.number) for v in x] for direction in known]
+        rule = _RULES.get(node.kind, _none)
+        if node.kind == "polynomial" and any(d[0] is not None for d in moves):
+            values[number], rule = _with_gradient(g, node, x[0])
+        else:
+            values[number] = g.add(
+                node.kind, x, node.rows, name=node.name, arrays=node.arrays, static=node.static, per_call=node.per_call
+            )
+        y = values[number]
+        if node.kind == "input":
+            names |= {(node.name, row): name for row, name in enumerate(row_names(node.name, node.rows))}
+        for (name, row), direction, d in zip(inputs, known, moves, strict=True):
+            if node.kind == "input" and node.name == name:
+                direction[y.number] = g.constant(np.eye(node.rows)[row])
+            elif any(v is not None for v in d):
+                moved = rule(node, y, x, d)
+                if moved is not None:
+                    direction[y.number] = moved
+    g.outputs = {name: values[v.number] for name, v in graph.outputs.items()}
+    for place, direction in zip(inputs, known, strict=True):
+        for output in outputs:
+            value = g.outputs[output]
+            g.outputs[derivative(output, names[place])] = direction.get(value.number) or value * 0.0
+    return pruned(g)
+
+
+def _sum(terms: Sequence[Moved]) -> Moved:
+    there = [t for t in terms if t is not None]
+    total = there[0] if there else None
+    for term in there[1:]:
+        total = total + term  # type: ignore[operator]
+    return total
+
+
+def _times(a: Moved, b: Value) -> Moved:
+    return None if a is None else a * b
+
+
+def _none(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    """Truths and statuses are piecewise constant."""
+    return None
+
+
+def _take(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    return None if d[0] is None else y.graph.take(d[0], node.static)
+
+
+def _concat(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    g = y.graph
+    return g.concat(*(g.constant(np.zeros(v.rows)) if m is None else m for v, m in zip(x, d, strict=True)))
+
+
+def _affine(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    g, weight = y.graph, node.arrays[0]
+    moving, added = node.static
+    terms: list[Moved] = [d[-1]] if added else []
+    if moving and d[1] is not None:
+        terms.append(g.affine(node.arrays[2], x[0]) * d[1])
+    if d[0] is not None:
+        change = node.arrays[2] if moving else None
+        if d[0].node.kind == "constant":  # a column of the matrix
+            column = weight @ d[0].node.arrays[0]
+            if change is None:
+                terms.append(g.constant(column))
+            else:
+                moved = (x[1], (change @ d[0].node.arrays[0])[:, None])
+                terms.append(g.affine(column[:, None], g.constant(1.0), moving=moved))
+        else:
+            terms.append(g.affine(weight, d[0], moving=None if change is None else (x[1], change)))
+    return _sum(terms)
+
+
+def _quadratic(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    """Linear in x where the derivative of x is the same for all rays."""
+    g, dx = y.graph, d[0]
+    assert dx is not None
+    if dx.node.kind == "constant":
+        return g.affine(_linear(node, dx.node.arrays[0]), x[0])
+    if dx.node.kind == "affine" and dx.node.static == (True, False) and dx.node.per_call:
+        base, scale = g.inputs_of(dx.number)
+        if base.node.kind == "constant":
+            one = base.node.arrays[0]
+            change = _linear(node, dx.node.arrays[2] @ one)
+            return g.affine(_linear(node, dx.node.arrays[0] @ one), x[0], moving=(scale, change))
+    rows = []
+    for form in node.static:
+        terms: list[Moved] = []
+        for i, j in form:
+            terms += [x[0][i] * dx[i] * 2.0] if i == j else [x[0][i] * dx[j], x[0][j] * dx[i]]
+        rows.append(_sum(terms))
+    return g.concat(*(r for r in rows if r is not None))
+
+
+def _linear(node: Node, dx: Array) -> Array:
+    """[R, K]: the derivative of a quadratic along dx [K] as a matrix on x."""
+    matrix = np.zeros((node.rows, len(dx)))
+    for r, form in enumerate(node.static):
+        for i, j in form:
+            matrix[r, i] += dx[j]
+            matrix[r, j] += dx[i]
+    return matrix
+
+
+def partial_derivatives(exponents: Exponents, weight: Array) -> tuple[Exponents, Array]:
+    """A polynomial with its partial derivatives.
+
+    Args:
+        exponents: [M, V]. weight: [R, M].
+
+    Returns exponents [M', V] that hold the monomials of all of them, and weights [1 + V, R, M']: the polynomial's,
+    then those of each derivative.
+    """
+    place = {tuple(map(int, e)): i for i, e in enumerate(exponents)}
+    used = [int(i) for i in np.flatnonzero(weight.any(0))]
+    terms: list[tuple[int, int, int, int]] = []
+    for v in range(exponents.shape[1]):
+        for i in used:
+            e = exponents[i]
+            if e[v]:
+                lower = tuple(int(k) - (j == v) for j, k in enumerate(e))
+                terms.append((1 + v, i, place.setdefault(lower, len(place)), int(e[v])))
+    out = np.zeros((1 + exponents.shape[1], len(weight), len(place)))
+    out[0, :, : len(exponents)] = weight
+    for row, source, target, factor in terms:
+        out[row, :, target] += factor * weight[:, source]
+    return np.array(list(place), dtype=np.int64).reshape(len(place), exponents.shape[1]), out
+
+
+def _with_gradient(g: Graph, node: Node, x: Value) -> tuple[Value, Callable[..., Moved]]:
+    exponents, weight = partial_derivatives(*node.arrays)
+    value, *gradient = g.split(
+        g.polynomial(exponents, weight.reshape(-1, len(exponents)), x), [node.rows] * len(weight)
+    )
+
+    def rule(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+        dx = d[0]
+        assert dx is not None
+        return _sum([part * dx[v] for v, part in enumerate(gradient)])
+
+    return value, rule
+
+
+def _series(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    coefficients = node.arrays[0][1:] * np.arange(1, len(node.arrays[0]))
+    return _times(d[0], y.graph.series(x[0], coefficients if len(coefficients) > 1 else [*coefficients, 0.0]))
+
+
+def _product(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    if x[0] == x[1]:
+        return _times(d[0], x[0] * 2.0)
+    return _sum([_times(d[0], x[1]), _times(d[1], x[0])])
+
+
+def _quotient(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    """One reciprocal serves all directions."""
+    below = None if d[1] is None else -(y * d[1])
+    return _times(_sum([d[0], below]), 1.0 / x[1])
+
+
+def _choice(truth: Value, then: Moved, otherwise: Moved) -> Moved:
+    g = truth.graph
+    return None if then is None and otherwise is None else g.select(truth, then or 0.0, otherwise or 0.0)
+
+
+def _minus(d: Moved) -> Moved:
+    return None if d is None else -d
+
+
+Rule = Callable[[Node, Value, Sequence[Value], Sequence[Moved]], Moved]
+_RULES: dict[str, Rule] = {
+    "take": _take,
+    "concat": _concat,
+    "affine": _affine,
+    "quadratic": _quadratic,
+    "series": _series,
+    "add": lambda node, y, x, d: _sum(d),
+    "sub": lambda node, y, x, d: _sum([d[0], _minus(d[1])]),
+    "mul": _product,
+    "div": _quotient,
+    "neg": lambda node, y, x, d: _minus(d[0]),
+    "sqrt": lambda node, y, x, d: _times(d[0], 0.5 / y),
+    "tanh": lambda node, y, x, d: _times(d[0], 1.0 - y * y),
+    "abs": lambda node, y, x, d: _choice(x[0] <= 0.0, _minus(d[0]), d[0]),
+    "max": lambda node, y, x, d: _choice(x[0] <= x[1], d[1], d[0]),
+    "min": lambda node, y, x, d: _choice(x[0] <= x[1], d[0], d[1]),
+    "clip": lambda node, y, x, d: _choice(x[0].between(*node.arrays[0]), d[0], None),
+    "select": lambda node, y, x, d: _choice(x[0], d[1], d[2]),
+}

@@ -1,0 +1,403 @@
+"""A model as one graph: operators on rows of rays, written once and read by every evaluator and writer.
+
+A value has R rows and one column a ray, or one for the whole call (a film position, a stop radius). `affine`,
+`polynomial`, `quadratic` and `series` stay whole and are lowered late: to matrix products and few passes over the rays
+for ONNX (`graph.onnx`), to fused multiply-adds for C and GLSL (`graph.scalars`). A new reader is one rule an operator:
+
+    input, constant             named rows of the caller; numbers
+    take, concat                rows of a value; rows of several values below each other
+    affine                      W x + b; W may be W0 + s W1 with s of the call, and rows may be added
+    quadratic                   sums of products of two rows of x, plus constants
+    polynomial                  W m with m the monomials of the rows of x
+    series                      a polynomial in one row, lowest coefficient first
+    add sub mul div max min     row by row; one row meets any number of rows
+    neg sqrt tanh abs clip      (clip between two numbers)
+    le between and select       truths: 1 where x <= y, and where low <= x <= high (0 for NaN); choice by a truth
+    first_failure               the code of the first test that fails, 0 where none does
+    whole                       a number as an integer
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Exponents = NDArray[np.int64]
+# Rows of a quadratic: the pairs of rows of x whose products are summed.
+Form = tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class Node:
+    """One operation.
+
+    Attributes:
+        kind: an operator of the module's table. inputs: numbers of earlier nodes.
+        rows: of its value. per_call: whether it is the same for all rays of a call.
+        name: of an input.
+        arrays: its numbers, float64 (exponents int64). static: what is neither a value nor a coefficient.
+    """
+
+    kind: str
+    inputs: tuple[int, ...]
+    rows: int
+    per_call: bool
+    name: str = ""
+    arrays: tuple[NDArray[Any], ...] = ()
+    static: tuple[Any, ...] = ()
+
+
+@dataclass(frozen=True)
+class Value:
+    """R rows of a graph; arithmetic appends operations to it."""
+
+    graph: Graph
+    number: int
+
+    @property
+    def node(self) -> Node:
+        return self.graph.nodes[self.number]
+
+    @property
+    def rows(self) -> int:
+        return self.node.rows
+
+    def __getitem__(self, rows: int | slice | list[int]) -> Value:
+        every = range(self.rows)
+        wanted = [every[rows]] if isinstance(rows, int) else list(every[rows]) if isinstance(rows, slice) else rows
+        return self.graph.take(self, wanted)
+
+    def __add__(self, other: Operand) -> Value:
+        return self.graph.each("add", self, other)
+
+    def __sub__(self, other: Operand) -> Value:
+        return self.graph.each("sub", self, other)
+
+    def __mul__(self, other: Operand) -> Value:
+        return self.graph.each("mul", self, other)
+
+    def __truediv__(self, other: Operand) -> Value:
+        return self.graph.each("div", self, other)
+
+    def __radd__(self, other: ArrayLike) -> Value:
+        return self.graph.constant(other) + self
+
+    def __rsub__(self, other: ArrayLike) -> Value:
+        return self.graph.constant(other) - self
+
+    def __rmul__(self, other: ArrayLike) -> Value:
+        return self * other
+
+    def __rtruediv__(self, other: ArrayLike) -> Value:
+        return self.graph.constant(other) / self
+
+    def __neg__(self) -> Value:
+        return self.graph.each("neg", self)
+
+    def sqrt(self) -> Value:
+        return self.graph.each("sqrt", self)
+
+    def tanh(self) -> Value:
+        return self.graph.each("tanh", self)
+
+    def abs(self) -> Value:
+        return self.graph.each("abs", self)
+
+    def maximum(self, other: Operand) -> Value:
+        return self.graph.each("max", self, other)
+
+    def minimum(self, other: Operand) -> Value:
+        return self.graph.each("min", self, other)
+
+    def clip(self, low: float, high: float) -> Value:
+        return self.graph.add("clip", (self,), self.rows, arrays=(np.array([low, high]),))
+
+    def whole(self) -> Value:
+        return self.graph.each("whole", self)
+
+    def __le__(self, other: Operand) -> Value:
+        return self.graph.each("le", self, other)
+
+    def __and__(self, other: Value) -> Value:
+        return self.graph.each("and", self, other)
+
+    def between(self, low: ArrayLike, high: ArrayLike) -> Value:
+        """1 where low <= value <= high, 0 elsewhere and for NaN; one number a row, or one for all."""
+        limits = np.broadcast_to(np.stack([low, high]).T, (self.rows, 2)).astype(np.float64)
+        return self.graph.add("between", (self,), self.rows, arrays=(limits,))
+
+
+Operand = Value | ArrayLike
+
+
+@dataclass(eq=False)
+class Graph:
+    """Nodes in order, and named results. Equal nodes are one."""
+
+    nodes: list[Node] = field(default_factory=list)
+    outputs: dict[str, Value] = field(default_factory=dict)
+    _known: dict[tuple[Any, ...], int] = field(default_factory=dict, repr=False)
+
+    def add(
+        self,
+        kind: str,
+        inputs: Sequence[Value],
+        rows: int,
+        *,
+        name: str = "",
+        arrays: Sequence[NDArray[Any]] = (),
+        static: tuple[Any, ...] = (),
+        per_call: bool | None = None,
+    ) -> Value:
+        """Append a node of any kind; `per_call` None: where all of its inputs are."""
+        numbers = tuple(v.number for v in inputs)
+        if per_call is None:
+            per_call = all(self.nodes[k].per_call for k in numbers)
+        key = (kind, numbers, rows, name, static, *((a.shape, a.tobytes()) for a in arrays))
+        if key not in self._known:
+            self._known[key] = len(self.nodes)
+            self.nodes.append(Node(kind, numbers, rows, per_call, name, tuple(arrays), static))
+        return Value(self, self._known[key])
+
+    def input(self, name: str, rows: int = 1, *, per_call: bool = False) -> Value:
+        return self.add("input", (), rows, name=name, per_call=per_call)
+
+    def constant(self, value: ArrayLike) -> Value:
+        """Numbers, one a row."""
+        array = np.atleast_1d(np.asarray(value, np.float64))
+        return self.add("constant", (), len(array), arrays=(array,), per_call=True)
+
+    def value(self, operand: Operand) -> Value:
+        return operand if isinstance(operand, Value) else self.constant(operand)
+
+    def each(self, kind: str, *operands: Operand) -> Value:
+        """An operation row by row; a single row stands for as many as the others have."""
+        values = [self.value(v) for v in operands]
+        rows = max(v.rows for v in values)
+        if any(v.rows not in (1, rows) for v in values):
+            raise ValueError(f"{kind} of {[v.rows for v in values]} rows")
+        return self.add(kind, values, rows)
+
+    def take(self, x: Value, rows: Sequence[int]) -> Value:
+        if list(rows) == list(range(x.rows)):
+            return x
+        if x.node.kind == "concat":  # from the part that holds them all
+            start = 0
+            for k in x.node.inputs:
+                part = Value(self, k)
+                if all(start <= r < start + part.rows for r in rows):
+                    return self.take(part, [r - start for r in rows])
+                start += part.rows
+        if x.node.kind == "constant":
+            return self.constant(x.node.arrays[0][list(rows)])
+        if x.node.kind == "take":
+            return self.take(Value(self, x.node.inputs[0]), [x.node.static[r] for r in rows])
+        return self.add("take", (x,), len(rows), static=tuple(int(r) for r in rows))
+
+    def split(self, x: Value, sizes: Iterable[int]) -> list[Value]:
+        """Consecutive rows of `x`, so many in each part."""
+        ends = np.cumsum([0, *sizes])
+        return [x[int(a) : int(b)] for a, b in zip(ends, ends[1:], strict=False)]
+
+    def concat(self, *parts: Value) -> Value:
+        return parts[0] if len(parts) == 1 else self.add("concat", parts, sum(p.rows for p in parts))
+
+    def affine(
+        self,
+        weight: ArrayLike,
+        x: Value,
+        bias: ArrayLike | None = None,
+        *,
+        moving: tuple[Value, ArrayLike] | None = None,
+        added: Value | None = None,
+    ) -> Value:
+        """weight [R, K] x + bias [R].
+
+        Args:
+            moving: (s, W1) with s one row of the call: the weight is then weight + s W1.
+            added: R rows that are added.
+        """
+        w = np.asarray(weight, np.float64)
+        b = np.zeros(len(w)) if bias is None else np.asarray(bias, np.float64)
+        arrays, inputs = [w, b], [x]
+        if moving is not None:
+            arrays.append(np.asarray(moving[1], np.float64))
+            inputs.append(moving[0])
+        if added is not None:
+            inputs.append(added)
+        static = (moving is not None, added is not None)
+        return self.add("affine", inputs, len(w), arrays=arrays, static=static)
+
+    def quadratic(self, x: Value, forms: Sequence[Form], bias: ArrayLike | None = None) -> Value:
+        """Row r is the sum of x_i x_j over the pairs (i, j) of form r, plus bias [R]."""
+        b = np.zeros(len(forms)) if bias is None else np.asarray(bias, np.float64)
+        return self.add("quadratic", (x,), len(forms), arrays=(b,), static=tuple(tuple(f) for f in forms))
+
+    def square(self, x: Value) -> Value:
+        """The squared length of x, one row."""
+        return self.quadratic(x, [tuple((i, i) for i in range(x.rows))])
+
+    def dot(self, a: Value, b: Value) -> Value:
+        """The scalar product of a and b, one row."""
+        return self.affine(np.ones((1, a.rows)), a * b)
+
+    def polynomial(self, exponents: Exponents, weight: ArrayLike, x: Value) -> Value:
+        """weight [R, M] times the monomials of x [V rows], for exponents [M, V], rows of which are unique."""
+        w = np.asarray(weight, np.float64)
+        return self.add("polynomial", (x,), len(w), arrays=(np.asarray(exponents, np.int64), w))
+
+    def series(self, x: Value, coefficients: ArrayLike) -> Value:
+        return self.add("series", (x,), x.rows, arrays=(np.asarray(coefficients, np.float64),))
+
+    def select(self, truth: Value, then: Operand, otherwise: Operand) -> Value:
+        return self.each("select", truth, then, otherwise)
+
+    def first_failure(self, tests: Sequence[tuple[Value, Value]], codes: Sequence[int]) -> Value:
+        """The status of a ray: code k of the first test, in order, that is not value <= limit; NaN fails; 0 if none.
+
+        Codes fall in the order in which rays meet the tests, but for several at one surface (`base.status`). ONNX
+        clips value - limit between 0 and the code: tests are to be scaled so that a failure exceeds every code.
+        """
+        flat = [v for pair in tests for v in pair]
+        return self.add("first_failure", flat, 1, static=tuple(int(c) for c in codes))
+
+    def inline(self, other: Graph, given: Mapping[str, Value]) -> dict[str, Value]:
+        """Append all of another graph, these values as its inputs (others stay inputs); returns its outputs."""
+        values: list[Value] = []
+        for node in other.nodes:
+            if node.kind == "input" and node.name in given:
+                values.append(given[node.name])
+                continue
+            inputs = [values[k] for k in node.inputs]
+            per_call = node.per_call if node.kind in ("input", "constant") else None
+            values.append(
+                self.add(
+                    node.kind, inputs, node.rows, name=node.name, arrays=node.arrays, static=node.static,
+                    per_call=per_call,
+                )
+            )  # fmt: skip
+        return {name: values[v.number] for name, v in other.outputs.items()}
+
+    def inputs_of(self, number: int) -> list[Value]:
+        return [Value(self, k) for k in self.nodes[number].inputs]
+
+
+def live_rows(graph: Graph, outputs: Mapping[str, Value]) -> dict[int, set[int]]:
+    """The rows of each node that the outputs need; a node that is not there is not needed."""
+    needed: dict[int, set[int]] = {}
+
+    def ask(number: int, rows: Iterable[int]) -> None:
+        available = graph.nodes[number].rows
+        needed.setdefault(number, set()).update(r if available > 1 else 0 for r in rows)
+
+    for value in outputs.values():
+        ask(value.number, range(value.rows))
+    for number in range(len(graph.nodes) - 1, -1, -1):
+        if number not in needed:
+            continue
+        node, rows = graph.nodes[number], needed[number]
+        if node.kind == "take":
+            ask(node.inputs[0], (node.static[r] for r in rows))
+        elif node.kind == "concat":
+            start = 0
+            for k in node.inputs:
+                end = start + graph.nodes[k].rows
+                mine = [r - start for r in rows if start <= r < end]
+                if mine:
+                    ask(k, mine)
+                start = end
+        elif node.kind in ("affine", "polynomial", "quadratic", "first_failure"):
+            for k in node.inputs[:1] if node.kind == "affine" else node.inputs:
+                ask(k, range(graph.nodes[k].rows))
+            if node.kind == "affine":
+                moving, added = node.static
+                if moving:
+                    ask(node.inputs[1], [0])
+                if added:
+                    ask(node.inputs[-1], rows)
+        else:
+            for k in node.inputs:
+                ask(k, rows)
+    return needed
+
+
+def pruned(graph: Graph, outputs: Mapping[str, Value] | None = None) -> Graph:
+    """The graph of these outputs (or its own) alone: rows of matrices and polynomials that nothing needs are gone."""
+    wanted = dict(graph.outputs if outputs is None else outputs)
+    live = live_rows(graph, wanted)
+    found = Graph()
+    place: dict[int, Value] = {}  # a node's value among the new ones
+    kept: dict[int, list[int]] = {}  # the old rows that it holds, in order
+
+    def rows_of(number: int, rows: Sequence[int]) -> Value:
+        """New value of old rows; a single row stands for any."""
+        known = kept[number]
+        if graph.nodes[number].rows == 1:
+            return place[number]
+        return found.take(place[number], [known.index(r) for r in rows])
+
+    for number, node in enumerate(graph.nodes):
+        if number not in live:
+            continue
+        every, rows = list(range(node.rows)), sorted(live[number])
+        if node.kind == "input":
+            place[number], kept[number] = found.input(node.name, node.rows, per_call=node.per_call), every
+            continue
+        kept[number] = rows
+        if node.kind == "constant":
+            place[number] = found.constant(node.arrays[0][rows])
+        elif node.kind == "take":
+            place[number] = rows_of(node.inputs[0], [node.static[r] for r in rows])
+        elif node.kind == "concat":
+            parts, start = [], 0
+            for k in node.inputs:
+                mine = [r - start for r in rows if start <= r < start + graph.nodes[k].rows]
+                parts += [rows_of(k, mine)] if mine else []
+                start += graph.nodes[k].rows
+            place[number] = found.concat(*parts)
+        else:
+            place[number] = _kept_rows(found, graph, node, rows, rows_of)
+    found.outputs = {name: rows_of(v.number, range(v.rows)) for name, v in wanted.items()}
+    return found
+
+
+def _kept_rows(found: Graph, graph: Graph, node: Node, rows: list[int], rows_of: Any) -> Value:
+    """A node that computes, for these of its rows."""
+
+    def whole(k: int) -> Value:
+        value: Value = rows_of(k, range(graph.nodes[k].rows))
+        return value
+
+    if node.kind in ("affine", "quadratic", "polynomial"):
+        inputs = [whole(k) for k in node.inputs]
+        arrays = [a[rows] for a in node.arrays] if node.kind != "polynomial" else [node.arrays[0], node.arrays[1][rows]]
+        static = node.static
+        if node.kind == "affine" and node.static[1]:
+            inputs[-1] = rows_of(node.inputs[-1], rows)
+        if node.kind == "quadratic":
+            static = tuple(node.static[r] for r in rows)
+        return found.add(node.kind, inputs, len(rows), arrays=arrays, static=static)
+    if node.kind == "first_failure":
+        return found.add(node.kind, [whole(k) for k in node.inputs], 1, static=node.static)
+    arrays = [a[rows] if node.kind == "between" else a for a in node.arrays]
+    inputs = [rows_of(k, rows) for k in node.inputs]
+    return found.add(node.kind, inputs, len(rows), arrays=arrays, static=node.static)
+
+
+def same_structure(graphs: Sequence[Graph]) -> bool:
+    """Whether graphs differ in their numbers only, so that one set of operations serves all of them."""
+
+    def shape(graph: Graph) -> list[Any]:
+        bare = []
+        for n in graph.nodes:
+            exponents = n.arrays[0].tobytes() if n.kind == "polynomial" else b""
+            bare.append((n.kind, n.inputs, n.rows, n.name, n.static, [a.shape for a in n.arrays], exponents))
+        return [bare, {name: v.number for name, v in graph.outputs.items()}]
+
+    first = shape(graphs[0])
+    return all(shape(g) == first for g in graphs[1:])

@@ -1,0 +1,243 @@
+"""Graphs as programs of float steps, one ray at a time: what C, GLSL and their like are written from.
+
+Several graphs of one structure (one for each of several fixed wavelengths) become one program with as many coefficient
+tables. Polynomials take few products; sums of products are fused multiply-adds, numbers are folded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from neurolens.base.errors import InputError
+from neurolens.graph.ir import Exponents, Graph, Node, pruned, same_structure
+from neurolens.graph.program import Expr, Program, row_names
+
+Array = NDArray[np.float64]
+# Pairs (a, b) of a truth: it holds where a <= b in all of them.
+Tests = list[tuple[Expr, Expr]]
+
+
+def lower(graphs: Graph | Sequence[Graph], fixed: Mapping[str, ArrayLike] | None = None) -> Program:
+    """The program of a graph, or of several of one structure, a coefficient table each.
+
+    Args:
+        fixed: inputs of the call that are numbers: they are folded in.
+
+    Inputs and outputs are named row by row, see `program.row_names`. Inputs that nothing needs are none.
+
+    Raises:
+        InputError: graphs that differ in more than numbers; numbers that float32 cannot hold.
+    """
+    kept = [pruned(g) for g in ([graphs] if isinstance(graphs, Graph) else graphs)]
+    if not same_structure(kept):
+        raise InputError("export", "models", "(graphs that differ)", "models of one structure")
+    return _Lowering(kept, fixed or {}).program
+
+
+class _Lowering:
+    def __init__(self, graphs: Sequence[Graph], fixed: Mapping[str, ArrayLike]) -> None:
+        self.graphs, self.fixed = graphs, fixed
+        self.program = Program(tables=len(graphs))
+        self.rows: list[list[Any]] = []  # Expr, or Tests for truths, of every row of every node
+        for number, node in enumerate(graphs[0].nodes):
+            given = [self.rows[k] for k in node.inputs]
+            rule = _RULES.get(node.kind)
+            if rule is not None:
+                arrays = [np.stack([g.nodes[number].arrays[i] for g in graphs], -1) for i in range(len(node.arrays))]
+                self.rows.append(rule(self, node, given, arrays))
+            else:
+                self.rows.append([self._each(node.kind, *(_row(v, r) for v in given)) for r in range(node.rows)])
+        for name, value in graphs[0].outputs.items():
+            rows = [self._number(v) for v in self.rows[value.number]]
+            self.program.outputs.update(zip(row_names(name, len(rows)), rows, strict=True))
+
+    def _number(self, value: Expr | Tests) -> Expr:
+        """A truth as 1 or 0."""
+        if isinstance(value, Expr):
+            return value
+        return self._choice(value, self.program.literal(1.0), self.program.literal(0.0))
+
+    def _choice(self, tests: Tests, then: Expr, otherwise: Expr) -> Expr:
+        for low, high in tests:
+            then = self.program.select(low, high, then, otherwise)
+        return then
+
+    def _each(self, kind: str, *given: Any) -> Any:
+        p = self.program
+        if kind == "and":
+            return [*self._tests(given[0]), *self._tests(given[1])]
+        if kind == "le":
+            return [(self._number(given[0]), self._number(given[1]))]
+        if kind == "select":
+            return self._choice(self._tests(given[0]), self._number(given[1]), self._number(given[2]))
+        numbers = [self._number(v) for v in given]
+        if kind == "add":
+            return p.sum(*numbers)
+        if kind == "tanh":
+            return p.tanh(numbers[0])
+        if kind == "abs":
+            return p.op("max", numbers[0], -numbers[0])
+        return numbers[0] if kind == "whole" else p.op(kind, *numbers)
+
+    def _tests(self, truth: Expr | Tests) -> Tests:
+        return [(self.program.literal(0.5), truth)] if isinstance(truth, Expr) else truth
+
+
+def _row(rows: Sequence[Any], r: int) -> Any:
+    """A single row stands for any."""
+    return rows[r if len(rows) > 1 else 0]
+
+
+def _input(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
+    if node.name in at.fixed:
+        return [at.program.literal(v) for v in np.atleast_1d(np.asarray(at.fixed[node.name], np.float64))]
+    # An input without a use is no argument: steps are appended when something takes them.
+    return [at.program.input(name) for name in row_names(node.name, node.rows)]
+
+
+def _affine(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
+    p, x, found = at.program, given[0], []
+    moving, added = node.static
+    for r in range(node.rows):
+        total = p.literal(arrays[1][r])
+        columns = range(len(x) - 1, -1, -1) if moving else range(len(x))
+        for c in columns:
+            weight = p.literal(arrays[0][r, c])
+            if moving and arrays[2][r, c].any():
+                weight = p.fma(given[1][0], p.literal(arrays[2][r, c]), weight)
+            total = p.fma(x[c], weight, total)
+        found.append(total + given[-1][r] if added else total)
+    return found
+
+
+def _quadratic(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
+    found = []
+    for form, bias in zip(node.static, arrays[0], strict=True):
+        total = at.program.literal(bias)
+        for i, j in reversed(form):
+            total = at.program.fma(given[0][i], given[0][j], total)
+        found.append(total)
+    return found
+
+
+def _polynomial(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
+    """Each monomial is made once, by one multiplication, and spent at once on every row: few stay in registers."""
+    p, variables = at.program, given[0]
+    table = _collected(variables, node.arrays[0], arrays[1])
+    rows = [p.literal(c) for c in table.pop((0,) * len(variables), np.zeros((node.rows, p.tables)))]
+    made = {tuple(int(i == v) for i in range(len(variables))): value for v, value in enumerate(variables)}
+    for e, factors in plan_monomials(list(table), len(variables)):
+        if factors is not None:
+            made[e] = made[factors[0]] * made[factors[1]]
+        if e in table:
+            rows = [
+                p.fma(made[e], p.literal(c), row) if c.any() else row for c, row in zip(table[e], rows, strict=True)
+            ]
+    return rows
+
+
+def _collected(variables: Sequence[Expr], exponents: Exponents, weight: Array) -> dict[tuple[int, ...], Array]:
+    """Coefficients [R, T] of the monomials that have any; variables that are numbers are multiplied in."""
+    numbers = {v: np.array(e.literal) for v, e in enumerate(variables) if e.literal is not None}
+    table: dict[tuple[int, ...], Array] = {}
+    for e, column in zip(exponents.tolist(), np.moveaxis(weight, 1, 0), strict=True):
+        for v, number in numbers.items():
+            if e[v]:
+                column, e[v] = column * number ** e[v], 0
+        if column.any():
+            key = tuple(e)
+            table[key] = table[key] + column if key in table else column
+    return table
+
+
+def _series(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
+    return [at.program.horner(x, list(arrays[0])) for x in given[0]]
+
+
+def _between(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Tests]:
+    p = at.program
+    limits = [(p.literal(low), p.literal(high)) for low, high in arrays[0]]
+    return [[(low, x), (x, high)] for x, (low, high) in zip(given[0], limits, strict=True)]
+
+
+def _clip(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
+    low, high = (at.program.literal(v) for v in arrays[0])
+    return [at.program.op("min", at.program.op("max", x, low), high) for x in given[0]]
+
+
+def _first_failure(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
+    status = at.program.literal(0.0)
+    for k in range(len(node.static) - 1, -1, -1):
+        status = at.program.select(given[2 * k][0], given[2 * k + 1][0], status, float(node.static[k]))
+    return [status]
+
+
+_RULES: dict[str, Callable[[_Lowering, Node, list[Any], list[Array]], list[Any]]] = {
+    "input": _input,
+    "constant": lambda at, node, given, arrays: [at.program.literal(v) for v in arrays[0]],
+    "take": lambda at, node, given, arrays: [given[0][r] for r in node.static],
+    "concat": lambda at, node, given, arrays: [row for part in given for row in part],
+    "clip": _clip,
+    "affine": _affine,
+    "quadratic": _quadratic,
+    "polynomial": _polynomial,
+    "series": _series,
+    "between": _between,
+    "first_failure": _first_failure,
+}
+
+
+Exponent = tuple[int, ...]
+Made = tuple[Exponent, tuple[Exponent, Exponent] | None]  # a monomial and the two that it is the product of
+
+
+def plan_monomials(wanted: Sequence[Exponent], variables: int) -> list[Made]:
+    """An order in which every monomial is a variable (None) or the product of two before it.
+
+    Factors that exist anyway are taken first; where none do, the one that adds least. Depth first: what a monomial is
+    made of was made just before.
+    """
+    units = [tuple(int(i == v) for i in range(variables)) for v in range(variables)]
+    factors: dict[Exponent, tuple[Exponent, Exponent]] = {}
+    known = {*units, *wanted}
+
+    def resolve(e: Exponent) -> None:
+        if sum(e) == 1 or e in factors:
+            return
+        options = []
+        for right in product(*(range(k + 1) for k in e)):
+            left = tuple(a - b for a, b in zip(e, right, strict=True))
+            if 0 < sum(right) <= sum(left):
+                options.append((sum(f not in known for f in {left, right}), sum(right), left, right))
+        _, _, left, right = min(options)
+        known.update((left, right))
+        factors[e] = (left, right)
+        resolve(left)
+        resolve(right)
+
+    for e in sorted(wanted, key=lambda e: (sum(e), e), reverse=True):
+        resolve(e)
+    return _depth_first([*units, *sorted(factors, key=lambda e: (sum(e), e))], factors, set(wanted))
+
+
+def _depth_first(
+    nodes: list[Exponent], factors: dict[Exponent, tuple[Exponent, Exponent]], wanted: set[Exponent]
+) -> list[Made]:
+    """Nodes after their factors; each is followed by those that it was the last factor of."""
+    waiting: dict[Exponent, set[Exponent]] = {e: set(pair) for e, pair in factors.items()}
+    order: list[Made] = []
+    stack = [e for e in reversed(nodes) if e not in factors]
+    while stack:
+        e = stack.pop()
+        order.append((e, factors.get(e)))
+        for child in sorted((c for c, missing in waiting.items() if e in missing), reverse=True):
+            waiting[child].discard(e)
+            if not waiting[child]:
+                del waiting[child]
+                stack.append(child)
+    return [(e, pair) for e, pair in order if pair is not None or e in wanted]
