@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
-from neurolens.programs.contract import FILM_X_Y, RAY, SCENE_RAY, STATUS, WAVELENGTH, derivative
-from neurolens.programs.expressions import Expr, Program
+from neurolens.graph.program import FILM_X_Y, RAY, SCENE_RAY, STATUS, WAVELENGTH, Expr, Program, derivative
 from neurolens.programs.tangents import with_derivatives
 
 Array = NDArray[np.float64]
@@ -46,7 +45,7 @@ def with_low_order_derivatives(program: Program, samples: Mapping[str, NDArray[n
     """Fit the derivatives of a program by orthogonal matching pursuit, each until it is good enough.
 
     Args:
-        program: of a lens, see `programs.contract`.
+        program: of a lens, see `graph.program`.
         samples: its inputs, of rays that cover what it will be asked.
 
     Returns None where low orders do not do: a lens too strong, or too few rays that pass.

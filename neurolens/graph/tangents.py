@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from neurolens.programs.contract import derivative
-from neurolens.programs.expressions import Argument, Expr, Program, Step
+from neurolens.graph.program import Argument, Expr, Program, Step, derivative
 
 
 def with_derivatives(program: Program, outputs: Sequence[str], inputs: Sequence[str]) -> Program:

@@ -11,12 +11,22 @@ from __future__ import annotations
 import numpy as np
 
 from neurolens.base import status as st
+from neurolens.graph.program import (
+    FILM_Z,
+    RAY,
+    SCENE_RAY,
+    STATUS,
+    STOP,
+    STOP_RADIUS,
+    TRANSMITTANCE,
+    WAVELENGTH,
+    Expr,
+    Program,
+)
 from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.shapes import is_plain
 from neurolens.optics.traceshapes import Vector, meet_shape
-from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STATUS, STOP, STOP_RADIUS, TRANSMITTANCE, WAVELENGTH
-from neurolens.programs.expressions import Expr, Program
 
 # The index is a polynomial in 1 / lambda^2 that holds it to float32's last bit.
 _INDEX = 3e-8
@@ -24,7 +34,7 @@ _AIR = "air"
 
 
 def exact_program(lens: Lens, pupil_z_mm: float, wavelength_nm: tuple[float, float], *, whole: bool = True) -> Program:
-    """Film and pupil points in; scene ray and status out, as `programs.contract` has them.
+    """Film and pupil points in; scene ray and status out, as `graph.program` has them.
 
     Args:
         pupil_z_mm: plane of the pupil points. wavelength_nm: range in which the indices hold to float32's last bit.

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from neurolens.graph.program import Expr, Program
 from neurolens.optics.prescription import Surface
 from neurolens.optics.shapes import LAST_STEP, STEEPEST, start_of
-from neurolens.programs.expressions import Expr, Program
 
 Vector = tuple[Expr, Expr, Expr]
 
