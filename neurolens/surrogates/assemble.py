@@ -1,8 +1,8 @@
 """A whole model as one graph: raw mm and nm in; scene ray, transmittance, stop crossing and status out.
 
 Light field, core, decoding, front surface, rims, domain: everything round a core is written here, once, for every kind
-of model. Inputs of the graph are `rays` (film x, y, pupil x, y in mm, wavelength in nm), and of the call `film_z_mm` and
-`stop_radius_mm`; outputs `scene_ray` (x, y, z in mm, unit direction), `transmittance`, `stop_xy_mm`, `status`.
+of model. Inputs of the graph are `rays` (film x, y, pupil x, y in mm, wavelength in nm) and, of the call, `film_z_mm`
+and `stop_radius_mm`; outputs `scene_ray` (x, y, z in mm, unit direction), `transmittance`, `stop_xy_mm`, `status`.
 """
 
 from __future__ import annotations
