@@ -13,7 +13,7 @@ import lens_models
 import numpy as np
 import onnx
 import pytest
-from neurolens.programs import compiler, loworder
+from neurolens.graph import compiler, loworder
 
 from neurolens.apertures import Aperture
 from neurolens.base import status as st
@@ -315,7 +315,7 @@ def test_no_torch_no_onnx(tmp_path: Path) -> None:
     code = (
         "import sys\n"
         "sys.modules.update(dict.fromkeys(['torch', 'onnx', 'sklearn', 'matplotlib']))\n"
-        "from neurolens.programs import compiler\n"
+        "from neurolens.graph import compiler\n"
         f"compiler.FLAGS = {compiler.FLAGS!r}\n"
         "from neurolens.cameras.build import Shot, make_camera\n"
         f"camera = make_camera('fused:{model_file()}', Shot((36.0, 24.0), 2.0))\n"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from neurolens.programs import compiler
+from neurolens.graph import compiler
 
 from neurolens.base.errors import InputError
 

@@ -16,7 +16,7 @@ from neurolens.evaluate.speed import Call, Unavailable
 from neurolens.graph.c import Signature, write_c
 from neurolens.graph.compiler import FLAGS, compile_c
 from neurolens.graph.program import Program
-from neurolens.programs import compiler
+from neurolens.graph import compiler
 
 _NAME = "lens"
 
