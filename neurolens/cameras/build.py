@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from neurolens.apertures import Aperture
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.fisheye import PROJECTIONS, Fisheye, check_field
@@ -28,6 +27,7 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thick import ThickLens
 from neurolens.cameras.thin import ThinLens
 from neurolens.cameras.vignetting import Vignetted
+from neurolens.optics.apertures import Aperture
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens

@@ -19,12 +19,11 @@ from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_search import COARSE, FINE
 from neurolens.cameras.sampling import arrived, check_film, positive
-from neurolens.optics.differentials import film_tangents, trace_differentials
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
-from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds, symmetric_about_axis
-from neurolens.optics.trace import Rays, trace
+from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds
+from neurolens.optics.trace import Rays, film_derivatives, trace, trace_differentials
 
 
 class ExactCamera:
@@ -76,7 +75,7 @@ class ExactCamera:
             film_z += film_offset_mm
             self.lens = replace(self.lens, film_z_mm=film_z)
         # A lens with cylinders is searched at many azimuths for one outline: coarser, for it fits none of them closely.
-        round_ = symmetric_about_axis(self.lens)
+        round_ = not self.lens.anamorphic
         detail = FINE if round_ else COARSE._replace(tighten=bounds is not None)
         if bounds is None:
             corner = math.hypot(*self.film_mm) / 2
@@ -175,7 +174,7 @@ class ExactCamera:
         rays = camera_rays(fx, fy, film_z, px, py, self._pupil_z_mm)
         gap = film_z - self._pupil_z_mm
         distance = torch.sqrt((fx - px) ** 2 + (fy - py) ** 2 + gap * gap)
-        moves = trace_differentials(self.lens, rays, film_tangents(rays, distance), wavelength).derivatives
+        moves = trace_differentials(self.lens, rays, film_derivatives(rays, distance), wavelength).derivatives
         d_film = torch.stack([torch.stack(list(m)) for m in moves], 1).to(torch.float32).numpy()
         return self._scene(film, pupil, wavelength_nm)._replace(d_film=d_film)
 

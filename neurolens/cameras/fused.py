@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.apertures import Aperture
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FloatArray, RayDifferentials
@@ -23,7 +22,8 @@ from neurolens.cameras.model import UNIT_SLACK, ModelScene, OnnxCamera
 from neurolens.graph.compiler import load_compiled
 from neurolens.graph.loworder import with_low_order_derivatives
 from neurolens.graph.program import FILM_X_Y, FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH, Program, derivative
-from neurolens.programs.tangents import with_derivatives
+from neurolens.graph.tangents import with_derivatives
+from neurolens.optics.apertures import Aperture
 
 _SAMPLES = 4096  # rays that low-order derivatives are fitted to
 

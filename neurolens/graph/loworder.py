@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.graph.program import FILM_X_Y, RAY, SCENE_RAY, STATUS, WAVELENGTH, Expr, Program, derivative
-from neurolens.programs.tangents import with_derivatives
+from neurolens.graph.tangents import with_derivatives
 
 Array = NDArray[np.float64]
 _DEGREE, _DEGREE_WAVE = 4, 2  # of film and pupil point; of what may be multiplied by the wavelength's variable

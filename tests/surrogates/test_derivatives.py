@@ -11,9 +11,9 @@ from lens_models import KINDS, model, prepared
 from torch import Tensor
 
 from neurolens.base import status as st
-from neurolens.optics.differentials import film_tangents, trace_differentials
-from neurolens.optics.pupil_rays import camera_rays
-from neurolens.surrogates.cores import Core, MirrorPolynomial, Partitioned
+from neurolens.optics.pupils import camera_rays
+from neurolens.optics.trace import film_derivatives, trace_differentials
+from neurolens.surrogates.cores import MirrorPolynomial, Partitioned
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.inversion.derivatives import differentiate, forward_mode, slopes_of
@@ -109,7 +109,7 @@ def test_differentials_are_those_of_the_exact_lens_to_one_percent(name: str) -> 
     distance = torch.sqrt(
         (rays.film_x - rays.pupil_x) ** 2 + (rays.film_y - rays.pupil_y) ** 2 + (rays.film_z - plane) ** 2
     )
-    exact = trace_differentials(m.lens, start, film_tangents(start, distance), rays.wavelength_nm)
+    exact = trace_differentials(m.lens, start, film_derivatives(start, distance), rays.wavelength_nm)
     wanted = torch.stack([torch.stack(list(t)) for t in exact.derivatives], 1)  # [6, 2, N]
     for rows in (slice(0, 3), slice(3, 6)):
         off = (d.d_film - wanted)[rows].square().mean().sqrt() / wanted[rows].square().mean().sqrt()

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 from lens_models import anamorphic
+from vignetting_oracle import vignetting_errors
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import ray_errors
-from neurolens.evaluate.vignetting import vignetting_errors
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.export import export_onnx

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-import torch
 from lens_models import prepared
 from onnx import TensorProto, helper, numpy_helper
 

@@ -14,7 +14,7 @@ import torch
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.evaluate.benches.compiled_source import FLAGS, CompiledSource, find_compiler
+from neurolens.evaluate.candidates import FLAGS, CompiledSource, find_compiler
 from neurolens.evaluate.speed import Unavailable
 from neurolens.graph.c import literal
 from neurolens.graph.program import SCENE_RAY, Program

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from neurolens.base import status as st
-from neurolens.frontsurface import meet_front
+from neurolens.optics.sag import meet_front
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP
 from neurolens.surrogates.domain import FilmRays
