@@ -244,7 +244,9 @@ class Graph:
 
     def dot(self, a: Value, b: Value) -> Value:
         """The scalar product of a and b, one row."""
-        return self.affine(np.ones((1, a.rows)), a * b)
+        if a == b:
+            return self.square(a)
+        return self.quadratic(self.concat(a, b), [tuple((k, a.rows + k) for k in range(a.rows))])
 
     def polynomial(self, exponents: Exponents, weight: ArrayLike, x: Value) -> Value:
         """weight [R, M] times the monomials of x [V rows], for exponents [M, V], rows of which are unique."""
