@@ -17,10 +17,10 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.cores import Network
 from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.gates import gate_values
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs
 from neurolens.surrogates.targets import scales_of, targets_of
 
@@ -115,5 +115,6 @@ def _network(known: Prepared, units: int) -> LensModel:
     ab = ridge(both, targets.vectors.reshape(3, -1)).reshape(6, -1)
     gates = ridge(features(pairs.rim), gate_values(pairs.lens, known.gates, pairs.rim))
     out = torch.cat([ab, ridge(m, targets.transmittance[None]), gates])
-    core = Network(hidden, (out[:, :-1].contiguous(), out[:, -1].contiguous()), shift, scale)
+    layers = tuple((w.numpy(), b.numpy()) for w, b in hidden)
+    core = Network(layers, (out[:, :-1].numpy(), out[:, -1].numpy()), shift.numpy(), scale.numpy())
     return LensModel(pairs.lens, pairs.domain, encoding, scales_of(pairs.lens), known.gates, core, "random network")

@@ -395,8 +395,8 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from neurolens.evaluate.measure import measure_errors
     from neurolens.optics.lensfile import read_lens
     from neurolens.surrogates.domain import domain_of
+    from neurolens.surrogates.export import export_onnx
     from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-    from neurolens.surrogates.onnx.export import export_onnx
     from neurolens.surrogates.pairs import PairSettings, make_pairs
 
     lens = read_lens(SINGLET).at(f_number=8, focal_length_mm=50)

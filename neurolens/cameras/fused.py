@@ -1,7 +1,7 @@
 """Lenses as compiled C cameras: everything between the random numbers and the weighted ray in one call.
 
 The system's C compiler makes the code when the camera is made (1 to 10 s, kept for the next time; see
-`programs.compiler`). It runs in float32 on the thread that calls it; workers that are forked share it.
+`graph.compiler`). It runs in float32 on the thread that calls it; workers that are forked share it.
 """
 
 from __future__ import annotations
@@ -20,10 +20,9 @@ from neurolens.cameras.fusedsource import Setting, camera_source
 from neurolens.cameras.graphprogram import program_of
 from neurolens.cameras.lens_film import LensFilm
 from neurolens.cameras.model import UNIT_SLACK, ModelScene, OnnxCamera
-from neurolens.programs.compiler import load_compiled
-from neurolens.programs.contract import FILM_X_Y, FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH, derivative
-from neurolens.programs.expressions import Program
-from neurolens.programs.loworder import with_low_order_derivatives
+from neurolens.graph.compiler import load_compiled
+from neurolens.graph.loworder import with_low_order_derivatives
+from neurolens.graph.program import FILM_X_Y, FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH, Program, derivative
 from neurolens.programs.tangents import with_derivatives
 
 _SAMPLES = 4096  # rays that low-order derivatives are fitted to
@@ -37,7 +36,7 @@ class FusedFilm:
 
     Args:
         film: of the same lens, focus and stop.
-        program: inputs and outputs of `programs.contract`.
+        program: inputs and outputs of `graph.program`.
         stop_radius_mm: of the round stop that the program knows.
         film_mm: width and height of the film whose rays differentials are fitted to.
         aperture: the shape of the opening, tested on the rays' crossings with the stop; None is round.

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.cameras.onnxfile import constants_and_nodes
 from neurolens.cameras.onnxshapes import Node
-from neurolens.programs.contract import (
+from neurolens.graph.program import (
     FILM_Z,
     RAY,
     SCENE_RAY,
@@ -28,8 +28,9 @@ from neurolens.programs.contract import (
     STOP_RADIUS,
     TRANSMITTANCE,
     WAVELENGTH,
+    Expr,
+    Program,
 )
-from neurolens.programs.expressions import Expr, Program
 from neurolens.programs.tanh import add_tanh
 
 # Objects are expressions, numbers constants.
@@ -39,7 +40,7 @@ MAX_STEPS = 200_000  # the largest models that ship take 3000; a compiler needs 
 
 
 def program_of(path: str | Path, data: bytes, state: Sequence[float] = ()) -> Program:
-    """The program of a model: inputs and outputs are those of `programs.contract`.
+    """The program of a model: inputs and outputs are those of `graph.program`.
 
     Args:
         path: of the model, for errors. data: its bytes, as `read_checked` gives them.

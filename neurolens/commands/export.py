@@ -83,8 +83,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("neurolens export", "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
     check_writable(args.out)
     from neurolens.cameras.model import load_model
-    from neurolens.surrogates.source.fused import Fixed, Parts
-    from neurolens.surrogates.source.writer import export_source
+    from neurolens.surrogates.source import Fixed, Parts, export_source
     from neurolens.surrogates.specialise import fixed_models
     from neurolens.surrogates.stored import load_fitted
 
@@ -175,7 +174,7 @@ def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] |
     """The graph with its card: the errors of the card given, or measured anew for what was fixed."""
     from neurolens.cameras.model import load_model
     from neurolens.evaluate.measure import measure_errors
-    from neurolens.surrogates.onnx.export import export_onnx
+    from neurolens.surrogates.export import export_onnx
 
     if len(models) > 1:
         wavelengths = [m.domain.wavelength_nm[0] for m in models]

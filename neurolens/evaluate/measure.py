@@ -23,10 +23,10 @@ from neurolens.evaluate.rays import PIXELS_ACROSS, ray_errors
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.domain import Domain, FilmRays
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model
 from neurolens.surrogates.fits import checkpoint
 from neurolens.surrogates.model import LensModel, Prediction
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSet
 
 # Keys of the ray and vignetting errors that a model's card promises and its record shows.

@@ -26,8 +26,8 @@ from neurolens.evaluate.records import plain
 from neurolens.evaluate.speed import race
 from neurolens.evaluate.state_errors import card_errors, errors_at, random_states
 from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.export import export_states
 from neurolens.surrogates.fit import ModelSettings
-from neurolens.surrogates.onnx.states import export_states
 from neurolens.surrogates.states.fit import StateSettings, fit_states
 from neurolens.surrogates.states.space import StateSpace
 

@@ -77,8 +77,9 @@ class _Space:
         return [np.broadcast_to(r, (r.shape[0], width)) if r.shape[1] != width else r for r in rows]
 
 
-def monomials(space: _Space, x: Rows, exponents: Exponents) -> Rows:
-    """[M, N] products of powers of the rows of x [V, N]."""
+def monomials(x: Rows, exponents: Exponents) -> Rows:
+    """[M, N] products of powers of the rows of x [V, N], an array or a tensor, for exponents [M, V]."""
+    space = _Space(x)
     powers = [space.ones_like(x)]
     for _ in range(int(exponents.max(initial=0))):
         powers.append(powers[-1] * x)
@@ -107,7 +108,7 @@ def _quadratic(space: _Space, node: Node, given: list[Rows]) -> Rows:
 
 
 def _polynomial(space: _Space, node: Node, given: list[Rows]) -> Rows:
-    return space.numbers(node.arrays[1]) @ monomials(space, given[0], node.arrays[0])
+    return space.numbers(node.arrays[1]) @ monomials(given[0], node.arrays[0])
 
 
 def _series(space: _Space, node: Node, given: list[Rows]) -> Rows:

@@ -1,8 +1,8 @@
 """A whole model as one graph: raw mm and nm in; scene ray, transmittance, stop crossing and status out.
 
-Light field, core, decoding, front surface, rims, domain: everything round a core is written here, once, for every kind of
-model. Inputs of the graph are `rays` (film x, y, pupil x, y in mm, wavelength in nm), and of the call `film_z_mm` and
-`stop_radius_mm`; outputs `scene_ray` (x, y, z in mm, unit direction), `transmittance`, `stop_xy_mm`, `status`.
+Light field, core, decoding, front surface, rims, domain: everything round a core is written here, once, for every kind
+of model. Inputs of the graph are `rays` (film x, y, pupil x, y in mm, wavelength in nm) and, of the call, `film_z_mm`
+and `stop_radius_mm`; outputs `scene_ray` (x, y, z in mm, unit direction), `transmittance`, `stop_xy_mm`, `status`.
 """
 
 from __future__ import annotations
@@ -157,7 +157,8 @@ class DirectionSeries:
 
     Attributes:
         kappa: factor on v that makes the polynomial of sinc monic, which saves an operation a ray.
-        sinc, minus_cos: coefficients, lowest first; kappa v times sinc(t) is the direction's x and y. None: v is a slope.
+        sinc, minus_cos: coefficients, lowest first; kappa v times sinc(t) is the direction's x and y. None: v is a
+            slope.
     """
 
     kappa: float

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurolens.surrogates.cores import monomials
+from neurolens.graph.interpret import monomials
 from neurolens.surrogates.lightfield import LightField
 
 Exponents = NDArray[np.int64]

@@ -8,7 +8,7 @@ kind of core is one class here; `stored.CORES` names it in files.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
@@ -110,13 +110,7 @@ class CoreValues:
 
 
 class Core:
-    """Base of all cores. Arrays may be handed in as tensors; they are kept as float64 numpy arrays."""
-
-    def __post_init__(self) -> None:
-        for f in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, f.name)
-            if f.name != "exponents" and (hasattr(value, "detach") or isinstance(value, tuple)):
-                object.__setattr__(self, f.name, _as_arrays(value))
+    """Base of all cores; their numbers are float64 numpy arrays."""
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
         """Append the core to a graph."""
@@ -162,12 +156,6 @@ class Core:
         gates = [] if values.gates is None else [values.gates]
         g.outputs["scalars"] = g.concat(values.transmittance, *gates)
         return g
-
-
-def _as_arrays(value: Any) -> Any:
-    if hasattr(value, "detach"):
-        return np.asarray(value.detach().cpu().double().numpy())
-    return tuple(_as_arrays(v) for v in value) if isinstance(value, tuple) else value
 
 
 def symmetric(rows: Value, field: Field, scalars: int) -> CoreValues:

@@ -13,7 +13,7 @@ from typing import Literal, cast, get_args
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.surrogates.cores import Basis, RawPolynomial
+from neurolens.surrogates.cores import Basis, Core, RawPolynomial, Residual
 from neurolens.surrogates.fits.checkpoint import of_zone, spent_s
 from neurolens.surrogates.fits.mirror import fit_mirror
 from neurolens.surrogates.fits.mlp import fit_network
@@ -26,9 +26,8 @@ from neurolens.surrogates.fits.target import TERMS_LADDER, first_order_um, reach
 from neurolens.surrogates.gates import choose_gates, explained
 from neurolens.surrogates.lightfield import Encoding, fit_encoding
 from neurolens.surrogates.lit import draw_everywhere
-from neurolens.surrogates.model import Core, Gate, LensModel
+from neurolens.surrogates.model import Gate, LensModel
 from neurolens.surrogates.pairs import RayPairs, trace_pairs
-from neurolens.surrogates.residual import Residual
 from neurolens.surrogates.targets import scales_of
 from neurolens.surrogates.threads import pinned_threads
 

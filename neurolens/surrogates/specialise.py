@@ -8,20 +8,16 @@ in white light take the whole model. A film position and a stop narrow the domai
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.base.errors import InputError
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.optics.glass import inverse_square_um
-from neurolens.surrogates.cores import InvariantPolynomial, MirrorPolynomial, Network, Partitioned, RawPolynomial
+from neurolens.surrogates.cores import STOP
 from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.model import STOP, Core, LensModel
-from neurolens.surrogates.residual import Residual
+from neurolens.surrogates.model import LensModel
 
 # A gate goes where at most this share of the domain's rays is blocked by it and by nothing else.
 IDLE_SHARE = 1e-5
@@ -90,8 +86,7 @@ def without_idle_gates(models: tuple[LensModel, ...]) -> tuple[LensModel, ...]:
     if len(left) == len(models[0].gates):
         return models
     return tuple(
-        replace(m, gates=tuple(m.gates[k] for k in left), core=_keep(m.core, [0, *(1 + k for k in left)]))
-        for m in models
+        replace(m, gates=tuple(m.gates[k] for k in left), core=m.core.keep([0, *(1 + k for k in left)])) for m in models
     )
 
 
@@ -101,18 +96,6 @@ def _blocked(model: LensModel) -> Tensor:
         vectors, scalars = model.core(model.encoding(sample_domain(model.domain, _IDLE_RAYS, seed=17)))
     stop = ((vectors[STOP] * model.scales.stop_mm) ** 2).sum(0) > model.domain.stop_radius_mm**2
     return torch.cat([stop[None], scalars[1:] > 0])
-
-
-def _keep(core: Core, scalars: list[int]) -> Any:
-    """A core with these of its scalars only."""
-    if isinstance(core, (InvariantPolynomial, MirrorPolynomial, RawPolynomial)):
-        return replace(core, scalars=core.scalars[scalars])
-    if isinstance(core, Network):
-        rows = [*range(core.ab_rows), *(core.ab_rows + k for k in scalars)]
-        return replace(core, output=(core.output[0][rows], core.output[1][rows]))
-    if isinstance(core, (Partitioned, Residual)):
-        return replace(core, parts=tuple(_keep(part, scalars) for part in core.parts))
-    raise TypeError(f"no part of a core of type {type(core).__name__}")
 
 
 def at_wavelength(model: LensModel, wavelength_nm: float) -> LensModel:
@@ -131,34 +114,6 @@ def at_wavelength(model: LensModel, wavelength_nm: float) -> LensModel:
         model,
         domain=replace(model.domain, wavelength_nm=(wavelength_nm, wavelength_nm)),
         encoding=replace(model.encoding, w_half=0.0),
-        core=_fixed(model.core, w),
+        core=model.core.fixed(w),
         settings={**model.settings, "wavelength_nm": wavelength_nm},
     )
-
-
-def _fixed(core: Core, w: float) -> Any:
-    if isinstance(core, (InvariantPolynomial, MirrorPolynomial)):
-        exponents, merge = _merge(core.exponents, w)
-        return replace(core, exponents=exponents, ab=core.ab @ merge, scalars=core.scalars @ merge)
-    if isinstance(core, RawPolynomial):
-        exponents, merge = _merge(core.exponents, w)
-        return replace(core, exponents=exponents, components=core.components @ merge, scalars=core.scalars @ merge)
-    if isinstance(core, Network):
-        # With w_half = 0 the network is shown w = 0; its shift makes that the wanted one.
-        shift = core.shift.clone()
-        shift[-1] -= w
-        return replace(core, shift=shift)
-    if isinstance(core, (Partitioned, Residual)):
-        # Zones are split by rho, which no wavelength changes.
-        return replace(core, parts=tuple(_fixed(part, w) for part in core.parts))
-    raise TypeError(f"no fixed wavelength for a core of type {type(core).__name__}")
-
-
-def _merge(exponents: NDArray[np.int64], w: float) -> tuple[NDArray[np.int64], Tensor]:
-    """Exponents without w, each once, and the matrix [M, M'] that sums the old coefficients into the new."""
-    rest = exponents.copy()
-    rest[:, -1] = 0
-    unique, place = np.unique(rest, axis=0, return_inverse=True)
-    merge = np.zeros((len(exponents), len(unique)))
-    merge[np.arange(len(exponents)), place.reshape(-1)] = w ** exponents[:, -1].astype(float)
-    return unique, torch.from_numpy(merge)

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.lightfield import Encoding, LightField, angle_vector
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Scales
+from neurolens.surrogates.model import Scales
 from neurolens.surrogates.pairs import PairSet
 
 

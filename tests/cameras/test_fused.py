@@ -13,6 +13,7 @@ import lens_models
 import numpy as np
 import onnx
 import pytest
+from neurolens.programs import compiler, loworder
 
 from neurolens.apertures import Aperture
 from neurolens.base import status as st
@@ -25,13 +26,11 @@ from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.fusedexact import FusedExactCamera
 from neurolens.cameras.graphprogram import program_of
 from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH, Program
 from neurolens.optics.lensfile import read_lens
-from neurolens.programs import compiler, loworder
-from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
-from neurolens.programs.expressions import Program
 from neurolens.render.renderer import render
 from neurolens.render.scenefile import load_scene
-from neurolens.surrogates.onnx.export import export_onnx
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.precision import store_weights
 
 ROOT = Path(__file__).parents[2]

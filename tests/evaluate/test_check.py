@@ -151,7 +151,7 @@ def test_a_poor_fit_is_said_by_its_card_the_command_and_the_source_code(
     errors: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from neurolens.cli import main
-    from neurolens.surrogates.onnx.export import export_onnx
+    from neurolens.surrogates.export import export_onnx
 
     assert errors["poor"] == [] == what_is_poor({"false_pass": 0.01, "rms_px": 1.0, "false_block": None})
     poor = {**errors, "poor": what_is_poor({**errors, "false_block": 0.042})}
@@ -171,7 +171,7 @@ def test_promises_of_another_shape_promise_nothing(errors: dict[str, Any], stran
 
 def test_the_command_says_which_zone_breaks(errors: dict[str, Any], tmp_path: Path) -> None:
     from neurolens.cli import main
-    from neurolens.surrogates.onnx.export import export_onnx
+    from neurolens.surrogates.export import export_onnx
 
     lying = copy.deepcopy(errors)
     lying["zones"]["2_stops"]["edge"]["rms_um"] /= 2

@@ -22,7 +22,7 @@ from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
 from neurolens.optics.traceprogram import exact_program
 from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.source.fused import RAY_ONLY, SCENE_RAY
+from neurolens.surrogates.source import RAY_ONLY, SCENE_RAY
 
 
 def test_the_exact_program_is_the_exact_trace() -> None:

@@ -18,9 +18,9 @@ from neurolens.evaluate.benches.vignetting import DOMAINS, OPENINGS, opening_err
 from neurolens.evaluate.experiment import LensChoice
 from neurolens.evaluate.plots.vignetting import pupil_masks
 from neurolens.evaluate.vignetting import relative_illumination, vignetting_errors
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.specialise import at_wavelength
 

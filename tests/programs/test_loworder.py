@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from neurolens.programs.contract import RAY, SCENE_RAY, STATUS, WAVELENGTH, derivative
-from neurolens.programs.expressions import Program
-from neurolens.programs.loworder import WORST, with_low_order_derivatives
+from neurolens.graph.loworder import WORST, with_low_order_derivatives
+from neurolens.graph.program import RAY, SCENE_RAY, STATUS, WAVELENGTH, Program, derivative
 
 COUNT = 2000
 

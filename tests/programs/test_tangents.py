@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from neurolens.base.errors import InputError
-from neurolens.programs.c import write_c
-from neurolens.programs.compiler import compile_c
-from neurolens.programs.contract import derivative
-from neurolens.programs.expressions import Program
 from neurolens.programs.tangents import with_derivatives
 from neurolens.programs.tanh import add_tanh
+
+from neurolens.base.errors import InputError
+from neurolens.graph.c import write_c
+from neurolens.graph.compiler import compile_c
+from neurolens.graph.program import Program, derivative
 
 X, Y = (v.ravel() for v in np.meshgrid(np.linspace(0.3, 2.0, 9), np.linspace(0.35, 1.9, 8)))
 

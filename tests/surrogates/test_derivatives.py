@@ -13,12 +13,12 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.optics.differentials import film_tangents, trace_differentials
 from neurolens.optics.pupil_rays import camera_rays
-from neurolens.surrogates.cores import MirrorPolynomial, Partitioned
+from neurolens.surrogates.cores import Core, MirrorPolynomial, Partitioned
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.inversion.derivatives import differentiate, forward_mode, slopes_of
 from neurolens.surrogates.lightfield import LightField
-from neurolens.surrogates.model import Core, LensModel
+from neurolens.surrogates.model import LensModel
 
 COLUMNS = ("film_x", "film_y", "pupil_x", "pupil_y", "wavelength_nm")
 

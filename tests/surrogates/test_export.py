@@ -21,8 +21,8 @@ from neurolens.modelfile import CARD_KEY
 from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.card import card_of, card_to_json
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.model import LensModel, Prediction
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.specialise import at_wavelength
 
 COUNT = 100_000

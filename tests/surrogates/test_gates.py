@@ -18,10 +18,10 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.gates import boundary_rays, choose_gates, gate_reach, gate_values
 from neurolens.surrogates.model import Gate, LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSet, PairSettings, load_pairs, make_pairs, reached, save_pairs, trace_pairs
 
 LENSES = Path(__file__).parents[2] / "lenses"

@@ -19,11 +19,11 @@ from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.vignetting import vignetting_errors
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model
 from neurolens.surrogates.fits.mirror import mirror_exponents
 from neurolens.surrogates.inversion.derivatives import slopes_of
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 
 pytestmark = pytest.mark.slow
 

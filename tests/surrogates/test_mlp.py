@@ -8,7 +8,7 @@ import torch
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import read_lens
-from neurolens.surrogates.cores import Network
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Network
 from neurolens.surrogates.domain import domain_of, sample_domain
 from neurolens.surrogates.fits import checkpoint, schedule
 from neurolens.surrogates.fits.mlp import fit_network
@@ -16,7 +16,7 @@ from neurolens.surrogates.fits.projection import Problem, activations, project
 from neurolens.surrogates.fits.training import Stand, minimise, normal_equations
 from neurolens.surrogates.gates import choose_gates
 from neurolens.surrogates.lightfield import LightField, fit_encoding
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP, LensModel
+from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs, trace_pairs
 from neurolens.surrogates.targets import film_equivalent_weights, scales_of, targets_of
 

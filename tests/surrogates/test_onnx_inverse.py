@@ -24,11 +24,11 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.modelfile import CARD_KEY
 from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.inversion.derivatives import differentiate
 from neurolens.surrogates.inversion.fit import fit_inverse
 from neurolens.surrogates.inversion.maps import InverseModel
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.onnx.inverse import export_inverse
 
 KINDS = ("invariants", "raw", "network", "thick", "fisheye")

@@ -14,9 +14,9 @@ from neurolens.cameras.model import load_model
 from neurolens.evaluate.measure import onnx_predictor
 from neurolens.surrogates.cores import Partitioned
 from neurolens.surrogates.domain import FilmRays
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,9 @@ from onnx import TensorProto, helper, numpy_helper
 
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import load_model
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.precision import store_weights
 
 KINDS = ("float16", "int8")

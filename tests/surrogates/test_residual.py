@@ -11,11 +11,10 @@ from lens_models import prepared
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
-from neurolens.surrogates.cores import Partitioned
+from neurolens.surrogates.cores import Partitioned, Residual
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
-from neurolens.surrogates.residual import Residual
 from neurolens.surrogates.specialise import at_wavelength
 from neurolens.surrogates.stored import load_fitted
 from neurolens.surrogates.targets import film_equivalent, targets_of

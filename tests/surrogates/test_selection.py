@@ -9,8 +9,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from neurolens.graph.interpret import monomials
 from neurolens.surrogates.bases import invariant_exponents, raw_exponents, solve, vector_columns, vector_gram
-from neurolens.surrogates.cores import monomials
 from neurolens.surrogates.fits.selection import SPANNED, Sweep, backward, forward, matching_pursuit, replace_terms
 from neurolens.surrogates.lightfield import LightField
 

@@ -11,21 +11,20 @@ import lens_models
 import numpy as np
 import pytest
 import torch
+from neurolens.programs.tanh import add_tanh
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.evaluate.benches.compiled_source import FLAGS, CompiledSource, find_compiler
 from neurolens.evaluate.speed import Unavailable
+from neurolens.graph.c import literal
+from neurolens.graph.program import Program
 from neurolens.optics.paraxial import first_order
-from neurolens.programs.c import literal
-from neurolens.programs.expressions import Program
-from neurolens.programs.tanh import add_tanh
 from neurolens.surrogates.card import card_of
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel, Prediction
-from neurolens.surrogates.source.fused import ALL, RAY_ONLY, SCENE_RAY, Fixed, Parts, fused_program
-from neurolens.surrogates.source.writer import export_source
+from neurolens.surrogates.source import ALL, RAY_ONLY, SCENE_RAY, Fixed, Parts, export_source, fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 
 COUNT = 50_000

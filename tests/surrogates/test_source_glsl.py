@@ -13,15 +13,15 @@ import lens_models
 import numpy as np
 import pytest
 import torch
+from neurolens.surrogates.source.glsl import write_glsl
 
 from neurolens.base import status as st
+from neurolens.graph.c import Signature
+from neurolens.graph.program import Program
 from neurolens.optics.paraxial import first_order
-from neurolens.programs.c import Signature
-from neurolens.programs.expressions import Program
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.source.fused import ALL, FREE, SCENE_RAY, Fixed, fused_program
-from neurolens.surrogates.source.glsl import write_glsl
+from neurolens.surrogates.source import ALL, FREE, SCENE_RAY, Fixed, fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 
 COUNT = 20_000

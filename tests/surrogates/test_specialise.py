@@ -13,7 +13,7 @@ import torch
 from neurolens.base.errors import InputError
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.surrogates.domain import FilmRays, sample_domain
-from neurolens.surrogates.onnx.export import export_onnx
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.specialise import at_wavelength
 
 

@@ -29,8 +29,8 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.export import export_states
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.states import export_states
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.states.fit import StateSettings, fit_states
 from neurolens.surrogates.states.model import StateModel, mix

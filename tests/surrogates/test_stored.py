@@ -17,8 +17,8 @@ import torch
 from neurolens.base.errors import ModelError
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.surrogates.cores import Partitioned
-from neurolens.surrogates.onnx.export import export_onnx
-from neurolens.surrogates.source.fused import fused_program
+from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.source import fused_program
 from neurolens.surrogates.stored import load_fitted, model_to_text
 
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from neurolens.base.errors import ModelError
 from neurolens.evaluate.benches.compiled_source import CompiledSource, find_compiler
 from neurolens.evaluate.speed import Call, Candidate, Unavailable
-from neurolens.programs.expressions import Program
+from neurolens.graph.program import Program
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.source.fused import ALL, FREE, Fixed, Parts, fused_program
+from neurolens.surrogates.source import ALL, FREE, Fixed, Parts, fused_program
 from neurolens.surrogates.stored import load_fitted
 
 # Inputs and results of a batch lie in the second-level cache.

@@ -12,7 +12,7 @@ from typing import Any
 from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.benches.fused_speed import WAVELENGTH_NM, WITHIN_UM, Row
 from neurolens.evaluate.benches.trace_speed_page import machine
-from neurolens.programs.compiler import FLAGS
+from neurolens.graph.compiler import FLAGS
 
 _NOTES = """\
 One thread, float32, batches that fit the caches, {rounds} rounds in turn in one process (best; median in brackets).

@@ -25,15 +25,15 @@ from neurolens.evaluate.experiment import LensChoice
 from neurolens.evaluate.layout import refractions
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.speed import Call, Candidate, Race, race
+from neurolens.graph.program import Program
 from neurolens.optics.prescription import Lens
 from neurolens.optics.traceprogram import exact_program
-from neurolens.programs.expressions import Program
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.source.fused import ALL, RAY_ONLY, Fixed, Parts, fused_program
+from neurolens.surrogates.source import ALL, RAY_ONLY, Fixed, Parts, fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 
 WITHIN_UM = 1.0

@@ -32,9 +32,9 @@ from neurolens.evaluate.records import plain
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
 from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, Prepared, fit_model, prepare
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.precision import store_weights
 

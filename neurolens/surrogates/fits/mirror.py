@@ -15,12 +15,13 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
+from neurolens.graph.interpret import monomials
 from neurolens.surrogates.bases import Exponents, solve
-from neurolens.surrogates.cores import MirrorPolynomial, monomials
+from neurolens.surrogates.cores import STOP, MirrorPolynomial
 from neurolens.surrogates.fits.boundaries import FitData, solve_scalars, stop_crossing
 from neurolens.surrogates.fits.selection import Sweep, forward, replace_terms
 from neurolens.surrogates.lightfield import Encoding, LightField
-from neurolens.surrogates.model import STOP, Gate
+from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import RayPairs
 from neurolens.surrogates.targets import film_equivalent
 
@@ -108,7 +109,8 @@ def fit_mirror(
     boundary, far = (
         monomials(encoding(rays.inputs).mirror_invariants(), exponents) for rays in (data.boundary, pairs.far)
     )
-    return MirrorPolynomial(exponents, ab, solve_scalars(data, features, train.transmittance, boundary, far))
+    scalars = solve_scalars(data, features, train.transmittance, boundary, far)
+    return MirrorPolynomial(exponents, ab.numpy(), scalars.numpy())
 
 
 def _scalar_terms(*, dispersive: bool) -> list[tuple[int, ...]]:

@@ -11,14 +11,14 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.optics.prescription import Lens
-from neurolens.surrogates.cores import InvariantPolynomial, Network
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, Network
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.fits.checkpoint import Checkpoint, fingerprint
 from neurolens.surrogates.fits.projection import Problem
 from neurolens.surrogates.fits.schedule import Training
 from neurolens.surrogates.gates import boundary_rays, boundary_weights, gate_values
 from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate
+from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import PairSet, RayPairs
 from neurolens.surrogates.targets import film_equivalent_weights, targets_of
 from neurolens.surrogates.threads import pinned_threads
@@ -82,8 +82,8 @@ def fit_network(
         best = training.run()
     if progress:
         progress(1.0)
-    hidden = tuple((w[:, :-1].clone(), w[:, -1].clone()) for w in best.hidden)
-    return Network(hidden, (best.output[:, :-1].clone(), best.output[:, -1].clone()), shift, scale)
+    *hidden, output = ((w[:, :-1].numpy().copy(), w[:, -1].numpy().copy()) for w in (*best.hidden, best.output))
+    return Network(tuple(hidden), output, shift.numpy(), scale.numpy())
 
 
 def _problem(

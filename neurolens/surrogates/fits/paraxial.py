@@ -14,10 +14,10 @@ from torch import Tensor
 
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.surrogates.cores import InvariantPolynomial
+from neurolens.surrogates.cores import DIRECTION, POSITION, InvariantPolynomial
 from neurolens.surrogates.fits.boundaries import FitData, fit_scalars, fit_stop
 from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import DIRECTION, POSITION, Gate
+from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import RayPairs
 from neurolens.surrogates.targets import scales_of
 
@@ -53,4 +53,4 @@ def fit_paraxial(
     ab[[POSITION, DIRECTION], :, 0] = ideal_map(pairs.lens, encoding, method)
     ab[2, :, 0] = fit_stop(data, exponents[:1])
     scalars = fit_scalars(data, exponents)
-    return InvariantPolynomial(exponents, ab, scalars)
+    return InvariantPolynomial(exponents, ab.numpy(), scalars.numpy())

@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.surrogates.cores import InvariantPolynomial, Network, Partitioned, RawPolynomial
+from neurolens.surrogates.cores import InvariantPolynomial, Network, Partitioned, RawPolynomial, Residual
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.pairs import PairSet, RayPairs
-from neurolens.surrogates.residual import Residual
 from neurolens.surrogates.targets import film_equivalent, targets_of
 
 ZoneCore = InvariantPolynomial | RawPolynomial | Network | Residual

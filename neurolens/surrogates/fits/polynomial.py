@@ -25,7 +25,7 @@ from neurolens.surrogates.bases import (
     vector_columns,
     vector_gram,
 )
-from neurolens.surrogates.cores import Basis, InvariantPolynomial, RawPolynomial
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Basis, InvariantPolynomial, RawPolynomial
 from neurolens.surrogates.fits.boundaries import (
     FitData,
     boundary_terms,
@@ -39,7 +39,7 @@ from neurolens.surrogates.fits.selection import Sweep, backward, forward, matchi
 from neurolens.surrogates.fits.transmittance_terms import transmittance_terms
 from neurolens.surrogates.gates import gate_values
 from neurolens.surrogates.lightfield import Encoding, LightField
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate
+from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import RayPairs
 from neurolens.surrogates.targets import weighed_apart
 
@@ -133,7 +133,7 @@ def _fit_invariant(data: FitData, settings: PolynomialSettings) -> InvariantPoly
     ab = torch.zeros((3, 2 * len(exponents)), dtype=torch.float64)
     ab[:2, [c if c < len(kept) else c - len(kept) + len(exponents) for c in columns]] = coefficients
     ab[STOP] = fit_stop(data, exponents)
-    return InvariantPolynomial(exponents, ab.reshape(3, 2, -1), fit_scalars(data, exponents))
+    return InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), fit_scalars(data, exponents).numpy())
 
 
 def _sweep(exponents: Exponents, field: LightField, outputs: Tensor) -> Sweep:
@@ -199,7 +199,7 @@ def _fit_raw(data: FitData, settings: PolynomialSettings) -> RawPolynomial:
     at = columns["scalars"]
     scalars = torch.zeros((1 + len(data.gates), len(place)), dtype=torch.float64)
     scalars[:, at] = solve_scalars(data, features[at], train.transmittance, boundary[at], far[at])
-    return RawPolynomial(exponents, components, scalars)
+    return RawPolynomial(exponents, components.numpy(), scalars.numpy())
 
 
 def _raw_support(variables: Tensor, outputs: Tensor, settings: PolynomialSettings, dispersive: bool) -> Exponents:

@@ -17,17 +17,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from neurolens.graph.interpret import monomials
 from neurolens.surrogates.cores import (
+    DIRECTION,
+    POSITION,
+    STOP,
+    Core,
     InvariantPolynomial,
     MirrorPolynomial,
     Network,
     Partitioned,
     RawPolynomial,
-    monomials,
 )
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.lightfield import Encoding, LightField, direction_of, direction_of_slope
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Core, LensModel, Prediction
+from neurolens.surrogates.model import LensModel, Prediction
 
 # Vectors [K, 2, N] of a core, and their slopes [K, 2, 5, N] with respect to p_x, p_y, u_x, u_y, w.
 VectorSlopes = tuple[Tensor, Tensor]

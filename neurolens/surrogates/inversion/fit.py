@@ -12,12 +12,13 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.optics.surfaces import Rays
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.inversion.guess import fit_guess
 from neurolens.surrogates.inversion.maps import STEPS, TOLERANCE, FilmSide, InverseModel, StopRays, StopSystem
 from neurolens.surrogates.inversion.newton import determinant
 from neurolens.surrogates.lightfield import LightField
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP, LensModel
+from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import RayPairs, join_pairs
 from neurolens.surrogates.targets import targets_of
 from neurolens.surrogates.threads import pinned_threads

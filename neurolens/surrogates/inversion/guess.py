@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neurolens.graph.interpret import monomials
 from neurolens.surrogates.bases import Exponents, solve
-from neurolens.surrogates.cores import monomials
 from neurolens.surrogates.fits.selection import Sweep, forward
 from neurolens.surrogates.lightfield import LightField
 

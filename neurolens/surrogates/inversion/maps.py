@@ -16,12 +16,13 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.frontsurface import meet_front
 from neurolens.optics.surfaces import Rays
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.inversion.derivatives import direction_slopes, field_slopes, slopes_of
 from neurolens.surrogates.inversion.guess import Guess
 from neurolens.surrogates.inversion.newton import Solved, determinant, limited_newton
 from neurolens.surrogates.lightfield import LightField, angle_vector
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP, LensModel, Prediction
+from neurolens.surrogates.model import LensModel, Prediction
 
 STEPS = 3
 # A solution counts where its residual is below this: of the stop's radius; of the front's radius and in radians.

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.surrogates.cores import InvariantPolynomial, MirrorPolynomial
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Core, InvariantPolynomial, MirrorPolynomial
 from neurolens.surrogates.inversion.derivatives import polynomial_slopes
 from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Core, LensModel
+from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.onnx.cores import CoreRows, Field, add_core
 from neurolens.surrogates.onnx.graph import Graph
 from neurolens.surrogates.onnx.light import DirectionSeries

@@ -19,13 +19,14 @@ from neurolens.base import status as st
 from neurolens.base.files import atomic_path
 from neurolens.modelfile import CARD_KEY
 from neurolens.surrogates.card import card_of, card_to_json
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP
+from neurolens.surrogates.export import check_gates, largest_angle
 from neurolens.surrogates.inversion.guess import Guess
 from neurolens.surrogates.inversion.maps import LIMIT, STEPS, TOLERANCE, InverseModel
 from neurolens.surrogates.inversion.newton import REACH, SHORTER
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP, LensModel
+from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.onnx.cores import CoreRows, Field
 from neurolens.surrogates.onnx.derivatives import Chain, Columns, add_core_slopes, film_and_pupil
-from neurolens.surrogates.onnx.export import check_gates, largest_angle
 from neurolens.surrogates.onnx.graph import FLOAT, INT32, Graph
 from neurolens.surrogates.onnx.light import (
     TEST_SCALE,

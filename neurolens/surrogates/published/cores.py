@@ -1,24 +1,24 @@
 """Cores of the published methods: their coordinates and their tests of who passes round plain polynomials.
 
-What comes out is what every core gives (`neurolens.surrogates.model.Core`), so that one code measures all.
+What comes out is what every core gives (`neurolens.surrogates.cores.Core`), so that one code measures and writes all.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from neurolens.surrogates.cores import RawPolynomial
-from neurolens.surrogates.lightfield import LightField, angle_vector
-from neurolens.surrogates.model import DIRECTION, POSITION
+from neurolens.graph.ir import Graph, Value
+from neurolens.surrogates.cores import DIRECTION, POSITION, ROUND, Core, CoreValues, Field, RawPolynomial, Units
 
 Three = tuple[Tensor, Tensor, Tensor]
 
 
 @dataclass(frozen=True, eq=False)
-class Cells:
+class Cells(Core):
     """A partition of the light field into two halves, each with a polynomial of its own or divided again.
 
     Attributes:
@@ -32,13 +32,9 @@ class Cells:
     low: RawPolynomial | Cells
     high: RawPolynomial | Cells
 
-    def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
-        beyond = field.invariants()[self.variable] > self.threshold
-        low, high = self.low(field), self.high(field)
-        return torch.where(beyond, high[0], low[0]), torch.where(beyond, high[1], low[1])
-
-    def to(self, dtype: torch.dtype) -> Cells:
-        return replace(self, low=self.low.to(dtype), high=self.high.to(dtype))
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        low, high = (half.build(g, field, units) for half in (self.low, self.high))
+        return low.chosen(field.products(ROUND[self.variable : self.variable + 1], w=False) <= self.threshold, high)
 
     @property
     def coefficients_per_vector(self) -> int:
@@ -51,7 +47,7 @@ class Cells:
 
 
 @dataclass(frozen=True, eq=False)
-class OuterPupil:
+class OuterPupil(Core):
     """A polynomial that gives the ray on the outer pupil: the position on a sphere, the direction in its tangent frame.
 
     Hanika and Dachsbacher 2014: the direction's components along the sphere's two tangents, which stay small where the
@@ -70,19 +66,17 @@ class OuterPupil:
     outer: float | None
     inner: tuple[float, float] | None
 
-    basis: str = "raw"
-
-    def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
-        vectors, scalars = self.polynomial(field)
-        position, tangents = vectors[POSITION], vectors[DIRECTION]
-        direction = angle_vector(*from_tangents(position, tangents, self.curvature))
-        tests = [] if self.inner is None else [_square(self.inner[0] * field.p + self.inner[1] * field.u) - 1]
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        unit, _, stop = units.vectors
+        values = self.polynomial.build(g, field, Units((unit, 1.0, stop), units.gates))
+        position, gates = values.vectors[POSITION], []
+        if self.inner is not None:
+            gates.append(g.square(field.p * self.inner[0] + field.u * self.inner[1]))
         if self.outer is not None:
-            tests.append(_square(self.outer * position) - 1)
-        return torch.stack([position, direction, vectors[2]]), torch.cat([scalars, *(t[None] for t in tests)])
-
-    def to(self, dtype: torch.dtype) -> OuterPupil:
-        return replace(self, polynomial=self.polynomial.to(dtype))
+            gates.append(g.square(position * (self.outer / unit)))
+        tests = g.concat(*((r2 - 1.0) * units.gates for r2 in gates)) if gates else None
+        direction = from_tangents(position, values.vectors[DIRECTION], self.curvature / unit)
+        return replace(values, unit=direction, gates=tests)
 
     @property
     def coefficients_per_vector(self) -> int:
@@ -93,39 +87,35 @@ class OuterPupil:
         return self.polynomial.coefficients
 
 
-def _square(v: Tensor) -> Tensor:
-    return v[0] * v[0] + v[1] * v[1]
+def to_tangents(position: Tensor, direction: Sequence[Tensor], curvature: float) -> Tensor:
+    """[2, N] components of unit directions along the tangents of the outer pupil's sphere at points [2, N].
 
-
-def tangent_frame(position: Tensor, curvature: float) -> tuple[Three, Three, Three]:
-    """Unit vectors ex, ey and the normal towards the scene at points [2, N] of the sphere of the outer pupil.
-
-    ex has no y component; on the axis ex and ey are x and y, and the normal is -z. Beyond the sphere's equator: there.
+    ex = (s, 0, cx) / l has no y component, ey = (-cx cy, l^2, s cy) / l, with c the curvature, s^2 = 1 - |c (x, y)|^2
+    and l^2 = s^2 + cx^2; the normal towards the scene is (cx, cy, -s). On the axis ex and ey are x and y. Beyond the
+    sphere's equator: there.
     """
     cx, cy = curvature * position[0], curvature * position[1]
     s = torch.sqrt((1 - cx * cx - cy * cy).clamp_min(0.0))
     inverse = torch.rsqrt((s * s + cx * cx).clamp_min(1e-30))
-    zero = torch.zeros_like(s)
-    ex = (s * inverse, zero, cx * inverse)
+    ex = (s * inverse, torch.zeros_like(s), cx * inverse)
     ey = (-cx * cy * inverse, (cx * cx + s * s) * inverse, s * cy * inverse)
-    return ex, ey, (cx, cy, -s)
-
-
-def to_tangents(position: Tensor, direction: Three, curvature: float) -> Tensor:
-    """[2, N] components of unit directions along the tangents at points [2, N]."""
-    ex, ey, _ = tangent_frame(position, curvature)
     return torch.stack([sum(a * d for a, d in zip(e, direction, strict=True)) for e in (ex, ey)])  # type: ignore[misc]
 
 
-def from_tangents(position: Tensor, tangents: Tensor, curvature: float) -> Three:
-    """Unit directions of `to_tangents`; components beyond the unit circle give a ray along the surface."""
-    a, b = tangents
-    square = a * a + b * b
-    along = torch.sqrt((1 - square).clamp_min(0.0))
+def from_tangents(position: Value, tangents: Value, curvature: float) -> Value:
+    """Unit directions (3 rows) of `to_tangents`; components beyond the unit circle give a ray along the surface."""
+    g = position.graph
+    square = g.square(tangents)
+    along = (1.0 - square).maximum(0.0).sqrt()
+    tangents = tangents * (1.0 / square.maximum(1.0).sqrt())
     if curvature == 0:
-        scale = torch.rsqrt(square.clamp_min(1.0))
-        return a * scale, b * scale, -along
-    ex, ey, n = tangent_frame(position, curvature)
-    scale = torch.rsqrt(square.clamp_min(1.0))
-    x, y, z = (scale * (a * p + b * q) + along * r for p, q, r in zip(ex, ey, n, strict=True))
-    return x, y, z
+        return g.concat(tangents, -along)
+    normal = position * curvature
+    s2 = (1.0 - g.square(normal)).maximum(0.0)
+    s, (a, b), (cx, cy) = s2.sqrt(), g.split(tangents, [1, 1]), g.split(normal, [1, 1])
+    length2 = s2 + cx * cx
+    inverse = 1.0 / length2.maximum(1e-30).sqrt()
+    a, b = a * inverse, b * inverse
+    x = a * s - b * cx * cy + along * cx
+    y = b * length2 + along * cy
+    return g.concat(x, y, a * cx + b * cy * s - along * s)

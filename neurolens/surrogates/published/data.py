@@ -12,12 +12,13 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.graph.interpret import monomials
 from neurolens.surrogates.bases import raw_exponents
-from neurolens.surrogates.cores import RawPolynomial, monomials
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, RawPolynomial
 from neurolens.surrogates.fit import Prepared
 from neurolens.surrogates.gates import gate_reach
 from neurolens.surrogates.lightfield import Encoding, LightField
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate
+from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import PairSet, RayPairs
 from neurolens.surrogates.published.cores import Cells, OuterPupil, to_tangents
 from neurolens.surrogates.targets import scales_of
@@ -117,7 +118,7 @@ def solve_outputs(outputs: tuple[Outputs, ...], supports: list[Exponents]) -> Ra
         row[at] = stable_solve(monomials(output.variables, support), output.values, output.weights)[0]
     components = torch.zeros((3, 2, len(place)), dtype=torch.float64)
     components[POSITION], components[DIRECTION], components[STOP] = rows[0:2], rows[2:4], rows[4:6]
-    return RawPolynomial(exponents, components, rows[6:])
+    return RawPolynomial(exponents, components.numpy(), rows[6:].numpy())
 
 
 def stable_solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None, cut: float = 1e-7) -> Tensor:

@@ -14,7 +14,8 @@ no single exchange leaves: one output of a lens may be several times worse than 
 
 from __future__ import annotations
 
-from neurolens.surrogates.cores import RawPolynomial, monomials
+from neurolens.graph.interpret import monomials
+from neurolens.surrogates.cores import RawPolynomial
 from neurolens.surrogates.published.data import PARITY, Outputs, RawData, parity_exponents, solve_outputs
 from neurolens.surrogates.published.pursuit import Pursuit
 

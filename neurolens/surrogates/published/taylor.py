@@ -26,9 +26,8 @@ from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
-from neurolens.surrogates.cores import RawPolynomial
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, RawPolynomial
 from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP
 from neurolens.surrogates.published.series import Series, Truncated, truncated
 from neurolens.surrogates.targets import scales_of
 
@@ -156,7 +155,7 @@ def fit_taylor(lens: Lens, encoding: Encoding, degree: int) -> RawPolynomial:
     rows, exponents = rows[:, used], exponents[used.numpy()]
     components = torch.zeros((3, 2, len(exponents)), dtype=torch.float64)
     components[POSITION], components[DIRECTION], components[STOP] = rows[0:2], rows[2:4], rows[4:6]
-    return RawPolynomial(exponents, components, rows[6:])
+    return RawPolynomial(exponents, components.numpy(), rows[6:].numpy())
 
 
 def _axial_transmittance(lens: Lens, encoding: Encoding, wavelength_nm: float) -> float:

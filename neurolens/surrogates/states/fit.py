@@ -16,12 +16,12 @@ import torch
 from neurolens import axes as ax
 from neurolens.base.errors import InputError
 from neurolens.surrogates.bases import Exponents, invariant_exponents, monomials, solve, vector_columns, vector_gram
-from neurolens.surrogates.cores import InvariantPolynomial
+from neurolens.surrogates.cores import STOP, InvariantPolynomial
 from neurolens.surrogates.fit import prepare
 from neurolens.surrogates.fits.boundaries import FitData, fit_scalars, fit_stop
 from neurolens.surrogates.fits.selection import Sweep
 from neurolens.surrogates.lightfield import Encoding, fit_encoding
-from neurolens.surrogates.model import STOP, Gate, LensModel, Scales
+from neurolens.surrogates.model import Gate, LensModel, Scales
 from neurolens.surrogates.pairs import PairSettings, RayPairs, make_pairs
 from neurolens.surrogates.states.model import State, StateModel
 from neurolens.surrogates.states.space import StateSpace
@@ -185,7 +185,7 @@ def _fit_node(
     ab[:STOP, columns] = solve(vectors, train.vectors[:STOP].flatten(1))
     scales = scales_of(pairs.lens)
     ab[STOP] = fit_stop(data, exponents) * (scales.stop_mm / stop_mm)
-    core = InvariantPolynomial(exponents, ab.reshape(3, 2, -1), fit_scalars(data, exponents))
+    core = InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), fit_scalars(data, exponents).numpy())
     return LensModel(
         lens=pairs.lens,
         domain=pairs.domain,

@@ -13,8 +13,6 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from neurolens import axes as ax
 from neurolens.base.errors import InputError
@@ -93,16 +91,16 @@ def mix_encodings(encodings: Sequence[Encoding], weights: ax.Array) -> Encoding:
 
 
 def mix(values: Sequence[Any], weights: ax.Array) -> Any:
-    """Weighted sum of tensors wherever they stand in equal structures of dataclasses and tuples.
+    """Weighted sum of float arrays wherever they stand in equal structures of dataclasses and tuples.
 
     Raises:
-        InputError: structures that differ in anything but the numbers of tensors.
+        InputError: structures that differ in anything but those numbers.
     """
     first = values[0]
-    if isinstance(first, Tensor):
+    if isinstance(first, np.ndarray) and first.dtype.kind == "f":
         if any(v.shape != first.shape for v in values):
-            raise InputError("state model", "nodes", [tuple(v.shape) for v in values], "tensors of one shape")
-        return torch.einsum("k,k...->...", torch.as_tensor(weights, dtype=first.dtype), torch.stack(list(values)))
+            raise InputError("state model", "nodes", [v.shape for v in values], "arrays of one shape")
+        return np.einsum("k,k...->...", weights, np.stack(values))
     if is_dataclass(first) and not isinstance(first, type):
         names = [f.name for f in fields(first)]
         return replace(first, **{n: mix([getattr(v, n) for v in values], weights) for n in names})

@@ -17,10 +17,10 @@ from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import ray_errors
 from neurolens.surrogates.cores import RawPolynomial
 from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import trace_pairs
 from neurolens.surrogates.published.adaptive import fit_adaptive
 from neurolens.surrogates.published.cores import Cells

@@ -19,9 +19,9 @@ from neurolens.cameras.model import load_model
 from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import ray_errors
 from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.lightfield import fit_encoding
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import trace_pairs
 from neurolens.surrogates.published import PUBLISHED
 from neurolens.surrogates.published.cores import from_tangents, tangent_frame, to_tangents

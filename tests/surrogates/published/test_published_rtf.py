@@ -19,10 +19,10 @@ from neurolens.cameras.model import load_model
 from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import ray_errors
 from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import trace_pairs
 from neurolens.surrogates.published.ellipse import least_ellipse
 from neurolens.surrogates.published.rtf import meridian_exponents, meridian_variables, turn, turn_back

@@ -14,15 +14,15 @@ import torch
 from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.measure import onnx_predictor
+from neurolens.graph.interpret import monomials
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays, trace
-from neurolens.surrogates.cores import monomials
 from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.fits.paraxial import ideal_map
 from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.published.series import truncated
 from neurolens.surrogates.published.taylor import expand
 from neurolens.surrogates.targets import scales_of

@@ -12,14 +12,32 @@ from typing import Any
 import neurolens
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
-from neurolens.programs.c import Signature, write_c
+from neurolens.graph.c import Signature, write_c
+from neurolens.graph.glsl import write_glsl
+from neurolens.graph.program import FILM_Z, STOP_RADIUS, Program
+from neurolens.graph.scalars import lower
+from neurolens.modelfile import DOMAIN_SLACK
+from neurolens.surrogates.assemble import ALL, SCALARS, Parts, model_graph
+from neurolens.surrogates.export import largest_angle
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.source.fused import ALL, FREE, Fixed, Parts, fused_program
-from neurolens.surrogates.source.glsl import write_glsl
 
 WRITERS = {"c": write_c, "glsl": write_glsl}
 _WIDTH = 110
 _ERRORS = ("rms_um", "p99_um", "max_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """Call arguments that a scene fixes; None leaves them to the caller.
+
+    A wavelength is fixed in the models themselves (`specialise.at_wavelength`), one model a table.
+    """
+
+    film_z_mm: float | None = None
+    stop_radius_mm: float | None = None
+
+
+FREE = Fixed()
 
 
 @dataclass(frozen=True)
@@ -51,7 +69,6 @@ def export_source(
     Raises:
         InputError: another language, a name that is no identifier, numbers that float32 cannot hold, a card that lacks
             what the comment says.
-        TypeError: a core that has no such form.
     """
     if language not in WRITERS:
         raise InputError("export", "to", language, f"one of {', '.join(WRITERS)}")
@@ -68,6 +85,27 @@ def export_source(
     target = Path(path)
     atomic_write_text(target, WRITERS[language](program, own, comment))
     return Written(target, Signature.of(program, own), sum(program.count().values()))
+
+
+def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fixed: Fixed = FREE) -> Program:
+    """The program of a model, or of several that differ only in their coefficients (one for each wavelength).
+
+    Inputs: `program.RAY`, then wavelength_nm where rays depend on it, film_z_mm unless fixed, and stop_radius_mm unless
+    fixed or without vignetting. Outputs: `program.SCENE_RAY`; transmittance, stop_x_mm and stop_y_mm as asked for;
+    status, a float.
+
+    Raises:
+        InputError: weights that float32 cannot hold; a fixed film position or stop outside the domain.
+    """
+    (near, far), widest = models[0].domain.film_z_mm, models[0].domain.stop_radius_mm
+    z, radius = fixed.film_z_mm, fixed.stop_radius_mm
+    if z is not None and not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
+        raise InputError("fix", "film_z", z, f"{near:.6g} to {far:.6g} mm, the film positions of the fit")
+    if radius is not None and not 0 <= radius <= widest * DOMAIN_SLACK:
+        raise InputError("fix", "stop", radius, f"0 to {widest:.6g} mm, the widest stop of the fit")
+    angle = max(largest_angle(model) for model in models)
+    known = {name: value for name, value in ((FILM_Z, z), (STOP_RADIUS, radius)) if value is not None}
+    return lower([model_graph(model, angle, SCALARS, parts) for model in models], known)
 
 
 def identifier(text: str) -> str:
