@@ -219,7 +219,7 @@ def _dark_film(lens: Lens, film_mm: tuple[float, float]) -> list[str]:
 def _model(path: Path, shot: Shot, fused: bool) -> Camera:
     from neurolens.cameras.fused import FusedCamera
     from neurolens.cameras.model import OnnxCamera, load_model
-    from neurolens.cameras.states import state_for
+    from neurolens.modelfile.states import state_for
 
     for field, value in {"efl_mm": shot.efl_mm, "field_deg": shot.field_deg}.items():
         _refuse(str(path), field, value, "left out: a model is of one size of its lens")

@@ -17,8 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.onnxfile import constants_and_nodes
-from neurolens.cameras.onnxshapes import Node
 from neurolens.graph.program import (
     FILM_Z,
     RAY,
@@ -31,6 +29,8 @@ from neurolens.graph.program import (
     Expr,
     Program,
 )
+from neurolens.modelfile.onnxfile import constants_and_nodes
+from neurolens.modelfile.shapes import Node
 from neurolens.programs.tanh import add_tanh
 
 # Objects are expressions, numbers constants.

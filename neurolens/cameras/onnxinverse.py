@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
-from neurolens.cameras.cardcheck import check_card, is_number
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.onnxfile import read_checked
 from neurolens.cameras.onnxlens import OUTPUTS
 from neurolens.cameras.onnxsession import open_session, run_session
 from neurolens.frontsurface import meet_front
+from neurolens.modelfile.cardcheck import check_card, is_number
+from neurolens.modelfile.onnxfile import read_checked
 
 # Rays a call: the Newton steps have more rows than a model.
 BATCH = 4096

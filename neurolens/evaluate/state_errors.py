@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from neurolens.axes import Axis
 from neurolens.base.errors import InputError
 from neurolens.cameras.model import OnnxLens
 from neurolens.evaluate.check import Promise, find_lens, share_promise
 from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.vignetting import vignetting_errors
+from neurolens.modelfile.axes import Axis
 from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs

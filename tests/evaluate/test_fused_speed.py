@@ -9,6 +9,7 @@ import lens_models
 import numpy as np
 import pytest
 import torch
+from neurolens.optics.traceprogram import exact_program
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
@@ -20,7 +21,6 @@ from neurolens.evaluate.benches.fused_speed import Row, ray_candidate, selected
 from neurolens.evaluate.speed import Unavailable, race
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
-from neurolens.optics.traceprogram import exact_program
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.source import RAY_ONLY, SCENE_RAY
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from neurolens.optics.traceprogram import exact_program
 
 from neurolens.base import status as st
 from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STATUS, STOP_RADIUS, TRANSMITTANCE, WAVELENGTH
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays, trace
-from neurolens.optics.traceprogram import exact_program
 
 FILM_MM = 60.0
 SHAPES: dict[str, tuple[float, dict[str, Any]]] = {

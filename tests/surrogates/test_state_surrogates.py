@@ -16,7 +16,6 @@ import onnx
 import pytest
 import torch
 
-from neurolens.axes import Axis, product, weights
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import OnnxCamera
@@ -25,6 +24,7 @@ from neurolens.evaluate.benches import outside
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.state_errors import check_states, random_states, space_of_card
 from neurolens.evaluate.vignetting import vignetting_errors
+from neurolens.modelfile.axes import Axis, product, weights
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens

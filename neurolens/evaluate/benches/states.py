@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from neurolens import __version__
-from neurolens.axes import Axis
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Report
 from neurolens.evaluate.experiment import near_limit_m, wavelengths_nm
@@ -21,6 +20,7 @@ from neurolens.evaluate.plots.states import panels_plot
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.records import kept_rows
 from neurolens.evaluate.train_states import fit_and_measure_states
+from neurolens.modelfile.axes import Axis
 from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neurolens.axes import Axis
 from neurolens.evaluate.plots.style import FIELD_COLOURS, INK, new_figure, plain_log_ticks, save, style
+from neurolens.modelfile.axes import Axis
 
 _LABELS = {"zoom": "focal length (mm)", "focus": "1 / distance in focus (1/m)"}
 
