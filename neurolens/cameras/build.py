@@ -176,8 +176,7 @@ def _thick(path: Path, shot: Shot) -> Camera:
 
 
 def _exact(path: Path, shot: Shot, fused: bool) -> Camera:
-    from neurolens.cameras.exact import ExactCamera
-    from neurolens.cameras.fusedexact import FusedExactCamera
+    from neurolens.cameras.exact import ExactCamera, FusedExactCamera
     from neurolens.optics.lenscheck import check_lens, doubts
     from neurolens.optics.lensfile import read_lens
     from neurolens.optics.paraxial import first_order

@@ -114,8 +114,9 @@ class _Reader:
             return [self._sum(first, [int(v) for v in axes], bool(node.attributes.get("keepdims", 1)))]
         if kind in ("MatMul", "Gemm"):
             return [self._product(*given)]
-        if kind in ("Cast", "DequantizeLinear") and not any(isinstance(a, _Tensor) for a in given):
-            return [_constant(kind, axis, given)]  # type: ignore[arg-type]
+        constants = _numbers(given)
+        if kind in ("Cast", "DequantizeLinear") and constants is not None:
+            return [_constant(kind, axis, constants)]
         if kind == "Cast":
             # To integers: only the status, which is whole.
             rule = Value.whole if node.attributes.get("to") in _WHOLE else _ELEMENTWISE["Identity"]
@@ -133,16 +134,18 @@ class _Reader:
     def _each(self, operation: Callable[..., Value], *given: Array | _Tensor) -> Array | _Tensor:
         shape = np.broadcast_shapes(*(a.shape for a in given))
         _check_room(math.prod(shape))
-        if not any(isinstance(a, _Tensor) for a in given):
-            return _folded(operation, shape, given)  # type: ignore[arg-type]
+        numbers = _numbers(given)
+        if numbers is not None:
+            return _folded(operation, shape, numbers)
         self.steps += math.prod(shape)
         value = operation(*(self.tensor(a).wide(shape) for a in given))
         places = np.arange(math.prod(shape)) if value.rows > 1 else np.zeros(math.prod(shape), int)
         return _Tensor(value, places.reshape(shape))
 
     def _concat(self, given: list[Array | _Tensor], axis: int) -> Array | _Tensor:
-        if not any(isinstance(a, _Tensor) for a in given):
-            return np.concatenate(given, axis)  # type: ignore[arg-type]
+        numbers = _numbers(given)
+        if numbers is not None:
+            return np.concatenate(numbers, axis)
         parts = [self.tensor(a) for a in given]
         ends = np.cumsum([0, *(p.size for p in parts)])
         places = [n + np.arange(p.size).reshape(p.shape) for n, p in zip(ends, parts, strict=False)]
@@ -155,30 +158,34 @@ class _Reader:
             array = array if keepdims else _taken(array, np.squeeze(_places(array), axis))
         return array
 
-    def _product(
-        self, weight: Array | _Tensor, x: Array | _Tensor, bias: Array | _Tensor | None = None
-    ) -> Array | _Tensor:
-        """weight [R, K] times x [K, 1], plus bias [R, 1]."""
+    def _product(self, weight: Array | _Tensor, x: Array | _Tensor, *bias: Array | _Tensor) -> Array | _Tensor:
+        """weight [R, K] times x [K, 1], plus bias [R, 1] or [1, 1]."""
         rows, columns = weight.shape
         _check_room(rows * x.size)
-        if not any(isinstance(a, _Tensor) for a in (weight, x, bias)):
-            total = weight.astype(np.float64) @ x  # type: ignore[union-attr]
-            return total if bias is None else total + bias  # type: ignore[operator]
+        numbers = _numbers((weight, x, *bias))
+        if numbers is not None:
+            return sum(numbers[2:], numbers[0].astype(np.float64) @ numbers[1])
         if x.shape != (columns, 1):
             raise ValueError(f"{weight.shape} times {x.shape}")
         self.steps += rows * columns
         places, vector = np.arange(rows)[:, None], self.tensor(x).column()
+        start = bias[0] if bias else np.zeros((1, 1))
         if isinstance(weight, _Tensor):
-            total = self.tensor(np.zeros((rows, 1)) if bias is None else bias).wide((rows, 1))
+            total = self.tensor(start).wide((rows, 1))
             for k in range(columns):
                 total = _Tensor(weight.value, weight.rows[:, k]).column() * vector[k] + total
-        elif isinstance(bias, _Tensor):
-            added = _Tensor(bias.value, np.broadcast_to(bias.rows, (rows, 1))).column()
+        elif isinstance(start, _Tensor):
+            added = _Tensor(start.value, np.broadcast_to(start.rows, (rows, 1))).column()
             total = self.graph.affine(weight, vector, added=added)
         else:
-            numbers = np.zeros(1) if bias is None else bias
-            total = self.graph.affine(weight, vector, np.broadcast_to(numbers, (rows, 1))[:, 0])
+            total = self.graph.affine(weight, vector, np.broadcast_to(start, (rows, 1))[:, 0])
         return _Tensor(total, places)
+
+
+def _numbers(given: Sequence[Array | _Tensor]) -> list[Array] | None:
+    """These arrays, where all are numbers."""
+    found = [a for a in given if not isinstance(a, _Tensor)]
+    return found if len(found) == len(given) else None
 
 
 def _places(array: Array | _Tensor) -> Array:

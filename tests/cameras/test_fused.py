@@ -13,6 +13,7 @@ import lens_models
 import numpy as np
 import onnx
 import pytest
+from neurolens.cameras.graphprogram import program_of
 from neurolens.programs import compiler, loworder
 
 from neurolens.apertures import Aperture
@@ -21,10 +22,8 @@ from neurolens.base.errors import InputError
 from neurolens.cameras import fused as fused_module
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import CameraRays
-from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.exact import ExactCamera, FusedExactCamera
 from neurolens.cameras.fused import FusedCamera
-from neurolens.cameras.fusedexact import FusedExactCamera
-from neurolens.cameras.graphprogram import program_of
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH, Program
 from neurolens.optics.lensfile import read_lens

@@ -9,7 +9,6 @@ import lens_models
 import numpy as np
 import pytest
 import torch
-from neurolens.optics.traceprogram import exact_program
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
@@ -19,8 +18,10 @@ from neurolens.evaluate.benches.fused import fused_candidate
 from neurolens.evaluate.benches.fused_page import goals, write
 from neurolens.evaluate.benches.fused_speed import Row, ray_candidate, selected
 from neurolens.evaluate.speed import Unavailable, race
+from neurolens.graph.scalars import lower
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
+from neurolens.optics.tracegraph import exact_graph
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.source import RAY_ONLY, SCENE_RAY
 
@@ -34,7 +35,7 @@ def test_the_exact_program_is_the_exact_trace() -> None:
     columns = {"film_x_mm": s.film_x, "film_y_mm": s.film_y, "pupil_x_mm": s.pupil_x, "pupil_y_mm": s.pupil_y}
     inputs = {k: v.numpy() for k, v in columns.items()} | {"wavelength_nm": s.wavelength_nm.numpy()}
     inputs |= {"film_z_mm": domain.film_z_mm[0], "stop_radius_mm": lens.stop_radius_mm}
-    found = exact_program(lens, domain.pupil_z_mm, domain.wavelength_nm).evaluate(inputs)
+    found = lower(exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm)).evaluate(inputs)
     status = exact.status.numpy()
     assert np.mean(found["status"] != status) < 1e-4 and len(np.unique(status)) > 3
     passed = (status == st.PASSED) & (found["status"] == st.PASSED)
@@ -42,7 +43,7 @@ def test_the_exact_program_is_the_exact_trace() -> None:
         assert np.abs(found[name] - column.numpy())[passed].max() < 1e-4
     assert exact.transmittance is not None
     assert np.abs(found["transmittance"] - exact.transmittance.numpy())[passed].max() < 1e-5
-    alone = exact_program(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=False).evaluate(inputs)
+    alone = lower(exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=False)).evaluate(inputs)
     assert np.array_equal(alone["dx"][passed], found["dx"][passed]) and "transmittance" not in alone
 
 
@@ -78,7 +79,7 @@ def test_without_a_compiler_or_coefficients_there_is_no_candidate(
     monkeypatch.setenv("CC", "")
     assert fused_candidate("x", model, model.domain) is None
     with pytest.raises(Unavailable, match="no C compiler"):
-        CompiledSource(exact_program(lens_models.lens(), 0.0, (400.0, 700.0)))
+        CompiledSource(lower(exact_graph(lens_models.lens(), 0.0, (400.0, 700.0))))
 
 
 def test_goals_and_page(tmp_path: Path) -> None:

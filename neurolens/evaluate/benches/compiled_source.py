@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.evaluate.speed import Call, Unavailable
+from neurolens.graph import compiler
 from neurolens.graph.c import Signature, write_c
 from neurolens.graph.compiler import FLAGS, compile_c
 from neurolens.graph.program import Program
-from neurolens.programs import compiler
 
 _NAME = "lens"
 

@@ -8,8 +8,7 @@ from typing import Any
 
 from neurolens.cameras.build import FUSED, Shot, make_camera
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.fusedexact import FusedExactCamera
+from neurolens.cameras.exact import ExactCamera, FusedExactCamera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order

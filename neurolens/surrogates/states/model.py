@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from neurolens import axes as ax
 from neurolens.base.errors import InputError
+from neurolens.modelfile import axes as ax
 from neurolens.modelfile.states import mix_domain
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.lightfield import Encoding
