@@ -88,10 +88,14 @@ class _Linear:
 
 @dataclass(frozen=True)
 class _Longer:
-    """A value with further rows below its own."""
+    """A value of more rows: before its own row `at`, sums of pairs of its rows stand."""
 
     name: str
-    rows: int  # with those
+    at: int
+    sums: int
+
+    def place(self, row: int) -> int:
+        return row if row < self.at else row + self.sums
 
 
 class _Writer:
@@ -107,7 +111,7 @@ class _Writer:
         self._constants: dict[tuple[bytes, str, tuple[int, ...]], str] = {}
         self._moved: dict[tuple[bytes, tuple[int, ...]], tuple[str, Array, tuple[int, ...]]] = {}
         self._cuts: dict[int, dict[tuple[int, ...], str]] = {}
-        self._squares: dict[int, tuple[str, list[tuple[int, int]]]] = {}
+        self._squares: dict[int, tuple[str, dict[tuple[int, int], int]]] = {}  # rows of squares, of x_i and x_i + x_j
 
     def body(self, shapes: Mapping[str, Sequence[int]]) -> list[NodeProto]:
         """All nodes, and with them the constants and results."""
@@ -240,20 +244,22 @@ def _take(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
 
 def _take_rows(w: _Writer, source: int, rows: Sequence[int]) -> str:
     """Rows, by one cut for all that take consecutive rows of the same value, where these do not overlap."""
-    value = w.known[source]
-    name = value.name if isinstance(value, _Longer) else w.name(source)
+    value, nodes = w.known[source], w.graphs[0].nodes
+    longer = value if isinstance(value, _Longer) else _Longer(w.name(source), nodes[source].rows, 0)
+    name, total, place = longer.name, nodes[source].rows + longer.sums, longer.place
     if source not in w._cuts:
-        nodes = w.graphs[0].nodes
-        end, total = 0, value.rows if isinstance(value, _Longer) else nodes[source].rows
+        end = 0
         cuts: list[tuple[int, ...]] = []
-        for run in sorted({n.static for n in nodes if n.kind == "take" and n.inputs[0] == source}):
+        takes = {n.static for n in nodes if n.kind == "take" and n.inputs[0] == source}
+        for run in sorted(tuple(place(r) for r in take) for take in takes):
             if run[0] >= end and run == tuple(range(run[0], run[-1] + 1)):
                 cuts += [tuple(range(end, run[0])), run]
                 end = run[-1] + 1
         cuts = [c for c in (*cuts, tuple(range(end, total))) if c]
         w._cuts[source] = dict(zip(cuts, w.split(name, [len(c) for c in cuts]), strict=True))
-    found = w._cuts[source].get(tuple(rows))
-    return found or w.op("Gather", name, w.const(list(rows), np.int64), axis=0)
+    wanted = [place(r) for r in rows]
+    found = w._cuts[source].get(tuple(wanted))
+    return found or w.op("Gather", name, w.const(wanted, np.int64), axis=0)
 
 
 def _concat(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
@@ -276,13 +282,18 @@ def _affine(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str | _
     if moving:
         # Sums of rows that a quadratic wants are further rows of the same product.
         sums = _mixed_pairs(w.graphs[0], number)
-        base, change = (np.concatenate([m, *(m[:, [i]] + m[:, [j]] for i, j in sums)], 1) for m in (weight, arrays[2]))
+        at = 1 + max((max(pair) for pair in sums), default=0)
+        base, change = (
+            np.concatenate([m[:, :at], *(m[:, [i]] + m[:, [j]] for i, j in sums), m[:, at:]], 1)
+            for m in (weight, arrays[2])
+        )
         matrix = w.op("Add", w.op("Mul", w.name(node.inputs[1]), w.numbers(change)), w.numbers(base))
         whole = w.op("MatMul", matrix, w.name(node.inputs[0]))
         if not sums:
             return whole
-        w._squares[number] = (w.op("Mul", whole, whole), sums)
-        return _Longer(whole, node.rows + len(sums))
+        longer = _Longer(whole, at, len(sums))
+        w._squares[number] = (w.op("Mul", whole, whole), _places(longer, node.rows, sums))
+        return longer
     if isinstance(source, _Linear):
         bias = bias + np.einsum("trk,tk->tr", weight, source.bias)
         weight, value = weight @ source.weight, source.value
@@ -310,17 +321,22 @@ def _quadratic(w: _Writer, number: int, node: Node, arrays: list[Array]) -> _Lin
         if sums:
             left, right = (_take_rows(w, source, [p[k] for p in sums]) for k in (0, 1))
             name = w.concat([name, w.op("Add", left, right)])
-        w._squares[source] = (w.op("Mul", name, name), sums)
-    squares, sums = w._squares[source]
-    matrix = np.zeros((node.rows, rows + len(sums)))
+        w._squares[source] = (w.op("Mul", name, name), _places(_Longer(name, rows, len(sums)), rows, sums))
+    squares, place = w._squares[source]
+    matrix = np.zeros((node.rows, len(place)))
     for r, form in enumerate(node.static):
         for i, j in form:
             if i == j:
-                matrix[r, i] += 1
+                matrix[r, place[i, i]] += 1
             else:
-                matrix[r, rows + sums.index((i, j))] += 0.5
-                matrix[r, [i, j]] -= 0.5
+                matrix[r, place[i, j]] += 0.5
+                matrix[r, [place[i, i], place[j, j]]] -= 0.5
     return _Linear(squares, np.repeat(matrix[None], len(w.graphs), 0), arrays[0])
+
+
+def _places(longer: _Longer, rows: int, sums: Sequence[tuple[int, int]]) -> dict[tuple[int, int], int]:
+    """Where the squares of rows (i, i) and of sums of two rows (i, j) stand."""
+    return {(i, i): longer.place(i) for i in range(rows)} | {pair: longer.at + k for k, pair in enumerate(sums)}
 
 
 def _polynomial(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
