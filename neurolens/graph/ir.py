@@ -376,11 +376,12 @@ def _kept_rows(found: Graph, graph: Graph, node: Node, rows: list[int], rows_of:
         return value
 
     if node.kind in ("affine", "quadratic", "polynomial"):
-        inputs = [whole(k) for k in node.inputs]
+        added = node.kind == "affine" and node.static[1]
+        inputs = [whole(k) for k in node.inputs[: -1 if added else None]]
         arrays = [a[rows] for a in node.arrays] if node.kind != "polynomial" else [node.arrays[0], node.arrays[1][rows]]
         static = node.static
-        if node.kind == "affine" and node.static[1]:
-            inputs[-1] = rows_of(node.inputs[-1], rows)
+        if added:
+            inputs.append(rows_of(node.inputs[-1], rows))
         if node.kind == "quadratic":
             static = tuple(node.static[r] for r in rows)
         return found.add(node.kind, inputs, len(rows), arrays=arrays, static=static)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from neurolens.programs import compiler
 
 from neurolens.base.errors import InputError
+from neurolens.graph import compiler
 
 SOURCE = "int answer(void) { return 42; }\n"
 
