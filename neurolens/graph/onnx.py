@@ -271,6 +271,8 @@ def _concat(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
         if of_rays and nodes[k].per_call:  # repeated for every ray
             zeros = w.const(np.zeros((nodes[k].rows, nodes[of_rays[0]].rows)))
             name = w.op("Add", w.op("MatMul", zeros, w.name(of_rays[0])), name)
+        elif nodes[k].per_call and nodes[k].rows == 1:  # [1], to stand in a column
+            name = w.op("Reshape", name, w.const([1, 1], np.int64))
         names.append(name)
     return w.concat(names)
 
