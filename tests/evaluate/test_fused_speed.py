@@ -1,4 +1,4 @@
-"""Fused models on the clock: the exact trace as a program, candidates, goals that cannot be missed unseen."""
+"""Fused models on the clock: the exact trace as a graph, candidates, goals that cannot be missed unseen."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ from neurolens.evaluate.benches.fused import fused_candidate
 from neurolens.evaluate.benches.fused_page import goals, write
 from neurolens.evaluate.benches.fused_speed import Row, ray_candidate, selected
 from neurolens.evaluate.speed import Unavailable, race
+from neurolens.graph.program import SCENE_RAY
 from neurolens.graph.scalars import lower
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
 from neurolens.optics.tracegraph import exact_graph
+from neurolens.surrogates.assemble import RAY_ONLY
 from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.source import RAY_ONLY, SCENE_RAY
 
 
-def test_the_exact_program_is_the_exact_trace() -> None:
+def test_the_exact_graph_is_the_exact_trace() -> None:
     lens, domain = lens_models.lens(), lens_models.domain()
     s = sample_domain(domain, 20_000, 3)
     s = replace(s, film_z=torch.full_like(s.film_z, domain.film_z_mm[0]))

@@ -29,12 +29,13 @@ from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
 from neurolens.optics.prescription import Lens
 from neurolens.optics.tracegraph import exact_graph
+from neurolens.surrogates.assemble import ALL, RAY_ONLY, Parts
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.source import ALL, RAY_ONLY, Fixed, Parts, fused_program
+from neurolens.surrogates.source import Fixed, fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 
 WITHIN_UM = 1.0
