@@ -35,8 +35,7 @@ from neurolens.base.files import atomic_path
 from neurolens.base.tomlfile import read_toml
 from neurolens.cameras.build import FUSED, Shot, make_camera
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.fusedexact import FusedExactCamera
+from neurolens.cameras.exact import ExactCamera, FusedExactCamera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.evaluate.image import DEFAULT, flip, flip_map
 from neurolens.evaluate.records import plain

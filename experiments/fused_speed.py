@@ -37,14 +37,15 @@ from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.speed import Call, Candidate, Race, race
 from neurolens.graph.compiler import FLAGS
 from neurolens.graph.program import Program
+from neurolens.graph.scalars import lower
 from neurolens.optics.prescription import Lens
-from neurolens.optics.traceprogram import exact_program
+from neurolens.optics.tracegraph import exact_graph
+from neurolens.surrogates.assemble import ALL, RAY_ONLY, Parts
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.assemble import ALL, RAY_ONLY, Parts
 from neurolens.surrogates.source import Fixed, fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 
@@ -165,7 +166,7 @@ def ray_candidate(name: str, file: Path) -> Candidate:
 
 def _add_exact(add: Callable[..., None], lens: Lens, domain: Domain, torch_compiled: bool) -> None:
     for work in ("ray", "whole"):
-        program = exact_program(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=work == "whole")
+        program = lower(exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=work == "whole"))
         add("exact C", work, program_candidate("", program, domain), program)
         if torch_compiled:
             add("exact torch", work, exact_candidates(lens, domain, transmittance=work == "whole")[1])

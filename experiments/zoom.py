@@ -15,13 +15,13 @@ from typing import Any
 from experiments import lab
 from neurolens import __version__
 from neurolens.analysis.plot_style import FIELD_COLOURS, INK, new_figure, save, style
-from neurolens.axes import Axis
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress, Report
 from neurolens.commands.arguments import whole
 from neurolens.evaluate.experiment import near_limit_m, wavelengths_nm
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.train_states import AXIS_LABELS, error_axes, error_line, fit_and_measure_states
+from neurolens.modelfile.axes import Axis
 from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs

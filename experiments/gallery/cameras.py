@@ -25,9 +25,8 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.progress import Report
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
-from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.exact import ExactCamera, FusedExactCamera
 from neurolens.cameras.fused import FusedCamera
-from neurolens.cameras.fusedexact import FusedExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens

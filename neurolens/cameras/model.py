@@ -21,8 +21,8 @@ from neurolens.cameras.onnxinverse import OnnxInverse, load_inverse
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.sampling import arrived, check_film, positive
-from neurolens.cameras.states import state_for
 from neurolens.modelfile import DOMAIN_SLACK
+from neurolens.modelfile.states import state_for
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.film_plane import film_z_mm
 

@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
-from neurolens.cameras.cardcheck import check_card, is_number
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.onnxfile import read_checked
 from neurolens.cameras.onnxlens import OUTPUTS
 from neurolens.cameras.onnxsession import open_session, run_session
+from neurolens.modelfile.cardcheck import check_card, is_number
+from neurolens.modelfile.onnxfile import read_checked
 from neurolens.optics.sag import meet_front
 
 # Rays a call: the Newton steps have more rows than a model.

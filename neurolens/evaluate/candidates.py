@@ -28,9 +28,9 @@ from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import Traced, trace
+from neurolens.surrogates.assemble import ALL, Parts
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.assemble import ALL, Parts
 from neurolens.surrogates.source import FREE, Fixed, fused_program
 from neurolens.surrogates.stored import load_fitted
 

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 import neurolens
-from neurolens.axes import Axis
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.cameras.model import OnnxLens
@@ -33,6 +32,7 @@ from neurolens.evaluate.measure import (
 )
 from neurolens.evaluate.rays import EachRay, ray_errors
 from neurolens.evaluate.vignetting import ZONES, false_shares
+from neurolens.modelfile.axes import Axis
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens

@@ -14,7 +14,6 @@ from typing import Any
 
 from neurolens import __version__
 from neurolens.analysis.plot_style import FIELD_COLOURS, INK, new_figure, plain_log_ticks, save, style
-from neurolens.axes import Axis
 from neurolens.base.config import to_dict, to_toml
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
@@ -26,6 +25,7 @@ from neurolens.evaluate.experiment import Experiment, keep_lens, relative_to
 from neurolens.evaluate.measure import known_record, note_record
 from neurolens.evaluate.records import plain
 from neurolens.evaluate.speed import race
+from neurolens.modelfile.axes import Axis
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.export import export_states
 from neurolens.surrogates.fit import ModelSettings

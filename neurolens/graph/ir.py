@@ -244,7 +244,9 @@ class Graph:
 
     def dot(self, a: Value, b: Value) -> Value:
         """The scalar product of a and b, one row."""
-        return self.affine(np.ones((1, a.rows)), a * b)
+        if a == b:
+            return self.square(a)
+        return self.quadratic(self.concat(a, b), [tuple((k, a.rows + k) for k in range(a.rows))])
 
     def polynomial(self, exponents: Exponents, weight: ArrayLike, x: Value) -> Value:
         """weight [R, M] times the monomials of x [V rows], for exponents [M, V], rows of which are unique."""
@@ -374,11 +376,12 @@ def _kept_rows(found: Graph, graph: Graph, node: Node, rows: list[int], rows_of:
         return value
 
     if node.kind in ("affine", "quadratic", "polynomial"):
-        inputs = [whole(k) for k in node.inputs]
+        added = node.kind == "affine" and node.static[1]
+        inputs = [whole(k) for k in node.inputs[: -1 if added else None]]
         arrays = [a[rows] for a in node.arrays] if node.kind != "polynomial" else [node.arrays[0], node.arrays[1][rows]]
         static = node.static
-        if node.kind == "affine" and node.static[1]:
-            inputs[-1] = rows_of(node.inputs[-1], rows)
+        if added:
+            inputs.append(rows_of(node.inputs[-1], rows))
         if node.kind == "quadratic":
             static = tuple(node.static[r] for r in rows)
         return found.add(node.kind, inputs, len(rows), arrays=arrays, static=static)

@@ -20,6 +20,7 @@ from neurolens.graph.program import Expr, Program, row_names
 Array = NDArray[np.float64]
 # Pairs (a, b) of a truth: it holds where a <= b in all of them.
 Tests = list[tuple[Expr, Expr]]
+_ROWS = 8  # of a matrix product at a time, of 16 registers; fewer would wait for one another
 
 
 def lower(graphs: Graph | Sequence[Graph], fixed: Mapping[str, ArrayLike] | None = None) -> Program:
@@ -101,17 +102,20 @@ def _input(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Arra
 
 
 def _affine(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
-    p, x, found = at.program, given[0], []
+    """By groups of rows whose sums fit the registers; each of the columns is spent on every row of a group at once."""
+    p, x = at.program, given[0]
     moving, added = node.static
-    for r in range(node.rows):
-        total = p.literal(arrays[1][r])
-        columns = range(len(x) - 1, -1, -1) if moving else range(len(x))
+    found = [p.literal(bias) for bias in arrays[1]]
+    if added:
+        found = [total + row for total, row in zip(found, given[-1], strict=True)]
+    columns = range(len(x) - 1, -1, -1) if moving else range(len(x))
+    for rows in np.array_split(np.arange(node.rows), max(1, round(node.rows / _ROWS))):
         for c in columns:
-            weight = p.literal(arrays[0][r, c])
-            if moving and arrays[2][r, c].any():
-                weight = p.fma(given[1][0], p.literal(arrays[2][r, c]), weight)
-            total = p.fma(x[c], weight, total)
-        found.append(total + given[-1][r] if added else total)
+            for r in rows:
+                weight = p.literal(arrays[0][r, c])
+                if moving and arrays[2][r, c].any():
+                    weight = p.fma(given[1][0], p.literal(arrays[2][r, c]), weight)
+                found[r] = p.fma(x[c], weight, found[r])
     return found
 
 

@@ -1,4 +1,4 @@
-"""Fused models on the clock: the exact trace as a program, candidates, goals that cannot be missed unseen."""
+"""Fused models on the clock: the exact trace as a graph, candidates, goals that cannot be missed unseen."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from neurolens.base import status as st
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import CompiledSource, find_compiler, fused_candidate
 from neurolens.evaluate.speed import Unavailable, race
+from neurolens.graph.program import SCENE_RAY
+from neurolens.graph.scalars import lower
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
-from neurolens.optics.traceprogram import exact_program
+from neurolens.optics.tracegraph import exact_graph
+from neurolens.surrogates.assemble import RAY_ONLY
 from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.source import RAY_ONLY, SCENE_RAY
 
 
-def test_the_exact_program_is_the_exact_trace() -> None:
+def test_the_exact_graph_is_the_exact_trace() -> None:
     lens, domain = lens_models.lens(), lens_models.domain()
     s = sample_domain(domain, 20_000, 3)
     s = replace(s, film_z=torch.full_like(s.film_z, domain.film_z_mm[0]))
@@ -31,7 +33,7 @@ def test_the_exact_program_is_the_exact_trace() -> None:
     columns = {"film_x_mm": s.film_x, "film_y_mm": s.film_y, "pupil_x_mm": s.pupil_x, "pupil_y_mm": s.pupil_y}
     inputs = {k: v.numpy() for k, v in columns.items()} | {"wavelength_nm": s.wavelength_nm.numpy()}
     inputs |= {"film_z_mm": domain.film_z_mm[0], "stop_radius_mm": lens.stop_radius_mm}
-    found = exact_program(lens, domain.pupil_z_mm, domain.wavelength_nm).evaluate(inputs)
+    found = lower(exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm)).evaluate(inputs)
     status = exact.status.numpy()
     assert np.mean(found["status"] != status) < 1e-4 and len(np.unique(status)) > 3
     passed = (status == st.PASSED) & (found["status"] == st.PASSED)
@@ -39,7 +41,7 @@ def test_the_exact_program_is_the_exact_trace() -> None:
         assert np.abs(found[name] - column.numpy())[passed].max() < 1e-4
     assert exact.transmittance is not None
     assert np.abs(found["transmittance"] - exact.transmittance.numpy())[passed].max() < 1e-5
-    alone = exact_program(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=False).evaluate(inputs)
+    alone = lower(exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=False)).evaluate(inputs)
     assert np.array_equal(alone["dx"][passed], found["dx"][passed]) and "transmittance" not in alone
 
 
@@ -75,7 +77,7 @@ def test_without_a_compiler_or_coefficients_there_is_no_candidate(
     monkeypatch.setenv("CC", "")
     assert fused_candidate("x", model, model.domain) is None
     with pytest.raises(Unavailable, match="no C compiler"):
-        CompiledSource(exact_program(lens_models.lens(), 0.0, (400.0, 700.0)))
+        CompiledSource(lower(exact_graph(lens_models.lens(), 0.0, (400.0, 700.0))))
 
 
 def test_goals_and_kept_rows(tmp_path: Path) -> None:

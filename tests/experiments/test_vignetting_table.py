@@ -18,6 +18,7 @@ from neurolens.base import status as st
 from neurolens.cameras.onnxlens import load_model
 from neurolens.evaluate.experiment import LensChoice
 from neurolens.evaluate.vignetting import relative_illumination
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import ModelError
-from neurolens.cameras.onnxshapes import BROADCAST, ELEMENTWISE, RAYS, SHAPED, Node, Shape, check_shapes
-from neurolens.cameras.protobuf import Fields, as_text, fields_of, integers, message, one, text, walk
 from neurolens.modelfile import CARD_KEY, CARD_KIND, CARD_SCHEMA
+from neurolens.modelfile.protobuf import Fields, as_text, fields_of, integers, message, one, text, walk
+from neurolens.modelfile.shapes import BROADCAST, ELEMENTWISE, RAYS, SHAPED, Node, Shape, check_shapes
 
 MAX_BYTES = 64 * 2**20
 OPERATORS = ELEMENTWISE | BROADCAST | frozenset(SHAPED)

@@ -1,4 +1,4 @@
-"""Shapes as steps of a program against the tracer: one surface, rays from the film, those that miss among them."""
+"""Shapes in the graph of a lens against the tracer: one surface, rays from the film, those that miss among them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import torch
 
 from neurolens.base import status as st
 from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STATUS, STOP_RADIUS, TRANSMITTANCE, WAVELENGTH
+from neurolens.graph.scalars import lower
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays, trace
-from neurolens.optics.traceprogram import exact_program
+from neurolens.optics.tracegraph import exact_graph
 
 FILM_MM = 60.0
 SHAPES: dict[str, tuple[float, dict[str, Any]]] = {
@@ -40,7 +41,7 @@ def lens_of(radius_mm: float, shape: dict[str, Any]) -> Lens:
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_program_and_tracer_agree(name: str) -> None:
+def test_graph_and_tracer_agree(name: str) -> None:
     lens, count = lens_of(*SHAPES[name]), 20_000
     rng = np.random.default_rng(len(name))
     film, pupil = rng.uniform(-25, 25, (2, count)), rng.uniform(-14, 14, (2, count))
@@ -48,7 +49,7 @@ def test_program_and_tracer_agree(name: str) -> None:
     points, wavelength = np.concatenate([film, pupil]).astype(np.float32), rng.uniform(400, 700, count)
     given = dict(zip(RAY, points, strict=True)) | {WAVELENGTH: wavelength.astype(np.float32)}
     given |= {FILM_Z: np.float32(FILM_MM), STOP_RADIUS: np.float32(lens.stop_radius_mm)}
-    found = exact_program(lens, 12.0, (400.0, 700.0)).evaluate(given)
+    found = lower(exact_graph(lens, 12.0, (400.0, 700.0))).evaluate(given)
 
     x, y, px, py = (torch.from_numpy(v).double() for v in points)
     way = torch.stack([px - x, py - y, torch.full_like(x, 12.0 - FILM_MM)])
@@ -72,5 +73,5 @@ def test_rays_that_are_none_do_not_pass() -> None:
     strange = np.float32([math.nan, math.inf, -math.inf, 3e38, 1e-40])
     given = {name: np.zeros(5, np.float32) for name in RAY} | {RAY[0]: strange, WAVELENGTH: np.full(5, 550, np.float32)}
     given |= {FILM_Z: np.float32(FILM_MM), STOP_RADIUS: np.float32(lens.stop_radius_mm)}
-    found = exact_program(lens, 12.0, (400.0, 700.0)).evaluate(given)
+    found = lower(exact_graph(lens, 12.0, (400.0, 700.0))).evaluate(given)
     assert (found[STATUS][:4] != st.PASSED).all() and found[STATUS][4] == st.PASSED

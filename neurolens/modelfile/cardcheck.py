@@ -6,9 +6,11 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from neurolens.base.errors import InputError, ModelError
-from neurolens.cameras.pupil_boxes import PupilTable
-from neurolens.cameras.states import check_states
+from neurolens.modelfile.states import check_states
 
 
 def is_number(value: Any) -> bool:
@@ -127,6 +129,18 @@ def check_card(file: Any, card: Mapping[str, Any]) -> None:
         raise ModelError(f"{file}: card: states: {type(error).__name__}: {error}") from error
 
 
+def pupil_rows(bounds: Mapping[str, Any]) -> NDArray[np.float32]:
+    """[3, R] low, high, half of the boxes in a card's bounds.
+
+    Raises:
+        InputError: no three lists of equal length, or numbers that float32 cannot hold.
+    """
+    rows = np.array([bounds["low_mm"], bounds["high_mm"], bounds["half_mm"]], dtype=np.float32)
+    if rows.ndim != 2 or rows.shape[1] < 2 or not np.isfinite(rows).all():
+        raise InputError("pupil bounds", "low_mm, high_mm, half_mm", rows.shape, "three lists of finite numbers")
+    return rows
+
+
 def _check_places(file: Any, card: Mapping[str, Any], rules: Mapping[str, Rule]) -> None:
     for place, (holds, expected) in rules.items():
         value: Any = card
@@ -140,6 +154,6 @@ def _check_places(file: Any, card: Mapping[str, Any], rules: Mapping[str, Rule])
             shown = _MISSING if value is _MISSING else repr(value)[:80]
             raise ModelError(f"{file}: card: {place}: got {shown}, expected {expected}")
     try:
-        PupilTable.of(card["domain"]["bounds"])
+        pupil_rows(card["domain"]["bounds"])
     except (InputError, ValueError, OverflowError) as error:
         raise ModelError(f"{file}: card: domain.bounds: {error}") from error
