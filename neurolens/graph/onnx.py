@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from onnx import ModelProto, NodeProto, TensorProto, checker, helper, numpy_helper
 
 from neurolens.base.errors import InputError
-from neurolens.graph.ir import Graph, Node, pruned, same_structure
+from neurolens.graph.ir import Graph, Node
+from neurolens.graph.monomials import Exponent, Pair, plan_products
+from neurolens.graph.passes import pruned, same_structure
 
 Array = NDArray[np.float64]
 # Opset 17 and IR 8 are read by every onnxruntime since 1.12.
@@ -448,8 +449,6 @@ _RULES: dict[str, Callable[[_Writer, int, Node, list[Array]], str | _Linear | _L
 }
 
 
-Exponent = tuple[int, ...]
-Pair = tuple[Exponent, Exponent]
 Block = tuple[str, list[Exponent]]
 
 
@@ -483,35 +482,3 @@ def _products(w: _Writer, blocks: list[Block], pairs: dict[Exponent, Pair]) -> B
         name, known = next(block for block in blocks if wanted[0] in block[1])
         factors.append(w.op("Gather", name, w.const([known.index(e) for e in wanted], np.int64), axis=0))
     return w.op("Mul", *factors), list(pairs)
-
-
-def _level(e: Exponent) -> int:
-    """0 for a variable, 1 for degree 2, 2 for 3 to 4, 3 for 5 to 8 ..."""
-    return (sum(e) - 1).bit_length()
-
-
-def plan_products(exponents: list[Exponent], variables: int) -> dict[int, dict[Exponent, Pair]]:
-    """How to build every monomial as a product of two of lower levels: {level: {monomial: (left, right)}}.
-
-    Factors that are wanted anyway come first, then small right factors; what is still missing is added. Greedy.
-    """
-    wanted = {e for e in exponents if sum(e) > 1}
-    parents: dict[Exponent, Pair] = {}
-    # From the highest degree down, so that an added factor is still ahead in the loop.
-    queue = sorted(wanted, key=lambda e: (sum(e), e))
-    while queue:
-        e = queue.pop()
-        options = []
-        for right in product(*(range(k + 1) for k in e)):
-            left = tuple(x - y for x, y in zip(e, right, strict=True))
-            if 0 < sum(right) <= sum(left) and _level(left) < _level(e):
-                missing = sum(sum(part) > 1 and part not in wanted for part in {left, right})
-                options.append((missing, _level(right), sum(right), left, right))
-        *_, left, right = min(options)
-        parents[e] = (left, right)
-        for part in (left, right):
-            if sum(part) > 1 and part not in wanted:
-                wanted.add(part)
-                queue = sorted([*queue, part], key=lambda e: (sum(e), e))
-    levels = sorted({_level(e) for e in parents})
-    return {n: {e: pair for e, pair in parents.items() if _level(e) == n} for n in levels}

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from neurolens.analysis import layout
-from neurolens.analysis import plot_style as style as style as style
+from neurolens.analysis import plot_style as style
 from neurolens.analysis.layout import lens_layout
 from neurolens.base.errors import InputError
 from neurolens.evaluate import figures as drawn

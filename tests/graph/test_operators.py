@@ -16,7 +16,8 @@ from neurolens.graph.c import write_c
 from neurolens.graph.compiler import compile_c
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph, Value, pruned
+from neurolens.graph.ir import Graph, Value
+from neurolens.graph.passes import pruned
 from neurolens.graph.program import row_names
 from neurolens.graph.scalars import lower
 
