@@ -26,13 +26,13 @@ from neurolens.evaluate.experiment import LensChoice
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
+from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.inversion.fit import convergence, fit_inverse
 from neurolens.surrogates.inversion.maps import LIMIT, STEPS, TOLERANCE, InverseModel, SceneSystem, StopSystem
 from neurolens.surrogates.inversion.newton import Solved, limited_newton, solve_small
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.threads import pinned_threads
 
 PUBLISHED_STEPS = (3, 5, 10, 20)
 # A residual beyond this (in stop radii; of the front's radius, in radians) has run away, not merely missed.

@@ -23,11 +23,11 @@ from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.train_states import AXIS_LABELS, error_axes, error_line, fit_and_measure_states
 from neurolens.modelfile.axes import Axis
 from neurolens.optics.lensfile import read_lens
+from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.states.fit import StateSettings
-from neurolens.surrogates.states.space import StateSpace, axes_of
-from neurolens.surrogates.threads import pinned_threads
+from neurolens.surrogates.states import StateSpace, axes_of
+from neurolens.surrogates.states_fit import StateSettings
 
 # Coefficients per vector, rays of a node, rays of a single fit's test.
 TERMS, RAYS, TESTS = 64, 15_000, 8_000

@@ -39,8 +39,7 @@ from neurolens.optics.prescription import Lens
 from neurolens.readers.any_format import read_any
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.states.model import State
-from neurolens.surrogates.states.space import StateSpace
+from neurolens.surrogates.states import State, StateSpace
 
 # How much worse than promised a figure may be, for the rays are others: so many standard deviations of what a sample of
 # its size can tell, at least a tenth, at most a half. A largest error has no such bound: more rays find larger ones.

@@ -21,7 +21,7 @@ from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain, domain_of
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
-from neurolens.surrogates.states.space import StateSpace, axes_of
+from neurolens.surrogates.states import StateSpace, axes_of
 
 # Near limit where none is stated: 14 focal lengths from the film (0.7 m for a 50 mm lens), and the object 8 before the
 # front vertex, where a long lens of short focus has less room than that.

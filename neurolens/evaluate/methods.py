@@ -32,11 +32,11 @@ from neurolens.optics.pupils import image_radius_mm
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model, prepare
-from neurolens.surrogates.fits.ablations import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.precision import Precision, store_weights
 from neurolens.surrogates.published import PUBLISHED
+from neurolens.surrogates.settings import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
 
 GROUPS = {
     "paraxial": "what renderers use today",

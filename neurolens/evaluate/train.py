@@ -35,10 +35,10 @@ from neurolens.evaluate.train_states import run_states
 from neurolens.evaluate.vignetting import relative_illumination
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.fit import NETWORKS, Prepared, prepare
 from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs
-from neurolens.surrogates.threads import pinned_threads
 
 _IDEAL = ("thin lens", "pinhole")
 _LIT_RAYS = 4096  # a film radius: a quarter of a second a model

@@ -29,7 +29,7 @@ from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.stored import model_to_text, storable
 
 if TYPE_CHECKING:
-    from neurolens.surrogates.states.model import StateModel
+    from neurolens.surrogates.states import StateModel
 
 STATE = "state"
 # A film position that lies in no domain: where the state is out of range, this takes the place of the one asked for.

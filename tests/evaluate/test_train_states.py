@@ -15,7 +15,7 @@ from neurolens.cameras.onnxlens import load_model
 from neurolens.evaluate.experiment import default_experiment
 from neurolens.evaluate.train_states import fit_and_measure_states, state_settings
 from neurolens.surrogates.fit import ModelSettings
-from neurolens.surrogates.states.fit import StateSettings
+from neurolens.surrogates.states_fit import StateSettings
 
 ZOOM = lens_models.LENSES / "nikon_zoom_70_200.toml"
 

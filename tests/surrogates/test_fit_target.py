@@ -13,9 +13,8 @@ from lens_models import prepared
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.surrogates import fit
 from neurolens.surrogates.card import card_of
-from neurolens.surrogates.fit import ModelSettings, fit_model
+from neurolens.surrogates.fit import TERMS_LADDER, ModelSettings, fit_model
 from neurolens.surrogates.fits import checkpoint
-from neurolens.surrogates.fits.target import TERMS_LADDER
 
 # The plainest polynomial: what is tested here is the choice of its size.
 PLAIN = ModelSettings("omp", degree=4)

@@ -16,10 +16,9 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.surrogates.domain import Domain, domain_of, sample_domain
+from neurolens.surrogates.domain import SPARSE, Domain, domain_of, lit_share, sample_domain, sample_lit
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.fits.gates import GateFit
-from neurolens.surrogates.lit import SPARSE, lit_share, sample_lit
+from neurolens.surrogates.gates import GateFit
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs, trace_pairs
 

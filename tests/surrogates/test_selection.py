@@ -176,14 +176,6 @@ def test_omp_looks_at_correlation_and_ols_at_what_is_left() -> None:
     assert picks == {"omp": [0, 2], "ols": [0, 1]}
 
 
-def test_the_search_may_be_restricted() -> None:
-    columns = correlated(9)
-    sweep = sweep_of(columns, np.random.default_rng(0).normal(size=(1, 400)))
-    forward(sweep, 5, among=[3, 4, 5, 6, 7, 8])
-    replace_terms(sweep, among=[3, 4, 5, 6, 7, 8])
-    assert set(sweep.chosen) <= {3, 4, 5, 6, 7, 8} and len(sweep.chosen) == 5
-
-
 # ---- bases ----
 
 

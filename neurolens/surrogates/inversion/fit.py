@@ -12,6 +12,7 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.optics.surfaces import Rays
+from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.inversion.guess import fit_guess
@@ -21,7 +22,6 @@ from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import RayPairs, join_pairs
 from neurolens.surrogates.targets import targets_of
-from neurolens.surrogates.threads import pinned_threads
 
 # Rays beyond the rims teach the guess how the map goes on; those that pass count more.
 _BEYOND_WEIGHT = 0.3

@@ -33,6 +33,7 @@ from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import PairSet, trace_pairs
 from neurolens.surrogates.published.data import RawData
+from neurolens.surrogates.settings import ModelSettings
 from neurolens.surrogates.targets import scales_of
 
 NETWORKS = 3  # whose mean is taken
@@ -89,21 +90,6 @@ def _ring(inputs: Value, networks: tuple[Layers, ...]) -> Value:
 
 
 @dataclass(frozen=True)
-class NetworkSettings:
-    """Shape and training: units a layer, hidden layers, Adam steps of each network, seconds of all, seed, rings.
-
-    Seconds are the processor's, so that a busy machine trains no worse.
-    """
-
-    units: int
-    layers: int
-    steps: int
-    seconds: float
-    seed: int
-    rings: int
-
-
-@dataclass(frozen=True)
 class _Rays:
     """Training rays in float32: inputs [5, N], values [7, N], and whether each passes [N] (1 or 0)."""
 
@@ -113,24 +99,26 @@ class _Rays:
 
 
 def fit_averaged(
-    data: RawData, settings: NetworkSettings, progress: Callable[[float], None] | None = None
+    data: RawData, settings: ModelSettings, progress: Callable[[float], None] | None = None
 ) -> tuple[Averaged, tuple[Gate, ...]]:
     """Train every network; the same seed gives the same weights where `steps` ends the training.
+
+    `partitions` are the rings; `seconds` are the processor's, of all networks, so that a busy machine trains no worse.
 
     Raises:
         InputError: more rings than the rays allow.
     """
     count = len(data.pairs.train)
-    if count < settings.rings * _FEWEST_RAYS:
+    if count < settings.partitions * _FEWEST_RAYS:
         most = max(1, count // _FEWEST_RAYS)
-        raise InputError("fit", "partitions", settings.rings, f"1 to {most} rings for {count} training rays")
+        raise InputError("fit", "partitions", settings.partitions, f"1 to {most} rings for {count} training rays")
     rays = _training_rays(data)
     rho = rays.inputs[0] ** 2 + rays.inputs[1] ** 2
-    shares = torch.arange(1, settings.rings) / settings.rings
+    shares = torch.arange(1, settings.partitions) / settings.partitions
     edges = tuple(float(e) for e in torch.quantile(rho[rays.passes > 0], shares))
     ends = (-math.inf, *edges, math.inf)
     rings: list[tuple[Layers, ...]] = []
-    total = settings.rings * NETWORKS
+    total = settings.partitions * NETWORKS
     for low, high in zip(ends, ends[1:], strict=False):
         within = (rho > low - _MARGIN) & (rho <= high + _MARGIN)
         ring = _Rays(rays.inputs[:, within], rays.values[:, within], rays.passes[within])
@@ -171,7 +159,7 @@ def _training_rays(data: RawData) -> _Rays:
     return _Rays(inputs.float(), outputs.float(), outputs[6].float())
 
 
-def _train(rays: _Rays, settings: NetworkSettings, seed: int, seconds: float) -> Layers:
+def _train(rays: _Rays, settings: ModelSettings, seed: int, seconds: float) -> Layers:
     generator = torch.Generator().manual_seed(seed)
     widths = [5, *[settings.units] * settings.layers, 7]
     weights: list[Tensor] = []

@@ -20,19 +20,19 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError  # type: ignore[import-untyped]
 from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.graph.interpret import monomials
 from neurolens.graph.ir import Graph, Value
+from neurolens.surrogates.bases import Exponents, monomials
 from neurolens.surrogates.cores import Core, CoreValues, Field, Units
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import trace_pairs
 from neurolens.surrogates.published.data import RawData, stable_solve
-from neurolens.surrogates.published.ellipse import least_ellipse
 from neurolens.surrogates.targets import scales_of
 
 Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ class Meridian(Core):
         ellipse: [K, 3]: radius across, radius along, centre along the meridian (mm).
     """
 
-    exponents: NDArray[np.int64]
+    exponents: Exponents
     outputs: Array
     slope: float
     pupil: float
@@ -141,7 +141,7 @@ def meridian_variables(field: LightField, slope: float) -> tuple[Tensor, Tensor]
     return torch.stack([torch.hypot(field.p[0], field.p[1]), *unit, field.w]), y
 
 
-def meridian_exponents(degree: int, *, dispersive: bool) -> NDArray[np.int64]:
+def meridian_exponents(degree: int, *, dispersive: bool) -> Exponents:
     """[M, 4] all exponents of y, dx, dy to a total degree, each with w^0, w^1 and w^2."""
     rows = [e for e in itertools.product(range(degree + 1), repeat=3) if sum(e) <= degree]
     return np.array([(*e, w) for w in range(3 if dispersive else 1) for e in rows], dtype=np.int64)
@@ -187,7 +187,7 @@ def fit_ellipses(data: RawData, positions: int = POSITIONS, count: int = _RAYS) 
     return knots, np.array(rows)
 
 
-def _passing(data: RawData, domain: Domain, y_mm: float, count: int) -> NDArray[np.float64]:
+def _passing(data: RawData, domain: Domain, y_mm: float, count: int) -> Array:
     """[K, 2] where passing rays from height y in the input plane cross the pupil plane, across and along."""
     points = torch.quasirandom.SobolEngine(3, scramble=True, seed=17).draw(count, dtype=torch.float64).T
     radius, angle = domain.pupil_radius_mm * torch.sqrt(points[0]), 2 * torch.pi * points[1]
@@ -198,3 +198,43 @@ def _passing(data: RawData, domain: Domain, y_mm: float, count: int) -> NDArray[
     rays = FilmRays(zero, zero + y_mm, plane, crossing[0], crossing[1], low + (high - low) * points[2])
     passed = trace_pairs(data.pairs.lens, rays, domain.pupil_z_mm).status == st.PASSED
     return np.asarray(crossing[:, passed].T.numpy(), dtype=np.float64)
+
+
+def least_ellipse(points: Array, tolerance: float = 1e-4) -> tuple[float, float, float]:
+    """Radius along x, radius along y and centre on the y axis of the least ellipse about points and mirror images.
+
+    The mirror is the y axis, x -> -x: the ellipse then has its centre on it and its axes along x and y. Khachiyan 1996,
+    with the steps of Todd and Yildirim 2007; the area is right to about `tolerance`, and all points lie inside.
+
+    Args:
+        points: [K, 2], at least one.
+    """
+    both = np.concatenate([points, points * [-1, 1]])
+    size = max(float(np.ptp(both, axis=0).max()), 1e-12)
+    try:
+        both = both[ConvexHull(both).vertices]
+    except (QhullError, ValueError):
+        half = np.ptp(both, axis=0) / 2  # points on a line
+        return max(float(half[0]), 1e-9 * size), max(float(half[1]), 1e-9 * size), float(both[:, 1].mean())
+    centre_y, scale = both[:, 1].mean(), size / 2
+    lifted = np.concatenate([both[:, :1], both[:, 1:] - centre_y, np.full((len(both), 1), scale)], axis=1).T / scale
+    weights = np.full(len(both), 1 / len(both))
+    for _ in range(2000):
+        inverse = np.linalg.inv((lifted * weights) @ lifted.T)
+        distance = np.einsum("ik,ij,jk->k", lifted, inverse, lifted)
+        far = int(distance.argmax())
+        near = int(np.where(weights > 1e-12, distance, np.inf).argmin())
+        excess, lack = distance[far] / 3 - 1, 1 - distance[near] / 3
+        if max(excess, lack) <= tolerance:
+            break
+        k = far if excess >= lack else near
+        step = (distance[k] - 3) / (3 * (distance[k] - 1))
+        step = max(step, -weights[k] / (1 - weights[k])) if weights[k] < 1 else step
+        weights *= 1 - step
+        weights[k] += step
+    centre = both.T @ weights
+    spread = ((both - centre).T * weights) @ (both - centre)
+    radii = np.sqrt(2 * np.diag(spread))
+    # The last ten thousandth: grow until every point is inside.
+    outside = np.sqrt((((both - [0.0, centre[1]]) / radii) ** 2).sum(1).max())
+    return float(radii[0] * outside), float(radii[1] * outside), float(centre[1])

@@ -23,8 +23,7 @@ from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import trace_pairs
-from neurolens.surrogates.published.adaptive import fit_adaptive
-from neurolens.surrogates.published.cores import Cells
+from neurolens.surrogates.published.adaptive import Cells, fit_adaptive
 from neurolens.surrogates.published.data import RawData
 from neurolens.surrogates.published.neural import Averaged, Layers
 

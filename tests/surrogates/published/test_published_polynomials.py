@@ -26,9 +26,15 @@ from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.lightfield import fit_encoding
 from neurolens.surrogates.pairs import trace_pairs
 from neurolens.surrogates.published import PUBLISHED
-from neurolens.surrogates.published.cores import from_tangents, to_tangents
-from neurolens.surrogates.published.data import PARITY, RawData, parity_exponents, slope_encoding
-from neurolens.surrogates.published.pursuit import Pursuit
+from neurolens.surrogates.published.data import (
+    PARITY,
+    RawData,
+    from_tangents,
+    parity_exponents,
+    slope_encoding,
+    to_tangents,
+)
+from neurolens.surrogates.published.polynomials import Pursuit
 
 FAST = {
     "dense": ModelSettings("hanika", basis="raw", degree=3),

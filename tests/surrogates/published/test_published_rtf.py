@@ -24,8 +24,7 @@ from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import trace_pairs
-from neurolens.surrogates.published.ellipse import least_ellipse
-from neurolens.surrogates.published.rtf import meridian_exponents, meridian_variables, turn
+from neurolens.surrogates.published.rtf import least_ellipse, meridian_exponents, meridian_variables, turn
 
 
 @cache

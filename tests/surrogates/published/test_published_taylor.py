@@ -21,10 +21,9 @@ from neurolens.optics.trace import Rays, trace
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
-from neurolens.surrogates.fits.paraxial import ideal_map
+from neurolens.surrogates.fits.polynomial import ideal_map
 from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.published.series import truncated
-from neurolens.surrogates.published.taylor import expand
+from neurolens.surrogates.published.taylor import expand, truncated
 from neurolens.surrogates.targets import scales_of
 
 # Conic and even powers, and a stop between.

@@ -1,7 +1,8 @@
-"""The course of a training: several starts on few rays, then the best, on as many rays as it takes not to overfit.
+"""Small networks with the symmetry of the lens (after NeuroLens, Zheng and Zheng 2017b), and the course of a training.
 
-A smooth lens is learnt from 2000 rays as well as from 16,000, at an eighth of the cost of a step. Where the error on
-rays that the fit has not seen runs ahead of that on its own, it goes on with twice as many.
+Several starts run on few rays, then the best, on as many rays as it takes not to overfit: a smooth lens is learnt from
+2000 rays as well as from 16,000, at an eighth of the cost of a step. Where the error on rays that the fit has not seen
+runs ahead of that on its own, it goes on with twice as many.
 """
 
 from __future__ import annotations
@@ -10,14 +11,27 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from neurolens.surrogates.fits.checkpoint import Checkpoint
-from neurolens.surrogates.fits.projection import Problem, Projection, activations, project
-from neurolens.surrogates.fits.training import Stand, minimise
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
+from neurolens.surrogates.bases import pinned_threads
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, Network
+from neurolens.surrogates.fits.checkpoint import Checkpoint, fingerprint
+from neurolens.surrogates.fits.projection import Problem, Projection, Stand, activations, minimise, project
+from neurolens.surrogates.gates import boundary_weights, gate_values
+from neurolens.surrogates.pairs import PairSet
+from neurolens.surrogates.targets import Prepared, film_equivalent_weights, targets_of
 
+# What the other outputs weigh against film-equivalent micrometres: so many um for 1 mm at the stop; and, for each mm of
+# the film radius, for a transmittance of 1 and for a gate of 1 (a rim radius twice over). They only decide which
+# features the hidden layers learn: the last layer is solved for each output by itself.
+_STOP_UM_PER_MM, _TRANSMITTANCE_UM, _GATE_UM = 30.0, 20.0, 10.0
+# Training ends at an RMS of this share of the film radius: float32 itself, which evaluates the model, has eps 1.2e-7.
+_ENOUGH = 1e-7
 FEWEST_RAYS = 2000
 # Each start gets this share of the steps before the best goes on.
 _TRIAL_STEPS = 0.1
@@ -27,6 +41,96 @@ _BURST = 10
 _GAP = 1.15
 # Converged, when so many bursts in a row lower the loss by less than this share each.
 _LITTLE, _IDLE = 0.01, 3
+
+
+def fit_network(
+    data: Prepared,
+    *,
+    units: int = 16,
+    layers: int = 2,
+    seed: int = 0,
+    seconds: float = 60.0,
+    steps: int = 300,
+    starts: int = 3,
+    rays: int = 16000,
+    base: InvariantPolynomial | None = None,
+    checkpoint: Path | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Network:
+    """Fit a network of `layers` tanh layers of `units` units, in float64 on one thread.
+
+    Position and direction weigh by their film-equivalent error, the stop crossing, the transmittance and the gates
+    modestly. Several random starts are tried, and the best goes on.
+
+    Args:
+        data: half the rays come from `pairs.train`, half from those near the boundaries and beyond (`boundary`).
+        steps: most steps of the optimiser (Levenberg-Marquardt); convergence or the time limit may end it earlier.
+        seconds: limit of the training. The same seed gives the same weights bit for bit where it does not bite.
+        starts: random starts.
+        rays: most rays used.
+        base: a polynomial whose residual is fitted instead.
+        checkpoint: file that takes the state every few seconds. Where it holds that of the very same fit, training
+            goes on from there, to the very same weights; a file that is damaged or of another fit is replaced.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        InputError: units, layers, steps, starts or seconds that are not positive, or no rays.
+        OSError: the checkpoint cannot be written.
+    """
+    numbers = {"units": units, "layers": layers, "steps": steps, "starts": starts, "seconds": seconds, "rays": rays}
+    for name, value in numbers.items():
+        if not value > 0:
+            raise InputError("mlp", name, value, "a positive number")
+    if not len(data.pairs.train):
+        raise InputError("mlp", "pairs.train", "(no rays)", "at least one passing ray")
+    with pinned_threads():
+        problem, shift, scale = _problem(data, rays, base)
+        key = fingerprint(problem.tensors, {**numbers, "seed": seed})
+        enough = (_ENOUGH * 1000 * data.pairs.domain.film_radius_mm) ** 2
+        kept = Checkpoint(checkpoint, key)
+        training = Training(problem, (units, layers), seed, steps, starts, seconds, enough, kept, progress)
+        best = training.run()
+    if progress:
+        progress(1.0)
+    *hidden, output = ((w[:, :-1].numpy().copy(), w[:, -1].numpy().copy()) for w in (*best.hidden, best.output))
+    return Network(tuple(hidden), output, shift.numpy(), scale.numpy())
+
+
+def _problem(data: Prepared, rays: int, base: InvariantPolynomial | None) -> tuple[Problem, Tensor, Tensor]:
+    """The weighted fit, and shift and scale [4] of the invariants."""
+    pairs, boundary = data.pairs, data.boundary
+    train = pairs.train.select(slice(0, max(rays - len(boundary), rays - rays // 2)))
+    boundary = boundary.select(slice(0, rays - len(train)))
+    parts = [_part(data, s, base) for s in (train, boundary) if len(s)]
+    inputs, *rest = (torch.cat(c, -1) for c in zip(*parts, strict=True))
+    low, high = inputs.amin(1), inputs.amax(1)
+    shift = (low + high) / 2
+    scale = torch.where(high > low, 2 / torch.where(high > low, high - low, 1.0), 1.0)
+    return Problem(((inputs - shift[:, None]) * scale[:, None]).T.contiguous(), *rest), shift, scale
+
+
+def _part(data: Prepared, pairs: PairSet, base: InvariantPolynomial | None) -> tuple[Tensor, ...]:
+    """Invariants [4, N] and the fields of `Problem` after the inputs, rays last."""
+    lens, domain, gates = data.pairs.lens, data.pairs.domain, data.gates
+    targets, gate = targets_of(lens, data.encoding, pairs), gate_values(lens, gates, pairs)
+    passes = (pairs.status == st.PASSED).to(torch.float64)
+    position_um, direction_um = film_equivalent_weights(lens, domain)
+    weights = torch.empty((3, len(pairs)), dtype=torch.float64)
+    weights[POSITION], weights[DIRECTION] = position_um * passes, direction_um * passes
+    gate_weights, stop_weights = boundary_weights(lens, gates, pairs)
+    weights[STOP] = _STOP_UM_PER_MM * lens.stop_radius_mm * stop_weights
+    vectors, scalars = targets.vectors, torch.cat([targets.transmittance[None], gate])
+    size = domain.film_radius_mm
+    scalar_weights = torch.cat([_TRANSMITTANCE_UM * size * passes[None], _GATE_UM * size * gate_weights])
+    field = targets.field
+    if base is not None:
+        known, known_scalars = base(field)
+        vectors, scalars = vectors - known, scalars - known_scalars
+    if data.encoding.mirror:  # x and y of each vector by themselves
+        p, u = (torch.cat([v] * 3)[:, None] for v in (field.p, field.u))
+        vectors, weights = vectors.reshape(6, 1, -1), weights.repeat_interleave(2, 0)
+        return field.mirror_invariants(), p, u, vectors, weights, scalars, scalar_weights
+    return field.invariants(), field.p[None], field.u[None], vectors, weights, scalars, scalar_weights
 
 
 @dataclass

@@ -15,18 +15,24 @@ import torch
 
 from neurolens.base.errors import InputError
 from neurolens.modelfile import axes as ax
-from neurolens.surrogates.bases import Exponents, invariant_exponents, monomials, solve, vector_columns, vector_gram
+from neurolens.surrogates.bases import (
+    Exponents,
+    invariant_exponents,
+    monomials,
+    pinned_threads,
+    solve,
+    vector_columns,
+    vector_gram,
+)
 from neurolens.surrogates.cores import STOP, InvariantPolynomial
 from neurolens.surrogates.fit import prepare
-from neurolens.surrogates.fits.boundaries import FitData, fit_scalars, fit_stop
-from neurolens.surrogates.fits.selection import Sweep
+from neurolens.surrogates.fits.boundaries import fit_scalars, fit_stop
+from neurolens.surrogates.fits.selection import JointSweep, Sweep, forward, replace_terms
 from neurolens.surrogates.lightfield import Encoding, fit_encoding
 from neurolens.surrogates.model import Gate, LensModel, Scales
 from neurolens.surrogates.pairs import PairSettings, RayPairs, make_pairs
-from neurolens.surrogates.states.model import State, StateModel
-from neurolens.surrogates.states.space import StateSpace
-from neurolens.surrogates.targets import film_equivalent, scales_of
-from neurolens.surrogates.threads import pinned_threads
+from neurolens.surrogates.states import State, StateModel, StateSpace
+from neurolens.surrogates.targets import Prepared, film_equivalent, scales_of
 
 # Nodes that choose the support and the gates; the others only fit coefficients.
 _CHOOSERS = 7
@@ -67,10 +73,9 @@ def fit_states(
     states = ax.product(space.axes)
     with pinned_threads():
         choosers = sorted({round(float(k)) for k in np.linspace(0, len(states) - 1, _CHOOSERS)})
-        known: dict[int, FitData] = {}
+        known: dict[int, Prepared] = {}
         for done, k in enumerate(choosers):
-            prepared = prepare(_pairs(space, states[k], settings))
-            known[k] = FitData(prepared.pairs, prepared.encoding, prepared.gates)
+            known[k] = prepare(_pairs(space, states[k], settings))
             if progress:
                 progress(0.3 * (done + 1) / len(choosers))
         gates = _all_gates([p.gates for p in known.values()])
@@ -84,7 +89,7 @@ def fit_states(
                 data = replace(known.pop(k), gates=gates)
             else:
                 pairs = _pairs(space, state, settings)
-                data = FitData(pairs, _scaled_like(scales, fit_encoding(pairs.domain, pairs.train)), gates)
+                data = Prepared(pairs, _scaled_like(scales, fit_encoding(pairs.domain, pairs.train)), gates)
             nodes.append(_fit_node(data, exponents, columns, stop_mm, settings))
             if progress:
                 progress(0.4 + 0.6 * (k + 1) / len(states))
@@ -120,7 +125,7 @@ def _all_gates(found: Sequence[tuple[Gate, ...]]) -> tuple[Gate, ...]:
     return tuple(sorted({g for gates in found for g in gates}, key=lambda g: (-g.surface, g.reason)))
 
 
-def choose_jointly(data: Sequence[FitData], settings: StateSettings) -> tuple[Exponents, list[int]]:
+def choose_jointly(data: Sequence[Prepared], settings: StateSettings) -> tuple[Exponents, list[int]]:
     """One support for all nodes: orthogonal least squares by the sum of the nodes' gains, then replacement.
 
     Returns the exponents [M, 4] kept and the columns of `bases.vector_columns` chosen among them (m p, then m u).
@@ -133,50 +138,18 @@ def choose_jointly(data: Sequence[FitData], settings: StateSettings) -> tuple[Ex
         outputs = film_equivalent(d.pairs.lens, d.pairs.domain, train.vectors)
         gram, moments = vector_gram(monomials(train.field.invariants(), exponents), train.field, outputs)
         sweeps.append(Sweep(gram, moments, (outputs.flatten(1) ** 2).sum(1).numpy()))
-    chosen = _forward(sweeps, settings.terms)
+    joint = JointSweep(sweeps)
+    forward(joint, settings.terms)
+    replace_terms(joint, _PASSES)
+    chosen = joint.chosen
     count = len(exponents)
     kept = sorted({k % count for k in chosen})
     place = {k: i for i, k in enumerate(kept)}
     return exponents[kept], sorted(place[k % count] + (k >= count) * len(kept) for k in chosen)
 
 
-def _gains(sweeps: Sequence[Sweep]) -> np.ndarray:
-    """[M] fall of the squared error of all nodes together; -1 where any node's other terms span the candidate."""
-    scores = np.stack([s.scores("ols") for s in sweeps])
-    return np.where((scores >= 0).all(0), scores.sum(0), -1.0)
-
-
-def _forward(sweeps: Sequence[Sweep], terms: int) -> list[int]:
-    """Columns chosen for all sweeps at once: the best sum of gains, then each exchanged for a better one."""
-    while len(sweeps[0].chosen) < terms:
-        gains = _gains(sweeps)
-        best = int(gains.argmax())
-        if gains[best] <= 0:
-            break
-        for s in sweeps:
-            s.add(best)
-    for _ in range(_PASSES):
-        exchanged = 0
-        for k in list(sweeps[0].chosen):
-            before = sum(s.residual for s in sweeps)
-            for s in sweeps:
-                s.drop(k)
-            gain = max(sum(s.residual for s in sweeps) - before, 0.0)
-            gains = _gains(sweeps)
-            best = int(gains.argmax())
-            best = k if gains[best] <= gain * (1 + 1e-9) else best
-            for s in sweeps:
-                s.add(best)
-            exchanged += best != k
-        for s in sweeps:
-            s.refresh()
-        if not exchanged:
-            break
-    return list(sweeps[0].chosen)
-
-
 def _fit_node(
-    data: FitData, exponents: Exponents, columns: list[int], stop_mm: float, settings: StateSettings
+    data: Prepared, exponents: Exponents, columns: list[int], stop_mm: float, settings: StateSettings
 ) -> LensModel:
     """The model of one node; its stop crossing is in units of `stop_mm`, the same at every node."""
     pairs, train, count = data.pairs, data.train, len(exponents)
