@@ -35,6 +35,7 @@ def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tupl
     g = Graph()
     values: dict[int, Value] = {}  # by the old graph's numbers
     known: list[dict[int, Value]] = [{} for _ in inputs]  # derivatives by the new graph's numbers, by direction
+    chains: dict[int, tuple[int, Value]] = {}  # a function of one value: that one, and the derivative by it
     names: dict[tuple[str, int], str] = {}
     for number, node in enumerate(graph.nodes):
         x = [values[k] for k in node.inputs]
@@ -49,12 +50,19 @@ def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tupl
         y = values[number]
         if node.kind == "input":
             names |= {(node.name, row): name for row, name in enumerate(row_names(node.name, node.rows))}
+        base = _base(node, x, moves, chains)
+        if base is not None:
+            factors = [None if all(d[i] is None for d in moves) else _factor(v, chains) for i, v in enumerate(x)]
+            factor = rule(node, y, x, factors)
+            if factor is None:
+                continue
+            chains[y.number] = base, factor
         for (name, row), direction, d in zip(inputs, known, moves, strict=True):
             if node.kind == "input" and node.name == name:
                 direction[y.number] = g.constant(np.eye(node.rows)[row])
             elif any(v is not None for v in d):
-                moved = rule(node, y, x, d)
-                if moved is not None:
+                moved = rule(node, y, x, d) if base is None else _times(direction[base], factor)
+                if moved is not None and not _is_zero(moved):
                     direction[y.number] = moved
     g.outputs = {name: values[v.number] for name, v in graph.outputs.items()}
     for place, direction in zip(inputs, known, strict=True):
@@ -62,6 +70,23 @@ def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tupl
             value = g.outputs[output]
             g.outputs[derivative(output, names[place])] = direction.get(value.number) or value * 0.0
     return pruned(g)
+
+
+def _factor(x: Value, chains: dict[int, tuple[int, Value]]) -> Value:
+    return chains[x.number][1] if x.number in chains else x.graph.constant(1.0)
+
+
+def _base(
+    node: Node, x: Sequence[Value], moves: Sequence[Sequence[Moved]], chains: dict[int, tuple[int, Value]]
+) -> int | None:
+    """The one value, of as many rows, that an operation row by row depends on; None: there are several, or none.
+
+    Its derivative by that value serves all directions.
+    """
+    moved = {v.number: v for i, v in enumerate(x) if any(d[i] is not None for d in moves)}
+    bases = {chains[n][0] if n in chains else n for n in moved}
+    same_rows = all(v.rows == node.rows for v in moved.values())
+    return bases.pop() if node.kind in _BY_ROWS and len(bases) == 1 and same_rows else None
 
 
 def _sum(terms: Sequence[Moved]) -> Moved:
@@ -73,7 +98,23 @@ def _sum(terms: Sequence[Moved]) -> Moved:
 
 
 def _times(a: Moved, b: Value) -> Moved:
-    return None if a is None else a * b
+    if a is None or _is_one(b):
+        return a
+    return b if _is_one(a) and b.rows >= a.rows else a * b
+
+
+def _is_one(value: Value) -> bool:
+    return value.node.kind == "constant" and bool((value.node.arrays[0] == 1).all())
+
+
+def _is_zero(value: Value) -> bool:
+    """Whether all rows are 0 whatever the rays: constants, and rows of matrices that hold nothing."""
+    g, node, rows = value.graph, value.node, list(range(value.rows))
+    if node.kind == "take":
+        node, rows = g.nodes[node.inputs[0]], list(node.static)
+    if node.kind == "constant":
+        return not node.arrays[0][rows].any()
+    return node.kind == "affine" and not node.static[1] and not any(a[rows].any() for a in node.arrays)
 
 
 def _none(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
@@ -122,13 +163,15 @@ def _quadratic(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> 
             one = base.node.arrays[0]
             change = _linear(node, dx.node.arrays[2] @ one)
             return g.affine(_linear(node, dx.node.arrays[0] @ one), x[0], moving=(scale, change))
-    rows = []
-    for form in node.static:
-        terms: list[Moved] = []
+    # All products x_i dx_j in one operation, then summed.
+    pairs = sorted({pair for form in node.static for i, j in form for pair in ((i, j), (j, i))})
+    products = g.take(x[0], [i for i, _ in pairs]) * g.take(dx, [j for _, j in pairs])
+    sums = np.zeros((node.rows, len(pairs)))
+    for r, form in enumerate(node.static):
         for i, j in form:
-            terms += [x[0][i] * dx[i] * 2.0] if i == j else [x[0][i] * dx[j], x[0][j] * dx[i]]
-        rows.append(_sum(terms))
-    return g.concat(*(r for r in rows if r is not None))
+            sums[r, pairs.index((i, j))] += 1
+            sums[r, pairs.index((j, i))] += 1
+    return g.affine(sums, products)
 
 
 def _linear(node: Node, dx: Array) -> Array:
@@ -175,7 +218,7 @@ def _with_gradient(g: Graph, node: Node, x: Value) -> tuple[Value, Callable[...,
     def rule(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
         dx = d[0]
         assert dx is not None
-        return _sum([part * dx[v] for v, part in enumerate(gradient)])
+        return _sum([part * dx[v] for v, part in enumerate(gradient) if not _is_zero(dx[v])])
 
     return value, rule
 
@@ -226,3 +269,4 @@ _RULES: dict[str, Rule] = {
     "clip": lambda node, y, x, d: _choice(x[0].between(*node.arrays[0]), d[0], None),
     "select": lambda node, y, x, d: _choice(x[0], d[1], d[2]),
 }
+_BY_ROWS = frozenset(("add", "sub", "mul", "div", "neg", "sqrt", "tanh", "abs", "max", "min", "clip", "select", "series"))

@@ -133,6 +133,8 @@ class Value:
 
 
 Operand = Value | ArrayLike
+# Done at once on numbers.
+_FOLDED: dict[str, Any] = {"add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative}
 
 
 @dataclass(eq=False)
@@ -181,6 +183,8 @@ class Graph:
         rows = max(v.rows for v in values)
         if any(v.rows not in (1, rows) for v in values):
             raise ValueError(f"{kind} of {[v.rows for v in values]} rows")
+        if kind in _FOLDED and all(v.node.kind == "constant" for v in values):
+            return self.constant(_FOLDED[kind](*(v.node.arrays[0] for v in values)))
         return self.add(kind, values, rows)
 
     def take(self, x: Value, rows: Sequence[int]) -> Value:
@@ -205,7 +209,11 @@ class Graph:
         return [x[int(a) : int(b)] for a, b in zip(ends, ends[1:], strict=False)]
 
     def concat(self, *parts: Value) -> Value:
-        return parts[0] if len(parts) == 1 else self.add("concat", parts, sum(p.rows for p in parts))
+        if len(parts) == 1:
+            return parts[0]
+        if all(p.node.kind == "constant" for p in parts):
+            return self.constant(np.concatenate([p.node.arrays[0] for p in parts]))
+        return self.add("concat", parts, sum(p.rows for p in parts))
 
     def affine(
         self,
