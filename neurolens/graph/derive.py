@@ -269,4 +269,6 @@ _RULES: dict[str, Rule] = {
     "clip": lambda node, y, x, d: _choice(x[0].between(*node.arrays[0]), d[0], None),
     "select": lambda node, y, x, d: _choice(x[0], d[1], d[2]),
 }
-_BY_ROWS = frozenset(("add", "sub", "mul", "div", "neg", "sqrt", "tanh", "abs", "max", "min", "clip", "select", "series"))
+_BY_ROWS = frozenset(
+    ("add", "sub", "mul", "div", "neg", "sqrt", "tanh", "abs", "max", "min", "clip", "select", "series")
+)

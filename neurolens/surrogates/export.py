@@ -62,10 +62,11 @@ def export_onnx(
         for name, by in (("scene_ray_d_film", RAY[:2]), ("scene_ray_d_pupil", RAY[2:])):
             graph.outputs[name] = graph.concat(*(graph.outputs.pop(derivative("scene_ray", row)) for row in by))
             shapes[name] = (2, 6)
-    return _write(path, write_onnx(graph, model_metadata(model, errors or {}), shapes=shapes))
+    return write_file(path, write_onnx(graph, model_metadata(model, errors or {}), shapes=shapes))
 
 
-def _write(path: str | Path, proto: Any) -> Path:
+def write_file(path: str | Path, proto: Any) -> Path:
+    """Write an ONNX model; returns the path."""
     target = Path(path)
     with atomic_path(target) as temporary:
         temporary.write_bytes(proto.SerializeToString())
@@ -116,7 +117,7 @@ def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | 
     angle = max(largest_angle(node, 8192) for node in model.nodes)
     graphs = [model_graph(node, angle, ONNX) for node in model.nodes]
     metadata = {CARD_KEY: card_to_json(state_card(model, errors or {}))}
-    return _write(path, write_onnx(graphs, metadata, mixing_of(model.axes)))
+    return write_file(path, write_onnx(graphs, metadata, mixing_of(model.axes)))
 
 
 def mixing_of(axes: Sequence[Axis]) -> Mixing:
