@@ -7,6 +7,7 @@ What values and derivatives have in common is done once (Griewank and Walther, "
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,9 +45,7 @@ def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tupl
         if node.kind == "polynomial" and any(d[0] is not None for d in moves):
             values[number], rule = _with_gradient(g, node, x[0])
         else:
-            values[number] = g.add(
-                node.kind, x, node.rows, name=node.name, arrays=node.arrays, static=node.static, per_call=node.per_call
-            )
+            values[number] = g.like(node, x)
         y = values[number]
         if node.kind == "input":
             names |= {(node.name, row): name for row, name in enumerate(row_names(node.name, node.rows))}
@@ -69,7 +68,33 @@ def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tupl
         for output in outputs:
             value = g.outputs[output]
             g.outputs[derivative(output, names[place])] = direction.get(value.number) or value * 0.0
-    return pruned(g)
+    return _joined(pruned(g))
+
+
+def _joined(graph: Graph) -> Graph:
+    """Products of several matrices with one value, as those of all directions with the planes, as one product."""
+    groups: dict[tuple[Any, ...], list[Node]] = {}
+    for node in graph.nodes:
+        if node.kind == "affine" and not node.static[1]:
+            groups.setdefault((node.inputs, node.static), []).append(node)
+    found, values = Graph(), list[Value]()
+    for node in graph.nodes:
+        inputs = [values[k] for k in node.inputs]
+        group = groups.get((node.inputs, node.static), []) if node.kind == "affine" else []
+        if len(group) > 1:
+            rows, arrays = (
+                sum(n.rows for n in group),
+                [np.concatenate(a) for a in zip(*(n.arrays for n in group), strict=True)],
+            )
+            start = sum(n.rows for n in group[: next(k for k, n in enumerate(group) if n is node)])
+            whole = found.add("affine", inputs, rows, arrays=arrays, static=node.static)
+            values.append(whole[start : start + node.rows])
+        elif node.kind == "take":
+            values.append(found.take(inputs[0], node.static))
+        else:
+            values.append(found.like(node, inputs))
+    found.outputs = {name: values[v.number] for name, v in graph.outputs.items()}
+    return found
 
 
 def _factor(x: Value, chains: dict[int, tuple[int, Value]]) -> Value:
@@ -93,14 +118,63 @@ def _sum(terms: Sequence[Moved]) -> Moved:
     there = [t for t in terms if t is not None]
     total = there[0] if there else None
     for term in there[1:]:
-        total = total + term  # type: ignore[operator]
+        total = _merged(total, term) or total + term  # type: ignore[arg-type, operator]
     return total
+
+
+_FEW = 2  # columns
+
+
+def _merged(a: Value, b: Value) -> Value | None:
+    """A sum of which one or both are products of narrow matrices, of the call or of numbers, as one product."""
+    g, narrow = a.graph, [v for v in (a, b) if _is_narrow(v)]
+    if not narrow or a.rows != b.rows or a.node.per_call or b.node.per_call:
+        return None
+    parts = [g.inputs_of(v.number) for v in narrow]
+    moving, added = narrow[0].node.static
+    if len(narrow) == 2:
+        other = narrow[1].node
+        if other.static[0] != moving or (moving and parts[0][1] != parts[1][1]):
+            return None
+        rest = _sum([p[-1] for v, p in zip(narrow, parts, strict=True) if v.node.static[1]])
+    else:
+        rest = _sum([parts[0][-1] if added else None, b if narrow[0] == a else a])
+    weights = [np.hstack([v.node.arrays[k] for v in narrow]) for k in ((0, 2) if moving else (0,))]
+    move = (parts[0][1], weights[1]) if moving else None
+    return g.affine(weights[0], g.concat(*(p[0] for p in parts)), moving=move, added=rest)
+
+
+def _is_narrow(v: Value) -> bool:
+    node = v.node
+    return node.kind == "affine" and node.rows > 1 and node.arrays[0].shape[1] <= _FEW and not node.arrays[1].any()
 
 
 def _times(a: Moved, b: Value) -> Moved:
     if a is None or _is_one(b):
         return a
-    return b if _is_one(a) and b.rows >= a.rows else a * b
+    if _is_one(a) and b.rows >= a.rows:
+        return b
+    column = _column(a) if b.rows == 1 and not b.node.per_call else None
+    if column is None:
+        return a * b
+    base, moving = column
+    return a.graph.affine(base, b, moving=moving)
+
+
+def _column(value: Value) -> tuple[Array, tuple[Value, Array] | None] | None:
+    """Two or more rows that are numbers, or numbers of which some times a value of the call are added, as columns."""
+    g, node, rows = value.graph, value.node, list(range(value.rows))
+    if node.kind == "take":
+        node, rows = g.nodes[node.inputs[0]], list(node.static)
+    if len(rows) == 1:
+        return None
+    if node.kind == "constant":
+        return node.arrays[0][rows, None], None
+    source = g.nodes[node.inputs[0]] if node.inputs else node
+    if node.kind != "affine" or node.static != (True, False) or source.kind != "constant" or node.arrays[1].any():
+        return None
+    base, change = (node.arrays[k][rows] @ source.arrays[0][:, None] for k in (0, 2))
+    return base, (Value(g, node.inputs[1]), change)
 
 
 def _is_one(value: Value) -> bool:
@@ -155,14 +229,11 @@ def _quadratic(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> 
     """Linear in x where the derivative of x is the same for all rays."""
     g, dx = y.graph, d[0]
     assert dx is not None
-    if dx.node.kind == "constant":
-        return g.affine(_linear(node, dx.node.arrays[0]), x[0])
-    if dx.node.kind == "affine" and dx.node.static == (True, False) and dx.node.per_call:
-        base, scale = g.inputs_of(dx.number)
-        if base.node.kind == "constant":
-            one = base.node.arrays[0]
-            change = _linear(node, dx.node.arrays[2] @ one)
-            return g.affine(_linear(node, dx.node.arrays[0] @ one), x[0], moving=(scale, change))
+    column = _column(dx)
+    if column is not None:
+        base, moving = column
+        change = moving and (moving[0], _linear(node, moving[1][:, 0]))
+        return g.affine(_linear(node, base[:, 0]), x[0], moving=change)
     # All products x_i dx_j in one operation, then summed.
     pairs = sorted({pair for form in node.static for i, j in form for pair in ((i, j), (j, i))})
     products = g.take(x[0], [i for i, _ in pairs]) * g.take(dx, [j for _, j in pairs])

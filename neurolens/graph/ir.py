@@ -213,7 +213,8 @@ class Graph:
             return parts[0]
         if all(p.node.kind == "constant" for p in parts):
             return self.constant(np.concatenate([p.node.arrays[0] for p in parts]))
-        return self.add("concat", parts, sum(p.rows for p in parts))
+        flat = [q for p in parts for q in (self.inputs_of(p.number) if p.node.kind == "concat" else [p])]
+        return self.add("concat", flat, sum(p.rows for p in flat))
 
     def affine(
         self,
@@ -274,6 +275,13 @@ class Graph:
         flat = [v for pair in tests for v in pair]
         return self.add("first_failure", flat, 1, static=tuple(int(c) for c in codes))
 
+    def like(self, node: Node, inputs: Sequence[Value]) -> Value:
+        """Append the operation of a node of any graph."""
+        per_call = node.per_call if node.kind in ("input", "constant") else None
+        return self.add(
+            node.kind, inputs, node.rows, name=node.name, arrays=node.arrays, static=node.static, per_call=per_call
+        )
+
     def inline(self, other: Graph, given: Mapping[str, Value]) -> dict[str, Value]:
         """Append all of another graph, these values as its inputs (others stay inputs); returns its outputs."""
         values: list[Value] = []
@@ -281,14 +289,7 @@ class Graph:
             if node.kind == "input" and node.name in given:
                 values.append(given[node.name])
                 continue
-            inputs = [values[k] for k in node.inputs]
-            per_call = node.per_call if node.kind in ("input", "constant") else None
-            values.append(
-                self.add(
-                    node.kind, inputs, node.rows, name=node.name, arrays=node.arrays, static=node.static,
-                    per_call=per_call,
-                )
-            )  # fmt: skip
+            values.append(self.like(node, [values[k] for k in node.inputs]))
         return {name: values[v.number] for name, v in other.outputs.items()}
 
     def inputs_of(self, number: int) -> list[Value]:

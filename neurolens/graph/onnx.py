@@ -284,6 +284,8 @@ def _affine(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str | _
         matrix = w.op("Add", w.op("Mul", w.name(node.inputs[1]), w.numbers(change)), w.numbers(base))
         if column:
             return matrix
+        if added:
+            return w.op("Gemm", matrix, w.name(node.inputs[0]), w.name(node.inputs[-1]))
         whole = w.op("MatMul", matrix, w.name(node.inputs[0]))
         if not sums:
             return whole
