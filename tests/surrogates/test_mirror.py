@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from lens_models import anamorphic
+from neurolens.surrogates.inversion.derivatives import slopes_of
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
@@ -22,7 +23,6 @@ from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model
 from neurolens.surrogates.fits.mirror import mirror_exponents
-from neurolens.surrogates.inversion.derivatives import slopes_of
 from neurolens.surrogates.model import LensModel
 
 pytestmark = pytest.mark.slow
