@@ -4,6 +4,7 @@
 #   make test     tests, then lint, format and types
 #   make bench    the tracer's speed, then models against it; fails when a promised ratio is lost
 #   make models   fit again every model of models/
+#   make gallery  what real lenses do: render and measure every effect
 #   make lint     lint, format and types only
 #   make format   rewrite the code in the project's format
 #   make clean    remove .venv and caches
@@ -23,7 +24,7 @@ export PIP_DEFAULT_TIMEOUT ?= 120
 export OMP_NUM_THREADS ?= 2
 export MPLBACKEND ?= Agg
 
-.PHONY: demo test bench models lint format clean
+.PHONY: demo test bench models gallery lint format clean
 .DELETE_ON_ERROR:
 
 demo: $(INSTALLED)
@@ -35,11 +36,14 @@ test: $(INSTALLED)
 	$(MAKE) --no-print-directory lint
 
 bench: $(INSTALLED)
-	$(BIN)/neurolens bench trace
-	$(BIN)/python -m neurolens.evaluate.bench
+	$(BIN)/python -m experiments trace
+	$(BIN)/python -m experiments promises
 
 models: $(INSTALLED)
-	$(BIN)/neurolens bench models
+	$(BIN)/python -m experiments models
+
+gallery: $(INSTALLED)
+	$(BIN)/python -m experiments gallery
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

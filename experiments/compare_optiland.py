@@ -5,7 +5,7 @@ Optiland (MIT licence) is no dependency of this project: it lives in an environm
     python3 -m venv /tmp/optiland
     /tmp/optiland/bin/pip install optiland==0.6.3 torch==2.13.0
     export OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 PYTHONPATH=.
-    /tmp/optiland/bin/python experiments/compare_optiland.py [--quick] [--out DIR]
+    /tmp/optiland/bin/python -m experiments optiland [--quick] [--out DIR]
 
 Writes optiland.md and optiland.json. Both trace light from the scene through the double Gauss (and the same with two
 even aspheres) with every rim and the stop, one wavelength, one thread, in float32 and float64; Optiland with constant
@@ -16,25 +16,17 @@ suits it best. Where a ray lands on the last surface is compared as well.
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import optiland
-import optiland.backend as be
 import torch
-from optiland.materials import IdealMaterial
-from optiland.optic import Optic
-from optiland.rays import RealRays
 
-from neurolens.base.files import atomic_write_text
+from experiments import lab
+from experiments.trace_speed import film_rays, with_aspheres
+from neurolens.base.errors import NeurolensError
 from neurolens.base.progress import Progress
-from neurolens.evaluate.benches.trace_speed import film_rays, with_aspheres
-from neurolens.evaluate.benches.trace_speed_page import machine
 from neurolens.evaluate.speed import Call, Candidate, Race, race
 from neurolens.optics import glass
 from neurolens.optics.lensfile import read_lens
@@ -42,8 +34,16 @@ from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays, compile_trace, trace
 from neurolens.surrogates.domain import FilmRays
 
-ROOT = Path(__file__).resolve().parents[1]
-LENS = ROOT / "lenses" / "laikin_double_gauss_50.toml"
+try:
+    import optiland
+    import optiland.backend as be
+    from optiland.materials import IdealMaterial
+    from optiland.optic import Optic
+    from optiland.rays import RealRays
+except ImportError as error:
+    raise NeurolensError(f"this needs Optiland 0.6.3 in an environment of its own: see {__file__}") from error
+
+LENS = lab.LENSES / "laikin_double_gauss_50.toml"
 FOCAL_MM = 50.0
 BATCHES = (4096, 16384, 65536)
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -99,7 +99,7 @@ def theirs(lens: Lens, backend: str, dtype: str) -> tuple[Callable[[FilmRays], C
         return call
 
     def land(rays: FilmRays) -> np.ndarray:
-        found = prepare(rays)()
+        found: Any = prepare(rays)()
         # Blocked rays go on with no intensity.
         out = np.stack([be.to_numpy(c) for c in (found.x, found.y, found.z, found.L, found.M, found.N)])
         return np.where(be.to_numpy(found.i) > 0, out, np.nan)
@@ -171,11 +171,11 @@ def rows_of(timed: Race, dtype: str, lens: Lens, agreement: dict[str, Any]) -> l
 
 def page(rows: list[dict[str, Any]], rounds: int) -> str:
     """The result as Markdown."""
-    m, loads = machine(), [v for r in rows for v in r["load"] if v is not None]
+    m, loads = lab.machine(), [v for r in rows for v in r["load"] if v is not None]
     lines = [
         "# Beside Optiland",
         "",
-        "`python experiments/compare_optiland.py`",
+        "`python -m experiments optiland`",
         "",
         "The same rays from the scene through the same 13 surfaces (12 refractions, every rim, the stop), one "
         f"wavelength, one thread; {rounds} rounds in turn. Ratios: by the best times (median within rounds).",
@@ -208,30 +208,29 @@ def page(rows: list[dict[str, Any]], rounds: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main() -> int:
-    """Race, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+ABOUT = __doc__
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `python -m experiments optiland`."""
     parser.add_argument("--quick", action="store_true", help="few rounds")
-    parser.add_argument("--out", type=Path, default=ROOT / "experiments" / "results", help="folder for the tables")
-    args = parser.parse_args()
+    lab.add_out(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Race, print and write."""
     warnings.simplefilter("ignore")
     be.set_backend("torch")
     be.grad_mode.disable()
     rounds = 5 if args.quick else 20
     lens = read_lens(LENS).at()
     contests = [(table, dtype) for table in (lens, with_aspheres(lens)) for dtype in DTYPES]
-    progress = Progress({f"{table.name}, {dtype}": 40.0 for table, dtype in contests})
+    progress = Progress({f"{table.name}, {dtype}": 40.0 for table, dtype in contests}, quiet=args.quiet)
     rows: list[dict[str, Any]] = []
     for table, dtype in contests:
         with progress.stage(f"{table.name}, {dtype}") as report:
             timed, agreement = contest(table, dtype, rounds, report)
         rows += rows_of(timed, dtype, table, agreement)
-    args.out.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(args.out / "optiland.json", json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")
-    atomic_write_text(args.out / "optiland.md", page(rows, rounds))
+    lab.write_results(args.out, "optiland", page(rows, rounds), {"machine": lab.machine(), "rows": rows})
     print(page(rows, rounds))
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

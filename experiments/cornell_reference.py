@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import load_scene
 
 ROOT = Path(__file__).parents[1]
 TARGET = ROOT / "tests" / "render" / "cornell_reference.csv"

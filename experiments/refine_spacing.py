@@ -56,7 +56,8 @@ class Spots:
         surfaces[SPACE] = replace(surfaces[SPACE], thickness_mm=values[0])
         rays = trace(replace(self.lens, surfaces=tuple(surfaces)), self.start, self.wavelength_nm, towards="film").rays
         reach = (values[1] - rays.z) / rays.dz
-        return tuple((p + reach * d).reshape(self.counts.shape) for p, d in ((rays.x, rays.dx), (rays.y, rays.dy)))
+        shape = self.counts.shape
+        return (rays.x + reach * rays.dx).reshape(shape), (rays.y + reach * rays.dy).reshape(shape)
 
     def loss(self, values: Tensor) -> Tensor:
         """Mean square distance from the centroid, mm^2, over fields of equal weight."""
@@ -119,7 +120,7 @@ def refine(spots: Spots, start: Tensor, free: tuple[bool, bool]) -> tuple[Tensor
     def evaluate() -> float:
         search.zero_grad()
         loss = spots.loss(values)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         assert values.grad is not None
         values.grad.mul_(mask)
         history.append(float(loss.detach()))

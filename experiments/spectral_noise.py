@@ -22,9 +22,9 @@ from neurolens.base.errors import NeurolensWarning
 from neurolens.base.files import atomic_write_text
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.render.colour import SRGB
-from neurolens.render.filmsettings import FilmSettings
+from neurolens.render.film import FilmSettings
 from neurolens.render.renderer import RenderResult, render
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import load_scene
 
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "experiments" / "results"

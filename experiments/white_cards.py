@@ -26,9 +26,9 @@ from neurolens.base.files import atomic_write_text
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.radiometry import film_light, white_card
-from neurolens.render.exr import write_png
+from neurolens.render.pictures import write_png
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import load_scene
 
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "experiments" / "results"

@@ -9,7 +9,7 @@ import argparse
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -46,7 +46,6 @@ def build_parser() -> Parser:
         convert,
         evaluate,
         export,
-        gallery,
         glass,
         lens,
         mitsuba,
@@ -57,16 +56,19 @@ def build_parser() -> Parser:
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    for command in (lens, analyse, glass, convert, train, evaluate, export, render, gallery, mitsuba, bench):
+    for command in (lens, analyse, glass, convert, train, evaluate, export, render, mitsuba, bench):
         command.add_parser(subparsers)
     return parser
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code; a wrong command line exits with code 2 as argparse does."""
+def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_parser) -> int:
+    """Run one command and return its exit code; a wrong command line exits with code 2 as argparse does.
+
+    `build` makes the parser; it runs where its errors and an interrupt are reported like the command's.
+    """
     args = argparse.Namespace(kept="nothing was done")
     try:
-        args = build_parser().parse_args(argv)
+        args = build().parse_args(argv)
         with _plain_warnings():
             code: int = args.run(args)
         sys.stdout.flush()

@@ -15,7 +15,7 @@ import pytest
 from command_line import described, failure, run_json
 
 from neurolens.cli import main
-from neurolens.render.exr import read_exr
+from neurolens.render.pictures import read_exr
 
 ROOT = Path(__file__).parents[1]
 # A singlet, a fisheye, an asphere that is the stop, cylinders, a nearly telecentric lens; tests/optics has them all.
@@ -341,7 +341,7 @@ def test_a_full_disk_is_one_line(
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("neurolens.render.exr.write_exr", full)
+    monkeypatch.setattr("neurolens.render.pictures.write_exr", full)
     line = failure(capsys, "render", scene, "--camera", "thin", "-o", tmp_path / "a.exr", "--quiet")
     kept = f"the render is kept: the same command goes on from {tmp_path / 'a.exr'}.part"
     assert line == f"neurolens: No space left on device; {kept}"

@@ -21,7 +21,7 @@ from PIL import Image
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.thin import ThinLens
 from neurolens.cli import main
-from neurolens.render.exr import read_exr, read_layers, write_exr
+from neurolens.render.pictures import read_exr, read_layers, write_exr
 
 SCENE = """\
 [camera]
@@ -155,7 +155,7 @@ def test_a_picture_that_cannot_be_written_keeps_the_render_and_the_older_picture
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
     # There is no checkpoint yet, then there is one that no other can take the place of: it has everything.
-    for writers in (["exr.write_exr"], ["exr.write_exr", "watch.write_checkpoint"]):
+    for writers in (["pictures.write_exr"], ["pictures.write_exr", "renderer.write_checkpoint"]):
         with monkeypatch.context() as patch:
             for writer in writers:
                 patch.setattr(f"neurolens.render.{writer}", full)
@@ -180,7 +180,7 @@ def test_a_disk_without_room_for_picture_and_checkpoint_is_told_as_it_is(
 
     common = ("render", scene, "--camera", "thin", "--quiet", "-o", out, "--threads", 1)
     run_json(capsys, *common, "--keep-checkpoint")
-    for writer in ("exr.write_exr", "watch.write_checkpoint"):
+    for writer in ("pictures.write_exr", "renderer.write_checkpoint"):
         monkeypatch.setattr(f"neurolens.render.{writer}", full)
 
     def said() -> str:
@@ -227,9 +227,9 @@ def test_a_picture_beyond_memory_is_one_line(
 ) -> None:
     common = ("render", scene, "--camera", "thin", "--quiet", "-o", tmp_path / "a.exr")
     with monkeypatch.context() as patch:
-        patch.setattr("neurolens.render.sums.os.sysconf", lambda _: 590)
+        patch.setattr("neurolens.render.film.os.sysconf", lambda _: 590)
         assert "64, 36" in (line := failure(capsys, *common)) and "2122 pixels" in line
-    monkeypatch.setattr("neurolens.render.sums.mmap.mmap", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOMEM, "")))
+    monkeypatch.setattr("neurolens.render.film.mmap.mmap", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOMEM, "")))
     assert "out of memory" in failure(capsys, *common)
 
 

@@ -12,7 +12,7 @@ from command_line import described, failure, run_json
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, check_writable
 from neurolens.cli import main
-from neurolens.render.exr import read_exr, write_exr
+from neurolens.render.pictures import read_exr, write_exr
 
 LENSES = Path(__file__).parents[1] / "lenses"
 SINGLET, PHONE = LENSES / "thorlabs_lb1471_biconvex_50.toml", LENSES / "phone_lens_6.toml"

@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from vignetting_oracle import vignetting_errors
 
 from neurolens.cameras.model import OnnxLens, load_model
-from neurolens.evaluate.check import promises_of
-from neurolens.evaluate.fresh import FreshRays, fresh_rays, measure
-from neurolens.evaluate.measure import onnx_predictor
-from neurolens.evaluate.state_errors import check_states, space_of_card
-from neurolens.evaluate.vignetting import vignetting_errors
+from neurolens.evaluate.check import check_states, promises_of, space_of_card
+from neurolens.evaluate.measure import FreshRays, fresh_rays, measure, onnx_predictor
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain

@@ -1,26 +1,221 @@
-"""Bundles of rays from the scene that fill the real stop, traced to the film.
+"""Bundles of rays from the scene that fill the real stop, traced to the film: pupil patterns, aiming, tracing.
 
 Works for every lens whose chief rays exist: fisheyes, anamorphic lenses, stops between, before and behind the glass.
-"""
+The chief ray is found from the stop outwards (`optics.aiming`), as pupils may move with the field (fisheyes).
+Its neighbours start on the plane across the chief ray at the front of the lens, and Newton's method on that plane takes
+each to its point of the stop; rays for which this fails at once walk there from the chief ray in small steps. The
+derivative of the mapping is also what turns stop area into the energy that a ray carries."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from neurolens.analysis.aim import Aim
-from neurolens.analysis.fields import DEFAULT_NM, Scene, on_plane
-from neurolens.analysis.patterns import Pattern, hexapolar
+from neurolens.analysis.fields import DEFAULT_NM, ChiefRays, Scene, on_plane
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.optics import apertures
-from neurolens.optics.media import media
+from neurolens.optics.aiming import without_rims
+from neurolens.optics.apertures import inside_on_tensors
+from neurolens.optics.passing import media
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
+
+# The outermost ring lies this share inside the stop's edge, so that rounding never clips it.
+_EDGE = 1e-7
+
+
+class Pattern(NamedTuple):
+    """Pupil points, each [P].
+
+    Attributes:
+        tangential, sagittal: shares of the stop's radius, in the meridional plane of the field (positive on the side
+            on which its image lies) and across it.
+        weight: share of the stop's area that a point stands for; sums to 1 (0 for the points of a fan).
+    """
+
+    tangential: Tensor
+    sagittal: Tensor
+    weight: Tensor
+
+
+def hexapolar(rings: int) -> Pattern:
+    """The centre and `rings` rings of 6, 12, 18, ... points, the last on the stop's edge; 1 + 3 n (n + 1) points.
+
+    The weights start from the area nearest to each ring, and are moved as little as makes the means of r^2, r^4, ...,
+    r^12 right: spots of steep aberrations are decided near the edge, where areas alone would be far off.
+    """
+    radius = [k / rings for k in range(rings + 1)]
+    weight = _ring_weights(rings)
+    t, s, w = [0.0], [0.0], [weight[0]]
+    for k in range(1, rings + 1):
+        r = radius[k] * (1 - _EDGE)
+        for i in range(6 * k):
+            angle = 2 * math.pi * i / (6 * k)
+            t.append(r * math.cos(angle))
+            s.append(r * math.sin(angle))
+            w.append(weight[k] / (6 * k))
+    return Pattern(_tensor(t), _tensor(s), _tensor(w))
+
+
+def _ring_weights(rings: int) -> list[float]:
+    """Shares of the disc for rings of radius 0, 1/n, ..., 1, all above 0."""
+    k = torch.arange(rings + 1, dtype=torch.float64)
+    inner, outer = ((k - 0.5).clamp_min(0) / rings) ** 2, ((k + 0.5).clamp_max(rings) / rings) ** 2
+    area = outer - inner
+    for moments in range(min(7, rings), 0, -1):
+        m = torch.arange(moments, dtype=torch.float64)[:, None]
+        power = (k / rings) ** (2 * m)
+        lack = 1 / (m[:, 0] + 1) - power @ area
+        moved = area + area * (torch.linalg.solve((power * area) @ power.T, lack) @ power)
+        if (moved > 0).all():
+            return moved.tolist()
+    return area.tolist()
+
+
+def grid(n: int) -> Pattern:
+    """Centres of the cells of an n by n square over the stop that lie inside it, all of one weight."""
+    line = (torch.arange(n, dtype=torch.float64) + 0.5) * (2 / n) - 1
+    t, s = (v.reshape(-1) for v in torch.meshgrid(line, line, indexing="ij"))
+    inside = t * t + s * s < 1
+    return Pattern(t[inside], s[inside], torch.full_like(t[inside], 1 / int(inside.sum())))
+
+
+def fan(n: int) -> Pattern:
+    """2 n points: n along the meridional plane from -1 to 1, then n across it. Odd n holds the centre."""
+    line = torch.linspace(-1, 1, n, dtype=torch.float64) * (1 - _EDGE)
+    zero = torch.zeros_like(line)
+    return Pattern(torch.cat([line, zero]), torch.cat([zero, line]), torch.zeros(2 * n, dtype=torch.float64))
+
+
+def points(tangential: list[float], sagittal: list[float]) -> Pattern:
+    """Single points, without weight."""
+    return Pattern(_tensor(tangential), _tensor(sagittal), torch.zeros(len(tangential), dtype=torch.float64))
+
+
+def _tensor(values: list[float]) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+_DIRECT, _STRIDES, _PER_STRIDE = 5, 8, 3  # Newton steps; strides of the careful walk
+_AIMED = 1e-8  # how near to its point, in stop radii, a ray must come
+_DIFFERENCE = 3e-6  # step of the derivative, in stop radii
+
+
+class Aim:
+    """The mapping from the plane across the chief rays at the front to the stop, for F * W * P rays at once."""
+
+    def __init__(self, scene: Scene, chief: ChiefRays, shape: tuple[int, int, int], waves: tuple[float, ...]) -> None:
+        lens = scene.lens
+        self.front = without_rims(replace(lens, surfaces=lens.surfaces[: lens.stop_index + 1]))
+        self.stop_mm = lens.stop_radius_mm
+        self.step_mm = _DIFFERENCE * lens.stop_radius_mm
+        self.along_x = scene.axis == "x"
+        self.shape = shape
+
+        def spread(values: Tensor) -> Tensor:
+            return values[:, None, None].expand(shape).reshape(-1)
+
+        self.chief = Rays(*(spread(c) for c in chief.start))
+        origin = scene.object_points(chief.start)
+        self.origin = None if origin is None else tuple(spread(c) for c in origin)
+        self.exists = spread(chief.exists)
+        self.wavelength: Tensor = torch.tensor(waves, dtype=torch.float64)[None, :, None].expand(shape).reshape(-1)
+
+    def rays(self, u: Tensor, v: Tensor, rows: Tensor | slice = slice(None)) -> Rays:
+        """Rays at (u, v) mm on the plane across their chief rays: u in the meridional plane, v across it."""
+        c = Rays(*(p[rows] for p in self.chief))
+        if self.along_x:
+            x, y, z = c.x + u * c.dz, c.y + v, c.z - u * c.dx
+        else:
+            x, y, z = c.x + v, c.y + u * c.dz, c.z - u * c.dy
+        if self.origin is None:
+            return Rays(x, y, z, c.dx, c.dy, c.dz)
+        ox, oy, oz = (p[rows] for p in self.origin)
+        dx, dy, dz = x - ox, y - oy, z - oz
+        length = torch.sqrt(dx * dx + dy * dy + dz * dz)
+        return Rays(x, y, z, dx / length, dy / length, dz / length)
+
+    def lead_mm(self, u: Tensor, v: Tensor) -> Tensor:
+        """Path from the object point to the plane across the chief rays, less that of the chief ray."""
+        if self.origin is None:
+            return torch.zeros_like(u)
+        square = _distance2(self.chief[:3], self.origin)
+        # sqrt(a + b) - sqrt(a) without the loss of digits.
+        more = u * u + v * v
+        return more / (torch.sqrt(square + more) + torch.sqrt(square))
+
+    def at(self, pattern: Pattern) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """u, v of the rays through the points of a pattern, whether they were found, and d(beam) / d(stop share)."""
+        goal_t, goal_s = (g.expand(self.shape).reshape(-1) for g in (-pattern.tangential, pattern.sagittal))
+        zero = torch.zeros_like(goal_t)
+        everything = torch.arange(len(zero))
+        u, v = self._newton(zero, zero, goal_t, goal_s, everything, _DIRECT)
+        error, stretch = self._error(u, v, goal_t, goal_s, everything)
+        lost = torch.nonzero(~(error < _AIMED) & self.exists)[:, 0]
+        if len(lost):
+            walk_u, walk_v = torch.zeros_like(goal_t[lost]), torch.zeros_like(goal_t[lost])
+            for stride in range(1, _STRIDES + 1):
+                share = stride / _STRIDES
+                walk_u, walk_v = self._newton(
+                    walk_u, walk_v, share * goal_t[lost], share * goal_s[lost], lost, _PER_STRIDE
+                )
+            u, v = u.index_copy(0, lost, walk_u), v.index_copy(0, lost, walk_v)
+            again, stretch_again = self._error(walk_u, walk_v, goal_t[lost], goal_s[lost], lost)
+            error, stretch = error.index_copy(0, lost, again), stretch.index_copy(0, lost, stretch_again)
+        aimed = (error < _AIMED) & self.exists
+        return torch.where(aimed, u, 0.0), torch.where(aimed, v, 0.0), aimed, stretch
+
+    def _newton(
+        self, u: Tensor, v: Tensor, goal_t: Tensor, goal_s: Tensor, rows: Tensor, steps: int
+    ) -> tuple[Tensor, Tensor]:
+        """Newton's steps from (u, v); a step that leaves the lens is halved and tried again."""
+        good_u, good_v = u, v
+        for _ in range(steps):
+            t, s, exists, (tu, tv, su, sv) = self._map(u, v, rows)
+            exists = exists & torch.isfinite(t + s)
+            good_u, good_v = torch.where(exists, u, good_u), torch.where(exists, v, good_v)
+            det = tu * sv - tv * su
+            det = torch.where(det == 0, 1.0, det)
+            et, es = goal_t - t, goal_s - s
+            next_u, next_v = u + (sv * et - tv * es) / det, v + (tu * es - su * et) / det
+            u = torch.where(exists, next_u, (u + good_u) / 2)
+            v = torch.where(exists, next_v, (v + good_v) / 2)
+        return u, v
+
+    def _error(self, u: Tensor, v: Tensor, goal_t: Tensor, goal_s: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Distance from the goal in stop radii (inf for rays that do not exist), and beam area per stop share."""
+        t, s, exists, (tu, tv, su, sv) = self._map(u, v, rows)
+        error = torch.where(exists, torch.hypot(t - goal_t, s - goal_s), math.inf)
+        beam = math.pi / (tu * sv - tv * su).abs()
+        if self.origin is not None:
+            # Solid angle of an area on the plane across the chief ray: cos / r^2, with cos = distance / r.
+            distance2 = _distance2(self.chief[:3], self.origin)[rows]
+            beam = beam * torch.sqrt(distance2) / (distance2 + u * u + v * v) ** 1.5
+        return error, beam
+
+    def _map(self, u: Tensor, v: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...]]:
+        """Stop coordinates (tangential, sagittal; in radii) of rays, whether they exist, and their derivatives."""
+        h, n = self.step_mm, len(u)
+        three = rows.repeat(3)
+        rays = self.rays(torch.cat([u, u + h, u]), torch.cat([v, v, v + h]), three)
+        with torch.no_grad():
+            out = trace(self.front, rays, self.wavelength[three], towards="film")
+        # The stop is the last surface of this lens: rays end on it.
+        x, y = out.rays.x / self.stop_mm, out.rays.y / self.stop_mm
+        t, s = (x, y) if self.along_x else (y, x)
+        exists = (out.status == 0).reshape(3, n).all(0)
+        t, s = t.reshape(3, n), s.reshape(3, n)
+        slopes = ((t[1] - t[0]) / h, (t[2] - t[0]) / h, (s[1] - s[0]) / h, (s[2] - s[0]) / h)
+        return t[0], s[0], exists, slopes
+
+
+def _distance2(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
+    return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
 
 
 @dataclass(frozen=True)
@@ -151,4 +346,4 @@ def _inside_stop(scene: Scene, pattern: Pattern) -> Tensor:
     if scene.lens.aperture is None:
         return torch.ones_like(t, dtype=torch.bool)
     x, y = (-t, s) if scene.axis == "x" else (s, -t)
-    return apertures.inside(scene.lens.aperture, x, y, 1.0)
+    return inside_on_tensors(scene.lens.aperture, x, y, 1.0)

@@ -2,22 +2,21 @@
 
 A field is an angle from the axis in degrees in one meridional plane, that of the chief ray (through the middle of the
 stop) in front of the lens. The light comes from the positive side of the plane's axis, so that its image lies on the
-negative side; image heights are given with the sign turned, positive.
-"""
+negative side; image heights are given with the sign turned, positive."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from neurolens.analysis.results import Array
 from neurolens.base.errors import InputError
 from neurolens.optics.aiming import Axis, aim_at_stop, without_rims
 from neurolens.optics.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
@@ -27,7 +26,29 @@ from neurolens.optics.pupils import image_radius_mm
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
-__all__ = ["DEFAULT_NM", "WIDE_DEG", "Axis", "ChiefRays", "Scene"]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Result:
+    """Base of the results. Arrays are numpy float64 with NaN where there is nothing; keys carry their unit."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain lists, numbers and texts by field name; NaN and infinities stay as floats."""
+        return {f.name: _plain(getattr(self, f.name)) for f in fields(self)}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    return value
+
 
 DEFAULT_NM = (LINE_D_NM, LINE_F_NM, LINE_C_NM)  # the first is the reference of the others
 

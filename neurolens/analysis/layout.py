@@ -1,18 +1,23 @@
-"""The section of a lens with rays from the scene, as the plain data that `plot_layout.lens_layout` draws."""
+"""The section of a lens with rays from the scene: as plain data, and drawn in millimetres with equal axes."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
-from neurolens.analysis.bundles import bundle
+from neurolens.analysis.bundles import Pattern, bundle, fan
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.patterns import Pattern, fan
+from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, new_figure, save, style
+from neurolens.base.errors import InputError
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.sag import sag_mm
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
@@ -27,7 +32,7 @@ def layout_profile(scene: Scene, film_radius_mm: float | None = None) -> dict[st
     Args:
         film_radius_mm: edge of the film; that of the image circle if not given.
 
-    Returns: plain data for `plot_layout.lens_layout`: surfaces, rays, film_z_mm, film_half_height_mm, title, subtitle.
+    Returns: plain data for `lens_layout`: surfaces, rays, film_z_mm, film_half_height_mm, title, subtitle.
         A field from which no ray of the section passes has no rays.
     """
     lens = scene.lens
@@ -66,22 +71,13 @@ def refractions(lens: Lens) -> int:
     return sum(a != b for a, b in zip(before, before[1:], strict=False))
 
 
-def sag_mm(surface: Surface, height: Tensor, axis: str) -> Tensor:
-    """Depth of a surface behind its vertex at heights along one transverse axis, mm; held where its conic ends."""
-    if surface.cylinder not in (None, axis):
-        return torch.zeros_like(height)
-    c = float(surface.curvature)
-    square = height * height
-    root = torch.sqrt((1 - (1 + float(surface.conic)) * c * c * square).clamp_min(0.0))
-    return c * square / (1 + root) + sum(float(a) * height.abs() ** p for p, a in surface.asphere)
-
-
 def _profile(s: Surface, vertex_mm: float, axis: str) -> list[list[float]] | None:
     """Points [65] of (z, height) from rim to rim of a surface that is no sphere; None for spheres and planes."""
     if not (s.conic or s.asphere or s.cylinder) or math.isinf(s.semi_diameter_mm):
         return None
     height = torch.linspace(-s.semi_diameter_mm, s.semi_diameter_mm, 65, dtype=torch.float64)
-    found: list[list[float]] = torch.stack([vertex_mm + sag_mm(s, height, axis), height], 1).tolist()
+    place = (height, torch.zeros_like(height)) if axis == "x" else (torch.zeros_like(height), height)
+    found: list[list[float]] = torch.stack([vertex_mm + sag_mm(s, *place, held=True), height], 1).tolist()
     return found
 
 
@@ -117,3 +113,170 @@ def _fan_lines(scene: Scene, field: float) -> list[list[list[float]]]:
     columns = [torch.stack([p.z, p.x if scene.axis == "x" else p.y], -1) for p in (far, *path, film)]
     found: list[list[list[float]]] = torch.stack(columns, 1).tolist()
     return found
+
+
+Points = NDArray[np.float64]
+Section = Mapping[str, Any]
+
+_AIR = 1.01  # a medium of a smaller index is drawn as air
+
+
+def lens_layout(profile: Mapping[str, Any], path: str | Path) -> Path:
+    """Draw a lens with rays, light from left to right.
+
+    Args:
+        profile: lens frame, mm:
+            surfaces: list of {z_mm, radius_mm (inf: plane), semi_diameter_mm, n_after, stop}, scene to film; what is
+                no sphere has its section as profile, [M, 2] of (z, y) from rim to rim;
+            rays: list of {points: [M, 2] of (z, y), label (one field a label, None: not in the legend), field (colour
+                number; by label where absent)};
+            film_z_mm, film_half_height_mm (either may be absent); height ("y", the transverse axis); title, subtitle.
+        path: PNG, PDF or SVG to write.
+    Raises:
+        InputError: no surface, a key missing, a semi-diameter that is not positive, a polyline of another shape.
+    """
+    surfaces = checked_surfaces(profile)
+    rays = checked_rays(profile)
+    height = max(float(s["semi_diameter_mm"]) for s in surfaces)
+    with style():
+        z = z_range(profile, surfaces, height)
+        top = max(height * 1.18, 1.06 * float(profile.get("film_half_height_mm") or 0))
+        figure = new_figure(9.4, min(9.0, max(3.4, 8.6 * 2 * top / (z[1] - z[0]) + 1.5)))
+        axes = figure.add_subplot()
+        axes.set(xlim=z, ylim=(-top, top), aspect="equal")
+        axes.set(xlabel="z (mm), light travels this way →", ylabel=f"{profile.get('height', 'y')} (mm)")
+        axes.plot(z, (0, 0), color=FAINT, lw=0.7, ls=(0, (12, 3, 2, 3)), zorder=1)
+        draw_glass(axes, surfaces)
+        draw_rims(axes, surfaces, height)
+        draw_film(axes, profile)
+        draw_rays(axes, rays)
+        subtitle = str(profile.get("subtitle") or "")
+        # The empty second line of the title keeps room for the subtitle, which has a lighter look of its own.
+        axes.set_title(str(profile.get("title", "")) + ("\n" if subtitle else ""), loc="left", fontweight="bold")
+        axes.annotate(
+            subtitle, (0, 1), xycoords="axes fraction", xytext=(0, 6), textcoords="offset points",
+            fontsize=9, color="#555b63", in_layout=False,
+        )  # fmt: skip
+        _legend(figure, axes)
+        return save(figure, path)
+
+
+def arc(surface: Section, half_height_mm: float | None = None) -> Points:
+    """Section of a surface from -h to h, [65, 2] of (z, y) in mm; h its semi-diameter or `half_height_mm`.
+
+    Points are even in angle, not height: the rim of a front lens close to a half ball stays smooth. A surface that
+    brings its own section (`profile`) has that.
+    """
+    if surface.get("profile") is not None and half_height_mm is None:
+        return np.asarray(surface["profile"], dtype=np.float64)
+    h = float(surface["semi_diameter_mm"] if half_height_mm is None else half_height_mm)
+    z, radius = float(surface["z_mm"]), float(surface["radius_mm"])
+    if not math.isfinite(radius) or radius == 0:
+        y = np.linspace(-h, h, 65)
+        return np.stack([np.full_like(y, z), y], axis=1)
+    angle = np.linspace(-1, 1, 65) * math.asin(min(1.0, h / abs(radius)))
+    return np.stack([z + radius * (1 - np.cos(angle)), abs(radius) * np.sin(angle)], axis=1)
+
+
+def element_outline(front: Section, back: Section) -> Points:
+    """Closed outline [K, 2] of the glass between two surfaces: both arcs, flats to the wider rim, the cylinder edge.
+
+    Where the flats would cross (a thin-edged lens of unlike rims) the edge runs straight from rim to rim.
+    """
+    a, b = arc(front), arc(back)
+    edge = max(float(front["semi_diameter_mm"]), float(back["semi_diameter_mm"]))
+    z_front, z_back = a[-1, 0], b[-1, 0]
+    if z_back <= z_front:
+        return np.concatenate([a, b[::-1]])
+    upper = np.array([[z_front, edge], [z_back, edge]])
+    lower = np.array([[z_back, -edge], [z_front, -edge]])
+    return np.concatenate([a, upper, b[::-1], lower])
+
+
+def checked_surfaces(profile: Mapping[str, Any]) -> list[Section]:
+    surfaces = list(profile.get("surfaces", ()))
+    if not surfaces:
+        raise InputError("lens layout", "surfaces", "(none)", "at least one surface")
+    for index, surface in enumerate(surfaces):
+        for key in ("z_mm", "radius_mm", "semi_diameter_mm", "n_after"):
+            value = surface.get(key)
+            if not isinstance(value, int | float) or math.isnan(value) or (key != "radius_mm" and math.isinf(value)):
+                raise InputError("lens layout", f"surface {index}, {key}", value, "a number")
+        if surface["semi_diameter_mm"] <= 0:
+            raise InputError(
+                "lens layout", f"surface {index}, semi_diameter_mm", surface["semi_diameter_mm"], "above 0"
+            )
+    return surfaces
+
+
+def checked_rays(profile: Mapping[str, Any]) -> list[tuple[str | None, int | None, Points]]:
+    """(label, field, points [M, 2]) for each ray, without points that are not finite, as a blocked ray leaves them."""
+    rays = []
+    for index, ray in enumerate(profile.get("rays", ())):
+        points = np.asarray(ray["points"], dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 2:
+            raise InputError("lens layout", f"ray {index}, points", f"({points.shape})", "[M, 2] of (z, y)")
+        rays.append((ray.get("label"), ray.get("field"), points[np.isfinite(points).all(axis=1)]))
+    return rays
+
+
+def z_range(profile: Mapping[str, Any], surfaces: Sequence[Section], height: float) -> tuple[float, float]:
+    """From a little before the glass (rays come in from there) to a little behind the film."""
+    film = profile.get("film_z_mm")
+    z = np.concatenate([arc(s)[:, 0] for s in surfaces] + ([np.array([float(film)])] if film is not None else []))
+    return float(z.min() - 0.55 * height - 0.04 * np.ptp(z)), float(z.max() + 0.06 * np.ptp(z) + 0.05 * height)
+
+
+def draw_glass(axes: Any, surfaces: Sequence[Section]) -> None:
+    """Fill each element, darker for a higher index, so that the parts of a cemented group stay apart."""
+    for front, back in zip(surfaces, surfaces[1:], strict=False):
+        n = float(front["n_after"])
+        if n < _AIR:
+            continue
+        tone = min(1.0, max(0.0, (n - 1.45) / 0.45))
+        fill = tuple(np.array([0.87, 0.93, 0.975]) * (1 - tone) + np.array([0.55, 0.71, 0.86]) * tone)
+        axes.fill(*element_outline(front, back).T, fc=fill, ec="#3d5a75", lw=0.9, joinstyle="round", zorder=2)
+
+
+def draw_rims(axes: Any, surfaces: Sequence[Section], height: float) -> None:
+    """A tick outside each rim of glass, which blocks rays; the stop as two solid bars."""
+    named = False
+    for surface in surfaces:
+        h, z = float(surface["semi_diameter_mm"]), arc(surface)[-1, 0]
+        stop = bool(surface.get("stop"))
+        reach = max(h * 1.15, h + 0.16 * height) if stop else h + 0.035 * height
+        look = {"color": INK, "lw": 3.2 if stop else 1.3, "solid_capstyle": "butt", "zorder": 4 if stop else 3}
+        for sign in (-1, 1):
+            label = "stop" if stop and not named else None
+            named = named or stop
+            axes.plot((z, z), (sign * h, sign * reach), label=label, **look)
+
+
+def draw_film(axes: Any, profile: Mapping[str, Any]) -> None:
+    film, half = profile.get("film_z_mm"), profile.get("film_half_height_mm")
+    if film is None:
+        return
+    bottom, top = axes.get_ylim()
+    half = float(half) if half else max(abs(bottom), abs(top))
+    axes.plot((film, film), (-half, half), color="#8b1a1a", lw=2.2, solid_capstyle="butt", zorder=5, label="film")
+
+
+def draw_rays(axes: Any, rays: Sequence[tuple[str | None, int | None, Points]]) -> None:
+    """Rays of one label share a colour and one entry of the legend; `field` sets the colour where given."""
+    labels: list[str | None] = []
+    for label, field, points in rays:
+        known = label in labels
+        if not known:
+            labels.append(label)
+        colour = FIELD_COLOURS[(labels.index(label) if field is None else int(field)) % len(FIELD_COLOURS)]
+        axes.plot(*points.T, color=colour, lw=0.85, alpha=0.85, zorder=3.5, label=None if known else label)
+
+
+def _legend(figure: Any, axes: Any) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    if not handles:
+        return
+    order = sorted(range(len(labels)), key=lambda i: labels[i] in ("stop", "film"))  # fields first
+    figure.legend(
+        [handles[i] for i in order], [labels[i] for i in order], loc="outside lower center", ncols=min(7, len(labels))
+    )

@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from neurolens.analysis.fields import Scene
-from neurolens.analysis.results import Array, Result
+from neurolens.analysis.fields import Array, Result, Scene
 from neurolens.base.errors import InputError
 from neurolens.optics.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, index_of
 from neurolens.optics.paraxial import is_pinhole

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from neurolens.apertures import Aperture
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.fisheye import PROJECTIONS, Fisheye, check_field
@@ -28,6 +27,7 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thick import ThickLens
 from neurolens.cameras.thin import ThinLens
 from neurolens.cameras.vignetting import Vignetted
+from neurolens.optics.apertures import Aperture
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens
@@ -176,8 +176,7 @@ def _thick(path: Path, shot: Shot) -> Camera:
 
 
 def _exact(path: Path, shot: Shot, fused: bool) -> Camera:
-    from neurolens.cameras.exact import ExactCamera
-    from neurolens.cameras.fusedexact import FusedExactCamera
+    from neurolens.cameras.exact import ExactCamera, FusedExactCamera
     from neurolens.optics.lenscheck import check_lens, doubts
     from neurolens.optics.lensfile import read_lens
     from neurolens.optics.paraxial import first_order
@@ -219,7 +218,7 @@ def _dark_film(lens: Lens, film_mm: tuple[float, float]) -> list[str]:
 def _model(path: Path, shot: Shot, fused: bool) -> Camera:
     from neurolens.cameras.fused import FusedCamera
     from neurolens.cameras.model import OnnxCamera, load_model
-    from neurolens.cameras.states import state_for
+    from neurolens.modelfile.states import state_for
 
     for field, value in {"efl_mm": shot.efl_mm, "field_deg": shot.field_deg}.items():
         _refuse(str(path), field, value, "left out: a model is of one size of its lens")

@@ -1,4 +1,4 @@
-"""The exact lens as a camera: every ray traced through every surface. The one camera that needs torch."""
+"""The exact lens as a camera, traced or compiled: every ray through every surface. The cameras that need torch."""
 
 from __future__ import annotations
 
@@ -12,19 +12,21 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
-from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
+from neurolens.base.errors import InputError
+from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.exact_pupils import OUTLINE, pupil_named
 from neurolens.cameras.front_aim import FrontAim, front_aim
+from neurolens.cameras.fused import FusedFilm
 from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_search import COARSE, FINE
 from neurolens.cameras.sampling import arrived, check_film, positive
-from neurolens.optics.differentials import film_tangents, trace_differentials
-from neurolens.optics.glass import LINE_D_NM
+from neurolens.optics.glass import LINE_D_NM, absorption_of
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
-from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds, symmetric_about_axis
-from neurolens.optics.trace import Rays, trace
+from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds
+from neurolens.optics.trace import Rays, film_derivatives, trace, trace_differentials
+from neurolens.optics.tracegraph import exact_graph
 
 
 class ExactCamera:
@@ -76,7 +78,7 @@ class ExactCamera:
             film_z += film_offset_mm
             self.lens = replace(self.lens, film_z_mm=film_z)
         # A lens with cylinders is searched at many azimuths for one outline: coarser, for it fits none of them closely.
-        round_ = symmetric_about_axis(self.lens)
+        round_ = not self.lens.anamorphic
         detail = FINE if round_ else COARSE._replace(tighten=bounds is not None)
         if bounds is None:
             corner = math.hypot(*self.film_mm) / 2
@@ -175,7 +177,7 @@ class ExactCamera:
         rays = camera_rays(fx, fy, film_z, px, py, self._pupil_z_mm)
         gap = film_z - self._pupil_z_mm
         distance = torch.sqrt((fx - px) ** 2 + (fy - py) ** 2 + gap * gap)
-        moves = trace_differentials(self.lens, rays, film_tangents(rays, distance), wavelength).derivatives
+        moves = trace_differentials(self.lens, rays, film_derivatives(rays, distance), wavelength).derivatives
         d_film = torch.stack([torch.stack(list(m)) for m in moves], 1).to(torch.float32).numpy()
         return self._scene(film, pupil, wavelength_nm)._replace(d_film=d_film)
 
@@ -188,3 +190,46 @@ class ExactCamera:
             return passes_at_any_azimuth(
                 self.lens, r, film_z, u, v, self._pupil_z_mm, wavelength_nm, self.film_mm
             ).numpy()
+
+
+class FusedExactCamera(ExactCamera):
+    """A prescription without coatings and absorption as a compiled camera: the rays of `ExactCamera` to rounding.
+
+    Args and attributes are those of `ExactCamera`, whose `dtype` is float32 here; for differentials see `FusedFilm`.
+
+    Raises:
+        InputError: as `ExactCamera`; no C compiler; coatings or glass that absorbs.
+    """
+
+    rays_a_call = MANY_RAYS_A_CALL
+
+    def __init__(self, lens: Lens, **kwargs: Any) -> None:
+        _check_bare(lens)
+        super().__init__(lens, **kwargs)
+        waves = self.wavelength_nm or (LINE_D_NM, LINE_D_NM)
+        graph = exact_graph(self.lens, self._pupil_z_mm, waves)
+        stop, surface = float(self.lens.stop_radius_mm), self.lens.stop_index
+        self._fused = FusedFilm(self.film, graph, stop, self.film_mm, self.lens.aperture, surface)
+        self.settings |= {"runtime": "fused"}
+
+    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
+        return self._fused.sample(film_mm, pupil, wavelength_nm)
+
+    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """As `sample`, with the differentials of the rays, which come from the same pass."""
+        return self._fused.sample(film_mm, pupil, wavelength_nm, True)
+
+    @property
+    def differentials_error(self) -> float | None:
+        """See `FusedFilm.moves_error`."""
+        return self._fused.moves_error
+
+
+def _check_bare(lens: Lens) -> None:
+    for k, s in enumerate(lens.surfaces):
+        coated = s.coating is not None and bool(s.coating.layers)
+        absorbs = (s.glass is not None or s.absorption_per_mm) and absorption_of(s, LINE_D_NM) is not None
+        if coated or absorbs:
+            found = "(a coating)" if coated else "(glass that absorbs)"
+            raise InputError(lens.path, f"surface {k}", found, "a bare, clear lens for a C tracer: leave out fused:")

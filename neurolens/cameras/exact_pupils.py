@@ -1,7 +1,7 @@
 """The pupils of the literature for the exact lens, each widened until it holds the outline of what passes.
 
-Found at one wavelength, some of them lose light (a paraxial exit pupil up to 12% of it; `neurolens bench pupils`): then
-pictures would differ in brightness. Widened, they differ in the share of rays that pass, and in noise.
+Found at one wavelength, some of them lose light (a paraxial exit pupil up to 12% of it; `python -m experiments
+pupils`): then pictures would differ in brightness. Widened, they differ in the share of rays that pass, and in noise.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lens_film import LensFilm
-from neurolens.frontsurface import Shape, meet_front, sag_and_slope
+from neurolens.optics.sag import Shape, meet_front, sag_and_derivatives
 
 Array = NDArray[np.float64]
 
@@ -83,7 +83,7 @@ class FrontAim:
         along, across = low + (high - low) * square[0], half * (2 * square[1].astype(np.float64) - 1)
         x, y = along * cos - across * sin, along * sin + across * cos
         with np.errstate(all="ignore"):
-            z, sx, sy = (np.zeros_like(x),) * 3 if self.shape is None else sag_and_slope(self.shape, x, y)
+            z, sx, sy = (np.zeros_like(x),) * 3 if self.shape is None else sag_and_derivatives(self.shape, x, y)
             position = np.stack([x, y, z])
             way = point_mm - position
             direction = way / np.sqrt(np.einsum("in,in->n", way, way))
@@ -118,7 +118,9 @@ def front_aim(film: LensFilm, film_mm: tuple[float, float], wavelength_nm: tuple
     empty = ~np.isfinite(table).all(0)
     table[:, empty] = np.array([[1.0], [-1.0], [0.0], [0.0]])
     far = float(table[3].max())
-    depth = 0.0 if shape is None else float(np.nan_to_num(sag_and_slope(shape, np.array([far]), np.zeros(1))[0])[0])
+    depth = (
+        0.0 if shape is None else float(np.nan_to_num(sag_and_derivatives(shape, np.array([far]), np.zeros(1))[0])[0])
+    )
     return FrontAim(shape, end, table, math.hypot(far, depth))
 
 

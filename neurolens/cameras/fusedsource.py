@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 
 from neurolens.graph.c import Signature, literal, write_c
+from neurolens.graph.derive import derivative
 from neurolens.graph.program import (
     FILM_X_Y,
     FILM_Z,
@@ -20,7 +21,6 @@ from neurolens.graph.program import (
     TRANSMITTANCE,
     WAVELENGTH,
     Program,
-    derivative,
 )
 
 BLOCK = 256  # rays: their numbers between the stages fit the first cache

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.apertures import Aperture
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
@@ -22,9 +21,10 @@ from neurolens.cameras.onnxinverse import OnnxInverse, load_inverse
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.sampling import arrived, check_film, positive
-from neurolens.cameras.states import state_for
-from neurolens.focus import film_z_mm
 from neurolens.modelfile import DOMAIN_SLACK
+from neurolens.modelfile.states import state_for
+from neurolens.optics.apertures import Aperture
+from neurolens.optics.film_plane import film_z_mm
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 

@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
-from neurolens.cameras.cardcheck import check_card, is_number
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.onnxfile import read_checked
 from neurolens.cameras.onnxlens import OUTPUTS
 from neurolens.cameras.onnxsession import open_session, run_session
-from neurolens.frontsurface import meet_front
+from neurolens.modelfile.cardcheck import check_card, is_number
+from neurolens.modelfile.onnxfile import read_checked
+from neurolens.optics.sag import meet_front
 
 # Rays a call: the Newton steps have more rows than a model.
 BATCH = 4096
@@ -106,7 +106,7 @@ class OnnxInverse:
 
     @property
     def front(self) -> Any:
-        """Shape of the surface on which scene rays are taken (`frontsurface.Shape`); None for the plane z = 0.
+        """Shape of the surface on which scene rays are taken (`optics.sag.Shape`); None for the plane z = 0.
 
         Raises:
             InputError: no file of the map of scene rays.

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.pupil_outline import turned
+from neurolens.modelfile.cardcheck import pupil_rows
 
 # Lattice on a row's box when the bounds are tightened; along and across (one half).
 _LATTICE = (96, 48)
@@ -40,10 +40,7 @@ class PupilTable:
     @staticmethod
     def of(bounds: Mapping[str, Any]) -> PupilTable:
         """From the fields of `optics.pupils.PupilBounds`, as a model's card holds them."""
-        rows = np.array([bounds["low_mm"], bounds["high_mm"], bounds["half_mm"]], dtype=np.float32)
-        if rows.ndim != 2 or rows.shape[1] < 2 or not np.isfinite(rows).all():
-            raise InputError("pupil bounds", "low_mm, high_mm, half_mm", rows.shape, "three lists of finite numbers")
-        return PupilTable(float(bounds["pupil_z_mm"]), float(bounds["film_radius_mm"]), rows)
+        return PupilTable(float(bounds["pupil_z_mm"]), float(bounds["film_radius_mm"]), pupil_rows(bounds))
 
     def sample(self, film_mm: FloatArray, square: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Uniform points in the boxes of film points.

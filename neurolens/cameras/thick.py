@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.apertures import Aperture
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray, RayDifferentials, towards
 from neurolens.cameras.sampling import ahead, arrived, check_film, concentric_disk, positive, sound, stratified
-from neurolens.focus import film_z_mm
+from neurolens.optics.apertures import Aperture
+from neurolens.optics.film_plane import film_z_mm
 
 _QUADRATURE = 256  # points a side
 

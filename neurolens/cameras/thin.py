@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from neurolens.apertures import Aperture
 from neurolens.base import status as st
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray, towards
 from neurolens.cameras.sampling import ahead, arrived, check_film, concentric_disk, positive, sound, stratified
-from neurolens.focus import film_z_mm
+from neurolens.optics.apertures import Aperture
+from neurolens.optics.film_plane import film_z_mm
 
 _QUADRATURE = 256  # points a side
 

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import math
 import time
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from neurolens.base.errors import InputError
-from neurolens.commands import analyse_text as text
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between, focus_of
-from neurolens.commands.output import print_json
+from neurolens.commands.output import number, print_json, table
 
 if TYPE_CHECKING:
     from neurolens.analysis.fields import Scene
+    from neurolens.optics.prescription import Lens
 
-WHATS = (
-    *("layout", "spots", "fans", "colour", "curvature", "distortion", "vignetting", "mtf", "seidel", "psf"),
-)  # fmt: skip
+
+WHATS = ("layout", "spots", "fans", "colour", "curvature", "distortion", "vignetting", "mtf", "seidel", "psf")
 _OF_FIELDS = ("spots", "fans", "mtf", "psf")  # take --fields and --wavelengths
 _BULK = {  # left out of the JSON unless asked for: a number a ray or a pixel
     "layout": ("rays", "surfaces"),
@@ -95,12 +96,11 @@ def run(args: argparse.Namespace) -> int:
         if args.output.exists() and not args.output.is_dir():
             raise InputError(args.output, "--output", str(args.output), "a folder")
         args.output.mkdir(parents=True, exist_ok=True)
-    from neurolens.commands.analyse_notes import state_notes
 
     began = time.perf_counter()
     scene, doubts = scene_of(args)
     scene.check()
-    found, pictures, notes = {}, {}, state_notes(scene.lens)
+    found, pictures, notes = {}, {}, [f"derived: {scene.lens.derived}"] if scene.lens.derived else []
     for what in args.what or WHATS:
         try:
             found[what], picture = _one(what, scene, args)
@@ -114,7 +114,9 @@ def run(args: argparse.Namespace) -> int:
     head = {"file": str(args.file), "name": scene.lens.name, "axis": scene.axis, "focus_m": scene.focus_m}
     more = {"pictures": pictures, "notes": notes, "warnings": doubts, "seconds": time.perf_counter() - began}
     if args.json:
-        print_json({**head, **{w: _trimmed(w, d, args.full) for w, d in found.items()}, **more})
+        bulk = {} if args.full else _BULK
+        shown = {w: {k: v for k, v in d.items() if k not in bulk.get(w, ())} for w, d in found.items()}
+        print_json({**head, **shown, **more})
     else:
         parts = [f"{scene.lens.name}\n{_subtitle(scene)}", *(_analysis(w).table(d) for w, d in found.items())]
         parts += [*(f"Note: {n}" for n in notes), *(f"Warning: {w}" for w in doubts)]
@@ -127,7 +129,6 @@ def run(args: argparse.Namespace) -> int:
 def scene_of(args: argparse.Namespace) -> tuple[Scene, list[str]]:
     """The lens in the state that the arguments of `add_lens_state` ask for with its object, and what is doubtful."""
     from neurolens.analysis.fields import DEFAULT_NM, Scene
-    from neurolens.commands.analyse_notes import read_told, table_warnings, wavelength_warnings
 
     tabled, told = read_told(args.file)
     lens = tabled.at(
@@ -169,35 +170,220 @@ def _subtitle(scene: Scene) -> str:
     return state_text(scene)
 
 
-def _trimmed(what: str, data: dict[str, Any], full: bool) -> dict[str, Any]:
-    return data if full else {k: v for k, v in data.items() if k not in _BULK.get(what, ())}
-
-
 def _analysis(what: str) -> _Analysis:
     """Looked up by name; torch and matplotlib are loaded here, not when the command line starts."""
-    from neurolens.analysis import plot_curves as curves
-    from neurolens.analysis import plot_points
-    from neurolens.analysis.colour import colour
-    from neurolens.analysis.curvature import curvature
-    from neurolens.analysis.distortion import distortion
-    from neurolens.analysis.fans import fans
-    from neurolens.analysis.illumination import illumination
-    from neurolens.analysis.layout import layout_profile
-    from neurolens.analysis.mtf import mtf
-    from neurolens.analysis.plot_layout import lens_layout
-    from neurolens.analysis.psf import psf
+    from neurolens.analysis import plots
+    from neurolens.analysis.field_curves import colour, curvature, distortion, illumination
+    from neurolens.analysis.layout import layout_profile, lens_layout
     from neurolens.analysis.seidel import seidel
-    from neurolens.analysis.spots import spots
+    from neurolens.analysis.spots import fans, mtf, spots
+    from neurolens.analysis.wavefront import psf
 
     return {
-        "layout": _Analysis(layout_profile, lens_layout, text.layout),
-        "spots": _Analysis(spots, plot_points.plot_spots, text.spots),
-        "fans": _Analysis(fans, plot_points.plot_fans, text.fans),
-        "colour": _Analysis(colour, curves.plot_colour, text.colour),
-        "curvature": _Analysis(curvature, curves.plot_curvature, text.curvature),
-        "distortion": _Analysis(distortion, curves.plot_distortion, text.distortion),
-        "vignetting": _Analysis(illumination, curves.plot_vignetting, text.vignetting),
-        "mtf": _Analysis(mtf, curves.plot_mtf, text.mtf),
-        "seidel": _Analysis(seidel, curves.plot_seidel, text.seidel),
-        "psf": _Analysis(psf, plot_points.plot_psf, text.psf),
+        "layout": _Analysis(layout_profile, lens_layout, _layout_text),
+        "spots": _Analysis(spots, plots.plot_spots, _spots_text),
+        "fans": _Analysis(fans, plots.plot_fans, _fans_text),
+        "colour": _Analysis(colour, plots.plot_colour, _colour_text),
+        "curvature": _Analysis(curvature, plots.plot_curvature, _curvature_text),
+        "distortion": _Analysis(distortion, plots.plot_distortion, _distortion_text),
+        "vignetting": _Analysis(illumination, plots.plot_vignetting, _vignetting_text),
+        "mtf": _Analysis(mtf, plots.plot_mtf, _mtf_text),
+        "seidel": _Analysis(seidel, plots.plot_seidel, _seidel_text),
+        "psf": _Analysis(psf, plots.plot_psf, _psf_text),
     }[what]
+
+
+def read_told(path: str | Path) -> tuple[Lens, list[str]]:
+    """A lens file, and what its reader warns of: glasses that contradict the catalogue, indices taken as constant."""
+    from neurolens.optics.lensfile import read_lens
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", NeurolensWarning)
+        lens = read_lens(path)
+    return lens, [str(w.message).removeprefix(f"{lens.path}: ") for w in caught]
+
+
+def table_warnings(tabled: Lens, lens: Lens, zoom: str | None) -> list[str]:
+    """Doubts about the table and, where one of its states is used, about them; see `neurolens.optics.lenscheck`.
+
+    Args:
+        tabled: as the file has it.
+        lens: the state that is analysed.
+        zoom: the name or focal length in mm of a state, if one was asked for.
+    """
+    from neurolens.optics.lenscheck import check_lens, doubts
+
+    found = {
+        "estimated": ["rim diameters are estimated, not the source's: vignetting is a guess"],
+        "derived": ["rim diameters are derived by a rule, the source has none: vignetting follows that rule"],
+    }.get(lens.rims, [])
+    # A stop that is smaller than stated is a choice, not a doubt; `neurolens lens` says so too.
+    checks = [c for c in check_lens(tabled) if c.quantity != "f-number" or (c.computed or 0.0) > (c.stated or 0.0)]
+    return found + doubts([c for c in checks if zoom or not c.state])
+
+
+def wavelength_warnings(lens: Lens, wavelength_nm: Iterable[float]) -> list[str]:
+    """Glasses of a lens that their source does not state at a wavelength in use."""
+    from neurolens.optics.glass import glass_of
+
+    waves, found = list(wavelength_nm), {}
+    for name in {s.glass: None for s in lens.surfaces if s.glass is not None}:
+        glass = glass_of(name)
+        outside = ", ".join(f"{nm:g}" for nm in waves if not glass.covers(nm))
+        if outside:
+            low, high = (round(1000 * v) for v in glass.range_um)
+            found[name] = f"the index of {glass} is stated for {low}-{high} nm: extrapolated at {outside} nm"
+    if any(s.n_d != 1 and s.glass is None for s in lens.surfaces):
+        far = ", ".join(f"{nm:g}" for nm in waves if not 365 <= nm <= 1014)
+        if far:
+            found[""] = f"glasses known by n_d and V_d alone are a guess at {far} nm, outside 365-1014 nm"
+    return list(found.values())
+
+
+_ROWS = 6  # of curves over the field: enough to see their shape
+_MTF_PER_MM = (10, 20, 30, 40, 50)
+
+
+def _layout_text(data: dict[str, Any]) -> str:
+    """Which fields the drawn rays belong to."""
+    counts: dict[str, int] = {}
+    for ray in data["rays"]:
+        counts[ray["label"]] = counts.get(ray["label"], 0) + 1
+    rows = [(label, str(count)) for label, count in counts.items()]
+    return f"Layout: {len(data['surfaces'])} surfaces\n" + table(("field", "rays drawn"), rows)
+
+
+def _spots_text(data: dict[str, Any]) -> str:
+    header = ("RMS µm", *_nanometres(data), "largest µm", "passed", "best focus mm", "RMS there")
+
+    def cells(i: int) -> list[str]:
+        best = (_three(data[key][i]) for key in ("best_shift_mm", "best_rms_um"))
+        each = (_three(v) for v in data["rms_by_wavelength_um"][i])
+        return [number(data["rms_um"][i]), *each, number(data["geometric_um"][i]), _percent(data["passed"][i]), *best]
+
+    airy = f"Airy disc radius {number(data['airy_um'], 3)} µm at the working f/{number(data['working_f_number'], 3)}"
+    head = f"Spots (radius from the centroid, all wavelengths; each by itself; {airy})"
+    return _over_field(head, data, header, cells, range(len(data["field_deg"])))
+
+
+def _fans_text(data: dict[str, Any]) -> str:
+    header = [f"{name} {wave}" for name in ("tang.", "sag.") for wave in _nanometres(data)]
+
+    def cells(i: int) -> list[str]:
+        return [_three(_largest(row)) for key in ("tangential_um", "sagittal_um") for row in data[key][i]]
+
+    head = "Ray fans (largest transverse aberration, µm)"
+    return _over_field(head, data, header, cells, range(len(data["field_deg"])))
+
+
+def _colour_text(data: dict[str, Any]) -> str:
+    some = _some(len(data["spectrum_nm"]), 9)
+    zones = ("paraxial", *(f"zone {z:.2f}" for z in data["zone"][1:]))
+    first = [(f"{data['spectrum_nm'][i]:.0f} nm", *(_three(v) for v in data["focus_shift_mm"][i])) for i in some]
+    head = "Lateral colour (height from that of the first line, µm)"
+    lines = [f"{w:.0f} nm" for w in data["line_nm"]]
+    lateral = _over_field(head, data, lines, lambda i: [_three(v) for v in data["lateral_um"][i]])
+    return f"Longitudinal colour (focus from the film, mm)\n{table(('wavelength', *zones), first)}\n\n{lateral}"
+
+
+def _curvature_text(data: dict[str, Any]) -> str:
+    keys = ("tangential_mm", "sagittal_mm", "petzval_mm")
+    head = f"Field curvature (focus from the film, mm; Petzval radius {number(data['petzval_radius_mm'])} mm)"
+    header = ("tangential", "sagittal", "Petzval")
+    return _over_field(head, data, header, lambda i: [_three(data[key][i]) for key in keys])
+
+
+def _distortion_text(data: dict[str, Any]) -> str:
+    names = list(data["error_percent"])
+    head = (
+        f"Distortion (%; {_fixed(data['edge_percent'], 2)}% at the edge against {data['reference']}; "
+        f"closest is {data['best']}; {number(data['scale_mm'])} mm per radian on the axis)"
+    )
+    header = [n.partition(",")[0] for n in names]
+    return _over_field(head, data, header, lambda i: [_three(data["error_percent"][n][i]) for n in names])
+
+
+def _vignetting_text(data: dict[str, Any]) -> str:
+    keys = ("relative", "unvignetted", "passed", "cos4")
+    header = ("illumination", "without rims", "rims pass", "cos^4")
+    head = "Vignetting and relative illumination"
+    return _over_field(head, data, header, lambda i: [_percent(data[key][i]) for key in keys])
+
+
+def _mtf_text(data: dict[str, Any]) -> str:
+    at = [data["frequency_per_mm"].index(f) for f in _MTF_PER_MM if f in data["frequency_per_mm"]]
+    header = [f"{data['frequency_per_mm'][k]:g}/mm {d}" for k in at for d in "TS"]
+    limit = ", ".join(_fixed(data["diffraction_limit"][k]) for k in at)
+    waves = ", ".join(f"{w:.0f}" for w in data["wavelength_nm"])
+    head = f"Geometric MTF ({waves} nm; T tangential, S sagittal; without diffraction, whose limit is {limit})"
+
+    def cells(i: int) -> list[str]:
+        return [_fixed(data[key][i][k]) for k in at for key in ("tangential", "sagittal")]
+
+    return _over_field(head, data, header, cells, range(len(data["field_deg"])))
+
+
+def _seidel_text(data: dict[str, Any]) -> str:
+    header = ("surface", *(name.replace(" colour", "") for name in data["names"]))
+    rows = [(str(k), *(f"{round(v, 5) + 0.0:.5f}" for v in row)) for k, row in enumerate(data["surfaces"])]
+    rows.append(("total", *(f"{round(v, 5) + 0.0:.5f}" for v in data["total"])))
+    odd = data["odd_powers"]
+    note = f"\nNot counted: the odd powers of surface {', '.join(map(str, odd))}" if odd else ""
+    head = f"Seidel sums (mm, {data['wavelength_nm']:.0f} nm, image height {number(data['image_height_mm'])} mm)"
+    return f"{head}\n" + table(header, rows) + note
+
+
+def _psf_text(data: dict[str, Any]) -> str:
+    rows = [
+        (_angle(data, i), number(data["half_width_um"][i]), number(data["strehl"][i], 3))
+        for i in range(len(data["field_deg"]))
+    ]
+    head = f"Point spread ({data['wavelength_nm'][0]:.0f} nm; Strehl ratio '-' where aberrations rule out diffraction)"
+    return f"{head}\n" + table(("field", "half width µm", "Strehl ratio"), rows)
+
+
+def _over_field(
+    head: str,
+    data: dict[str, Any],
+    header: Sequence[str],
+    cells: Callable[[int], Sequence[str]],
+    fields: Iterable[int] | None = None,
+) -> str:
+    """A table with a row a field: its angle, its height and `cells` of it; some fields where none are given."""
+    chosen = _some(len(data["field_deg"])) if fields is None else fields
+    rows = [(_angle(data, i), _fixed(data["height_mm"][i], 2), *cells(i)) for i in chosen]
+    return f"{head}\n{table(('field', 'height mm', *header), rows)}"
+
+
+def _angle(data: dict[str, Any], i: int) -> str:
+    field = data["field_deg"][i]
+    return "axis" if field == 0 else f"{field:.2f}°"
+
+
+def _nanometres(data: dict[str, Any]) -> list[str]:
+    return [f"{w:.0f} nm" for w in data["wavelength_nm"]]
+
+
+def _some(count: int, rows: int = _ROWS) -> list[int]:
+    """About so many of the indices below `count`, evenly spread, both ends among them."""
+    steps = min(rows, count) - 1
+    return [round(k * (count - 1) / steps) for k in range(steps + 1)] if steps > 0 else [0] * count
+
+
+def _fixed(value: float, places: int = 3) -> str:
+    """So many places, "-" where there is no value."""
+    return "-" if math.isnan(value) else f"{value + 0.0:.{places}f}"
+
+
+def _percent(value: float) -> str:
+    return "-" if math.isnan(value) else f"{100 * value:.1f}%"
+
+
+def _largest(values: Sequence[float]) -> float:
+    seen = [abs(v) for v in values if not math.isnan(v)]
+    return max(seen) if seen else math.nan
+
+
+def _three(value: float) -> str:
+    """Three digits; what rounding leaves of a zero is a zero."""
+    return number(0.0 if abs(value) < 1e-6 else value, 3)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
-    from neurolens.apertures import Aperture
+    from neurolens.optics.apertures import Aperture
     from neurolens.optics.prescription import Lens
 
 
@@ -180,7 +180,7 @@ def aperture_of(args: argparse.Namespace) -> Aperture | None:
     Raises:
         InputError: shapes that exclude each other, a picture that cannot be read.
     """
-    from neurolens.render.masks import make_aperture
+    from neurolens.render.pictures import make_aperture
 
     return make_aperture(args.blades, args.blade_rotation, args.blade_curvature, args.aperture_mask)
 

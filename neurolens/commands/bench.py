@@ -1,199 +1,155 @@
-"""`neurolens bench WHAT`: speed and numerics of the exact tracer, and surrogates against it, written as tables."""
+"""`neurolens bench surrogates`: every method on the same rays of every lens, as records, tables and plots."""
 
 from __future__ import annotations
 
 import argparse
-import sys
+import json
+import math
+import platform
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
-from neurolens.commands import (
-    bench_equal_time,
-    bench_fused,
-    bench_inverse,
-    bench_mitsuba,
-    bench_models,
-    bench_render,
-    bench_surrogates,
-    bench_vignetting,
-    bench_zoom,
-)
 from neurolens.commands.arguments import Parser, whole
 
-_DESCRIPTION = """\
-Measure the exact tracer and surrogates on this machine and write tables.
-Needs the extra "train" (torch)."""
-_TRACE = """\
-Rays per second of the exact tracer: eager and compiled, float32 and float64, by number of
-surfaces and threads, with two aspheres, and the memory that it takes. Candidates run in turn,
-so that ratios are fair on a busy machine; absolute figures want a quiet one.
-Writes trace_speed.md and trace_speed.json."""
-_EXTREMES = """\
-Errors of float32 from float64, and of float64 from 50 digits, at the ends of what optics allows:
-f/0.6 to f/45, 220 degrees, radii from the semi-diameter to a plane, grazing rays, the critical
-angle, cemented equal indices, near and far objects, every lens file, both ways.
-Exit code 1 where a number is not finite or a status differs away from any edge.
-Writes extremes.md and extremes.json."""
+if TYPE_CHECKING:
+    from neurolens.evaluate.methods import BenchSettings
 
-_PUPILS = """\
-What share of the rays that a pupil sends pass the lens: the pupils of the literature and the outlines
-of this project's cameras, on the lenses of the theses, beside their figures (half a minute).
-Writes passage.md, passage.json and passage.png."""
+SURROGATES = """\
+Fit every method for every lens on the same rays, measure errors, size and time against the exact
+tracer, and write one JSON record a lens and method, one table and plot a lens, and a summary over
+the lenses with the median and the worst.
+
+A record that is there, made by the same settings and version, is not made again: a run that was
+interrupted goes on where it stopped. A method that fails on a lens is a row with the reason."""
+_EPILOG = """\
+examples:
+  neurolens bench surrogates my_lens.toml
+  neurolens bench surrogates laikin_double_gauss_50 my_lens.toml --methods ours schrade
+
+DIR holds summary.md, LENS.md and LENS.png, records/, models/ (ONNX) and config.json."""
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the command to the command line."""
     parser = subparsers.add_parser(
-        "bench", help="speed and numerics of the exact tracer; surrogates", description=_DESCRIPTION
+        "bench",
+        help="every kind of surrogate on a lens, against its exact trace",
+        description='Race the methods on lenses of your own. Needs the extra "train" (torch).',
     )
     kinds = parser.add_subparsers(metavar="WHAT", required=True, parser_class=Parser)
-    _add_trace(kinds)
-    _add_extremes(kinds)
-    _add_pupils(kinds)
-    bench_surrogates.add_parser(kinds)
-    bench_vignetting.add_parsers(kinds)
-    bench_fused.add_parser(kinds)
-    bench_models.add_parser(kinds)
-    bench_inverse.add_parser(kinds)
-    bench_zoom.add_parser(kinds)
-    bench_equal_time.add_parser(kinds)
-    bench_render.add_parser(kinds)
-    bench_mitsuba.add_parser(kinds)
-
-
-def _add_trace(kinds: Any) -> None:
-    parser = kinds.add_parser("trace", help="rays per second and memory", description=_TRACE)
-    parser.add_argument("--quick", action="store_true", help="12 refractions on one thread, few rounds (a minute)")
-    parser.add_argument("--only", metavar="TEXT", default="", help="lens files whose name holds this text")
-    parser.add_argument(
-        "--threads", metavar="N", type=whole(1), nargs="+", default=[1, 2], help="thread counts (default: 1 2)"
+    parser = kinds.add_parser(
+        "surrogates", help="all methods on all axes of the trade", description=SURROGATES, epilog=_EPILOG
     )
-    parser.add_argument("--rounds", metavar="N", type=whole(1), help="rounds (default 20; quick 5)")
-    _add_out(parser)
-    parser.set_defaults(run=run_trace, kept="lenses that were finished are in the table")
+    add_surrogate_arguments(parser, "+")
+    parser.set_defaults(run=run_surrogates, kept="finished records are kept; the same command goes on")
 
 
-def _add_extremes(kinds: Any) -> None:
-    parser = kinds.add_parser("extremes", help="errors and statuses at the ends", description=_EXTREMES)
-    parser.add_argument("--rays", metavar="N", type=whole(100), default=20000, help="rays a case (default 20000)")
-    _add_out(parser)
-    parser.set_defaults(run=run_extremes, kept="nothing is written")
-
-
-def _add_pupils(kinds: Any) -> None:
-    parser = kinds.add_parser("pupils", help="share of rays that pass", description=_PUPILS)
-    parser.add_argument("--rays", metavar="N", type=whole(1000), default=2**17, help="rays a method (default 131072)")
-    parser.add_argument("--only", metavar="TEXT", default="", help="lens files whose name holds this text")
-    _add_out(parser)
-    parser.set_defaults(run=run_pupils, kept="nothing is written")
-
-
-def _add_out(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", metavar="DIR", type=Path, help="folder for the tables (default: experiments/results)")
+def add_surrogate_arguments(parser: argparse.ArgumentParser, lenses: str) -> None:
+    """Add the lenses, as many as argparse's `lenses` says, and the options."""
+    parser.add_argument("lenses", metavar="LENS", nargs=lenses, help="lens files, or names of lenses/")
+    parser.add_argument(
+        "--methods", metavar="METHOD", nargs="+", default=[],
+        help="rows by name, or groups: paraxial, published, ours, ablations (default: the first three)",
+    )  # fmt: skip
+    parser.add_argument("--near", action="store_true", help="focus from infinity to the near limit, not infinity alone")
+    parser.add_argument("--quick", action="store_true", help="6000 rays, 3 rounds, no compiled tracer: a rough look")
+    parser.add_argument("--rays", metavar="N", type=whole(1000, 10**6), help="rays of fits and errors (default 30000)")
+    parser.add_argument("--seed", metavar="N", type=whole(0), default=1, help="of the rays (default 1)")
+    parser.add_argument("--rounds", metavar="N", type=whole(0), help="of the race, 0 for none (default 10)")
+    parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=1, help="of the race (default 1)")
+    parser.add_argument("--again", action="store_true", help="make the chosen records again")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, default=Path("runs/surrogates"), help="folder (default: runs/surrogates)"
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
 
 
-def run_trace(args: argparse.Namespace) -> int:
-    """Time the tracer, lens by lens; the table is written after each."""
-    from neurolens.base.progress import Progress
-    from neurolens.evaluate.benches.trace_memory import SIZES, Unmeasured, memory_of
-    from neurolens.evaluate.benches.trace_speed import MAIN, chosen_lenses, selected, time_lens, with_aspheres
-    from neurolens.evaluate.benches.trace_speed_page import Found, page, write
-    from neurolens.evaluate.project import project_root
-
-    _quiet_glasses()
-    root = project_root()
-    out = args.out or root / "experiments" / "results"
-    lenses, missing = chosen_lenses(root / "lenses")
-    lenses = selected({MAIN: lenses[MAIN]} if args.quick else lenses, args.only)
-    rounds = args.rounds or (5 if args.quick else 20)
-    found = Found(rounds, missing=[] if args.quick or args.only else missing)
-    threads = args.threads[:1] if args.quick else args.threads
-    plan = {_stage(n): (2.0 if n == MAIN else 1.0) * (8 + n + n * len(threads)) for n in lenses} | {"memory": 10.0}
-    progress = Progress(plan, quiet=args.quiet)
-    for n, lens in lenses.items():
-        with progress.stage(_stage(n)) as report:
-            aspheric = with_aspheres(lens) if n == MAIN else None
-            found.rows += time_lens(lens, threads, rounds, aspheric=aspheric, report=report)
-        write(found, out)
-    if MAIN in lenses:
-        with progress.stage("memory") as report:
-            try:
-                for i, size in enumerate(SIZES[: 2 if args.quick else 3]):
-                    found.memory.append(memory_of(root / "lenses" / Path(lenses[MAIN].path).name, size))
-                    report((i + 1) / len(SIZES))
-            except Unmeasured as reason:
-                found.missing.append(str(reason))
-        write(found, out)
-    print(page(found))
-    return 0
-
-
-def _quiet_glasses() -> None:
-    """No word on glasses of unknown dispersion: it changes nothing here."""
-    import warnings
-
-    from neurolens.base.errors import NeurolensWarning
-
-    warnings.simplefilter("ignore", NeurolensWarning)
-
-
-def _stage(count: int) -> str:
-    return f"{count} refractions"
-
-
-def run_extremes(args: argparse.Namespace) -> int:
-    """Measure every case; 1 where something happened that never may."""
-    import json
-
+def run_surrogates(args: argparse.Namespace) -> int:
+    """Make what is missing, and write the pages after every lens."""
     from neurolens.base.files import atomic_write_text
     from neurolens.base.progress import Progress
-    from neurolens.evaluate.benches import extremes
-    from neurolens.evaluate.benches.extreme_cases import all_cases
-    from neurolens.evaluate.project import project_root
+    from neurolens.evaluate.experiment import LensChoice
+    from neurolens.evaluate.methods import Bench, chosen_rows, run_bench
+    from neurolens.evaluate.methods_page import NOTES, summary_page, write_lens
+    from neurolens.evaluate.records import plain
+    from neurolens.evaluate.train import versions
 
-    _quiet_glasses()
-    root = project_root()
-    out = args.out or root / "experiments" / "results"
-    with Progress(quiet=args.quiet).stage("extremes") as report:
-        cases = list(all_cases(root / "lenses", args.rays))
-        done = []
-        for case in cases:
-            done.append(extremes.measure(case))
-            report(len(done) / len(cases))
-    bad = extremes.failures(done)
-    text = extremes.page(done, bad)
+    rows, settings, out = chosen_rows(args.methods), _settings(args), args.out
+    files = _lens_files(args.lenses)
+    if out.exists() and not out.is_dir():
+        raise InputError("neurolens bench surrogates", "--out", str(out), "a folder, not a file")
+    benches = [Bench(LensChoice(file), settings, out) for file in files]
     out.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(out / "extremes.md", text)
-    atomic_write_text(out / "extremes.json", json.dumps(extremes.to_json(done), indent=1, allow_nan=False) + "\n")
-    print(text)
-    for line in bad:
-        print(f"neurolens: {line}", file=sys.stderr)
-    return 1 if bad else 0
+    config = {
+        "lenses": [str(file) for file in files],
+        "methods": [row.name for row in rows],
+        "settings": asdict(settings),
+        "seed": args.seed,
+        "versions": versions(),
+        "machine": {"processor": platform.processor() or platform.machine(), "system": platform.platform()},
+    }
+    atomic_write_text(out / "config.json", json.dumps(plain(config), indent=1) + "\n")
+    facts = f"{_conditions(args, settings)} {NOTES}"
+    found: dict[str, Any] = {}
 
+    def done(bench: Bench, records: list[dict[str, Any]]) -> None:
+        found[bench.name] = records
+        write_lens(bench.name, records, facts, out)
+        atomic_write_text(out / "summary.md", summary_page(found, facts))
 
-def run_pupils(args: argparse.Namespace) -> int:
-    """Measure every case of the theses and draw three."""
-    from neurolens.base.progress import Progress
-    from neurolens.evaluate.benches import passage, passage_page
-    from neurolens.evaluate.benches.passage_cases import CASES, DRAWN
-    from neurolens.evaluate.project import project_root
-
-    _quiet_glasses()
-    root = project_root()
-    cases = [case for case in CASES if args.only in case.lens]
-    if not cases:
-        known = ", ".join(dict.fromkeys(case.lens for case in CASES))
-        raise InputError("neurolens bench pupils", "--only", args.only, f"part of one of: {known}")
-    with Progress(quiet=args.quiet).stage("pupils") as report:
-        done = []
-        for case in cases:
-            done.append(passage.measure(case, root / "lenses", args.rays))
-            report(len(done) / (len(cases) + 1))
-        pixel = [] if args.only else list(passage.pixel_rates(root / "lenses", args.rays))
-        shown = [p for p in done if p.case in DRAWN] or done[:1]
-        cameras = [passage.camera_of(p.case, root / "lenses") for p in shown]
-    out = args.out or root / "experiments" / "results"
-    print(passage_page.write(done, pixel, shown, cameras, args.rays, out))
+    run_bench(benches, rows, again=args.again, progress=Progress(quiet=args.quiet), done=done)
+    print(f"{summary_page(found, facts)}\nLook at\n  {out / 'summary.md'}\n  {out / (benches[0].name + '.md')}, ...")
     return 0
+
+
+def _settings(args: argparse.Namespace) -> BenchSettings:
+    from neurolens.evaluate.experiment import DomainChoice
+    from neurolens.evaluate.methods import BenchSettings
+    from neurolens.surrogates.pairs import PairSettings
+
+    rays = args.rays or (6000 if args.quick else 30000)
+    rounds = args.rounds if args.rounds is not None else (3 if args.quick else 10)
+    return BenchSettings(
+        # The goals are stated for 400-700 nm.
+        domain=DomainChoice(focus_m=None if args.near else (math.inf, math.inf), wavelength_nm=(400.0, 700.0)),
+        pairs=PairSettings(rays, rays, rays, args.seed),
+        vignetting_rays=50_000 if args.quick else 200_000,
+        rounds=rounds,
+        threads=args.threads,
+        compile_exact=not args.quick,
+    )
+
+
+def _lens_files(names: list[str]) -> list[Path]:
+    """Files of the arguments: paths, or names in lenses/ of the working folder or the project.
+
+    Raises:
+        InputError: no such file, or two of one name, whose records would be the same file.
+    """
+    from neurolens.evaluate.describe import project_root
+
+    files = []
+    for name in names:
+        path = Path(name)
+        if not path.is_file():
+            folder = project_root() / "lenses"
+            path = folder / f"{name}.toml"
+            if not path.is_file():
+                raise InputError("neurolens bench surrogates", "LENS", name, f"a lens file, or a name in {folder}")
+        files.append(path)
+    twice = sorted({f.stem for f in files if sum(g.stem == f.stem for g in files) > 1})
+    if twice:
+        raise InputError("neurolens bench surrogates", "LENS", twice, "files whose names differ")
+    return files
+
+
+def _conditions(args: argparse.Namespace, settings: BenchSettings) -> str:
+    focus = "focus from infinity to the near limit" if args.near else "focus at infinity"
+    pairs = settings.pairs
+    return (
+        f"Full aperture and lit film, 400-700 nm (one wavelength where no dispersion is known), {focus}; {pairs.train} "
+        f"rays to fit, {pairs.held_out} to measure, {settings.vignetting_rays} for the vignetting, seed {pairs.seed}; "
+        f"{settings.threads} thread{'s' * (settings.threads > 1)}, {settings.rounds} rounds."
+    )

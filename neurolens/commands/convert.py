@@ -139,7 +139,7 @@ def write_checked(lens: Lens, path: Path) -> None:
 def summary(lens: Lens, told: list[str]) -> dict[str, Any]:
     """What was read, for people and for --json; mm."""
     from neurolens.optics import paraxial
-    from neurolens.readers.assemble import first_order, is_anamorphic
+    from neurolens.readers.assemble import first_order
 
     data, efl_mm = first_order(lens), {"x": math.inf, "y": math.inf}
     axis: Literal["x", "y"]
@@ -152,7 +152,7 @@ def summary(lens: Lens, told: list[str]) -> dict[str, Any]:
         "surfaces": len(lens.surfaces),
         "stop_surface": lens.stop_index,
         "efl_mm": efl_mm["y"],
-        "efl_x_mm": efl_mm["x"] if is_anamorphic(lens) else None,
+        "efl_x_mm": efl_mm["x"] if lens.anamorphic else None,
         "back_focus_mm": data.back_focus_mm,
         "film_gap_mm": float(lens.surfaces[-1].thickness_mm),
         "f_number": data.f_number,

@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     model = load_model(args.model)  # on one thread: the race shares out batches
     space = None
     if model.axes:
-        from neurolens.evaluate.state_errors import check_states, space_of_card
+        from neurolens.evaluate.check import check_states, space_of_card
 
         space = space_of_card(model.card, model.axes, args.lens, args.model)
         lens = space.lens

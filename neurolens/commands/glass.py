@@ -12,7 +12,7 @@ from neurolens.commands.arguments import add_json
 from neurolens.commands.output import number, print_json, table
 
 if TYPE_CHECKING:
-    from neurolens.optics.dispersion import Glass
+    from neurolens.optics.catalogue import Glass
 
 _DESCRIPTION = """\
 Look glasses up in the catalogue that ships with neurolens: index, Abbe number, the

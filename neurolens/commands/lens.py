@@ -1,23 +1,23 @@
-"""`neurolens lens FILE`: what a lens file holds, computed and drawn."""
+"""`neurolens lens FILE`: what a lens file holds, computed and drawn; a folder as a table; rims by a rule."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import time
 import warnings
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.commands import lens_list, lens_rims
-from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, focus_of, given_options
-from neurolens.commands.lens_text import lens_text
-from neurolens.commands.output import print_json
+from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between, focus_of, given_options
+from neurolens.commands.output import number, print_json, table
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens
-    from neurolens.surrogates.domain import Domain
+    from neurolens.optics.rims import Rim, RimRule
+
 
 _DESCRIPTION = """\
 Read a lens file strictly and print what follows from it: focal length, pupils, film plane,
@@ -52,8 +52,10 @@ def add_parser(subparsers: Any) -> None:
         "--layout", metavar="OUT.png", type=Path,
         help="draw the lens with rays from three field points: axis, 70%% and edge of the film (.png, .pdf, .svg)",
     )  # fmt: skip
-    lens_list.add_arguments(parser)
-    lens_rims.add_arguments(parser)
+    parser.add_argument(
+        "--layouts", metavar="OUT.png", type=Path, help='after "list": draw all lenses in section on one sheet'
+    )
+    _add_rims(parser)
     parser.add_argument(
         "--breathing", metavar="OUT.png", type=Path,
         help="draw field of view, focal length and magnification against the focus distance (.png, .pdf, .svg)",
@@ -70,10 +72,6 @@ def _check_mode(args: argparse.Namespace, listing: bool) -> None:
         "FOLDER": (args.folder is not None, listing, 'after "list"'),
         "--vignetting": (args.vignetting is not None, args.derive_rims, "with --derive-rims"),
         "--breathing": (args.breathing is not None, alone, "with one lens file alone"),
-        **{
-            name: (True, not listing and not args.derive_rims, "with one lens file alone")
-            for name in given_options(args)
-        },
         "-o": (args.output is not None, args.derive_rims, "with --derive-rims"),
         "--half-field": (args.half_field is not None, args.derive_rims, "with --derive-rims"),
         "--derive-rims": (args.derive_rims, not listing, "with one lens file"),
@@ -87,16 +85,16 @@ def _check_mode(args: argparse.Namespace, listing: bool) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the data of a lens, and draw it where asked; or the table of a folder; or derived rims."""
-    listing = str(args.file) == lens_list.WORD
+    listing = str(args.file) == "list"
     _check_mode(args, listing)
     if listing:
-        return lens_list.run(args)
+        return _run_list(args)
     if args.derive_rims:
-        return lens_rims.run(args)
+        return _run_rims(args)
     for option in ("layout", "breathing"):
         if getattr(args, option) is not None:
             check_layout_path(getattr(args, option), f"--{option}")
-    from neurolens.evaluate.describe import describe_lens, file_doubts, glass_table
+    from neurolens.evaluate.describe import describe_lens, file_doubts, glass_table, layout_profile
     from neurolens.optics.lensfile import read_lens
     from neurolens.surrogates.domain import domain_of
 
@@ -131,9 +129,11 @@ def run(args: argparse.Namespace) -> int:
     }
     data["warnings"] += file_doubts(tabled)
     if args.layout is not None:
-        draw_layout(lens, domain, args.layout)
+        from neurolens.analysis.layout import lens_layout
+
+        lens_layout(layout_profile(lens, domain), args.layout)
     if args.breathing is not None:
-        from neurolens.evaluate.plots.breathing import draw_breathing
+        from neurolens.evaluate.figures import draw_breathing
 
         found = draw_breathing(lens, args.breathing)
         data["breathing"] = {name: [asdict(b) for b in breaths] for name, breaths in found.items()}
@@ -157,9 +157,224 @@ def check_layout_path(path: Path, option: str = "--layout") -> None:
         raise InputError(path, option, str(path.parent), "a folder that exists")
 
 
-def draw_layout(lens: Lens, domain: Domain, path: Path) -> None:
-    """Draw the section of a lens with rays."""
-    from neurolens.evaluate.layout import layout_profile
-    from neurolens.evaluate.plots import lens_layout
+def lens_text(data: dict[str, Any]) -> str:
+    """The data of `neurolens lens` as a page of text."""
+    parts = [_head(data), _first_order(data), _light(data), _surfaces(data)]
+    if data["configurations"]:
+        zoom = [f"{c['name']} ({number(c['efl_mm'])} mm)" for c in data["configurations"] if not _near(c)]
+        near = [f"{c['name']} ({number(c['object_distance_mm'])} mm)" for c in data["configurations"] if _near(c)]
+        parts += [f"Zoom states (--zoom, also mm between them): {', '.join(zoom)}"] if zoom else []
+        parts += [f"Focus states (--zoom, or --focusing internal): {', '.join(near)} to the object"] if near else []
+    if data["derived"]:
+        parts.append(f"Derived: {data['derived']}")
+    parts += [f"Warning: {text}" for text in data["warnings"]]
+    if data["layout"]:
+        parts.append(f"Layout drawn in {data['layout']}")
+    if data["breathing_plot"]:
+        parts.append(f"Focus breathing drawn in {data['breathing_plot']}")
+    return "\n\n".join(parts)
 
-    lens_layout(layout_profile(lens, domain), path)
+
+def _near(configuration: dict[str, Any]) -> bool:
+    return configuration["object_distance_mm"] is not None
+
+
+def _head(data: dict[str, Any]) -> str:
+    by = f", {data['designer']}" if data["designer"] else ""
+    return f"{data['name']}{by}\n{data['source']}"
+
+
+def _first_order(data: dict[str, Any]) -> str:
+    focus = "infinity" if math.isinf(data["focus_m"]) else f"{data['focus_m']:g} m"
+
+    def mm(key: str) -> str:
+        return f"{number(data[key], 6)} mm"
+
+    rows = [
+        ("focal length", mm("efl_mm"), "" if data["efl_x_mm"] is None else "in the y-z plane, as all that follows"),
+        *(() if data["efl_x_mm"] is None else (("", mm("efl_x_mm"), "in the x-z plane"),)),
+        ("back focus", mm("back_focus_mm"), "last vertex to rear focal point"),
+        ("f-number", f"f/{number(data['f_number'])}", "focal length over entrance pupil"),
+        ("working f-number", f"f/{number(data['working_f_number'])}", "of the real marginal ray at this focus"),
+        ("principal planes", f"{mm('front_principal_z_mm')}, {mm('rear_principal_z_mm')}", "front H, rear H'"),
+        ("entrance pupil", mm("entrance_pupil_z_mm"), f"diameter {mm('entrance_pupil_diameter_mm')}"),
+        ("exit pupil", mm("exit_pupil_z_mm"), f"diameter {mm('exit_pupil_diameter_mm')}"),
+        ("film plane", mm("film_z_mm"), f"focus at {focus}"),
+        ("stop", f"surface {data['stop_surface']}", f"diameter {mm('stop_diameter_mm')}"),
+        ("refractions", str(data["refractions"]), ""),
+    ]
+    return _columns(rows)
+
+
+def _light(data: dict[str, Any]) -> str:
+    reached, stated = data["half_field_reached_deg"], data["half_field_deg"]
+    anamorphic = data["efl_x_mm"] is not None
+    along, states = " along y" if anamorphic else "", "" if stated is None else f"; the file states {stated:g}"
+    rows = [
+        ("image radius", f"{number(data['image_radius_mm'])} mm", f"from {data['image_radius_from']}"),
+        ("half field", _degrees(reached), f"reached at the edge of the film{along}{states}"),
+        *((("", _degrees(data["half_field_reached_x_deg"]), "along x"),) if anamorphic else ()),
+        (
+            "rays that pass",
+            f"{100 * data['passing_share']:.1f}%",
+            "of rays uniform over the film and over the disc of all passing rays, 5% wider",
+        ),
+        *(("", f"{100 * e['share']:.1f}%", e["text"]) for e in data["ended"]),
+    ]
+    return _columns(rows)
+
+
+def _degrees(angle: float | None) -> str:
+    return "-" if angle is None else f"{angle:.2f} degrees"
+
+
+def _columns(rows: list[tuple[str, str, str]]) -> str:
+    wide = max(len(value) for _, value, _ in rows)
+    return "\n".join(f"{name:18}{value:{wide}}  {note}".rstrip() for name, value, note in rows)
+
+
+def _surfaces(data: dict[str, Any]) -> str:
+    header = ["surface", "radius mm", "thickness mm", "diameter mm", "n_d", "V_d", "", ""]
+    rows = []
+    for s in data["surfaces"]:
+        radius = "plane" if math.isinf(s["radius_mm"]) else f"{s['radius_mm']:.4f}"
+        glass = ("", "") if s["n_d"] == 1 else (f"{s['n_d']:.4f}", "-" if s["V_d"] is None else f"{s['V_d']:.2f}")
+        name = "stop" if s["stop"] else s["glass"] or s["material"] or ""
+        size = f"{s['thickness_mm']:.4f}", f"{s['diameter_mm']:.4f}"
+        rows.append([str(s["surface"]), radius, *size, *glass, name, surface_words(s)])
+    if not any(row[-1] for row in rows):
+        header, rows = header[:-1], [row[:-1] for row in rows]
+    return table(header, rows)
+
+
+def surface_words(row: dict[str, Any]) -> str:
+    """What a row of `evaluate.describe.glass_table` has beside radius and glass, in a few words; empty of a sphere."""
+    powers = sorted(map(int, row["asphere"]))
+    span = "" if not powers else f"asphere {powers[0]}" + (f"-{powers[-1]}" if len(powers) > 1 else "")
+    words = [
+        span,
+        f"K {row['conic']:.4g}" if row["conic"] else "",
+        f"cylinder {row['cylinder']}" if row["cylinder"] else "",
+        f"coating {row['coating']['name']}" if row["coating"] else "",
+        f"absorbs {row['absorption_per_mm']:.3g}/mm" if row["absorption_per_mm"] else "",
+    ]
+    return ", ".join(word for word in words if word)
+
+
+HEADER = ("lens", "name", "EFL mm", "f/", "half field", "refr.", "asph.", "cyl.", "states", "rims", "verdict")
+
+
+def _run_list(args: argparse.Namespace) -> int:
+    """Print the table; draw the sheet where asked."""
+    from neurolens.evaluate.describe import lens_files, library, project_root, sections
+
+    if args.layouts is not None and not args.layouts.parent.is_dir():
+        raise InputError(args.layouts, "--layouts", str(args.layouts.parent), "a folder that exists")
+    files = lens_files(args.folder or project_root() / "lenses")
+    rows = library(files)
+    if args.layouts is not None:
+        from neurolens.evaluate.figures import sheet
+
+        sheet(sections([Path(r["file"]) for r in rows if "name" in r]), args.layouts)
+    if args.json:
+        print_json({"lenses": rows, "layouts": None if args.layouts is None else str(args.layouts)})
+    else:
+        print(_list_text(rows))
+        if args.layouts is not None:
+            print(f"\nSections drawn in {args.layouts}")
+    return 0
+
+
+def _list_text(rows: list[dict[str, Any]]) -> str:
+    """The table, and below it every doubt."""
+    text = table(HEADER, [_cells(row) for row in rows], left=2)
+    doubtful = [row for row in rows if row["doubts"]]
+    found = f"\n\n{len(rows)} lenses, {len(doubtful)} of them doubtful"
+    lines = [f"  {row['lens']}: {doubt}" for row in doubtful for doubt in row["doubts"]]
+    return text + found + (":\n" + "\n".join(lines) if lines else "")
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    if "name" not in row:
+        return [row["lens"], *["-"] * 9, row["verdict"]]
+    efl = number(row["efl_mm"]) + ("" if row["efl_x_mm"] is None else f" / {number(row['efl_x_mm'], 3)}")
+    field = "-" if row["half_field_deg"] is None else f"{row['half_field_deg']:.4g}°"
+    counts = [str(row[key] or "-") for key in ("refractions", "aspheres", "cylinders", "states")]
+    return [row["lens"], row["name"], efl, number(row["f_number"], 3), field, *counts, row["rims"], row["verdict"]]
+
+
+def _add_rims(parser: argparse.ArgumentParser) -> None:
+    """Add --derive-rims and what goes with it."""
+    rims = parser.add_argument_group("rims")
+    rims.add_argument(
+        "--derive-rims", action="store_true",
+        help="compute the diameters from the f-number and the field, and print them beside those of the file",
+    )  # fmt: skip
+    rims.add_argument(
+        "--vignetting", metavar="SHARE", type=between(0.01, 1, "a share"),
+        help="share of the pupil's height that is kept at the edge of the field (default: 0.5)",
+    )  # fmt: skip
+    rims.add_argument(
+        "--half-field", metavar="DEG", type=between(0.01, 179, "an angle in degrees"),
+        help="edge of the field, in degrees from the axis (default: as the file states)",
+    )  # fmt: skip
+    rims.add_argument("-o", "--output", metavar="OUT.toml", type=Path, help="write the lens with its derived rims")
+
+
+def _run_rims(args: argparse.Namespace) -> int:
+    """Print the table of rims; write the lens with derived rims only where -o asks for it."""
+    from neurolens.evaluate.describe import read_quietly
+    from neurolens.optics.lenswriter import write_lens
+    from neurolens.optics.rims import RimRule, derive_rims, half_field_deg
+
+    if args.output is not None and not args.output.parent.is_dir():
+        raise InputError(args.output, "-o", str(args.output.parent), "a folder that exists")
+    lens = read_quietly(args.file)
+    rule = RimRule(vignetting=0.5 if args.vignetting is None else args.vignetting, half_field_deg=args.half_field)
+    derived, rims = derive_rims(lens, rule)
+    field = args.half_field or half_field_deg(lens)
+    if args.output is not None:
+        write_lens(replace(derived, notes=_notes(derived, rule, field)), args.output)
+    data = {
+        "file": str(args.file),
+        "f_number": lens.f_number,
+        "vignetting": rule.vignetting,
+        "clear_edge": rule.clear_edge,
+        "half_field_deg": field,
+        "rims": [vars(rim) for rim in rims],
+        "output": None if args.output is None else str(args.output),
+    }
+    if args.json:
+        print_json(data)
+    else:
+        print(_rims_text(lens, data, rims))
+    return 0
+
+
+def _notes(lens: Lens, rule: RimRule, field: float) -> str:
+    """The lens's notes and how its rims came about."""
+    said = (
+        f"Rims are derived by neurolens lens --derive-rims: the stop from the f-number, the whole axial beam, "
+        f"{100 * rule.vignetting:g}% of the pupil's height kept at {field:.4g} degrees, "
+        f"a clear edge of {100 * rule.clear_edge:g}%."
+    )
+    return f"{lens.notes} {said}".strip()
+
+
+def _rims_text(lens: Lens, data: dict[str, Any], rims: list[Rim]) -> str:
+    rows = []
+    for rim in rims:
+        note = (
+            "stop" if lens.surfaces[rim.surface].stop else "trimmed: a neighbour is in the way" if rim.trimmed else ""
+        )
+        share = f"{100 * (rim.derived_mm / rim.tabled_mm - 1):+.1f}%"
+        cells = (f"{v:.3f}" for v in (rim.tabled_mm, rim.axis_mm, rim.field_mm, rim.derived_mm))
+        rows.append((str(rim.surface), *cells, share, note))
+    head = (
+        f"{lens.name}\nRims for f/{lens.f_number:g} and {data['half_field_deg']:.4g} degrees half field, where "
+        f"{100 * data['vignetting']:g}% of the pupil's height is kept; diameters in mm; "
+        f"those of the file are marked as {lens.rims}."
+    )
+    header = ("surface", "in the file", "axial beam", "field", "derived", "change", "")
+    tail = f"\n\nWritten to {data['output']}" if data["output"] else "\n\nNothing is written without -o OUT.toml"
+    return head + "\n\n" + table(header, rows) + tail

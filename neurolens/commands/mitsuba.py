@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.cameras.build import make_camera
     from neurolens.mitsuba import load_scene, render
     from neurolens.mitsuba.library import libraries
-    from neurolens.render.exr import write_exr, write_png
+    from neurolens.render.pictures import write_exr, write_png
 
     scene = load_scene(args.scene, args.variant)
     width, height = (int(v) for v in scene.sensors()[0].film().size())

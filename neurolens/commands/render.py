@@ -24,12 +24,12 @@ from neurolens.commands.render_files import (
     write_pictures,
 )
 from neurolens.evaluate.records import plain
-from neurolens.render.filmsettings import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS, FilmSettings
+from neurolens.render.film import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS, FilmSettings
 
 if TYPE_CHECKING:
-    from neurolens.apertures import Aperture
     from neurolens.cameras.build import Shot
     from neurolens.cameras.contract import Camera
+    from neurolens.optics.apertures import Aperture
     from neurolens.render.renderer import RenderResult
     from neurolens.render.scene import CameraSettings
 
@@ -155,8 +155,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.render.film import PixelGrid
     from neurolens.render.illuminants import check_name
     from neurolens.render.renderer import render
-    from neurolens.render.scenechecks import files_named
-    from neurolens.render.scenefile import load_scene
+    from neurolens.render.scene import files_named, load_scene
 
     scene = load_scene(args.scene)
     files.spare(args.scene.parent / name for name in files_named(scene.settings))
@@ -172,10 +171,7 @@ def run(args: argparse.Namespace) -> int:
     camera = make_camera(args.camera, shot_of(settings, args, scene.aperture))
     for note in camera.settings.get("notes", ()):
         warn(note)
-    with (
-        Stopping() as stopping,
-        Progress(quiet=args.quiet).stage(f"render {scene.name}, {camera.name}") as report,
-    ):
+    with Stopping() as stopping, Progress(quiet=args.quiet).stage(f"render {scene.name}, {camera.name}") as report:
         result = render(
             scene, camera, width=width, height=height, samples=args.samples, seed=args.seed,
             threads=args.threads, max_depth=args.max_depth, film=film, progress=report,

@@ -20,9 +20,8 @@ from neurolens.commands.arguments import positive
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
-    from neurolens.render.filmsettings import FilmSettings
-    from neurolens.render.renderer import RenderResult
-    from neurolens.render.watch import Watch
+    from neurolens.render.film import FilmSettings
+    from neurolens.render.renderer import RenderResult, Watch
 
 _AT_ONCE_S = 1.0
 
@@ -137,8 +136,8 @@ def warn(text: str) -> None:
 
 def watch_of(args: argparse.Namespace, files: Files, stop: Callable[[], bool]) -> Watch:
     """What the command line asks for beside the render."""
-    from neurolens.render.exr import write_png
-    from neurolens.render.watch import Watch
+    from neurolens.render.pictures import write_png
+    from neurolens.render.renderer import Watch
 
     return Watch(
         preview=partial(write_png, files.preview, exposure=args.exposure),
@@ -160,8 +159,8 @@ def write_pictures(
         NeurolensError: they cannot be written; it says what there is to go on from.
     """
     from neurolens.render.colour import COLOUR_SPACES
-    from neurolens.render.develop import MEANING
-    from neurolens.render.exr import write_exr, write_png
+    from neurolens.render.job import MEANING
+    from neurolens.render.pictures import write_exr, write_png
 
     space = COLOUR_SPACES[film.colour_space]
     told = metadata | {"render": plain(result.stats)}

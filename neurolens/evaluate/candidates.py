@@ -2,23 +2,37 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from threading import get_ident
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 
+from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.evaluate.rays import frame_width_mm
 from neurolens.evaluate.speed import Call, Candidate, Unavailable
+from neurolens.graph import compiler
+from neurolens.graph.c import Signature, write_c
+from neurolens.graph.compiler import FLAGS, compile_c
+from neurolens.graph.program import Program
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import Traced, trace
+from neurolens.surrogates.assemble import ALL, Parts
 from neurolens.surrogates.domain import Domain, FilmRays
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.source import FREE, Fixed, fused_program
+from neurolens.surrogates.stored import load_fitted
 
 EAGER_BATCHES = (8192, 16384, 32768)
 COMPILED_BATCHES = (16384,)  # each further size would compile anew, for half a minute
@@ -115,3 +129,132 @@ def model_candidate(name: str, model: Any, stop_radius_mm: float) -> Candidate:
         return lambda: model.rays(film, pupil, columns[5], film_z_mm, stop_radius_mm)
 
     return Candidate(name, prepare)
+
+
+_NAME = "lens"
+
+
+def find_compiler() -> str:
+    """A C compiler: $CC, else cc, gcc or clang.
+
+    Raises:
+        Unavailable: none is there.
+    """
+    try:
+        return compiler.find_compiler()
+    except InputError as error:
+        raise Unavailable("no C compiler (looked for $CC, cc, gcc, clang)") from error
+
+
+class CompiledSource:
+    """A program as a shared library in a temporary folder of its own.
+
+    Raises:
+        Unavailable: there is no compiler, or it fails; the message says how.
+    """
+
+    def __init__(self, program: Program, flags: tuple[str, ...] = FLAGS) -> None:
+        self.signature = Signature.of(program, _NAME)
+        self._folder = tempfile.TemporaryDirectory(prefix="neurolens-source-")
+        folder = Path(self._folder.name)
+        library = folder / "lens.so"
+        text = write_c(program, _NAME, ["A model on the clock."]) + self._wrapper()
+        find_compiler()
+        try:
+            self.warnings = compile_c(text, library, flags)
+        except InputError as error:
+            raise Unavailable(str(error)) from error
+        self._run = ctypes.CDLL(str(library)).neurolens_run
+        self._run.argtypes, self._run.restype = [ctypes.c_size_t, ctypes.c_void_p], None
+
+    def _wrapper(self) -> str:
+        """All arguments as one array of pointers: ctypes takes long over each argument."""
+        s = self.signature
+        kinds = ["(const float *)a[{}]"] * len(s.per_ray) + ["*(const float *)a[{}]"] * len(s.per_call)
+        kinds += ["*(const int *)a[{}]"] * (s.bands > 1) + ["(float *)a[{}]"] * len(s.outputs) + ["(int *)a[{}]"]
+        given = ", ".join(kind.format(i) for i, kind in enumerate(kinds))
+        return f"void neurolens_run(size_t n, void **a) {{ {_NAME}_rays(n, {given}); }}\n"
+
+    def outputs(self, count: int) -> dict[str, NDArray[Any]]:
+        """Arrays for the results of so many rays."""
+        found: dict[str, NDArray[Any]] = {name: np.empty(count, np.float32) for name in self.signature.outputs}
+        return {**found, "status": np.empty(count, np.int32)}
+
+    def prepared(self, inputs: Mapping[str, ArrayLike], out: Mapping[str, NDArray[Any]], band: int = 0) -> Call:
+        """A call that computes rays into `out`; inputs by name, arrays [N] or numbers, others are passed over."""
+        s = self.signature
+        count = len(out["status"])
+        arrays = [np.ascontiguousarray(inputs[name], np.float32) for name in (*s.per_ray, *s.per_call)]
+        if any(a.shape != (count,) for a in arrays[: len(s.per_ray)]):
+            raise ValueError("inputs and outputs of one length expected")
+        arrays += [np.array([band], np.int32)] if s.bands > 1 else []
+        arrays += [*(out[name] for name in s.outputs), out["status"]]
+        pointers = (ctypes.c_void_p * len(arrays))(*(a.ctypes.data for a in arrays))
+        run, size = self._run, ctypes.c_size_t(count)
+
+        def call(kept: Any = arrays) -> None:
+            run(size, pointers)
+
+        return call
+
+    def rays(self, inputs: Mapping[str, ArrayLike], band: int = 0) -> dict[str, NDArray[Any]]:
+        """Results of rays, by name, status among them."""
+        out = self.outputs(len(np.asarray(inputs[self.signature.per_ray[0]])))
+        self.prepared(inputs, out, band)()
+        return out
+
+
+# Inputs and results of a batch lie in the second-level cache.
+FUSED_BATCHES = (2048, 4096, 8192, 16384)
+
+
+def program_candidate(name: str, program: Program, domain: Domain, stop_radius_mm: float | None = None) -> Candidate:
+    """A program of `surrogates.fused`, compiled when the race prepares it.
+
+    Args:
+        stop_radius_mm: None takes the domain's.
+    """
+    compiled: list[CompiledSource] = []
+    room: dict[tuple[int, int], dict[str, NDArray[Any]]] = {}
+
+    def prepare(rays: FilmRays) -> Call:
+        if not compiled:
+            compiled.append(CompiledSource(program))
+        source = compiled[0]
+        names = ("film_x_mm", "film_y_mm", "film_z_mm", "pupil_x_mm", "pupil_y_mm", "wavelength_nm")
+        columns: dict[str, Any] = {n: c.numpy().astype(np.float32) for n, c in zip(names, rays.columns(), strict=False)}
+        columns["film_z_mm"] = columns["film_z_mm"][0]
+        columns["stop_radius_mm"] = np.float32(domain.stop_radius_mm if stop_radius_mm is None else stop_radius_mm)
+        count = len(rays)
+        calls: dict[int, Call] = {}
+
+        def call() -> None:
+            # A thread writes where it wrote before, as tracers and onnxruntime do with the memory that they get back.
+            thread = get_ident()
+            if thread not in calls:
+                if (thread, count) not in room:
+                    room[thread, count] = source.outputs(count)
+                calls[thread] = source.prepared(columns, room[thread, count])
+            calls[thread]()
+
+        return call
+
+    return Candidate(name, prepare, FUSED_BATCHES)
+
+
+def fused_candidate(
+    name: str, model: LensModel | Sequence[LensModel] | Path, domain: Domain, *, parts: Parts = ALL, fixed: Fixed = FREE
+) -> Candidate | None:
+    """A model, or that of an exported file, as compiled C; None where there is no compiler, or no form in C.
+
+    Args:
+        model: one, or one for each fixed wavelength (of which the first is timed).
+    """
+    try:
+        find_compiler()
+        found = load_fitted(model) if isinstance(model, Path) else model
+        models = [found] if isinstance(found, LensModel) else found
+        program = fused_program(models, parts, fixed)
+    except (Unavailable, ModelError, TypeError):
+        return None
+    return program_candidate(name, program, domain, fixed.stop_radius_mm)

@@ -1,18 +1,24 @@
-"""A lens in figures: first-order data, film, field and how much light gets through, with units in the keys."""
+"""A lens in figures, a folder of lenses as a table, and their sections, with units in the keys."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+import warnings
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
 
+from neurolens.analysis import layout
+from neurolens.analysis.fields import Scene
+from neurolens.analysis.layout import refractions
 from neurolens.base import status as st
-from neurolens.evaluate.layout import refractions
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.optics.focusing import at_infinity
 from neurolens.optics.glass import glass_of, table_notes
-from neurolens.optics.internal import at_infinity
-from neurolens.optics.lenscheck import check_lens, doubts
+from neurolens.optics.lenscheck import check_lens, doubts, film_edge_mm, verdict
+from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, image_radius_mm
@@ -177,3 +183,119 @@ def warnings_of(lens: Lens, f_number: float, reached_deg: float | None, far: boo
     if far and lens.half_field_deg is not None and reached_deg is not None and reached_deg < lens.half_field_deg - 2:
         found.append(f"the edge of the film sees {reached_deg:.1f} degrees, the source says {lens.half_field_deg:.1f}")
     return found
+
+
+def layout_profile(lens: Lens, domain: Domain) -> dict[str, Any]:
+    """Section of a lens with meridional fans of rays to the axis, 70% and the edge of the domain's film, d line.
+
+    Args:
+        lens: placed by `Lens.at`; where it is not, the film is that of the domain's farthest focus.
+
+    Returns: as `analysis.layout.layout_profile`.
+    """
+    if lens.film_z_mm is None:
+        lens = replace(lens, film_z_mm=float(domain.film_z_mm[0]))
+    return layout.layout_profile(Scene(lens, domain.focus_m[0]), domain.film_radius_mm)
+
+
+UNREADABLE = "unreadable"
+_NO_FIELD = 0.2  # film radius over focal length at which a lens of unknown field is drawn
+
+
+def lens_files(folder: Path) -> list[Path]:
+    """The lens files of a folder, by name.
+
+    Raises:
+        InputError: no such folder, a file, or none in it.
+    """
+    if folder.is_file():
+        raise InputError(folder, "lens folder", "(a file)", 'a folder of lens files; leave out "list" for one lens')
+    if not folder.is_dir():
+        raise InputError(folder, "lens folder", "(missing)", "a folder of lens files (*.toml)")
+    files = sorted(folder.glob("*.toml"))
+    if not files:
+        raise InputError(folder, "lens folder", "(no *.toml)", "a folder of lens files")
+    return files
+
+
+def read_quietly(path: Path) -> Lens:
+    """A lens without the warnings of reading it, which its check repeats."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NeurolensWarning)
+        return read_lens(path)
+
+
+def library(files: list[Path]) -> list[dict[str, Any]]:
+    """One row a lens file.
+
+    Returns: lens, file, name, efl_mm and efl_x_mm computed (the latter of an anamorphic lens only), stated_efl_mm,
+        f_number of the stop, half_field_deg as stated, image_radius_mm as stated, refractions, aspheres, cylinders,
+        states (zoom or focus), rims, verdict ("ok", "doubtful", or "unreadable" with the error as its doubt), doubts,
+        and checks: a list of {state, quantity, computed, stated, doubt}.
+    """
+    return [_row(path) for path in files]
+
+
+def _row(path: Path) -> dict[str, Any]:
+    try:
+        lens = read_quietly(path)
+        checks = check_lens(lens)
+    except NeurolensError as error:
+        return {"lens": path.stem, "file": str(path), "verdict": UNREADABLE, "doubts": [str(error)]}
+    data = first_order(lens)
+    cylinders = sum(s.cylinder is not None for s in lens.surfaces)
+    return {
+        "lens": path.stem,
+        "file": str(path),
+        "name": lens.name,
+        "efl_mm": float(data.efl_mm),
+        "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if cylinders else None,
+        "stated_efl_mm": lens.stated_efl_mm,
+        "f_number": float(data.f_number),
+        "half_field_deg": lens.half_field_deg,
+        "image_radius_mm": lens.image_radius_mm,
+        "refractions": refractions(lens),
+        "aspheres": sum(s.conic != 0 or bool(s.asphere) for s in lens.surfaces),
+        "cylinders": cylinders,
+        "states": len(lens.configurations),
+        "rims": lens.rims,
+        "verdict": verdict(checks),
+        "doubts": doubts(checks),
+        "checks": [asdict(c) for c in checks],
+    }
+
+
+def sections(files: list[Path]) -> list[dict[str, Any]]:
+    """The sections of lenses with rays, focused at infinity, as `figures.sheet` draws them.
+
+    An anamorphic lens is shown in its y-z plane.
+    """
+    found = []
+    for path in files:
+        lens = read_quietly(path).at()
+        data = first_order(lens)
+        edge = film_edge_mm(lens)
+        if edge is None:
+            edge = _NO_FIELD * abs(data.efl_mm) if lens.half_field_deg is None else image_radius_mm(lens)[0]
+        profile = layout.layout_profile(Scene(lens, math.inf, "y"), edge)
+        found.append({**profile, "title": path.stem, "subtitle": _caption(lens, data.efl_mm, data.f_number)})
+    return found
+
+
+def _caption(lens: Lens, efl_mm: float, f_number: float) -> str:
+    text = f"{efl_mm:.4g} mm f/{f_number:.2g}"
+    if lens.anamorphic:
+        text = f"{efl_mm:.3g} / {first_order(lens, meridian='x').efl_mm:.3g} mm f/{f_number:.2g}"
+    return text + ("" if lens.half_field_deg is None else f", {lens.half_field_deg:.3g}°") + f", rims {lens.rims}"
+
+
+def project_root() -> Path:
+    """The project's folder: that of the source, or else, for a package installed away from it, the working folder.
+
+    Raises:
+        InputError: neither has the folder experiments/.
+    """
+    for root in (Path(__file__).parents[2], Path.cwd()):
+        if (root / "experiments").is_dir():
+            return root
+    raise InputError(Path.cwd(), "experiments/", "(missing)", "the project's folder as the working folder")

@@ -224,10 +224,7 @@ class Experiment:
         return StateSpace(
             lens,
             axes_of(
-                lens,
-                zoom=chosen.zoom is not None,
-                internal=chosen.focusing == "internal",
-                state=chosen.configuration,
+                lens, zoom=chosen.zoom is not None, internal=chosen.focusing == "internal", state=chosen.configuration
             ),
             zoom=chosen.configuration,
             f_number=chosen.f_number,

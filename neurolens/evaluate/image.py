@@ -79,13 +79,6 @@ def to_srgb(linear: ArrayLike, exposure: float = 1.0) -> Image:
     return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
 
 
-def rel_squared_error_map(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DEFAULT) -> Image:
-    """(a - b)^2 / (b^2 + eps) for each pixel, mean over the channels, [H, W]; a the test, b the reference picture."""
-    a, b = _checked_pair(test, reference)
-    ratio: Image = ((a - b) ** 2 / (b**2 + settings.eps)).mean(axis=2)
-    return ratio
-
-
 def rel_mse(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DEFAULT) -> float:
     """Relative mean squared error on linear radiance: mean over pixels and channels of (a - b)^2 / (b^2 + eps).
 
@@ -97,7 +90,8 @@ def rel_mse(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DEF
     Raises:
         InputError: shapes that differ or are not [H, W, 3]; values that are not finite.
     """
-    errors = np.sort(rel_squared_error_map(test, reference, settings), axis=None)
+    a, b = _checked_pair(test, reference)
+    errors = np.sort(((a - b) ** 2 / (b**2 + settings.eps)).mean(axis=2), axis=None)
     kept = max(1, errors.size - int(settings.trim * errors.size))
     return float(errors[:kept].mean())
 
@@ -145,21 +139,6 @@ def seed_pairs(count: int) -> list[tuple[int, int]]:
     return [(i, (i + 1) % count) for i in range(count)]
 
 
-def noise_floor(exact_renders: Sequence[ArrayLike], settings: ImageSettings = DEFAULT) -> dict[str, Any]:
-    """How much exact renders of different seeds differ from each other, mean over the pairs of `seed_pairs`.
-
-    Args:
-        exact_renders: at least four [H, W, 3] linear renders, equal but for their seeds.
-    Returns:
-        noise_floor_flip, noise_floor_rel_mse, pairs.
-    Raises:
-        InputError: too few renders, or pictures that do not fit each other.
-    """
-    pairs = seed_pairs(len(exact_renders))
-    flips, errors = _over_pairs(exact_renders, exact_renders, pairs, settings)
-    return {"noise_floor_flip": _mean(flips), "noise_floor_rel_mse": _mean(errors), "pairs": len(pairs)}
-
-
 def compare(
     renders: Sequence[ArrayLike], exact_renders: Sequence[ArrayLike], settings: ImageSettings = DEFAULT
 ) -> dict[str, Any]:
@@ -201,14 +180,6 @@ def compare(
         "pixels_per_degree": settings.pixels_per_degree,
         "eps": settings.eps,
         "trim": settings.trim,
-    }
-
-
-def error_maps(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DEFAULT) -> dict[str, Image]:
-    """Both errors for each pixel, [H, W]: `flip` in [0, 1], `rel_squared_error` without unit."""
-    return {
-        "flip": flip_map(test, reference, settings),
-        "rel_squared_error": rel_squared_error_map(test, reference, settings),
     }
 
 

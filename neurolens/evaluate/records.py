@@ -52,7 +52,7 @@ class ModelRecord(TypedDict, total=False):
     false_pass_near_rim: float | None  # within 2% of a rim; false_block_near_rim likewise
     false_block_near_rim: float | None
     stopped_down: dict[str, dict[str, float | None]]  # "2_stops", "4_stops" closed, same fit: false_pass, false_block
-    zones: dict[str, dict[str, dict[str, Any]]]  # "full", "2_stops" by zone of the film; see `fresh.Findings`
+    zones: dict[str, dict[str, dict[str, Any]]]  # "full", "2_stops" by zone of the film; see `measure.Findings`
     poor: list[str]  # what of these errors shows in a picture
     coefficients_per_vector: int | None  # A and B terms both count; a raw basis: all scalars of the vector
     parameters: int | None  # of the whole model: coefficients or weights, rims included
@@ -178,23 +178,6 @@ def write_results(path: str | Path, results: Mapping[str, Any]) -> None:
     check_results(results, path)
     versioned = {"schema_version": SCHEMA_VERSION, **plain(results)}
     atomic_write_text(path, json.dumps(versioned, indent=1, allow_nan=False) + "\n")
-
-
-def kept_rows(path: Path, listed: str, named: str, maker: str) -> dict[str, dict[str, Any]]:
-    """Rows of an earlier run of a benchmark, by name; none where there is no such file.
-
-    Args:
-        listed, named: keys of the list of rows, and of a row's name. maker: the command that writes the file.
-
-    Raises:
-        InputError: a file that holds something else.
-    """
-    if not path.is_file():
-        return {}
-    try:
-        return {str(row[named]): dict(row) for row in json.loads(path.read_text(encoding="utf-8"))[listed]}
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(path, "file", f"({type(error).__name__})", f"records of {maker}") from error
 
 
 def plain(value: Any) -> Any:

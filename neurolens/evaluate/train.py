@@ -13,26 +13,26 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from neurolens.analysis.layout import lens_layout
 from neurolens.base.config import to_dict, to_toml
 from neurolens.base.errors import NeurolensWarning
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
+from neurolens.evaluate.describe import layout_profile, refractions
 from neurolens.evaluate.experiment import Experiment, keep_lens, relative_to
-from neurolens.evaluate.fresh import MORE
-from neurolens.evaluate.gain import domain_facts, scene_gain
+from neurolens.evaluate.figures import illumination_plot
 from neurolens.evaluate.image import DEFAULT
-from neurolens.evaluate.layout import layout_profile, refractions
-from neurolens.evaluate.light import illumination
-from neurolens.evaluate.measure import Measured, fit_and_measure, shared_rays, what_is_poor
-from neurolens.evaluate.pictures import Pictures, render_all
-from neurolens.evaluate.plots import error_against_coefficients_plot, illumination_plot, lens_layout, pareto_plot
+from neurolens.evaluate.measure import FRESH, MORE, Measured, fit_and_measure, onnx_predictor, shared_rays, what_is_poor
+from neurolens.evaluate.plots import error_against_coefficients_plot, pareto_plot
 from neurolens.evaluate.rays import pixel_um, pupil_disc_share
 from neurolens.evaluate.records import break_even_rays, write_results
 from neurolens.evaluate.report import write_report
+from neurolens.evaluate.scenes import Pictures, domain_facts, render_all, scene_gain
 from neurolens.evaluate.speed import Race, race
 from neurolens.evaluate.train_states import run_states
+from neurolens.evaluate.vignetting import relative_illumination
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain
@@ -41,6 +41,7 @@ from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs
 from neurolens.surrogates.threads import pinned_threads
 
 _IDEAL = ("thin lens", "pinhole")
+_LIT_RAYS = 4096  # a film radius: a quarter of a second a model
 _PACKAGES = ("neurolens", "torch", "numpy", "onnxruntime", "onnx", "OpenEXR")
 
 
@@ -87,7 +88,7 @@ def run_experiment(
         timed = _race(experiment, prepared, measured, progress)
         with progress.stage("illumination"):
             shown = [m for m in measured if m.settings.label in _shown(experiment, measured)]
-            light = illumination(shown, lens, domain, pairs.settings.seed)
+            light = _illumination(shown, lens, domain, pairs.settings.seed)
         gain = scene_gain(experiment, folder / "models", progress)
         drawn = _render(experiment, lens, domain, measured, pictures, progress)
     results = {
@@ -97,7 +98,11 @@ def run_experiment(
         "domain": _describe_domain(lens, pairs),
         "settings": to_dict(resolved),
         "models": [m.record for m in measured],
-        "exact": [timed.record(name) for name in ("exact eager", "exact compiled") if _ran(timed, name)],
+        "exact": [
+            timed.record(name)
+            for name in ("exact eager", "exact compiled")
+            if name in timed.ns or name in timed.unavailable
+        ],
         "cameras": [{"name": n, "ns_per_ray": timed.timing(n)} for n in _IDEAL] + drawn.cameras,
         "images": drawn.images,
         "image_settings": asdict(DEFAULT) if drawn.images else None,
@@ -156,10 +161,6 @@ def _race(experiment: Experiment, prepared: Prepared, measured: Sequence[Measure
     return timed
 
 
-def _ran(timed: Race, name: str) -> bool:
-    return name in timed.ns or name in timed.unavailable
-
-
 def _render(
     experiment: Experiment, lens: Lens, domain: Domain, measured: Sequence[Measured], folder: Path, progress: Progress
 ) -> Pictures:
@@ -169,6 +170,21 @@ def _render(
     files = {m.settings.label: m.file for m in measured if m.settings.label in names}
     with progress.stage("render") as report:
         return render_all(experiment.render, lens, domain, files, folder, report)
+
+
+def _illumination(measured: Sequence[Measured], lens: Lens, domain: Domain, seed: int) -> dict[str, Any]:
+    """Curves at full aperture for `illumination_plot`: film_radius_mm, exact, models (name to list).
+
+    Args:
+        seed: of the rays of the fit, so that these are others.
+    """
+    light: dict[str, Any] = {"film_radius_mm": [], "exact": [], "models": {}}
+    for m in measured:
+        predict = onnx_predictor(load_model(m.file))
+        curves = relative_illumination(lens, domain, predict, points=_LIT_RAYS, seed=seed + FRESH)
+        light["film_radius_mm"], light["exact"] = curves["film_radius_mm"], curves["exact"]
+        light["models"][m.settings.label] = curves["model"]
+    return light
 
 
 def _shown(experiment: Experiment, measured: Sequence[Measured]) -> tuple[str, ...]:
@@ -182,20 +198,14 @@ def best_models(measured: Sequence[Measured]) -> tuple[str, ...]:
     for networks in (False, True):
         rows = [m for m in measured if (m.settings.method in NETWORKS) == networks and m.settings.family != "paraxial"]
         if rows:
-            names.append(min(rows, key=_error).settings.label)
+            names.append(min(rows, key=lambda m: m.error).settings.label)
     return tuple(names)
-
-
-def _error(m: Measured) -> float:
-    """Film-equivalent error, or the angle where no ray is within 60 degrees."""
-    value = m.record.get("rms_um")
-    return float(value if value is not None else m.record.get("direction_rms_deg") or 1e9)
 
 
 def _draw(
     lens: Lens, domain: Domain, measured: Sequence[Measured], timed: Race, light: dict[str, Any], folder: Path
 ) -> list[dict[str, Any]]:
-    """Plots of the trade, the lens and its light; `light` as of `light.illumination`."""
+    """Plots of the trade, the lens and its light; `light` as of `_illumination`."""
     records = [m.record for m in measured]
     exact = [timed.record(n) for n in ("exact eager", "exact compiled") if n in timed.ns]
     error = "rms_um" if any(r.get("rms_um") for r in records) else "direction_rms_deg"

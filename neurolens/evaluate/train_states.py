@@ -13,18 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from neurolens import __version__
+from neurolens.analysis.plot_style import FIELD_COLOURS, INK, new_figure, plain_log_ticks, save, style
 from neurolens.base.config import to_dict, to_toml
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import model_candidate
+from neurolens.evaluate.check import card_errors, errors_at, random_states
 from neurolens.evaluate.experiment import Experiment, keep_lens, relative_to
 from neurolens.evaluate.measure import known_record, note_record
-from neurolens.evaluate.plots.states import states_plot
 from neurolens.evaluate.records import plain
 from neurolens.evaluate.speed import race
-from neurolens.evaluate.state_errors import card_errors, errors_at, random_states
+from neurolens.modelfile.axes import Axis
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.export import export_states
 from neurolens.surrogates.fit import ModelSettings
@@ -151,7 +152,7 @@ def _time(file: Path, name: str) -> Any:
 
 def _page(results: Mapping[str, Any]) -> str:
     """A page with the table of states and the plot."""
-    from neurolens.evaluate import markup
+    from neurolens.evaluate import report as markup
 
     keys = ("rms_um", "p99_um", "direction_rms_deg", "false_pass", "false_block")
     names = [a["name"] for a in results["axes"]]
@@ -184,3 +185,64 @@ def _fingerprint(space: StateSpace, settings: StateSettings, states: int) -> str
         states,
     ]
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+
+
+AXIS_LABELS = {"zoom": "focal length (mm)", "focus": "1 / distance in focus (1/m)"}
+
+
+def states_plot(
+    models: Mapping[str, Sequence[Mapping[str, Any]]],
+    axis: Axis,
+    path: str | Path,
+    *,
+    title: str = "One model of many states",
+) -> Path:
+    """Film-equivalent RMS over the first state axis, and false passes and blocks below it.
+
+    Args:
+        models: name to rows as of `check.errors_at`.
+        axis: the first axis.
+        path: PNG, PDF or SVG to write.
+    """
+    with style():
+        figure = new_figure(7.2, 5.6)
+        top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        for number, (name, rows) in enumerate(models.items()):
+            colour = FIELD_COLOURS[number % len(FIELD_COLOURS)]
+            error_line(top, axis, rows, colour, name)
+            for key, mark in (("false_pass", "^"), ("false_block", "v")):
+                x, share = [r[axis.name] for r in rows], [100 * (r[key] or 0.0) for r in rows]
+                bottom.plot(x, share, mark, ms=4, color=colour, alpha=0.8, label=f"{name}: {key.replace('_', ' ')}")
+        error_axes(top, axis, [r["rms_um"] for rows in models.values() for r in rows])
+        top.set_title(title, loc="left", fontweight="bold")
+        top.set_ylabel("film-equivalent RMS (um)")
+        top.legend(loc="best", fontsize="small")
+        bottom.set_ylabel("share of rays (%)")
+        bottom.set_ylim(0, max(0.02, *bottom.get_ylim()))
+        bottom.set_xlabel(AXIS_LABELS.get(axis.name, f"{axis.name} ({axis.unit})"))
+        bottom.grid(True)
+        bottom.legend(loc="best", fontsize="small")
+        return save(figure, path)
+
+
+def error_line(axes: Any, axis: Axis, rows: Sequence[Mapping[str, Any]], colour: str, label: str) -> None:
+    """Film-equivalent RMS of rows over a state axis; a line where no other axis varies."""
+    ordered = sorted(rows, key=lambda r: r[axis.name])
+    several = any(set(r) & set(AXIS_LABELS) - {axis.name} for r in rows)  # another axis varies too: no line
+    y = [r["rms_um"] or float("nan") for r in ordered]
+    axes.plot([r[axis.name] for r in ordered], y, "o" if several else "o-", ms=4, color=colour, label=label)
+
+
+def error_axes(axes: Any, axis: Axis, errors: Sequence[float | None]) -> None:
+    """Logarithmic axes of errors over a state axis, its nodes marked."""
+    for knot in axis.knots:
+        axes.axvline(knot, color=INK, lw=0.5, ls=":")
+    if axis.name == "zoom":
+        axes.set_xscale("log")
+        plain_log_ticks(axes.xaxis)
+    axes.set_yscale("log")
+    plain_log_ticks(axes.yaxis)
+    known = [e for e in errors if e]
+    if known:  # at least a decade, so that noise does not look like a trend
+        axes.set_ylim(min(known) / 2, max(10 * min(known), 2 * max(known)))
+    axes.grid(True)

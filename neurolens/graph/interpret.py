@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.graph.ir import Exponents, Graph, Node, live_rows
+from neurolens.graph.ir import Exponents, Graph, Node
+from neurolens.graph.passes import live_rows
 
 # torch tensors or numpy arrays, [R, N]; values of the call are [R, 1].
 Rows = Any

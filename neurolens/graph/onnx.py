@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from onnx import ModelProto, NodeProto, TensorProto, checker, helper, numpy_helper
 
 from neurolens.base.errors import InputError
-from neurolens.graph.ir import Graph, Node, pruned, same_structure
+from neurolens.graph.ir import Graph, Node
+from neurolens.graph.monomials import Exponent, Pair, plan_products
+from neurolens.graph.passes import pruned, same_structure
 
 Array = NDArray[np.float64]
 # Opset 17 and IR 8 are read by every onnxruntime since 1.12.
@@ -88,10 +89,14 @@ class _Linear:
 
 @dataclass(frozen=True)
 class _Longer:
-    """A value with further rows below its own."""
+    """A value of more rows: before its own row `at`, sums of pairs of its rows stand."""
 
     name: str
-    rows: int  # with those
+    at: int
+    sums: int
+
+    def place(self, row: int) -> int:
+        return row if row < self.at else row + self.sums
 
 
 class _Writer:
@@ -107,7 +112,7 @@ class _Writer:
         self._constants: dict[tuple[bytes, str, tuple[int, ...]], str] = {}
         self._moved: dict[tuple[bytes, tuple[int, ...]], tuple[str, Array, tuple[int, ...]]] = {}
         self._cuts: dict[int, dict[tuple[int, ...], str]] = {}
-        self._squares: dict[int, tuple[str, list[tuple[int, int]]]] = {}
+        self._squares: dict[int, tuple[str, dict[tuple[int, int], int]]] = {}  # rows of squares, of x_i and x_i + x_j
 
     def body(self, shapes: Mapping[str, Sequence[int]]) -> list[NodeProto]:
         """All nodes, and with them the constants and results."""
@@ -240,20 +245,22 @@ def _take(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
 
 def _take_rows(w: _Writer, source: int, rows: Sequence[int]) -> str:
     """Rows, by one cut for all that take consecutive rows of the same value, where these do not overlap."""
-    value = w.known[source]
-    name = value.name if isinstance(value, _Longer) else w.name(source)
+    value, nodes = w.known[source], w.graphs[0].nodes
+    longer = value if isinstance(value, _Longer) else _Longer(w.name(source), nodes[source].rows, 0)
+    name, total, place = longer.name, nodes[source].rows + longer.sums, longer.place
     if source not in w._cuts:
-        nodes = w.graphs[0].nodes
-        end, total = 0, value.rows if isinstance(value, _Longer) else nodes[source].rows
+        end = 0
         cuts: list[tuple[int, ...]] = []
-        for run in sorted({n.static for n in nodes if n.kind == "take" and n.inputs[0] == source}):
+        takes = {n.static for n in nodes if n.kind == "take" and n.inputs[0] == source}
+        for run in sorted(tuple(place(r) for r in take) for take in takes):
             if run[0] >= end and run == tuple(range(run[0], run[-1] + 1)):
                 cuts += [tuple(range(end, run[0])), run]
                 end = run[-1] + 1
         cuts = [c for c in (*cuts, tuple(range(end, total))) if c]
         w._cuts[source] = dict(zip(cuts, w.split(name, [len(c) for c in cuts]), strict=True))
-    found = w._cuts[source].get(tuple(rows))
-    return found or w.op("Gather", name, w.const(list(rows), np.int64), axis=0)
+    wanted = [place(r) for r in rows]
+    found = w._cuts[source].get(tuple(wanted))
+    return found or w.op("Gather", name, w.const(wanted, np.int64), axis=0)
 
 
 def _concat(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
@@ -265,6 +272,8 @@ def _concat(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
         if of_rays and nodes[k].per_call:  # repeated for every ray
             zeros = w.const(np.zeros((nodes[k].rows, nodes[of_rays[0]].rows)))
             name = w.op("Add", w.op("MatMul", zeros, w.name(of_rays[0])), name)
+        elif nodes[k].per_call and nodes[k].rows == 1:  # [1], to stand in a column
+            name = w.op("Reshape", name, w.const([1, 1], np.int64))
         names.append(name)
     return w.concat(names)
 
@@ -276,7 +285,11 @@ def _affine(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str | _
     if moving:
         # Sums of rows that a quadratic wants are further rows of the same product.
         sums = _mixed_pairs(w.graphs[0], number)
-        base, change = (np.concatenate([m, *(m[:, [i]] + m[:, [j]] for i, j in sums)], 1) for m in (weight, arrays[2]))
+        at = 1 + max((max(pair) for pair in sums), default=0)
+        base, change = (
+            np.concatenate([m[:, :at], *(m[:, [i]] + m[:, [j]] for i, j in sums), m[:, at:]], 1)
+            for m in (weight, arrays[2])
+        )
         column = w.graphs[0].nodes[node.inputs[0]].kind == "constant"
         if column:  # times the weight before the state or the call is known
             columns = np.stack([g.nodes[node.inputs[0]].arrays[0] for g in w.graphs])[:, :, None]
@@ -289,8 +302,9 @@ def _affine(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str | _
         whole = w.op("MatMul", matrix, w.name(node.inputs[0]))
         if not sums:
             return whole
-        w._squares[number] = (w.op("Mul", whole, whole), sums)
-        return _Longer(whole, node.rows + len(sums))
+        longer = _Longer(whole, at, len(sums))
+        w._squares[number] = (w.op("Mul", whole, whole), _places(longer, node.rows, sums))
+        return longer
     if isinstance(source, _Linear):
         bias = bias + np.einsum("trk,tk->tr", weight, source.bias)
         weight, value = weight @ source.weight, source.value
@@ -318,17 +332,22 @@ def _quadratic(w: _Writer, number: int, node: Node, arrays: list[Array]) -> _Lin
         if sums:
             left, right = (_take_rows(w, source, [p[k] for p in sums]) for k in (0, 1))
             name = w.concat([name, w.op("Add", left, right)])
-        w._squares[source] = (w.op("Mul", name, name), sums)
-    squares, sums = w._squares[source]
-    matrix = np.zeros((node.rows, rows + len(sums)))
+        w._squares[source] = (w.op("Mul", name, name), _places(_Longer(name, rows, len(sums)), rows, sums))
+    squares, place = w._squares[source]
+    matrix = np.zeros((node.rows, len(place)))
     for r, form in enumerate(node.static):
         for i, j in form:
             if i == j:
-                matrix[r, i] += 1
+                matrix[r, place[i, i]] += 1
             else:
-                matrix[r, rows + sums.index((i, j))] += 0.5
-                matrix[r, [i, j]] -= 0.5
+                matrix[r, place[i, j]] += 0.5
+                matrix[r, [place[i, i], place[j, j]]] -= 0.5
     return _Linear(squares, np.repeat(matrix[None], len(w.graphs), 0), arrays[0])
+
+
+def _places(longer: _Longer, rows: int, sums: Sequence[tuple[int, int]]) -> dict[tuple[int, int], int]:
+    """Where the squares of rows (i, i) and of sums of two rows (i, j) stand."""
+    return {(i, i): longer.place(i) for i in range(rows)} | {pair: longer.at + k for k, pair in enumerate(sums)}
 
 
 def _polynomial(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
@@ -438,8 +457,6 @@ _RULES: dict[str, Callable[[_Writer, int, Node, list[Array]], str | _Linear | _L
 }
 
 
-Exponent = tuple[int, ...]
-Pair = tuple[Exponent, Exponent]
 Block = tuple[str, list[Exponent]]
 
 
@@ -473,35 +490,3 @@ def _products(w: _Writer, blocks: list[Block], pairs: dict[Exponent, Pair]) -> B
         name, known = next(block for block in blocks if wanted[0] in block[1])
         factors.append(w.op("Gather", name, w.const([known.index(e) for e in wanted], np.int64), axis=0))
     return w.op("Mul", *factors), list(pairs)
-
-
-def _level(e: Exponent) -> int:
-    """0 for a variable, 1 for degree 2, 2 for 3 to 4, 3 for 5 to 8 ..."""
-    return (sum(e) - 1).bit_length()
-
-
-def plan_products(exponents: list[Exponent], variables: int) -> dict[int, dict[Exponent, Pair]]:
-    """How to build every monomial as a product of two of lower levels: {level: {monomial: (left, right)}}.
-
-    Factors that are wanted anyway come first, then small right factors; what is still missing is added. Greedy.
-    """
-    wanted = {e for e in exponents if sum(e) > 1}
-    parents: dict[Exponent, Pair] = {}
-    # From the highest degree down, so that an added factor is still ahead in the loop.
-    queue = sorted(wanted, key=lambda e: (sum(e), e))
-    while queue:
-        e = queue.pop()
-        options = []
-        for right in product(*(range(k + 1) for k in e)):
-            left = tuple(x - y for x, y in zip(e, right, strict=True))
-            if 0 < sum(right) <= sum(left) and _level(left) < _level(e):
-                missing = sum(sum(part) > 1 and part not in wanted for part in {left, right})
-                options.append((missing, _level(right), sum(right), left, right))
-        *_, left, right = min(options)
-        parents[e] = (left, right)
-        for part in (left, right):
-            if sum(part) > 1 and part not in wanted:
-                wanted.add(part)
-                queue = sorted([*queue, part], key=lambda e: (sum(e), e))
-    levels = sorted({_level(e) for e in parents})
-    return {n: {e: pair for e, pair in parents.items() if _level(e) == n} for n in levels}

@@ -7,19 +7,21 @@ tables. Polynomials take few products; sums of products are fused multiply-adds,
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.graph.ir import Exponents, Graph, Node, pruned, same_structure
+from neurolens.graph.ir import Exponents, Graph, Node
+from neurolens.graph.monomials import plan_monomials
+from neurolens.graph.passes import pruned, same_structure
 from neurolens.graph.program import Expr, Program, row_names
 
 Array = NDArray[np.float64]
 # Pairs (a, b) of a truth: it holds where a <= b in all of them.
 Tests = list[tuple[Expr, Expr]]
+_ROWS = 8  # of a matrix product at a time, of 16 registers; fewer would wait for one another
 
 
 def lower(graphs: Graph | Sequence[Graph], fixed: Mapping[str, ArrayLike] | None = None) -> Program:
@@ -101,17 +103,20 @@ def _input(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Arra
 
 
 def _affine(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
-    p, x, found = at.program, given[0], []
+    """By groups of rows whose sums fit the registers; each of the columns is spent on every row of a group at once."""
+    p, x = at.program, given[0]
     moving, added = node.static
-    for r in range(node.rows):
-        total = p.literal(arrays[1][r])
-        columns = range(len(x) - 1, -1, -1) if moving else range(len(x))
+    found = [p.literal(bias) for bias in arrays[1]]
+    if added:
+        found = [total + row for total, row in zip(found, given[-1], strict=True)]
+    columns = range(len(x) - 1, -1, -1) if moving else range(len(x))
+    for rows in np.array_split(np.arange(node.rows), max(1, round(node.rows / _ROWS))):
         for c in columns:
-            weight = p.literal(arrays[0][r, c])
-            if moving and arrays[2][r, c].any():
-                weight = p.fma(given[1][0], p.literal(arrays[2][r, c]), weight)
-            total = p.fma(x[c], weight, total)
-        found.append(total + given[-1][r] if added else total)
+            for r in rows:
+                weight = p.literal(arrays[0][r, c])
+                if moving and arrays[2][r, c].any():
+                    weight = p.fma(given[1][0], p.literal(arrays[2][r, c]), weight)
+                found[r] = p.fma(x[c], weight, found[r])
     return found
 
 
@@ -190,54 +195,3 @@ _RULES: dict[str, Callable[[_Lowering, Node, list[Any], list[Array]], list[Any]]
     "between": _between,
     "first_failure": _first_failure,
 }
-
-
-Exponent = tuple[int, ...]
-Made = tuple[Exponent, tuple[Exponent, Exponent] | None]  # a monomial and the two that it is the product of
-
-
-def plan_monomials(wanted: Sequence[Exponent], variables: int) -> list[Made]:
-    """An order in which every monomial is a variable (None) or the product of two before it.
-
-    Factors that exist anyway are taken first; where none do, the one that adds least. Depth first: what a monomial is
-    made of was made just before.
-    """
-    units = [tuple(int(i == v) for i in range(variables)) for v in range(variables)]
-    factors: dict[Exponent, tuple[Exponent, Exponent]] = {}
-    known = {*units, *wanted}
-
-    def resolve(e: Exponent) -> None:
-        if sum(e) == 1 or e in factors:
-            return
-        options = []
-        for right in product(*(range(k + 1) for k in e)):
-            left = tuple(a - b for a, b in zip(e, right, strict=True))
-            if 0 < sum(right) <= sum(left):
-                options.append((sum(f not in known for f in {left, right}), sum(right), left, right))
-        _, _, left, right = min(options)
-        known.update((left, right))
-        factors[e] = (left, right)
-        resolve(left)
-        resolve(right)
-
-    for e in sorted(wanted, key=lambda e: (sum(e), e), reverse=True):
-        resolve(e)
-    return _depth_first([*units, *sorted(factors, key=lambda e: (sum(e), e))], factors, set(wanted))
-
-
-def _depth_first(
-    nodes: list[Exponent], factors: dict[Exponent, tuple[Exponent, Exponent]], wanted: set[Exponent]
-) -> list[Made]:
-    """Nodes after their factors; each is followed by those that it was the last factor of."""
-    waiting: dict[Exponent, set[Exponent]] = {e: set(pair) for e, pair in factors.items()}
-    order: list[Made] = []
-    stack = [e for e in reversed(nodes) if e not in factors]
-    while stack:
-        e = stack.pop()
-        order.append((e, factors.get(e)))
-        for child in sorted((c for c, missing in waiting.items() if e in missing), reverse=True):
-            waiting[child].discard(e)
-            if not waiting[child]:
-                del waiting[child]
-                stack.append(child)
-    return [(e, pair) for e, pair in order if pair is not None or e in wanted]

@@ -15,7 +15,7 @@ Mitsuba itself is imported by the functions, not with this package.
 """
 
 from neurolens.mitsuba.library import require_mitsuba
-from neurolens.mitsuba.rendering import camera, load_scene, render
+from neurolens.mitsuba.scenes import camera, load_scene, render
 from neurolens.mitsuba.sensor import register
 
 __all__ = ["camera", "load_scene", "register", "render", "require_mitsuba"]

@@ -1,4 +1,4 @@
-"""The one place that imports Mitsuba and Dr.Jit, and says what is missing where it cannot."""
+"""The one place that imports Mitsuba and Dr.Jit; their numbers to numpy and back, in scalar and compiled variants."""
 
 from __future__ import annotations
 
@@ -6,7 +6,11 @@ import importlib
 from functools import cache
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from neurolens.base.errors import InputError, NeurolensError
+from neurolens.cameras.contract import FloatArray
 
 DEFAULT_VARIANT = "llvm_ad_spectral"
 
@@ -54,3 +58,26 @@ def _compile(variant: str) -> None:
     """One small kernel: a missing LLVM shows only when the first is made."""
     mi, dr = libraries()
     dr.eval(mi.Float(dr.arange(mi.UInt32, 2)) + 1)
+
+
+def rows(*values: Any) -> FloatArray:
+    """Numbers of the current variant, one wide or N, as [len(values), N] float32; evaluates them."""
+    arrays = [np.atleast_1d(np.asarray(value, np.float32)) for value in values]
+    return np.stack(np.broadcast_arrays(*arrays))
+
+
+def number(values: FloatArray) -> Any:
+    """Numbers [N] as the variant's Float; in scalar variants N is 1."""
+    mi, dr = libraries()
+
+    return mi.Float(np.ascontiguousarray(values)) if dr.is_jit_v(mi.Float) else float(values[0])
+
+
+def vector(kind: Any, values: FloatArray) -> Any:
+    """Numbers [D, N] as a vector, point, colour or spectrum `kind` of D parts."""
+    return kind(*(number(row) for row in values))
+
+
+def matrix(transform: Any) -> NDArray[np.float64]:
+    """A transform of any variant as float64 [4, 4]."""
+    return np.array(transform.matrix, np.float64).reshape(4, 4, -1)[..., 0]

@@ -1,8 +1,21 @@
 """The Mitsuba sensor "neurolens": any camera of our contract, one numpy call a wavefront.
 
+Mitsuba's camera looks along +z with y up and x to the left of the picture, ours along -z with x to the right: half a
+turn about y. The origin is the centre of the film plane, as in our scenes.
+
 In spectral variants a ray carries four wavelengths. Where the camera's rays hardly depend on the wavelength they are
 Mitsuba's own four, each with its weight (hero wavelengths, Wilkie et al. 2014); a lens that disperses gives all four
-lanes the same wavelength, for one ray is of one. See `wavelengths` for how that is drawn, and for RGB variants.
+lanes the same wavelength, for one ray is of one.
+
+A path of an RGB renderer carries three numbers, not a wavelength; a lens that disperses needs one. Each ray takes a
+wavelength, drawn by the film's response, and its channel c is weighted by
+
+    w_c(lambda) = response_c(lambda) B_c(lambda) / pdf(lambda),
+
+the diagonal of what our film makes of light of the basis spectra B (Mallett and Yuksel 2019; `SpectralRange`), without
+its few negative values (Mitsuba's scalar variants drop samples below 0) and scaled to a mean of 1: white stays white,
+and any colour stays itself where the rays do not depend on the wavelength. The terms off the diagonal have mean 0; an
+RGB renderer has no place for them, and colour fringes of saturated objects differ by them from a spectral render.
 
 Weights are ours: a uniform environment of radiance 1 gives 1 on the axis, and falls off towards the edge as the lens
 vignettes. Scalar variants ask for one ray at a time, which takes a model about a millisecond: for tests.
@@ -11,21 +24,116 @@ vignettes. Scalar variants ask for one ray at a time, which takes a model about 
 from __future__ import annotations
 
 import math
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
-from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.mitsuba.arrays import matrix, number, rows, vector
-from neurolens.mitsuba.library import libraries, require_mitsuba
-from neurolens.mitsuba.rays import FilmRays, LocalRays
-from neurolens.mitsuba.wavelengths import ChannelWavelengths, wavelength_samples
-from neurolens.render.film import PixelGrid
-from neurolens.render.filmsettings import FilmSettings
-from neurolens.render.masks import make_aperture
+from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
+from neurolens.mitsuba.library import libraries, matrix, number, require_mitsuba, rows, vector
+from neurolens.render.film import FilmSettings, PixelGrid
+from neurolens.render.pictures import make_aperture
+from neurolens.render.sampler import hash32
+from neurolens.render.spectrum import SpectralRange
 from neurolens.render.wavelengths import mode_for
+
+BATCH = RAYS_A_CALL  # of the camera
+_TURNED = np.array([[-1], [1], [-1]], np.float32)  # half a turn about y
+
+
+class LocalRays(NamedTuple):
+    """Rays in Mitsuba's camera frame: origin [3, N] in scene units, unit direction [3, N], weight [N], 0 if blocked."""
+
+    origin: FloatArray
+    direction: FloatArray
+    weight: FloatArray
+
+
+@dataclass(frozen=True)
+class FilmRays:
+    """Rays of a camera for samples of a Mitsuba film.
+
+    Attributes:
+        camera: of our contract. grid: the whole film, turned as our pictures are.
+        crop_offset, crop_size: the part that samples in [0, 1)^2 cover, as shares of the film (x, y).
+        units_per_m: scene units in a metre.
+    """
+
+    camera: Camera
+    grid: PixelGrid
+    crop_offset: tuple[float, float] = (0.0, 0.0)
+    crop_size: tuple[float, float] = (1.0, 1.0)
+    units_per_m: float = 1.0
+
+    def sample(self, position: FloatArray, aperture: FloatArray, wavelength_nm: FloatArray) -> LocalRays:
+        """Rays for film positions [2, N] and aperture samples [2, N] in [0, 1), and wavelengths [N] in nm.
+
+        Wavelengths beyond what the camera was made for become its last ones: Mitsuba draws from 360 to 830 nm, and the
+        eye sees a few thousandths of white light outside 400 to 700.
+        """
+        count = position.shape[1]
+        origin, direction = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
+        weight = np.empty(count, np.float32)
+        accepted = self.camera.wavelength_nm
+        if accepted is not None:
+            wavelength_nm = np.clip(wavelength_nm, *accepted)
+        for start in range(0, count, BATCH):
+            part = slice(start, start + BATCH)
+            film = self._film_points(position[:, part])
+            pupil = np.ascontiguousarray(aperture[:, part], np.float32)
+            rays = self.camera.sample(film, pupil, np.ascontiguousarray(wavelength_nm[part], np.float32))
+            passed = rays.status == 0
+            weight[part] = np.where(passed, rays.weight, np.float32(0))
+            # What did not pass still needs a ray that a scene can be asked about.
+            direction[:, part] = np.where(passed, rays.direction * _TURNED, [[0], [0], [1]])
+            origin[:, part] = np.where(passed, rays.origin_m * _TURNED, np.float32(0))
+        origin *= np.float32(self.units_per_m)
+        return LocalRays(origin, direction, weight)
+
+    def _film_points(self, position: FloatArray) -> FloatArray:
+        """Film points [2, N] in mm."""
+        size = np.array([self.grid.width, self.grid.height], np.float32)[:, None]
+        offset, part = (np.array(x, np.float32)[:, None] for x in (self.crop_offset, self.crop_size))
+        place = (position * part + offset) * size
+        return self.grid.film_points(np.zeros(position.shape[1], np.intp), place)
+
+
+class ChannelWavelengths:
+    """Draws wavelengths over a range and weighs them for R, G and B.
+
+    Args:
+        low_nm, high_nm: the range, within 380 to 780 nm. One too narrow to tell colours apart gives weights of 1.
+    """
+
+    def __init__(self, low_nm: float, high_nm: float) -> None:
+        even = np.array([low_nm, high_nm]), np.ones(2)
+        self._range = SpectralRange(low_nm, high_nm, light=even)
+        diagonal = np.maximum(self._range.response * self._range.basis, 0)
+        weights = diagonal / diagonal.mean(axis=1, keepdims=True)
+        self._weights = (weights if self._range.colours else np.ones_like(weights)).astype(np.float32)
+
+    def draw(self, sample: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Wavelengths [N] in nm and weights [3, N] for uniform samples [N] in [0, 1)."""
+        weights = self._weights.take(self._range.bin_of(sample), axis=1)
+        return self._range.wavelengths_nm(sample), weights
+
+
+def wavelength_samples(position: FloatArray, aperture: FloatArray) -> FloatArray:
+    """Uniform numbers [N] in [0, 1) for the wavelengths of a wavefront, from its points [2, N] on film and aperture.
+
+    Steps of the golden ratio from a start that the first points decide: a pixel's samples follow each other in a
+    wavefront, and so many in a row are spread almost evenly, which saves most of the colour noise. RGB variants of
+    Mitsuba draw no such number at all.
+    """
+    first = np.ascontiguousarray(np.concatenate([position[:, :1], aperture[:, :1]]), np.float32)
+    start = np.zeros(1, np.uint32)
+    for value in first.view(np.uint32):
+        start = hash32(start + value)
+    steps = np.arange(position.shape[1], dtype=np.uint32) * np.uint32(0x9E3779B9) + start
+    return (steps >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)
+
 
 PLUGIN = "neurolens"
 LIGHT_NM = (400.0, 700.0)  # which sets the exposure, and the wavelengths of RGB variants; as our scenes have it

@@ -7,11 +7,15 @@
 
 Where to look:
 
-    prescription     Lens (`at`, `scaled`, `with_filter`, `with_hood`, `pinhole`), Surface, Coating, Configuration
-    lensfile, lenswriter                 TOML files
-    trace            trace, compile_trace, Rays; `sequence` follows ghosts, `differentials` the derivatives of rays
-    paraxial         first_order; `bestfocus`, `breathing`, `zoom`, `internal` what a photographer changes
-    glass, catalogue                     dispersion and absorption; `coatings`, `thinfilm`, `polarisation` the films
-    pupils, pupil_methods, radiometry    where light passes, and how much reaches the film
-    lenscheck, rims, clearance           whether a table can be trusted and built
+    prescription          Lens (`at`, `scaled`, `with_filter`, `with_hood`, `pinhole`), Surface, Coating, Configuration
+    lensfile, lenswriter  TOML files
+    trace                 trace, compile_trace, Rays, ray differentials; `sequence` follows ghosts
+    surfaces, shapes      spheres and planes, conics and aspheres; `passing` one surface with its tests
+    paraxial              first_order; `states`, `focusing`, `accessories` what a photographer changes
+    catalogue, glass      dispersion and absorption; `coatings`, `transmission` thin films and polarisation
+    pupils, radiometry    where light passes, and how much reaches the film; `pupil_methods` those of the literature
+    lenscheck, rims       whether a table agrees with its source, and rims for one without; `aiming` rays to its stop
+
+Cameras use three modules that load without torch: `sag` (depth, ends and clearance of surfaces), `film_plane` (focus)
+and `apertures` (shapes of the stop).
 """

@@ -10,8 +10,8 @@ import math
 from dataclasses import replace
 
 from neurolens.base.errors import InputError
-from neurolens.optics.clearance import check_clearance, surface_sag_mm
 from neurolens.optics.prescription import Configuration, Lens, Surface
+from neurolens.optics.sag import check_clearance, sag_mm
 
 BK7_N_D, BK7_V_D = 1.5168, 64.17
 _WIDEST_DEG = 75.0  # a plate that shall not vignette a wider half field would be four times as wide as it is far
@@ -70,7 +70,7 @@ def with_filter(
     beside = lens.surfaces[-1 if rear else 0]
     if diameter_mm is None:
         field = 45.0 if rear else min(lens.half_field_deg or 45.0, _WIDEST_DEG)
-        sag = surface_sag_mm(beside, beside.semi_diameter_mm, 0.0)  # the rim may lie further away than the vertex
+        sag = sag_mm(beside, beside.semi_diameter_mm, 0.0)  # the rim may lie further away than the vertex
         reach = gap_mm + thickness_mm + max(-sag if rear else sag, 0.0)
         diameter_mm = beside.diameter_mm + 2 * reach * math.tan(math.radians(field))
     _require(lens.path, diameter_mm=diameter_mm)

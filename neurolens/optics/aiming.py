@@ -15,9 +15,9 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neurolens.optics.clearance import surface_sag_mm
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens
+from neurolens.optics.sag import sag_mm
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
@@ -110,7 +110,7 @@ def _follow(
     """From the stop to the scene: the rays turned round, [n * G], their field angle and existence [n, G]."""
     stop, z = front.surfaces[-1], float(front.vertices_mm[-2])
     h, a = height.reshape(-1), angle.reshape(-1)
-    known = {float(v): surface_sag_mm(stop, float(v), 0.0) if axis == "x" else surface_sag_mm(stop, 0.0, float(v))
+    known = {float(v): sag_mm(stop, float(v), 0.0) if axis == "x" else sag_mm(stop, 0.0, float(v))
              for v in torch.unique(h)}  # fmt: skip
     sag = torch.tensor([known[float(v)] for v in h[:: angle.shape[1]]], dtype=torch.float64)
     # The ray starts a millimetre before the stop's surface, so that this too is met and refracts where it is glass.

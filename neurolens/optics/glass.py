@@ -11,7 +11,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics import catalogue
-from neurolens.optics.dispersion import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
+from neurolens.optics.catalogue import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
 from neurolens.optics.prescription import Surface
 
 __all__ = [

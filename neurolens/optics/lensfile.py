@@ -51,29 +51,99 @@ The format, complete; keys marked optional may be left out:
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neurolens.apertures import Aperture
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.tomlfile import read_toml, reject_unknown
-from neurolens.optics.clearance import check_clearance
-from neurolens.optics.lensfields import half_field, number, text
-from neurolens.optics.lensrows import read_surfaces, unused_coatings
-from neurolens.optics.prescription import Configuration, Lens
+from neurolens.optics import catalogue, coatings
+from neurolens.optics.apertures import Aperture
+from neurolens.optics.glass import check_against_table
+from neurolens.optics.prescription import Coating, Configuration, Lens, Surface
+from neurolens.optics.sag import check_clearance
 
 SCHEMA = 1
+MAX_SURFACES = 500
+MAX_LAYERS = 200
+MAX_POWER = 40
+MAX_INDEX = 4.5  # germanium, the densest lens material there is, has 4.0
+RIMS = ("source", "estimated", "derived")
 LENS_KEYS = (
     *("schema", "name", "designer", "source", "f_number", "efl_mm", "efl_x_mm", "image_radius_mm", "half_field_deg"),
     *("rims", "notes", "surfaces", "coating", "configuration", "aperture"),
 )
+SURFACE_KEYS = (
+    *("radius_mm", "thickness_mm", "diameter_mm", "n_d", "V_d", "glass", "material", "stop", "conic", "asphere"),
+    *("cylinder", "absorption_per_mm", "coating"),
+)
 CONFIGURATION_KEYS = (
     *("name", "efl_mm", "half_field_deg", "thickness_mm", "f_number", "stop_diameter_mm", "object_distance_mm"),
 )
-RIMS = ("source", "estimated", "derived")
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table of a file, read strictly: every error names the file, the place, the value and what was expected.
+
+    Attributes:
+        where: goes in front of the key in errors, with its separator: "surface 3, ".
+    """
+
+    data: Mapping[str, Any]
+    file: str
+    where: str = ""
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.data
+
+    def error(self, key: str, value: object, expected: str) -> InputError:
+        return InputError(self.file, self.where + key, value, expected)
+
+    def only(self, known: Sequence[str]) -> None:
+        """Raise for a key that is not known."""
+        reject_unknown(self.file, self.where, self.data, known)
+
+    def number(self, key: str, *, unit: str = "", above: float | None = None, finite: bool = True) -> float:
+        """A number: an integer or a float, never a bool, a text or NaN."""
+        value = self.data.get(key, "(missing)")
+        expected = "a finite number" if finite else "a number"
+        expected += (f" above {above:g}" if above is not None else "") + (f" in {unit}" if unit else "")
+        try:
+            found = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else float(value)
+        except OverflowError:
+            found = math.nan
+        if math.isnan(found) or (finite and math.isinf(found)) or (above is not None and not found > above):
+            raise self.error(key, value, expected)
+        return found
+
+    def text(self, key: str, *, required: bool = True) -> str:
+        """A text; an empty one where a text that is not required is absent."""
+        if key not in self.data and not required:
+            return ""
+        value = self.data.get(key, "(missing)")
+        if key not in self.data or not isinstance(value, str) or (required and not value.strip()):
+            raise self.error(key, value, "a text")
+        return value
+
+    def flag(self, key: str) -> bool:
+        """True or false; false where it is absent."""
+        value = self.data.get(key, False)
+        if not isinstance(value, bool):
+            raise self.error(key, value, "true or false")
+        return value
+
+    def half_field(self) -> float | None:
+        """The optional `half_field_deg`."""
+        if "half_field_deg" not in self.data:
+            return None
+        angle = self.number("half_field_deg", unit="degrees", above=0)
+        if angle >= 180:
+            raise self.error("half_field_deg", angle, "an angle from the axis, below 180 degrees")
+        return angle
 
 
 def read_lens(path: str | Path) -> Lens:
@@ -87,90 +157,205 @@ def read_lens(path: str | Path) -> Lens:
             two, surfaces that overlap inside their rims in any zoom state. It names file, surface and field.
     """
     data, file = read_toml(path), str(path)
-    reject_unknown(file, "", data, LENS_KEYS)
+    table = Table(data, file)
+    table.only(LENS_KEYS)
     if data.get("schema") != SCHEMA or isinstance(data["schema"], bool):
-        raise InputError(file, "schema", data.get("schema", "(missing)"), f"{SCHEMA}, the version of the format")
-    surfaces = read_surfaces(data, file)
+        raise table.error("schema", data.get("schema", "(missing)"), f"{SCHEMA}, the version of the format")
+    surfaces = _surfaces(table)
     if data.get("rims", "(missing)") not in RIMS:
         expected = 'where the diameters come from: "source", "estimated" or "derived"'
-        raise InputError(file, "rims", data.get("rims", "(missing)"), expected)
+        raise table.error("rims", data.get("rims", "(missing)"), expected)
+
+    def optional(key: str) -> float | None:
+        return table.number(key, above=0) if key in table else None
+
     lens = Lens(
-        name=text(data, "name", file),
-        source=text(data, "source", file),
+        name=table.text("name"),
+        source=table.text("source"),
         surfaces=surfaces,
-        f_number=number(data, "f_number", file, above=0),
-        image_radius_mm=number(data, "image_radius_mm", file, above=0) if "image_radius_mm" in data else None,
-        half_field_deg=half_field(data, file),
-        designer=text(data, "designer", file, required=False),
-        notes=text(data, "notes", file, required=False),
-        rims=text(data, "rims", file),
-        configurations=_configurations(data, len(surfaces), file),
+        f_number=table.number("f_number", above=0),
+        image_radius_mm=optional("image_radius_mm"),
+        half_field_deg=table.half_field(),
+        designer=table.text("designer", required=False),
+        notes=table.text("notes", required=False),
+        rims=table.text("rims"),
+        configurations=_configurations(table, len(surfaces)),
         path=file,
-        aperture=_aperture(data, file),
-        stated_efl_mm=number(data, "efl_mm", file, above=0) if "efl_mm" in data else None,
-        stated_efl_x_mm=number(data, "efl_x_mm", file, above=0) if "efl_x_mm" in data else None,
+        aperture=_aperture(table),
+        stated_efl_mm=optional("efl_mm"),
+        stated_efl_x_mm=optional("efl_x_mm"),
     )
     check_clearance(surfaces, file)
     for c in lens.configurations:
-        moved = dict(c.thickness_mm)
-        rows = [replace(s, thickness_mm=moved.get(k, s.thickness_mm)) for k, s in enumerate(surfaces)]
-        check_clearance(rows, file, f'configuration "{c.name}", ')
+        check_clearance(lens.with_gaps(dict(c.thickness_mm)).surfaces, file, f'configuration "{c.name}", ')
     unknown = ", ".join(str(k) for k, s in enumerate(surfaces) if s.n_d != 1 and s.V_d is None and s.glass is None)
     if unknown:
         message = f"{file}: V_d is not given after surface {unknown}: the index is taken as constant"
         warnings.warn(message, NeurolensWarning, stacklevel=2)
-    for name in unused_coatings(data):
+    used = {row.get("coating") for row in data["surfaces"]}
+    for name in (coating["name"] for coating in data.get("coating", []) if coating["name"] not in used):
         warnings.warn(f'{file}: coating "{name}": no surface has it', NeurolensWarning, stacklevel=2)
     return lens
 
 
-def _aperture(data: Mapping[str, Any], file: str) -> Aperture | None:
-    if "aperture" not in data:
-        return None
-    table, where = data["aperture"], "aperture, "
-    if not isinstance(table, Mapping):
-        raise InputError(file, "aperture", table, "a table under [aperture]")
-    reject_unknown(file, where, table, ("blades", "rotation_deg", "curvature"))
-    more: dict[str, Any] = {k: number(table, k, file, where) for k in ("rotation_deg", "curvature") if k in table}
-    try:
-        return Aperture(table.get("blades"), **more)
-    except InputError as error:
-        raise InputError(file, where + error.field, error.value, error.expected) from None
+def _surfaces(table: Table) -> tuple[Surface, ...]:
+    """All rows, checked one by one and together."""
+    rows = table.data.get("surfaces", "(missing)")
+    if not isinstance(rows, list) or not rows:
+        raise table.error("surfaces", rows, "a list of tables, one a surface")
+    if len(rows) > MAX_SURFACES:
+        raise table.error("surfaces", f"({len(rows)} of them)", f"at most {MAX_SURFACES}")
+    known = _coatings(table)
+    surfaces: list[Surface] = []
+    for k, row in enumerate(rows):
+        if not isinstance(row, Mapping):
+            expected = "a table such as { radius_mm = 50.0, thickness_mm = 5.0, diameter_mm = 20.0 }"
+            raise table.error(f"surface {k}", row, expected)
+        before = surfaces[-1].n_d if surfaces else 1.0
+        surfaces.append(_surface(Table(row, table.file, f"surface {k}, "), before, known))
+    stops = [k for k, s in enumerate(surfaces) if s.stop]
+    if len(stops) != 1:
+        found = f"(stop = true on surfaces {', '.join(map(str, stops))})" if stops else "(no stop)"
+        raise table.error("surfaces", found, "exactly one row with stop = true")
+    if surfaces[-1].n_d != 1:
+        raise table.error(f"surface {len(rows) - 1}, n_d", surfaces[-1].n_d, "air between last surface and film")
+    return tuple(surfaces)
 
 
-def _configurations(data: Mapping[str, Any], n_surfaces: int, file: str) -> tuple[Configuration, ...]:
-    tables = data.get("configuration", [])
+def _surface(row: Table, n_before: float, known: Mapping[str, Coating]) -> Surface:
+    row.only(SURFACE_KEYS)
+    radius_mm = row.number("radius_mm", unit="mm, inf for a plane", finite=False)
+    if radius_mm == 0:
+        raise row.error("radius_mm", radius_mm, "a radius that is not 0 (a plane is inf)")
+    surface = Surface(
+        stop=row.flag("stop"),
+        radius_mm=math.inf if math.isinf(radius_mm) else radius_mm,
+        thickness_mm=row.number("thickness_mm", unit="mm"),
+        diameter_mm=row.number("diameter_mm", unit="mm", above=0),
+        **_glass(row),
+        **_shape(row),
+    )
+    check_against_table(surface, row.file, row.where)
+    if "coating" not in row:
+        return surface
+    name = row.text("coating")
+    if name in known:
+        return replace(surface, coating=known[name])
+    design = coatings.design(name, n_before, surface.n_d, file=row.file, where=f"{row.where}coating")
+    return replace(surface, coating=design)
+
+
+def _glass(row: Table) -> dict[str, Any]:
+    """The medium after the surface; what a catalogue knows need not be in the file."""
+    for key in ("V_d", "material", "absorption_per_mm"):
+        if key in row and "n_d" not in row and "glass" not in row:
+            raise row.error("n_d", "(missing)", f"the index of the glass, as {key} is given")
+    medium: dict[str, Any] = {"n_d": row.number("n_d") if "n_d" in row else 1.0}
+    if not 1 <= medium["n_d"] <= MAX_INDEX:
+        raise row.error("n_d", medium["n_d"], f"a refractive index from 1 to {MAX_INDEX}")
+    if "V_d" in row:
+        medium["V_d"] = row.number("V_d", above=0)
+    if "material" in row:
+        medium["material"] = row.text("material")
+    if "absorption_per_mm" in row:
+        medium["absorption_per_mm"] = row.number("absorption_per_mm", unit="1/mm")
+        if medium["absorption_per_mm"] < 0:
+            raise row.error("absorption_per_mm", medium["absorption_per_mm"], "at least 0: no glass shines")
+    if "glass" in row:
+        medium["glass"] = row.text("glass")
+        known = catalogue.find(medium["glass"], row.file, f"{row.where}glass")
+        medium = {"V_d": known.V_d, **medium, "n_d": medium["n_d"] if "n_d" in row else known.n_d}
+    return medium
+
+
+def _shape(row: Table) -> dict[str, Any]:
+    """Conic, asphere and cylinder of a row."""
+    shape: dict[str, Any] = {"conic": row.number("conic")} if "conic" in row else {}
+    if "cylinder" in row:
+        shape["cylinder"] = row.text("cylinder")
+        if shape["cylinder"] not in ("x", "y"):
+            raise row.error("cylinder", shape["cylinder"], 'the axis along which it is curved: "x" or "y"')
+    if "asphere" not in row:
+        return shape
+    given = row.data["asphere"]
+    if not isinstance(given, Mapping) or not given:
+        raise row.error("asphere", given, "a table such as { 4 = 1e-6, 6 = 2e-9 }")
+    terms = []
+    for key in given:
+        if not (key.isascii() and key.isdecimal() and str(int(key)) == key and 2 <= int(key) <= MAX_POWER):
+            raise row.error("asphere", key, f"a power from 2 to {MAX_POWER}")
+        if isinstance(given[key], Mapping) and len(given[key]) == 1:  # TOML takes 4.5 for a key in a key
+            power = f"{key}.{next(iter(given[key]))}"
+            raise row.error("asphere", power, f"a whole power from 2 to {MAX_POWER}")
+        terms.append((int(key), Table(given, row.file, f"{row.where}asphere, power ").number(key)))
+    return {**shape, "asphere": tuple(sorted(terms))}
+
+
+def _coatings(table: Table) -> dict[str, Coating]:
+    """The coatings that the file itself defines, by name."""
+    found: dict[str, Coating] = {}
+    for place, given in enumerate(_tables(table, "coating")):
+        one = Table(given, table.file, f"coating {place}, ")
+        one.only(("name", "layers"))
+        name, rows = one.text("name"), given.get("layers", "(missing)")
+        if name in found:
+            raise one.error("name", name, "a name that no other coating has")
+        if not isinstance(rows, list) or not 0 < len(rows) <= MAX_LAYERS:
+            raise one.error("layers", rows, f"1 to {MAX_LAYERS} layers such as [1.38, 99.6]")
+        layers = []
+        for n, row in enumerate(rows):
+            if not isinstance(row, list) or len(row) != 2:
+                raise one.error("layers", row, "[refractive index, thickness in nm]")
+            film = Table({"index": row[0], "thickness_nm": row[1]}, table.file, f"{one.where}layer {n}, ")
+            layers.append((film.number("index", above=0), film.number("thickness_nm", above=0)))
+        found[name] = Coating(name, tuple(layers))
+    return found
+
+
+def _tables(table: Table, key: str) -> list[Mapping[str, Any]]:
+    """The tables under [[key]]."""
+    tables = table.data.get(key, [])
     if not isinstance(tables, list) or not all(isinstance(t, Mapping) for t in tables):
-        raise InputError(file, "configuration", tables, "tables under [[configuration]]")
+        raise table.error(key, tables, f"tables under [[{key}]]")
+    return tables
+
+
+def _aperture(table: Table) -> Aperture | None:
+    if "aperture" not in table:
+        return None
+    if not isinstance(table.data["aperture"], Mapping):
+        raise table.error("aperture", table.data["aperture"], "a table under [aperture]")
+    blades = Table(table.data["aperture"], table.file, "aperture, ")
+    blades.only(("blades", "rotation_deg", "curvature"))
+    more: dict[str, Any] = {k: blades.number(k) for k in ("rotation_deg", "curvature") if k in blades}
+    try:
+        return Aperture(blades.data.get("blades"), **more)
+    except InputError as error:
+        raise blades.error(error.field, error.value, error.expected) from None
+
+
+def _configurations(lens: Table, n_surfaces: int) -> tuple[Configuration, ...]:
     result: list[Configuration] = []
-    for place, table in enumerate(tables):
-        where = f"configuration {place}, "
-        reject_unknown(file, where, table, CONFIGURATION_KEYS)
-        name = text(table, "name", file, where)
+    for place, given in enumerate(_tables(lens, "configuration")):
+        table = Table(given, lens.file, f"configuration {place}, ")
+        table.only(CONFIGURATION_KEYS)
+        name = table.text("name")
         if name in [c.name for c in result]:
-            raise InputError(file, f"{where}name", name, "a name that no other configuration has")
-        where = f'configuration "{name}", '
-        moved = table.get("thickness_mm", "(missing)")
+            raise table.error("name", name, "a name that no other configuration has")
+        table = replace(table, where=f'configuration "{name}", ')
+        moved = given.get("thickness_mm", "(missing)")
         if not isinstance(moved, Mapping):
-            raise InputError(file, f"{where}thickness_mm", moved, "a table such as { 5 = 26.15 }, by surface number")
+            raise table.error("thickness_mm", moved, "a table such as { 5 = 26.15 }, by surface number")
         thickness = []
         for key in moved:
             if not (key.isascii() and key.isdecimal() and str(int(key)) == key and int(key) < n_surfaces):
-                raise InputError(file, f"{where}thickness_mm", key, f"a surface number from 0 to {n_surfaces - 1}")
-            thickness.append((int(key), number(moved, key, file, f"{where}thickness_mm, surface ", unit="mm")))
-        given = {
-            key: number(table, key, file, where, above=0)
-            for key in ("efl_mm", "f_number", "stop_diameter_mm", "object_distance_mm")
-            if key in table
-        }
-        if not given.keys() & {"efl_mm", "object_distance_mm"}:
-            raise InputError(file, f"{where}efl_mm", "(missing)", "the focal length of a zoom state")
-        result.append(
-            Configuration(
-                name,
-                thickness_mm=tuple(thickness),
-                half_field_deg=half_field(table, file, where),
-                **{"efl_mm": None, **given},
-            )
-        )
+                raise table.error("thickness_mm", key, f"a surface number from 0 to {n_surfaces - 1}")
+            gaps = Table(moved, lens.file, f"{table.where}thickness_mm, surface ")
+            thickness.append((int(key), gaps.number(key, unit="mm")))
+        above_0 = ("efl_mm", "f_number", "stop_diameter_mm", "object_distance_mm")
+        values = {key: table.number(key, above=0) for key in above_0 if key in table}
+        if not values.keys() & {"efl_mm", "object_distance_mm"}:
+            raise table.error("efl_mm", "(missing)", "the focal length of a zoom state")
+        state = {"efl_mm": None, **values}
+        result.append(Configuration(name, thickness_mm=tuple(thickness), half_field_deg=table.half_field(), **state))
     return tuple(result)

@@ -1,4 +1,4 @@
-"""First-order (paraxial) data: focal length, principal planes, pupils, focus. Plain numbers, d line unless told."""
+"""First-order (paraxial) data: focal length, principal planes, pupils, focus. Plain numbers, d line by default."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from neurolens import focus
 from neurolens.base.errors import InputError
+from neurolens.optics import film_plane
 from neurolens.optics.glass import LINE_D_NM, index_of
 from neurolens.optics.prescription import Lens
 
@@ -156,7 +156,7 @@ def stop_radius_mm(lens: Lens, f_number: float) -> float:
 
 
 def film_z_mm(lens: Lens, focus_m: float) -> float:
-    """Film plane that focuses an object `focus_m` metres from the film (unit focusing; see `neurolens.focus`).
+    """Film plane that focuses an object `focus_m` metres from the film (unit focusing; see `film_plane`).
 
     A pinhole's film stays where it is: it is as sharp at every distance.
 
@@ -166,7 +166,8 @@ def film_z_mm(lens: Lens, focus_m: float) -> float:
     data = first_order(lens)
     if is_pinhole(lens):
         return float(data.rear_focal_z_mm)
-    return focus.film_z_mm(data.efl_mm, data.front_principal_z_mm, data.rear_principal_z_mm, focus_m, file=lens.path)
+    planes = data.front_principal_z_mm, data.rear_principal_z_mm
+    return film_plane.film_z_mm(data.efl_mm, *planes, focus_m, file=lens.path)
 
 
 def image_z_mm(lens: Lens, object_z_mm: float) -> float:

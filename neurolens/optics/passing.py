@@ -1,50 +1,78 @@
-"""One surface passed: met, tested, refracted; and how rays start and what becomes of those that are lost."""
+"""The media between surfaces, and one surface passed: met, tested, refracted; how rays start and how they are lost."""
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.optics import apertures
+from neurolens.optics import glass
+from neurolens.optics.apertures import inside_on_tensors
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.shapes import intersect_shape, is_plain
 from neurolens.optics.surfaces import (
+    AIR,
+    Counts,
     Hit,
+    Labels,
     Medium,
+    Mode,
     Rays,
+    Survival,
+    also,
+    at_most,
     intersect_plane,
     intersect_sphere,
+    medium,
     nearest_approach,
+    positive,
     refract,
     times,
 )
-from neurolens.optics.survival import Counts, Labels, Survival, also, at_most, positive
+
+
+def media(lens: Lens, wavelength_nm: Tensor | float) -> list[Medium]:
+    """Media from the scene to the film; media(...)[k] lies before surface k. The same object where it does not change.
+
+    `wavelength_nm` is a number or a tensor [N]; a dispersive medium has the shape of the wavelength.
+    """
+    known: dict[Any, Medium] = {_medium_key(None): AIR}
+    found = [AIR]
+    for s in lens.surfaces:
+        key = _medium_key(s)
+        if key not in known:
+            known[key] = medium(glass.index_of(s, wavelength_nm))
+        found.append(known[key])
+    return found
+
+
+def absorption_per_mm(lens: Lens, wavelength_nm: Tensor | float) -> list[Any]:
+    """Napierian absorption of the media from the scene to the film, in 1/mm; None where there is none."""
+    return [None, *(_absorption(s, wavelength_nm) for s in lens.surfaces)]
+
+
+def _absorption(s: Surface, wavelength_nm: Tensor | float) -> Any:
+    if s.glass is None and not s.absorption_per_mm:
+        return None
+    return glass.absorption_of(s, wavelength_nm)
+
+
+def _medium_key(s: Surface | None) -> Any:
+    if s is None or (s.glass is None and s.V_d is None and not isinstance(s.n_d, Tensor) and s.n_d == 1):
+        return "air"
+    return (s.glass, None if s.glass else (id(s.n_d) if isinstance(s.n_d, Tensor) else float(s.n_d), s.V_d))
+
 
 # How far the squared length of a direction may be from 1; float32 rounding is a thousandth of this.
 UNIT_SLACK = 1e-3
 
 # Rim radius over radius of curvature from which on a sphere's rim is tested by its depth.
 DEEP = 0.25
-
-
-class Mode(NamedTuple):
-    """How to trace: direction of travel (+1 to the film), whether lost rays stay finite on the way, whether they are
-    put on the axis at once (for gradients)."""
-
-    sense: int
-    guard: bool
-    freeze: bool
-
-    @property
-    def spend(self) -> bool:
-        """Whether tests may overwrite the numbers they test: where nobody else needs them, outside a compiler."""
-        return not self.guard and not torch.compiler.is_compiling()
 
 
 def check_rays(rays: Rays, wavelength_nm: Tensor | float) -> None:
@@ -118,11 +146,11 @@ def meet(lens: Lens, k: int, r: Rays, before: Medium, entering: bool, mode: Mode
     surface = lens.surfaces[k]
     plane = _is_plane(surface)
     if plane:
-        hit = intersect_plane(r, mode.sense, mode.guard, mode.spend)
+        hit = intersect_plane(r, mode)
     elif is_plain(surface):
-        hit = intersect_sphere(r, surface.curvature, mode.sense, before, entering, mode.guard, mode.spend)
+        hit = intersect_sphere(r, surface.curvature, mode, before, entering)
     else:
-        hit = intersect_shape(r, surface, mode.sense, before, mode.guard, mode.spend)
+        hit = intersect_shape(r, surface, mode, before)
     tests.require(hit.met, k, st.MISSED)
     if _is_deep(surface):
         # By its depth: a point on the far half of the sphere may be near the axis, but there is no glass.
@@ -135,7 +163,7 @@ def meet(lens: Lens, k: int, r: Rays, before: Medium, entering: bool, mode: Mode
             tests.end(distance2 < math.inf)
         tests.require(at_most(distance2, surface.semi_diameter_mm**2, spend=mode.spend), k, st.RIM)
     if lens.aperture is not None and surface.stop:
-        tests.require(apertures.inside(lens.aperture, hit.x, hit.y, lens.stop_radius_mm), k, st.RIM)
+        tests.require(inside_on_tensors(lens.aperture, hit.x, hit.y, lens.stop_radius_mm), k, st.RIM)
     return hit
 
 
@@ -150,7 +178,7 @@ def bend(
     if before is after:
         return Rays(hit.x, hit.y, hit.z, r.dx, r.dy, r.dz), hit.q, hit.q2
     c = 0.0 if _is_plane(surface) else surface.curvature
-    bent, q, q2 = refract(r, hit, c, mode.sense, before, after, mode.guard)
+    bent, q, q2 = refract(r, hit, c, mode, before, after)
     if isinstance(before.n, Tensor) or before.n != 1:
         # From air nothing is totally reflected.
         tests.require(positive(q2, spend=mode.spend), k, st.TOTAL_REFLECTION)

@@ -11,7 +11,8 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal
 
-from neurolens.apertures import Aperture
+from neurolens.base.errors import InputError
+from neurolens.optics.apertures import Aperture
 
 Focus = Literal["film", "best", "internal"]
 
@@ -200,7 +201,7 @@ class Lens:
             field_deg: full field of view at infinity focus that the image circle shall see: the lens is rescaled, the
                 image circle stays (by the traced chief ray, along x; distortion included).
             zoom: name of a state of the file, or a focal length in mm between those of its states, as a number or its
-                text (`neurolens.optics.zoom`; marked in `derived`).
+                text (`neurolens.optics.states`; marked in `derived`).
             focus: "film" moves the film as the paraxial image does; "best" to the least RMS spot of the axial point at
                 the d line; "internal" moves the groups as the file's focus states do, film fixed.
 
@@ -213,10 +214,52 @@ class Lens:
         return states.at(self, focus_m, f_number, focal_length_mm, field_deg, zoom, focus)
 
     def scaled(self, factor: float) -> Lens:
-        """All lengths times `factor`; angles, indices and f-number stay."""
-        from neurolens.optics import scaling
+        """All lengths times `factor`; angles, indices and f-number stay.
 
-        return scaling.scaled(self, factor)
+        A grey filter keeps its density (its absorption per mm shrinks as it grows), a catalogue glass absorbs more when
+        it is thicker, and coatings keep their layers.
+
+        Raises:
+            InputError: a factor that is not positive and finite.
+        """
+        if not 0 < factor < math.inf:
+            raise InputError(self.path, "factor", factor, "a positive number")
+
+        def scale(value: Any) -> Any:
+            return None if value is None else value * factor
+
+        def gaps(pairs: tuple[tuple[int, Any], ...]) -> tuple[tuple[int, Any], ...]:
+            return tuple((k, t * factor) for k, t in pairs)
+
+        def surface(s: Surface) -> Surface:
+            return replace(
+                s,
+                radius_mm=scale(s.radius_mm),
+                thickness_mm=scale(s.thickness_mm),
+                diameter_mm=s.diameter_mm * factor,
+                asphere=tuple((p, a * factor ** (1 - p)) for p, a in s.asphere),
+                absorption_per_mm=s.absorption_per_mm / factor,
+            )
+
+        def configuration(c: Configuration) -> Configuration:
+            return replace(
+                c,
+                efl_mm=scale(c.efl_mm),
+                thickness_mm=gaps(c.thickness_mm),
+                stop_diameter_mm=scale(c.stop_diameter_mm),
+                object_distance_mm=scale(c.object_distance_mm),
+            )
+
+        return replace(
+            self,
+            surfaces=tuple(surface(s) for s in self.surfaces),
+            configurations=tuple(configuration(c) for c in self.configurations),
+            infinity_mm=gaps(self.infinity_mm),
+            image_radius_mm=scale(self.image_radius_mm),
+            film_z_mm=scale(self.film_z_mm),
+            stated_efl_mm=scale(self.stated_efl_mm),
+            stated_efl_x_mm=scale(self.stated_efl_x_mm),
+        )
 
     def with_stop_radius(self, radius_mm: float) -> Lens:
         """The same lens with another opening of the stop."""

@@ -3,29 +3,206 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.optics.clearance import end_mm, surface_sag_mm
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.optics.pupil_grid import FEW, Box, Place, search, union
-from neurolens.optics.pupil_rays import camera_rays, passes_at_any_azimuth, pupil_plane_z_mm, symmetric_about_axis
+from neurolens.optics.sag import end_mm, sag_mm
+from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
-__all__ = [
-    "PupilBounds",
-    "camera_rays",
-    "image_radius_mm",
-    "passes_at_any_azimuth",
-    "pupil_bounds",
-    "pupil_plane_z_mm",
-    "symmetric_about_axis",
-]
+# Azimuths at which lenses with cylinders are searched, 5 degrees apart: at 15, one of them lost 7% of its corners.
+# Their two planes of symmetry give the rest: what passes at -a is the mirror image of what passes at a. In groups,
+# the first of which find most of what passes.
+_STEP_DEG = 5
+AZIMUTHS = tuple(math.radians(_STEP_DEG * k) for k in range(-18, 19))
+_GROUPS = (AZIMUTHS[18:19], AZIMUTHS[::9], tuple(a for k, a in enumerate(AZIMUTHS) if k % 9))
+# Azimuths of a film are those at radii this share smaller too: outlines are interpolated between radii.
+_BETWEEN_RADII = 0.03
+
+
+def pupil_plane_z_mm(lens: Lens) -> float:
+    """z of the plane on which pupil points lie: the paraxial exit pupil, where passing rays crowd together.
+
+    The rear vertex stands in where the exit pupil lies near or behind the film or too far in front of it to be useful.
+    """
+    data = first_order(lens)
+    rear = float(lens.vertices_mm[len(lens.surfaces) - 1])
+    film = data.rear_focal_z_mm
+    z = data.exit_pupil_z_mm
+    useful = math.isfinite(z) and 0.25 * (film - rear) < film - z < 20 * abs(data.efl_mm)
+    return float(z) if useful else rear
+
+
+def camera_rays(
+    film_x: Tensor, film_y: Tensor, film_z: Tensor | float, pupil_x: Tensor, pupil_y: Tensor, pupil_z: float
+) -> Rays:
+    """Camera rays from film points towards (or away from) pupil points, all [N] in mm, lens frame; dz is negative."""
+    x, y = pupil_x - film_x, pupil_y - film_y
+    z = torch.as_tensor(pupil_z, dtype=film_x.dtype, device=film_x.device) - film_z
+    scale = -torch.sign(z) / torch.sqrt(x * x + y * y + z * z)
+    start_z = torch.as_tensor(film_z, dtype=film_x.dtype, device=film_x.device).expand_as(film_x)
+    return Rays(film_x, film_y, start_z, x * scale, y * scale, (z * scale).expand_as(film_x))
+
+
+def passes_at_any_azimuth(
+    lens: Lens,
+    film_radius: Tensor,
+    film_z: Tensor | float,
+    pupil_x: Tensor,
+    pupil_y: Tensor,
+    pupil_z: float,
+    wavelength_nm: float,
+    film_mm: tuple[float, float] | None = None,
+) -> Tensor:
+    """Whether light passes from film points on +x through pupil points, bool [N], however the whole may be turned.
+
+    Blades and masks are left out: the round opening about them holds what they let through at every azimuth. Only
+    lenses with cylinders are traced at more than one azimuth, `AZIMUTHS`, for they change with it.
+
+    Args:
+        film_radius, pupil_x, pupil_y: [N] mm. film_z, pupil_z: planes, mm, lens frame.
+        film_mm: width and height of a film; of the azimuths, those at which it has points that far from its middle.
+    """
+    lens = replace(lens, aperture=None)
+    passed = torch.zeros_like(film_radius, dtype=torch.bool)
+    round_ = not lens.anamorphic
+    low, high = (None, None) if round_ or film_mm is None else azimuths_on_film(film_radius, film_mm)
+    planes = torch.as_tensor(film_z, dtype=film_radius.dtype).expand_as(film_radius)
+    for group in ((0.0,),) if round_ else _GROUPS:
+        # Together, for few rays take nearly as long as many.
+        azimuth = torch.tensor(group, dtype=film_radius.dtype)[:, None]
+        asked = (~passed).expand(len(group), -1)
+        if low is not None and high is not None:
+            asked = asked & (low <= azimuth.abs()) & (high >= azimuth.abs())
+        which, left = torch.nonzero(asked, as_tuple=True)
+        if not len(left):
+            continue
+        r, u, v = film_radius[left], pupil_x[left], pupil_y[left]
+        c, s = torch.cos(azimuth[which, 0]), torch.sin(azimuth[which, 0])
+        rays = camera_rays(c * r, s * r, planes[left], c * u - s * v, s * u + c * v, pupil_z)
+        passed[left[trace(lens, rays, wavelength_nm).status == 0]] = True
+    return passed
+
+
+def azimuths_on_film(film_radius: Tensor, film_mm: tuple[float, float]) -> tuple[Tensor, Tensor]:
+    """Least and largest azimuth in the first quadrant, rad [N], at which a centred film has points that far out.
+
+    With half a step of `AZIMUTHS` beyond either; beyond the corner, those about the corner's.
+    """
+    width, height = film_mm
+    radius = (film_radius * (1 - _BETWEEN_RADII)).clamp_min(1e-12)
+    low, high = torch.acos((width / 2 / radius).clamp_max(1)), torch.asin((height / 2 / radius).clamp_max(1))
+    corner = math.atan2(height, width)
+    beyond = 1.001 * math.radians(_STEP_DEG) / 2
+    return low.clamp_max(corner) - beyond, high.clamp_min(corner) + beyond
+
+
+_STRIDE = 4  # of the points of a grid that are traced first; then only those that may widen what they found
+FEW = 40  # points of a grid, of which so few pass that it may miss the edges of what passes, or the whole of it
+
+
+class Box(NamedTuple):
+    """Bounds of passing points for a film point on +x: along it, across it, from the axis, mm; how many were found."""
+
+    low: float
+    high: float
+    half: float
+    radius: float
+    points: int = 0
+
+
+class Place(NamedTuple):
+    """A film point on +x: its distance from the axis and its plane, mm."""
+
+    radius: float
+    film_z: float
+
+
+def union(boxes: Sequence[Box]) -> Box:
+    """The box that holds all; an empty one (low > high) of none."""
+    if not boxes:
+        return Box(1.0, -1.0, 0.0, 0.0)
+    return Box(
+        min(b.low for b in boxes), max(b.high for b in boxes), max(b.half for b in boxes), max(b.radius for b in boxes)
+    )
+
+
+def search(
+    lens: Lens,
+    places: Sequence[Place],
+    wavelengths: Sequence[float],
+    pupil_z: float,
+    boxes: Sequence[Box],
+    points: int,
+    film_mm: tuple[float, float] | None,
+) -> list[Box | None]:
+    """Boxes of the passing points of grids over `boxes` (upper halves: the lens is symmetric), a step wider; None for
+    a film point whose grid no ray passes.
+
+    A coarse grid inside each is traced first. Where enough of it passes, only the points that may lie beyond its
+    extent by less than one of its steps follow; elsewhere all points near those found, or all.
+
+    Args:
+        places, boxes: film points and where to look from each.
+        wavelengths: nm; rays of any of them count.
+        points: of a grid along, and twice those across.
+        film_mm: see `passes_at_any_azimuth`.
+    """
+    if not places:
+        return []
+    low, high, half = (
+        torch.tensor([getattr(b, k) for b in boxes], dtype=torch.float64) for k in ("low", "high", "half")
+    )
+    u = low[:, None] + (high - low)[:, None] * torch.linspace(0, 1, points, dtype=torch.float64)
+    v = half[:, None] * torch.linspace(0, 1, points // 2, dtype=torch.float64)
+    radius, film_z = (torch.tensor(c, dtype=torch.float64) for c in zip(*places, strict=True))
+    pu, pv = u[:, :, None].expand(-1, -1, v.shape[1]), v[:, None, :].expand(-1, u.shape[1], -1)
+    passed = torch.zeros(pu.shape, dtype=torch.bool)
+
+    def look(at: Tensor) -> None:
+        for w in wavelengths:
+            job, i, j = torch.nonzero(at & ~passed, as_tuple=True)
+            x, y = u[job, i], v[job, j]
+            passed[job, i, j] = passes_at_any_azimuth(lens, radius[job], film_z[job], x, y, pupil_z, w, film_mm)
+
+    first = torch.zeros_like(passed)
+    first[:, ::_STRIDE, ::_STRIDE] = True
+    look(first)
+    du, dv = u[:, 1] - u[:, 0], v[:, 1] - v[:, 0]
+    look(~first & _may_widen(passed, pu, pv, _STRIDE * du, _STRIDE * dv))
+    least, most, across, reach = (t.tolist() for t in _extent(passed, pu, pv))
+    return [
+        Box(least[k] - a, most[k] + a, across[k] + b, reach[k] + math.hypot(a, b) / 2, count) if count else None
+        for k, (a, b, count) in enumerate(zip(du.tolist(), dv.tolist(), passed.sum((1, 2)).tolist(), strict=True))
+    ]
+
+
+def _extent(passed: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Least and largest u, largest v and largest distance from the axis of the passing points, each [M]."""
+    nothing = torch.tensor(-math.inf, dtype=u.dtype)
+    largest = [torch.where(passed, c, nothing).amax((1, 2)) for c in (-u, u, v, torch.hypot(u, v))]
+    return -largest[0], largest[1], largest[2], largest[3]
+
+
+def _may_widen(passed: Tensor, u: Tensor, v: Tensor, du: Tensor, dv: Tensor) -> Tensor:
+    """Points that may lie beyond the extent found, by less than a step, along, across or from the axis; or more."""
+    least, most, across, reach = (t[:, None, None] for t in _extent(passed, u, v))
+    du, dv = du[:, None, None], dv[:, None, None]
+    distance = torch.hypot(u, v)
+    within = (u > least - du) & (u < most + du) & (v < across + dv) & (distance < reach + torch.hypot(du, dv))
+    beyond = (u < least) | (u > most) | (v > across) | (distance > reach)
+    count = passed.sum((1, 2))[:, None, None]
+    # About few, all points are tried, two steps around; about none, the whole grid.
+    near = (u > least - 2 * du) & (u < most + 2 * du) & (v < across + 2 * dv)
+    return (within & beyond) | ((count < FEW) & near) | (count == 0)
+
 
 # Where rays are looked for again: within so many paraxial exit pupils of the axis, where the box of the rear rim is so
 # many times wider than that.
@@ -89,7 +266,7 @@ def pupil_bounds(
         InputError: when no ray passes from any film point.
     """
     plane = pupil_plane_z_mm(lens) if pupil_z_mm is None else pupil_z_mm
-    if not symmetric_about_axis(lens):
+    if lens.anamorphic:
         points = min(points, _AT_MANY_AZIMUTHS)
     wavelengths = sorted(set(wavelength_nm))
     data = first_order(lens)
@@ -133,7 +310,7 @@ def _starts(lens: Lens, place: Place, plane: float, near: float, exit_z: float) 
     rear = lens.surfaces[-1]
     rear_z = float(lens.vertices_mm[len(lens.surfaces) - 1])
     limit = min(rear.semi_diameter_mm, end_mm(rear))
-    depths = [surface_sag_mm(rear, limit * t, 0.0) for t in (0.0, 0.5, 0.8, 1 - 1e-12)]
+    depths = [sag_mm(rear, limit * t, 0.0) for t in (0.0, 0.5, 0.8, 1 - 1e-12)]
     # Every ray that enters crosses the rear surface between the planes that hold it, within the rim's radius; seen
     # from the film point, that cylinder's two ends bound it on the pupil plane.
     ends = []

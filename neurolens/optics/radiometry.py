@@ -24,7 +24,7 @@ from neurolens.base.errors import InputError
 from neurolens.optics.aiming import without_rims
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import camera_rays, pupil_bounds, pupil_plane_z_mm, symmetric_about_axis
+from neurolens.optics.pupils import camera_rays, pupil_bounds, pupil_plane_z_mm
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
@@ -136,7 +136,7 @@ def disc_irradiance(radius_mm: float, distance_mm: float, height_mm: Array) -> A
 def _check(lens: Lens, radius: Array) -> None:
     if lens.film_z_mm is None:
         raise InputError(lens.path, "film_z_mm", None, "a focused lens: lens.at(focus_m=...)")
-    if not symmetric_about_axis(lens) or lens.aperture is not None:
+    if lens.anamorphic or lens.aperture is not None:
         raise InputError(lens.path, "surfaces", "(cylinders or blades)", "a lens that is round about its axis")
     if (
         radius.ndim != 1

@@ -16,9 +16,9 @@ import torch
 
 from neurolens.base.errors import InputError
 from neurolens.optics.aiming import aim_at_stop, without_rims
-from neurolens.optics.clearance import end_mm, neighbours, surface_sag_mm
 from neurolens.optics.paraxial import first_order, stop_radius_mm
 from neurolens.optics.prescription import Configuration, Lens, Surface
+from neurolens.optics.sag import end_mm, neighbours, sag_mm
 from neurolens.optics.trace import trace
 
 _FIELDS = 17  # from the axis to the edge; rims are widest at one of the ends, but for an oddity in between
@@ -65,7 +65,7 @@ def derive_rims(lens: Lens, rule: RimRule | None = None) -> tuple[Lens, list[Rim
     """The lens with derived rims (marked `rims = "derived"`) and stops, and how they compare with those it had.
 
     Raises:
-        InputError: a rule out of range, a lens whose field nobody states, a lens with cylinders, a field that no ray
+        InputError: a rule out of range, a lens without a stated field, a lens with cylinders, a field that no ray
             through the middle of the stop reaches.
     """
     rule = rule or RimRule()
@@ -122,11 +122,10 @@ def _states(lens: Lens) -> Iterator[Lens]:
 
 def _moved(lens: Lens, c: Configuration) -> Lens:
     """The table with the thicknesses, field and f-number of a state."""
-    moved = dict(c.thickness_mm)
-    rows = tuple(replace(s, thickness_mm=moved.get(k, s.thickness_mm)) for k, s in enumerate(lens.surfaces))
     # Without a field of its own a state has that of the image circle, where there is one.
     field = c.half_field_deg or (None if lens.image_radius_mm else lens.half_field_deg)
-    return replace(lens, surfaces=rows, half_field_deg=field, f_number=c.f_number or lens.f_number)
+    moved = lens.with_gaps(dict(c.thickness_mm))
+    return replace(moved, half_field_deg=field, f_number=c.f_number or lens.f_number)
 
 
 def _stop_of(lens: Lens, c: Configuration) -> float:
@@ -184,7 +183,7 @@ def _which_to_trim(before: Surface, after: Surface, k: int, k_after: int, h: flo
     """Of two surfaces that meet at height h, the one whose flat, ground from there outwards, clears the other."""
 
     def slope(s: Surface) -> float:
-        return surface_sag_mm(s, h, 0.0) - surface_sag_mm(s, 0.99 * h, 0.0)
+        return sag_mm(s, h, 0.0) - sag_mm(s, 0.99 * h, 0.0)
 
     if slope(after) >= 0:
         return (k,)
@@ -195,7 +194,7 @@ def _meeting_height(before: Surface, after: Surface, gap: float, limit: float) -
     """Distance from the axis, up to `limit`, at which two surfaces first meet, mm."""
 
     def clear(h: float) -> bool:
-        return gap + surface_sag_mm(after, h, 0.0) - surface_sag_mm(before, h, 0.0) >= 0
+        return gap + sag_mm(after, h, 0.0) - sag_mm(before, h, 0.0) >= 0
 
     low = 0.0
     for i in range(1, _STEPS + 1):

@@ -13,9 +13,19 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.optics import glass, thinfilm
-from neurolens.optics.media import absorption_per_mm, media
-from neurolens.optics.passing import Mode, along_axis, bend, check_rays, meet, sound_wavelength, start, unit
+from neurolens.optics import coatings, glass
+from neurolens.optics.passing import (
+    Mode,
+    absorption_per_mm,
+    along_axis,
+    bend,
+    check_rays,
+    media,
+    meet,
+    sound_wavelength,
+    start,
+    unit,
+)
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Hit, Medium, Rays, fresnel_transmittance, root, times
 from neurolens.optics.transmission import normal_at, way_mm
@@ -107,7 +117,7 @@ def _share(
 ) -> Tensor | float:
     """Unpolarised power that goes on, [N]: transmitted or reflected at one surface."""
     if surface.coating is not None and surface.coating.layers:
-        share = thinfilm.reflectance if action == "R" else thinfilm.transmittance
+        share = coatings.reflectance if action == "R" else coatings.transmittance
         return share(times(hit.q, 1 / before.n), before.n, after.n, surface.coating.layers, wavelength_nm, sense)
     if before is after:
         return 0.0 if action == "R" else 1.0

@@ -16,10 +16,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neurolens.optics.clearance import surface_sag_mm
 from neurolens.optics.prescription import Surface
-from neurolens.optics.surfaces import Hit, Medium, Rays, nearest_approach, root, times
-from neurolens.optics.survival import also, at_most, choose, positive
+from neurolens.optics.sag import sag_mm
+from neurolens.optics.surfaces import (
+    Hit,
+    Medium,
+    Mode,
+    Rays,
+    also,
+    at_most,
+    choose,
+    nearest_approach,
+    positive,
+    root,
+    times,
+)
 
 Vector = tuple[Tensor, Tensor, Tensor]
 
@@ -40,15 +51,16 @@ def is_plain(surface: Surface) -> bool:
     return not (conic or surface.asphere or surface.cylinder)
 
 
-def intersect_shape(r: Rays, surface: Surface, sense: int, before: Medium, guard: bool, spend: bool) -> Hit:
+def intersect_shape(r: Rays, surface: Surface, mode: Mode, before: Medium) -> Hit:
     """Meet a conic, cylinder or asphere at the root next to the vertex. Arguments as for a sphere."""
     w = (float(surface.cylinder != "y"), float(surface.cylinder != "x"))
     nearest = nearest_approach(r, before.inverse_n2)
     if surface.asphere:
-        return _meet_asphere(r, nearest, surface, w, sense, before, guard, spend)
+        return _meet_asphere(r, nearest, surface, w, mode, before)
     c = surface.curvature
     kind = (c * w[0], c * w[1], c * (1 + surface.conic))
-    met, q2, q, t = _meet_quadric(r, nearest, kind, sense, before, guard, spend)
+    guard, spend = mode.guard, mode.spend
+    met, q2, q, t = _meet_quadric(r, nearest, kind, mode.sense, before, guard, spend)
     x, y, z = _along(nearest, t, (r.dx, r.dy, r.dz))
     nx, ny, nz = times(x, -kind[0]), times(y, -kind[1]), 1 - times(z, kind[2])
     length2 = torch.addcmul(torch.addcmul(nx * nx, ny, ny), nz, nz)
@@ -98,22 +110,13 @@ def _meet_quadric(
     return also(positive(q2.clone() if spend else q2, spend=spend), sound), q2, q, t
 
 
-def _meet_asphere(
-    r: Rays,
-    m: Vector,
-    surface: Surface,
-    w: tuple[float, float],
-    sense: int,
-    before: Medium,
-    guard: bool,
-    spend: bool,
-) -> Hit:
+def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], mode: Mode, before: Medium) -> Hit:
     """Iterate along the rays, from the conic that fits the asphere best.
 
     All steps but the last are taken outside the graph: the last one alone carries the derivative of the solution
     (implicit function theorem), so that gradients cost no memory for iterations.
     """
-    p = (r.dx, r.dy, r.dz)
+    p, sense, guard, spend = (r.dx, r.dy, r.dz), mode.sense, mode.guard, mode.spend
     (c, cz), steps = start_of(surface)
     with torch.no_grad():
         held = Rays(*(v.detach() for v in r))
@@ -130,8 +133,8 @@ def _meet_asphere(
     at = _along(m, t.detach(), p)
     step = _step(at, p, surface, w, sense, last=True)
     x, y, z = _along(at, step, p)
-    slope, cos2 = _slope(surface, w, x, y)
-    nx, ny = (times(v * -slope, k) for v, k in zip((x, y), w, strict=True))
+    derivative, cos2 = _derivative(surface, w, x, y)
+    nx, ny = (times(v * -derivative, k) for v, k in zip((x, y), w, strict=True))
     scale = torch.rsqrt(torch.addcmul(nx * nx, ny, ny) + 1)
     q = torch.addcmul(torch.addcmul(p[2], nx, p[0]), ny, p[1]) * (scale * sense)
     length = times((deciding if polish else step).abs(), before.n)
@@ -165,7 +168,7 @@ def _fitted(
         return (curvature, curvature * (1 + conic)), STEPS[-1][1]
     radius_mm = 1 / curvature if curvature else math.inf
     same = Surface(radius_mm, 0.0, 2 * rim_mm, conic=conic, asphere=asphere)
-    points = [(h, surface_sag_mm(same, h, 0.0)) for h in (rim_mm * i / 24 for i in range(1, 25))]
+    points = [(h, sag_mm(same, h, 0.0)) for h in (rim_mm * i / 24 for i in range(1, 25))]
     points = [(h, z) for h, z in points if math.isfinite(z)]
     # Linear least squares for c and cz: each point's error is that of its height along the axis, times 2.
     hh, hz, zz = (sum(h ** (4 - 2 * k) * z ** (2 * k) for h, z in points) for k in range(3))
@@ -183,17 +186,17 @@ def _step(at: Vector, p: Vector, surface: Surface, w: tuple[float, float], sense
     """Euler's step along the rays towards sag(x, y) = z: Newton's with the bend of the surface taken into account.
 
     Newton's own step is lost where a ray all but touches the surface, for there two meetings lie close together; the
-    parabola through value, slope and bend has both, and the sign of its root is that of the one wanted. The `last` step
-    is Newton's: by then both are the same.
+    parabola through value, derivative and bend has both, and the sign of its root is that of the one wanted. The `last`
+    step is Newton's: by then both are the same.
     """
     x, y, z = at
-    sag, slope, turn = _sag(surface, w, x, y)
+    sag, derivative, turn = _sag(surface, w, x, y)
     along = _weighted((x, y, z), p, w)
-    rate = slope * along - p[2]
+    rate = derivative * along - p[2]
     if last:
         return (z - sag) / rate
-    # Second derivative of the sag along the ray, but for what the polynomial adds to the change of its own slope.
-    bend = slope * _weighted(p, p, w)
+    # Second derivative of the sag along the ray, but for what the polynomial adds to the change of its own derivative.
+    bend = derivative * _weighted(p, p, w)
     if turn is not None:
         bend = torch.addcmul(bend, along * along, turn)
     lack = 2 * (sag - z)
@@ -203,30 +206,30 @@ def _step(at: Vector, p: Vector, surface: Surface, w: tuple[float, float], sense
 
 
 def _sag(surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    """The asphere at points [N]: depth, slope d sag / d h divided by h, and the change d slope / d h divided by h of
+    """The asphere at points [N]: depth, its derivative by h over h, and the derivative of this by h over h of
     the conic alone, None without a conic."""
     h2 = _height2(w, x, y)
-    sag, slope = _polynomials(surface, h2, (0, 1))
+    sag, derivative = _polynomials(surface, h2, (0, 1))
     c = surface.curvature
     if not isinstance(c, Tensor) and c == 0:
-        return sag * h2, slope, None
+        return sag * h2, derivative, None
     cos = torch.sqrt((1 - h2 * ((1 + surface.conic) * c * c)).clamp_min(STEEPEST))
     # One division for both c h^2 / (1 + cos) and c / cos.
     both = c / torch.addcmul(cos, cos, cos)
     inverse = torch.addcmul(both, both, cos)
     turn = inverse * inverse * inverse * (1 + surface.conic)
-    return torch.addcmul(sag, both, cos) * h2, inverse + slope, turn
+    return torch.addcmul(sag, both, cos) * h2, inverse + derivative, turn
 
 
-def _slope(surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor | None]:
+def _derivative(surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor | None]:
     """d sag / d h divided by h at points [N], and the conic's squared cosine, positive where it exists."""
     h2 = _height2(w, x, y)
-    (slope,) = _polynomials(surface, h2, (1,))
+    (derivative,) = _polynomials(surface, h2, (1,))
     c = surface.curvature
     if not isinstance(c, Tensor) and c == 0:
-        return slope, None
+        return derivative, None
     cos2 = 1 - h2 * ((1 + surface.conic) * c * c)
-    return slope + c * torch.rsqrt(cos2.clamp_min(STEEPEST)), cos2
+    return derivative + c * torch.rsqrt(cos2.clamp_min(STEEPEST)), cos2
 
 
 def _height2(w: tuple[float, float], x: Tensor, y: Tensor) -> Tensor:
@@ -237,7 +240,7 @@ def _polynomials(surface: Surface, h2: Tensor, orders: Sequence[int]) -> list[Te
     """sum A_p h^(p - 2) (order 0) and sum p A_p h^(p - 2) (order 1) by Horner's rule, each [N]."""
     powers = dict(surface.asphere)
     even = all(p % 2 == 0 for p in powers)
-    # In h^2, or in h where odd powers occur; the root is kept from 0, where its slope is infinite.
+    # In h^2, or in h where odd powers occur; the root is kept from 0, where its derivative is infinite.
     h = h2 if even else torch.sqrt(h2.clamp_min(1e-30))
     highest, down = max(powers), 2 if even else 1
     found = []

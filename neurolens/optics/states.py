@@ -1,22 +1,37 @@
-"""What a photographer changes, in this order: zoom, size, f-number, focus. `Lens.at` is the front door."""
+"""What a photographer changes, in this order: zoom, size, f-number, focus. Called by `Lens.at`.
+
+Between the zoom states of the source, the places of all groups, measured from the film, are interpolated against log
+focal length; then the focal length and the image's place are made exact by moving the groups behind the first varying
+gap (which keeps its interpolated value); a zoom of two moving groups has no freedom left, and is solved wholly. What a
+real cam does between the states is not in the source: the result is marked as derived.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import get_args
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.optics import paraxial
 from neurolens.optics.aiming import aim_at_stop
-from neurolens.optics.bestfocus import best_focus_z_mm
-from neurolens.optics.internal import at_infinity, focused_inside, gaps_mm, zoom_state_of
+from neurolens.optics.focusing import (
+    at_infinity,
+    best_focus_z_mm,
+    focused_inside,
+    gaps_mm,
+    infinity_states,
+    monotone,
+    zoom_state_of,
+)
 from neurolens.optics.prescription import Configuration, Focus, Lens
 from neurolens.optics.pupils import image_radius_mm
+from neurolens.optics.sag import check_clearance
 from neurolens.optics.trace import trace
-from neurolens.optics.zoom import zoomed
 
 
 def at(
@@ -170,3 +185,157 @@ def _film_z_mm(lens: Lens, focus_m: float | None, object_mm: float | None, focus
         focus_m = math.inf if focus_m is None else focus_m
         film_z = paraxial.film_z_mm(lens, focus_m)
     return best_focus_z_mm(lens, focus_m) if focus == "best" else film_z
+
+
+MOVES = 0.02  # a group moves whose travel is above this share of the largest travel
+_STATED = 1e-6  # a focal length this near to a state's, as stated or as computed, is the state's
+_ROUNDS = 40
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _State:
+    """A zoom state of the source: focal length as computed, and what varies.
+
+    places: distance of the groups' fronts from the film (paraxial image), scene to film, one more than `gaps`.
+    """
+
+    source: Configuration
+    efl_mm: float
+    places: Vector
+
+
+def zoomed(lens: Lens, efl_mm: float) -> Lens:
+    """The lens at infinity focus, zoomed to a focal length between those of its states.
+
+    At the focal length of a state, stated or computed, it is that state. Else its `derived` says between which states
+    it lies; stop, field and nominal f-number are interpolated too.
+
+    Raises:
+        InputError: fewer than two states, a focal length beyond theirs, or groups that would collide on the way.
+    """
+    states = _states(lens)
+    if len(states) < 2:
+        raise InputError(lens.path, "zoom", efl_mm, "the name of a state: a zoom needs two states of the file or more")
+    for s in states:
+        for known in (s.source.efl_mm, s.efl_mm):
+            if known is not None and abs(efl_mm / known - 1) < _STATED:
+                return in_state(lens, s.source)
+    known_mm = [e for s in states for e in (s.source.efl_mm, s.efl_mm) if e is not None]
+    if not min(known_mm) < efl_mm < max(known_mm):
+        raise InputError(lens.path, "zoom", efl_mm, f"a focal length from {min(known_mm):g} to {max(known_mm):g} mm")
+    gaps = _varying_gaps(lens)
+    places = _solved(lens, gaps, states, efl_mm)
+    inner = dict(zip(gaps, (places[:-1] - places[1:]).tolist(), strict=True))
+    last = len(lens.surfaces) - 1
+    beside = _between(states, efl_mm)
+    moved = in_state(lens, Configuration("", efl_mm, (*inner.items(), (last, float(places[-1])))))
+    check_clearance(moved.surfaces, lens.path, f"zoom {efl_mm:g} mm, ")
+    moved = _interpolated_texts(moved, states, efl_mm)
+    names = " and ".join(f'"{s.source.name}"' for s in beside)
+    return replace(moved, derived=f"Zoom to {efl_mm:g} mm, between the source's states {names}: gaps interpolated.")
+
+
+def _states(lens: Lens) -> list[_State]:
+    """The zoom states by ascending focal length."""
+    gaps, found = _varying_gaps(lens), []
+    for c in infinity_states(lens):
+        data = paraxial.first_order(lens.with_gaps(gaps_mm(lens, c)))
+        thickness = gaps_mm(lens, c)
+        inner = [thickness[k] for k in gaps]
+        places = data.back_focus_mm + np.append(np.cumsum(inner[::-1])[::-1], 0.0)
+        found.append(_State(c, data.efl_mm, places))
+    return sorted(found, key=lambda s: s.efl_mm)
+
+
+def _varying_gaps(lens: Lens) -> list[int]:
+    """Surfaces behind which a zoom state sets the gap, but the last, whose gap ends at the film."""
+    last = len(lens.surfaces) - 1
+    return sorted({k for c in infinity_states(lens) for k, _ in c.thickness_mm} - {last})
+
+
+def _solved(lens: Lens, gaps: list[int], states: list[_State], efl_mm: float) -> Vector:
+    """Places of the groups with this focal length and the paraxial image on the film: Gauss-Newton, least moves."""
+    x = [math.log(s.efl_mm) for s in states]
+    target = min(max(math.log(efl_mm), x[0]), x[-1])
+    known = np.array([s.places for s in states])
+    places, (moving, kept) = np.array(monotone(x, known.tolist(), target)), _movement(known)
+    if moving.sum() > 2:
+        (gap_mm,) = monotone(x, (known[:, kept : kept + 1] - known[:, kept + 1 : kept + 2]).tolist(), target)
+        if moving[kept]:
+            places[kept] = places[kept + 1] + gap_mm
+        else:
+            places[kept + 1] = places[kept] - gap_mm
+    directions = _directions(moving, kept)
+
+    def wrong(places: Vector) -> Vector:
+        inner = dict(zip(gaps, (places[:-1] - places[1:]).tolist(), strict=True))
+        data = paraxial.first_order(lens.with_gaps(inner))
+        return np.array([data.efl_mm - efl_mm, data.back_focus_mm - places[-1]])
+
+    step_mm = 1e-4 * efl_mm
+    for _ in range(_ROUNDS):
+        off = wrong(places)
+        if np.abs(off).max() < 1e-12 * efl_mm:
+            return places
+        columns = [(wrong(places + step_mm * d) - wrong(places - step_mm * d)) / (2 * step_mm) for d in directions]
+        change = np.linalg.lstsq(np.array(columns).T, -off, rcond=1e-6)[0] @ directions
+        places = places + change
+        if np.abs(change).max() < 1e-13 * efl_mm:
+            return places
+    raise InputError(lens.path, "zoom", efl_mm, "a position between states that its groups can reach in focus")
+
+
+def _movement(places: Vector) -> tuple[NDArray[np.bool_], int]:
+    """Which groups move, and the first gap that varies, from the places [states, groups]."""
+    travel = np.ptp(places, axis=0)
+    least = MOVES * travel.max()
+    varies = np.ptp(places[:, :-1] - places[:, 1:], axis=0) > least
+    return travel > least, int(np.argmax(varies))
+
+
+def _directions(moving: NDArray[np.bool_], kept: int) -> Vector:
+    """The moves [D, groups] that may correct the interpolation."""
+    unit = np.eye(len(moving))
+    if moving.sum() < 2:
+        return unit
+    if moving.sum() == 2:
+        return np.asarray(unit[moving])
+    # The first varying gap is kept: what bounds it moves together, or stands still if one of the two does.
+    together = [unit[kept] + unit[kept + 1]] if moving[kept] and moving[kept + 1] else []
+    others = [unit[j] for j in np.flatnonzero(moving) if j not in (kept, kept + 1)]
+    return np.array(together + others)
+
+
+def _between(states: list[_State], efl_mm: float) -> tuple[_State, _State]:
+    i = sum(s.efl_mm <= efl_mm for s in states[1:-1])
+    return states[i], states[i + 1]
+
+
+def _interpolated_texts(lens: Lens, states: list[_State], efl_mm: float) -> Lens:
+    """Stop, half field (by the image's height) and nominal f-number between those of the states that say."""
+    x = [math.log(s.efl_mm) for s in states]
+    place = min(max(math.log(efl_mm), x[0]), x[-1])
+
+    def value(known: list[float | None]) -> float | None:
+        sure = [(at, [k]) for at, k in zip(x, known, strict=True) if k is not None]
+        if not sure or not sure[0][0] <= place <= sure[-1][0]:
+            return None
+        return monotone([s[0] for s in sure], [s[1] for s in sure], place)[0]
+
+    heights = [
+        None if s.source.half_field_deg is None or s.source.half_field_deg >= 89
+        else s.efl_mm * math.tan(math.radians(s.source.half_field_deg))
+        for s in states
+    ]  # fmt: skip
+    height, stop = value(heights), value([s.source.stop_diameter_mm for s in states])
+    f_number = value([s.source.f_number for s in states])
+    if stop is not None:
+        lens = lens.with_stop_radius(stop / 2)
+    return replace(
+        lens,
+        half_field_deg=lens.half_field_deg if height is None else math.degrees(math.atan(height / efl_mm)),
+        f_number=lens.f_number if f_number is None else f_number,
+        stated_efl_mm=None,
+    )

@@ -1,20 +1,126 @@
-"""Where a ray meets a sphere or a plane and how it bends there: pure functions on separate x, y, z tensors [N].
+"""Where a ray meets a sphere or a plane and how it bends there, and the tests that it passes on the way.
 
-Directions in here are optical direction cosines: unit vectors times the refractive index of the medium, p = n d, for
-which Snell's law needs no division (p after = p before + a multiple of the normal). `sense` is +1 for rays travelling
-from the scene to the film (+z) and -1 for camera rays. Coordinates are relative to the surface's vertex. Formulas:
-Spencer and Murty 1962, "General Ray-Tracing Procedure", in the form that needs no division by dz and gives the cosine
-of incidence for free; optical direction cosines as in Welford 1986, "Aberrations of Optical Systems", ch. 4.
+Pure functions on separate x, y, z tensors [N]. Directions in here are optical direction cosines: unit vectors times the
+refractive index of the medium, p = n d, for which Snell's law needs no division (p after = p before + a multiple of the
+normal). `sense` is +1 for rays travelling from the scene to the film (+z) and -1 for camera rays. Coordinates are
+relative to the surface's vertex. Formulas: Spencer and Murty 1962, "General Ray-Tracing Procedure", in the form that
+needs no division by dz and gives the cosine of incidence for free; optical direction cosines as in Welford 1986,
+"Aberrations of Optical Systems", ch. 4.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from neurolens.optics.survival import positive
+from neurolens.base import status as st
+
+
+def positive(value: Tensor, sense: int = 1, *, spend: bool = False) -> Tensor:
+    """Whether value * sense > 0, [N]; NaN is not. With `spend` as 1.0 and 0.0 in the place of `value` itself.
+
+    Comparisons that give truth values are not vectorised on CPUs and cost five times as much as those in place; only
+    for values that are not used afterwards, and never where gradients are wanted.
+    """
+    if not spend:
+        return value > 0 if sense > 0 else value < 0
+    return value.gt_(0) if sense > 0 else value.lt_(0)
+
+
+def at_most(value: Tensor, limit: float, *, spend: bool = False) -> Tensor:
+    """Whether value <= limit, [N]; NaN is not. `spend` as for `positive`."""
+    return value.le_(limit) if spend else value <= limit
+
+
+def also(first: Tensor, second: Tensor) -> Tensor:
+    """Both tests passed, [N]; spends `first` where tests are 1.0 and 0.0."""
+    return first.mul_(second) if first.is_floating_point() else first & second
+
+
+def choose(test: Tensor, yes: Tensor, no: Tensor) -> Tensor:
+    """`yes` where the test passed, else `no`, [N]. Of a test in numbers a mixture, for which both must be finite."""
+    return torch.lerp(no, yes, test) if test.is_floating_point() else torch.where(test, yes, no)
+
+
+class Labels:
+    """The tests at each surface (met, inside the rim, not totally reflected), in the order in which they are called.
+
+    The first failure rules. A ray goes on until it misses a surface or is totally reflected; one that a rim stops goes
+    on, too, since its crossings are learnt from. This form keeps one label a ray, written at its first failure: what a
+    compiler turns into few instructions in registers, and what gradients can be taken through. `Counts` has the same
+    methods.
+    """
+
+    def __init__(self, sound: Tensor, otherwise: int) -> None:
+        """Start with the rays that are `sound` [N] boolean; the others have the status `otherwise`."""
+        self._status = (~sound).to(torch.int32) * otherwise
+        self._goes_on = sound
+
+    def require(self, passed: Tensor, surface: int, reason: int) -> None:
+        """Apply the next test; `passed` is [N], boolean (in `Counts` 1.0 and 0.0, too)."""
+        self._status = torch.where(passed | (self._status != 0), self._status, st.blocked(surface, reason))
+        if reason != st.RIM:
+            self._goes_on = self._goes_on & passed
+
+    def end(self, sound: Tensor) -> None:
+        """End rays that are not `sound` [N] boolean, whatever their status."""
+        self._goes_on = self._goes_on & sound
+
+    def only(self, value: Tensor, otherwise: float) -> Tensor:
+        """`value` [N] of the rays that go on, `otherwise` for the others, even where it is NaN."""
+        return torch.where(self._goes_on, value, otherwise)
+
+    def status(self) -> Tensor:
+        """Status of every ray, [N] int32; see `neurolens.base.status`."""
+        return self._status
+
+
+class Counts:
+    """How many tests a ray passed before its first failure, in numbers throughout: truth values, selections and
+    conversions between them cost more than all the optics."""
+
+    def __init__(self, sound: Tensor, otherwise: int) -> None:
+        """Start with the rays that are `sound` [N], 1.0 or 0.0; the others have the status `otherwise`."""
+        self._alive, self._goes_on = sound.clone(), sound.clone()
+        self._count = sound.clone()
+        self._meanings = [otherwise]
+        self._mask: Tensor | None = None
+
+    def require(self, passed: Tensor, surface: int, reason: int) -> None:
+        passed = passed.to(self._alive.dtype)
+        self._alive.mul_(passed)
+        self._count.add_(self._alive)
+        self._meanings.append(st.blocked(surface, reason))
+        if reason != st.RIM:
+            self._goes_on.mul_(passed)
+            self._mask = None
+
+    def end(self, sound: Tensor) -> None:
+        self._goes_on.mul_(sound)
+        self._mask = None
+
+    def only(self, value: Tensor, otherwise: float) -> Tensor:
+        bits = torch.int32 if value.dtype == torch.float32 else torch.int64
+        if self._mask is None:
+            self._mask = self._goes_on.to(bits).neg_()
+        # All bits or none: the only product with 0 that a NaN does not survive.
+        kept = value.view(bits).bitwise_and(self._mask).view(value.dtype)
+        return kept if otherwise == 0 else kept.add_(1 - self._goes_on, alpha=otherwise)
+
+    def status(self) -> Tensor:
+        return _table((*self._meanings, st.PASSED), self._count.device).index_select(0, self._count.int())
+
+
+Survival = Labels | Counts
+
+
+@lru_cache(maxsize=256)
+def _table(meanings: tuple[int, ...], device: torch.device) -> Tensor:
+    """Kept, for sending it anew with every chunk would make the host wait for an accelerator."""
+    return torch.tensor(meanings, dtype=torch.int32, device=device)
 
 
 class Rays(NamedTuple):
@@ -26,6 +132,20 @@ class Rays(NamedTuple):
     dx: Tensor
     dy: Tensor
     dz: Tensor
+
+
+class Mode(NamedTuple):
+    """How to trace: direction of travel (+1 to the film), whether lost rays stay finite on the way, whether they are
+    put on the axis at once (for gradients)."""
+
+    sense: int
+    guard: bool
+    freeze: bool
+
+    @property
+    def spend(self) -> bool:
+        """Whether tests may overwrite the numbers they test: where they are not used again, outside a compiler."""
+        return not self.guard and not torch.compiler.is_compiling()
 
 
 class Medium(NamedTuple):
@@ -73,7 +193,7 @@ def times(a: Tensor, k: Any) -> Tensor:
 
 
 def root(square: Tensor, guard: bool) -> Tensor:
-    """Square root; with `guard`, 1 instead of NaN (or of an infinite slope) where there is none."""
+    """Square root; with `guard`, 1 instead of NaN (or of an infinite derivative) where there is none."""
     if guard:
         return torch.sqrt(torch.where(square > 0, square, 1.0))
     if torch.compiler.is_compiling():
@@ -99,15 +219,13 @@ def _minus_curved(a: Tensor, f: Tensor, n2: Any, curvature: Any) -> Tensor:
     return plus_times(a, times(f, n2), -curvature)
 
 
-def intersect_sphere(
-    r: Rays, curvature: Any, sense: int, before: Medium, entering: bool, guard: bool, spend: bool
-) -> Hit:
+def intersect_sphere(r: Rays, curvature: Any, mode: Mode, before: Medium, entering: bool) -> Hit:
     """Meet a sphere of signed curvature (1/mm) at the root next to the vertex.
 
-    `entering` marks the first surface met, where rays may arrive at more than 90 degrees. `guard` keeps rays without a
-    meeting finite (for gradients and for crossings that are learnt from); without it they are NaN. `spend` is as in
-    `survival.positive`.
+    `entering` marks the first surface met, where rays may arrive at more than 90 degrees. Rays without a meeting are
+    NaN, but finite where the mode guards.
     """
+    sense, guard, spend = mode.sense, mode.guard, mode.spend
     mx, my, mz = nearest_approach(r, before.inverse_n2)
     m2 = (mx * mx).addcmul_(my, my).addcmul_(mz, mz)
     f = plus_times(m2 * curvature, mz, -2.0)
@@ -129,7 +247,7 @@ def intersect_sphere(
         t = f / denominator
         # One comparison: NaN from a negative square fails it too.
         met = positive(denominator, sense, spend=spend)
-    # In place where nobody needs the nearest approach any more: a third less memory to move.
+    # In place where the nearest approach is not used again: a third less memory to move.
     add = Tensor.addcmul_ if spend else torch.addcmul
     x, y, z = add(mx, t, r.dx), add(my, t, r.dy), add(mz, t, r.dz)
     if entering:
@@ -138,8 +256,9 @@ def intersect_sphere(
     return Hit(x, y, z, q, q2, met)
 
 
-def intersect_plane(r: Rays, sense: int, guard: bool, spend: bool) -> Hit:
-    """Meet the plane z = 0; a ray that does not travel along `sense` misses it. Arguments as for a sphere."""
+def intersect_plane(r: Rays, mode: Mode) -> Hit:
+    """Meet the plane z = 0; a ray that does not travel along `sense` misses it."""
+    sense, guard, spend = mode.sense, mode.guard, mode.spend
     q = r.dz * sense
     met = positive(q.clone() if spend else q, spend=spend)
     t = r.z / (torch.where(met, r.dz, float(sense)) if guard else r.dz)
@@ -149,15 +268,15 @@ def intersect_plane(r: Rays, sense: int, guard: bool, spend: bool) -> Hit:
 
 
 def refract(
-    r: Rays, hit: Hit, curvature: Any, sense: int, before: Medium, after: Medium, guard: bool
+    r: Rays, hit: Hit, curvature: Any, mode: Mode, before: Medium, after: Medium
 ) -> tuple[Rays, Tensor, Tensor]:
     """Snell's law: the tangential part of the optical direction cosines stays, the normal part follows their length.
 
     Returns the refracted rays (vertex frame), n' times the cosine of refraction [N], and the square of that before
     guarding, which is not positive where the ray is totally reflected.
     """
-    q2 = hit.q2 + (after.n2 - before.n2)
-    q = root(q2, guard)
+    sense, q2 = mode.sense, hit.q2 + (after.n2 - before.n2)
+    q = root(q2, mode.guard)
     bend = q - hit.q
     if hit.normal is not None:
         direction = (torch.addcmul(p, bend, n, value=sense) for p, n in zip(r[3:], hit.normal, strict=True))

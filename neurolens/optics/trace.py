@@ -1,4 +1,4 @@
-"""The exact tracer: every ray through every surface, in either direction, with the same code.
+"""The exact tracer: every ray through every surface, in either direction, with the same code, and ray differentials.
 
 This is the truth that surrogates are measured against. Rays are separate tensors of shape [N] (a structure of
 arrays); float64 for truth, float32 for speed. A ray that cannot go on carries a status and stays finite.
@@ -17,13 +17,10 @@ from torch.autograd import forward_ad
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.optics import glass
-from neurolens.optics.media import media
-from neurolens.optics.passing import Mode, along_axis, bend, check_rays, meet, sound_wavelength, start, unit
+from neurolens.optics.passing import Mode, along_axis, bend, check_rays, media, meet, sound_wavelength, start, unit
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays, times
 from neurolens.optics.transmission import passage
-
-__all__ = ["CHUNK", "Crossing", "Rays", "Traced", "compile_trace", "trace"]
 
 Towards = Literal["scene", "film"]
 Transmittance = bool | Literal["polarised"]
@@ -230,3 +227,77 @@ def _fill(whole: Any, part: Any, at: slice) -> None:
     elif isinstance(part, tuple):
         for a, b in zip(whole, part, strict=True):
             _fill(a, b, at)
+
+
+class Differentials(NamedTuple):
+    """A traced ray and its derivatives.
+
+    Attributes:
+        traced: as `trace` gives it.
+        derivatives: for every parameter, the derivatives of the resulting ray: x, y, z (mm per unit of it) and
+            direction, each [N]; 0 for rays that do not go on. Points move on the last surface.
+    """
+
+    traced: Traced
+    derivatives: tuple[Rays, ...]
+
+
+def trace_differentials(
+    lens: Lens,
+    rays: Rays,
+    derivatives: Sequence[Rays],
+    wavelength_nm: Tensor | float = glass.LINE_D_NM,
+    *,
+    towards: Towards = "scene",
+) -> Differentials:
+    """Trace rays together with their derivatives.
+
+    Args:
+        lens, rays, wavelength_nm, towards: as for `trace`.
+        derivatives: of the rays with respect to some parameters, one `Rays` each (components [N]), such as
+            those of `film_derivatives`.
+
+    Raises:
+        InputError: as `trace`, and a derivative whose components have not the shape and dtype of the rays.
+    """
+    for n, derivative in enumerate(derivatives):
+        for name, c, r in zip(Rays._fields, derivative, rays, strict=True):
+            if c.shape != r.shape or c.dtype != r.dtype:
+                found = f"({tuple(c.shape)}, {c.dtype})"
+                raise InputError(
+                    "trace", f"derivatives[{n}].{name}", found, f"like the rays: {tuple(r.shape)}, {r.dtype}"
+                )
+    traced, carried = None, []
+    for derivative in derivatives:
+        with forward_ad.dual_level():
+            dual = Rays(
+                *(forward_ad.make_dual(r.contiguous(), t.contiguous()) for r, t in zip(rays, derivative, strict=True))
+            )
+            out = trace(lens, dual, wavelength_nm, towards=towards)
+            parts = [forward_ad.unpack_dual(c) for c in out.rays]
+            moved = (torch.zeros_like(p.primal) if p.tangent is None else p.tangent for p in parts)
+            # A lost ray was replaced by one along the axis, whose derivative is 0 already; others may carry NaN.
+            carried.append(Rays(*(torch.nan_to_num(s, 0.0, 0.0, 0.0) for s in moved)))
+            traced = out._replace(rays=Rays(*(p.primal for p in parts)))
+    return Differentials(
+        trace(lens, rays, wavelength_nm, towards=towards) if traced is None else traced, tuple(carried)
+    )
+
+
+def film_derivatives(rays: Rays, distance_mm: Tensor | float) -> tuple[Rays, Rays]:
+    """Derivatives of camera rays with respect to the film point's x and y (mm), the pupil point held.
+
+    Args:
+        rays: from the film point towards the pupil point, unit directions, each [N].
+        distance_mm: from film point to pupil point along the ray, positive, number or [N].
+
+    With d = (P - F) / |P - F|, dd/dF_x = (d d_x - e_x) / |P - F|.
+    """
+    zero, one = torch.zeros_like(rays.x), torch.ones_like(rays.x)
+    found = []
+    for axis, along in enumerate((rays.dx, rays.dy)):
+        e = [0.0, 0.0, 0.0]
+        e[axis] = 1.0
+        dx, dy, dz = ((c * along - k) / distance_mm for c, k in zip(rays[3:], e, strict=True))
+        found.append(Rays(one * e[0], one * e[1], zero, dx, dy, dz))
+    return found[0], found[1]

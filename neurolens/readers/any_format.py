@@ -1,4 +1,4 @@
-"""One door for every lens file: the format is told by the suffix and checked against the content."""
+"""Lens files of any format: recognised by their content, else by their suffix."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from neurolens.readers.source import decode, read_bytes
 from neurolens.readers.tables import looks_like_table, read_table
 from neurolens.readers.zemax import looks_like_zmx, read_zmx
 
-_HEAD = 20_000  # characters from which a format is told
+_HEAD = 20_000  # characters by which a format is recognised
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ FORMATS = (
 def read_any(path: str | Path, given: Given | None = None) -> Lens:
     """The lens of a file in any format that neurolens reads, its own TOML too.
 
-    The content decides: a suffix only helps where the content tells nothing.
+    The content decides; the suffix counts where the content is not recognised.
 
     Args:
         given: what the user says where the file does not (name, source, f-number, units).

@@ -9,12 +9,11 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.optics import catalogue, paraxial, rims
-from neurolens.optics.clearance import check_clearance
-from neurolens.optics.dispersion import Glass
-from neurolens.optics.lensfields import MAX_INDEX
-from neurolens.optics.lensrows import MAX_POWER, MAX_SURFACES
+from neurolens.optics.catalogue import Glass
+from neurolens.optics.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
 from neurolens.optics.paraxial import FirstOrder
-from neurolens.optics.prescription import Configuration, Lens, Surface
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.sag import check_clearance
 from neurolens.readers.source import warn
 
 # A diameter that the file does not give, until `finish` has found it.
@@ -25,11 +24,7 @@ SAME_INDEX, SAME_ABBE = 2e-5, 0.005  # how near the catalogue printed figures ar
 
 
 def finish(
-    lens: Lens,
-    *,
-    pupil_mm: float | None = None,
-    film_given: bool = True,
-    stop_limit_mm: float | None = None,
+    lens: Lens, *, pupil_mm: float | None = None, film_given: bool = True, stop_limit_mm: float | None = None
 ) -> Lens:
     """A lens from the rows of a file, with what follows from them: f-number or stop, and back focus.
 
@@ -132,12 +127,7 @@ def check_states(lens: Lens) -> None:
     """Raise for rims beyond their sphere and surfaces that overlap, in the table and in every state of it."""
     check_clearance(lens.surfaces, lens.path)
     for c in lens.configurations:
-        check_clearance(moved(lens, c).surfaces, lens.path, f'configuration "{c.name}", ')
-
-
-def is_anamorphic(lens: Lens) -> bool:
-    """Whether a lens has cylinders."""
-    return any(s.cylinder for s in lens.surfaces)
+        check_clearance(lens.with_gaps(dict(c.thickness_mm)).surfaces, lens.path, f'configuration "{c.name}", ')
 
 
 def first_order(lens: Lens) -> FirstOrder:
@@ -149,20 +139,13 @@ def first_order(lens: Lens) -> FirstOrder:
     try:
         data = paraxial.first_order(lens, meridian="y")
     except InputError:
-        if not is_anamorphic(lens):
+        if not lens.anamorphic:
             raise
         data = paraxial.first_order(lens, meridian="x")
     if not 0 < data.entrance_pupil_diameter_mm < math.inf:
         found = f"(seen from the scene {data.entrance_pupil_diameter_mm:g} mm wide)"
         raise InputError(lens.path, "stop", found, "a stop whose image in front of it has a size")
     return data
-
-
-def moved(lens: Lens, c: Configuration) -> Lens:
-    """The lens with the thicknesses of a state."""
-    thickness = dict(c.thickness_mm)
-    rows = (replace(s, thickness_mm=thickness.get(k, s.thickness_mm)) for k, s in enumerate(lens.surfaces))
-    return replace(lens, surfaces=tuple(rows))
 
 
 def _check_rows(rows: Sequence[Surface], file: str) -> None:

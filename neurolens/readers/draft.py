@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensrows import MAX_SURFACES
+from neurolens.optics.lensfile import MAX_SURFACES
 from neurolens.optics.prescription import Configuration, Lens, Surface
-from neurolens.readers.assemble import check_states, finish, first_order, moved, smaller_stop, with_rims
+from neurolens.readers.assemble import check_states, finish, first_order, smaller_stop, with_rims
 from neurolens.readers.source import unit_mm, warn
 
 
@@ -142,7 +142,7 @@ def _stop_aperture(draft: Draft) -> float | None:
 
 
 def _states(draft: Draft) -> tuple[State, ...]:
-    """The states of the file; a lone table that is focused near becomes a focus state of its own."""
+    """The states of the file; a table without states that is focused near becomes a focus state of its own."""
     if not draft.states and math.isfinite(draft.object_distance):
         return (State("as filed", object_distance=draft.object_distance, film_given=draft.film_given),)
     return draft.states
@@ -155,7 +155,7 @@ def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
     if not state.film_given:
         thickness.pop(last, None)
     found = Configuration(state.name, None, tuple(sorted(thickness.items())))
-    there = moved(lens, found)
+    there = lens.with_gaps(dict(found.thickness_mm))
     data = first_order(there)
     opening, f_number = state.stop_diameter, state.f_number
     pupil = state.pupil

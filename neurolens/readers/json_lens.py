@@ -1,8 +1,9 @@
 """Prescriptions as JSON, in the form that ../shared/data/README.md defines: surfaces with full diameters in mm.
 
 A radius of 0 is a plane, an index of null is air, a last thickness of 0 or null stands for the computed back focus,
-`cyl-x` is a cylinder curved along x. States marked as interpolated by the transcriber are left out with a warning. The
-forms of DeepLens and ISET are read too (`json_others`).
+`cyl-x` is a cylinder curved along x. What the file states beside its table is checked against it: focal length and back
+focus, and the object's distance of every focus state. States marked as interpolated by the transcriber are left out
+with a warning. The forms of DeepLens and ISET are read too (`json_others`).
 """
 
 from __future__ import annotations
@@ -13,18 +14,15 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from neurolens.base.errors import InputError
-from neurolens.base.tomlfile import reject_unknown
-from neurolens.optics.lensfields import number, text
-from neurolens.optics.lensrows import MAX_SURFACES
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.readers.assemble import UNKNOWN, finish, same_glass
+from neurolens.optics import paraxial
+from neurolens.optics.lensfile import MAX_SURFACES, Table
+from neurolens.optics.prescription import Configuration, Lens, Surface
+from neurolens.readers.assemble import UNKNOWN, check_states, finish, first_order, same_glass
 from neurolens.readers.draft import Given
 from neurolens.readers.json_others import read_others
-from neurolens.readers.json_stated import check_computed, image_and_field, stated_efl
-from neurolens.readers.json_states import read_states
 from neurolens.readers.source import decode, read_bytes, warn
 
 KEYS = (
@@ -40,6 +38,14 @@ SHAPES = {"sphere": None, "asphere": None, "cyl-x": "x", "cyl-y": "y"}
 _NOT_THE_SOURCE_S = re.compile(
     r"diameters?[^.;]*\b(trimmed|enlarged|chosen|estimated|inferred|computed|reduced)\b", re.IGNORECASE
 )
+STATE_KEYS = (
+    *("name", "efl_mm", "efl_y_mm", "efl_x_mm", "f_number", "object_distance_mm", "magnification"),
+    *("thickness_overrides", "stop_diameter_mm", "interpolated_by_transcriber", "note"),
+)
+MAX_STATES = 200
+DOUBTFUL = 0.05  # relative difference of a stated object distance from the paraxial one that is worth a warning
+AGREES = 1e-4  # relative: more than rounding of the printed figures, less than any wrong digit
+_NUMBER = r"([0-9]+(?:\.[0-9]+)?)"
 
 
 def read_json_lens(path: str | Path, given: Given | None = None, *, catalogue: bool = True) -> Lens:
@@ -64,26 +70,25 @@ def read_json_lens(path: str | Path, given: Given | None = None, *, catalogue: b
     other = read_others(data, file, given)
     if other is not None:
         return other
-    reject_unknown(file, "", data, KEYS)
+    table = Table(data, file)
+    table.only(KEYS)
     rows = data.get("surfaces", "(missing)")
     if not isinstance(rows, list) or not rows or len(rows) > MAX_SURFACES:
         found = f"({len(rows)} of them)" if isinstance(rows, list) else rows
-        raise InputError(file, "surfaces", found, f"a list of 1 to {MAX_SURFACES} objects")
+        raise table.error("surfaces", found, f"a list of 1 to {MAX_SURFACES} objects")
     last = len(rows) - 1
-    surfaces = tuple(_surface(row, k, file, is_last=k == last, catalogue=catalogue) for k, row in enumerate(rows))
-    notes, estimated = text(data, "notes", file, required=False), data.get("diameters_estimated", False)
-    if not isinstance(estimated, bool):
-        raise InputError(file, "diameters_estimated", estimated, "true or false")
+    surfaces = tuple(_surface(row, k, file, k == last, catalogue) for k, row in enumerate(rows))
+    notes, estimated = table.text("notes", required=False), table.flag("diameters_estimated")
     if not estimated and _NOT_THE_SOURCE_S.search(notes):
         warn(file, "the notes tell of diameters that are not the source's; rims are taken as estimated")
         estimated = True
-    stated = number(data, "f_number", file, above=0) if data.get("f_number") is not None else math.nan
+    stated = table.number("f_number", above=0) if data.get("f_number") is not None else math.nan
     lens = Lens(
-        name=given.name or text(data, "name", file),
-        source=given.source or text(data, "source", file),
+        name=given.name or table.text("name"),
+        source=given.source or table.text("source"),
         surfaces=surfaces,
         f_number=given.f_number if given.f_number is not None and math.isnan(stated) else stated,
-        designer=_optional_text(data, "designer", file),
+        designer=_optional_text(table, "designer"),
         notes=notes,
         rims="estimated" if estimated else "source",
         path=file,
@@ -127,60 +132,214 @@ def _load(path: str | Path) -> dict[str, Any]:
     return data
 
 
-def _surface(row: Any, k: int, file: str, *, is_last: bool, catalogue: bool) -> Surface:
-    where = f"surface {k}, "
-    if not isinstance(row, Mapping):
-        raise InputError(file, f"surface {k}", row, "an object with radius_mm, thickness_mm, diameter_mm")
-    reject_unknown(file, where, row, SURFACE_KEYS)
-    radius = number(row, "radius_mm", file, where, unit="mm, 0 for a plane")
-    thickness = 0.0 if is_last and row.get("thickness_mm") is None else number(row, "thickness_mm", file, where)
-    if row.get("diameter_mm") is None and not row.get("stop"):
-        raise InputError(file, f"{where}diameter_mm", "(null)", "the full clear diameter in mm")
-    diameter = UNKNOWN if row.get("diameter_mm") is None else number(row, "diameter_mm", file, where, above=0)
-    stop, shape = row.get("stop", False), row.get("shape", "sphere")
-    if not isinstance(stop, bool):
-        raise InputError(file, f"{where}stop", stop, "true or false")
+def _surface(given: Any, k: int, file: str, is_last: bool, catalogue: bool) -> Surface:
+    if not isinstance(given, Mapping):
+        raise InputError(file, f"surface {k}", given, "an object with radius_mm, thickness_mm, diameter_mm")
+    row = Table(given, file, f"surface {k}, ")
+    row.only(SURFACE_KEYS)
+    radius = row.number("radius_mm", unit="mm, 0 for a plane")
+    thickness = 0.0 if is_last and given.get("thickness_mm") is None else row.number("thickness_mm")
+    if given.get("diameter_mm") is None and not given.get("stop"):
+        raise row.error("diameter_mm", "(null)", "the full clear diameter in mm")
+    diameter = UNKNOWN if given.get("diameter_mm") is None else row.number("diameter_mm", above=0)
+    stop, shape = row.flag("stop"), given.get("shape", "sphere")
     if not isinstance(shape, str) or shape not in SHAPES:
-        raise InputError(file, f"{where}shape", shape, f"one of {', '.join(SHAPES)}")
-    conic = number(row, "conic", file, where) if row.get("conic") is not None else 0.0
+        raise row.error("shape", shape, f"one of {', '.join(SHAPES)}")
     return Surface(
         radius_mm=radius or math.inf,
         thickness_mm=thickness,
         diameter_mm=diameter,
         stop=stop,
-        conic=conic,
-        asphere=_asphere(row, file, where),
+        conic=row.number("conic") if given.get("conic") is not None else 0.0,
+        asphere=_asphere(row),
         cylinder=SHAPES[shape],
-        **_glass(row, file, where, catalogue=catalogue),
+        **_glass(row, catalogue),
     )
 
 
-def _glass(row: Mapping[str, Any], file: str, where: str, *, catalogue: bool) -> dict[str, Any]:
-    if row.get("n_d") is None:
+def _glass(row: Table, catalogue: bool) -> dict[str, Any]:
+    if row.data.get("n_d") is None:
         for key in ("V_d", "material"):
-            if row.get(key) not in (None, "air"):
-                raise InputError(file, f"{where}n_d", "(null)", f"the index of the glass, as {key} is given")
+            if row.data.get(key) not in (None, "air"):
+                raise row.error("n_d", "(null)", f"the index of the glass, as {key} is given")
         return {}
-    medium: dict[str, Any] = {"n_d": number(row, "n_d", file, where, above=0)}
-    medium["V_d"] = number(row, "V_d", file, where, above=0) if row.get("V_d") is not None else None
-    medium["material"] = _optional_text(row, "material", file, where) or None
-    if catalogue:
-        medium["glass"] = same_glass(medium["material"], medium["n_d"], medium["V_d"])
-    return medium
+    n_d = row.number("n_d", above=0)
+    V_d = row.number("V_d", above=0) if row.data.get("V_d") is not None else None
+    material = _optional_text(row, "material") or None
+    return {
+        "n_d": n_d,
+        "V_d": V_d,
+        "material": material,
+        "glass": same_glass(material, n_d, V_d) if catalogue else None,
+    }
 
 
-def _asphere(row: Mapping[str, Any], file: str, where: str) -> tuple[tuple[int, float], ...]:
-    given = row.get("aspheric_coefficients") or {}
+def _asphere(row: Table) -> tuple[tuple[int, float], ...]:
+    given = row.data.get("aspheric_coefficients") or {}
     if not isinstance(given, Mapping):
-        raise InputError(file, f"{where}aspheric_coefficients", given, 'an object such as {"4": 1e-6}')
+        raise row.error("aspheric_coefficients", given, 'an object such as {"4": 1e-6}')
     terms = []
     for key in given:
         if not (key.isascii() and key.isdecimal() and len(key) < 4):
-            raise InputError(file, f"{where}aspheric_coefficients", key, "powers of r as keys")
-        terms.append((int(key), number(given, key, file, f"{where}aspheric_coefficients, power ")))
+            raise row.error("aspheric_coefficients", key, "powers of r as keys")
+        terms.append((int(key), Table(given, row.file, f"{row.where}aspheric_coefficients, power ").number(key)))
     return tuple(sorted((power, value) for power, value in terms if value))
 
 
-def _optional_text(table: Mapping[str, Any], key: str, file: str, where: str = "") -> str:
+def _optional_text(table: Table, key: str) -> str:
     """A text that may be null."""
-    return "" if table.get(key) is None else text(table, key, file, where, required=False)
+    return "" if table.data.get(key) is None else table.text(key, required=False)
+
+
+def stated_efl(lens: Lens, data: Mapping[str, Any]) -> Lens:
+    """The lens with the focal length that the file states: of several, those of an anamorphic lens by meridian, else
+    the first (the state that the table is in)."""
+    given = data.get("efl_mm")
+    values = [given] if not isinstance(given, list) else given
+    for value in values:
+        real = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value > 0
+        if value is not None and not real:
+            raise InputError(lens.path, "efl_mm", given, "a number above 0 in mm, a list of them, or null")
+    if not values or values[0] is None:
+        return lens
+    if lens.anamorphic and len(values) == 2:
+        y = paraxial.first_order(lens, meridian="y").efl_mm
+        x = paraxial.first_order(lens, meridian="x").efl_mm
+        a, b = map(float, values)
+        straight = abs(math.log(a / abs(y))) + abs(math.log(b / abs(x)))
+        crossed = abs(math.log(b / abs(y))) + abs(math.log(a / abs(x)))
+        a, b = (a, b) if straight <= crossed else (b, a)
+        return replace(lens, stated_efl_mm=a, stated_efl_x_mm=b)
+    return replace(lens, stated_efl_mm=float(values[0]))
+
+
+def check_computed(lens: Lens, data: Mapping[str, Any]) -> None:
+    """Warn where focal length or back focus differ from those that the file says were computed from its table."""
+    given = data.get("computed_at_nd") or {}
+    if not isinstance(given, Mapping):
+        raise InputError(lens.path, "computed_at_nd", given, "an object with efl_mm and bfd_mm")
+    table = replace(lens, surfaces=tuple(replace(s, glass=None) for s in lens.surfaces))
+    axes: tuple[tuple[Literal["x", "y"], str], ...] = (("y", ""), ("y", "_y"), ("x", "_x"))
+    for axis, suffix in axes:
+        found = paraxial.first_order(table, meridian=axis)
+        for key, value in ((f"efl{suffix}_mm", found.efl_mm), (f"bfd{suffix}_mm", found.back_focus_mm)):
+            expected = given.get(key)
+            if isinstance(expected, int | float) and not abs(value - expected) <= AGREES * abs(found.efl_mm):
+                warn(lens.path, f"{key} computed from the table is {value:.6g}; the file says {expected:.6g}")
+
+
+def image_and_field(data: Mapping[str, Any], file: str) -> dict[str, Any]:
+    """`image_radius_mm` and `half_field_deg` from the free text of `field_or_image_circle`, where it is clear.
+
+    Understood: "image radius 21.6 mm", "image circle 43.2 mm", "38 deg half field", "+-20 deg", "180 deg full field",
+    "AOV 45.2 deg" (full; of several the first), and the keys fullFieldDeg and imageCircleMm. Else a warning.
+    """
+    text = data.get("field_or_image_circle")
+    found: dict[str, Any] = {"image_radius_mm": None, "half_field_deg": None}
+    if text is None or text == "":
+        return found
+    if not isinstance(text, str):
+        raise InputError(file, "field_or_image_circle", text, "a text or null")
+    for pattern, key, factor in (
+        (rf"image radius {_NUMBER} mm", "image_radius_mm", 1.0),
+        (rf"image height {_NUMBER} mm", "image_radius_mm", 1.0),
+        (rf"image circle {_NUMBER} mm", "image_radius_mm", 0.5),
+        (r'"imageCircleMm": *' + _NUMBER, "image_radius_mm", 0.5),
+        (rf"{_NUMBER} deg half field", "half_field_deg", 1.0),
+        (rf"\+-{_NUMBER} deg", "half_field_deg", 1.0),
+        (rf"{_NUMBER} deg full field", "half_field_deg", 0.5),
+        (rf"AOV {_NUMBER}", "half_field_deg", 0.5),
+        (r'"fullFieldDeg": *' + _NUMBER, "half_field_deg", 0.5),
+    ):
+        match = re.search(pattern, text)
+        if match and found[key] is None:
+            found[key] = float(match[1]) * factor
+    if found == {"image_radius_mm": None, "half_field_deg": None}:
+        warn(file, f"field_or_image_circle is not clear and left out: {json.dumps(text)}")
+    return found
+
+
+def read_states(lens: Lens, data: Mapping[str, Any]) -> Lens:
+    """The lens with the states of the file.
+
+    Raises:
+        InputError: an unknown key, a surface that does not exist, a value out of range, a name given twice, surfaces
+            that overlap in a state.
+    """
+    states: list[Configuration] = []
+    for place, given in enumerate(_tables(data, lens.path)):
+        if not isinstance(given, Mapping):
+            raise InputError(lens.path, f"configuration {place}", given, "an object with thickness_overrides")
+        table = Table(given, lens.path, f"configuration {place}, ")
+        table.only(STATE_KEYS)
+        name = table.text("name")
+        if given.get("interpolated_by_transcriber"):
+            warn(lens.path, f'configuration "{name}" is left out: interpolated by the transcriber, not from the source')
+            continue
+        if name in [c.name for c in states]:
+            raise table.error("name", name, "a name that no other configuration has")
+        states.append(_state(lens, replace(table, where=f'configuration "{name}", '), name))
+    whole = replace(lens, configurations=tuple(states))
+    check_states(whole)
+    return whole
+
+
+def _tables(data: Mapping[str, Any], file: str) -> list[Any]:
+    given = data.get("configurations")
+    if isinstance(given, Mapping):
+        Table(given, file, "configurations, ").only(("configs",))
+        given = given.get("configs")
+    tables = [] if given is None else given
+    if not isinstance(tables, list) or len(tables) > MAX_STATES:
+        raise InputError(file, "configurations", given, f"null or a list of at most {MAX_STATES} states")
+    return tables
+
+
+def _state(lens: Lens, table: Table, name: str) -> Configuration:
+    """One state; what the source leaves open (focal length, object distance) follows from its thicknesses."""
+    given: dict[str, float | None] = {
+        key: table.number(key, above=0) if table.data.get(key) is not None else None
+        for key in ("efl_mm", "efl_y_mm", "f_number", "stop_diameter_mm")
+    }
+    efl_y, distance = given.pop("efl_y_mm"), table.data.get("object_distance_mm")
+    efl = given.pop("efl_mm") if given["efl_mm"] is not None else (given.pop("efl_mm"), efl_y)[1]
+    state = Configuration(name, efl, _thickness(lens, table), **given)
+    table_lens = lens.with_gaps(dict(state.thickness_mm))
+    paraxial_mm = _object_distance_mm(table_lens)
+    if isinstance(distance, str):
+        if not (math.isfinite(paraxial_mm) and paraxial_mm > 0):
+            raise table.error("object_distance_mm", distance, "a distance in mm, or null")
+        warn(
+            lens.path,
+            f"{table.where}object_distance_mm {distance!r}: {paraxial_mm:.6g} mm follows from the thicknesses",
+        )
+        return replace(state, object_distance_mm=paraxial_mm)
+    if distance is not None:
+        stated = table.number("object_distance_mm", unit="mm", above=0)
+        if not abs(paraxial_mm / stated - 1) <= DOUBTFUL:
+            focused = f"{stated:g} is stated; the thicknesses focus {paraxial_mm:.6g}"
+            warn(lens.path, f"{table.where}object_distance_mm {focused}")
+        return replace(state, object_distance_mm=stated)
+    return state if efl is not None else replace(state, efl_mm=first_order(table_lens).efl_mm)
+
+
+def _object_distance_mm(lens: Lens) -> float:
+    """Distance from the object in focus on the tabled film to the front vertex (Newton's x x' = -f^2)."""
+    data = first_order(lens)
+    beyond = float(lens.vertices_mm[-1]) - data.rear_focal_z_mm
+    return data.efl_mm**2 / beyond - data.front_focal_z_mm if beyond else math.inf
+
+
+def _thickness(lens: Lens, table: Table) -> tuple[tuple[int, float], ...]:
+    given = table.data.get("thickness_overrides", "(missing)")
+    if not isinstance(given, Mapping):
+        raise table.error("thickness_overrides", given, 'an object such as {"5": 26.15}')
+    gaps = Table(given, lens.path, f"{table.where}thickness_overrides, surface ")
+    found = []
+    for key in given:
+        if not (key.isascii() and key.isdecimal() and len(key) < 5 and int(key) < len(lens.surfaces)):
+            expected = f"a surface number from 0 to {len(lens.surfaces) - 1}"
+            raise table.error("thickness_overrides", key, expected)
+        value = gaps.number(key, unit="mm")
+        found.append((int(key), value))
+    return tuple(sorted(found))

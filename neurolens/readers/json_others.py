@@ -13,8 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.base.tomlfile import reject_unknown
-from neurolens.optics.lensfields import number
+from neurolens.optics.lensfile import Table
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.readers.assemble import first_order, named_glass
 from neurolens.readers.draft import Draft, Given, Row, lens_of
@@ -46,7 +45,7 @@ def read_others(data: Mapping[str, Any], file: str, given: Given) -> Lens | None
         return None
     lens = lens_of(draft, given)
     if "foclen" in data:
-        stated, found = number(data, "foclen", file), first_order(lens).efl_mm
+        stated, found = Table(data, file).number("foclen"), first_order(lens).efl_mm
         if abs(found - stated) > 0.01 * abs(stated):
             warn(file, f"foclen says {stated:.5g} mm, the first order of its surfaces {found:.5g} mm")
     return lens
@@ -64,83 +63,84 @@ def _draft(data: Mapping[str, Any], file: str) -> Draft | None:
 
 
 def _deeplens(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: str) -> Draft:
-    reject_unknown(file, "", {k: v for k, v in data.items() if not _repeats(k)}, _DEEPLENS)
-    surfaces = [_deeplens_surface(row, file, f"surface {k}, ") for k, row in enumerate(rows)]
+    Table({k: v for k, v in data.items() if not _repeats(k)}, file).only(_DEEPLENS)
+    surfaces = [_deeplens_surface(Table(row, file, f"surface {k}, ")) for k, row in enumerate(rows)]
     return Draft(
         file=file,
         kind="DeepLens",
         rows=tuple(Row(s, aperture=True) for s in surfaces),
         name=_line(data.get("info")),
-        image_radius=number(data, "r_sensor", file, above=0) if "r_sensor" in data else None,
+        image_radius=Table(data, file).number("r_sensor", above=0) if "r_sensor" in data else None,
         film_given=surfaces[-1].thickness_mm > 0,
         unit="mm",
     )
 
 
-def _deeplens_surface(row: Mapping[str, Any], file: str, where: str) -> Surface:
-    kind, stop = row.get("type"), row.get("type") in _STOPS
+def _deeplens_surface(row: Table) -> Surface:
+    given, kind, stop = row.data, row.data.get("type"), row.data.get("type") in _STOPS
     if kind not in ("Spheric", "Aspheric", *_STOPS):
-        raise InputError(file, f"{where}type", kind, "Spheric, Aspheric, Stop or Aperture")
+        raise row.error("type", kind, "Spheric, Aspheric, Stop or Aperture")
     # ai2, ai4, ... say the list ai once more.
-    once = {k: v for k, v in row.items() if not (_repeats(k) or (k[:2] == "ai" and k[2:].isdecimal() and "ai" in row))}
-    reject_unknown(file, where, once, _DEEPLENS_SURFACE)
+    again = [k for k in given if _repeats(k) or (k[:2] == "ai" and k[2:].isdecimal() and "ai" in given)]
+    Table({k: v for k, v in given.items() if k not in again}, row.file, row.where).only(_DEEPLENS_SURFACE)
     shape: dict[str, Any] = {}
     if kind == "Aspheric":
-        terms = row.get("ai") or []
+        terms = given.get("ai") or []
         if not isinstance(terms, list):
-            raise InputError(file, f"{where}ai", terms, "a list of coefficients of r^2, r^4, ...")
-        table = {f"ai[{k}]": value for k, value in enumerate(terms)}
-        sag = [(2 * k + 2, number(table, key, file, where)) for k, key in enumerate(table)]
-        conic = number(row, "k", file, where) if "k" in row else 0.0
+            raise row.error("ai", terms, "a list of coefficients of r^2, r^4, ...")
+        table = Table({f"ai[{k}]": value for k, value in enumerate(terms)}, row.file, row.where)
+        sag = [(2 * k + 2, table.number(key)) for k, key in enumerate(table.data)]
+        conic = row.number("k") if "k" in row else 0.0
         shape = {"conic": conic, "asphere": tuple((power, value) for power, value in sag if value)}
     return Surface(
-        radius_mm=math.inf if stop else _radius_mm(row, file, where),
-        thickness_mm=number(row, "d_next", file, where, unit="mm"),
-        diameter_mm=2 * number(row, "r", file, where, unit="mm", above=0),
+        radius_mm=math.inf if stop else _radius_mm(row),
+        thickness_mm=row.number("d_next", unit="mm"),
+        diameter_mm=2 * row.number("r", unit="mm", above=0),
         stop=stop,
         **shape,
-        **_medium(row.get("mat2"), file, where),
+        **_medium(row),
     )
 
 
-def _radius_mm(row: Mapping[str, Any], file: str, where: str) -> float:
+def _radius_mm(row: Table) -> float:
     """`roc` has more digits than `c`, where both are there; 0 is a plane in both."""
     if "roc" in row:
-        return number(row, "roc", file, where, unit="mm", finite=False) or math.inf
-    c = number(row, "c", file, where, unit="1/mm")
+        return row.number("roc", unit="mm", finite=False) or math.inf
+    c = row.number("c", unit="1/mm")
     return 1 / c if c else math.inf
 
 
-def _medium(name: Any, file: str, where: str) -> dict[str, Any]:
+def _medium(row: Table) -> dict[str, Any]:
+    name = row.data.get("mat2")
     if not isinstance(name, str):
-        raise InputError(file, f"{where}mat2", name, 'a glass, "n_d/V_d" or "air"')
+        raise row.error("mat2", name, 'a glass, "n_d/V_d" or "air"')
     if name.lower() in _AIR:
         return {}
     index, slash, abbe = name.partition("/")
     if not slash:
-        return named_glass(name, file, f"{where}mat2")
+        return named_glass(name, row.file, f"{row.where}mat2")
     try:
         return {"n_d": float(index), "V_d": float(abbe)}
     except ValueError:
-        raise InputError(file, f"{where}mat2", name, 'two numbers, "n_d/V_d"') from None
+        raise row.error("mat2", name, 'two numbers, "n_d/V_d"') from None
 
 
 def _iset(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: str) -> Draft:
-    reject_unknown(file, "", data, _ISET)
+    Table(data, file).only(_ISET)
     if data.get("microlens"):
         raise InputError(file, "microlens", "(given)", "a lens without microlenses")
     surfaces = []
-    for k, row in enumerate(rows):
-        where = f"surface {k}, "
-        reject_unknown(file, where, row, _ISET_SURFACE)
-        ior = number(row, "ior", file, where)
+    for k, given in enumerate(rows):
+        row = Table(given, file, f"surface {k}, ")
+        row.only(_ISET_SURFACE)
+        ior = row.number("ior")
         surface = Surface(
-            radius_mm=number(row, "radius", file, where, unit="mm, 0 for a plane") or math.inf,
-            thickness_mm=number(row, "thickness", file, where, unit="mm"),
-            diameter_mm=2 * number(row, "semi_aperture", file, where, unit="mm", above=0),
+            radius_mm=row.number("radius", unit="mm, 0 for a plane") or math.inf,
+            thickness_mm=row.number("thickness", unit="mm"),
+            diameter_mm=2 * row.number("semi_aperture", unit="mm", above=0),
             n_d=ior or 1.0,  # the stop stands in air
             stop=ior == 0,
-            conic=number(row, "conic_constant", file, where) if "conic_constant" in row else 0.0,
+            conic=row.number("conic_constant") if "conic_constant" in row else 0.0,
         )
         surfaces.append(surface)
     return Draft(

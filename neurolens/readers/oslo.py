@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensrows import MAX_SURFACES
+from neurolens.optics.lensfile import MAX_SURFACES
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.readers.assemble import UNKNOWN, named_glass
 from neurolens.readers.draft import Draft, Given, Row, lens_of

@@ -135,5 +135,5 @@ def unit_mm(unit: str, file: str, field: str = "--units") -> float:
 
 
 def warn(file: str, message: str) -> None:
-    """Tell the user something about a file that was read all the same."""
+    """Warn of something in a file that is read nevertheless."""
     warnings.warn(f"{file}: {message}", NeurolensWarning, stacklevel=3)

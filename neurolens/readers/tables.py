@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensrows import MAX_SURFACES
+from neurolens.optics.lensfile import MAX_SURFACES
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.readers.draft import Draft, Given, Row, lens_of
 from neurolens.readers.source import Line, read_lines

@@ -1,41 +1,135 @@
 """A render kept on disk: its sums, and all that they depend on, in one file that is whole or not there.
 
-The file is a zip of numpy arrays (an .npz), stored as they are: `sums.npy`, `done.npy` and `about.json`. It is read
-with suspicion: names, sizes and headers must be those that this render would write, before a byte reaches memory, and
-the checksums of zip find what rotted.
+The file is a zip of numpy arrays (an .npz), stored as they are: `sums.npy`, `done.npy` and `about.json`. Names, sizes
+and headers must be those that this render would write, before a byte reaches memory; the checksums of zip find what is
+damaged. `about.json` holds the identity of the render: what its picture depends on, as JSON that two renders can
+compare.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import math
 import os
 import zipfile
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
-from neurolens.render.identity import NOTHING, difference
-from neurolens.render.sums import Film, Tiling
+from neurolens.cameras.contract import Camera
+from neurolens.render.film import Film, FilmSettings, Tiling
+from neurolens.render.job import Job
+from neurolens.render.mesh import tracer
 
+# Settings of a camera that say where it was read and what was noted, not what it does.
+_NO_MATTER = ("model", "notes")
+_NOTHING = "(nothing)"  # a place that one of two identities lacks
+_PROBES, _DIGITS = 1024, 16
 _FORMAT = 2
 _ABOUT, _SUMS, _DONE = "about.json", "sums.npy", "done.npy"
 SPENT = ("seconds", "camera_thread_seconds", "thread_seconds")
 _LARGEST_ABOUT = 8 << 20
 _LONGEST = 80  # characters of a value in a message
-AGAIN = "or --restart to begin again"
+_AGAIN = "or --restart to begin again"
+
+
+def identity(job: Job) -> dict[str, Any]:
+    """All that the sums of a film depend on, but for the number of samples.
+
+    The scene is its tables, textures and meshes; the camera its settings and what it does with some rays. What traces
+    meshes counts, too, for a picture shall not be half of one rounding and half of another.
+    """
+    scene, camera = job.scene, job.camera
+    # What is given apart, and may be other than the scene's.
+    common = replace(scene.settings.camera, width=1, height=1, samples=1, max_depth=1, focus_m=1.0, f_number=None)
+    bare = replace(scene, name="", settings=replace(scene.settings, camera=common, film=FilmSettings()))
+    kept = {key: value for key, value in camera.settings.items() if key not in _NO_MATTER}
+    told = {
+        "neurolens": __version__,
+        "scene": digest(bare),
+        "camera": {"name": camera.name, **kept, "rays": _rays(camera)},
+        "width": job.grid.width,
+        "height": job.grid.height,
+        "film_mm": list(job.grid.film_mm),
+        "seed": job.seed,
+        "max_depth": job.max_depth,
+        "wavelengths": job.settings.wavelengths,
+        "wavelength_sampling": job.settings.wavelength_sampling,
+        "white_balance": job.settings.white_balance,
+        "differentials": job.differentials,
+    }
+    if scene.triangles:
+        told["meshes traced by"] = tracer()
+    return json.loads(json.dumps(told, default=str))
+
+
+def _leaves(tree: Any, place: str = "") -> dict[str, Any]:
+    if not isinstance(tree, dict) or not tree:
+        return {place: tree}
+    found: dict[str, Any] = {}
+    for key, value in tree.items():
+        found |= _leaves(value, f"{place}.{key}" if place else str(key))
+    return found
+
+
+def digest(value: Any) -> str:
+    """Hexadecimal digits that stand for a value made of dataclasses, mappings, sequences, arrays and plain values."""
+    hasher = hashlib.sha256()
+    _feed(hasher, value)
+    return hasher.hexdigest()[:_DIGITS]
+
+
+def _feed(hasher: Any, value: Any) -> None:
+    """Every part is preceded by what it is and how long, so that no two values read alike."""
+    if isinstance(value, np.ndarray):
+        hasher.update(f"array {value.dtype.str} {value.shape};".encode())
+        hasher.update(np.ascontiguousarray(value).data)
+    elif isinstance(value, Mapping):
+        hasher.update(f"mapping {len(value)};".encode())
+        for key in sorted(value, key=str):
+            _feed(hasher, str(key))
+            _feed(hasher, value[key])
+    elif isinstance(value, (tuple, list)):
+        hasher.update(f"sequence {len(value)};".encode())
+        for item in value:
+            _feed(hasher, item)
+    elif is_dataclass(value):
+        _feed(hasher, type(value).__name__)
+        _feed(hasher, {field.name: getattr(value, field.name) for field in fields(value)})
+    elif hasattr(value, "__dict__"):
+        _feed(hasher, type(value).__name__)
+        _feed(hasher, vars(value))
+    else:
+        text = repr(value)
+        hasher.update(f"{type(value).__name__} {len(text)} {text};".encode())
+
+
+def _rays(camera: Camera) -> str:
+    """Digest of the rays of a fixed set of samples: no two cameras that differ share it."""
+    random = np.random.default_rng(0)
+    film = ((random.random((2, _PROBES)) - 0.5) * np.array(camera.film_mm)[:, None]).astype(np.float32)
+    low, high = camera.wavelength_nm or (400.0, 700.0)
+    nm = np.linspace(low, high, _PROBES).astype(np.float32)
+    rays = camera.sample(film, random.random((2, _PROBES), np.float32), nm)
+    passed = rays.status == 0
+    told = [rays.status, *(np.where(passed, part, 0) for part in (rays.origin_m, rays.direction, rays.weight))]
+    return digest(told)
 
 
 def write_checkpoint(path: Path, film: Film, identity: dict[str, Any], spent: dict[str, float]) -> None:
     """Write what a film has, while workers may go on.
 
     Args:
-        identity: see `neurolens.render.identity`. spent: seconds so far, by the names of `SPENT`.
+        identity: of the job. spent: seconds so far, by the names of `SPENT`.
 
     Raises:
         OSError: it cannot be written; an older checkpoint is still there.
@@ -96,21 +190,22 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
 
 
 def _corrupt(path: Path, why: str) -> InputError:
-    return InputError(path, "file", f"({why})", f"a whole checkpoint of a render, {AGAIN}")
+    return InputError(path, "file", f"({why})", f"a whole checkpoint of a render, {_AGAIN}")
 
 
 def _check_render(path: Path, about: dict[str, Any], identity: dict[str, Any]) -> None:
     if about["format"] != _FORMAT:
-        raise InputError(path, "format", about["format"], f"{_FORMAT}, {AGAIN}")
-    found = difference(about["render"], identity)
-    if found is not None:
-        place, there, here = found
-        shown = there if len(repr(there)) <= _LONGEST else f"({_short(there)})"
-        raise InputError(path, place, shown, f"{_short(here)} as asked now, {AGAIN}")
+        raise InputError(path, "format", about["format"], f"{_FORMAT}, {_AGAIN}")
+    found, wanted = _leaves(about["render"]), _leaves(identity)
+    for place in [*wanted, *found]:
+        there, here = found.get(place, _NOTHING), wanted.get(place, _NOTHING)
+        if json.dumps(there) != json.dumps(here):  # as text: NaN equals NaN
+            shown = there if len(repr(there)) <= _LONGEST else f"({_short(there)})"
+            raise InputError(path, place, shown, f"{_short(here)} as asked now, {_AGAIN}")
 
 
 def _short(value: Any) -> str:
-    text = "nothing" if value == NOTHING else repr(value)
+    text = "nothing" if value == _NOTHING else repr(value)
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
@@ -123,7 +218,7 @@ def _check_tiling(path: Path, about: dict[str, Any], tiling: Tiling) -> None:
         raise _corrupt(path, "impossible times")
     if (about["tile"], about["step"]) != (tiling.tile, tiling.step):
         expected = f"{tiling.samples} as asked now: below {max(tiling.step, about['step'])} samples none can be added"
-        raise InputError(path, "samples", about["samples"], f"{expected}; give the same, {AGAIN}")
+        raise InputError(path, "samples", about["samples"], f"{expected}; give the same, {_AGAIN}")
 
 
 def _check_samples(path: Path, samples: int, tiling: Tiling, done: NDArray[np.int64]) -> None:
@@ -135,8 +230,8 @@ def _check_samples(path: Path, samples: int, tiling: Tiling, done: NDArray[np.in
         return
     most = int(had.max())
     if most > tiling.samples:
-        raise InputError(path, "samples", most, f"{tiling.samples} at most, as asked now: ask for more, {AGAIN}")
-    expected = f"a multiple of {tiling.step}, which alone can be raised to {tiling.samples}; give the same, {AGAIN}"
+        raise InputError(path, "samples", most, f"{tiling.samples} at most, as asked now: ask for more, {_AGAIN}")
+    expected = f"a multiple of {tiling.step}, which alone can be raised to {tiling.samples}; give the same, {_AGAIN}"
     raise InputError(path, "samples", samples, expected)
 
 
@@ -155,15 +250,11 @@ def _fill(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, array: ND
     with archive.open(info) as member:
         if member.read(len(header)) != header:
             raise _corrupt(path, f"{info.filename} of another shape or type")
-        _read_into(member, array.reshape(-1).data.cast("B"))
+        memory, place = array.reshape(-1).data.cast("B"), 0
+        while place < len(memory):
+            got = member.readinto(memory[place : place + (1 << 24)])  # type: ignore[attr-defined]
+            if not got:
+                raise EOFError("it ends too early")
+            place += got
         if member.read(1):
             raise _corrupt(path, f"{info.filename} too long")
-
-
-def _read_into(member: IO[bytes], memory: memoryview) -> None:
-    place = 0
-    while place < len(memory):
-        got = member.readinto(memory[place : place + (1 << 24)])  # type: ignore[attr-defined]
-        if not got:
-            raise EOFError("it ends too early")
-        place += got

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from neurolens.cameras.contract import FloatArray
+
 Matrix = NDArray[np.float64]
 
 BRADFORD: Matrix = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
@@ -79,3 +81,15 @@ def balance(white_rgb: ArrayLike) -> Matrix:
     """Matrix [3, 3] on linear sRGB that makes the colour `white_rgb` [3] neutral and keeps its luminance."""
     white = SRGB.to_xyz @ np.asarray(white_rgb, np.float64)
     return _solve(SRGB.to_xyz, adaptation(white, xyz_of(SRGB.white)) @ SRGB.to_xyz)
+
+
+def srgb_to_linear(encoded: NDArray[np.floating]) -> FloatArray:
+    """Linear light of sRGB-encoded values in [0, 1] (IEC 61966-2-1)."""
+    encoded = np.asarray(encoded, np.float32)
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def linear_to_srgb(linear: NDArray[np.floating]) -> FloatArray:
+    """sRGB encoding of linear light, clipped to [0, 1] (IEC 61966-2-1)."""
+    clipped = np.clip(np.nan_to_num(np.asarray(linear, np.float32), nan=0.0), 0.0, 1.0)
+    return np.where(clipped <= 0.0031308, clipped * 12.92, 1.055 * clipped ** (1 / 2.4) - 0.055).astype(np.float32)

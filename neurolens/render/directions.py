@@ -1,8 +1,4 @@
-"""Directions drawn by a table over the sphere.
-
-The table is a picture in the equirectangular form: its middle looks along -z, its right half along +x, its top row is
-at the zenith (+y).
-"""
+"""Directions: frames, and directions drawn by cosine, in a cone, or by a table over the sphere."""
 
 from __future__ import annotations
 
@@ -12,8 +8,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
+from neurolens.render.primitives import dot
 
-_PI = np.float32(math.pi)
+_PI, TWO_PI = np.float32(math.pi), np.float32(2 * math.pi)
+
+
+def orthonormal(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors [3, N] that make a right-handed frame with each unit normal [3, N] (Duff et al. 2017)."""
+    x, y, z = normal
+    sign = np.copysign(np.float32(1), z)
+    a = np.float32(-1) / (sign + z)
+    b = x * y * a
+    tangent = np.stack([1 + sign * x * x * a, sign * b, -sign * x])
+    bitangent = np.stack([b, sign + y * y * a, -y])
+    return tangent, bitangent
+
+
+def cosine_direction(normal: FloatArray, square: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Directions [3, N] with density cos / pi about the normals, and their cosines [N].
+
+    A normal plus a uniform point on the unit sphere has that distribution; no tangent frame is needed.
+    """
+    height = 1 - 2 * square[0]
+    radius = np.sqrt(1 - height * height)
+    angle = square[1] * TWO_PI
+    direction = np.empty_like(normal)
+    np.cos(angle, out=direction[0])
+    np.sin(angle, out=direction[1])
+    direction[:2] *= radius
+    direction[2] = height
+    direction += normal
+    # The point opposite to the normal would give the zero vector.
+    length2 = np.maximum(dot(direction, direction), np.float32(1e-12))
+    direction /= np.sqrt(length2)
+    return direction, np.maximum(dot(direction, normal), np.float32(1e-6))
+
+
+def one_less_cosine(sin2: FloatArray) -> FloatArray:
+    """1 - cos of the half angle of a cone, from its squared sine, without loss for narrow cones."""
+    sin2 = np.minimum(sin2, np.float32(1))
+    return sin2 / (1 + np.sqrt(1 - sin2))
+
+
+def in_cone(axis: FloatArray, one_less_cos: FloatArray, square: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Directions [3, N] uniform within cones about unit axes [3, N], and their cosines' distance from 1, [N].
+
+    1 - cos directly, not cos: a distant sphere's cone is narrower than float32 resolves near 1.
+    """
+    lost = square[0] * one_less_cos
+    sin = np.sqrt(lost * (2 - lost))
+    angle = square[1] * TWO_PI
+    tangent, bitangent = orthonormal(axis)
+    return axis * (1 - lost) + tangent * (sin * np.cos(angle)) + bitangent * (sin * np.sin(angle)), lost
 
 
 def cell_of(direction: FloatArray, height: int, width: int, turn: float = 0.0) -> NDArray[np.intp]:
@@ -26,8 +72,7 @@ def cell_of(direction: FloatArray, height: int, width: int, turn: float = 0.0) -
     down = np.arccos(np.clip(direction[1], -1, 1)) / _PI
     column = np.minimum((across * np.float32(width)).astype(np.intp), width - 1)
     row = np.minimum((down * np.float32(height)).astype(np.intp), height - 1)
-    result: NDArray[np.intp] = row * width + column
-    return result
+    return row * width + column
 
 
 def centres(height: int, width: int) -> FloatArray:
@@ -41,6 +86,9 @@ def centres(height: int, width: int) -> FloatArray:
 
 class DirectionTable:
     """Directions with a density per solid angle that is constant in each cell, in proportion to its weight.
+
+    The table is a picture in the equirectangular form: its middle looks along -z, its right half along +x, its top row
+    is at the zenith (+y).
 
     Args:
         weights: [H, W], 0 or more, at least one above 0.

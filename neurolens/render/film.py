@@ -1,17 +1,63 @@
-"""The film: which film point a pixel is, and the linear RGB that gathers there."""
+"""The film: which film point a pixel is, and the sums that gather there.
+
+Sums of every pixel, by tiles and passes, lie in memory that forked workers share.
+"""
 
 from __future__ import annotations
 
+import mmap
+import multiprocessing
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import FloatArray
 
-# A picture whose pixels are this much out of square is a mistake, not a choice.
-_ASPECT_TOLERANCE = 0.02
+ColourSpaceName = Literal["sRGB", "ACEScg"]
+WavelengthMode = Literal["auto", "one", "hero", "lanes"]
+WavelengthSampling = Literal["importance", "uniform"]
+COLOUR_SPACE_NAMES: tuple[str, ...] = get_args(ColourSpaceName)
+WAVELENGTH_MODES: tuple[str, ...] = get_args(WavelengthMode)
+WAVELENGTH_SAMPLINGS: tuple[str, ...] = get_args(WavelengthSampling)
+
+FORKS = sys.platform.startswith("linux")
+BATCH = 32768  # paths; fewer, and calling numpy costs more than computing; many more, and their state leaves the cache
+SAMPLES_A_PASS = 16
+CHUNK_BYTES = 16 << 20  # of the sums that are copied at a time
+
+# Columns of the sums: linear sRGB; squared luminance of independent samples; depth in m over the samples that hit
+# something, and how many those are; samples whose camera ray passed; samples that were not finite and add no light.
+RGB, LUMINANCE2, DEPTH, HITS, PASSED, DROPPED, COLUMNS = slice(0, 3), 3, 4, 5, 6, 7, 8
+# Of a render in the main process: the sums, and at the end picture and layers, in the writer's order too.
+BYTES_A_PIXEL = 8 * COLUMNS + 100
+_LONGEST_WAIT_S = 5.0
+_ASPECT_TOLERANCE = 0.02  # a picture whose pixels are this much out of square is a mistake, not a choice
+
+
+@dataclass(frozen=True)
+class FilmSettings:
+    """The [film] table of a scene: spectral sampling and colour.
+
+    Attributes:
+        colour_space: of the EXR, linear: "sRGB" (Rec. 709 primaries, D65) or "ACEScg" (AP1, the white of ACES).
+        white_balance: illuminant that becomes neutral, named as those of lights are; None leaves D65 neutral.
+        wavelengths: of a path: "one"; "hero", four that share the path (Wilkie et al. 2014); "lanes", four paths one
+            after the other that share all random numbers, a quarter of the wavelengths apart; "auto", hero where the
+            camera's rays do not depend on the wavelength (by more than a twentieth of a pixel), else one.
+        wavelength_sampling: "importance", by the film's response times the light of the scene, or "uniform".
+    """
+
+    colour_space: ColourSpaceName = "sRGB"
+    white_balance: str | None = None
+    wavelengths: WavelengthMode = "auto"
+    wavelength_sampling: WavelengthSampling = "importance"
 
 
 @dataclass(frozen=True)
@@ -46,3 +92,127 @@ class PixelGrid:
         points[0] = (0.5 - across) * self.film_mm[0]
         points[1] = (down - 0.5) * self.film_mm[1]
         return points
+
+
+def check_memory(width: int, height: int) -> None:
+    """Refuse a picture before memory is taken for it.
+
+    Raises:
+        InputError: its film alone would fill the machine.
+    """
+    try:
+        most = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return  # a system that does not say
+    if width * height * BYTES_A_PIXEL > most:
+        expected = f"at most {most // BYTES_A_PIXEL} pixels: each takes {BYTES_A_PIXEL} bytes, of {most / 1e9:.3g} GB"
+        raise InputError("picture", "width x height", (width, height), expected)
+
+
+def fork_context() -> Any:
+    """Where locks and processes come from: forked ones on Linux."""
+    return multiprocessing.get_context("fork" if FORKS else None)
+
+
+def shared(shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
+    """Zeros that forked workers share.
+
+    Raises:
+        MemoryError: the system has not as much to give.
+    """
+    size = int(np.prod(shape, dtype=np.float64)) * np.dtype(dtype).itemsize
+    try:
+        return np.frombuffer(mmap.mmap(-1, size), dtype).reshape(shape)
+    except (OSError, OverflowError, ValueError):
+        raise MemoryError(f"{size} bytes") from None
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """How a render is cut: tiles of consecutive pixels, passes of consecutive samples.
+
+    A function of the picture alone. What a worker holds at a time depends on a tile, not on the picture.
+
+    Attributes:
+        pixels, samples: of the picture. tile: pixels a tile. step: samples a pass; the last pass may have fewer.
+    """
+
+    pixels: int
+    samples: int
+    tile: int
+    step: int
+
+    @classmethod
+    def of(cls, pixels: int, samples: int) -> Tiling:
+        """Tiles of about `BATCH` paths a pass."""
+        step = min(samples, SAMPLES_A_PASS)
+        return cls(pixels, samples, max(1, BATCH // step), step)
+
+    @property
+    def tiles(self) -> int:
+        return -(-self.pixels // self.tile)
+
+    @property
+    def passes(self) -> int:
+        return -(-self.samples // self.step)
+
+    def pixels_of(self, first: int, stop: int | None = None) -> slice:
+        """The pixels of a tile, or of the tiles from `first` up to `stop`."""
+        return slice(first * self.tile, min((first + 1 if stop is None else stop) * self.tile, self.pixels))
+
+    def samples_done(self, done: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Samples a pixel after so many passes."""
+        return np.minimum(done * self.step, self.samples)
+
+    def chunks(self) -> Iterator[tuple[int, int]]:
+        """First tile, and the one after the last, of parts of the picture."""
+        tiles = max(1, CHUNK_BYTES // (8 * COLUMNS * self.tile))
+        for first in range(0, self.tiles, tiles):
+            yield first, min(first + tiles, self.tiles)
+
+
+class Film:
+    """Sums of the pixels and how many passes are in them.
+
+    Sums and passes of a tile change together, with the lock held: whoever copies them under the lock has a whole tile,
+    and a worker that is killed while somebody else holds the lock leaves none half done.
+
+    Attributes:
+        sums: [pixels, COLUMNS] float64. done: [tiles] passes finished.
+    """
+
+    def __init__(self, tiling: Tiling) -> None:
+        self.tiling = tiling
+        self.sums = shared((tiling.pixels, COLUMNS), np.float64)
+        self.done = shared((tiling.tiles,), np.int64)
+        self.lock = fork_context().Lock()
+
+    def add(self, tile: int, sums: NDArray[np.float64]) -> None:
+        """Add one pass to a tile."""
+        with self.lock:
+            self.sums[self.tiling.pixels_of(tile)] += sums
+            self.done[tile] += 1
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep all tiles as they are inside the block.
+
+        Raises:
+            NeurolensError: the lock does not come free, for a worker was killed while it held it.
+        """
+        if not self.lock.acquire(timeout=_LONGEST_WAIT_S):
+            raise NeurolensError("a render worker was killed while it wrote to the film")
+        try:
+            yield
+        finally:
+            self.lock.release()
+
+    def copy(self, first: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Sums [n, COLUMNS] of the pixels, and passes, of the tiles from `first` up to `stop`."""
+        with self.held():
+            return self.sums[self.tiling.pixels_of(first, stop)].copy(), self.done[first:stop].copy()
+
+    @property
+    def fraction(self) -> float:
+        """Share of the work that is done."""
+        return float(self.done.sum()) / (self.tiling.tiles * self.tiling.passes)

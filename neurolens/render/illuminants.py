@@ -1,4 +1,4 @@
-"""Light sources: CIE illuminants, black bodies and measured spectra.
+"""Spectra of light: the CIE's tables and illuminants, daylight, black bodies and measured spectra.
 
 Only the shape of a spectrum is used: the emission of a light says how bright it is. Every spectrum is scaled as a
 whole, which keeps its chromaticity, so that emission 1 has the luminance of daylight D65 of emission 1.
@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import cache
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import suggestion
-from neurolens.render.checks import require
-from neurolens.render.spectrum import table
 
-Spectrum = tuple[NDArray[np.float64], NDArray[np.float64]]  # wavelengths in nm, increasing, and values there
+FloatArray64 = NDArray[np.float64]
+Spectrum = tuple[FloatArray64, FloatArray64]  # wavelengths in nm, increasing, and values there
 
 CIE_NAMES = ("D65", "D50", "A", "E")
 _KELVIN = re.compile(r"(\d+(?:\.\d*)?) ?K")
@@ -31,27 +31,41 @@ _SECOND_RADIATION_CONSTANT = 1.438776877e-2  # h c / k, m K
 _MOST_ROWS, _LARGEST_FILE = 10_000, 1_000_000
 
 
-@dataclass(frozen=True)
-class IlluminantSettings:
-    """A measured spectrum: `spectrum` = [[nm, value], ...], or a CSV `file` beside the scene file with such rows.
-
-    Values are radiance per nm in any unit; between them they are interpolated linearly. Increasing wavelengths, which
-    cover those of the camera, and values of 0 or more, one of them above 0.
-    """
-
-    spectrum: tuple[tuple[float, float], ...] | None = None
-    file: Path | None = None
-
-    def __post_init__(self) -> None:
-        one = (self.spectrum is None) != (self.file is None)
-        require(one, "spectrum", "(missing)" if self.file is None else "(given)", "either spectrum or file")
-        if self.spectrum is not None:
-            check_spectrum("settings", "spectrum", self.spectrum)
+def _csv(name: str) -> list[list[str]]:
+    text = resources.files("neurolens.render").joinpath(f"data/{name}.csv").read_text(encoding="utf-8")
+    return [line.split(",") for line in text.splitlines()]
 
 
-def check_spectrum(
-    file: str | Path, field: str, rows: Sequence[Sequence[float]], most: float | None = None
-) -> Spectrum:
+@cache
+def _tables() -> dict[str, FloatArray64]:
+    """Columns wavelength_nm, x, y, z, d65, d50, red, green, blue; made by experiments/make_spectral_tables.py."""
+    names, *rows = _csv("spectra")
+    columns = np.array(rows, np.float64).T
+    columns.flags.writeable = False
+    return dict(zip(names, columns, strict=True))
+
+
+def table(name: str) -> FloatArray64:
+    """A column of the shipped table, one value every 5 nm from 380 to 780 nm."""
+    return _tables()[name]
+
+
+@cache
+def daylight_table() -> tuple[FloatArray64, FloatArray64]:
+    """Wavelengths [41] in nm, and the CIE's components S0, S1, S2 of daylight [3, 41] there (CIE 15:2018)."""
+    rows = np.array(_csv("daylight")[1:], np.float64).T
+    return rows[0], rows[1:]
+
+
+def daylight_weights(x: FloatArray64, y: FloatArray64) -> FloatArray64:
+    """Weights 1, M1, M2 [3, N] of S0, S1, S2 of daylight of chromaticities (x, y) (Wyszecki and Stiles 1982)."""
+    below = 0.0241 + 0.2562 * x - 0.7341 * y
+    m1 = (-1.3515 - 1.7703 * x + 5.9114 * y) / below
+    m2 = (0.0300 - 31.4424 * x + 30.0717 * y) / below
+    return np.stack([np.ones_like(m1), m1, m2])
+
+
+def check_spectrum(file: Path, field: str, rows: Sequence[Sequence[float]], most: float | None = None) -> Spectrum:
     """The rows (nm, value) as two arrays: scaled to the largest value 1, or with `most` as they are and at most that.
 
     Raises:
@@ -103,11 +117,11 @@ def read_spectrum(scene: Path, field: str, path: Path, most: float | None = None
     return check_spectrum(path, "row", rows, most)
 
 
-def planck(wavelength_nm: ArrayLike, kelvin: float) -> NDArray[np.float64]:
+def planck(wavelength_nm: ArrayLike, kelvin: float) -> FloatArray64:
     """Spectral radiance of a black body by Planck's law, 1 at 560 nm."""
     nm = np.asarray(wavelength_nm, np.float64)
 
-    def exponent(length_nm: ArrayLike) -> NDArray[np.float64]:
+    def exponent(length_nm: ArrayLike) -> FloatArray64:
         return _SECOND_RADIATION_CONSTANT / (np.asarray(length_nm) * 1e-9 * kelvin)
 
     # expm1(b) / expm1(a) without overflow where a black body is cold.

@@ -1,27 +1,26 @@
-"""One render made ready: scene, camera and film, and how one pass of one tile is rendered."""
+"""One render: scene, camera and film made ready, how one pass of one tile is rendered, and the film developed."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
+from neurolens.render import film as columns
 from neurolens.render.colour import SRGB, balance
-from neurolens.render.film import PixelGrid
-from neurolens.render.filmsettings import FilmSettings
-from neurolens.render.integrator import trace
-from neurolens.render.palette import Index
+from neurolens.render.film import Film, FilmSettings, PixelGrid, Tiling, shared
+from neurolens.render.integrator import lit, trace
 from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler
-from neurolens.render.scatter import lit
-from neurolens.render.scene import CameraSettings
-from neurolens.render.scenefile import Scene
-from neurolens.render.sums import COLUMNS, DEPTH, DROPPED, HITS, LUMINANCE2, PASSED, RGB, Film, Tiling, shared
+from neurolens.render.scene import CameraSettings, Scene
+from neurolens.render.spectrum import Index
 from neurolens.render.wavelengths import LANES, mode_for, spectral_range
 from neurolens.render.world import World
 
+WeightedRays = tuple[FloatArray, FloatArray, FloatArray]  # origin, direction [3, N] and weight [N] or [lanes, N]
 # Of a sample's luminance; sums of colours up to a million times as bright stay within float32.
 _BRIGHTEST_SAMPLE = 1e30
 
@@ -39,6 +38,7 @@ class Job:
     """One render: the scene made ready, and memory shared by the workers.
 
     Attributes:
+        scene, camera, grid, seed, max_depth, settings, differentials: as asked for; settings are those of the film.
         mode: how wavelengths are taken. balance: matrix [3, 3] on the film's linear sRGB that makes the light of the
             white balance neutral; where there is none, `neutral`. luminance_row: [3], of the film's sRGB after that.
         paths_a_sample: lanes of a sample; film: see `Film`.
@@ -54,24 +54,25 @@ class Job:
         samples: int,
         seed: int,
         max_depth: int,
-        film: FilmSettings,
+        settings: FilmSettings,
         differentials: bool = False,
     ) -> None:
-        settings = scene.settings.camera
-        self.mode = mode_for(camera, grid, settings.wavelengths_nm, film)
-        self.camera, self.grid, self.max_depth, self.differentials = camera, grid, max_depth, differentials
-        self.spectral = spectral_range(scene, camera, film, LANES if self.mode == "hero" else 1)
+        self.scene, self.camera, self.grid = scene, camera, grid
+        self.seed, self.max_depth, self.settings, self.differentials = seed, max_depth, settings, differentials
+        pose = scene.settings.camera
+        self.mode = mode_for(camera, grid, pose.wavelengths_nm, settings)
+        self.spectral = spectral_range(scene, camera, settings, LANES if self.mode == "hero" else 1)
         self.world = World(scene, self.spectral)
-        self.balance = np.eye(3)
-        self.neutral = film.white_balance is None or not self.spectral.colours
-        if film.white_balance is not None and not self.neutral:
-            self.balance = balance(self.spectral.film_rgb(self.world.palette.illuminant(film.white_balance)))
+        white = settings.white_balance if self.spectral.colours else None
+        self.neutral, self.balance = white is None, np.eye(3)
+        if white is not None:
+            self.balance = balance(self.spectral.film_rgb(self.world.palette.illuminant(white)))
         response = self.spectral.rotated(self.spectral.response)
         self._response = response.reshape(-1, 3, self.spectral.bins)  # [lanes, 3, bins]
         self.luminance_row = SRGB.to_xyz[1] @ self.balance
         self._luminance = np.einsum("c,lcb->lb", self.luminance_row, self._response).astype(np.float32)
         self.sampler = Sampler(samples, seed)
-        self._axes, self._position = camera_axes(settings), np.array(settings.position_m, np.float32)
+        self._axes, self._position = camera_axes(pose), np.array(pose.position_m, np.float32)
         # Paths of one sample: four lanes share their random numbers, and are independent of the others only together.
         self.paths_a_sample = LANES if self.mode == "lanes" else 1
         self.tiling = Tiling.of(grid.width * grid.height, samples)
@@ -80,7 +81,7 @@ class Job:
         self.message, self.stop = shared((4096,), np.uint8), shared((1,), np.uint8)
 
     def render_tile(self, camera: Camera, tile: int, part: int) -> tuple[NDArray[np.float64], float]:
-        """Sums [pixels, COLUMNS] of one pass of one tile, and the seconds that the camera took."""
+        """Sums [pixels, columns] of one pass of one tile, and the seconds that the camera took."""
         within = self.tiling.pixels_of(tile)
         step = self.tiling.step
         pixels = np.arange(within.start, within.stop)
@@ -98,16 +99,15 @@ class Job:
         answered = time.perf_counter()
 
         bins, distance = self.spectral.bin_of(hue), np.full(len(hue), np.inf, np.float32)
-        value = trace(
-            self.world, self.sampler, keys, origin, direction, weight, bins, self.max_depth, first_distance=distance
-        )
+        rays = origin, direction, weight, bins
+        value = trace(self.world, self.sampler, keys, *rays, self.max_depth, first_distance=distance)
         shape = (len(pixels), len(indices))
-        sums = np.empty((len(pixels), COLUMNS))
+        sums = np.empty((len(pixels), columns.COLUMNS))
         self._sum_light(sums, value, bins, shape)
-        self._sum_depth(sums, origin, direction, distance, shape)
+        self._sum_depth(sums, origin, direction, distance)
         passed = np.zeros(len(hue), np.bool_)
         passed[lit(weight)] = True
-        sums[:, PASSED] = np.count_nonzero(passed.reshape(shape), axis=1)
+        sums[:, columns.PASSED] = np.count_nonzero(passed.reshape(shape), axis=1)
         return sums, answered - asked
 
     def _sum_light(self, sums: NDArray[np.float64], value: FloatArray, bins: Index, shape: tuple[int, int]) -> None:
@@ -121,36 +121,29 @@ class Job:
         dropped = ~(np.abs(luminance) <= _BRIGHTEST_SAMPLE)
         if dropped.any():
             value, luminance = np.where(dropped, np.float32(0), value), np.where(dropped, np.float32(0), luminance)
-        sums[:, DROPPED] = np.count_nonzero(dropped.reshape(shape), axis=1)
+        sums[:, columns.DROPPED] = np.count_nonzero(dropped.reshape(shape), axis=1)
         luminance = luminance.reshape(shape)
         colour = self._response.take(bins, axis=-1).reshape(-1, 3, *shape)
-        sums[:, RGB] = np.einsum("lcps,lps->pc", colour, value.reshape(-1, *shape))
+        sums[:, columns.RGB] = np.einsum("lcps,lps->pc", colour, value.reshape(-1, *shape))
         if self.paths_a_sample > 1:
             luminance = np.add.reduceat(luminance, np.arange(0, shape[1], self.paths_a_sample), axis=1)
-        sums[:, LUMINANCE2] = np.einsum("ps,ps->p", luminance, luminance, dtype=np.float64)
+        sums[:, columns.LUMINANCE2] = np.einsum("ps,ps->p", luminance, luminance, dtype=np.float64)
 
     def _sum_depth(
-        self,
-        sums: NDArray[np.float64],
-        origin: FloatArray,
-        direction: FloatArray,
-        distance: FloatArray,
-        shape: tuple[int, int],
+        self, sums: NDArray[np.float64], origin: FloatArray, direction: FloatArray, distance: FloatArray
     ) -> None:
         """Distance along the optical axis from the film's plane to what camera rays hit first."""
-        hit = np.isfinite(distance)
+        hit, shape = np.isfinite(distance), (len(sums), -1)
         away = -self._axes[:, 2]
         with np.errstate(over="ignore", invalid="ignore"):  # rays that do not pass hold anything
             depth = away @ (origin - self._position[:, None])
             depth += distance * (away @ direction)
         hit &= np.isfinite(depth)
-        sums[:, DEPTH] = np.where(hit, depth, np.float32(0)).reshape(shape).sum(axis=1, dtype=np.float64)
-        sums[:, HITS] = np.count_nonzero(hit.reshape(shape), axis=1)
+        sums[:, columns.DEPTH] = np.where(hit, depth, np.float32(0)).reshape(shape).sum(axis=1, dtype=np.float64)
+        sums[:, columns.HITS] = np.count_nonzero(hit.reshape(shape), axis=1)
 
-    def _hero_rays(
-        self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, hue: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Rays of the hero wavelengths; weights [lanes, N] of all lanes where there are several."""
+    def _hero_rays(self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, hue: FloatArray) -> WeightedRays:
+        """Rays of the hero wavelengths, with the weights of all lanes where there are several."""
         sample = camera.sample_differentials if self.differentials else camera.sample  # type: ignore[attr-defined]
         rays = self._camera_rays(sample, film_mm, pupil, self._camera_wavelengths(hue))
         lanes = self.spectral.lanes
@@ -168,8 +161,8 @@ class Job:
 
     def _camera_rays(
         self, sample: Callable[..., CameraRays], film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Origins and directions [3, N] in the scene and weights [N], 0 for rays that do not pass."""
+    ) -> WeightedRays:
+        """Rays in the scene; their weight is 0 where they do not pass."""
         count = len(wavelength_nm)
         origin, direction = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
         weight = np.empty(count, np.float32)
@@ -197,3 +190,61 @@ def _turned(hue: FloatArray, by: FloatArray | np.float32) -> FloatArray:
     turned = hue + by
     turned -= turned >= 1
     return turned
+
+
+# Of the layers, for the metadata of a picture.
+MEANING = {
+    "samples": "samples in the pixel",
+    "variance": "of the pixel's luminance (linear sRGB), from its samples as if they were independent",
+    "depth": "channel Z: m along the optical axis from the film's plane to the first surface, mean; inf: none",
+    "blocked": "share of the samples whose camera ray did not pass",
+}
+
+
+@dataclass(frozen=True)
+class Layers:
+    """What a picture says of its own pixels, [H, W] float32 each.
+
+    Attributes:
+        samples, depth, blocked: see `MEANING`; what is in focus is at depth `focus_m`.
+        variance: of the pixel's luminance (of linear sRGB after the white balance), estimated from its samples as if
+            they were independent: the sample variance over their number. That of low-discrepancy samples is lower.
+            Infinite below two samples. With wavelength lanes four paths count as one sample.
+    """
+
+    samples: FloatArray
+    variance: FloatArray
+    depth: FloatArray
+    blocked: FloatArray
+
+
+def develop(job: Job) -> tuple[FloatArray, Layers]:
+    """Picture [H, W, 3] float32 linear sRGB and its layers; each tile is divided by the samples that it has.
+
+    It may be called while the workers go on.
+    """
+    tiling, grid = job.tiling, job.grid
+    rgb = np.zeros((tiling.pixels, 3), np.float32)
+    planes = np.zeros((4, tiling.pixels), np.float32)
+    for first, stop in tiling.chunks():
+        sums, done = job.film.copy(first, stop)
+        part = tiling.pixels_of(first, stop)
+        samples = np.repeat(tiling.samples_done(done), tiling.tile)[: len(sums)]
+        colour = sums[:, columns.RGB] / np.maximum(samples, 1)[:, None]
+        rgb[part] = colour if job.neutral else colour @ job.balance.T
+        planes[:, part] = _layers(job, sums, samples)
+    shape = (grid.height, grid.width)
+    return rgb.reshape(*shape, 3), Layers(*(plane.reshape(shape) for plane in planes))
+
+
+def _layers(job: Job, sums: NDArray[np.float64], samples: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Samples, variance, depth and blocked share [4, n]."""
+    total = sums[:, columns.RGB] @ job.luminance_row
+    groups = -(-samples // job.paths_a_sample)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Of the sum over independent samples, then of the mean over paths.
+        spread = np.maximum(sums[:, columns.LUMINANCE2] - total**2 / groups, 0) * groups / (groups - 1)
+        variance = np.where(groups > 1, spread / samples.astype(np.float64) ** 2, np.inf)
+        depth = np.where(sums[:, columns.HITS] > 0, sums[:, columns.DEPTH] / sums[:, columns.HITS], np.inf)
+        blocked = np.where(samples > 0, 1 - sums[:, columns.PASSED] / samples, 0.0)
+    return np.stack([samples, variance, depth, blocked])

@@ -1,22 +1,26 @@
-"""All lights of a scene that can be aimed at, as one.
+"""All lights of a scene that can be aimed at, as one: rectangles, discs, spheres, points and spots.
 
-A light is chosen partly by how much it lights the point that the camera looks at, partly at random. Its group (see
-`neurolens.render.arealights`, `pointlights` and `environment`) then gives a direction towards it.
+A light is chosen partly by how much it lights the point that the camera looks at, partly at random. Its group then
+gives a direction towards it: a rectangle and a disc are sampled uniformly over their area, a sphere over the cone that
+it fills. (The sky and the sun are groups of `neurolens.render.environment`.)
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.checks import BLACK, Vector
+from neurolens.render.directions import TWO_PI, in_cone, one_less_cosine, orthonormal
+from neurolens.render.primitives import dot
+from neurolens.render.scenetables import BLACK, Disc, PointLight, Quad, Sphere, SpotLight, Vector
 
 Numbers = NDArray[np.intp]
+Aimed = tuple[FloatArray, FloatArray, FloatArray]  # direction [3, N], distance [N] m, inverse density [N]
 
 
 @dataclass(frozen=True)
@@ -38,29 +42,27 @@ class LightSamples:
     scale: FloatArray
 
 
-class LightGroup(Protocol):
+class LightGroup:
     """Lights of one kind, numbered from 0.
 
     Attributes:
-        count: how many. sizeless: whether `sample` gives irradiances in place of inverse densities.
+        count: how many. sizeless: whether `sample` gives the irradiance of intensity 1 in place of inverse densities.
     """
 
     count: int
-    sizeless: bool
+    sizeless = False
 
     def importance(self, target_m: Vector) -> NDArray[np.float64]:
         """About the irradiance [count] at a point, its three colours added up."""
-        ...
+        raise NotImplementedError
 
-    def sample(
-        self, number: Numbers, point: FloatArray, square: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Direction [3, N], distance [N], inverse density [N] from points [3, N] for numbers [2, N] in [0, 1)."""
-        ...
+    def sample(self, number: Numbers, point: FloatArray, square: FloatArray) -> Aimed:
+        """Directions from points [3, N] to the lights of some numbers [N], for samples [2, N] in [0, 1)."""
+        raise NotImplementedError
 
     def pdf(self, number: Numbers, point: FloatArray, distance: FloatArray, cosine: FloatArray) -> FloatArray:
-        """Density [N] per solid angle with which `sample` takes a direction that hits lights [N]."""
-        ...
+        """Density [N] per solid angle with which `sample` takes a direction that hits lights [N]; 0 without surface."""
+        return np.zeros_like(distance)
 
 
 class Lights:
@@ -126,3 +128,125 @@ class Lights:
                 density[rows] = group.pdf(light[rows] - first, *hit)
         density *= self.probability.take(light)
         return density
+
+
+def _irradiance(
+    area: NDArray[np.floating], middle: NDArray[np.floating], emission: Sequence[Vector], target_m: Vector
+) -> NDArray[np.float64]:
+    """About that at a point, of lights [n] of some area that they show it, the three colours added up."""
+    away2 = np.sum((middle - np.array(target_m)) ** 2, axis=1)
+    return area * np.array([sum(rgb) for rgb in emission]) / np.maximum(away2, 1e-6)
+
+
+class FlatLights(LightGroup):
+    """Rectangles, then discs: each a corner and two edges, of a disc its centre and two radii."""
+
+    def __init__(self, quads: Sequence[Quad], discs: Sequence[Disc]) -> None:
+        self.count, self._quads = len(quads) + len(discs), len(quads)
+        self._emission = [light.emission for light in (*quads, *discs)]
+        corner = np.array([q.corner_m for q in quads] + [d.centre_m for d in discs], np.float64).reshape(-1, 3)
+        normal = np.array([d.normal for d in discs], np.float64).reshape(-1, 3).T
+        radius = np.array([d.radius_m for d in discs])
+        tangent, bitangent = orthonormal(normal / np.linalg.norm(normal, axis=0))
+        edge_u = np.concatenate([np.array([q.edge_u_m for q in quads]).reshape(-1, 3), (tangent * radius).T])
+        edge_v = np.concatenate([np.array([q.edge_v_m for q in quads]).reshape(-1, 3), (bitangent * radius).T])
+        normal = np.cross(edge_u, edge_v)
+        area = np.linalg.norm(normal, axis=1)
+        self._corner, self._edge_u, self._edge_v = (a.T.astype(np.float32) for a in (corner, edge_u, edge_v))
+        self._normal = (normal / area[:, None]).T.astype(np.float32)
+        area[self._quads :] *= math.pi
+        self._area = area.astype(np.float32)
+        self._middle = corner + 0.5 * (edge_u + edge_v)
+        self._middle[self._quads :] = corner[self._quads :]
+
+    def importance(self, target_m: Vector) -> NDArray[np.float64]:
+        return _irradiance(self._area, self._middle, self._emission, target_m)
+
+    def sample(self, number: Numbers, point: FloatArray, square: FloatArray) -> Aimed:
+        if self._quads < self.count:
+            radius, angle = np.sqrt(square[0]), square[1] * TWO_PI
+            disc = np.stack([radius * np.cos(angle), radius * np.sin(angle)])
+            square = np.where(number < self._quads, square, disc)
+        direction = self._corner.take(number, axis=1)
+        direction += self._edge_u.take(number, axis=1) * square[0]
+        direction += self._edge_v.take(number, axis=1) * square[1]
+        direction -= point
+        distance2 = dot(direction, direction)
+        distance = np.sqrt(distance2)
+        direction /= distance
+        inverse_pdf = dot(self._normal.take(number, axis=1), direction)
+        inverse_pdf *= -self._area.take(number)
+        inverse_pdf /= distance2
+        return direction, distance, np.maximum(inverse_pdf, np.float32(0), out=inverse_pdf)
+
+    def pdf(self, number: Numbers, point: FloatArray, distance: FloatArray, cosine: FloatArray) -> FloatArray:
+        return distance * distance / (self._area.take(number) * cosine)
+
+
+class SphereLights(LightGroup):
+    """Spheres that emit outwards."""
+
+    def __init__(self, spheres: Sequence[Sphere]) -> None:
+        self.count, self._emission = len(spheres), [s.emission for s in spheres]
+        self._centre = np.array([s.centre_m for s in spheres], np.float32).reshape(-1, 3).T
+        self._radius2 = np.array([s.radius_m**2 for s in spheres], np.float32)
+
+    def importance(self, target_m: Vector) -> NDArray[np.float64]:
+        return _irradiance(np.pi * self._radius2, self._centre.T, self._emission, target_m)
+
+    def sample(self, number: Numbers, point: FloatArray, square: FloatArray) -> Aimed:
+        axis = self._centre.take(number, axis=1) - point
+        away2 = dot(axis, axis)
+        away = np.sqrt(away2)
+        axis /= away
+        radius2 = self._radius2.take(number)
+        one_less_cos: FloatArray = one_less_cosine(radius2 / away2)
+        direction, lost = in_cone(axis, one_less_cos, square)
+        distance: FloatArray = away * (1 - lost) - np.sqrt(np.maximum(radius2 - away2 * (lost * (2 - lost)), 0))
+        inverse_pdf: FloatArray = one_less_cos * TWO_PI
+        inverse_pdf[away2 <= radius2] = 0  # inside the light
+        return direction, distance, inverse_pdf
+
+    def pdf(self, number: Numbers, point: FloatArray, distance: FloatArray, cosine: FloatArray) -> FloatArray:
+        away = self._centre.take(number, axis=1) - point
+        return np.float32(1) / (TWO_PI * one_less_cosine(self._radius2.take(number) / dot(away, away)))
+
+
+class PointLights(LightGroup):
+    """Points, then spots, which only aiming at them finds; a point is a spot that shines everywhere."""
+
+    sizeless = True
+
+    def __init__(self, points: Sequence[PointLight], spots: Sequence[SpotLight]) -> None:
+        lights = [*points, *spots]
+        self.count = len(lights)
+        self._position = np.array([light.position_m for light in lights], np.float32).reshape(-1, 3).T
+        self._intensity = np.array([sum(light.intensity) for light in lights])
+        axis = np.zeros((3, self.count))
+        axis[:, len(points) :] = np.array([np.subtract(s.look_at_m, s.position_m) for s in spots]).reshape(-1, 3).T
+        length = np.linalg.norm(axis, axis=0)
+        self._axis = (axis / np.where(length > 0, length, 1)).astype(np.float32)
+        # Falloff is the smoothstep of (cos - start) / width. A point's axis is 0, and so are its cosines.
+        outer, inner = (
+            np.array([math.cos(math.radians(getattr(s, name))) for s in spots]) for name in ("outer_deg", "inner_deg")
+        )
+        self._start = np.concatenate([np.full(len(points), -1.0), outer]).astype(np.float32)
+        self._per_width = np.concatenate([np.ones(len(points)), 1 / (inner - outer)]).astype(np.float32)
+
+    def importance(self, target_m: Vector) -> NDArray[np.float64]:
+        to = np.array(target_m)[:, None] - self._position
+        distance2 = np.maximum(np.sum(to**2, axis=0), 1e-6)
+        return self._intensity * self._falloff(np.arange(self.count), to / np.sqrt(distance2)) / distance2
+
+    def _falloff(self, number: Numbers, away: NDArray[np.floating]) -> FloatArray:
+        """Share [N] of the intensity that leaves in unit directions [3, N]."""
+        cosine = dot(self._axis.take(number, axis=1), away)
+        t = np.clip((cosine - self._start.take(number)) * self._per_width.take(number), 0, 1)
+        return t * t * (3 - 2 * t)
+
+    def sample(self, number: Numbers, point: FloatArray, square: FloatArray) -> Aimed:
+        direction = self._position.take(number, axis=1) - point
+        distance2 = dot(direction, direction)
+        distance = np.sqrt(distance2)
+        direction /= distance
+        return direction, distance, self._falloff(number, -direction) / distance2

@@ -3,31 +3,28 @@
 Nodes have 16 children and leaves 8 triangles: few levels, and at each level one dense test of every (ray, node) pair
 against 16 boxes or 8 triangles, which is what numpy does fast. Triangles carry the three planes of Havel and Herout
 2010, "Yet faster ray-triangle intersection".
+
+Where the Python binding of Embree is installed (`pip install neurolens[embree]`), Embree takes the place of the tree.
+Hits agree within the rounding of float32.
 """
 
 from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.primitives import NEAREST, IntArray, Rays, slabs
+from neurolens.render.primitives import NEAREST, FloatArray64, IntArray, Primitive, Rays, slabs
 
 _BRANCHES, _LEAF = 16, 8
 _PAIRS_AT_ONCE = 4096  # keeps the [pairs, 8] temporaries inside the L2 cache
+_STEP = np.float32(1e-5)  # m by which a ray starts again that met the surface that it leaves
 
 
-def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Unit normals [V, 3]: the area-weighted mean of the triangles around each vertex."""
-    corners = vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(total, faces[:, k], normal)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
-
-
-def _split(rows: NDArray[np.intp], centres: NDArray[np.float64]) -> list[NDArray[np.intp]]:
+def _split(rows: NDArray[np.intp], centres: FloatArray64) -> list[NDArray[np.intp]]:
     """Up to 16 groups of triangles: the largest group is halved at the median of its longest side, again and again."""
     groups = [rows]
     while len(groups) < _BRANCHES:
@@ -44,49 +41,17 @@ def _split(rows: NDArray[np.intp], centres: NDArray[np.float64]) -> list[NDArray
     return groups
 
 
-class Mesh:
-    """Triangles with a tree over them; triangle k is surface `first` + k.
+def _tree(centres: FloatArray64, low: FloatArray64, high: FloatArray64) -> tuple[list, list, list]:
+    """A tree over triangles of some middles and bounds [T, 3]: of each node boxes [16, 6] and children [16]; leaves.
 
-    Args:
-        first: number of the first triangle's surface.
-        vertices: [V, 3] in metres.
-        faces: [T, 3].
+    A child is a node number, or -1 - leaf number.
     """
+    boxes: list[FloatArray64] = []
+    children: list[NDArray[np.int32]] = []
+    leaves: list[NDArray[np.intp]] = []
 
-    def __init__(self, first: int, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
-        self.first, self.count = first, len(faces)
-        corners = vertices[faces]  # [T, 3 corners, 3]
-        low, high = corners.min(axis=1), corners.max(axis=1)
-        boxes: list[NDArray[np.float64]] = []
-        children: list[NDArray[np.int32]] = []
-        leaves: list[NDArray[np.intp]] = []
-        self._build(np.arange(self.count), corners.mean(axis=1), low, high, boxes, children, leaves)
-        self._low, self._high = low.min(axis=0).astype(np.float32), high.max(axis=0).astype(np.float32)
-        bounds = np.array(boxes)  # [nodes, 16, 6]
-        # A hair wider, so that rounding to float32 never cuts a triangle off.
-        grow = 1e-6 * max(1.0, float(np.abs(vertices).max()))
-        self._node_low = np.ascontiguousarray((bounds[..., :3] - grow).transpose(2, 0, 1), np.float32)
-        self._node_high = np.ascontiguousarray((bounds[..., 3:] + grow).transpose(2, 0, 1), np.float32)
-        self._children = np.array(children)
-        self._leaf_rows = np.array(leaves, np.int32)  # [L, 8]
-        self._leaf_planes = np.ascontiguousarray(
-            triangle_planes(corners).astype(np.float32)[self._leaf_rows].transpose(2, 3, 0, 1)
-        )  # [3, 4, leaves, 8]
-
-    def _build(
-        self,
-        rows: NDArray[np.intp],
-        centres: NDArray[np.float64],
-        low: NDArray[np.float64],
-        high: NDArray[np.float64],
-        boxes: list[NDArray[np.float64]],
-        children: list[NDArray[np.int32]],
-        leaves: list[NDArray[np.intp]],
-    ) -> int:
-        """Append the node over triangles `rows` and everything below; return its number.
-
-        A child is a node number, or -1 - leaf number.
-        """
+    def build(rows: NDArray[np.intp]) -> int:
+        """Append the node over triangles `rows` and everything below; return its number."""
         number = len(boxes)
         box = np.full((_BRANCHES, 6), np.nan)  # no ray meets an empty child, as NaN fails every comparison
         child = np.zeros(_BRANCHES, np.int32)
@@ -98,11 +63,37 @@ class Mesh:
                 child[k] = -1 - len(leaves)
                 leaves.append(np.resize(group, _LEAF))  # short leaves repeat their triangles
             else:
-                child[k] = self._build(group, centres, low, high, boxes, children, leaves)
+                child[k] = build(group)
         return number
 
+    build(np.arange(len(centres)))
+    return boxes, children, leaves
+
+
+class Mesh:
+    """Triangles with a tree over them; triangle k is surface `first` + k.
+
+    Args:
+        first: number of the first triangle's surface. vertices: [V, 3] in metres. faces: [T, 3].
+    """
+
+    def __init__(self, first: int, vertices: FloatArray64, faces: NDArray[np.int64]) -> None:
+        self.first = first
+        corners = vertices[faces]  # [T, 3 corners, 3]
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        boxes, children, leaves = _tree(corners.mean(axis=1), low, high)
+        self._low, self._high = low.min(axis=0).astype(np.float32), high.max(axis=0).astype(np.float32)
+        bounds = np.array(boxes)  # [nodes, 16, 6]
+        # A hair wider, so that rounding to float32 never cuts a triangle off.
+        grow = 1e-6 * max(1.0, float(np.abs(vertices).max()))
+        self._node_low = np.ascontiguousarray((bounds[..., :3] - grow).transpose(2, 0, 1), np.float32)
+        self._node_high = np.ascontiguousarray((bounds[..., 3:] + grow).transpose(2, 0, 1), np.float32)
+        self._children = np.array(children)
+        self._leaf_rows = np.array(leaves, np.int32)  # [L, 8]
+        planes = triangle_planes(corners).astype(np.float32)[self._leaf_rows]
+        self._leaf_planes = np.ascontiguousarray(planes.transpose(2, 3, 0, 1))  # [3, 4, leaves, 8]
+
     def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
-        """See `Primitive`."""
         entry, exit_ = slabs(rays, self._low, self._high)
         np.minimum(exit_, best, out=exit_)
         np.maximum(entry, NEAREST, out=entry)
@@ -135,8 +126,7 @@ class Mesh:
             to_high *= inverse
             np.maximum(entry, np.minimum(to_low, to_high), out=entry)
             np.minimum(exit_, np.maximum(to_low, to_high), out=exit_)
-        result: NDArray[np.bool_] = entry <= exit_
-        return result
+        return entry <= exit_
 
     def _meet_leaves(
         self, rays: Rays, best: FloatArray, found: IntArray, ray: NDArray[np.intp], leaf: IntArray
@@ -170,7 +160,7 @@ class Mesh:
         found[ray[won]] = self.first + self._leaf_rows[leaf[won], column[won]]
 
 
-def triangle_planes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def triangle_planes(corners: FloatArray64) -> FloatArray64:
     """Plane and barycentric coordinates of triangles [T, 3, 3] as affine functions of a point, [T, 3, 4].
 
     Row 0 is the distance from the plane, rows 1 and 2 the weights of corners 1 and 2.
@@ -182,3 +172,64 @@ def triangle_planes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     across_b, across_c = np.cross(edge_c, normal) / area2, np.cross(normal, edge_b) / area2
     rows = [np.column_stack([n, -np.sum(n * a, axis=1)]) for n in (unit, across_b, across_c)]
     return np.stack(rows, axis=1)
+
+
+def make_mesh(first: int, vertices: FloatArray64, faces: NDArray[np.int64]) -> Primitive:
+    """Triangles to hit, through Embree if it is installed; arguments as for `Mesh`."""
+    try:
+        return EmbreeMesh(first, vertices, faces)
+    except ImportError:
+        return Mesh(first, vertices, faces)
+
+
+def tracer() -> str:
+    """What `make_mesh` makes meshes hit with: their hits differ by rounding."""
+    try:
+        _library()
+    except ImportError:
+        return "the built-in tree"
+    return "Embree"
+
+
+def _library() -> tuple[Any, Any]:
+    """The parts of embreex; by name, as nothing is known of their types."""
+    return import_module("embreex.mesh_construction"), import_module("embreex.rtcore_scene")
+
+
+class EmbreeMesh:
+    """Triangles in an Embree scene; arguments as for `Mesh`.
+
+    Raises:
+        ImportError: embreex is not installed.
+    """
+
+    def __init__(self, first: int, vertices: FloatArray64, faces: NDArray[np.int64]) -> None:
+        mesh_construction, rtcore_scene = _library()
+        self.first = first
+        corners = np.ascontiguousarray(vertices[faces], np.float32)
+        # Robust: watertight at the edges that triangles share.
+        self._scene = rtcore_scene.EmbreeScene(robust=True)
+        self._triangles = mesh_construction.TriangleMesh(self._scene, corners)
+        self._low, self._high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+
+    def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
+        entry, exit_ = slabs(rays, self._low, self._high)
+        np.minimum(exit_, best, out=exit_)
+        np.maximum(entry, NEAREST, out=entry)
+        # The box is flat where the mesh is: a hair of slack keeps what lies in it.
+        ray = np.flatnonzero(entry * np.float32(1 - 1e-5) <= exit_)
+        start = rays.origin.take(ray, axis=1)
+        moved = np.zeros(len(ray), np.float32)
+        while ray.size:
+            direction = rays.direction.take(ray, axis=1)
+            reach = np.minimum(best.take(ray) - moved, np.float32(1e30))
+            origin, towards = np.ascontiguousarray(start.T), np.ascontiguousarray(direction.T)
+            hit = self._scene.run(origin, towards, dists=reach, output=True)
+            met = np.flatnonzero(hit["primID"] >= 0)
+            distance = hit["tfar"][met] + moved[met]
+            ok = (distance > NEAREST) & (distance < best[ray[met]])
+            best[ray[met[ok]]] = distance[ok]
+            found[ray[met[ok]]] = self.first + hit["primID"][met[ok]]
+            again = met[distance <= NEAREST]
+            ray, moved = ray[again], moved[again] + _STEP
+            start = start.take(again, axis=1) + direction.take(again, axis=1) * _STEP

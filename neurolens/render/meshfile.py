@@ -18,22 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.render.checks import FARTHEST_M
-from neurolens.render.mesh import vertex_normals
-from neurolens.render.shapes import MeshSettings
+from neurolens.render.scenetables import FARTHEST_M, MeshSettings
 
 LARGEST_FILE = 500_000_000  # bytes
 _LARGEST_HEADER = 100_000
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _INDEX = r"-?[1-9]\d*"
+_CORNER = rf"{_INDEX}(?:/(?:{_INDEX})?(?:/{_INDEX})?)?"
 _OBJ_LINES = {
     "v": (re.compile(rf"v(?: {_NUMBER}){{3,7}}"), "v X Y Z"),
     "vt": (re.compile(rf"vt(?: {_NUMBER}){{2,3}}"), "vt U V"),
     "vn": (re.compile(rf"vn(?: {_NUMBER}){{3}}"), "vn X Y Z"),
-    "f": (
-        re.compile(rf"f(?: {_INDEX}(?:/(?:{_INDEX})?(?:/{_INDEX})?)?){{3,}}"),
-        "f I J K, counted from 1, or back from -1",
-    ),
+    "f": (re.compile(rf"f(?: {_CORNER}){{3,}}"), "f I J K, counted from 1, or back from -1"),
 }
 
 
@@ -70,15 +66,23 @@ def read_mesh(scene: Path, field: str, settings: MeshSettings) -> TriangleSet:
     placed = settings.scale * mesh.vertices @ turn.T + np.array(settings.translate_m)
     if not np.all(np.abs(placed) <= FARTHEST_M):
         raise InputError(scene, f"{field}.vertices_m", "(too far)", f"points within {FARTHEST_M:g} m in the scene")
-    return TriangleSet(placed, mesh.faces, mesh.uv, _normals(mesh, settings.smooth, turn))
+    normals = mesh.normals
+    if settings.smooth and normals is None:
+        normals = vertex_normals(mesh.vertices, mesh.faces)
+    if settings.smooth is False or normals is None:
+        return TriangleSet(placed, mesh.faces, mesh.uv)
+    turned = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-30) @ turn.T
+    return TriangleSet(placed, mesh.faces, mesh.uv, turned)
 
 
-def _normals(mesh: TriangleSet, smooth: bool | None, turn: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """The normals to interpolate: those of the file, else those of the triangles around, or none."""
-    if smooth is False or (smooth is None and mesh.normals is None):
-        return None
-    own = vertex_normals(mesh.vertices, mesh.faces) if mesh.normals is None else mesh.normals
-    return own / np.linalg.norm(own, axis=1, keepdims=True).clip(1e-30) @ turn.T
+def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Unit normals [V, 3]: the area-weighted mean of the triangles around each vertex."""
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(total, faces[:, k], normal)
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
 
 
 def _check(scene: Path, field: str, mesh: TriangleSet) -> None:
@@ -106,26 +110,19 @@ def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
         InputError: see `read_mesh`.
     """
     kind = path.suffix.lower()
-    if kind not in (".obj", ".ply"):
-        raise InputError(scene, field, str(path), "a mesh file that ends in .obj or .ply")
     try:
+        if kind not in (".obj", ".ply"):
+            raise InputError(scene, field, str(path), "a mesh file that ends in .obj or .ply")
         if not path.is_file():
             raise InputError(scene, field, str(path), "a mesh file that exists")
-        size = path.stat().st_size
-        if size > LARGEST_FILE:
+        if path.stat().st_size > LARGEST_FILE:
             raise InputError(scene, field, str(path), f"a file of at most {LARGEST_FILE} bytes")
         content = path.read_bytes()
-    except OSError as error:
-        raise InputError(scene, field, str(path), f"a mesh file that can be read ({error.strerror})") from None
-    try:
-        if kind == ".obj":
-            text, least = _checked_obj(scene, field, path, content)
-            mesh = _load_obj(text)
-        else:
-            least = _promised_faces(scene, field, path, content)
-            mesh = _load_ply(content)
+        mesh, least = (_read_obj if kind == ".obj" else _read_ply)(scene, field, path, content)
     except (InputError, MemoryError):
         raise
+    except OSError as error:
+        raise InputError(scene, field, str(path), f"a mesh file that can be read ({error.strerror})") from None
     except Exception as error:  # trimesh raises whatever its parsing runs into
         raise InputError(scene, field, str(path), f"a mesh file that trimesh can read ({error})") from None
     if len(mesh.faces) < least:
@@ -133,14 +130,15 @@ def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
     return mesh
 
 
-def _checked_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[str, int]:
-    """The vertices and faces of an OBJ file, line by line in one form, and the number of triangles.
+def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[TriangleSet, int]:
+    """The triangles of an OBJ file, and how many its faces should give.
 
-    Indices are counted from 1, also those that the file counts back from the line before: -1 is the last one so far.
-
-    The loader passes over lines that it does not understand; here they are refused. So are indices beyond the
-    lines before, which it takes for texture coordinates or normals that are not there.
+    The loader passes over lines that it does not understand; here they are refused. So are indices beyond the lines
+    before, which it takes for texture coordinates or normals that are not there. It gets the lines in one form, their
+    indices counted from 1, also those that the file counts back from the line before: -1 is the last one so far.
     """
+    from trimesh.exchange.obj import load_obj
+
     if b"\0" in content:
         raise InputError(scene, field, str(path), "a text file, without zero bytes")
     # Only comments and names can hold more than ASCII, in any encoding. A line may go on after a backslash.
@@ -152,15 +150,17 @@ def _checked_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[s
         if not words or words[0] not in _OBJ_LINES:
             continue
         pattern, form = _OBJ_LINES[words[0]]
-        lines.append(" ".join(words))
-        if not pattern.fullmatch(lines[-1]):
-            raise InputError(scene, f"{field} {path.name}, line {number}", line[:60], form)
+        place = f"{field} {path.name}, line {number}"
+        if not pattern.fullmatch(" ".join(words)):
+            raise InputError(scene, place, line[:60], form)
         counts[words[0]] += 1
         if words[0] == "f":
             triangles += len(words) - 3
-            corners = _counted_from_one(scene, f"{field} {path.name}, line {number}", words[1:], counts)
-            lines[-1] = f"f {' '.join(corners)}"
-    return "\n".join(lines) + "\n", triangles
+            words[1:] = _counted_from_one(scene, place, words[1:], counts)
+        lines.append(" ".join(words))
+    # One part, as groups and materials are left out.
+    parts = load_obj(io.StringIO("\n".join(lines) + "\n"), skip_materials=True).get("geometry", {})
+    return _triangles(next(iter(parts.values()), {})), triangles
 
 
 def _counted_from_one(scene: Path, field: str, corners: list[str], counts: dict[str, int]) -> list[str]:
@@ -184,8 +184,10 @@ def _counted_from_one(scene: Path, field: str, corners: list[str], counts: dict[
     return counted
 
 
-def _promised_faces(scene: Path, field: str, path: Path, content: bytes) -> int:
-    """The number of faces that the header of a PLY file promises; no more than the file can hold."""
+def _read_ply(scene: Path, field: str, path: Path, content: bytes) -> tuple[TriangleSet, int]:
+    """The triangles of a PLY file, and how many faces its header promises; no more than the file can hold."""
+    from trimesh.exchange.ply import load_ply
+
     head, end, _ = content[:_LARGEST_HEADER].partition(b"end_header")
     if not head.startswith(b"ply") or not end:
         raise InputError(scene, field, str(path), "a PLY file, which begins with ply and a header")
@@ -194,21 +196,7 @@ def _promised_faces(scene: Path, field: str, path: Path, content: bytes) -> int:
         if count > len(content):
             found = f"({count} elements {name.decode()} in {len(content)} bytes)"
             raise InputError(scene, f"{field} {path.name}, header", found, "no more elements than bytes")
-    return promised.get(b"face", 0)
-
-
-def _load_obj(text: str) -> TriangleSet:
-    from trimesh.exchange.obj import load_obj
-
-    # One part, as groups and materials are left out.
-    parts = list(load_obj(io.StringIO(text), skip_materials=True).get("geometry", {}).values())
-    return _triangles(parts[0]) if parts else _triangles({})
-
-
-def _load_ply(content: bytes) -> TriangleSet:
-    from trimesh.exchange.ply import load_ply
-
-    return _triangles(load_ply(io.BytesIO(content), skip_materials=True))
+    return _triangles(load_ply(io.BytesIO(content), skip_materials=True)), promised.get(b"face", 0)
 
 
 def _triangles(loaded: dict[str, Any]) -> TriangleSet:
@@ -220,3 +208,30 @@ def _triangles(loaded: dict[str, Any]) -> TriangleSet:
     uv, normals = getattr(loaded.get("visual"), "uv", None), loaded.get("vertex_normals")
     extra = [None if x is None or len(x) != len(vertices) else np.asarray(x, np.float64) for x in (uv, normals)]
     return TriangleSet(vertices, faces.reshape(-1, 3), *extra)
+
+
+def encloses(mesh: TriangleSet, point: NDArray[np.float64]) -> bool:
+    """Whether a point [3] lies inside a closed mesh whose triangles face outwards.
+
+    By the winding number, the sum of the solid angles of the triangles over 4 pi (van Oosterom and Strackee 1983): 1
+    inside, 0 outside. A room, whose triangles face inwards, has -1; for an open mesh it means nothing.
+    """
+    corners = mesh.vertices[mesh.faces]
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    if not np.all((point > low) & (point < high)) or not _is_closed(corners):
+        return False
+    a, b, c = np.moveaxis(corners - point, 1, 0)
+    la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+    volume = np.sum(a * np.cross(b, c), axis=1)
+    ab, bc, ca = (np.sum(x * y, axis=1) for x, y in ((a, b), (b, c), (c, a)))
+    solid = 2 * np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb)
+    return bool(solid.sum() / (4 * np.pi) > 0.5)
+
+
+def _is_closed(corners: NDArray[np.float64]) -> bool:
+    """Whether each edge of triangles [T, 3, 3] runs as often one way as the other, by position."""
+    _, number = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    faces = number.reshape(-1, 3)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    forth, back = (np.unique(pair, axis=0, return_counts=True) for pair in (edges, edges[:, ::-1]))
+    return forth[0].shape == back[0].shape and all(np.array_equal(x, y) for x, y in zip(forth, back, strict=True))

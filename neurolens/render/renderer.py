@@ -1,28 +1,131 @@
-"""Renders a scene through a camera."""
+"""Renders a scene through a camera, with what goes on beside: progress, a preview, checkpoints, an early end."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.render.develop import Layers, develop
-from neurolens.render.film import PixelGrid
-from neurolens.render.filmsettings import FilmSettings
-from neurolens.render.identity import identity
+from neurolens.render.checkpoint import identity, read_checkpoint, write_checkpoint
+from neurolens.render.film import DROPPED, PASSED, FilmSettings, PixelGrid, check_memory
 from neurolens.render.illuminants import check_name
-from neurolens.render.job import Job
-from neurolens.render.scenefile import Scene
-from neurolens.render.sums import DROPPED, PASSED, check_memory
-from neurolens.render.watch import Keeper, Progress, Watch
+from neurolens.render.job import Job, Layers, develop
+from neurolens.render.scene import Scene
 from neurolens.render.workers import run
 
+Progress = Callable[[float, float], None]
+# Previews and checkpoints wait so many times as long as the last one took: they cost a twentieth of one core at most.
+_REST = 20.0
 _MOST_SAMPLES = 1 << 20
+
+
+@dataclass(frozen=True)
+class Watch:
+    """How a long render is kept safe.
+
+    Attributes:
+        preview: called with the picture so far, [H, W, 3] linear sRGB, at most every `preview_s` seconds.
+        checkpoint: file that the render is kept in every `checkpoint_s` seconds, when it is stopped and when it fails,
+            and that it goes on from where it exists. Once written it stays until the caller, who then has the picture,
+            removes it.
+        restart: begin again, whatever the checkpoint holds.
+        keep: write the checkpoint of a render that is complete, too, to add samples later.
+        stop: asked now and then; True ends the render with what it has.
+        note: told in one line what went wrong beside the render, such as a preview that could not be written.
+    """
+
+    preview: Callable[[FloatArray], None] | None = None
+    preview_s: float = 5.0
+    checkpoint: Path | None = None
+    checkpoint_s: float = 30.0
+    restart: bool = False
+    keep: bool = False
+    stop: Callable[[], bool] = lambda: False
+    note: Callable[[str], None] = lambda _: None
+
+
+class Keeper:
+    """Does what a `Watch` asks for, for one job.
+
+    Attributes:
+        resumed: share of the work that was done before.
+    """
+
+    def __init__(self, job: Job, watch: Watch, progress: Progress | None) -> None:
+        self._job, self._watch, self._progress = job, watch, progress
+        self._identity = identity(job) if watch.checkpoint is not None else {}
+        self._earlier_s, self._written = 0.0, False
+        if watch.checkpoint is not None and watch.checkpoint.exists() and not watch.restart:
+            spent = read_checkpoint(watch.checkpoint, job.film, self._identity)
+            self._earlier_s, self._written = spent["seconds"], True
+            job.seconds[:] = spent["camera_thread_seconds"], spent["thread_seconds"]
+        self.resumed = job.film.fraction
+        self._kept = self.resumed if self._written else 0.0
+        self._began = time.perf_counter()
+        self._preview_at = self._began + watch.preview_s
+        self._checkpoint_at = self._began + watch.checkpoint_s
+        self._failed: set[str] = set()
+
+    @property
+    def seconds(self) -> float:
+        """Spent on the render, earlier runs included."""
+        return self._earlier_s + time.perf_counter() - self._began
+
+    def __call__(self) -> bool:
+        """What is due; True where the render shall stop."""
+        watch, fraction, now = self._watch, self._job.film.fraction, time.perf_counter()
+        if self._progress is not None and fraction > self.resumed:
+            pace = (now - self._began) / (fraction - self.resumed)
+            self._progress(fraction, pace * (1 - fraction))
+        if (preview := watch.preview) is not None and now >= self._preview_at and fraction:
+            self._preview_at = self._try("preview", lambda: preview(develop(self._job)[0]), watch.preview_s)
+        if watch.checkpoint is not None and now >= self._checkpoint_at:
+            self._checkpoint_at = self._try("checkpoint", self.save, watch.checkpoint_s)
+        return watch.stop()
+
+    def save(self) -> None:
+        """Write the checkpoint, where there is one to write and something to keep that it has not yet."""
+        fraction = self._job.film.fraction
+        if self._watch.checkpoint is None or not fraction:
+            return
+        if self._kept == fraction and self._watch.checkpoint.exists():
+            return  # a disk may have no room for another
+        camera, every = (float(s) for s in self._job.seconds)
+        spent = {"seconds": self.seconds, "camera_thread_seconds": camera, "thread_seconds": every}
+        write_checkpoint(self._watch.checkpoint, self._job.film, self._identity, spent)
+        self._written, self._kept = True, fraction
+
+    def finish(self) -> None:
+        """Keep a render that stopped; one that is complete only where a checkpoint would else tell of less of it."""
+        if self._watch.keep or self._written or self._job.film.fraction < 1:
+            self._try("checkpoint", self.save)
+
+    def rescue(self, error: NeurolensError) -> NeurolensError:
+        """Keep what a render that failed had; the error, with where that is."""
+        self._try("checkpoint", self.save)
+        if not self._written:
+            return error
+        return NeurolensError(f"{error}; what was done is kept in {self._watch.checkpoint}: the same command goes on")
+
+    def _try(self, what: str, act: Callable[[], None], pause_s: float = 0.0) -> float:
+        """Do what the render can do without, and say when next; the first failure of a kind is told."""
+        began = time.perf_counter()
+        try:
+            act()
+        except (OSError, NeurolensError, MemoryError) as error:
+            if what not in self._failed:
+                self._failed.add(what)
+                place = getattr(error, "filename", None)
+                said = getattr(error, "strerror", None) or str(error) or type(error).__name__
+                self._watch.note(f"{what} not written: {f'{place}: ' if place else ''}{said}")
+        done = time.perf_counter()
+        return done + max(pause_s, _REST * (done - began))
 
 
 @dataclass(frozen=True)
@@ -94,8 +197,7 @@ def render(
     if differentials:
         _check_differentials(camera)
     job = Job(scene, camera, grid, samples, seed, max_depth, film, differentials)
-    named = partial(identity, scene, camera, grid, seed, max_depth, film, differentials)
-    keeper = Keeper(job, watch or Watch(), named, progress)
+    keeper = Keeper(job, watch or Watch(), progress)
     try:
         idle = watch is None and progress is None
         run(job, min(threads, job.tiling.tiles), None if idle else keeper)
@@ -108,13 +210,13 @@ def render(
         seconds = keeper.seconds
     keeper.finish()
     rgb, layers = develop(job)
-    stats = {"scene": scene.name, "threads": threads, **_stats(job, film, seed, seconds)}
+    stats = {"scene": scene.name, "threads": threads, **_stats(job, seconds)}
     # Else a result would keep the film's sums in memory.
     save = keeper.save if watch is not None and watch.checkpoint is not None else None
     return RenderResult(rgb, stats, layers, save)
 
 
-def _stats(job: Job, film: FilmSettings, seed: int, seconds: float) -> dict[str, Any]:
+def _stats(job: Job, seconds: float) -> dict[str, Any]:
     grid, tiling = job.grid, job.tiling
     pixels = np.minimum(tiling.tile, tiling.pixels - tiling.tile * np.arange(tiling.tiles))
     paths = int(np.sum(pixels * tiling.samples_done(job.film.done)))
@@ -126,12 +228,12 @@ def _stats(job: Job, film: FilmSettings, seed: int, seconds: float) -> dict[str,
         "samples": tiling.samples,
         "samples_done": paths / tiling.pixels,
         "complete": job.film.fraction == 1,
-        "seed": seed,
+        "seed": job.seed,
         "max_depth": job.max_depth,
         "wavelengths_nm": [job.spectral.low_nm, job.spectral.high_nm],
         "wavelengths": job.mode,
-        "wavelength_sampling": film.wavelength_sampling,
-        "white_balance": film.white_balance,
+        "wavelength_sampling": job.settings.wavelength_sampling,
+        "white_balance": job.settings.white_balance,
         "differentials": job.differentials,
         "seconds": seconds,
         "paths": paths,

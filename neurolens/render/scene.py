@@ -1,31 +1,42 @@
-"""What a scene file says: frozen dataclasses, one for each kind of table, checked one by one.
+"""A scene: the TOML file, then the pictures, meshes and spectra it names, with every reference checked.
 
-Metres, y up, colours linear sRGB. The reader is `neurolens.render.scenefile`. Shapes are in `neurolens.render.shapes`,
-materials in `materialsettings`, lights without a surface in `lightsettings`.
+What the tables of shapes, materials and lights mean stands in `neurolens.render.scenetables`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
+from typing import Any
 
-from neurolens.render.checks import BLACK, Vector, length, require, require_place, require_positive
-from neurolens.render.filmsettings import FilmSettings
-from neurolens.render.illuminants import IlluminantSettings
-from neurolens.render.lightsettings import Environment, PointLight, Sky, SpotLight
-from neurolens.render.materialsettings import Material, ReflectanceSettings, Texture
-from neurolens.render.shapes import Box, Disc, MeshSettings, Plane, Quad, Room, Sphere
+import numpy as np
+
+from neurolens.base.config import from_dict
+from neurolens.base.errors import InputError
+from neurolens.base.tomlfile import read_toml, suggestion
+from neurolens.cameras.contract import FloatArray
+from neurolens.optics.apertures import Aperture
+from neurolens.render import scenetables as tables
+from neurolens.render.film import FilmSettings
+from neurolens.render.illuminants import Spectrum, check_name, check_spectrum, illuminant, read_spectrum
+from neurolens.render.meshfile import TriangleSet, encloses, read_mesh
+from neurolens.render.pictures import make_aperture, read_environment, read_picture
+from neurolens.render.scenetables import BLACK, Checked, Material, MeasuredSpectrum, Texture, Vector, require
+
+_SHAPES = ("planes", "quads", "discs", "spheres", "boxes", "rooms", "meshes")
+_WALLS = ("left", "right", "floor", "ceiling", "far", "near")
 
 
 @dataclass(frozen=True)
-class CameraSettings:
+class CameraSettings(Checked):
     """Where the camera stands and what it takes; which camera it is, the caller of `render` decides.
 
     Attributes:
         position_m: film-plane centre. look_at_m: a point on the optical axis. up: points to the picture's top.
         focus_m: distance from film to the object in focus. f_number: None leaves it to the lens.
         blades, blade_rotation_deg, blade_curvature, aperture_mask: shape of the stop's opening, see
-            `neurolens.apertures`; the mask is a picture beside the scene. Without them the lens's own, else round.
+            `optics.apertures`; the mask is a picture beside the scene. Without them the lens's own, else round.
         film_width_mm, film_height_mm: the part of the film that is used.
         wavelengths_nm: range of light. width, height: picture in pixels. samples: a pixel.
         max_depth: number of surfaces along a path at which light is scattered.
@@ -49,27 +60,12 @@ class CameraSettings:
     max_depth: int = 6
 
     def __post_init__(self) -> None:
-        for field in ("position_m", "look_at_m", "up"):
-            require_place(field, getattr(self, field))
-        axis = tuple(b - a for a, b in zip(self.position_m, self.look_at_m, strict=True))
-        require(length(axis) > 0, "look_at_m", self.look_at_m, "a point other than position_m")  # type: ignore[arg-type]
-        across = _cross(axis, self.up)  # type: ignore[arg-type]
-        parallel = length(across) <= 1e-6 * length(axis) * length(self.up)  # type: ignore[arg-type]
-        require(not parallel, "up", self.up, "a direction not along the optical axis")
-        require(self.focus_m > 0, "focus_m", self.focus_m, "a number above 0")
-        if self.f_number is not None:
-            require_positive("f_number", self.f_number)
-        require_positive("film_width_mm", self.film_width_mm)
-        require_positive("film_height_mm", self.film_height_mm)
-        low, high = self.wavelengths_nm
-        require(380 <= low <= high <= 780, "wavelengths_nm", self.wavelengths_nm, "low and high within 380 to 780")
-        for field, most in (("width", 16384), ("height", 16384), ("samples", 1 << 20), ("max_depth", 1000)):
-            value = getattr(self, field)
-            require(1 <= value <= most, field, value, f"an integer from 1 to {most}")
-
-
-def _cross(a: Vector, b: Vector) -> Vector:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+        super().__post_init__()
+        axis, up = np.subtract(self.look_at_m, self.position_m), np.array(self.up)
+        far, high = float(np.linalg.norm(axis)), float(np.linalg.norm(up))
+        require(far > 0, "look_at_m", self.look_at_m, "a point other than position_m")
+        across = float(np.linalg.norm(np.cross(axis, up)))
+        require(across > 1e-6 * far * high, "up", self.up, "a direction not along the optical axis")
 
 
 @dataclass(frozen=True)
@@ -78,23 +74,197 @@ class SceneSettings:
 
     camera: CameraSettings
     film: FilmSettings = FilmSettings()
-    illuminants: dict[str, IlluminantSettings] | None = None
-    environment: Environment = Environment(colour=BLACK)
-    sky: Sky | None = None
-    reflectances: dict[str, ReflectanceSettings] | None = None
+    illuminants: dict[str, MeasuredSpectrum] | None = None
+    environment: tables.Environment = tables.Environment(colour=BLACK)
+    sky: tables.Sky | None = None
+    reflectances: dict[str, MeasuredSpectrum] | None = None
     textures: dict[str, Texture] | None = None
     materials: dict[str, Material] | None = None
-    planes: tuple[Plane, ...] = ()
-    quads: tuple[Quad, ...] = ()
-    discs: tuple[Disc, ...] = ()
-    spheres: tuple[Sphere, ...] = ()
-    boxes: tuple[Box, ...] = ()
-    rooms: tuple[Room, ...] = ()
-    meshes: tuple[MeshSettings, ...] = ()
-    points: tuple[PointLight, ...] = ()
-    spots: tuple[SpotLight, ...] = ()
+    planes: tuple[tables.Plane, ...] = ()
+    quads: tuple[tables.Quad, ...] = ()
+    discs: tuple[tables.Disc, ...] = ()
+    spheres: tuple[tables.Sphere, ...] = ()
+    boxes: tuple[tables.Box, ...] = ()
+    rooms: tuple[tables.Room, ...] = ()
+    meshes: tuple[tables.MeshSettings, ...] = ()
+    points: tuple[tables.PointLight, ...] = ()
+    spots: tuple[tables.SpotLight, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.sky is not None:
-            dark = self.environment == Environment(colour=BLACK)
-            require(dark, "sky", "(given)", "either sky or environment")
+        dark = self.sky is None or self.environment == tables.Environment(colour=BLACK)
+        require(dark, "sky", "(given)", "either sky or environment")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene with all it needs.
+
+    Attributes:
+        name: the file's name without ending. settings: the tables of the file.
+        images: linear RGB [H, W, 3] of each image texture. triangles: one a mesh.
+        aperture: shape of the stop's opening, None where the scene says nothing.
+        illuminants, reflectances: measured spectra by name.
+        environment: linear RGB [H, W, 3] of the environment's picture, if it has one.
+    """
+
+    name: str
+    settings: SceneSettings
+    images: dict[str, FloatArray]
+    triangles: tuple[TriangleSet, ...]
+    aperture: Aperture | None = None
+    illuminants: dict[str, Spectrum] = field(default_factory=dict)
+    reflectances: dict[str, Spectrum] = field(default_factory=dict)
+    environment: FloatArray | None = None
+
+
+def load_scene(path: str | Path) -> Scene:
+    """Read a scene file; pictures and meshes lie beside it.
+
+    Raises:
+        InputError: names file, field, value and what was expected, for an unknown or missing key, a wrong type or
+            value, a material or texture that is not defined, a picture or mesh that is missing or broken, a
+            degenerate triangle.
+    """
+    return scene_from_tables(read_toml(path), path)
+
+
+def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> Scene:
+    """As `load_scene`, for tables already in memory; `path` is for messages and for finding files."""
+    path = Path(path)
+    settings = from_dict(SceneSettings, tables, path)
+    triangles = tuple(read_mesh(path, f"meshes[{k}]", mesh) for k, mesh in enumerate(settings.meshes))
+    _check_references(path, settings, triangles)
+    _check_camera(path, settings, triangles)
+    images = {
+        name: read_picture(path, f"textures.{name}.file", path.parent / texture.file)
+        for name, texture in (settings.textures or {}).items()
+        if texture.file is not None
+    }
+    around, scale = settings.environment.file, settings.environment.scale
+    return Scene(
+        path.stem,
+        settings,
+        images,
+        triangles,
+        _aperture(path, settings.camera),
+        _illuminants(path, settings),
+        _spectra(path, "reflectances", settings.reflectances, settings.camera, most=1.0),
+        None if around is None else read_environment(path, "environment.file", path.parent / around, scale),
+    )
+
+
+def _aperture(path: Path, camera: CameraSettings) -> Aperture | None:
+    mask = None if camera.aperture_mask is None else path.parent / camera.aperture_mask
+    try:
+        return make_aperture(camera.blades, camera.blade_rotation_deg, camera.blade_curvature, mask)
+    except InputError as error:
+        raise InputError(path, f"camera, {error.file} {error.field}", error.value, error.expected) from None
+
+
+def _illuminants(path: Path, settings: SceneSettings) -> dict[str, Spectrum]:
+    """The measured illuminants; every light's illuminant exists."""
+    low, high = settings.camera.wavelengths_nm
+    measured = _spectra(path, "illuminants", settings.illuminants, settings.camera)
+    for name, (nm, values) in measured.items():
+        if illuminant(name) is not None:
+            raise InputError(path, f"illuminants.{name}", name, "a name that no illuminant has yet")
+        if not np.interp(np.linspace(low, high, 4096), nm, values).any():
+            raise InputError(path, f"illuminants.{name}", "(all 0)", f"light between {low:g} and {high:g} nm")
+    for kind in ("quads", "discs", "spheres", "points", "spots"):
+        for k, light in enumerate(getattr(settings, kind)):
+            check_name(path, f"{kind}[{k}].illuminant", light.illuminant, measured)
+    check_name(path, "environment.illuminant", settings.environment.illuminant, measured)
+    if settings.film.white_balance is not None:
+        check_name(path, "film.white_balance", settings.film.white_balance, measured)
+    return measured
+
+
+def _spectra(
+    path: Path,
+    kind: str,
+    tables: Mapping[str, MeasuredSpectrum] | None,
+    camera: CameraSettings,
+    most: float | None = None,
+) -> dict[str, Spectrum]:
+    """Measured spectra over all of the camera's wavelengths: scaled to a maximum of 1, or with `most` as they are."""
+    low, high = camera.wavelengths_nm
+    found = {}
+    for name, given in (tables or {}).items():
+        place = f"{kind}.{name}"
+        if given.file is not None:
+            nm, values = read_spectrum(path, f"{place}.file", path.parent / given.file, most)
+        else:
+            nm, values = check_spectrum(path, f"{place}.spectrum", given.spectrum or (), most)
+        if nm[0] > low or nm[-1] < high:
+            expected = f"the {low:g} to {high:g} nm of the camera; what is dark there is written as 0"
+            raise InputError(path, place, f"({nm[0]:g} to {nm[-1]:g} nm)", expected)
+        found[name] = nm, values
+    return found
+
+
+def _check_references(path: Path, settings: SceneSettings, triangles: Sequence[TriangleSet]) -> None:
+    """Every material, texture and reflectance that is named exists, and textures lie where they can."""
+    materials, textures = settings.materials or {}, settings.textures or {}
+    for name, material in materials.items():
+        if material.texture is not None:
+            _known(path, f"materials.{name}.texture", material.texture, textures)
+        if isinstance(material.reflectance, str):
+            _known(path, f"materials.{name}.reflectance", material.reflectance, settings.reflectances or {})
+    for kind in _SHAPES:
+        for k, shape in enumerate(getattr(settings, kind)):
+            for part in ("material", *(_WALLS if kind == "rooms" else ())):
+                used = getattr(shape, part)
+                if used is None:
+                    continue
+                place = f"{kind}[{k}].{part}"
+                _known(path, place, used, materials)
+                mesh = triangles[k] if kind == "meshes" else None
+                _check_texture(path, place, kind, materials[used], textures, mesh)
+
+
+def _known(path: Path, place: str, name: str, names: Mapping[str, Any]) -> None:
+    if name not in names:
+        listed = ", ".join(names) or "none is defined"
+        raise InputError(path, place, name, f"one of: {listed}{suggestion(name, list(names))}")
+
+
+def _check_texture(
+    path: Path, place: str, kind: str, material: Material, textures: Mapping[str, Texture], mesh: TriangleSet | None
+) -> None:
+    texture, name = textures.get(material.texture or ""), material.texture
+    if texture is None:
+        return
+    if kind == "spheres":
+        raise InputError(path, place, name, "a material without texture on a curved shape")
+    if mesh is not None:
+        if texture.kind != "image" or texture.size_m is not None:
+            raise InputError(path, place, name, "an image texture without size_m on a mesh")
+        if mesh.uv is None:
+            raise InputError(path, place, name, "a mesh file with texture coordinates, or no texture")
+    elif kind not in ("quads", "discs") and texture.kind == "image" and texture.size_m is None:
+        raise InputError(path, f"textures.{name}.size_m", "(missing)", "width, height in m")
+
+
+def _check_camera(path: Path, settings: SceneSettings, triangles: Sequence[TriangleSet]) -> None:
+    """The middle of the film is in nothing solid: a sphere, a box, or a closed mesh with its front outside."""
+    at = np.array(settings.camera.position_m)
+    spheres, boxes = settings.spheres, settings.boxes
+    solids: dict[str, Any] = {f"meshes[{k}]": encloses(mesh, at) for k, mesh in enumerate(triangles)}
+    solids |= {f"spheres[{k}]": np.sum((at - s.centre_m) ** 2) < s.radius_m**2 for k, s in enumerate(spheres)}
+    solids |= {f"boxes[{k}]": np.all((at > b.min_m) & (at < b.max_m)) for k, b in enumerate(boxes)}
+    for name, inside in solids.items():
+        if inside:
+            position = list(settings.camera.position_m)
+            raise InputError(path, "camera.position_m", position, f"a place outside {name}")
+
+
+def files_named(tables: Any) -> Iterator[Path]:
+    """Every file that a scene's tables name, as it is written there."""
+    if isinstance(tables, Path):
+        yield tables
+    elif is_dataclass(tables):
+        for each in fields(tables):
+            yield from files_named(getattr(tables, each.name))
+    elif isinstance(tables, (Mapping, tuple)):
+        for item in tables.values() if isinstance(tables, Mapping) else tables:
+            yield from files_named(item)

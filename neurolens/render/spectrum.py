@@ -7,8 +7,7 @@ D65, so white light is the number 1 at every wavelength and D65 itself sits in t
 
 from __future__ import annotations
 
-from functools import cache
-from importlib import resources
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -16,29 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.cameras.contract import FloatArray
 from neurolens.render.colour import SRGB
+from neurolens.render.illuminants import FloatArray64, Spectrum, daylight_table, illuminant, table
+from neurolens.render.scenetables import Vector
 
-FloatArray64 = NDArray[np.float64]
-
-FRAUNHOFER_NM = {"d": 587.5618, "F": 486.1327, "C": 656.2725}
+_DFC_NM = 587.5618, 486.1327, 656.2725  # Fraunhofer lines d, F and C
 # Beyond this the three responses are so alike over the range that separating them would only amplify noise.
 _LARGEST_CONDITION = 30.0
 _DEFENSIVE = 0.1  # share of the wavelengths that is spread evenly, whatever the importance says
 _STEPS = 2048  # at which the importance is read
-
-
-@cache
-def _tables() -> dict[str, FloatArray64]:
-    """Columns wavelength_nm, x, y, z, d65, d50, red, green, blue; made by experiments/make_spectral_tables.py."""
-    text = resources.files("neurolens.render").joinpath("data/spectra.csv").read_text(encoding="utf-8")
-    names, *rows = (line.split(",") for line in text.splitlines())
-    columns = np.array(rows, np.float64).T
-    columns.flags.writeable = False
-    return dict(zip(names, columns, strict=True))
-
-
-def table(name: str) -> FloatArray64:
-    """A column of the shipped table, one value every 5 nm from 380 to 780 nm."""
-    return _tables()[name]
 
 
 class SpectralRange:
@@ -66,12 +50,7 @@ class SpectralRange:
     """
 
     def __init__(
-        self,
-        low_nm: float,
-        high_nm: float,
-        bins: int = 256,
-        light: tuple[FloatArray64, FloatArray64] | None = None,
-        lanes: int = 1,
+        self, low_nm: float, high_nm: float, bins: int = 256, light: Spectrum | None = None, lanes: int = 1
     ) -> None:
         self.low_nm, self.high_nm = low_nm, high_nm
         self.bins, self.lanes = bins, lanes
@@ -170,18 +149,85 @@ class SpectralRange:
         """Index [bins], Cauchy's A + B / lambda^2 through n_d and n_F - n_C = (n_d - 1) / V_d; constant without V_d."""
         if v_d is None:
             return np.full(self.bins, n_d, np.float32)
-        inverse = {line: 1 / nm**2 for line, nm in FRAUNHOFER_NM.items()}
-        b = (n_d - 1) / v_d / (inverse["F"] - inverse["C"])
-        return (n_d + b * (self.centres_nm**-2.0 - inverse["d"])).astype(np.float32)
+        d, f, c = (1 / nm**2 for nm in _DFC_NM)
+        b = (n_d - 1) / v_d / (f - c)
+        return (n_d + b * (self.centres_nm**-2.0 - d)).astype(np.float32)
 
 
-def srgb_to_linear(encoded: NDArray[np.floating]) -> FloatArray:
-    """Linear light of sRGB-encoded values in [0, 1] (IEC 61966-2-1)."""
-    encoded = np.asarray(encoded, np.float32)
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
+Index = NDArray[np.intp]
 
 
-def linear_to_srgb(linear: NDArray[np.floating]) -> FloatArray:
-    """sRGB encoding of linear light, clipped to [0, 1] (IEC 61966-2-1)."""
-    clipped = np.clip(np.nan_to_num(np.asarray(linear, np.float32), nan=0.0), 0.0, 1.0)
-    return np.where(clipped <= 0.0031308, clipped * 12.92, 1.055 * clipped ** (1 / 2.4) - 0.055).astype(np.float32)
+class Palette:
+    """Spectra [rows, bins], looked up by row and wavelength bin; colours that occur twice share a row."""
+
+    def __init__(
+        self, spectral: SpectralRange, measured: Mapping[str, Spectrum], reflectances: Mapping[str, Spectrum]
+    ) -> None:
+        self._spectral, self._measured, self._reflectances = spectral, measured, reflectances
+        self._rows: list[FloatArray] = []
+        self._numbers: dict[object, int] = {}
+        self._flat: FloatArray = np.zeros(0, np.float32)
+
+    def colour(self, rgb: Vector) -> int:
+        """Row of a colour."""
+        return self._row(rgb, lambda: self._spectral.spectrum(rgb))
+
+    def reflectance(self, value: Vector | str) -> int:
+        """Row of a colour, or of a measured reflectance."""
+        if not isinstance(value, str):
+            return self.colour(value)
+        return self._row(("reflectance", value), lambda: self._spectral.means(*self._reflectances[value]))
+
+    def absorption(self, transmittance: Vector, depth_m: float) -> int:
+        """Row of the absorption coefficient in 1/m of which `transmittance` is left after `depth_m`."""
+        return self._row(
+            ("absorption", transmittance, depth_m), lambda: -np.log(self._spectral.spectrum(transmittance)) / depth_m
+        )
+
+    def light(self, rgb: Vector, name: str) -> int:
+        """Row of the light of an illuminant, tinted by a colour; relative to D65."""
+        if name == "D65" or not any(rgb):
+            return self.colour(rgb)
+        return self._row((*rgb, name), lambda: self._spectral.spectrum(rgb) * self.illuminant(name))
+
+    def illuminant(self, name: str) -> FloatArray:
+        """Radiance [bins] relative to D65 of an illuminant of luminance 1 on the film."""
+        found = illuminant(name, self._measured)
+        assert found is not None  # names are checked where scenes are read
+        return self._spectral.relative(*found).astype(np.float32)
+
+    def measured_light(self, key: object, spectrum: Spectrum, luminance: float) -> int:
+        """Row of a light of a spectrum in any unit, scaled to a luminance (1 is that of D65)."""
+        return self._row(("light", key), lambda: self._spectral.relative(*spectrum) * luminance)
+
+    def daylight(self, component: int) -> tuple[int, float]:
+        """Row of component S0, S1 or S2 of daylight over D65, and its luminance on the film."""
+        nm, components = daylight_table()
+        ratio = self._spectral.over_d65(nm, components[component])
+        return self._row(("daylight", component), lambda: ratio), self._spectral.luminance(ratio)
+
+    def index(self, n_d: float, v_d: float | None) -> int:
+        """Row of a refractive index."""
+        return self._row(("index", n_d, v_d), lambda: self._spectral.refractive_index(n_d, v_d))
+
+    def _row(self, key: object, make: Callable[[], NDArray[np.floating]]) -> int:
+        if key not in self._numbers:
+            self._numbers[key] = len(self._rows)
+            self._rows.append(np.asarray(make(), np.float32))
+        return self._numbers[key]
+
+    def means(self, rows: list[int]) -> FloatArray:
+        """Means of rows over the bins."""
+        return np.array([self._rows[row].mean() for row in rows], np.float32)
+
+    def freeze(self) -> None:
+        """Lay the rows out for `look_up`."""
+        rows = np.stack(self._rows) if self._rows else np.zeros((1, self._spectral.bins), np.float32)
+        rows = self._spectral.rotated(rows)
+        self._flat = rows.reshape(*rows.shape[:-2], -1)
+
+    def look_up(self, row: Index, bins: Index) -> FloatArray:
+        """Values [N] of rows [N] at wavelength bins [N]; [lanes, N] where a path carries several wavelengths."""
+        where = row * self._spectral.bins
+        where += bins
+        return self._flat.take(where, axis=-1)

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.checks import Vector
-from neurolens.render.materialsettings import Texture
-from neurolens.render.palette import Index
-from neurolens.render.spectrum import SpectralRange
+from neurolens.render.scenetables import Texture, Vector
+from neurolens.render.spectrum import Index, SpectralRange
 
 Frame = NDArray[np.float64]
 
@@ -62,32 +59,20 @@ def triangle_frames(planes: Frame, uv: Frame) -> Frame:
     return np.concatenate([rows, np.ones((len(uv), 2, 1))], axis=2)
 
 
-@dataclass(frozen=True)
-class Textured:
-    """Surfaces in a row with one texture, or none.
-
-    Attributes:
-        count: how many. texture: its name. frames: [count, 2, 5] from `_frame` or `triangle_frames`.
-    """
-
-    count: int
-    texture: str | None = None
-    frames: Frame | None = None
-
-
 class TextureTable:
     """The textures of a scene, looked up by surface.
 
     Args:
         textures: by name. images: linear RGB [H, W, 3] of those of kind "image".
-        surfaces: all surfaces. colour: gives a colour's row of the palette.
+        surfaces: for surfaces in a row how many, the name of their texture and their frames [count, 2, 5] (one of the
+            functions above), or None. colour: gives a colour's row of the palette.
     """
 
     def __init__(
         self,
         textures: dict[str, Texture],
         images: dict[str, FloatArray],
-        surfaces: Sequence[Textured],
+        surfaces: Sequence[tuple[int, str | None, Frame | None]],
         colour: Callable[[Vector], int],
         spectral: SpectralRange,
     ) -> None:
@@ -96,18 +81,18 @@ class TextureTable:
         self._basis = spectral.rotated(spectral.basis.astype(np.float32))
         numbers = {name: k for k, name in enumerate(textures)}
         self._rows = [np.array([colour(c) for c in t.colours or ()], np.intp) for t in textures.values()]
-        total = sum(part.count for part in surfaces)
+        total = sum(count for count, _, _ in surfaces)
         self._number, self._frames = np.full(total, -1), np.zeros((2, 4, total), np.float32)
         first = 0
-        for part in surfaces:
-            if part.texture is not None and part.frames is not None:
-                texture, rows = textures[part.texture], slice(first, first + part.count)
+        for count, name, frames in surfaces:
+            if name is not None and frames is not None:
+                texture, rows = textures[name], slice(first, first + count)
                 cell = texture.cell_m
-                size = texture.size_m or ((cell, cell) if cell else part.frames[0, :, 4])
-                self._number[rows] = numbers[part.texture]
+                size = texture.size_m or ((cell, cell) if cell else frames[0, :, 4])
+                self._number[rows] = numbers[name]
                 # In cells, or in pictures.
-                self._frames[:, :, rows] = np.moveaxis(part.frames[:, :, :4] / np.array(size)[:, None], 0, -1)
-            first += part.count
+                self._frames[:, :, rows] = np.moveaxis(frames[:, :, :4] / np.array(size)[:, None], 0, -1)
+            first += count
         self._used = bool(np.any(self._number >= 0))
 
     def apply(
@@ -146,5 +131,4 @@ class TextureTable:
         column = ((u - np.floor(u)) * width).astype(np.intp)
         row = ((1 - (v - np.floor(v))) * height).astype(np.intp)
         rgb = image[np.minimum(row, height - 1), np.minimum(column, width - 1)]
-        result: FloatArray = np.einsum("nc,...cn->...n", rgb, self._basis.take(bins, axis=-1))
-        return result
+        return np.einsum("nc,...cn->...n", rgb, self._basis.take(bins, axis=-1))

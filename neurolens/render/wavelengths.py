@@ -9,14 +9,13 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
-from neurolens.render.checks import Vector
 from neurolens.render.directions import centres
-from neurolens.render.film import PixelGrid
-from neurolens.render.filmsettings import FilmSettings, WavelengthMode
-from neurolens.render.illuminants import illuminant
-from neurolens.render.scenefile import Scene
-from neurolens.render.sky import sun_spectrum, total_spectrum
-from neurolens.render.spectrum import FloatArray64, SpectralRange
+from neurolens.render.environment import sun_spectrum, total_spectrum
+from neurolens.render.film import FilmSettings, PixelGrid, WavelengthMode
+from neurolens.render.illuminants import FloatArray64, Spectrum, illuminant
+from neurolens.render.scene import Scene
+from neurolens.render.scenetables import Vector
+from neurolens.render.spectrum import SpectralRange
 
 LANES = 4  # wavelengths of a hero path, and paths that share their random numbers
 _FINE = 1024  # wavelengths at which the light of a scene is summed up
@@ -41,7 +40,7 @@ def spectral_range(scene: Scene, camera: Camera, film: FilmSettings, lanes: int 
     return SpectralRange(low, high, light=light, lanes=lanes)
 
 
-def expected_light(scene: Scene) -> tuple[FloatArray64, FloatArray64]:
+def expected_light(scene: Scene) -> Spectrum:
     """Spectrum (nm, radiance relative to D65) of a scene's light: its lamps by their area, and as much environment."""
     fine = SpectralRange(*scene.settings.camera.wavelengths_nm, _FINE)
     lamps: dict[str, FloatArray64] = {}  # sums of emission by illuminant
@@ -61,9 +60,12 @@ def expected_light(scene: Scene) -> tuple[FloatArray64, FloatArray64]:
             light += fine.relative(*found) * fine.spectrum(rgb)
         if light.any():
             total += light / light.mean()
-    for spectrum in _daylight(scene):
-        shine = fine.relative(*spectrum)
-        total += shine / shine.mean()
+    if (sky := scene.settings.sky) is not None:
+        upper = centres(32, 16)
+        sources = [total_spectrum(sky, upper[:, upper[1] > 0]), *([sun_spectrum(sky)[:2]] if sky.sun else [])]
+        for spectrum in sources:
+            shine = fine.relative(*spectrum)
+            total += shine / shine.mean()
     return fine.centres_nm, total if total.any() else np.ones(_FINE)
 
 
@@ -81,15 +83,6 @@ def _lamps(scene: Scene) -> Iterator[tuple[str, Vector, float]]:
     for spot in settings.spots:
         middle = np.radians(0.5 * (spot.inner_deg + spot.outer_deg))
         yield spot.illuminant, spot.intensity, 2 * (1 - float(np.cos(middle)))
-
-
-def _daylight(scene: Scene) -> Iterator[tuple[FloatArray64, FloatArray64]]:
-    """Spectra of the clear sky and of the sun, where the scene has them."""
-    if (sky := scene.settings.sky) is not None:
-        upper = centres(32, 16)
-        yield total_spectrum(sky, upper[:, upper[1] > 0])
-        if sky.sun:
-            yield sun_spectrum(sky)[:2]
 
 
 def mode_for(camera: Camera, grid: PixelGrid, limits_nm: tuple[float, float], film: FilmSettings) -> WavelengthMode:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import threading
 import time
 import traceback
@@ -20,10 +19,9 @@ from typing import Any
 import numpy as np
 
 from neurolens.base.errors import NeurolensError
+from neurolens.render.film import FORKS, fork_context
 from neurolens.render.job import Job
-from neurolens.render.sums import fork_context
 
-FORKS = sys.platform.startswith("linux")
 _POLL_S, _PATIENCE_S = 0.05, 5.0
 
 
@@ -60,7 +58,9 @@ def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None
     if job.message[0]:
         raise NeurolensError(bytes(job.message).rstrip(bytes(1)).decode(errors="replace"))
     if killed:
-        raise NeurolensError(f"a render worker was killed{_why(killed[0])} before it had finished")
+        guess = ": did the memory run out?" if killed[0] == -signal.SIGKILL else ""
+        why = f" (signal {-killed[0]}{guess})" if killed[0] < 0 else ""
+        raise NeurolensError(f"a render worker was killed{why} before it had finished")
 
 
 def _dismiss(job: Job, team: Sequence[Any]) -> None:
@@ -76,13 +76,6 @@ def _dismiss(job: Job, team: Sequence[Any]) -> None:
         for worker in late:
             worker.kill()
             worker.join()
-
-
-def _why(exit_code: int) -> str:
-    if exit_code >= 0:
-        return ""
-    guess = ": did the memory run out?" if exit_code == -signal.SIGKILL else ""
-    return f" (signal {-exit_code}{guess})"
 
 
 def _work(job: Job, claimed: Any, parent: int | None = None) -> None:

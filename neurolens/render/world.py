@@ -7,30 +7,129 @@ what a ray meets that meets nothing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.arealights import FlatLights, SphereLights
-from neurolens.render.assembly import Assembly, Surfaces
-from neurolens.render.checks import BLACK
-from neurolens.render.coat import CoatTable
-from neurolens.render.environment import SkyLight, SunLight, make_surroundings
-from neurolens.render.lights import Lights, LightSamples
-from neurolens.render.lightsettings import PointLight, SpotLight
-from neurolens.render.materialsettings import Material
-from neurolens.render.palette import Index, Palette
-from neurolens.render.pointlights import PointLights
-from neurolens.render.primitives import Box, IntArray, Primitive, Rays
-from neurolens.render.scenefile import Scene
-from neurolens.render.shapes import Disc, Sphere
-from neurolens.render.spectrum import SpectralRange
-from neurolens.render.textures import Textured, TextureTable
+from neurolens.render import textures
+from neurolens.render.environment import SunLight, make_surroundings
+from neurolens.render.lights import FlatLights, Lights, LightSamples, PointLights, SphereLights
+from neurolens.render.materials import CoatTable
+from neurolens.render.mesh import make_mesh, triangle_planes
+from neurolens.render.primitives import AxisQuad, Box, Disc, IntArray, Plane, Primitive, Quad, Rays, Spheres
+from neurolens.render.scene import Scene
+from neurolens.render.scenetables import BLACK, Emitter, Material, Vector
+from neurolens.render.spectrum import Index, Palette, SpectralRange
 
 DIFFUSE, GLOSSY, MIRROR, GLASS, NOTHING = range(5)
 _KINDS = {"diffuse": DIFFUSE, "glossy": GLOSSY, "mirror": MIRROR, "glass": GLASS}
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Surfaces in a row that differ only in where they are.
+
+    Attributes:
+        normals: [count, 3]. frames: [count, 2, 5] of textures. emitter: what shines, None if it does not.
+    """
+
+    normals: NDArray[np.float64]
+    material: Material | None = None
+    frames: NDArray[np.float64] | None = None
+    emitter: Emitter | None = None
+
+
+def _unit(vector: Vector) -> NDArray[np.float64]:
+    return np.array(vector) / np.linalg.norm(vector)
+
+
+class Assembly:
+    """All shapes of a scene, from its tables: quads, discs, planes, rooms, boxes, spheres, meshes.
+
+    Attributes:
+        primitives: to hit. surfaces: in order of their numbers. boxes: whose faces are told apart after a hit.
+        smooth: of meshes with interpolated normals the first surface, planes [T, 3, 4] and corners' normals [T, 3, 3].
+        first_sphere: number of the first sphere's surface.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene, self._materials = scene, scene.settings.materials or {}
+        self.primitives: list[Primitive] = []
+        self.surfaces: list[Surfaces] = []
+        self.boxes: list[Box] = []
+        self.smooth: list[tuple[int, FloatArray, FloatArray]] = []
+        self._count = 0
+        self._add_flat()
+        self._add_boxes()
+        self.first_sphere = self._count
+        self._add_spheres()
+        self._add_meshes()
+
+    def _add(
+        self,
+        normals: NDArray[np.float64],
+        material: str | None,
+        frames: NDArray[np.float64] | None = None,
+        emitter: Emitter | None = None,
+    ) -> None:
+        shining = emitter if emitter is not None and any(emitter.emission) else None
+        made = None if material is None else self._materials[material]
+        self.surfaces.append(Surfaces(normals, made, frames, shining))
+        self._count += len(normals)
+
+    def _add_flat(self) -> None:
+        settings = self._scene.settings
+        for quad in settings.quads:
+            corner, u, v = (np.array(x, np.float64) for x in (quad.corner_m, quad.edge_u_m, quad.edge_v_m))
+            normal = np.cross(u, v) / np.linalg.norm(np.cross(u, v))
+            aligned = np.count_nonzero(u) == 1 and np.count_nonzero(v) == 1
+            axis, first = int(np.argmax(np.abs(normal))), self._count
+            shape = AxisQuad(first, corner, corner + u + v, axis) if aligned else Quad(first, corner, u, v)
+            self.primitives.append(shape)
+            self._add(normal[None], quad.material, textures.quad_frame(corner, u, v)[None], quad)
+        for disc in settings.discs:
+            centre, normal = np.array(disc.centre_m, np.float64), _unit(disc.normal)
+            self.primitives.append(Disc(self._count, centre, normal, disc.radius_m))
+            frame = textures.disc_frame(centre, normal, disc.radius_m)
+            self._add(normal[None], disc.material, frame[None], disc)
+        for plane in settings.planes:
+            point, normal = np.array(plane.point_m, np.float64), _unit(plane.normal)
+            self.primitives.append(Plane(self._count, point, normal))
+            self._add(normal[None], plane.material, textures.plane_frame(point, normal)[None])
+
+    def _add_boxes(self) -> None:
+        rooms = [(room, room.walls(), True) for room in self._scene.settings.rooms]
+        boxes = [(box, (box.material,) * 6, False) for box in self._scene.settings.boxes]
+        for table, materials, inside in [*rooms, *boxes]:
+            low, high = np.array(table.min_m, np.float64), np.array(table.max_m, np.float64)
+            box = Box(self._count, low, high, inside)
+            self.primitives.append(box)
+            self.boxes.append(box)
+            for face, name in enumerate(materials):
+                normal = np.zeros((1, 3))
+                normal[0, face // 2] = 1.0 if face % 2 else -1.0
+                self._add(normal, name, textures.box_frame(low, face // 2)[None])
+
+    def _add_spheres(self) -> None:
+        if spheres := self._scene.settings.spheres:
+            centres, radii = np.array([s.centre_m for s in spheres]), np.array([s.radius_m for s in spheres])
+            self.primitives.append(Spheres(self._count, centres, radii))
+        for sphere in spheres:
+            self._add(np.zeros((1, 3)), sphere.material, None, sphere)
+
+    def _add_meshes(self) -> None:
+        for mesh, triangles in zip(self._scene.settings.meshes, self._scene.triangles, strict=True):
+            first = self._count
+            self.primitives.append(make_mesh(first, triangles.vertices, triangles.faces))
+            planes = triangle_planes(triangles.vertices[triangles.faces])
+            uv = triangles.uv
+            frames = None if uv is None else textures.triangle_frames(planes, uv[triangles.faces])
+            self._add(planes[:, 0, :3], mesh.material, frames)
+            if triangles.normals is not None:
+                corners = triangles.normals[triangles.faces].astype(np.float32)
+                self.smooth.append((first, planes.astype(np.float32), corners))
 
 
 class World:
@@ -55,10 +154,10 @@ class World:
         self.palette.freeze()
         self._shadow_casters = [p for p in self._primitives if not self._never_shades(p)]
 
-    def _fill_tables(self, surfaces: Sequence[Surfaces], spectral: SpectralRange) -> None:
+    def _fill_tables(self, surfaces: list[Surfaces], spectral: SpectralRange) -> None:
         """One row a surface, and the last one for nothing."""
-        parts = [*surfaces, Surfaces(np.zeros((1, 3)), None)]
-        materials, counts = [part.material for part in parts], [part.count for part in parts]
+        parts = [*surfaces, Surfaces(np.zeros((1, 3)))]
+        materials, counts = [part.material for part in parts], [len(part.normals) for part in parts]
         colour, palette = self.palette.colour, self.palette
 
         def spread(values: list[int] | list[float], kind: type) -> NDArray:
@@ -66,22 +165,27 @@ class World:
 
         self.normal = np.concatenate([part.normals for part in parts]).T.astype(np.float32)
         self.kind = spread([_KINDS[m.kind] if m else NOTHING for m in materials], np.uint8)
-        self.light = spread([part.light for part in parts], np.intp)
-        self.emission_row = spread([palette.light(part.emission, part.illuminant) for part in parts], np.intp)
+        shining = np.array([part.emitter is not None for part in parts])
+        self.light = np.repeat(np.where(shining, np.cumsum(shining) - 1, -1), counts)
+        self.emission_row = spread([self._emission(part.emitter) for part in parts], np.intp)
         reflectances = [palette.reflectance((m and m.reflectance) or BLACK) for m in materials]
         self.reflectance_row = spread(reflectances, np.intp)
         self.specular_row = spread([colour((m and m.specular) or BLACK) for m in materials], np.intp)
         self.index_row = spread([palette.index(m.n_d, m.V_d) if m and m.n_d else 0 for m in materials], np.intp)
         self.absorption_row = spread([self._absorption(m) for m in materials], np.intp)
-        alphas = [m.roughness**2 if m and m.roughness else 1.0 for m in materials]
         self.absorbs = bool(self.absorption_row.any())
+        alphas = [m.roughness**2 if m and m.roughness else 1.0 for m in materials]
         self.alpha = spread(alphas, np.float32)
         used = sorted({alpha for alpha, m in zip(alphas, materials, strict=True) if m and m.kind == "glossy"})
         self.coat = CoatTable(used)
         self.coat_row = spread([used.index(alpha) if alpha in used else 0 for alpha in alphas], np.intp)
-        textures = [m.texture if m else None for m in materials]
-        textured = [Textured(p.count, t, p.frames) for p, t in zip(parts, textures, strict=True)]
-        self.textures = TextureTable(self.scene.settings.textures or {}, self.scene.images, textured, colour, spectral)
+        named = [m.texture if m else None for m in materials]
+        framed = [(n, t, part.frames) for n, t, part in zip(counts, named, parts, strict=True)]
+        tables, images = self.scene.settings.textures or {}, self.scene.images
+        self.textures = textures.TextureTable(tables, images, framed, colour, spectral)
+
+    def _emission(self, emitter: Emitter | None) -> int:
+        return 0 if emitter is None else self.palette.light(emitter.emission, emitter.illuminant)
 
     def _absorption(self, material: Material | None) -> int:
         if material is None or material.transmittance is None or material.transmittance_depth_m is None:
@@ -95,48 +199,41 @@ class World:
             self._spheres[:, number] = (*sphere.centre_m, 1 / sphere.radius_m)
         self._has_spheres = bool(self.scene.settings.spheres)
 
-    def _make_lights(self, surfaces: Sequence[Surfaces]) -> None:
-        """All lights, in the order in which `Assembly` counts those with a surface: quads, discs, spheres."""
-        settings, light = self.scene.settings, self.palette.light
+    def _make_lights(self, surfaces: list[Surfaces]) -> None:
+        """All lights, in the order of `Assembly` those with a surface: quads, discs, spheres."""
+        settings = self.scene.settings
         quads = [quad for quad in settings.quads if any(quad.emission)]
         discs = [disc for disc in settings.discs if any(disc.emission)]
         spheres = [sphere for sphere in settings.spheres if any(sphere.emission)]
-        sizeless: list[PointLight | SpotLight] = [*settings.points, *settings.spots]
-        self._surroundings = make_surroundings(settings.environment, settings.sky, self.scene.environment, self.palette)
-        self._sky, self._sun = SkyLight(self._surroundings), SunLight(settings.sky)
-        groups = (
-            FlatLights(quads, discs),
-            SphereLights(spheres),
-            PointLights(settings.points, settings.spots),
-            self._sun,
-            self._sky,
-        )
+        points = [*settings.points, *settings.spots]
+        self._sky = make_surroundings(settings.environment, settings.sky, self.scene.environment, self.palette)
+        self._sun = SunLight(settings.sky)
+        sizeless = PointLights(settings.points, settings.spots)
+        groups = (FlatLights(quads, discs), SphereLights(spheres), sizeless, self._sun, self._sky)
         self.lights = Lights(groups, settings.camera.look_at_m)
-        rows = [light(part.emission, part.illuminant) for part in surfaces if part.light >= 0]
-        rows += [light(point.intensity, point.illuminant) for point in sizeless]
+        # Rooms that hold all of these cast no shadows: see `_never_shades`.
+        self._shining_m = [np.array(point.position_m) for point in points]
+        around = [(sphere.centre_m, sphere.radius_m) for sphere in spheres]
+        around += [(disc.centre_m, disc.radius_m) for disc in discs]
+        self._shining_m += [np.add(centre, side * radius) for centre, radius in around for side in (-1, 1)]
+        for quad in quads:
+            corners = quad.corner_m, quad.edge_u_m, quad.edge_v_m
+            self._shining_m += [np.array(quad.corner_m), np.sum(corners, axis=0)]
+        rows = [self._emission(part.emitter) for part in surfaces if part.emitter is not None]
+        rows += [self.palette.light(point.intensity, point.illuminant) for point in points]
         if settings.sky is not None and self._sun.count:
             rows.append(self._sun.row(settings.sky, self.palette))
         # The sky's number is the last; what it shines depends on the direction.
         self._sky_number = len(rows) if self._sky.count else -1
         self._sun_number = len(rows) - 1 if self._sun.count else -1
         self.light_emission_row = np.array([*rows, 0], np.intp)
-        self.dark = self._surroundings.dark and not self._sun.count
+        self.dark = self._sky.dark and not self._sun.count
 
     def _never_shades(self, shape: Primitive) -> bool:
         """Whether no shadow ray can be blocked: the walls of a room around every light, as walls let light in."""
         if not isinstance(shape, Box) or not shape.room or self._sky.count or self._sun.count:
             return False
-        settings = self.scene.settings
-        points = [np.array(point.position_m) for point in settings.points]
-        points += [np.array(spot.position_m) for spot in settings.spots]
-        round_lights: list[Sphere | Disc] = [*settings.spheres, *settings.discs]
-        for light in round_lights:
-            if any(light.emission):
-                points += [np.add(light.centre_m, side * light.radius_m) for side in (-1, 1)]
-        for quad in settings.quads:
-            if any(quad.emission):
-                points += [np.array(quad.corner_m), np.sum([quad.corner_m, quad.edge_u_m, quad.edge_v_m], axis=0)]
-        return all(bool(np.all((p > shape.low) & (p < shape.high))) for p in points)
+        return all(bool(np.all((p > shape.low) & (p < shape.high))) for p in self._shining_m)
 
     def nearest(self, rays: Rays) -> tuple[FloatArray, IntArray]:
         """Distance [N] in m (inf: none) and surface [N] that rays hit first; -1 for none, of a box its first face."""
@@ -173,15 +270,15 @@ class World:
             local *= self._spheres[3].take(number)
             normal[:, rows] = local
         shading = normal
-        for mesh in self._smooth:
-            rows = np.flatnonzero((surface >= mesh.first) & (surface < mesh.first + len(mesh.planes)))
+        for first, planes, normals in self._smooth:
+            rows = np.flatnonzero((surface >= first) & (surface < first + len(planes)))
             if rows.size:
                 shading = normal.copy() if shading is normal else shading
-                triangle = surface[rows] - mesh.first
+                triangle = surface[rows] - first
                 at = np.vstack([point.take(rows, axis=1), np.ones(len(rows), np.float32)])
-                u, v = np.einsum("tij,jt->it", mesh.planes[triangle, 1:], at)
+                u, v = np.einsum("tij,jt->it", planes[triangle, 1:], at)
                 weights = np.stack([1 - u - v, u, v])
-                blended = np.einsum("it,tij->jt", weights, mesh.normals[triangle])
+                blended = np.einsum("it,tij->jt", weights, normals[triangle])
                 shading[:, rows] = blended / np.sqrt(np.maximum(np.sum(blended**2, axis=0), 1e-12))
         return normal, shading
 
@@ -197,7 +294,7 @@ class World:
         emitted = self.palette.look_up(self.light_emission_row.take(light), bins)
         if self._sky_number >= 0:
             far = np.flatnonzero(light == self._sky_number)
-            emitted[..., far] = self._surroundings.radiance(aimed.direction.take(rows[far], axis=1), bins[far])
+            emitted[..., far] = self._sky.radiance(aimed.direction.take(rows[far], axis=1), bins[far])
         return emitted
 
     def environment(self, direction: FloatArray, bins: Index, density: FloatArray | None = None) -> FloatArray:
@@ -205,7 +302,7 @@ class World:
 
         With `density` [N], with which scattering chose them, each part is weighted against aiming at it.
         """
-        light = self._surroundings.radiance(direction, bins)
+        light = self._sky.radiance(direction, bins)
         if self._sky_number >= 0 and density is not None:
             light /= self._rivals(self._sky_number, self._sky.far_pdf(direction), density)
         if self._sun_number >= 0:
@@ -220,5 +317,4 @@ class World:
     def _rivals(self, light: int, pdf: FloatArray, density: FloatArray) -> FloatArray:
         """1 over the weight [N] of scattering by the power heuristic."""
         ratio = pdf * self.lights.probability[light] / density
-        result: FloatArray = 1 + ratio * ratio
-        return result
+        return 1 + ratio * ratio

@@ -178,18 +178,26 @@ class DirectionSeries:
     """
 
     kappa: float
-    sinc: Array | None
-    minus_cos: Array | None
+    sinc: Array | None = None
+    minus_cos: Array | None = None
 
     @staticmethod
     def of(model: LensModel, angle: float, form: Form) -> DirectionSeries:
+        """That of a model: no series for slopes."""
         if model.direction == "slope":
-            return DirectionSeries(1.0, None, None)
-        if form.exact:  # Taylor; 12 terms hold 1e-14 to 130 degrees
-            k = np.arange(12)
-            factorials = np.array([math.factorial(2 * i) for i in k], np.float64)
-            cos = (-1.0) ** k / factorials
-            return DirectionSeries(1.0, cos / (2 * k + 1), -cos)
+            return DirectionSeries(1.0)
+        return DirectionSeries.exact() if form.exact else DirectionSeries.fitted(angle)
+
+    @staticmethod
+    def exact() -> DirectionSeries:
+        """Taylor's; 12 terms hold 1e-14 to 130 degrees."""
+        k = np.arange(12)
+        cos = (-1.0) ** k / np.array([math.factorial(2 * i) for i in k], np.float64)
+        return DirectionSeries(1.0, cos / (2 * k + 1), -cos)
+
+    @staticmethod
+    def fitted(angle: float) -> DirectionSeries:
+        """The shortest that hold float32's last bit up to an angle (rad)."""
         sinc = fit_series(lambda t: np.sinc(np.sqrt(t) / np.pi), angle**2, _SERIES / max(angle, 0.1))
         minus_cos = fit_series(lambda t: -np.cos(np.sqrt(t)), angle**2, _SERIES)
         n = len(sinc) - 1

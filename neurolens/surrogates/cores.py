@@ -110,7 +110,9 @@ class CoreValues:
 
 
 class Core:
-    """Base of all cores; their numbers are float64 numpy arrays."""
+    """Base of all cores; their numbers are float64 numpy arrays. `basis` is a word for cards."""
+
+    basis: ClassVar[str] = "invariants"
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
         """Append the core to a graph."""
@@ -252,6 +254,7 @@ class MirrorPolynomial(_Polynomial):
     exponents: Exponents
     ab: Array
     scalars: Array
+    basis = "mirror"
     _vectors = "ab"
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
@@ -279,6 +282,7 @@ class RawPolynomial(_Polynomial):
     exponents: Exponents
     components: Array
     scalars: Array
+    basis = "raw"
     _vectors = "components"
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neurolens.axes import Axis
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
@@ -20,7 +19,8 @@ from neurolens.graph.ir import Graph, Value
 from neurolens.graph.onnx import Mixing, write_onnx
 from neurolens.graph.program import RAY
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
-from neurolens.optics.internal import at_infinity
+from neurolens.modelfile.axes import Axis
+from neurolens.optics.focusing import at_infinity
 from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.assemble import ONNX, model_graph
 from neurolens.surrogates.card import card_of, card_to_json, lens_facts, reference_rays

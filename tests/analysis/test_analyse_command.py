@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from shipped import LENSES
 
-from neurolens.analysis import plot_curves, plot_layout, plot_points, plot_style
+from neurolens.analysis import layout, plot_style, plots
 from neurolens.cli import main
 from neurolens.commands.analyse import WHATS
 
-LENSES = Path(__file__).parents[2] / "lenses"
 TESSAR = LENSES / "brendel_tessar_100.toml"
 ANAMORPHIC = LENSES / "schneider_anamorphic_31.toml"
 
@@ -48,7 +48,7 @@ def test_text_and_picture_of_each(
     what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[Any] = []
-    for module in (plot_curves, plot_points, plot_layout):
+    for module in (plots, layout):
         monkeypatch.setattr(module, "new_figure", lambda *s: made.append(plot_style.new_figure(*s)) or made[-1])
     assert main(["analyse", str(TESSAR), what, "-o", str(tmp_path / "pictures")]) == 0
     text = capsys.readouterr().out

@@ -13,16 +13,15 @@ import numpy as np
 import pytest
 import torch
 from analysis_lenses import cartesian, library, thin
+from shipped import LENSES
 
-from neurolens.analysis.mtf import mtf
-from neurolens.analysis.plot_points import plot_psf, plot_spots
-from neurolens.analysis.psf import psf
-from neurolens.analysis.spots import spots, working_f_number
+from neurolens.analysis.plots import plot_psf, plot_spots
+from neurolens.analysis.spots import mtf, spots, working_f_number
+from neurolens.analysis.wavefront import psf
 from neurolens.cli import main
 from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.prescription import Lens
 
-LENSES = Path(__file__).parents[2] / "lenses"
 GAUSS = LENSES / "laikin_double_gauss_50.toml"
 D = 587.5618
 

@@ -9,13 +9,12 @@ import pytest
 import torch
 from analysis_lenses import INF, cartesian, library, scene, thin
 
-from neurolens.analysis.bundles import bundle
+from neurolens.analysis.bundles import Pattern, bundle, fan, grid, hexapolar, points
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.patterns import Pattern, fan, grid, hexapolar, points
 from neurolens.analysis.spots import working_f_number
 from neurolens.analysis.wavefront import wavefront
-from neurolens.apertures import Aperture
 from neurolens.base.errors import InputError
+from neurolens.optics.apertures import Aperture
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
@@ -94,11 +93,7 @@ def test_a_cartesian_lens_is_perfect_on_the_axis() -> None:
 
 
 def test_a_cylinder_focuses_one_meridian_only() -> None:
-    rows = [
-        Surface(INF, 0.0, 10, stop=True),
-        Surface(50.0, 0.0, 30, 1.5, cylinder="y"),
-        Surface(INF, 100.0, 30),
-    ]
+    rows = [Surface(INF, 0.0, 10, stop=True), Surface(50.0, 0.0, 30, 1.5, cylinder="y"), Surface(INF, 100.0, 30)]
     lens = Lens("cylinder", "", tuple(rows), 10.0, half_field_deg=5.0, film_z_mm=100.0)
     along = bundle(Scene(lens, axis="y"), [0.0], [587.5618], points([0.1, 0.0], [0.0, 0.1]))
     assert along.tangential_mm[0, 0].tolist() == pytest.approx([0, 0], abs=1e-4)

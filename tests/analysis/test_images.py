@@ -11,17 +11,12 @@ import pytest
 import torch
 from analysis_lenses import INF, cartesian, library, slower, thin
 
-from neurolens.analysis.bundles import bundle
-from neurolens.analysis.distortion import distortion
-from neurolens.analysis.fans import fans
+from neurolens.analysis.bundles import bundle, grid, hexapolar
+from neurolens.analysis.field_curves import distortion, illumination
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.illumination import illumination
 from neurolens.analysis.layout import layout_profile
-from neurolens.analysis.mtf import diffraction_mtf, mtf
-from neurolens.analysis.patterns import grid, hexapolar
-from neurolens.analysis.psf import diffraction_image, psf
-from neurolens.analysis.spots import spots, working_f_number
-from neurolens.analysis.wavefront import wavefront
+from neurolens.analysis.spots import diffraction_mtf, fans, mtf, spots, working_f_number
+from neurolens.analysis.wavefront import diffraction_image, psf, wavefront
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace

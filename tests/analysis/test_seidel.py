@@ -11,12 +11,9 @@ import pytest
 import torch
 from analysis_lenses import INF, ROOT, cartesian, library, scene, slower, thin
 
-from neurolens.analysis.bundles import bundle
-from neurolens.analysis.colour import colour
-from neurolens.analysis.curvature import curvature
-from neurolens.analysis.distortion import distortion
+from neurolens.analysis.bundles import bundle, points
+from neurolens.analysis.field_curves import colour, curvature, distortion
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.patterns import points
 from neurolens.analysis.seidel import seidel
 from neurolens.analysis.wavefront import wavefront
 from neurolens.base.errors import InputError

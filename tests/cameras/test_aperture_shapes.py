@@ -8,13 +8,13 @@ import lens_models
 import numpy as np
 import pytest
 
-from neurolens.apertures import Aperture
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.thin import ThinLens
+from neurolens.optics.apertures import Aperture
 
 FILM = (36.0, 24.0)
 STAR = Aperture(mask=np.array([[0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 1, 0, 1, 0]]))

@@ -11,7 +11,7 @@ from camera_helpers import GAUSS, ROOT, camera, film_rays
 
 from neurolens.base import status as st
 from neurolens.cli import main
-from neurolens.render.exr import read_exr
+from neurolens.render.pictures import read_exr
 
 SCENE = ROOT / "experiments" / "scenes" / "white.toml"
 

@@ -11,10 +11,10 @@ import lens_models
 import numpy as np
 import pytest
 
-from neurolens.apertures import Aperture
 from neurolens.base import status as st
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.radiometry import film_light

@@ -11,7 +11,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.sampling import concentric_disk
 from neurolens.cameras.thin import ThinLens
-from neurolens.focus import film_z_mm
+from neurolens.optics.film_plane import film_z_mm
 
 
 def square_grid(side: int) -> np.ndarray:

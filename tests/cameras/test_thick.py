@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from camera_helpers import FILM, GAUSS, ROOT, at, camera, differences, film_rays, film_value, jittered
 
-from neurolens.apertures import Aperture
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.thick import ThickLens
 from neurolens.cameras.thin import ThinLens
+from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.radiometry import disc_irradiance

@@ -13,12 +13,21 @@ import numpy as np
 import pytest
 from lens_models import domain, exported, lens, model
 from scipy.stats import poisson
+from vignetting_oracle import vignetting_errors
 
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.check import check_model, share_promise
-from neurolens.evaluate.fresh import STOPS, ZONED, fresh_rays, measure, with_more
-from neurolens.evaluate.measure import measure_errors, measure_on, what_is_poor
-from neurolens.evaluate.vignetting import ZONES, vignetting_errors
+from neurolens.evaluate.measure import (
+    STOPS,
+    ZONED,
+    fresh_rays,
+    measure,
+    measure_errors,
+    measure_on,
+    what_is_poor,
+    with_more,
+)
+from neurolens.evaluate.vignetting import ZONES
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 RAYS = 6000

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from neurolens.evaluate.gain import nearest_depth_m
-from neurolens.render.scenefile import load_scene
+from neurolens.evaluate.scenes import nearest_depth_m
+from neurolens.render.scene import load_scene
 
 CAMERA = """
 [camera]

@@ -27,9 +27,8 @@ def noisy(picture: np.ndarray, sigma: float, seed: int) -> np.ndarray:
 def test_equal_pictures_have_no_error(picture: np.ndarray) -> None:
     assert image.rel_mse(picture, picture) == 0.0
     assert image.flip(picture, picture) == 0.0
-    maps = image.error_maps(picture, picture)
-    assert maps["flip"].shape == maps["rel_squared_error"].shape == (24, 32)
-    assert not maps["flip"].any() and not maps["rel_squared_error"].any()
+    found = image.flip_map(picture, picture)
+    assert found.shape == (24, 32) and not found.any()
 
 
 @pytest.mark.parametrize(("level", "offset", "eps"), [(1.0, 0.1, 0.01), (0.0, 0.1, 0.01), (20.0, -2.0, 1e-4)])
@@ -99,7 +98,7 @@ def test_noise_floor_of_known_noise() -> None:
     """Two renders of level L with noise s: the mean of (a - b)^2 / b^2 is about 2 s^2 / L^2."""
     level, sigma = 1.0, 0.02
     renders = [noisy(np.full((64, 64, 3), level), sigma, seed) for seed in range(5)]
-    floor = image.noise_floor(renders, ImageSettings(eps=1e-9))
+    floor = image.compare(renders, renders, ImageSettings(eps=1e-9))
     assert floor["pairs"] == 5
     assert floor["noise_floor_rel_mse"] == pytest.approx(2 * sigma**2, rel=0.03)
     assert floor["noise_floor_flip"] > 0
@@ -127,7 +126,7 @@ def test_comparing_fewer_renders_uses_the_floor_of_the_same_pairs(picture: np.nd
     exact = [noisy(picture, 0.02 * (1 + seed), seed) for seed in range(4)]
     figures = image.compare(exact[:1], exact)
     assert figures["pairs"] == 1 and figures["flip_ratio"] == 1.0
-    assert figures["noise_floor_flip"] == image.noise_floor(exact)["noise_floor_flip"]
+    assert figures["noise_floor_flip"] == image.compare(exact, exact)["noise_floor_flip"]
 
 
 def test_a_floor_of_zero_gives_no_ratio(picture: np.ndarray) -> None:
@@ -155,7 +154,7 @@ def test_bad_pictures_are_refused(test: np.ndarray, words: str) -> None:
 
 def test_bad_counts_and_settings_are_refused(picture: np.ndarray) -> None:
     with pytest.raises(InputError, match="at least 4"):
-        image.noise_floor([picture] * 3)
+        image.compare([picture], [picture] * 3)
     with pytest.raises(InputError, match="surrogate renders"):
         image.compare([picture] * 5, [picture] * 4)
     for bad in ({"exposure": 0.0}, {"eps": -1.0}, {"pixels_per_degree": math.nan}, {"trim": 1.0}):

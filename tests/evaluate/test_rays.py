@@ -11,8 +11,15 @@ import pytest
 import torch
 
 from neurolens.base.errors import InputError
-from neurolens.evaluate.film_equivalent import focused_vergence, local_jacobian, pupil_middle
-from neurolens.evaluate.rays import angles_deg, frame_width_mm, pupil_disc_share, ray_errors
+from neurolens.evaluate.rays import (
+    angles_deg,
+    focused_vergence,
+    frame_width_mm,
+    local_jacobian,
+    pupil_disc_share,
+    pupil_middle,
+    ray_errors,
+)
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface

@@ -96,14 +96,3 @@ def test_number_takes_only_finite_numbers() -> None:
     assert [records.number(record, key) for key in ("a", "b", "c", "d", "e.min", "e.max", "f", "f.min", "g")] == [
         1.0, None, None, None, 2.5, None, None, None, None,
     ]  # fmt: skip
-
-
-def test_rows_of_an_earlier_run_are_kept_or_refused(tmp_path: Path) -> None:
-    file = tmp_path / "rows.json"
-    assert records.kept_rows(file, "lenses", "lens", "a command") == {}
-    file.write_text('{"lenses": [{"lens": "a", "n": 1}, {"lens": "b"}]}', encoding="utf-8")
-    assert records.kept_rows(file, "lenses", "lens", "a command") == {"a": {"lens": "a", "n": 1}, "b": {"lens": "b"}}
-    for text in ("", "[]", "{}", '{"lenses": 3}', '{"lenses": [{"n": 1}]}', '{"lenses": ["a"]}'):
-        file.write_text(text, encoding="utf-8")
-        with pytest.raises(InputError, match=r"rows\.json: file: .*records of a command"):
-            records.kept_rows(file, "lenses", "lens", "a command")

@@ -10,8 +10,7 @@ from urllib.parse import unquote
 import pytest
 
 from neurolens.base.errors import InputError
-from neurolens.evaluate.markup import DASH, local_url, show
-from neurolens.evaluate.report import write_report
+from neurolens.evaluate.report import DASH, local_url, write_report
 
 HOSTILE = "<script>alert('x')</script>\"&'"
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -113,18 +112,6 @@ def read(path: Path) -> Page:
     return Page(path.read_text(encoding="utf-8"))
 
 
-def test_a_full_report_shows_every_figure(run_dir: Path) -> None:
-    page = read(write_report(run_dir, full_results()))
-    for wanted in (
-        "Tessar 50 mm", "neurolens train experiments/quickstart.toml", "49.64", "400 to 700", "2.13.0", "183 s",
-        "1.84", "6.1", "31", "0.00042", "0.11", "0.13", "18.4", "7.2", "13.1", "3.66", "210", "160", "unavailable",
-        "no C++ compiler", "12.5", "24", "0.081", "1.012", "0.61", "fit.terms",
-    ):  # fmt: skip
-        assert wanted in page.text, wanted
-    for unit in ("µm", "ns/ray", "°", "(s)", "Mray", "kB", "%"):
-        assert unit in page.text, unit
-
-
 def test_every_picture_and_link_exists_and_nothing_needs_the_network(run_dir: Path) -> None:
     path = write_report(run_dir, full_results())
     page = read(path)
@@ -193,25 +180,6 @@ def test_bad_input_is_one_clear_error(tmp_path: Path) -> None:
         write_report(tmp_path, {"modles": []})
 
 
-@pytest.mark.parametrize(
-    ("value", "digits", "shown"),
-    [(None, 3, DASH), (0.0, 3, "0"), (0.00042, 2, "0.00042"), (12.34, 3, "12.3"), (40, 6, "40"), (2.0e-6, 2, "2.0e-06"),
-     (12345.6, 3, "12,346"), (-0.5, 3, "-0.5"), (3e9, 3, "3.00e+09")],
-)  # fmt: skip
-def test_numbers_as_shown(value: float | None, digits: int, shown: str) -> None:
-    assert show(value, digits) == shown
-
-
 def test_a_name_with_a_colon_is_a_file_not_a_scheme(tmp_path: Path) -> None:
     (tmp_path / "javascript:x").write_bytes(b"any")
     assert local_url(tmp_path, "javascript:x") == "./javascript%3Ax"
-
-
-def test_models_that_were_stopped_down_have_a_table(tmp_path: Path) -> None:
-    shares = {"false_pass": 0.0012, "false_block": None}
-    models = [{"name": "a", "stopped_down": {"2_stops": shares, "4_stops": shares}}, {"name": "b"}]
-    page = write_report(tmp_path, {"models": models}).read_text()
-    table = page.partition("stopped down</h3>")[2].partition("</table>")[0]
-    assert "0.12" in table and "4 stops closed: false pass (%)" in table and "false block" not in table
-    assert ">b<" not in table
-    assert "stopped down</h3>" not in write_report(tmp_path, {"models": models[1:]}).read_text()

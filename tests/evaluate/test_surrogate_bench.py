@@ -14,11 +14,10 @@ from lens_models import LENSES
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.cli import main
-from neurolens.evaluate.benches import surrogates as surrogate_bench
-from neurolens.evaluate.benches.surrogate_methods import Row, all_rows, chosen_rows
-from neurolens.evaluate.benches.surrogate_page import lens_page, summary_page, write_lens
-from neurolens.evaluate.benches.surrogates import Bench, BenchSettings, run_bench
+from neurolens.evaluate import methods as surrogate_bench
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
+from neurolens.evaluate.methods import Bench, BenchSettings, Row, all_rows, chosen_rows, run_bench
+from neurolens.evaluate.methods_page import lens_page, summary_page, write_lens
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
 
@@ -96,9 +95,7 @@ def test_one_record_a_method_with_every_figure(made: tuple[Path, list[dict[str, 
 def test_a_method_that_fails_is_a_row_with_the_reason(made: tuple[Path, list[dict[str, Any]]]) -> None:
     refused = by_method(made[1])["refused"]
     assert "less | fewer" in refused["failed"] and refused["fingerprint"]
-    page = lens_page("a", made[1], "")
-    assert "| refused | failed: fit: degree: got 9, expected less / fewer |" in page
-    rows = [line for line in page.splitlines() if line.startswith("|")]
+    rows = [line for line in lens_page("a", made[1], "").splitlines() if line.startswith("|")]
     assert len({line.count("|") for line in rows}) == 1  # one table, no cell that breaks it
 
 
@@ -157,7 +154,6 @@ def test_a_lens_that_cannot_be_is_rows_too(tmp_path: Path) -> None:
     bench = Bench(LensChoice(tmp_path / "missing.toml"), SETTINGS, tmp_path)
     records = run_bench([bench], ROWS, progress=Progress(quiet=True))["missing"]
     assert all("missing.toml" in r["failed"] for r in records)
-    assert "0 of 1" in summary_page({"missing": records}, "")
     write_lens("missing", records, "", tmp_path)
     assert not (tmp_path / "missing.png").exists()
 
@@ -169,9 +165,6 @@ def test_pages_tell_median_and_worst(made: tuple[Path, list[dict[str, Any]]], tm
     row = next(line for line in page.splitlines() if line.startswith(f"| {name} |"))
     better = by_method(records)[name]["direction_rms_deg"]
     assert f"{(better + 3) / 2:.3g}, 3" in row and ", 0.25 |" in row  # the least speed-up
-    lenses = [line for line in page.splitlines() if line.startswith(("| other |", "| cooke |"))]
-    assert [line.split(" ")[1] for line in lenses] == ["other", "cooke"] and " / 3 / " in lenses[0]  # the worst first
-    assert "- refused: a paper" in page
     write_lens("cooke", records, "facts", tmp_path)
     assert (tmp_path / "cooke.png").stat().st_size > 10_000 and "cooke.png" in (tmp_path / "cooke.md").read_text()
 
@@ -191,8 +184,7 @@ def test_rows_by_name_group_and_method() -> None:
     ("args", "words"),
     [
         (["nonsense"], ["LENS", "nonsense"]),
-        (["--methods", "nonsense"], ["--methods", "nonsense"]),
-        (["cooke_triplet_50", "--library"], ["--library"]),
+        (["cooke_triplet_50", "--methods", "nonsense"], ["--methods", "nonsense"]),
         (["cooke_triplet_50", str(LENSES / "cooke_triplet_50.toml")], ["names differ"]),
     ],
 )

@@ -9,9 +9,9 @@ from pathlib import Path
 import lens_models
 import pytest
 
+from experiments.zoom import CASES, page
 from neurolens.base.errors import InputError
 from neurolens.cameras.onnxlens import load_model
-from neurolens.evaluate.benches.states import CASES, page
 from neurolens.evaluate.experiment import default_experiment
 from neurolens.evaluate.train_states import fit_and_measure_states, state_settings
 from neurolens.surrogates.fit import ModelSettings

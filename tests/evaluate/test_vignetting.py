@@ -6,13 +6,15 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
+from vignetting_oracle import vignetting_errors
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.evaluate.vignetting import deciding_rim_ratio, relative_illumination, stopped_down, vignetting_errors
+from neurolens.evaluate.vignetting import deciding_rim_ratio, relative_illumination
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.pupils import PupilBounds
@@ -48,14 +50,15 @@ def opening(
     return predict
 
 
+def stopped_down(lens: Lens, domain: Domain, predict: Any, count: int) -> list[dict[str, Any]]:
+    """At full aperture, and closed by two and by four stops."""
+    radii = [domain.stop_radius_mm / 2 ** (closed / 2) for closed in (0, 2, 4)]
+    return [vignetting_errors(lens, domain, predict, stop_radius_mm=r, count=count) for r in radii]
+
+
 def test_the_true_opening_has_no_false_rays() -> None:
     result = vignetting_errors(*hole(10.0), opening(1.0), count=32768)
-    assert [result[k] for k in ("false_pass", "false_block", "false_pass_near_rim", "false_block_near_rim")] == [
-        0,
-        0,
-        0,
-        0,
-    ]
+    assert not any(result[k] for k in ("false_pass", "false_block", "false_pass_near_rim", "false_block_near_rim"))
     assert result["passing_share"] == pytest.approx(1 / 1.05**2, rel=2e-3)
 
 
@@ -76,8 +79,8 @@ def test_an_opening_too_small_blocks_the_ring() -> None:
 def test_stopping_down_keeps_the_shares_of_a_hole() -> None:
     lens, domain = hole(10.0)
     results = stopped_down(lens, domain, opening(1.01), count=262144)
-    assert [results[k]["stop_radius_mm"] for k in ("full", "2_stops", "4_stops")] == pytest.approx([10, 5, 2.5])
-    for result in results.values():
+    assert [result["stop_radius_mm"] for result in results] == pytest.approx([10, 5, 2.5])
+    for result in results:
         assert result["false_pass"] == pytest.approx((1.01**2 - 1) / 1.01**2, rel=0.05)
 
 
@@ -128,7 +131,7 @@ def test_a_real_lens_against_itself_stopped_down() -> None:
         traced = trace_pairs(lens.with_stop_radius(stop_radius_mm), rays, domain.pupil_z_mm)
         return SimpleNamespace(status=traced.status, transmittance=traced.transmittance)
 
-    for result in stopped_down(lens, domain, exactly, count=32768).values():
+    for result in stopped_down(lens, domain, exactly, count=32768):
         assert result["false_pass"] == result["false_block"] == 0
     light = relative_illumination(lens, domain, exactly, points=2048, rows=5)
     assert light["max_difference"] == 0

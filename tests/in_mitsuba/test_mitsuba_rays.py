@@ -11,9 +11,8 @@ from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.mitsuba import load_scene
-from neurolens.mitsuba.rays import BATCH, FilmRays
 from neurolens.mitsuba.scenes import our_scene
-from neurolens.mitsuba.wavelengths import ChannelWavelengths, wavelength_samples
+from neurolens.mitsuba.sensor import BATCH, ChannelWavelengths, FilmRays, wavelength_samples
 from neurolens.render.film import PixelGrid
 from neurolens.render.spectrum import SpectralRange
 

@@ -22,9 +22,9 @@ from neurolens.cameras.thin import ThinLens
 from neurolens.cli import main
 from neurolens.mitsuba import camera, load_scene, register, render, require_mitsuba
 from neurolens.mitsuba.scenes import our_scene, with_our_spectra
-from neurolens.render.exr import read_exr
+from neurolens.render.pictures import read_exr
 from neurolens.render.renderer import render as our_render
-from neurolens.render.scenefile import scene_from_tables
+from neurolens.render.scene import scene_from_tables
 
 pytest.importorskip("mitsuba", reason='needs the extra "mitsuba"')
 

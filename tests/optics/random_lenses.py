@@ -8,8 +8,8 @@ from typing import Any
 
 from hypothesis import strategies as hs
 
-from neurolens.optics.clearance import surface_sag_mm
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.sag import sag_mm
 
 RIM_MM = 10.0
 
@@ -67,4 +67,4 @@ def gap_mm(a: Surface, b: Surface) -> float:
     rim = min(a.semi_diameter_mm, b.semi_diameter_mm)
     places = [rim * i / 16 for i in range(17)]
     points = [*((h, 0.0) for h in places), *((0.0, h) for h in places), *((0.7 * h, 0.7 * h) for h in places)]
-    return max(0.0, *(surface_sag_mm(a, *at) - surface_sag_mm(b, *at) for at in points)) + 1e-3
+    return max(0.0, *(sag_mm(a, *at) - sag_mm(b, *at) for at in points)) + 1e-3

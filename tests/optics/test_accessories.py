@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from shipped import tabled
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
@@ -19,13 +20,12 @@ from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Configuration, Lens
 from neurolens.optics.trace import Rays, trace
 
-LENSES = Path(__file__).parents[2] / "lenses"
 PLATE_MM, N_D = 3.0, 1.5168
 
 
 @pytest.fixture(scope="module")
 def lens() -> Lens:
-    return read_lens(LENSES / "laikin_double_gauss_50.toml").at()
+    return tabled("laikin_double_gauss_50").at()
 
 
 def axial_focus_mm(lens: Lens, object_z_mm: float = -math.inf, height: float = 1e-3) -> float:
@@ -70,7 +70,7 @@ def test_a_grey_filter_absorbs_by_beer_and_lambert(lens: Lens) -> None:
 
 
 def test_filters_renumber_states(tmp_path: Path) -> None:
-    zoom = read_lens(LENSES / "ogawa_zoom_70_200.toml")
+    zoom = tabled("ogawa_zoom_70_200")
     for filtered in (zoom.with_filter(2.0), zoom.with_filter(2.0, rear=True), zoom.with_hood(10.0, 90.0)):
         for state in ("72mm", "135mm", 100.0):
             efl = first_order(zoom.at(zoom=state)).efl_mm
@@ -79,11 +79,10 @@ def test_filters_renumber_states(tmp_path: Path) -> None:
         assert replace(read_lens(tmp_path / "filtered.toml"), path=filtered.path) == filtered
 
 
-@pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 @pytest.mark.parametrize("rear", [True, False])
 def test_a_lens_with_a_filter_focuses_inside_as_before(rear: bool) -> None:
     for name in ("sony_sonnar_55", "tajima_retrofocus_24"):
-        bare = read_lens(LENSES / f"{name}.toml").at()
+        bare = tabled(name).at()
         filtered = bare.with_filter(0.5, n_d=N_D, gap_mm=0.1 if rear else 3.0, rear=rear)
         near = filtered.at(focus_m=2.0, focus="internal")
         assert near.film_z_mm is not None

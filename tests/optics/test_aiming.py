@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
+from shipped import tabled
 
 from neurolens.optics.aiming import aim_at_stop, without_rims
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-LENSES = Path(__file__).parents[2] / "lenses"
 INF = math.inf
-
-
-def shipped(name: str) -> Lens:
-    return read_lens(LENSES / f"{name}.toml")
 
 
 @pytest.mark.parametrize(
@@ -35,7 +28,7 @@ def shipped(name: str) -> Lens:
     ],
 )
 def test_rays_meet_their_points_of_the_stop_at_their_field(name: str, half_field_deg: float) -> None:
-    lens = shipped(name)
+    lens = tabled(name)
     field = torch.deg2rad(torch.linspace(0, half_field_deg, 6, dtype=torch.float64))
     height = lens.stop_radius_mm * torch.linspace(-0.5, 0.5, 5, dtype=torch.float64).expand(6, 5)
     found = aim_at_stop(lens, field, height)
@@ -50,7 +43,7 @@ def test_rays_meet_their_points_of_the_stop_at_their_field(name: str, half_field
 
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_both_planes_of_an_anamorphic_lens(axis: str) -> None:
-    lens = shipped("cooke_anamorphic_42")
+    lens = tabled("cooke_anamorphic_42")
     field = torch.deg2rad(torch.tensor([0.0, 5.0, 10.0], dtype=torch.float64))
     found = aim_at_stop(lens, field, torch.zeros(3, 1, dtype=torch.float64), axis=axis)  # type: ignore[arg-type]
     out = trace(lens, found.rays, towards="film", record=[lens.stop_index])

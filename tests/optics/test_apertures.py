@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from shipped import LENSES, tabled
 
-from neurolens.apertures import Aperture
 from neurolens.base.errors import InputError
 from neurolens.optics import apertures
+from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.optics.trace import Rays, trace
-from neurolens.render.masks import make_aperture, read_mask
+from neurolens.render.pictures import make_aperture, read_mask
 
-LENSES = Path(__file__).parents[2] / "lenses"
 STAR = np.array([[0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 1, 0, 1, 0]])
 SHAPES = [
     *(Aperture(n) for n in (3, 4, 5, 6, 9, 50)),
@@ -92,7 +92,7 @@ def test_torch_and_numpy_agree_and_nan_is_outside(shape: Aperture, dtype: torch.
     points = (torch.rand(2, 20_000, generator=torch.Generator().manual_seed(1), dtype=dtype) * 2 - 1) * 3.1
     points[0, 0], points[1, 1] = math.nan, math.nan
     x, y = points
-    opened = apertures.inside(shape, x, y, 3.0) & (x * x + y * y <= 9.0)
+    opened = apertures.inside_on_tensors(shape, x, y, 3.0) & (x * x + y * y <= 9.0)
     assert opened.numpy().tolist() == shape.inside(x.numpy(), y.numpy(), 3.0).tolist()
     assert not opened[:2].any()
 
@@ -101,7 +101,7 @@ def test_torch_and_numpy_agree_and_nan_is_outside(shape: Aperture, dtype: torch.
 @pytest.mark.parametrize("towards", ["scene", "film"])
 def test_the_tracer_passes_the_share_of_the_round_stop(shape: Aperture, towards: str) -> None:
     """Near the axis the stop's image is sharp, so that even points of the pupil are even points of the stop."""
-    lens = read_lens(LENSES / "laikin_double_gauss_50.toml").at(f_number=11)
+    lens = tabled("laikin_double_gauss_50").at(f_number=11)
     x, y = (torch.tensor(v) for v in square_of_points(400))
     plane, film_z, reach = pupil_plane_z_mm(lens), lens.film_z_mm, 0.55 * first_order(lens).exit_pupil_diameter_mm
     assert film_z is not None
@@ -122,7 +122,7 @@ def test_the_tracer_passes_the_share_of_the_round_stop(shape: Aperture, towards:
 
 
 def test_round_stops_and_scale_know_nothing_of_blades() -> None:
-    lens = read_lens(LENSES / "brendel_tessar_100.toml")
+    lens = tabled("brendel_tessar_100")
     bladed = lens.with_aperture(Aperture(5))
     assert bladed.sha256 == lens.sha256
     assert bladed.at(focal_length_mm=50).aperture == Aperture(5)
@@ -173,7 +173,7 @@ def test_shapes_that_are_none(fields: dict, expected: str) -> None:
 
 
 def test_blades_in_a_lens_file(tmp_path: Path) -> None:
-    lens = read_lens(LENSES / "brendel_tessar_100.toml").with_aperture(Aperture(7, 10.0, 0.25))
+    lens = tabled("brendel_tessar_100").with_aperture(Aperture(7, 10.0, 0.25))
     write_lens(lens, tmp_path / "bladed.toml")
     assert read_lens(tmp_path / "bladed.toml").aperture == Aperture(7, 10.0, 0.25)
     with pytest.raises(InputError, match="mask"):
@@ -219,7 +219,7 @@ def test_bad_masks(tmp_path: Path) -> None:
     image.fromarray(np.ones((1, 4097), np.uint8)).save(tmp_path / "large.png")
     (tmp_path / "text.png").write_text("no picture")
     (tmp_path / "cut.png").write_bytes((tmp_path / "dark.png").read_bytes()[:40])
-    for file, expected in (("dark", "dark"), ("large", "4096"), ("text", "read"), ("cut", "read"), ("none", "missing")):
+    for file, expected in (("dark", "dark"), ("large", "4096"), ("text", "read"), ("cut", "read"), ("none", "exists")):
         with pytest.raises(InputError, match=expected):
             read_mask(tmp_path / f"{file}.png")
     with pytest.raises(InputError, match="not both"):

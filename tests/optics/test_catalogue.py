@@ -12,7 +12,7 @@ import torch
 from neurolens.base.errors import InputError
 from neurolens.cli import main
 from neurolens.optics import catalogue
-from neurolens.optics.dispersion import LINE_C_NM, LINE_D_NM, LINE_F_NM
+from neurolens.optics.catalogue import LINE_C_NM, LINE_D_NM, LINE_F_NM
 
 ORACLE = Path(__file__).parents[3] / "shared" / "data" / "oracle" / "glass_indices.json"
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neurolens.base.errors import InputError
 from neurolens.optics import coatings
-from neurolens.optics.thinfilm import Layers, amplitudes, powers, reflectance, transmittance
+from neurolens.optics.coatings import Layers, amplitudes, powers, reflectance, transmittance
 
 LAM_NM = 550.0
 FROM_AIR, FROM_GLASS = (1.0, 1.52), (1.52, 1.0)

@@ -6,19 +6,15 @@ import math
 
 import pytest
 import torch
-from lens_models import LENSES
+from shipped import tabled
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.optics.differentials import film_tangents, trace_differentials
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.surfaces import Rays
-from neurolens.optics.trace import trace
-
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
+from neurolens.optics.trace import film_derivatives, trace, trace_differentials
 
 
 def asphere() -> Lens:
@@ -28,7 +24,7 @@ def asphere() -> Lens:
 
 def lenses() -> dict[str, Lens]:
     names = ("laikin_double_gauss_50", "muller_fisheye_100")
-    return {name: read_lens(LENSES / f"{name}.toml") for name in names} | {"asphere": asphere()}
+    return {name: tabled(name) for name in names} | {"asphere": asphere()}
 
 
 def film_rays(lens: Lens, fx: Tensor, fy: Tensor, px: Tensor, py: Tensor) -> tuple[Rays, Tensor]:
@@ -47,7 +43,7 @@ def test_equal_to_central_differences(name: str) -> None:
     fx, fy, px, py = (torch.rand(400, generator=g, dtype=torch.float64) * 2 - 1 for _ in range(4))
     fx, fy, px, py = 0.3 * f * fx, 0.3 * f * fy, 0.5 * rear * px, 0.5 * rear * py
     rays, distance = film_rays(lens, fx, fy, px, py)
-    out = trace_differentials(lens, rays, film_tangents(rays, distance))
+    out = trace_differentials(lens, rays, film_derivatives(rays, distance))
     passed = out.traced.status == 0
     assert passed.sum() > 100
     h = 1e-4
@@ -60,10 +56,10 @@ def test_equal_to_central_differences(name: str) -> None:
 
 
 def test_near_the_axis_of_a_focused_lens_the_direction_turns_by_one_over_the_focal_length() -> None:
-    lens = read_lens(LENSES / "laikin_double_gauss_50.toml").at()
+    lens = tabled("laikin_double_gauss_50").at()
     zero = torch.zeros(1, dtype=torch.float64)
     rays, distance = film_rays(lens, zero, zero, zero, zero)
-    dx, dy = trace_differentials(lens, rays, film_tangents(rays, distance)).derivatives
+    dx, dy = trace_differentials(lens, rays, film_derivatives(rays, distance)).derivatives
     f = first_order(lens).efl_mm
     assert float(dx.dx) == pytest.approx(-1 / f, rel=1e-12) and float(dy.dy) == pytest.approx(-1 / f, rel=1e-12)
     assert abs(float(dx.dy)) < 1e-15 and abs(float(dx.dz)) < 1e-15
@@ -74,7 +70,7 @@ def test_directions_stay_unit_vectors_and_lost_rays_have_no_derivative() -> None
     g = torch.Generator().manual_seed(4)
     fx, fy, px, py = ((torch.rand(2000, generator=g, dtype=torch.float64) * 2 - 1) * 30 for _ in range(4))
     rays, distance = film_rays(lens, fx, fy, px, py)
-    out = trace_differentials(lens, rays, film_tangents(rays, distance))
+    out = trace_differentials(lens, rays, film_derivatives(rays, distance))
     d = out.traced.rays
     lost = (d.x == 0) & (d.y == 0) & (out.traced.status != 0)  # replaced by a ray along the axis
     assert lost.any()
@@ -86,23 +82,23 @@ def test_directions_stay_unit_vectors_and_lost_rays_have_no_derivative() -> None
 
 
 def test_float32_gives_the_same_to_rounding() -> None:
-    lens = read_lens(LENSES / "laikin_double_gauss_50.toml").at()
+    lens = tabled("laikin_double_gauss_50").at()
     points = [torch.linspace(-9, 9, 50, dtype=torch.float64) * k for k in (1.0, 0.5, 0.3, -0.4)]
     found = []
     for dtype in (torch.float64, torch.float32):
         rays, distance = film_rays(lens, *(p.to(dtype) for p in points))
-        found.append(trace_differentials(lens, rays, film_tangents(rays, distance)))
+        found.append(trace_differentials(lens, rays, film_derivatives(rays, distance)))
     ok = (found[0].traced.status == 0) & (found[1].traced.status == 0)
     for k in range(2):
         for a, b in zip(found[0].derivatives[k], found[1].derivatives[k], strict=True):
             assert (a - b.double())[ok].abs().max() < 2e-5 * (1 + a[ok].abs().max())
 
 
-def test_no_tangents_and_wrong_ones() -> None:
+def test_no_derivatives_and_wrong_ones() -> None:
     lens = asphere()
     rays, _ = film_rays(lens, *(torch.zeros(3, dtype=torch.float64) for _ in range(4)))
     assert trace_differentials(lens, rays, ()).derivatives == ()
-    with pytest.raises(InputError, match=r"tangents\[0\].x"):
+    with pytest.raises(InputError, match=r"derivatives\[0\].x"):
         trace_differentials(lens, rays, (Rays(*(c[:2] for c in rays)),))
     with pytest.raises(InputError, match="float32"):
         trace_differentials(lens, rays, (Rays(*(c.float() for c in rays)),))

@@ -6,24 +6,16 @@ for one, for a decision of the host, raises.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
+from shipped import focused
 
-from neurolens.evaluate.benches.bundles import from_film, generator
-from neurolens.optics.lensfile import read_lens
+from experiments.extreme_cases import from_film, generator
 from neurolens.optics.prescription import Lens
 from neurolens.optics.trace import CHUNK, Rays, Traced, trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-FOLDER = Path(__file__).parents[2] / "lenses"
 NAMES = ["laikin_double_gauss_50", "canon_aspheric_50", "schneider_anamorphic_31", "shimizu_fisheye_220"]
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here: nothing was run on one")
-
-
-def shipped(name: str) -> Lens:
-    return read_lens(FOLDER / f"{name}.toml").at()
 
 
 def bundle(lens: Lens, count: int, dtype: torch.dtype) -> tuple[Rays, torch.Tensor]:
@@ -44,7 +36,7 @@ def tensors(out: Traced) -> list[torch.Tensor]:
 @pytest.mark.parametrize("options", [{}, {"transmittance": True}, {"transmittance": "polarised"}, {"record": [0, 3]}])
 def test_the_host_decides_nothing(name: str, options: dict[str, object]) -> None:
     """Rays without values go through the whole lens, in one chunk and in several."""
-    lens = shipped(name)
+    lens = focused(name)
     for count in (100, CHUNK + 100):
         start = on("meta", *bundle(lens, count, torch.float32))
         out = trace(lens, *start, **options)  # type: ignore[arg-type]
@@ -56,7 +48,7 @@ def test_the_host_decides_nothing(name: str, options: dict[str, object]) -> None
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", NAMES)
 def test_the_same_results_on_cuda(name: str, dtype: torch.dtype) -> None:
-    lens = shipped(name)
+    lens = focused(name)
     start = bundle(lens, 20000, dtype)
     here = trace(lens, *start, transmittance=True)
     there = trace(lens, *on("cuda", *start), transmittance=True)
@@ -73,7 +65,7 @@ def test_the_same_results_on_cuda(name: str, dtype: torch.dtype) -> None:
 @needs_cuda
 @pytest.mark.parametrize("name", NAMES)
 def test_no_synchronisation_on_cuda(name: str) -> None:
-    lens = shipped(name)
+    lens = focused(name)
     start = on("cuda", *bundle(lens, 3 * CHUNK + 5, torch.float32))
     trace(lens, *start, transmittance=True)  # what is set up once
     torch.cuda.synchronize()

@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
+from shipped import tabled
 
-from neurolens.optics.lenscheck import check_lens, doubts, verdict
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.lightcheck import axial_beam, axial_blur_mm, corner_illumination, film_edge_mm
+from neurolens.optics.lenscheck import (
+    axial_beam,
+    axial_blur_mm,
+    check_lens,
+    corner_illumination,
+    doubts,
+    film_edge_mm,
+    verdict,
+)
 from neurolens.optics.prescription import Lens, Surface
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-LENSES = Path(__file__).parents[2] / "lenses"
 INF = math.inf
 
 
-def shipped(name: str) -> Lens:
-    return read_lens(LENSES / f"{name}.toml")
-
-
 def changed(name: str, surface: int, **figures: object) -> Lens:
-    lens = shipped(name)
+    lens = tabled(name)
     rows = list(lens.surfaces)
     rows[surface] = replace(rows[surface], **figures)  # type: ignore[arg-type]
     return replace(lens, surfaces=tuple(rows))
@@ -50,7 +50,7 @@ def test_mistakes_that_circulated_are_found() -> None:
     # A dropped asphere: here the power goes with it.
     assert "the focal length is" in said(changed("canon_aspheric_50", 4, asphere=()))
     # Semi-diameters in the column of diameters.
-    lens = shipped("laikin_double_gauss_50")
+    lens = tabled("laikin_double_gauss_50")
     half = replace(
         lens, surfaces=tuple(s if s.stop else replace(s, diameter_mm=s.diameter_mm / 2) for s in lens.surfaces)
     )
@@ -59,10 +59,10 @@ def test_mistakes_that_circulated_are_found() -> None:
 
 def test_each_doubt_has_its_reason() -> None:
     assert "puts the film at z = " in said(changed("laikin_double_gauss_50", 12, thickness_mm=39.0))
-    assert "the stop gives f/1.2, the source says f/1.8" in said(shipped("laikin_double_gauss_50").at(f_number=1.2))
+    assert "the stop gives f/1.2, the source says f/1.8" in said(tabled("laikin_double_gauss_50").at(f_number=1.2))
     assert "negative thickness" in said(changed("cooke_triplet_50", 0, thickness_mm=0.5, diameter_mm=24.0))
-    assert "no light comes from 45 degrees" in said(replace(shipped("cooke_triplet_50"), half_field_deg=45.0))
-    dark = replace(shipped("brendel_tessar_100"), image_radius_mm=75.0)
+    assert "no light comes from 45 degrees" in said(replace(tabled("cooke_triplet_50"), half_field_deg=45.0))
+    dark = replace(tabled("brendel_tessar_100"), image_radius_mm=75.0)
     assert "the corner of the film gets" in said(dark)
     singlet = (Surface(INF, 1.0, 30.0, stop=True), Surface(30.0, 8.0, 34.0, 1.5), Surface(-30.0, 30.0, 34.0))
     window = (*singlet[:-1], replace(singlet[-1], thickness_mm=1.0), Surface(INF, 1.0, 34.0, 1.5), Surface(INF, 20, 34))
@@ -72,7 +72,7 @@ def test_each_doubt_has_its_reason() -> None:
 
 
 def test_states_are_checked_too() -> None:
-    lens = shipped("nikon_zoom_70_200")
+    lens = tabled("nikon_zoom_70_200")
     bad = replace(lens.configurations[1], efl_mm=120.0)
     near = replace(lens.configurations[3], object_distance_mm=500.0)
     found = said(replace(lens, configurations=(lens.configurations[0], bad, near)))

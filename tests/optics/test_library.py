@@ -6,22 +6,19 @@ Where ../shared is there, the figures are also compared with those computed else
 from __future__ import annotations
 
 import json
-import math
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
+from shipped import NAMES, tabled
 
 from neurolens.optics.lenscheck import Check, check_lens, doubts, in_state, verdict
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.optics.trace import trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-LENSES = sorted((Path(__file__).parents[2] / "lenses").glob("*.toml"))
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "lenses"
 # What is wrong with a table that ships, in words of the reason; every other lens is in order.
 DOUBTFUL = {
@@ -73,16 +70,15 @@ SAME_TABLE = {
 }
 
 
-@lru_cache
-def checked(path: Path) -> tuple[Lens, tuple[Check, ...]]:
-    lens = read_lens(path)
-    return lens, tuple(check_lens(lens))
+@cache
+def checked(name: str) -> tuple[Lens, tuple[Check, ...]]:
+    return tabled(name), tuple(check_lens(tabled(name)))
 
 
-@pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
-def test_a_lens_does_what_its_source_says(path: Path) -> None:
-    lens, checks = checked(path)
-    found, expected = doubts(list(checks)), DOUBTFUL.get(path.stem, [])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_lens_does_what_its_source_says(name: str) -> None:
+    lens, checks = checked(name)
+    found, expected = doubts(list(checks)), DOUBTFUL.get(name, [])
     assert verdict(list(checks)) == ("doubtful" if expected else "ok")
     assert len(found) == len(expected), found
     assert all(any(words in doubt for doubt in found) for words in expected), found
@@ -94,10 +90,10 @@ def test_a_lens_does_what_its_source_says(path: Path) -> None:
         assert first_order(lens).f_number == pytest.approx(lens.f_number, rel=1e-4)
 
 
-@pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
-def test_a_lens_lights_its_film_without_nan(path: Path) -> None:
+@pytest.mark.parametrize("name", NAMES)
+def test_a_lens_lights_its_film_without_nan(name: str) -> None:
     """In every state, rays from the film's middle and from half way out pass, and no number is lost."""
-    lens, checks = checked(path)
+    lens, checks = checked(name)
     corner = [c.computed for c in checks if c.quantity == "illumination of the corner"]
     assert all(0.05 < share <= 1.2 for share in corner if share is not None)
     for state in (lens, *(in_state(lens, c) for c in lens.configurations)):
@@ -119,14 +115,14 @@ def test_a_lens_lights_its_film_without_nan(path: Path) -> None:
         assert passed[100:].float().mean() > 0.1
 
 
-@pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
-def test_figures_computed_elsewhere_from_the_same_table(path: Path) -> None:
+@pytest.mark.parametrize("name", NAMES)
+def test_figures_computed_elsewhere_from_the_same_table(name: str) -> None:
     """EFL and back focus to rounding, but where our file takes its glass from a catalogue; blur to its sampling."""
     if not SHARED.is_dir():
         pytest.skip("../shared is not there")
-    other = json.loads((SHARED / f"{SAME_TABLE[path.stem]}.json").read_text())
+    other = json.loads((SHARED / f"{SAME_TABLE[name]}.json").read_text())
     computed = other["computed_at_nd"]
-    lens, checks = checked(path)
+    lens, checks = checked(name)
     rel = 3e-4 if any(s.glass for s in lens.surfaces) else 1e-6
     for meridian in ("y", "x") if "efl_x_mm" in computed else ("y",):
         data = first_order(lens, meridian=meridian)  # type: ignore[arg-type]
@@ -138,32 +134,40 @@ def test_figures_computed_elsewhere_from_the_same_table(path: Path) -> None:
     if lens.rims == "source" and "f_number_from_stop" in computed:
         assert first_order(lens).f_number == pytest.approx(computed["f_number_from_stop"], rel=max(rel, 1e-5))
     blur = next((c.computed for c in checks if c.quantity.startswith("axial blur")), None)
-    if blur is not None and "axial_rms_spot_over_efl" in computed and path.stem != "schaefter_primoplan_100":
+    if blur is not None and "axial_rms_spot_over_efl" in computed and name != "schaefter_primoplan_100":
         # Theirs is along one line of the pupil, ours over its area: the rim counts for less.
         assert 0.4 < blur / computed["axial_rms_spot_over_efl"] < 1.6
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared is not there")
 def test_no_prescription_of_the_collection_is_missing() -> None:
-    assert {path.stem for path in LENSES} == set(SAME_TABLE)
+    assert set(NAMES) == set(SAME_TABLE)
     assert {path.stem for path in SHARED.glob("*.json")} == set(SAME_TABLE.values())
 
 
-@pytest.mark.parametrize(
-    ("name", "state", "magnification"),
-    [
-        ("nikon_zoom_70_200", "71mm near", -0.0868),
-        ("nikon_zoom_70_200", "135mm near", -0.1583),
-        ("nikon_zoom_70_200", "196mm near", -0.2332),
-        ("nikon_zoom_14_24", "18mm 1:40", -0.025),
-        ("nikon_zoom_14_24", "23mm near", -0.135),
-        ("sony_sonnar_55", "1.7m", -0.03333),
-    ],
-)
-def test_focus_states_have_the_magnification_of_the_source(name: str, state: str, magnification: float) -> None:
-    lens = next(checked(p)[0] for p in LENSES if p.stem == name)
-    c = next(c for c in lens.configurations if c.name == state)
-    data = first_order(in_state(lens, c))
-    assert c.object_distance_mm is not None and math.isfinite(c.object_distance_mm)
-    found = -data.efl_mm / (c.object_distance_mm + data.front_principal_z_mm - data.efl_mm)
-    assert found == pytest.approx(magnification, rel=0.02)
+# Stated focal length in mm; number of refracting surfaces.
+STATED = {
+    "laikin_double_gauss_50": (50.0, 12),
+    "brendel_tessar_100": (100.0, 7),
+    "tronnier_double_gauss_100": (100.0, 10),
+    "muller_fisheye_100": (100.0, 11),
+    "ogawa_zoom_70_200": (72.1, 33),
+    "thorlabs_lb1471_biconvex_50": (50.0, 2),
+    "shimizu_fisheye_220": (6.3, 23),
+}
+
+
+@pytest.mark.parametrize("name", STATED)
+def test_focal_length_and_f_number_are_those_of_the_source(name: str) -> None:
+    efl_mm, refractions = STATED[name]
+    data = first_order(tabled(name))
+    assert data.efl_mm == pytest.approx(efl_mm, rel=0.01)
+    assert data.f_number == pytest.approx(tabled(name).f_number, rel=0.03)
+    assert sum(not s.stop for s in tabled(name).surfaces) == refractions
+
+
+# The tables of the zoom and of this fisheye stand 2 mm out of focus, as their notes say.
+@pytest.mark.parametrize("name", sorted(STATED.keys() - {"ogawa_zoom_70_200", "shimizu_fisheye_220"}))
+def test_tabled_film_lies_at_the_focus(name: str) -> None:
+    table = tabled(name)
+    assert table.vertices_mm[-1] == pytest.approx(first_order(table).rear_focal_z_mm, abs=0.01 * table.vertices_mm[-1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,14 +13,31 @@ import tmm
 import torch
 from torch import Tensor
 
-from neurolens.optics.polarisation import Step, polarised_fields, polarised_transmittance
-from neurolens.optics.thinfilm import Layers, powers, transmittance
+from neurolens.optics.coatings import Layers, powers, transmittance
+from neurolens.optics.transmission import Step, pass_surface, power, unpolarised
 
 ROOT = Path(__file__).parents[2]
 SHARED = ROOT.parent / "shared" / "data" / "oracle"
 OWN = json.loads((ROOT / "tests" / "data" / "fresnel_paths.json").read_text())["lenses"]
 LAM_NM = 587.5618
 FILMS: Layers = ((1.38, 100.0), (2.1, 120.0), (1.7, 80.0))
+
+
+def fields_along(steps: list[Step]) -> tuple[Tensor, Tensor]:
+    """Two orthogonal inputs of unit power before and after all steps, as real and imaginary parts, [2, 2, 3, N]."""
+    entering = leaving = unpolarised(steps[0].before)
+    for step in steps:
+        leaving = pass_surface(leaving, step, LAM_NM)
+    return entering, leaving
+
+
+def polarised_transmittance(steps: list[Step]) -> Tensor:
+    return power(fields_along(steps)[1])
+
+
+def polarised_fields(steps: list[Step]) -> SimpleNamespace:
+    entering, leaving = fields_along(steps)
+    return SimpleNamespace(entering=entering[0], leaving=torch.complex(leaving[0], leaving[1]))
 
 
 def normals(row: dict[str, Any], x: Tensor, y: Tensor) -> Tensor:
@@ -53,8 +71,8 @@ def column(lens: dict[str, Any], name: str) -> Tensor:
 def check(lens: dict[str, Any]) -> None:
     steps = path_of(lens)
     exact, product = column(lens, "exact"), column(lens, "product")
-    torch.testing.assert_close(polarised_transmittance(steps, LAM_NM), exact, rtol=0, atol=1e-13)
-    single = polarised_transmittance(path_of(lens, torch.float32), LAM_NM)
+    torch.testing.assert_close(polarised_transmittance(steps), exact, rtol=0, atol=1e-13)
+    single = polarised_transmittance(path_of(lens, torch.float32))
     assert single.dtype == torch.float32
     torch.testing.assert_close(single.double(), exact, rtol=0, atol=5e-6)
     averages = torch.ones_like(exact)
@@ -132,14 +150,14 @@ def test_parallel_and_crossed_tilted_plates(films: Layers):
     p = powers(TILTED_X[2], 1.0, 1.6, films, LAM_NM)
     parallel = [*plate(AXIS, TILTED_X, 1.6, films), *plate(AXIS, TILTED_X, 1.6, films)]
     crossed = [*plate(AXIS, TILTED_X, 1.6, films), *plate(AXIS, TILTED_Y, 1.6, films)]
-    exact = polarised_transmittance(parallel, LAM_NM), polarised_transmittance(crossed, LAM_NM)
+    exact = polarised_transmittance(parallel), polarised_transmittance(crossed)
     torch.testing.assert_close(exact[0], (p.T_s**4 + p.T_p**4) / 2, rtol=0, atol=1e-14)
     torch.testing.assert_close(exact[1], (p.T_s * p.T_p) ** 2, rtol=0, atol=1e-14)
 
 
 def test_plate_at_brewsters_angle_passes_p_whole():
     n, tilt = 1.5, math.atan(1.5)
-    fields = polarised_fields(plate(AXIS, unit((math.sin(tilt), 0, math.cos(tilt))), n), LAM_NM)
+    fields = polarised_fields(plate(AXIS, unit((math.sin(tilt), 0, math.cos(tilt))), n))
     along_x = fields.entering[:, 0]  # components of both inputs along the plane of incidence
     leaving = (along_x.unsqueeze(1) * fields.leaving).sum(0)
     torch.testing.assert_close(leaving.abs().squeeze(), torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
@@ -155,7 +173,7 @@ def test_normal_incidence_needs_no_plane_of_incidence():
     d = torch.nn.functional.normalize(normal + offset, dim=0).requires_grad_()
     n = normal.clone().requires_grad_()
     steps = through(d, (n, 1.0, 1.6, FILMS), (n, 1.6, 1.2, ()))
-    t = polarised_transmittance(steps, LAM_NM)
+    t = polarised_transmittance(steps)
     one = torch.ones(300, dtype=torch.float64)
     expected = transmittance(one, 1.0, 1.6, FILMS, LAM_NM) * transmittance(one, 1.6, 1.2, (), LAM_NM)
     torch.testing.assert_close(t, expected, rtol=0, atol=1e-11)
@@ -179,7 +197,7 @@ def skew_path(count: int = 40, films: Layers = FILMS) -> list[Step]:
 def test_skew_coated_path_equals_jones_calculus_with_tmm():
     """Two-by-two matrices of tmm's amplitudes, and a rotation by the angle between planes of incidence, ray by ray."""
     steps = skew_path(count=6)
-    ours = polarised_transmittance(steps, LAM_NM)
+    ours = polarised_transmittance(steps)
     for ray in range(6):
         jones = torch.eye(2, dtype=torch.complex128)
         s_last = None
@@ -206,9 +224,9 @@ def test_turning_the_whole_path_changes_nothing():
     steps, turn = skew_path(), torch.linalg.qr(torch.randn((3, 3), generator=g, dtype=torch.float64))[0]
     turned = [s._replace(**{f: tuple(turn @ torch.stack(getattr(s, f))) for f in s._fields[:3]}) for s in steps]
     flipped = [s._replace(normal=tuple(-c for c in s.normal)) for s in steps]
-    expected = polarised_transmittance(steps, LAM_NM)
+    expected = polarised_transmittance(steps)
     for other in (turned, flipped):
-        torch.testing.assert_close(polarised_transmittance(other, LAM_NM), expected, rtol=0, atol=1e-13)
+        torch.testing.assert_close(polarised_transmittance(other), expected, rtol=0, atol=1e-13)
 
 
 def test_a_camera_ray_carries_as_much_as_the_light_it_stands_for():
@@ -218,19 +236,19 @@ def test_a_camera_ray_carries_as_much_as_the_light_it_stands_for():
         Step(s.normal, tuple(-c for c in s.after), tuple(-c for c in s.before), s.n_after, s.n_before, s.layers, -1)
         for s in reversed(steps)
     ]
-    expected = polarised_transmittance(steps, LAM_NM)
-    torch.testing.assert_close(polarised_transmittance(back, LAM_NM), expected, rtol=0, atol=1e-13)
+    expected = polarised_transmittance(steps)
+    torch.testing.assert_close(polarised_transmittance(back), expected, rtol=0, atol=1e-13)
 
 
 def test_fields_stay_across_the_direction_and_carry_the_power():
     steps = skew_path()
-    fields = polarised_fields(steps, LAM_NM)
+    fields = polarised_fields(steps)
     first, last = torch.stack(list(steps[0].before)), torch.stack(list(steps[-1].after))
     assert (fields.entering * first).sum(1).abs().max() < 1e-14
     torch.testing.assert_close(torch.linalg.cross(fields.entering[0], fields.entering[1], dim=0), first)
     assert (fields.leaving * last).sum(1).abs().max() < 1e-14
     power = 0.5 * (fields.leaving.abs() ** 2).sum((0, 1))
-    torch.testing.assert_close(power, polarised_transmittance(steps, LAM_NM), rtol=0, atol=1e-14)
+    torch.testing.assert_close(power, polarised_transmittance(steps), rtol=0, atol=1e-14)
 
 
 def test_single_ray_gradients_equal_finite_differences():
@@ -242,7 +260,7 @@ def test_single_ray_gradients_equal_finite_differences():
     def power(parts: Tensor) -> Tensor:
         d, *n = torch.nn.functional.normalize(parts, dim=1)
         return polarised_transmittance(
-            through(d, (n[0], 1.0, 1.7, FILMS), (n[1], 1.7, 1.5, ()), (n[2], 1.5, 1.0, FILMS)), LAM_NM
+            through(d, (n[0], 1.0, 1.7, FILMS), (n[1], 1.7, 1.5, ()), (n[2], 1.5, 1.0, FILMS))
         )
 
     assert torch.autograd.gradcheck(power, (parts,))
@@ -261,8 +279,8 @@ def test_fresnels_rhomb_turns_linear_into_circular_light():
         Step(tuple(normal), tuple(AXIS), tuple(bounced), n, 1.0, reflected=True),
         Step(tuple(-normal), tuple(bounced), tuple(AXIS), n, 1.0, reflected=True),
     ]
-    torch.testing.assert_close(polarised_transmittance(steps, LAM_NM), torch.ones(1, dtype=torch.float64))
-    fields = polarised_fields(steps, LAM_NM)
+    torch.testing.assert_close(polarised_transmittance(steps), torch.ones(1, dtype=torch.float64))
+    fields = polarised_fields(steps)
     diagonal = torch.tensor([math.sqrt(0.5), math.sqrt(0.5), 0], dtype=torch.float64)
     share = (fields.entering[:, :, 0] * diagonal).sum(1)
     x, y, z = (share[:, None] * fields.leaving[:, :, 0]).sum(0)
@@ -274,7 +292,7 @@ def test_a_mirror_at_normal_incidence_turns_the_field_round():
     """r_p = -r_s in the usual signs, yet a mirror must not prefer any direction."""
     back = -AXIS
     steps = [Step(tuple(AXIS), tuple(AXIS), tuple(back), 1.0, 1.5, reflected=True)]
-    fields = polarised_fields(steps, LAM_NM)
+    fields = polarised_fields(steps)
     torch.testing.assert_close(fields.leaving.real, -0.2 * fields.entering)
 
 
@@ -284,4 +302,4 @@ def test_total_reflection_transmits_nothing():
         Step(tuple(AXIS), tuple(d), tuple(AXIS), 1.5, 1.0, FILMS),
         Step(tuple(AXIS), tuple(AXIS), tuple(AXIS), 1, 1.5),
     ]
-    assert polarised_transmittance(steps, LAM_NM).item() == 0
+    assert polarised_transmittance(steps).item() == 0

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
+from shipped import tabled
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupil_methods import (
     RadialPupil,
@@ -25,8 +24,6 @@ from neurolens.optics.pupil_methods import (
 )
 from neurolens.optics.radiometry import film_light
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-LENSES = Path(__file__).parents[2] / "lenses"
 FILM_RADIUS = 18.0
 METHODS: dict[str, Callable[[Lens, float], RadialPupil]] = {
     "hull": hull_disc,
@@ -39,7 +36,7 @@ METHODS: dict[str, Callable[[Lens, float], RadialPupil]] = {
 
 @cache
 def lens(name: str, efl_mm: float, f_number: float) -> Lens:
-    return read_lens(LENSES / f"{name}.toml").at(focal_length_mm=efl_mm, f_number=f_number)
+    return tabled(name).at(focal_length_mm=efl_mm, f_number=f_number)
 
 
 def rate_and_light(some: Lens, pupil: RadialPupil, count: int = 20_000) -> tuple[float, float]:
@@ -117,4 +114,4 @@ def test_shapes_are_filled_evenly_and_turn_with_the_film_point(shape: str) -> No
 @pytest.mark.parametrize("make", [hull_disc, wu_exit_pupil, METHODS["pixel disc"], METHODS["boxes"]])
 def test_a_lens_without_a_film(make: Callable[[Lens, float], RadialPupil]) -> None:
     with pytest.raises(InputError, match="film_z_mm"):
-        make(read_lens(LENSES / "tronnier_double_gauss_100.toml"), 10.0)
+        make(tabled("tronnier_double_gauss_100"), 10.0)

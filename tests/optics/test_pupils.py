@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from shipped import NAMES, focused
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.pupils import camera_rays, image_radius_mm, pupil_bounds, pupil_plane_z_mm
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
-
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-LENSES = sorted((Path(__file__).parents[2] / "lenses").glob("*.toml"))
 
 
 def outside(lens: Lens, film_radius: float, rows: int, points: int) -> tuple[int, int, int]:
@@ -50,9 +46,9 @@ def outside(lens: Lens, film_radius: float, rows: int, points: int) -> tuple[int
     return int(passed.sum()), int((~in_row).sum()), int((torch.hypot(x, y) > bounds.disc_mm).sum())
 
 
-@pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
-def test_bounds_hold_what_passes(path: Path) -> None:
-    lens = read_lens(path).at()
+@pytest.mark.parametrize("name", NAMES)
+def test_bounds_hold_what_passes(name: str) -> None:
+    lens = focused(name)
     passed, beyond_row, beyond_disc = outside(lens, image_radius_mm(lens)[0], rows=17, points=64)
     assert passed > 1000
     assert beyond_row <= 1e-4 * passed + 1
@@ -71,9 +67,9 @@ def test_bounds_hold_at_a_deep_rear_surface(radius: float) -> None:
     assert beyond_disc <= 1e-4 * passed
 
 
-@pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
-def test_the_pupil_plane_is_apart_from_the_film(path: Path) -> None:
-    lens = read_lens(path).at()
+@pytest.mark.parametrize("name", NAMES)
+def test_the_pupil_plane_is_apart_from_the_film(name: str) -> None:
+    lens = focused(name)
     assert lens.film_z_mm is not None
     rear = lens.vertices_mm[len(lens.surfaces) - 1]
     assert lens.film_z_mm - pupil_plane_z_mm(lens) >= 0.25 * (lens.film_z_mm - rear)
@@ -81,7 +77,7 @@ def test_the_pupil_plane_is_apart_from_the_film(path: Path) -> None:
 
 def test_no_ray_passes() -> None:
     """The stop is shut."""
-    shut = read_lens(next(p for p in LENSES if "thorlabs" in p.stem)).at().with_stop_radius(0.0)
+    shut = focused("thorlabs_acl5040u_asphere_40").with_stop_radius(0.0)
     with pytest.raises(InputError, match="no ray passes"):
         pupil_bounds(shut, 10.0, (60.0, 60.0), (500.0, 500.0), rows=3, points=16)
 
@@ -99,7 +95,7 @@ def test_camera_rays_run_towards_the_lens() -> None:
 
 
 def test_image_radius_rules() -> None:
-    tessar = read_lens(next(p for p in LENSES if "tessar" in p.stem)).at()
+    tessar = focused("brendel_tessar_100")
     f = first_order(tessar).efl_mm
     stated = replace(tessar, image_radius_mm=33.0)
     assert image_radius_mm(stated) == (33.0, "the lens file")
@@ -107,12 +103,12 @@ def test_image_radius_rules() -> None:
     assert image_radius_mm(by_field)[0] == pytest.approx(f * math.tan(math.radians(20)))
     dark, why = image_radius_mm(replace(tessar, image_radius_mm=None, half_field_deg=None))
     assert "illumination" in why and dark > f * math.tan(math.radians(20))
-    fisheye = read_lens(next(p for p in LENSES if "muller" in p.stem)).at()
+    fisheye = focused("muller_fisheye_100")
     radius, why = image_radius_mm(fisheye)
     # Its rims end the light at about 74 degrees, before the stated 78. A scaled lens has a scaled image.
     assert "illumination" in why
     assert radius / first_order(fisheye).efl_mm == pytest.approx(1.3, abs=0.1)
     assert image_radius_mm(fisheye.scaled(0.14))[0] == pytest.approx(0.14 * radius, rel=1e-9)
-    wider = read_lens(next(p for p in LENSES if "shimizu" in p.stem)).at()
+    wider = focused("shimizu_fisheye_220")
     radius, why = image_radius_mm(wider)
     assert "half field" in why and radius / first_order(wider).efl_mm == pytest.approx(1.86, abs=0.03)

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from shipped import tabled
 
-from neurolens.apertures import Aperture
 from neurolens.base.errors import InputError
 from neurolens.optics.accessories import pinhole, with_hood
-from neurolens.optics.lensfile import read_lens
+from neurolens.optics.apertures import Aperture
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.radiometry import FilmLight, disc_irradiance, film_light, white_card
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-LENSES = Path(__file__).parents[2] / "lenses"
-
 
 def lens(name: str, **state: float) -> Lens:
-    return read_lens(LENSES / f"{name}.toml").at(**state)
+    return tabled(name).at(**state)
 
 
 def product(light: FilmLight) -> np.ndarray:
@@ -69,11 +65,7 @@ def test_on_the_axis_it_is_pi_sin2_of_the_last_ray() -> None:
 
 
 def test_a_thin_singlet_with_a_small_stop_and_far_rims_falls_as_cos4() -> None:
-    rows = (
-        Surface(math.inf, 0.01, 1.0, stop=True),
-        Surface(50.0, 0.2, 60.0, 1.5),
-        Surface(-50.0, 50.0, 60.0),
-    )
+    rows = (Surface(math.inf, 0.01, 1.0, stop=True), Surface(50.0, 0.2, 60.0, 1.5), Surface(-50.0, 50.0, 60.0))
     singlet = Lens("thin", "", rows, 50.0).at()
     assert singlet.film_z_mm is not None
     height = np.array([0.0, 5.0, 12.0, 20.0])

@@ -10,10 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as hs
 from random_lenses import lenses
 
+from experiments.extreme_cases import Case, disc, unit
+from experiments.extremes import measure
 from neurolens.base import status as st
-from neurolens.evaluate.benches.bundles import disc, unit
-from neurolens.evaluate.benches.extreme_cases import Case
-from neurolens.evaluate.benches.extremes import measure
 from neurolens.optics.prescription import Lens
 from neurolens.optics.trace import Rays, trace
 

@@ -4,27 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from shipped import tabled
 
 from neurolens.base.errors import InputError
 from neurolens.optics.aiming import aim_at_stop
-from neurolens.optics.clearance import check_clearance
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.rims import RimRule, derive_rims, half_field_deg
+from neurolens.optics.sag import check_clearance
 from neurolens.optics.trace import trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-LENSES = Path(__file__).parents[2] / "lenses"
 INF = math.inf
-
-
-def shipped(name: str) -> Lens:
-    return read_lens(LENSES / f"{name}.toml")
 
 
 def passing(lens: Lens, field_deg: float, heights: list[float]) -> list[bool]:
@@ -38,7 +31,7 @@ def passing(lens: Lens, field_deg: float, heights: list[float]) -> list[bool]:
 @pytest.mark.parametrize("vignetting", [0.3, 0.7])
 def test_rims_clip_as_the_rule_says(name: str, vignetting: float) -> None:
     """The whole axial beam passes; of the edge of the field the share asked for does, and hardly more."""
-    lens = shipped(name)
+    lens = tabled(name)
     field = lens.half_field_deg or half_field_deg(lens)
     derived, rims = derive_rims(lens, RimRule(vignetting))
     assert derived.rims == "derived" and not any(r.trimmed for r in rims)
@@ -54,14 +47,14 @@ def test_rims_clip_as_the_rule_says(name: str, vignetting: float) -> None:
 
 def test_rims_of_a_double_gauss_come_out_near_the_printed_ones() -> None:
     """Laikin prints the diameters of this one: the rule is off by a tenth at the ends, where it matters."""
-    lens, rims = shipped("laikin_double_gauss_50"), derive_rims(shipped("laikin_double_gauss_50"))[1]
+    lens, rims = tabled("laikin_double_gauss_50"), derive_rims(tabled("laikin_double_gauss_50"))[1]
     ends = [r.derived_mm / r.tabled_mm for r in rims if r.surface in (0, 1, 2, 11, 12)]
     assert all(0.9 < ratio < 1.0 for ratio in ends)
     assert all(0.75 < r.derived_mm / r.tabled_mm < 1.01 for r in rims if r.surface != lens.stop_index)
 
 
 def test_a_zoom_gets_rims_for_all_its_states_and_stops_for_each() -> None:
-    lens = shipped("nikon_zoom_70_200")
+    lens = tabled("nikon_zoom_70_200")
     derived, _ = derive_rims(lens)
     for c in derived.configurations:
         moved = dict(c.thickness_mm)
@@ -76,7 +69,7 @@ def test_a_zoom_gets_rims_for_all_its_states_and_stops_for_each() -> None:
 
 
 def test_deriving_twice_changes_nothing() -> None:
-    once, _ = derive_rims(shipped("tajima_retrofocus_24"))
+    once, _ = derive_rims(tabled("tajima_retrofocus_24"))
     twice, _ = derive_rims(once)
     assert [s.diameter_mm for s in twice.surfaces] == pytest.approx([s.diameter_mm for s in once.surfaces], abs=2e-3)
 
@@ -103,7 +96,7 @@ def test_neighbours_that_would_touch_are_trimmed() -> None:
 
 
 def test_field_of_a_lens_that_states_only_its_image_circle() -> None:
-    lens = shipped("tajima_retrofocus_24")
+    lens = tabled("tajima_retrofocus_24")
     assert half_field_deg(lens) == pytest.approx(math.degrees(math.atan(21.633 / 24.0)), abs=1e-3)
 
 
@@ -120,4 +113,4 @@ def test_field_of_a_lens_that_states_only_its_image_circle() -> None:
 )
 def test_what_cannot_be_derived_is_an_error_that_says_why(name: str, rule: RimRule, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        derive_rims(shipped(name), rule)
+        derive_rims(tabled(name), rule)

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.optics import shapes
-from neurolens.optics.clearance import surface_sag_mm
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Coating, Lens, Surface
+from neurolens.optics.sag import sag_mm
 from neurolens.optics.trace import Rays, Traced, trace
 
 PRECISIONS = [torch.float64, torch.float32]
@@ -95,13 +95,12 @@ def aimed(s: Surface, count: int, dtype: torch.dtype, steepest_deg: float = 75.0
     u = torch.rand(4, count, generator=g, dtype=torch.float64)
     r, a = 0.97 * s.semi_diameter_mm * u[0].sqrt(), 2 * math.pi * u[1]
     x, y = r * a.cos(), r * a.sin()
-    z = torch.tensor([surface_sag_mm(s, float(p), float(q)) for p, q in zip(x, y, strict=True)], dtype=torch.float64)
+    z = torch.tensor([sag_mm(s, float(p), float(q)) for p, q in zip(x, y, strict=True)], dtype=torch.float64)
     step = 1e-5
     slopes = []
     for dx, dy in ((step, 0.0), (0.0, step)):
         ahead, behind = (
-            [surface_sag_mm(s, float(p) + k * dx, float(q) + k * dy) for p, q in zip(x, y, strict=True)]
-            for k in (1, -1)
+            [sag_mm(s, float(p) + k * dx, float(q) + k * dy) for p, q in zip(x, y, strict=True)] for k in (1, -1)
         )
         slopes.append(
             (torch.tensor(ahead, dtype=torch.float64) - torch.tensor(behind, dtype=torch.float64)) / (2 * step)
@@ -137,7 +136,7 @@ def test_points_known_beforehand_are_found(name: str, dtype: torch.dtype) -> Non
 def test_the_point_lies_on_the_asphere_to_rounding(name: str) -> None:
     rays, _ = aimed(SHAPES[name], 2000, torch.float64)
     x, y, z = first_point(lens_of(SHAPES[name]), rays).path[0][:3]
-    sag = [surface_sag_mm(SHAPES[name], float(a), float(b)) for a, b in zip(x, y, strict=True)]
+    sag = [sag_mm(SHAPES[name], float(a), float(b)) for a, b in zip(x, y, strict=True)]
     assert (z - torch.tensor(sag, dtype=torch.float64)).abs().max() < 1e-13
 
 

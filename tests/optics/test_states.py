@@ -4,33 +4,32 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
+from shipped import NAMES, tabled
 
 from neurolens.base.errors import InputError
-from neurolens.optics.bestfocus import axial_rays, best_focus_z_mm
-from neurolens.optics.breathing import breathing, field_change
-from neurolens.optics.clearance import check_clearance
-from neurolens.optics.internal import focus_states, infinity_states, nearest_focus_m
-from neurolens.optics.interpolate import monotone
+from neurolens.optics.focusing import (
+    axial_rays,
+    best_focus_z_mm,
+    breathing,
+    field_change,
+    focus_states,
+    infinity_states,
+    monotone,
+    nearest_focus_m,
+)
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Coating, Lens, Surface
+from neurolens.optics.sag import check_clearance
 from neurolens.optics.trace import Rays, trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-LENSES = Path(__file__).parents[2] / "lenses"
 ZOOMS = ("ogawa_zoom_70_200", "nikon_zoom_70_200", "nikon_zoom_14_24", "nikon_zoom_80_200", "itoh_zoom_100_146")
 INTERNAL = ("nikon_zoom_70_200", "nikon_zoom_14_24", "sony_sonnar_55", "tajima_retrofocus_24")
-
-
-@cache
-def tabled(name: str) -> Lens:
-    return read_lens(LENSES / f"{name}.toml")
 
 
 def gaps(lens: Lens) -> list[float]:
@@ -164,6 +163,17 @@ def test_interpolation_stays_between_neighbours_and_keeps_its_rows() -> None:
     assert monotone([0.0, 2.0], [[1.0], [5.0]], 0.5) == pytest.approx([2.0])
 
 
+@pytest.mark.parametrize(
+    ("configuration", "efl_mm", "half_field_deg"),
+    [("72mm", 72.1, 17.0), ("135mm", 135.0, 9.15), ("194mm", 194.01, 6.0)],
+)
+def test_zoom_states(configuration: str, efl_mm: float, half_field_deg: float) -> None:
+    zoomed = tabled("ogawa_zoom_70_200").at(zoom=configuration)
+    assert first_order(zoomed).efl_mm == pytest.approx(efl_mm, rel=0.001)
+    assert first_order(zoomed).f_number == pytest.approx(2.8, rel=0.001)
+    assert zoomed.half_field_deg == half_field_deg
+
+
 # --- Size
 
 
@@ -209,6 +219,14 @@ def test_the_edge_of_the_image_circle_sees_the_field_asked_for() -> None:
 def test_states_that_a_double_gauss_has_not(state: dict, expected: str) -> None:
     with pytest.raises(InputError, match=expected):
         tabled("laikin_double_gauss_50").at(**state)
+
+
+@pytest.mark.parametrize(("name", "efl_mm"), [("brendel_tessar_100", 50), ("muller_fisheye_100", 14)])
+def test_rescaling_keeps_angles_and_f_number(name: str, efl_mm: float) -> None:
+    small = tabled(name).at(focal_length_mm=efl_mm)
+    assert first_order(small).efl_mm == pytest.approx(efl_mm, rel=1e-12)
+    assert first_order(small).f_number == pytest.approx(first_order(tabled(name)).f_number, rel=1e-12)
+    assert small.half_field_deg == tabled(name).half_field_deg
 
 
 # --- Stop
@@ -410,8 +428,7 @@ def test_breathing_of_groups_that_move_inside_is_traced_magnification() -> None:
 
 
 def test_every_shipped_lens_with_states_reaches_all_of_them() -> None:
-    for path in sorted(LENSES.glob("*.toml")):
-        lens = read_lens(path)
+    for lens in map(tabled, NAMES):
         for state in lens.configurations:
             assert lens.at(zoom=state.name).film_z_mm is not None
         for state in focus_states(lens):

@@ -6,25 +6,23 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as hs
+from shipped import tabled
 from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays, trace
 
-ROOT = Path(__file__).parents[2] / "lenses"
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", NeurolensWarning)  # glasses of unknown dispersion
-    DOUBLE_GAUSS = read_lens(ROOT / "laikin_double_gauss_50.toml").at()
-    FISHEYE = read_lens(ROOT / "muller_fisheye_100.toml").at()
+    DOUBLE_GAUSS = tabled("laikin_double_gauss_50").at()
+    FISHEYE = tabled("muller_fisheye_100").at()
 PLATE = Lens(
     "plate", "", (Surface(math.inf, 5, 20, 1.5), Surface(math.inf, 5, 20), Surface(math.inf, 1, 10, stop=True)), 2.0
 )
@@ -71,11 +69,7 @@ def test_wild_numbers_end_a_ray_and_never_leave_as_one(
 
 
 @given(
-    hs.lists(
-        hs.lists(hs.floats(width=32) | hs.floats(-50, 50), min_size=6, max_size=6),
-        min_size=1,
-        max_size=8,
-    ),
+    hs.lists(hs.lists(hs.floats(width=32) | hs.floats(-50, 50), min_size=6, max_size=6), min_size=1, max_size=8),
     hs.sampled_from(sorted(TABLES)),
     hs.sampled_from(["film", "scene"]),
     hs.booleans(),

@@ -16,7 +16,6 @@ from neurolens.optics.prescription import Lens
 from neurolens.readers.any_format import read_any
 from neurolens.readers.source import MAX_BYTES
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 GAUSS = plain(read_lens(Path(__file__).parents[2] / "lenses" / "laikin_double_gauss_50.toml"))
 CONSTANT = replace(GAUSS, surfaces=tuple(replace(s, V_d=None) for s in GAUSS.surfaces))
 TEXTS = {suffix: write(CONSTANT if suffix in (".len", ".dat", ".txt") else GAUSS) for suffix, write in WRITERS.items()}

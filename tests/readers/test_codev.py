@@ -15,8 +15,6 @@ from neurolens.optics.prescription import Lens
 from neurolens.readers.codev import read_seq
 from neurolens.readers.draft import Given
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-
 TEXT = """\
 RDM;LEN       "VERSION: 11.2 SR1       LENS VERSION: 84       Creation Date: 28-May-2019"
 TITLE 'A singlet; for a test!' ! that is a comment

@@ -9,13 +9,12 @@ from pathlib import Path
 import pytest
 from command_line import failure
 from lens_formats import WRITERS, CannotSay, plain
+from shipped import PATHS
 
 from neurolens.cli import main
 from neurolens.optics.lensfile import read_lens
 from neurolens.readers.any_format import read_any
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-LENSES = sorted((Path(__file__).parents[2] / "lenses").glob("*.toml"))
 TABLE = "# Singlet\n0 4.0 0 10\n50 5.0 1.5 20\n-50.0 0 1 20\n"
 
 
@@ -93,11 +92,11 @@ def test_wrong_command_lines(
 
 def test_options_for_tables_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "lens.zmx"
-    path.write_text(WRITERS[".zmx"](plain(read_lens(LENSES[0]))))
+    path.write_text(WRITERS[".zmx"](plain(read_lens(PATHS[0]))))
     assert "--gap-before" in failure(capsys, "convert", path, "-o", tmp_path / "lens.toml", "--gap-before")
 
 
-@pytest.mark.parametrize("path", LENSES[::4], ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", PATHS[::4], ids=lambda p: p.stem)
 def test_round_trip(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Other program -> lens file -> the same lens, bit for bit."""
     lens = plain(read_lens(path))
@@ -114,11 +113,11 @@ def test_round_trip(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 def test_a_lens_file_of_our_own_is_read_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "lens.toml"
-    assert main(["convert", str(LENSES[2]), "-o", str(out)]) == 0
-    assert replace(read_lens(out), path=str(LENSES[2])) == read_lens(LENSES[2])
+    assert main(["convert", str(PATHS[2]), "-o", str(out)]) == 0
+    assert replace(read_lens(out), path=str(PATHS[2])) == read_lens(PATHS[2])
     capsys.readouterr()
-    assert "--name and --source only" in failure(capsys, "convert", LENSES[2], "-o", out, "--force", "--units", "in")
-    assert main(["convert", str(LENSES[2]), "-o", str(out), "--force", "--name", "mine"]) == 0
+    assert "--name and --source only" in failure(capsys, "convert", PATHS[2], "-o", out, "--force", "--units", "in")
+    assert main(["convert", str(PATHS[2]), "-o", str(out), "--force", "--name", "mine"]) == 0
     assert read_lens(out).name == "mine"
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from lens_formats import WRITERS, CannotSay, plain
+from shipped import PATHS
 
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
@@ -15,8 +16,6 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.trace import Rays, trace
 from neurolens.readers.any_format import read_any
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-LENSES = sorted((Path(__file__).parents[2] / "lenses").glob("*.toml"))
 NO_DISPERSION = (".len", ".dat", ".txt")
 
 
@@ -51,7 +50,7 @@ def assert_same_optics(found: Lens, expected: Lens) -> None:
 
 
 @pytest.mark.parametrize("suffix", WRITERS)
-@pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", PATHS, ids=lambda p: p.stem)
 def test_library_lens_comes_back(path: Path, suffix: str, tmp_path: Path) -> None:
     lens = plain(read_lens(path))
     if suffix in NO_DISPERSION:
@@ -89,7 +88,7 @@ def assert_same_states(found: Lens, expected: Lens) -> None:
 
 def test_every_format_is_met_by_some_lens() -> None:
     said = dict.fromkeys(WRITERS, 0)
-    for path in LENSES:
+    for path in PATHS:
         lens = plain(read_lens(path))
         for suffix, write in WRITERS.items():
             rows = tuple(replace(s, V_d=None) for s in lens.surfaces) if suffix in NO_DISPERSION else lens.surfaces

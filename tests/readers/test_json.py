@@ -15,7 +15,6 @@ from neurolens.optics.prescription import Lens
 from neurolens.readers.draft import Given
 from neurolens.readers.json_lens import read_json_lens
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 SHARED = sorted((Path(__file__).parents[3] / "shared" / "data" / "lenses").glob("*.json"))
 
 

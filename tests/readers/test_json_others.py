@@ -28,7 +28,6 @@ ISET: dict[str, Any] = {
         {"radius": 0, "thickness": 0, "ior": 1, "semi_aperture": 9.0},
     ],
 }
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 
 
 def written(folder: Path, data: Any) -> Path:

@@ -15,8 +15,6 @@ from neurolens.readers.draft import Given
 from neurolens.readers.oslo import read_len
 from neurolens.readers.tables import read_table
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-
 # A biconvex singlet of R = 50 mm, 5 mm thick, n = 1.5, behind a stop: EFL by the lensmaker's formula.
 TABLE = """\
 # Singlet behind a stop

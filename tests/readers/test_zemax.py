@@ -16,8 +16,6 @@ from neurolens.optics.prescription import Lens
 from neurolens.readers.draft import Given
 from neurolens.readers.zemax import read_zmx
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
-
 HEAD = """\
 VERS 140730 73 26155
 MODE SEQ
@@ -170,11 +168,7 @@ def test_surface_types(block: str, shape: tuple[float, float, dict[int, float], 
         ("TYPE STANDARD\n  CURV -2", "TYPE XPOLYNOM\n  CURV -2", r"line 32, TYPE: got 'XPOLYNOM'"),
         ("TYPE STANDARD\n  CURV -2", "TYPE TOROIDAL\n  PARM 1 33\n  CURV -2", r"torus is not read"),
         ("TYPE STANDARD\n  CURV -2", "TYPE TOROIDAL\n  PARM 2 1E-5\n  CURV -2", r"PARM 2 of TOROIDAL"),
-        (
-            "TYPE STANDARD\n  CURV -2",
-            "TYPE BICONICX\n  PARM 1 33\n  CURV -2",
-            r"BICONICX.*radii infinite",
-        ),
+        ("TYPE STANDARD\n  CURV -2", "TYPE BICONICX\n  PARM 1 33\n  CURV -2", r"BICONICX.*radii infinite"),
         ("TYPE STANDARD\n  CURV -2", "TYPE ODDASPHE\n  PARM 1 1E-3\n  CURV -2", r"PARM 1 of ODDASPHE"),
         ("TYPE STANDARD\n  CURV -2", "TYPE STANDARD\n  PARM 1 1E-3\n  CURV -2", r"PARM 1 of STANDARD"),
         ("  DIAM 9 1", "  OBSC 0 3 0\n  DIAM 9 1", r"line 35, OBSC: got \(unknown keyword\)"),

@@ -10,8 +10,19 @@ import OpenEXR
 import pytest
 
 from neurolens.cli import main
-from neurolens.render.colour import ACESCG, BRADFORD, COLOUR_SPACES, SRGB, adaptation, balance, conversion, xyz_of
-from neurolens.render.exr import read_exr, write_exr
+from neurolens.render.colour import (
+    ACESCG,
+    BRADFORD,
+    COLOUR_SPACES,
+    SRGB,
+    adaptation,
+    balance,
+    conversion,
+    linear_to_srgb,
+    srgb_to_linear,
+    xyz_of,
+)
+from neurolens.render.pictures import read_exr, write_exr
 
 
 def test_matrices_of_the_standards() -> None:
@@ -77,6 +88,12 @@ def test_the_exr_says_its_colour_space(name: str, half: bool, tmp_path: Path) ->
     assert stored[0, 0] == pytest.approx(np.ones(3), abs=1e-3 if half else 1e-6)
     back = stored @ conversion(space, SRGB).T
     assert back == pytest.approx(picture, abs=2e-3 if half else 1e-6)
+
+
+def test_srgb_encoding_round_trip() -> None:
+    linear = np.linspace(0, 1, 101)
+    assert np.allclose(srgb_to_linear(linear_to_srgb(linear)), linear, atol=1e-6)
+    assert linear_to_srgb(np.array([-1.0, np.nan, 9.0])) == pytest.approx([0, 0, 1], abs=1e-6)
 
 
 SCENE = """

@@ -11,7 +11,7 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.render.film import PixelGrid
 from neurolens.render.integrator import trace
 from neurolens.render.sampler import FILM, Sampler
-from neurolens.render.scenefile import load_scene
+from neurolens.render.scene import load_scene
 from neurolens.render.spectrum import SpectralRange
 from neurolens.render.world import World
 

@@ -9,20 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from render_helpers import WHITE, diffuse, scene
+from render_helpers import FILM, WHITE, assert_same_mean, diffuse, scene
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.render.film import PixelGrid
-from neurolens.render.filmsettings import FilmSettings
+from neurolens.render.film import FilmSettings, PixelGrid
 from neurolens.render.renderer import render
-from neurolens.render.scenefile import Scene
+from neurolens.render.scene import Scene
 from neurolens.render.spectrum import SpectralRange
 from neurolens.render.wavelengths import dispersion_px, mode_for
 
-FILM = (36.0, 24.0)
 SMALL: dict[str, Any] = {"width": 12, "height": 8, "threads": 1}
 MATERIALS: dict[str, Any] = {
     "red": diffuse(0.8, 0.1, 0.05),
@@ -59,14 +57,6 @@ def renders(made: Scene, camera: Any, mode: str, seeds: int, **options: Any) -> 
     film = FilmSettings(wavelengths=mode)  # type: ignore[arg-type]
     options = SMALL | {"samples": 16, "max_depth": 5} | options
     return np.stack([render(made, camera, seed=seed, film=film, **options).rgb for seed in range(seeds)])
-
-
-def assert_same_mean(a: np.ndarray, b: np.ndarray, resolved: float) -> None:
-    """Means over pixels agree within 4 standard errors over seeds, which are at most `resolved` of them."""
-    means = a.mean(axis=(1, 2)), b.mean(axis=(1, 2))  # [seed, 3]
-    error = np.sqrt(sum(m.var(axis=0, ddof=1) / len(m) for m in means))
-    assert np.all(error < resolved * means[0].mean(axis=0))
-    assert np.all(np.abs(means[0].mean(axis=0) - means[1].mean(axis=0)) < 4 * error)
 
 
 def colour_noise(pictures: np.ndarray) -> float:
@@ -162,7 +152,7 @@ def test_one_wavelength_of_light_makes_the_same_grey_with_four_lanes() -> None:
 
 @pytest.mark.parametrize("mode", ["hero", "lanes"])
 def test_workers_do_not_change_the_picture(mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 256)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 256)
     film = FilmSettings(wavelengths=mode)  # type: ignore[arg-type]
     made = room(tmp_path, "flint")
     one, two = (

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from render_helpers import diffuse, world
 
-from neurolens.render.embree import EmbreeMesh, make_mesh
-from neurolens.render.mesh import Mesh
+from neurolens.render.mesh import EmbreeMesh, Mesh, make_mesh
 from neurolens.render.primitives import Rays
 
 RANDOM = np.random.default_rng(11)

@@ -8,20 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from render_helpers import WHITE, diffuse, scene
+from render_helpers import FILM, SIZE, WHITE, diffuse, lit_scene, scene
 
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
-from neurolens.render.develop import develop
-from neurolens.render.film import PixelGrid
-from neurolens.render.filmsettings import FilmSettings
-from neurolens.render.job import Job
-from neurolens.render.renderer import render
-from neurolens.render.sums import BYTES_A_PIXEL, COLUMNS
-from neurolens.render.watch import Watch
+from neurolens.render.film import BYTES_A_PIXEL, COLUMNS, FilmSettings, PixelGrid
+from neurolens.render.job import Job, develop
+from neurolens.render.renderer import Watch, render
 
-FILM = (36.0, 24.0)
 # One wavelength: the film is grey, and light of radiance 1 gives 1 whatever the sample.
 GREY: dict[str, Any] = {"wavelengths_nm": [550, 550], "position_m": [0, 0, 0], "look_at_m": [0, 0, -1]}
 
@@ -41,7 +36,7 @@ def test_variance_is_that_of_a_coin(mode: Any, paths: int) -> None:
     """n tosses of 0 or 2, half of each (Sobol' points see to it): the variance of their mean is 1 / (n - 1)."""
     made, samples = scene(GREY, environment=WHITE), 64
     camera = Coin(4000.0, FILM, 1.0)
-    found = render(made, camera, width=36, height=24, samples=samples, film=FilmSettings(wavelengths=mode))
+    found = render(made, camera, **SIZE, samples=samples, film=FilmSettings(wavelengths=mode))
     scale = float(found.rgb.mean())  # the coin's exposure
     assert found.rgb == pytest.approx(np.full((24, 36, 3), scale), rel=1e-3)
     tosses = samples // paths
@@ -51,18 +46,16 @@ def test_variance_is_that_of_a_coin(mode: Any, paths: int) -> None:
 
 def test_one_sample_has_no_variance_and_every_sample_is_counted() -> None:
     made = scene(GREY, environment=WHITE)
-    one = render(made, Pinhole(400.0, FILM), width=36, height=24, samples=1).layers
+    one = render(made, Pinhole(400.0, FILM), **SIZE, samples=1).layers
     assert np.all(np.isinf(one.variance)) and np.all(one.samples == 1)
-    odd = render(made, Pinhole(400.0, FILM), width=36, height=24, samples=37).layers
+    odd = render(made, Pinhole(400.0, FILM), **SIZE, samples=37).layers
     assert np.all(odd.samples == 37) and np.all(odd.variance < 1e-6)
 
 
 def test_variance_follows_the_noise_of_renders_with_other_seeds() -> None:
     """A rough scene at few samples: Sobol' points do better than independent ones, by less than an order."""
-    ball = {"centre_m": [0, 0, -2], "radius_m": 0.7, "material": "m"}
-    lamp = {"centre_m": [1, 1, -1], "radius_m": 0.3, "emission": [9, 8, 7]}
-    made = scene(GREY, environment=WHITE, materials={"m": diffuse(0.7, 0.6, 0.5)}, spheres=[ball, lamp])
-    found = [render(made, ThinLens(50.0, 2.0, 3.0, FILM), width=36, height=24, samples=8, seed=s) for s in range(12)]
+    made = lit_scene(camera=GREY)
+    found = [render(made, ThinLens(50.0, 2.0, 3.0, FILM), **SIZE, samples=8, seed=s) for s in range(12)]
     scatter = np.var([f.rgb[..., 1] for f in found], axis=0, ddof=1).mean()
     stated = np.mean([f.layers.variance for f in found])
     assert 0.7 < stated / scatter < 10
@@ -74,7 +67,7 @@ def test_depth_is_measured_along_the_axis_from_the_film(camera: Any) -> None:
     wall = {"point_m": [5.0, 1.0, 0.0], "normal": [1, 0, 0], "material": "m"}
     pose = {"position_m": [2.0, 1.0, 0.0], "look_at_m": [9.0, 1.0, 0.0]}
     made = scene(pose, materials={"m": diffuse(0.5, 0.5, 0.5)}, planes=[wall])
-    depth = render(made, camera, width=36, height=24, samples=4).layers.depth
+    depth = render(made, camera, **SIZE, samples=4).layers.depth
     assert depth == pytest.approx(np.full((24, 36), 3.0), rel=1e-5)
 
 
@@ -82,7 +75,7 @@ def test_depth_is_infinite_where_nothing_is_and_the_mean_of_what_is() -> None:
     """A floor below a pinhole: at height y on the film the floor is at height / tan, and above the horizon nothing."""
     floor = {"point_m": [0, -1, 0], "normal": [0, 1, 0], "material": "m"}
     made = scene(GREY, materials={"m": diffuse(0.5, 0.5, 0.5)}, planes=[floor])
-    found = render(made, Pinhole(20.0, FILM), width=36, height=24, samples=256).layers
+    found = render(made, Pinhole(20.0, FILM), **SIZE, samples=256).layers
     assert np.all(np.isinf(found.depth[:12])) and np.all(np.isfinite(found.depth[12:]))
     assert not found.blocked.any()
     # The image distance is the focal length; the pinhole lies that far in front of the film.
@@ -93,7 +86,7 @@ def test_depth_is_infinite_where_nothing_is_and_the_mean_of_what_is() -> None:
 
 
 def test_blocked_is_the_share_of_camera_rays_that_do_not_pass() -> None:
-    found = render(scene(GREY, environment=WHITE), Coin(400.0, FILM), width=36, height=24, samples=64).layers
+    found = render(scene(GREY, environment=WHITE), Coin(400.0, FILM), **SIZE, samples=64).layers
     # Half of the coin weighs 0: nothing passes there either.
     assert found.blocked == pytest.approx(np.full((24, 36), 0.5), abs=1e-6)
 
@@ -104,7 +97,7 @@ def some_job(width: int, height: int, samples: int = 40) -> Job:
 
 
 def test_a_picture_on_its_way_is_divided_by_what_each_tile_has(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 16 * 100)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 16 * 100)
     job = some_job(36, 24)
     assert (job.tiling.tiles, job.tiling.passes) == (9, 3)
     for tile, passes in ((0, 3), (1, 1), (8, 2)):
@@ -127,22 +120,22 @@ def peak_bytes(act: Any) -> int:
 
 
 def test_a_worker_holds_a_tile_and_the_picture_156_bytes_a_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 16 * 256)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 16 * 256)
     small, large = some_job(48, 32), some_job(960, 640)
     assert large.film.sums.nbytes == 960 * 640 * 8 * COLUMNS
     tiles = [peak_bytes(lambda job=job: job.render_tile(job.camera, 3, 1)) for job in (small, large)]
     assert tiles[1] < 1.05 * tiles[0]
-    monkeypatch.setattr("neurolens.render.sums.CHUNK_BYTES", 1 << 20)
+    monkeypatch.setattr("neurolens.render.film.CHUNK_BYTES", 1 << 20)
     assert peak_bytes(lambda: develop(large)) < (BYTES_A_PIXEL - 8 * COLUMNS) * 960 * 640
 
 
 def test_previews_come_while_the_render_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """So many samples take longer than the first preview, which is white where there is anything."""
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 16 * 100)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 16 * 100)
     shown: list[Any] = []
     watch = Watch(preview=shown.append, preview_s=0, stop=lambda: len(shown) > 1)
     made = scene(GREY, environment=WHITE)
-    found = render(made, Pinhole(4000.0, FILM), width=36, height=24, samples=100_000, watch=watch)
+    found = render(made, Pinhole(4000.0, FILM), **SIZE, samples=100_000, watch=watch)
     assert not found.stats["complete"] and found.layers.samples.max() < 100_000
     for preview in (*shown, found.rgb):
         lit = preview > 0

@@ -7,21 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from render_helpers import WHITE, diffuse, radiance, scene, world
-
-from neurolens.render.integrator import trace
-from neurolens.render.sampler import Sampler
-from neurolens.render.spectrum import SpectralRange
-from neurolens.render.world import World
-
-MATERIALS: dict[str, Any] = {
-    "white": diffuse(1, 1, 1),
-    "grey": diffuse(0.5, 0.5, 0.5),
-    "mirror": {"kind": "mirror", "reflectance": [1, 1, 1]},
-    "glass": {"kind": "glass", "n_d": 1.6, "V_d": 35.0},
-    "plastic": {"kind": "glossy", "specular": [0.05] * 3, "roughness": 0.3, "reflectance": [0.5] * 3},
-}
-FLOOR = {"point_m": [0, 0, 0], "normal": [0, 1, 0], "material": "grey"}
+from render_helpers import FLOOR, MATERIALS, WHITE, radiance, world
 
 
 def box_of_lights(half: float, emission: float) -> list[dict[str, Any]]:
@@ -95,12 +81,8 @@ def test_variance_falls_as_one_over_the_number_of_samples() -> None:
     made = world(materials=MATERIALS, rooms=[walls], spheres=[lamp])
     counts, variances = [8, 32, 128], []
     for samples in counts:
-        sampler, pixels = Sampler(samples, 0), 512
-        pixel, sample = np.divmod(np.arange(pixels * samples), samples)
-        rays = [np.repeat(np.float32(v)[:, None], len(pixel), axis=1) for v in ((0, 1, 1.5), (0, -0.6, -0.8))]
-        ones = np.ones(len(pixel), np.float32)
-        value = trace(made, sampler, sampler.keys(pixel, sample), *rays, ones, np.full(len(pixel), 128), 5)
-        variances.append(value.reshape(pixels, samples).mean(axis=1).var())
+        value = radiance(made, [0, 1, 1.5], [0, 0.4, 0.7], samples=samples, max_depth=5, pixels=512)
+        variances.append(value.reshape(512, samples).mean(axis=1).var())
     slope = np.polyfit(np.log(counts), np.log(variances), 1)[0]
     assert -1.6 < slope < -0.93
 
@@ -121,9 +103,7 @@ def test_a_thin_pane_absorbs_as_much_as_its_thickness_says(thickness_m: float) -
 def test_glass_absorbs_by_beer_and_lambert(lanes: int) -> None:
     glass = {"kind": "glass", "n_d": 1.5, "transmittance": [0.5, 0.5, 0.5], "transmittance_depth_m": 0.1}
     slab = {"min_m": [-9, -9, -0.3], "max_m": [9, 9, 0], "material": "glass"}
-    made = World(
-        scene(materials={"glass": glass}, boxes=[slab], environment=WHITE), SpectralRange(400, 700, lanes=lanes)
-    )
+    made = world(lanes=lanes, materials={"glass": glass}, boxes=[slab], environment=WHITE)
     # At a slant: with R at each face and A the share that is left of a crossing, T + R of the whole slab.
     sin = 0.6
     inner = math.sqrt(1 - (sin / 1.5) ** 2)
@@ -133,12 +113,7 @@ def test_glass_absorbs_by_beer_and_lambert(lanes: int) -> None:
     r = 0.5 * (s + p)
     through = (1 - r) ** 2 * left / (1 - (r * left) ** 2)
     back = r + (1 - r) ** 2 * r * left**2 / (1 - (r * left) ** 2)
-    samples = 16384
-    sampler = Sampler(samples, 0)
-    keys = sampler.keys(np.zeros(samples, np.intp), np.arange(samples))
-    rays = [np.repeat(np.float32(v)[:, None], samples, axis=1) for v in ((0, 0, 1), (sin, 0, -0.8))]
-    weight = np.ones((lanes, samples) if lanes > 1 else samples, np.float32)
-    values = trace(made, sampler, keys, *rays, weight, np.arange(samples) * 256 // samples, 40)
+    values = radiance(made, [0, 0, 1], [sin, 0, 0.2], samples=16384, max_depth=40, lanes=lanes)
     assert np.allclose(values.reshape(lanes, -1).mean(axis=1), through + back, rtol=0.02)
 
 
@@ -164,64 +139,6 @@ def test_a_measured_reflectance_is_what_is_reflected() -> None:
     values = radiance(made, [0, 1, 1], [0, 0, 0], samples=1024, max_depth=1)
     nm = 400 + 300 * (np.arange(1024) // 4 + 0.5) / 256
     assert np.allclose(values, np.interp(nm, *np.transpose(spectrum)), atol=3e-3)
-
-
-def test_square_light_over_a_floor() -> None:
-    light = {"corner_m": [-0.5, 2, -0.5], "edge_u_m": [1, 0, 0], "edge_v_m": [0, 0, 1], "emission": [3, 3, 3]}
-    made = world(materials=MATERIALS, planes=[FLOOR], quads=[light])
-    values = radiance(made, [0, 1, 4], [0, 0, 0], samples=16384, max_depth=1)
-    # Form factor of a rectangle a x b at distance c over one corner, four of them around the point below the middle.
-    x = y = 0.5 / 2.0
-    part = x / math.hypot(1, x) * math.atan(y / math.hypot(1, x))
-    factor = 4 * (part + y / math.hypot(1, y) * math.atan(x / math.hypot(1, y))) / (2 * math.pi)
-    assert values.mean() == pytest.approx(0.5 * 3 * factor, rel=2e-3)
-
-
-def test_back_of_a_square_light_is_dark() -> None:
-    light = {"corner_m": [-0.5, 2, -0.5], "edge_u_m": [0, 0, 1], "edge_v_m": [1, 0, 0], "emission": [3, 3, 3]}
-    made = world(materials=MATERIALS, planes=[FLOOR], quads=[light])
-    assert not radiance(made, [0, 1, 4], [0, 0, 0], max_depth=1).any()
-    assert not radiance(made, [0, 1, 0.1], [0, 2, 0.1], max_depth=1).any()
-    assert np.allclose(radiance(made, [0, 3, 0.1], [0, 2, 0.1], max_depth=1), 3)
-
-
-@pytest.mark.parametrize(("radius", "height", "aside"), [(0.5, 2.0, 1.0), (0.01, 30.0, 40.0), (1e-3, 100.0, 0.0)])
-def test_sphere_light_obeys_the_inverse_square_law(radius: float, height: float, aside: float) -> None:
-    light = {"centre_m": [aside, height, 0], "radius_m": radius, "emission": [7, 7, 7]}
-    made = world(materials=MATERIALS, planes=[FLOOR], spheres=[light])
-    values = radiance(made, [0, 1, 1], [0, 0, 0], samples=16384, max_depth=1)
-    distance2 = height**2 + aside**2
-    expected = 0.5 * 7 * radius**2 / distance2 * height / math.sqrt(distance2)
-    assert values.mean() == pytest.approx(expected, rel=5e-3)
-
-
-def test_shadow_of_a_sphere() -> None:
-    light = {"centre_m": [0, 4, 0], "radius_m": 0.01, "emission": [100, 100, 100]}
-    ball = {"centre_m": [0, 2, 0], "radius_m": 0.5, "material": "grey"}
-    made = world(materials=MATERIALS, planes=[FLOOR], spheres=[ball, light])
-    # The shadow's edge lies 4 tan(asin(0.5 / 2)) = 1.033 m from the middle.
-    assert not radiance(made, [0, 1, 3], [1.0, 0, 0], samples=256, max_depth=1).any()
-    assert radiance(made, [0, 1, 3], [1.07, 0, 0], samples=256, max_depth=1).all()
-
-
-@pytest.mark.parametrize("floor", ["grey", "plastic"])
-def test_aiming_at_lights_changes_the_noise_and_not_the_mean(floor: str) -> None:
-    lamps = [
-        {"centre_m": [-0.4, 0.7, 0.2], "radius_m": 0.3, "emission": [2, 2, 2]},
-        {"centre_m": [0.9, 0.8, 0.2], "radius_m": 0.2, "emission": [5, 3, 1]},
-        {"centre_m": [0.2, 0.25, -0.6], "radius_m": 0.25, "material": "plastic"},
-    ]
-    panel = {"corner_m": [-0.5, 1.5, -0.5], "edge_u_m": [1, 0, 0], "edge_v_m": [0, 0, 1], "emission": [1, 2, 3]}
-    plane = FLOOR | {"material": floor}
-    # White surroundings are found by scattering alone, in both: their noise would hide that of the lamps.
-    for around, noise, error in (({"environment": WHITE}, 1.0, 0.03), ({}, 0.3, 0.05)):
-        made = world(materials=MATERIALS, planes=[plane], spheres=lamps, quads=[panel], **around)
-        aimed = radiance(made, [0, 1, 3], [0.1, 0, 0], samples=16384, max_depth=3)
-        found = radiance(made, [0, 1, 3], [0.1, 0, 0], samples=65536, max_depth=3, aim=False, seed=1)
-        assert aimed.std() < noise * found.std()
-        tolerance = 4 * math.hypot(aimed.std() / 128, found.std() / 256)
-        assert tolerance < error * aimed.mean()
-        assert abs(aimed.mean() - found.mean()) < tolerance
 
 
 def test_light_is_seen_in_a_mirror_and_through_glass() -> None:

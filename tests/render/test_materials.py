@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from neurolens.render.coat import CoatTable
 from neurolens.render.materials import (
+    CoatTable,
     GlossyLobes,
     cosine_direction,
     fresnel_dielectric,

@@ -10,35 +10,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-from render_helpers import WHITE, diffuse, scene
+from render_helpers import FILM, SIZE, WHITE, diffuse, lit_scene, scene
 
 from neurolens.base.errors import InputError, ModelError, NeurolensError
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
-from neurolens.render import bench
-from neurolens.render.renderer import render
-from neurolens.render.sums import Film, Tiling
-from neurolens.render.watch import Watch
+from neurolens.render.film import Film, Tiling
+from neurolens.render.renderer import Watch, render
 
-FILM = (36.0, 24.0)
 LETTER_F = ["#####", "#....", "####.", "#....", "#....", "#...."]
 
 
 def letter_quads() -> list[dict[str, Any]]:
     """The letter F of glowing squares 1 m wide on the plane z = -10, as one standing at the origin reads it."""
     rows, columns = len(LETTER_F), len(LETTER_F[0])
-    return [
-        {
-            "corner_m": [c - columns / 2, rows / 2 - r - 1, -10],
-            "edge_u_m": [1, 0, 0],
-            "edge_v_m": [0, 1, 0],
-            "emission": [1, 1, 1],
-        }
-        for r in range(rows)
-        for c in range(columns)
-        if LETTER_F[r][c] == "#"
-    ]
+    square = {"edge_u_m": [1, 0, 0], "edge_v_m": [0, 1, 0], "emission": [1, 1, 1]}
+    cells = [(r, c) for r in range(rows) for c in range(columns) if LETTER_F[r][c] == "#"]
+    return [square | {"corner_m": [c - columns / 2, rows / 2 - r - 1, -10]} for r, c in cells]
 
 
 @pytest.mark.parametrize("camera", [Pinhole(20.0, (10.0, 12.0)), ThinLens(20.0, 8.0, 10.0, (10.0, 12.0))])
@@ -58,37 +47,27 @@ def test_letter_is_upright_and_unmirrored(camera: Any, turn: int) -> None:
     assert np.all(cells[expected] > 0.7) and np.all(cells[~expected] < 0.1)
 
 
-def test_white_environment_is_white() -> None:
-    for camera in (Pinhole(400.0, FILM), ThinLens(400.0, 4.0, 5.0, FILM)):
-        rgb = render(scene(environment=WHITE), camera, width=48, height=32, samples=64).rgb
-        assert rgb.mean(axis=(0, 1)) == pytest.approx([1, 1, 1], abs=5e-3)
-
-
-def test_coloured_wall_in_white_light_keeps_its_colour() -> None:
+@pytest.mark.parametrize("colour", [None, (0.7, 0.2, 0.05)])
+@pytest.mark.parametrize("camera", [Pinhole(400.0, FILM), ThinLens(400.0, 4.0, 5.0, FILM)], ids=["pinhole", "thin"])
+def test_white_is_white_and_a_wall_in_it_keeps_its_colour(camera: Any, colour: Any) -> None:
     wall = {"point_m": [0, 0, -1], "normal": [0, 0, 1], "material": "m"}
-    made = scene(environment=WHITE, materials={"m": diffuse(0.7, 0.2, 0.05)}, planes=[wall])
-    rgb = render(made, Pinhole(400.0, FILM), width=48, height=32, samples=64).rgb
-    assert rgb.mean(axis=(0, 1)) == pytest.approx([0.7, 0.2, 0.05], abs=5e-3)
+    tables = {} if colour is None else {"materials": {"m": diffuse(*colour)}, "planes": [wall]}
+    rgb = render(scene(environment=WHITE, **tables), camera, width=48, height=32, samples=64).rgb
+    assert rgb.mean(axis=(0, 1)) == pytest.approx(colour or (1, 1, 1), abs=5e-3)
 
 
 def test_uniform_light_falls_off_with_the_fourth_power_of_the_cosine() -> None:
-    rgb = render(scene(environment=WHITE), Pinhole(20.0, FILM), width=36, height=24, samples=256).rgb
+    rgb = render(scene(environment=WHITE), Pinhole(20.0, FILM), **SIZE, samples=256).rgb
     x, y = np.meshgrid(np.arange(36) - 17.5, np.arange(24) - 11.5)
     cos4 = (20**2 / (20**2 + x**2 + y**2)) ** 2
     assert np.abs(rgb.mean(axis=2) - cos4).max() < 0.05
     assert np.abs((rgb - cos4[..., None]).mean()) < 2e-3
 
 
-def lit_scene() -> Any:
-    ball = {"centre_m": [0, 0, -2], "radius_m": 0.7, "material": "m"}
-    lamp = {"centre_m": [1, 1, -1], "radius_m": 0.3, "emission": [9, 8, 7]}
-    return scene(environment=WHITE, materials={"m": diffuse(0.7, 0.6, 0.5)}, spheres=[ball, lamp])
-
-
 def test_workers_do_not_change_the_picture_and_seeds_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 1024)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 1024)
     made, camera = lit_scene(), ThinLens(50.0, 2.0, 3.0, FILM)
-    options: dict[str, Any] = {"width": 36, "height": 24, "samples": 40}
+    options = SIZE | {"samples": 40}
     one = render(made, camera, threads=1, **options)
     seen: list[float] = []
     two = render(made, camera, threads=2, progress=lambda fraction, left: seen.append(fraction), **options)
@@ -101,21 +80,15 @@ def test_workers_do_not_change_the_picture_and_seeds_do(monkeypatch: pytest.Monk
 
 def test_cameras_share_their_noise() -> None:
     made = lit_scene()
-    options: dict[str, Any] = {"width": 36, "height": 24, "samples": 4, "threads": 1}
+    options = SIZE | {"samples": 4, "threads": 1}
     pinhole = render(made, Pinhole(50.0, FILM), **options).rgb
     almost = render(made, ThinLens(50.0, 1e5, np.inf, FILM), **options).rgb
     other = render(made, Pinhole(50.0, FILM), seed=1, **options).rgb
     assert np.abs(pinhole - almost).mean() < 0.02 * np.abs(pinhole - other).mean()
 
 
-class Bare(Pinhole):
-    """Has no differentials."""
-
-    sample_differentials = None  # type: ignore[assignment]
-
-
 def test_differentials_are_asked_for_and_change_nothing() -> None:
-    made, options = lit_scene(), {"width": 36, "height": 24, "samples": 4, "threads": 1}
+    made, options = lit_scene(), SIZE | {"samples": 4, "threads": 1}
     asked = 0
 
     class Counting(ThinLens):
@@ -129,7 +102,8 @@ def test_differentials_are_asked_for_and_change_nothing() -> None:
     assert asked >= 36 * 24 * 4 and np.array_equal(plain.rgb, with_them.rgb)
     assert 0 < with_them.stats["camera_thread_seconds"] < with_them.stats["thread_seconds"]
     with pytest.raises(InputError, match="differentials"):
-        render(made, Bare(50.0, FILM), differentials=True, **options)
+        camera.sample_differentials = None  # type: ignore[assignment, method-assign]
+        render(made, camera, differentials=True, **options)
 
 
 class HalfBlocked(Pinhole):
@@ -143,7 +117,7 @@ class HalfBlocked(Pinhole):
 
 
 def test_rays_that_do_not_pass_are_black_whatever_they_hold() -> None:
-    result = render(lit_scene(), HalfBlocked(50.0, FILM), width=36, height=24, samples=4)
+    result = render(lit_scene(), HalfBlocked(50.0, FILM), **SIZE, samples=4)
     assert not result.rgb[:, :18].any() and result.rgb[:, 18:].mean() > 0.5
     assert result.stats["passed_fraction"] == pytest.approx(0.5, abs=1e-6)
 
@@ -153,13 +127,6 @@ class Prism(Pinhole):
 
     dispersive = True
     wavelength_nm = (450.0, 650.0)
-
-
-class Broken(Pinhole):
-    """Fails in the middle of the work."""
-
-    def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
-        raise RuntimeError("no rays today")
 
 
 class Raising(Pinhole):
@@ -177,14 +144,15 @@ class Raising(Pinhole):
         (ModelError("a.onnx: cannot run it"), "a.onnx: cannot run it"),
         (MemoryError("2 TB"), "a render worker ran out of memory (2 TB)"),
         (ValueError("x" * 10_000), "a render worker failed: ValueError: xxx"),
+        (RuntimeError("no rays today"), "a render worker failed: RuntimeError: no rays today (test_renderer.py:"),
     ],
 )
 def test_what_a_worker_raises_is_one_line(error: Exception, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 64)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 64)
     camera = Raising(50.0, FILM)
     camera.error = error
     with pytest.raises(NeurolensError) as failed:
-        render(scene(environment=WHITE), camera, width=36, height=24, samples=1, threads=2)
+        render(scene(environment=WHITE), camera, **SIZE, samples=1, threads=2)
     assert str(failed.value).startswith(said) and len(str(failed.value).splitlines()) == 1
 
 
@@ -201,9 +169,9 @@ class Killed(Pinhole):
 def test_a_killed_worker_ends_the_render_and_what_was_done_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 64)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 64)
     part, camera = tmp_path / "a.exr.part", Killed(50.0, FILM)
-    options: dict[str, Any] = {"width": 36, "height": 24, "samples": 40, "threads": 2}
+    options = SIZE | {"samples": 40, "threads": 2}
     with pytest.raises(NeurolensError, match=r"killed \(signal 9: did the memory run out\?\).* kept in .*a\.exr\.part"):
         render(scene(environment=WHITE), camera, watch=Watch(checkpoint=part), **options)
     with np.load(part, allow_pickle=False) as kept:
@@ -212,7 +180,7 @@ def test_a_killed_worker_ends_the_render_and_what_was_done_is_kept(
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system does not pin processes")
 def test_workers_are_pinned_where_there_is_one_for_each_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 256)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 256)
     free = os.sched_getaffinity(0)
 
     class Telling(Pinhole):
@@ -221,14 +189,14 @@ def test_workers_are_pinned_where_there_is_one_for_each_core(tmp_path: Path, mon
             return self
 
     threads = max(2, len(free))
-    render(scene(environment=WHITE), Telling(50.0, FILM), width=36, height=24, samples=16, threads=threads)
+    render(scene(environment=WHITE), Telling(50.0, FILM), **SIZE, samples=16, threads=threads)
     told = [path.read_text() for path in tmp_path.iterdir()]
     assert len(told) == threads and {int(core) for core in told} == free
     assert os.sched_getaffinity(0) == free  # those of the caller stay
 
 
 def test_a_film_that_a_dead_worker_holds_is_an_error_not_a_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums._LONGEST_WAIT_S", 0.01)
+    monkeypatch.setattr("neurolens.render.film._LONGEST_WAIT_S", 0.01)
     film = Film(Tiling.of(100, 16))
     film.lock.acquire()
     with pytest.raises(NeurolensError, match="killed while it wrote"):
@@ -247,13 +215,13 @@ class Reopened(Pinhole):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_each_worker_opens_its_own_camera(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 256)
+    monkeypatch.setattr("neurolens.render.film.BATCH", 256)
     made = scene(environment=WHITE)
-    assert render(made, Reopened(50.0, FILM), width=36, height=24, samples=1, threads=threads).rgb.any()
+    assert render(made, Reopened(50.0, FILM), **SIZE, samples=1, threads=threads).rgb.any()
 
 
-def test_errors_are_clear(monkeypatch: pytest.MonkeyPatch) -> None:
-    made, small = scene(environment=WHITE), {"width": 36, "height": 24, "samples": 1}
+def test_errors_are_clear() -> None:
+    made, small = scene(environment=WHITE), SIZE | {"samples": 1}
     for change, field in (
         ({"samples": 0}, "samples"),
         ({"samples": 1 << 40}, "samples.*at most 1048576"),
@@ -267,11 +235,3 @@ def test_errors_are_clear(monkeypatch: pytest.MonkeyPatch) -> None:
         render(made, Prism(50.0, FILM), **small)
     narrow = scene({"wavelengths_nm": [460, 640]}, environment=WHITE)
     assert render(narrow, Prism(50.0, FILM), **small).rgb.shape == (24, 36, 3)
-    monkeypatch.setattr("neurolens.render.sums.BATCH", 64)
-    with pytest.raises(NeurolensError, match=r"^a render worker failed: RuntimeError: no rays today \(.*\.py:\d+\)$"):
-        render(made, Broken(50.0, FILM), threads=2, **small)
-
-
-def test_the_bench_says_one_line_of_a_missing_scene(capsys: pytest.CaptureFixture[str]) -> None:
-    assert bench.main(["nosuch.toml"]) == 2
-    assert "nosuch.toml" in capsys.readouterr().err

@@ -6,20 +6,27 @@ import math
 
 import numpy as np
 import pytest
-from render_helpers import diffuse, radiance, scene, world
+from render_helpers import FLOOR, MATERIALS, assert_aimed, radiance, scene, world
 
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.render.colour import SRGB
-from neurolens.render.environment import SunLight
-from neurolens.render.filmsettings import FilmSettings
-from neurolens.render.lightsettings import Sky
+from neurolens.render.environment import (
+    SunLight,
+    daylight_table,
+    daylight_weights,
+    sky_colour,
+    sun_direction,
+    sun_spectrum,
+    zenith,
+)
+from neurolens.render.film import FilmSettings
+from neurolens.render.illuminants import table
 from neurolens.render.renderer import render
-from neurolens.render.sky import daylight_table, daylight_weights, sky_colour, sun_direction, sun_spectrum, zenith
-from neurolens.render.spectrum import SpectralRange, table
+from neurolens.render.scenetables import Sky
+from neurolens.render.spectrum import SpectralRange
 from neurolens.render.wavelengths import expected_light
 
-FLOOR = {"point_m": [0, 0, 0], "normal": [0, 1, 0], "material": "white"}
-MATERIALS = {"white": diffuse(1, 1, 1)}
+WHITE_FLOOR = FLOOR | {"material": "white"}
 
 
 @pytest.mark.parametrize(("name", "kelvin"), [("d65", 6500.0), ("d50", 5000.0)])
@@ -43,7 +50,7 @@ def perez(t: float, theta: np.ndarray, gamma: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("elevation", "turbidity"), [(60.0, 3.0), (10.0, 2.0), (35.0, 8.0)])
 def test_irradiance_of_the_sky_is_the_integral_of_its_luminance(elevation: float, turbidity: float) -> None:
     sky = {"sun_elevation_deg": elevation, "sun_azimuth_deg": 70, "turbidity": turbidity, "sun": False}
-    made = world(materials=MATERIALS, sky=sky, planes=[FLOOR])
+    made = world(materials=MATERIALS, sky=sky, planes=[WHITE_FLOOR])
     spectral = SpectralRange(400, 700)
     samples = 16384
     values = radiance(made, [0, 1, 3], [0, 0, 0], samples=samples, max_depth=1)
@@ -63,19 +70,15 @@ def test_irradiance_of_the_sky_is_the_integral_of_its_luminance(elevation: float
 def test_aiming_at_the_sky_changes_the_noise_and_not_the_mean() -> None:
     ball = {"centre_m": [0.3, 0.5, 0], "radius_m": 0.3, "material": "white"}
     sky = {"sun_elevation_deg": 25, "sun_azimuth_deg": 200, "sun": False}
-    made = world(materials=MATERIALS, sky=sky, planes=[FLOOR], spheres=[ball])
-    aimed = radiance(made, [0, 1, 3], [0.2, 0, 0.1], samples=16384, max_depth=2)
-    found = radiance(made, [0, 1, 3], [0.2, 0, 0.1], samples=65536, max_depth=2, aim=False, seed=1)
-    assert aimed.std() < 0.9 * found.std()
-    tolerance = 4 * math.hypot(aimed.std() / 128, found.std() / 256)
-    assert tolerance < 0.03 * aimed.mean() and abs(aimed.mean() - found.mean()) < tolerance
+    made = world(materials=MATERIALS, sky=sky, planes=[WHITE_FLOOR], spheres=[ball])
+    assert_aimed(made, [0.2, 0, 0.1], 0.9, max_depth=2)
 
 
 def test_the_sun_lights_as_its_disc_shines_and_is_seen_where_it_stands() -> None:
     settings = {"sun_elevation_deg": 40, "sun_azimuth_deg": 30}
     sky = Sky(**settings)
     with_sun, without = (
-        world(materials=MATERIALS, sky=settings | {"sun": sun}, planes=[FLOOR]) for sun in (True, False)
+        world(materials=MATERIALS, sky=settings | {"sun": sun}, planes=[WHITE_FLOOR]) for sun in (True, False)
     )
     towards = sun_direction(sky)
     assert towards == pytest.approx([math.cos(0.698132) * 0.5, math.sin(0.698132), -math.cos(0.698132) * 0.8660254])
@@ -144,7 +147,7 @@ def test_one_and_four_wavelengths_a_path_see_the_same_sky() -> None:
         {"position_m": [0, 1, 3]},
         materials=MATERIALS | {"coat": coat},
         sky={"sun_elevation_deg": 35, "sun_azimuth_deg": 220},
-        planes=[FLOOR],
+        planes=[WHITE_FLOOR],
         spheres=[ball],
         spots=[spot],
     )

@@ -1,15 +1,18 @@
-"""Wavelengths drawn by importance: exact densities, the same means, less noise."""
+"""Colours go to spectra and come back; wavelengths drawn by importance have exact densities and less noise."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
-from render_helpers import WHITE, diffuse, scene
+from render_helpers import WHITE, assert_same_mean, diffuse, scene
 
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.render.filmsettings import FilmSettings
+from neurolens.render.film import FilmSettings
+from neurolens.render.illuminants import table
 from neurolens.render.renderer import render
-from neurolens.render.spectrum import SpectralRange, table
+from neurolens.render.spectrum import SpectralRange
 from neurolens.render.wavelengths import expected_light, spectral_range
 
 FLAT = (table("wavelength_nm"), np.ones(81))
@@ -31,9 +34,9 @@ def test_the_density_is_that_of_the_bins(light: tuple[np.ndarray, np.ndarray]) -
     assert np.diff(spectral.edges_nm).max() <= 10.01 * 300 / 256
 
 
-@pytest.mark.parametrize("light", [FLAT, SPIKE], ids=["flat", "spike"])
+@pytest.mark.parametrize("light", [None, FLAT, SPIKE], ids=["even", "flat", "spike"])
 @pytest.mark.parametrize("rgb", [(1, 1, 1), (0.9, 0.1, 0.05), (0, 1, 0), (0.2, 0.3, 0.7), (0, 0, 1)])
-def test_colours_come_back_through_any_bins(rgb: tuple[float, float, float], light: tuple) -> None:
+def test_colours_come_back_through_any_bins(rgb: tuple[float, float, float], light: Any) -> None:
     for limits in ((380, 780), (400, 700), (450, 650)):
         spectral = SpectralRange(*limits, light=light)
         spectrum = spectral.spectrum(rgb)
@@ -46,7 +49,7 @@ def test_upsampling_conserves_energy_and_reciprocates_over_the_cube() -> None:
     axis = np.linspace(0, 1, 9)
     cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
     spectra = spectral.spectrum(cube)
-    assert spectra.min() >= 0 and spectra.max() <= 1 + 1e-6
+    assert spectra.min() >= 0 and spectra.max() <= 1 + 1e-6 and np.allclose(spectra[-1], 1, atol=1e-6)
     assert spectra.astype(float) @ spectral.response.T / spectral.bins == pytest.approx(cube, abs=1e-5)
     # Complementary colours are complementary at every wavelength.
     assert spectral.spectrum(cube) + spectral.spectrum(1 - cube) == pytest.approx(np.ones_like(spectra), abs=1e-6)
@@ -90,17 +93,26 @@ def coloured_room() -> object:
     )
 
 
-def renders(film: FilmSettings, seeds: int, samples: int = 16) -> np.ndarray:
-    made = coloured_room()
-    options = {"width": 18, "height": 12, "samples": samples, "threads": 1, "max_depth": 3}
-    return np.stack([render(made, CAMERA, seed=k, film=film, **options).rgb for k in range(seeds)])  # type: ignore
-
-
 def test_importance_changes_the_noise_and_not_the_mean() -> None:
-    even = renders(FilmSettings(wavelength_sampling="uniform", wavelengths="one"), 24)
-    drawn = renders(FilmSettings(wavelength_sampling="importance", wavelengths="one"), 24)
-    means = even.mean(axis=(1, 2)), drawn.mean(axis=(1, 2))  # [seed, 3]
-    error = np.sqrt(sum(m.var(axis=0, ddof=1) / len(m) for m in means))
-    assert np.all(error < 0.01 * means[0].mean(axis=0))
-    assert np.all(np.abs(means[0].mean(axis=0) - means[1].mean(axis=0)) < 4 * error)
+    made, options = coloured_room(), {"width": 18, "height": 12, "samples": 16, "threads": 1, "max_depth": 3}
+    even, drawn = (
+        np.stack([render(made, CAMERA, seed=k, film=film, **options).rgb for k in range(24)])
+        for film in (FilmSettings(wavelength_sampling=s, wavelengths="one") for s in ("uniform", "importance"))
+    )
+    assert_same_mean(even, drawn, 0.01)
     assert drawn.var(axis=0).mean() < 0.8 * even.var(axis=0).mean()
+
+
+@pytest.mark.parametrize("limits", [(587.5618, 587.5618), (540, 560)])
+def test_light_of_one_wavelength_makes_a_grey_picture(limits: tuple[float, float]) -> None:
+    spectral = SpectralRange(*limits)
+    assert not spectral.colours
+    assert np.all(spectral.response == 1)
+    assert np.allclose(spectral.wavelengths_nm(np.float32([0, 0.999])), limits, atol=0.1)
+
+
+def test_cauchy_index_has_the_asked_abbe_number() -> None:
+    lines = [SpectralRange(nm, nm).refractive_index(1.62, 36.4)[0] for nm in (587.5618, 486.1327, 656.2725)]
+    assert lines[0] == pytest.approx(1.62, abs=1e-6)
+    assert (lines[0] - 1) / (lines[1] - lines[2]) == pytest.approx(36.4, rel=1e-4)
+    assert np.all(SpectralRange(400, 700).refractive_index(1.5, None) == np.float32(1.5))

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from lens_models import KINDS, anamorphic, model, prepared
+from lens_models import KINDS, model, prepared
 from torch import Tensor
 
 from neurolens.base import status as st
-from neurolens.optics.differentials import film_tangents, trace_differentials
-from neurolens.optics.pupil_rays import camera_rays
+from neurolens.optics.pupils import camera_rays
+from neurolens.optics.trace import film_derivatives, trace_differentials
 from neurolens.surrogates.cores import InvariantPolynomial, Network, Residual
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
@@ -26,11 +26,6 @@ def _outputs(model: LensModel, rays: FilmRays) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def mirror() -> LensModel:
-    return fit_model(anamorphic(), ModelSettings("ols", terms=16))
-
-
-@pytest.fixture(scope="module")
 def residual() -> LensModel:
     """The mean of a polynomial and a network."""
     whole, network = model("invariants"), model("network").core
@@ -40,9 +35,9 @@ def residual() -> LensModel:
     return replace(whole, core=Residual((half, other)))
 
 
-@pytest.mark.parametrize("kind", [*KINDS, "zones", "residual", "mirror"])
+@pytest.mark.parametrize("kind", [*KINDS, "zones", "residual"])
 def test_derivatives_are_the_finite_differences_of_the_model(kind: str, request: pytest.FixtureRequest) -> None:
-    m = request.getfixturevalue(kind) if kind in ("mirror", "residual") else model(kind)
+    m = request.getfixturevalue(kind) if kind == "residual" else model(kind)
     rays = sample_domain(m.domain, 3000, seed=3)
     d = m.differentiate(rays)
     ok = d.prediction.status == st.PASSED
@@ -77,7 +72,7 @@ def test_differentials_are_those_of_the_exact_lens_to_one_percent(name: str) -> 
     distance = torch.sqrt(
         (rays.film_x - rays.pupil_x) ** 2 + (rays.film_y - rays.pupil_y) ** 2 + (rays.film_z - plane) ** 2
     )
-    exact = trace_differentials(m.lens, start, film_tangents(start, distance), rays.wavelength_nm)
+    exact = trace_differentials(m.lens, start, film_derivatives(start, distance), rays.wavelength_nm)
     wanted = torch.stack([torch.stack(list(t)) for t in exact.derivatives], 1)  # [6, 2, N]
     for rows in (slice(0, 3), slice(3, 6)):
         off = (d.d_film - wanted)[rows].square().mean().sqrt() / wanted[rows].square().mean().sqrt()

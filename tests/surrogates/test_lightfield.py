@@ -9,8 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph
+from neurolens.surrogates.assemble import DirectionSeries
 from neurolens.surrogates.domain import FilmRays
-from neurolens.surrogates.lightfield import Encoding, angle_vector, direction_of, direction_of_slope
+from neurolens.surrogates.lightfield import Encoding, angle_vector
 
 ENCODING = Encoding(50.0, 10.0, 0.3, 20.0, 7.0, 4.1, 2.1)
 
@@ -70,9 +73,15 @@ def directions(count: int = 2000, most_degrees: float = 125.0) -> Tensor:
     return torch.stack([theta.sin() * phi.cos(), theta.sin() * phi.sin(), -theta.cos()])
 
 
+def decoded(series: DirectionSeries, vector: Tensor) -> Tensor:
+    g = Graph()
+    g.outputs["d"] = series.decode(g.input("v", 2))
+    return evaluate(g, {"v": vector})["d"]
+
+
 def test_directions_come_back_from_angle_vectors() -> None:
     d = directions()
-    torch.testing.assert_close(torch.stack(direction_of(angle_vector(*d))), d, rtol=0, atol=1e-13)
+    torch.testing.assert_close(decoded(DirectionSeries.exact(), angle_vector(*d)), d, rtol=0, atol=1e-13)
 
 
 def test_angle_vectors_are_angles() -> None:
@@ -84,11 +93,18 @@ def test_angle_vectors_are_angles() -> None:
 
 
 def test_decoded_directions_are_unit_in_float32() -> None:
-    d = torch.stack(direction_of(angle_vector(*directions().float())))
+    d = decoded(DirectionSeries.exact(), angle_vector(*directions().float()))
     assert d.dtype == torch.float32
     torch.testing.assert_close(d.norm(dim=0), torch.ones(d.shape[1]), rtol=0, atol=1e-6)
 
 
 def test_directions_come_back_from_slopes() -> None:
     d = directions(most_degrees=85.0)
-    torch.testing.assert_close(torch.stack(direction_of_slope(d[:2] / -d[2])), d, rtol=0, atol=1e-13)
+    torch.testing.assert_close(decoded(DirectionSeries(1.0), d[:2] / -d[2]), d, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("degrees", [1.0, 20.0, 60.0, 112.0])
+def test_short_series_hold_directions_to_the_last_bit_of_float32(degrees: float) -> None:
+    series = DirectionSeries.fitted(math.radians(degrees))
+    d = directions(most_degrees=degrees)
+    torch.testing.assert_close(decoded(series, series.kappa * angle_vector(*d)), d, rtol=0, atol=6e-8)

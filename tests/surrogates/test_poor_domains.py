@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from vignetting_oracle import vignetting_errors
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.evaluate.vignetting import vignetting_errors
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.surrogates.domain import Domain, domain_of, sample_domain

@@ -11,20 +11,20 @@ import lens_models
 import numpy as np
 import pytest
 import torch
-from neurolens.programs.tanh import add_tanh
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.evaluate.benches.compiled_source import FLAGS, CompiledSource, find_compiler
+from neurolens.evaluate.candidates import FLAGS, CompiledSource, find_compiler
 from neurolens.evaluate.speed import Unavailable
 from neurolens.graph.c import literal
-from neurolens.graph.program import Program
+from neurolens.graph.program import SCENE_RAY, Program
 from neurolens.optics.paraxial import first_order
+from neurolens.surrogates.assemble import ALL, RAY_ONLY, Parts
 from neurolens.surrogates.card import card_of
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel, Prediction
-from neurolens.surrogates.source import ALL, RAY_ONLY, SCENE_RAY, Fixed, Parts, export_source, fused_program
+from neurolens.surrogates.source import Fixed, export_source, fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 
 COUNT = 50_000
@@ -207,7 +207,7 @@ def test_fixed_values_outside_the_domain_are_refused() -> None:
 
 def test_tanh() -> None:
     program = Program()
-    program.outputs["y"] = add_tanh(program, [program.input("x")])[0]
+    program.outputs["y"] = program.tanh(program.input("x"))
     x = np.concatenate([np.linspace(-12, 12, 200_001), 10.0 ** np.linspace(-40, 1, 5001), [0.0, 3e38]])
     x = x.astype(np.float32)
     found = program.evaluate({"x": x})["y"].astype(np.float64)

@@ -13,15 +13,16 @@ import lens_models
 import numpy as np
 import pytest
 import torch
-from neurolens.surrogates.source.glsl import write_glsl
 
 from neurolens.base import status as st
 from neurolens.graph.c import Signature
-from neurolens.graph.program import Program
+from neurolens.graph.glsl import write_glsl
+from neurolens.graph.program import SCENE_RAY, Program
 from neurolens.optics.paraxial import first_order
+from neurolens.surrogates.assemble import ALL
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.source import ALL, FREE, SCENE_RAY, Fixed, fused_program
+from neurolens.surrogates.source import FREE, Fixed, fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 
 COUNT = 20_000

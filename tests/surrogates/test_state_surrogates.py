@@ -15,16 +15,16 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from vignetting_oracle import vignetting_errors
 
-from neurolens.axes import Axis, product, weights
+from experiments import outside
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import OnnxLens, load_model
-from neurolens.evaluate.benches import outside
+from neurolens.evaluate.check import check_states, random_states, space_of_card
 from neurolens.evaluate.rays import ray_errors
-from neurolens.evaluate.state_errors import check_states, random_states, space_of_card
-from neurolens.evaluate.vignetting import vignetting_errors
+from neurolens.modelfile.axes import Axis, product, weights
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens

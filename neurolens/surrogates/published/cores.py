@@ -65,6 +65,7 @@ class OuterPupil(Core):
     curvature: float
     outer: float | None
     inner: tuple[float, float] | None
+    basis = "raw"
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
         unit, _, stop = units.vectors

@@ -57,6 +57,7 @@ class Averaged(Core):
 
     edges: tuple[float, ...]
     networks: tuple[tuple[Layers, ...], ...]
+    basis = "raw"
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
         inputs, rho = field.raw(), field.products(ROUND[:1], w=False)

@@ -63,6 +63,7 @@ class Meridian(Core):
     film: float
     knots: Array
     ellipse: Array
+    basis = "raw"
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
         p, u, unit = field.p, field.u, units.vectors[0]

@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 import torch
 
-from neurolens import axes as ax
 from neurolens.base.errors import InputError
+from neurolens.modelfile import axes as ax
 from neurolens.surrogates.bases import Exponents, invariant_exponents, monomials, solve, vector_columns, vector_gram
 from neurolens.surrogates.cores import STOP, InvariantPolynomial
 from neurolens.surrogates.fit import prepare

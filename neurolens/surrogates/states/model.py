@@ -1,6 +1,6 @@
 """Surrogates of a lens in many states (zoom, internal focus): models of one structure at nodes, mixed between.
 
-Every number of the model at a state is interpolated from the nodes (see `neurolens.axes`), so that the model at a state
+Every number of the model at a state is interpolated from the nodes (see `modelfile.axes`), so that the model at a state
 is a plain `LensModel`, and everything that knows those knows this one. A core is linear in its numbers: its error at a
 state is at most a small multiple (the Lebesgue constant) of the nodes' errors, plus that of interpolating the exact
 lens itself.
@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from neurolens import axes as ax
 from neurolens.base.errors import InputError
-from neurolens.statetable import mix_domain
+from neurolens.modelfile import axes as ax
+from neurolens.modelfile.states import mix_domain
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import LensModel
@@ -31,7 +31,7 @@ class StateModel:
 
     Attributes:
         space: the states, and the exact lens at each.
-        nodes: one model a node, in the order of `neurolens.axes.product`; of one structure: they differ in numbers.
+        nodes: one model a node, in the order of `modelfile.axes.product`; of one structure: they differ in numbers.
         fit_s: seconds that the whole fit took.
     """
 

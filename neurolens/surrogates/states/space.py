@@ -9,9 +9,9 @@ from functools import cached_property
 
 import numpy as np
 
-from neurolens.axes import Axis, product, weights
 from neurolens.base.errors import InputError
-from neurolens.optics.internal import infinity_states, nearest_focus_m
+from neurolens.modelfile.axes import Axis, product, weights
+from neurolens.optics.focusing import infinity_states, nearest_focus_m
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm

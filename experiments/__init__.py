@@ -1,0 +1,1 @@
+"""Measurements of the README, of models/ and of experiments/results: `python -m experiments NAME`."""

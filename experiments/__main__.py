@@ -1,0 +1,60 @@
+"""`python -m experiments NAME`: the measurements behind the README's tables, the gallery, and the models that ship.
+
+Run from the project's folder. A measurement is a module of this folder with `ABOUT`, `add_arguments` and `run`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+from neurolens import cli
+from neurolens.commands.arguments import Parser
+
+NAMES = {
+    "trace": ("trace_speed", "rays per second and memory of the exact tracer"),
+    "extremes": ("extremes", "errors and statuses at the ends of what optics allows"),
+    "pupils": ("pupils", "share of rays that pass a lens, by how its pupil is sampled"),
+    "surrogates": ("surrogates", "all methods on a set of lenses, or on the whole library"),
+    "vignetting": ("vignetting", "false passes and blocks, illumination"),
+    "outside": ("outside", "random inputs through exported models"),
+    "fused": ("fused_speed", "models as C against the exact lens as C"),
+    "models": ("make_models", "make the models that ship"),
+    "inverse": ("inverse", "inverse maps: how often they arrive"),
+    "zoom": ("zoom", "models of whole zooms, of internal focus"),
+    "equal-time": ("equal_time_page", "error over render time of every camera"),
+    "render": ("render_times_page", "render time by camera and scene"),
+    "mitsuba": ("mitsuba_speed", "speed of the renderer beside Mitsuba 3"),
+    "renderer": ("renderer_speed", "speed of the renderer on one scene, and of its meshes"),
+    "promises": ("promises", "models against the speed that their index promises"),
+    "gallery": ("gallery.run", "what real lenses do: figures and numbers"),
+    "optiland": ("compare_optiland", "speed of the exact tracer beside Optiland"),
+}
+_DESCRIPTION = """\
+Measure on this machine what the README reports, and write tables to experiments/results.
+Needs the extra "train"; run it from the project's folder."""
+
+
+def build_parser(argv: Sequence[str]) -> Parser:
+    """The whole command line; only the measurement that `argv` names is imported."""
+    parser = Parser(prog="python -m experiments", description=_DESCRIPTION)
+    kinds = parser.add_subparsers(metavar="NAME", required=True, parser_class=Parser)
+    for name, (module, text) in NAMES.items():
+        chosen = kinds.add_parser(name, help=text)
+        if argv[:1] == [name]:
+            found = import_module(f"experiments.{module}")
+            chosen.description = found.ABOUT
+            chosen.set_defaults(run=found.run, kept="what was finished is kept")
+            found.add_arguments(chosen)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one measurement and return its exit code, as `neurolens.cli.main` does."""
+    given = sys.argv[1:] if argv is None else argv
+    return cli.main(given, lambda: build_parser(given))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

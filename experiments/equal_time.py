@@ -1,0 +1,392 @@
+"""Equal time and equal samples: what each camera's picture is worth after so many seconds, against the exact lens.
+
+Renders are kept, one file a render, named by everything that it depends on, so that a run may be resumed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+import neurolens
+from experiments.equal_time_errors import (
+    Estimate,
+    FilmMap,
+    Floats,
+    Law,
+    bias_and_variance,
+    film_map,
+    paired_bias,
+    reference_variance,
+    squared_error,
+    weights,
+)
+from neurolens.base.files import atomic_path
+from neurolens.base.tomlfile import read_toml
+from neurolens.cameras.build import FUSED, Shot, make_camera
+from neurolens.cameras.contract import Camera
+from neurolens.cameras.exact import ExactCamera, FusedExactCamera
+from neurolens.cameras.onnxlens import load_model
+from neurolens.evaluate.image import DEFAULT, flip, flip_map
+from neurolens.evaluate.records import plain
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.paraxial import first_order
+from neurolens.render.film import FilmSettings
+from neurolens.render.renderer import render
+from neurolens.render.scene import CameraSettings, Scene, load_scene
+from neurolens.surrogates.domain import Domain
+
+EXACT, THIN = "exact", "thin lens"
+LENS = "laikin_double_gauss_50"
+# Name in the tables to the file in models/; those named fused run as compiled C (`cameras.fused`).
+MODELS = {"ols-28": f"{LENS}.ols-28.onnx", "mlp-16x2": f"{LENS}.mlp-16x2.onnx"}
+MODELS["fused mlp-16x2"] = MODELS["mlp-16x2"]
+FUSED_EXACT = "fused exact"
+EXACTS = (EXACT, FUSED_EXACT)
+
+
+def scene_cameras(root: Path, shot: CameraSettings) -> tuple[dict[str, Camera], ExactCamera]:
+    """The cameras of a scene by name, the exact one first, and the exact one in float64 for film-space errors.
+
+    All of the lens share the pupil bounds of the models' domain, so that the same random numbers are the same rays.
+    """
+    lens = read_lens(root / "lenses" / f"{LENS}.toml")
+    data = first_order(lens)
+    widest = shot.f_number is None or shot.f_number < data.f_number
+    f_number = data.f_number if widest else float(shot.f_number or 0)
+    card = load_model(root / "models" / next(iter(MODELS.values()))).card
+    bounds = Domain.from_dict(card["domain"]).bounds
+    film = (shot.film_width_mm, shot.film_height_mm)
+    set_ = Shot(film, shot.focus_m, None if widest else f_number, wavelength_nm=shot.wavelengths_nm)
+
+    same: dict[str, Any] = {
+        "film_mm": film,
+        "focus_m": shot.focus_m,
+        "f_number": set_.f_number,
+        "wavelength_nm": shot.wavelengths_nm,
+        "bounds": bounds,
+    }
+    cameras: dict[str, Camera] = {EXACT: ExactCamera(lens, **same)}
+    for name, model in MODELS.items():
+        spec = str(root / "models" / model)
+        cameras[name] = make_camera(FUSED + spec if name.startswith("fused") else spec, set_)
+    cameras[FUSED_EXACT] = FusedExactCamera(lens, **same)
+    cameras[THIN] = make_camera("thin", replace(set_, efl_mm=data.efl_mm, f_number=f_number))
+    return cameras, ExactCamera(lens, dtype="float64", **same)
+
+
+_SOURCES = ("cameras", "optics", "programs", "render")  # folders of the package that a picture depends on
+
+
+@dataclass(frozen=True)
+class Shelf:
+    """The renders of one scene through one camera.
+
+    Attributes:
+        folder: of its files; its name ends in the hash of scene, camera, film, size and source.
+    """
+
+    folder: Path
+    scene: Scene
+    camera: Camera
+    film: FilmSettings
+    size: tuple[int, int]
+
+    def file(self, samples: int, seed: int, threads: int) -> Path:
+        return self.folder / f"{samples}-{seed}-{threads}.npz"
+
+    def take(self, samples: int, seed: int, threads: int) -> tuple[NDArray[np.float32], float]:
+        """The picture [H, W, 3] and the seconds that it took, rendered or as an earlier run left it.
+
+        A file that is broken is made again. Raises what `render` does.
+        """
+        width, height = self.size
+        file = self.file(samples, seed, threads)
+        known = _read(file, (height, width, 3))
+        if known is not None:
+            return known
+        found = render(
+            self.scene, self.camera, width=width, height=height, samples=samples, seed=seed, threads=threads,
+            film=self.film,
+        )  # fmt: skip
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with atomic_path(file) as temporary:
+            np.savez(temporary, rgb=found.rgb, seconds=np.float64(found.stats["seconds"]))
+        return found.rgb, float(found.stats["seconds"])
+
+    def warm_up(self) -> None:
+        """A sample a pixel that nobody counts: the first render of a camera loads code and fills caches."""
+        width, height = self.size
+        render(self.scene, self.camera, width=width, height=height, samples=1, threads=1, film=self.film)
+
+
+def shelf(
+    run: Path, scene_file: Path, scene: Scene, name: str, camera: Camera, film: FilmSettings, size: tuple[int, int]
+) -> Shelf:
+    """The shelf of a camera in the folder of a run."""
+    about = [neurolens.__version__, _source(), _scene_bytes(scene_file), plain(camera.settings), film.__dict__, size]
+    model = camera.settings.get("model")
+    if model is not None:
+        about.append(hashlib.sha256(Path(model).read_bytes()).hexdigest())
+    digest = hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()
+    return Shelf(run / scene.name / f"{name.replace(' ', '-')}-{digest[:16]}", scene, camera, film, size)
+
+
+def _read(file: Path, shape: tuple[int, ...]) -> tuple[NDArray[np.float32], float] | None:
+    try:
+        with np.load(file, allow_pickle=False) as kept:
+            rgb, seconds = kept["rgb"], float(kept["seconds"])
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    good = rgb.shape == shape and rgb.dtype == np.float32 and np.isfinite(rgb).all() and seconds > 0
+    return (rgb, seconds) if good else None
+
+
+def _source() -> str:
+    """Hash of the code that makes pictures."""
+    digest = hashlib.sha256()
+    package = Path(neurolens.__file__).parent
+    for file in sorted(f for part in _SOURCES for f in (package / part).rglob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def _scene_bytes(file: Path) -> str:
+    """Hash of a scene file and of the files that it names, wherever it names one."""
+    digest = hashlib.sha256(file.read_bytes())
+    for named in sorted(set(_strings(read_toml(file)))):
+        beside = file.parent / named
+        if Path(named).suffix and beside.is_file():
+            digest.update(beside.read_bytes())
+    return digest.hexdigest()
+
+
+def _strings(value: Any) -> list[str]:
+    """Every string in tables of tables."""
+    if isinstance(value, str):
+        return [value]
+    inner = list(value.values()) if isinstance(value, Mapping) else value if isinstance(value, list) else []
+    return [text for part in inner for text in _strings(part)]
+
+
+SCENES = ("grid", "lights", "room")
+# Weight of a squared error: that of the RMSE, and of the relative MSE.
+MEASURES: dict[str, float | None] = {"mse": None, "rel_mse": DEFAULT.eps}
+_PASS_SEED, _SHORT_SEED, _REFERENCE_SEED = 100, 1000, 1_000_000
+
+
+@dataclass(frozen=True)
+class Counts:
+    """How much is rendered.
+
+    Attributes:
+        size: width and height in pixels.
+        short: samples of the renders shorter than a pass, each `repeats` times. pass_samples, passes: of a pass, and
+            how many. reference: samples of each half of the reference, rendered in `parts` with a seed each.
+    """
+
+    size: tuple[int, int] = (160, 90)
+    short: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
+    repeats: int = 4
+    pass_samples: int = 64
+    passes: int = 8
+    reference: int = 2048
+    parts: int = 2
+
+    @property
+    def jobs(self) -> list[tuple[int, int]]:
+        """(samples, seed) of the renders through each camera, passes last."""
+        short = [(n, _SHORT_SEED * (i + 1) + k) for k in range(self.repeats) for i, n in enumerate(self.short)]
+        return short + [(self.pass_samples, _PASS_SEED + k) for k in range(self.passes)]
+
+
+QUICK = Counts((64, 36), (1, 2, 4, 8), 2, 16, 4, 256, 1)
+
+
+@dataclass(frozen=True)
+class Level:
+    """Renders of one sample count: seconds best and median, mean squared errors and FLIP against the reference."""
+
+    samples: int
+    seconds_min: float
+    seconds_median: float
+    mse: float
+    rel_mse: float
+    flip: float
+
+
+@dataclass(frozen=True)
+class CameraResult:
+    """One camera in one scene.
+
+    Attributes:
+        levels: by samples. pass_s: best and median seconds of a pass.
+        bias2: by measure, against the exact camera with the same random numbers; the exact camera's is 0.
+        extrapolated2: by measure, bias^2 from the camera's own passes and the reference.
+        variance: by measure, of a pass. flip_same: FLIP of the mean picture against the exact camera's, same numbers.
+        picture: [H, W, 3] mean of the passes. flip_map: [H, W] of it against the reference.
+        film: where its rays land on the film.
+    """
+
+    name: str
+    levels: tuple[Level, ...]
+    pass_s: tuple[float, float]
+    bias2: dict[str, Estimate]
+    extrapolated2: dict[str, Estimate]
+    variance: dict[str, Estimate]
+    flip_same: float
+    picture: Floats
+    flip_map: Floats
+    film: FilmMap
+
+    def law(self, measure: str, bias2: float | None = None) -> Law:
+        """Error over time of a measure; `bias2` stands in for the estimate, which is taken as 0 where negative."""
+        known = max(self.bias2[measure].value, 0.0) if bias2 is None else bias2
+        points = [(level.seconds_min, getattr(level, measure)) for level in self.levels]
+        first = tuple(sorted((t, e) for t, e in points if t < self.pass_s[0] and e > 0))
+        return Law(known, self.variance[measure].value, self.pass_s[0], first)
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """All cameras in one scene; `noise2` is the reference's own variance by measure, `flip_halves` its halves' FLIP."""
+
+    name: str
+    settings: CameraSettings
+    f_number: float
+    counts: Counts
+    threads: int
+    reference: Floats
+    noise2: dict[str, float]
+    flip_halves: float
+    cameras: dict[str, CameraResult]
+
+
+def measure_scene(
+    file: Path, root: Path, run: Path, counts: Counts, threads: int, report: Callable[[float], None]
+) -> SceneResult:
+    """Render and measure one scene; what an earlier run left in `run` is not rendered again."""
+    torch.set_num_threads(1)  # in this process; workers do so themselves
+    scene = load_scene(file)
+    shot = scene.settings.camera
+    cameras, truth = scene_cameras(root, shot)
+    film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
+    shelves = {name: shelf(run, file, scene, name, c, film, counts.size) for name, c in cameras.items()}
+    halves, rendered = _render(shelves, counts, threads, report)
+    maps = {name: film_map(truth, c, wavelengths_nm=shot.wavelengths_nm) for name, c in cameras.items()}
+    reference = (halves[0] + halves[1]) / 2
+    by = {measure: weights(reference, eps) for measure, eps in MEASURES.items()}
+    found = {
+        name: camera_result(name, pictures, rendered[EXACT], halves, by, counts, maps[name])
+        for name, pictures in rendered.items()
+    }
+    noise2 = {measure: reference_variance(halves, weight) for measure, weight in by.items()}
+    f_number = float(cameras[EXACT].settings["f_number"])
+    apart = flip(halves[0], halves[1])
+    return SceneResult(scene.name, shot, f_number, counts, threads, reference, noise2, apart, found)
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Pictures [H, W, 3] and seconds of one camera, in the order of `Counts.jobs`."""
+
+    pictures: list[Floats]
+    seconds: list[float]
+
+
+def _render(
+    shelves: Mapping[str, Shelf], counts: Counts, threads: int, report: Callable[[float], None]
+) -> tuple[list[Floats], dict[str, Rendered]]:
+    """The reference's halves, and every camera's renders: the cameras in turn, so that none has the quiet minutes."""
+    jobs = counts.jobs
+    total = 2 * counts.reference + len(shelves) * sum(n for n, _ in jobs)
+    done, halves = 0, []
+    for half in range(2):
+        pictures, part = [], counts.reference // counts.parts
+        for k in range(counts.parts):
+            seed = _REFERENCE_SEED + half * counts.parts + k
+            pictures.append(shelves[EXACT].take(part, seed, threads=2)[0].astype(np.float64))
+            done += part
+            report(done / total)
+        halves.append(np.mean(pictures, axis=0))
+    rendered = {name: Rendered([], []) for name in shelves}
+    for kept in shelves.values():
+        if not all(kept.file(n, seed, threads).exists() for n, seed in jobs):
+            kept.warm_up()
+    for samples, seed in jobs:
+        for name, kept in shelves.items():
+            rgb, seconds = kept.take(samples, seed, threads)
+            rendered[name].pictures.append(rgb.astype(np.float64))
+            rendered[name].seconds.append(seconds)
+            done += samples
+            report(done / total)
+    return halves, rendered
+
+
+def camera_result(
+    name: str,
+    own: Rendered,
+    exact: Rendered,
+    halves: list[Floats],
+    by: Mapping[str, Floats],
+    counts: Counts,
+    film: FilmMap,
+) -> CameraResult:
+    """What one camera's renders say, against the exact lens's and the halves of the reference; weights `by` measure."""
+    passes, others = np.stack(own.pictures[-counts.passes :]), np.stack(exact.pictures[-counts.passes :])
+    times = own.seconds[-counts.passes :]
+    both = {measure: bias_and_variance(passes, halves, weight) for measure, weight in by.items()}
+    picture, reference = passes.mean(axis=0), (halves[0] + halves[1]) / 2
+    return CameraResult(
+        name,
+        tuple(_levels(own, halves, by, counts)),
+        (min(times), float(np.median(times))),
+        {measure: paired_bias(passes, others, weight) for measure, weight in by.items()},
+        {measure: b for measure, (b, _) in both.items()},
+        {measure: v for measure, (_, v) in both.items()},
+        flip(picture, others.mean(axis=0)),
+        picture,
+        flip_map(picture, reference),
+        film,
+    )
+
+
+def _levels(own: Rendered, halves: list[Floats], by: Mapping[str, Floats], counts: Counts) -> Iterator[Level]:
+    """Errors by sample count: of the short renders, then of as many passes as fit, in groups that share none."""
+    reference = (halves[0] + halves[1]) / 2
+
+    def level(samples: int, pictures: list[Floats], seconds: list[float]) -> Level:
+        errors = {m: float(np.mean([squared_error(p, halves, w) for p in pictures])) for m, w in by.items()}
+        seen = float(np.mean([flip(p, reference) for p in pictures]))
+        return Level(samples, min(seconds), float(np.median(seconds)), errors["mse"], errors["rel_mse"], seen)
+
+    order = [n for n, _ in counts.jobs]
+    for samples in counts.short:
+        mine = [k for k, n in enumerate(order) if n == samples]
+        yield level(samples, [own.pictures[k] for k in mine], [own.seconds[k] for k in mine])
+    passes, times = own.pictures[-counts.passes :], own.seconds[-counts.passes :]
+    for together in (2**k for k in range(int(math.log2(counts.passes)) + 1)):
+        groups = [passes[k : k + together] for k in range(0, counts.passes - together + 1, together)]
+        pictures = [np.mean(group, axis=0) for group in groups]
+        yield level(together * counts.pass_samples, pictures, [together * t for t in times])
+
+
+def scene_file(name: str, root: Path) -> Path:
+    """The file of a scene of the project by name, or of any by its path; read, so that mistakes show before the work.
+
+    Raises:
+        InputError: as `load_scene`.
+    """
+    file = root / "experiments" / "scenes" / f"{name}.toml" if name in SCENES else Path(name)
+    load_scene(file)
+    return file

@@ -1,0 +1,383 @@
+"""The lens of a panel, exact and as a surrogate fitted once to all shots of one state; its cameras, and what they see.
+
+One surrogate serves all shots of a state of the lens; a window is a part of a film, a view what a measure is given.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.gallery.settings import Panel
+from neurolens import __version__
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.progress import Report
+from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
+from neurolens.cameras.exact import ExactCamera, FusedExactCamera
+from neurolens.cameras.fused import FusedCamera
+from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.thin import ThinLens
+from neurolens.cameras.vignetting import Vignetted
+from neurolens.evaluate.image import Image
+from neurolens.evaluate.measure import fit_and_measure, known_record
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.paraxial import film_z_mm, first_order
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.render.pictures import make_aperture
+from neurolens.render.scene import Scene
+from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.fit import ModelSettings, prepare
+from neurolens.surrogates.pairs import PairSettings, make_pairs
+
+_CLEAR = 0.95  # rims over the radius of curvature, at most
+_VIGNETTING_RAYS = 50_000
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A panel with its lens and scene.
+
+    Attributes:
+        lens: in its state (size, zoom, widened, groups focused), stop at the shot's f-number, film in its place.
+        focus_m, f_number, film_mm: as set. offset_mm: of the film from where first order focuses this lens.
+    """
+
+    panel: Panel
+    scene: Scene
+    lens: Lens
+    focus_m: float
+    f_number: float
+    film_mm: tuple[float, float]
+    offset_mm: float
+
+    @property
+    def wavelength_nm(self) -> tuple[float, float]:
+        return self.scene.settings.camera.wavelengths_nm
+
+
+@dataclass(frozen=True)
+class Surrogate:
+    """An exported model, the domain it was fitted to, and its record (`rms_um`, ...; see `records.ModelRecord`)."""
+
+    file: Path
+    domain: Domain
+    record: dict[str, Any]
+
+
+def shot_of(panel: Panel, scene: Scene) -> Shot:
+    """The lens and the settings of a panel.
+
+    Raises:
+        InputError: as `read_lens` and `Lens.at`.
+    """
+    camera = scene.settings.camera
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NeurolensWarning)  # a lens of one wavelength is what the file asks for
+        lens = read_lens(panel.lens).at(focal_length_mm=panel.efl_mm, field_deg=panel.field_deg, zoom=panel.zoom)
+    lens = widened(lens, panel.widen)
+    shape = make_aperture(panel.blades, panel.blade_rotation_deg, panel.blade_curvature, panel.aperture_mask)
+    lens = lens.with_aperture(shape or scene.aperture or lens.aperture)
+    focus_m = camera.focus_m if panel.focus_m is None else panel.focus_m
+    f_number = panel.f_number or camera.f_number or float(first_order(lens).f_number)
+    lens = lens.at(f_number=f_number, focus_m=focus_m, focus=panel.focusing)
+    assert lens.film_z_mm is not None  # `at` places the film
+    film_z = float(lens.film_z_mm) + panel.film_offset_mm
+    lens = replace(lens, infinity_mm=())  # groups that have moved to focus stay there
+    return Shot(
+        panel,
+        scene,
+        replace(lens, film_z_mm=film_z),
+        focus_m,
+        f_number,
+        panel.film_mm or (camera.film_width_mm, camera.film_height_mm),
+        film_z - film_z_mm(lens, focus_m),
+    )
+
+
+def widened(lens: Lens, factor: float) -> Lens:
+    """The lens with all rims but the stop's wider by a factor, none near its surface's radius of curvature."""
+
+    def wider(s: Surface) -> Surface:
+        if s.stop or factor == 1:
+            return s
+        most = 2 * _CLEAR * abs(float(s.radius_mm))
+        return replace(s, diameter_mm=max(s.diameter_mm, min(factor * s.diameter_mm, most)))
+
+    return replace(lens, surfaces=tuple(wider(s) for s in lens.surfaces))
+
+
+def same_state(a: Shot, b: Shot) -> bool:
+    """Whether one surrogate serves both: the same glass and fit, whatever the stop and the film's place."""
+    same = a.lens.sha256 == b.lens.sha256 and a.panel.fit == b.panel.fit
+    return same and a.panel.model == b.panel.model and a.wavelength_nm == b.wavelength_nm
+
+
+def surrogate_of(shots: Sequence[Shot], cache: Path, report: Report) -> Surrogate:
+    """The shipped model that the shots name, or one fitted to all of them, taken from `cache` if it is there.
+
+    Args:
+        shots: of one state of the lens (`same_state`).
+    """
+    named = shots[0].panel.model
+    if named is not None:
+        card = load_model(named).card
+        return Surrogate(named, Domain.from_dict(card["domain"]), dict(card["errors"]))
+    lens = min((s.lens for s in shots), key=lambda each: -each.stop_radius_mm).with_aperture(None)
+    films = [float(s.lens.film_z_mm or 0) for s in shots]
+    asked = {
+        "film_radius_mm": max(math.hypot(*s.film_mm) / 2 for s in shots),
+        "film_z_mm": (min(films), max(films)),
+        "focus_m": (max(s.focus_m for s in shots), min(s.focus_m for s in shots)),
+        "wavelength_nm": shots[0].wavelength_nm,
+    }
+    return fitted(lens, asked, shots[0].panel.fit, cache, report)
+
+
+def fitted(
+    lens: Lens,
+    asked: dict[str, Any],
+    fit: ModelSettings,
+    cache: Path,
+    report: Report,
+    pairs: PairSettings = PairSettings(),  # noqa: B008  frozen
+) -> Surrogate:
+    """A surrogate of `lens` over the domain `asked` (arguments of `domain_of`), kept in `cache`."""
+    made_of = [__version__, lens.sha256, lens.stop_radius_mm, asked, asdict(fit), asdict(pairs)]
+    fingerprint = hashlib.sha256(json.dumps(made_of, sort_keys=True, default=str).encode()).hexdigest()
+    folder = cache / f"{lens.lens_id}-{fingerprint[:12]}"
+    file = folder / f"{fit.label}.onnx"
+    made = sorted(folder.glob(f"{fit.label}.json"))
+    if made and file.is_file():
+        told = json.loads(made[0].read_text(encoding="utf-8"))
+        record = known_record(made[0], file, told.get("fingerprint", ""))
+        if record is not None:
+            return Surrogate(file, Domain.from_dict(load_model(file).card["domain"]), record)
+    folder.mkdir(parents=True, exist_ok=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NeurolensWarning)  # its errors stand in the table
+        domain = domain_of(lens, **asked)
+        prepared = prepare(make_pairs(lens, domain, pairs))
+        measured = fit_and_measure(prepared, fit, folder, _VIGNETTING_RAYS, report)
+    return Surrogate(measured.file, domain, measured.record)
+
+
+Array = NDArray[np.float64]
+
+NEAR_CORNER = 0.95  # of the way to the film's corner, where falloff is matched and measured
+_SQUARE = 64  # pupil samples a side
+
+
+def illumination(camera: Camera, radii_mm: Array, azimuth_deg: float = 33.7) -> Array:
+    """Mean weight of the rays of film points [N] mm from the centre at 550 nm: a white card without noise."""
+    middle = ((np.arange(_SQUARE) + 0.5) / _SQUARE).astype(np.float32)
+    square = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
+    where = np.array([math.cos(math.radians(azimuth_deg)), math.sin(math.radians(azimuth_deg))])
+    wavelength, found = np.full(square.shape[1], 550.0, np.float32), []
+    for radius in radii_mm:
+        film = np.repeat((where * radius)[:, None], square.shape[1], axis=1).astype(np.float32)
+        rays = camera.sample(film, square, wavelength)
+        found.append(np.where(rays.status == st.PASSED, rays.weight, 0).mean(dtype=np.float64))
+    return np.array(found)
+
+
+def post_process(radius_mm: Any, k: float) -> Any:
+    """The vignette that editors and shaders draw: the cosine law, (1 + k r^2)^-2 at a film radius r in mm."""
+    return (1 + k * radius_mm * radius_mm) ** -2
+
+
+def strength_for(radius_mm: float, left: float) -> float:
+    """k of the post-process that leaves the share `left` of the light at a radius."""
+    return float((left**-0.5 - 1) / radius_mm**2)
+
+
+class PostProcessed:
+    """A camera whose picture is even, darkened afterwards by a post-process that meets a lens at one film radius.
+
+    Args:
+        plain: the camera that takes the picture. lens: whose light is met at the centre and near the film's corner.
+    """
+
+    def __init__(self, plain: Camera, lens: Camera) -> None:
+        radius = NEAR_CORNER * math.hypot(*plain.film_mm) / 2
+        middle, corner = illumination(lens, np.array([0.0, radius]))
+        self.strength = strength_for(radius, corner / middle)
+        self._plain = plain
+        self.film_mm, self.name, self.achromatic = plain.film_mm, "post-process", getattr(plain, "achromatic", False)
+        self.wavelength_nm, self.dispersive = plain.wavelength_nm, plain.dispersive
+        self.settings: dict[str, Any] = {**plain.settings, "post_process_k": self.strength}
+
+    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """As the camera's, every ray weighing what the post-process leaves at its film point [2, N]."""
+        rays = self._plain.sample(film_mm, pupil, wavelength_nm)
+        left = post_process(np.hypot(film_mm[0], film_mm[1]), self.strength).astype(np.float32)
+        return replace(rays, weight=np.where(rays.status == st.PASSED, left, np.float32(0)))
+
+
+class Window:
+    """A part of a camera's film, as a camera: film points are counted from the window's centre.
+
+    Args:
+        camera: of the whole film.
+        window_mm: centre x and y as printed (x right, y up: the lens frame turned by 180 degrees), width and height.
+    """
+
+    def __init__(self, camera: Camera, window_mm: tuple[float, float, float, float]) -> None:
+        x, y, width, height = window_mm
+        self._camera = camera
+        self._centre = np.array([[-x], [-y]], np.float32)
+        self.film_mm = (width, height)
+        self.name, self.wavelength_nm, self.dispersive = camera.name, camera.wavelength_nm, camera.dispersive
+        self.achromatic = getattr(camera, "achromatic", False)
+        self.rays_a_call = getattr(camera, "rays_a_call", RAYS_A_CALL)
+        self.settings: dict[str, Any] = {**camera.settings, "window_mm": list(window_mm)}
+
+    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """As the camera's, the film points [2, N] in mm counted from the window's centre."""
+        return self._camera.sample(film_mm + self._centre, pupil, wavelength_nm)
+
+    def for_worker(self) -> Window:
+        """The same window on a camera of the worker's own."""
+        opener = getattr(self._camera, "for_worker", None)
+        other = Window.__new__(Window)
+        other.__dict__.update(self.__dict__)
+        other._camera = self._camera if opener is None else opener()
+        return other
+
+
+def exact_camera(shot: Shot, surrogate: Surrogate | None, kind: type[ExactCamera] = ExactCamera) -> Camera:
+    """The prescription itself, sampled over the surrogate's pupil: the same rays for the same random numbers."""
+    return kind(
+        replace(shot.lens, film_z_mm=None),
+        film_mm=shot.film_mm,
+        focus_m=shot.focus_m,
+        wavelength_nm=shot.wavelength_nm,
+        bounds=None if surrogate is None else surrogate.domain.bounds,
+        film_offset_mm=shot.offset_mm,
+    )
+
+
+def surrogate_camera(shot: Shot, surrogate: Surrogate | None, kind: type[OnnxCamera] = OnnxCamera) -> Camera:
+    """The exported model."""
+    assert surrogate is not None
+    return kind(
+        load_model(surrogate.file),
+        film_mm=shot.film_mm,
+        focus_m=shot.focus_m,
+        f_number=float(first_order(shot.lens).f_number),
+        aperture=shot.lens.aperture,
+        wavelength_nm=shot.wavelength_nm,
+        film_offset_mm=shot.offset_mm,
+    )
+
+
+def thin_camera(shot: Shot, surrogate: Surrogate | None) -> Camera:
+    """A thin lens of the same focal length, f-number and focus, its film moved as the panel asks."""
+    return ThinLens(
+        float(first_order(shot.lens).efl_mm),
+        shot.f_number,
+        shot.focus_m,
+        shot.film_mm,
+        aperture=shot.lens.aperture,
+        film_offset_mm=shot.panel.film_offset_mm,
+    )
+
+
+def pinhole_camera(shot: Shot, surrogate: Surrogate | None) -> Camera:
+    """A pinhole at the focal length."""
+    return Pinhole(float(first_order(shot.lens).efl_mm), shot.film_mm, shot.f_number)
+
+
+def post_processed(shot: Shot, surrogate: Surrogate | None) -> Camera:
+    """A thin lens without vignetting, darkened afterwards to the exact lens's centre and corner."""
+    return PostProcessed(thin_camera(shot, surrogate), exact_camera(shot, surrogate))
+
+
+# Columns that an effect may ask for. A camera is made of the shot and of the surrogate, None where no column needs one.
+CAMERAS: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
+    "exact": exact_camera,
+    "surrogate": surrogate_camera,
+    "thin": thin_camera,
+    "pinhole": pinhole_camera,
+    "post": post_processed,
+}
+# The same as compiled code: many times as fast, but not for every lens, nor on every machine.
+_COMPILED: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
+    "exact": partial(exact_camera, kind=FusedExactCamera),
+    "surrogate": partial(surrogate_camera, kind=FusedCamera),
+}
+TITLES = {
+    "exact": "exact lens",
+    "surrogate": "surrogate",
+    "thin": "thin lens",
+    "pinhole": "pinhole",
+    "post": "post-process",
+}
+
+
+def camera_of(column: str, shot: Shot, surrogate: Surrogate | None, compiled: bool = False) -> Camera:
+    """The camera of a column, with what the panel leaves of its vignetting.
+
+    Args:
+        compiled: as compiled code, where there can be such: the same rays to rounding.
+    """
+    camera = None
+    if compiled and column in _COMPILED:
+        with suppress(InputError):  # coatings, absorbing glass, or no compiler
+            camera = _COMPILED[column](shot, surrogate)
+    if camera is None:
+        camera = CAMERAS[column](shot, surrogate)
+    left = shot.panel.vignetting
+    return camera if left == "both" else Vignetted(camera, left, shot.wavelength_nm)
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera's share of a panel.
+
+    Attributes:
+        shot: panel, scene and lens. camera: of the whole film, in millimetres of the lens frame.
+        column: its name. rgb: [H, W, 3] linear sRGB of the part that is drawn, before any exposure.
+    """
+
+    shot: Shot
+    camera: Camera
+    column: str
+    rgb: FloatArray
+
+    @property
+    def window_mm(self) -> tuple[float, float, float, float]:
+        """Centre x and y as printed, width and height of the picture."""
+        return self.shot.panel.window_mm or (0.0, 0.0, *self.shot.film_mm)
+
+    @property
+    def grey(self) -> Image:
+        """[H, W] luminance (Rec. 709)."""
+        return luminance(self.rgb)
+
+    def places_mm(self) -> tuple[Image, Image]:
+        """Film x and y [H, W] of the pixels' middles, as printed: x right, y up."""
+        height, width = self.rgb.shape[:2]
+        x, y, wide, tall = self.window_mm
+        across = x + wide * ((np.arange(width) + 0.5) / width - 0.5)
+        up = y + tall * (0.5 - (np.arange(height) + 0.5) / height)
+        x_mm, y_mm = np.meshgrid(across, up)
+        return x_mm, y_mm
+
+
+def luminance(rgb: FloatArray) -> Image:
+    """Rec. 709 luminance of linear RGB [..., 3]."""
+    grey: Image = np.asarray(rgb, np.float64) @ np.array([0.2126, 0.7152, 0.0722])
+    return grey

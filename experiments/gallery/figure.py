@@ -1,0 +1,176 @@
+"""The figure of an effect: a row a panel, a column a camera, their difference last; axes in millimetres of film."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image as Pictures
+
+from experiments.gallery.cameras import TITLES, luminance
+from neurolens.analysis.plot_style import new_figure, style
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path
+from neurolens.evaluate.image import Image, to_srgb
+
+DPI = 100  # a picture of 240 pixels is 2.4 inches wide: one pixel of it, one of the figure
+MOST_BYTES = 250_000
+_SCALE_COLOURS = 20
+_LEFT, _GAP, _HEAD, _FOOT, _BAR, _LABEL = 0.52, 0.1, 0.62, 0.34, 0.98, 0.2  # inches
+
+
+@dataclass(frozen=True)
+class Row:
+    """One panel's pictures.
+
+    Attributes:
+        label, window_mm: centre x and y as printed, width and height.
+        pictures: column to linear RGB [H, W, 3]. exposure: factor on them.
+        difference: [H, W] |surrogate - exact| in luminance, as a share of white, or None.
+    """
+
+    label: str
+    window_mm: tuple[float, float, float, float]
+    pictures: dict[str, Any]
+    exposure: float
+    difference: Image | None
+
+
+def difference_of(surrogate: Any, exact: Any, exposure: float) -> Image:
+    """|surrogate - exact| in luminance [H, W], as a share of the display's white."""
+    return np.abs(luminance(surrogate) - luminance(exact)) * exposure
+
+
+def exposure_of(exact: Any, stops: float | str) -> float:
+    """The factor on linear RGB that `Panel.exposure` asks for."""
+    if not isinstance(stops, str):
+        return float(2.0**stops)
+    brightest = float(np.percentile(luminance(exact), 99.5)) or float(luminance(exact).max())
+    return 0.9 / brightest if brightest > 0 else 1.0
+
+
+def draw(title: str, rows: Sequence[Row], path: Path) -> None:
+    """Write the figure as a PNG of at most `MOST_BYTES`.
+
+    Raises:
+        InputError: no rows, or a figure that cannot be made so small.
+    """
+    if not rows:
+        raise InputError("gallery figure", "rows", "(none)", "at least one panel")
+    maps = [row.difference for row in rows if row.difference is not None]
+    scale = _rounded_up(max((float(np.percentile(m, 99.5)) for m in maps), default=0.0))
+    with style():
+        figure, boxes, bar = _page(rows, bool(maps))
+        figure.text(0.006, 1 - 0.08 / figure.get_figheight(), title, fontsize=12.5, fontweight="bold", va="top")
+        shown = None
+        for index, (row, places) in enumerate(zip(rows, boxes, strict=True)):
+            for k, (column, place) in enumerate(zip([*row.pictures, "difference"], places, strict=False)):
+                if column == "difference" and row.difference is None:
+                    continue
+                axes = figure.add_axes(place)
+                extent = _extent(row.window_mm)
+                if column == "difference":
+                    shown = axes.imshow(
+                        row.difference, cmap="magma", vmin=0, vmax=scale, extent=extent, interpolation="nearest"
+                    )
+                else:
+                    picture = to_srgb(row.pictures[column], row.exposure)
+                    axes.imshow(picture, extent=extent, interpolation="nearest")
+                _axes(axes, first=k == 0)
+                if k == 0:
+                    axes.set_title(row.label, loc="left", fontsize=8.6, pad=3)
+                if index == 0:
+                    name = TITLES.get(column, "|surrogate - exact|" if column == "difference" else column)
+                    height = places[0][1] + places[0][3] + _LABEL / figure.get_figheight()
+                    figure.text(place[0], height, name, fontsize=9.5, fontweight="bold", va="bottom")
+        if shown is not None:
+            colours = figure.colorbar(shown, cax=figure.add_axes(bar), format="%.1e")
+            colours.set_label("share of white", fontsize=8)
+            colours.ax.tick_params(labelsize=7)
+            colours.outline.set_visible(False)
+        _save_small(figure, path)
+
+
+def _extent(window_mm: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    x, y, width, height = window_mm
+    return x - width / 2, x + width / 2, y - height / 2, y + height / 2
+
+
+def _axes(axes: Any, first: bool) -> None:
+    axes.tick_params(labelsize=6.5, length=2, pad=1.5)
+    axes.locator_params(nbins=4)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    if first:
+        axes.set_ylabel("film y (mm)", fontsize=7, labelpad=1)
+        axes.set_xlabel("film x (mm)", fontsize=7, labelpad=1)
+    else:
+        axes.set_xticks([])
+        axes.set_yticks([])
+
+
+def _page(rows: Sequence[Row], maps: bool) -> tuple[Any, list[list[Any]], Any]:
+    """A figure, boxes (left, bottom, width, height in shares) of every row's pictures, and that of the colour bar."""
+    sizes = [next(iter(row.pictures.values())).shape[:2] for row in rows]
+    columns = max(len(row.pictures) for row in rows) + maps
+    wide = max(width for _, width in sizes) / DPI
+    heights = [height / DPI for height, _ in sizes]
+    page = (_LEFT + columns * (wide + _GAP) + (_BAR if maps else 0), _HEAD + sum(h + _FOOT + _LABEL for h in heights))
+    figure = new_figure(*page)
+    figure.set_layout_engine("none")
+
+    def box(left: float, top: float, width: float, height: float) -> tuple[float, float, float, float]:
+        return left / page[0], 1 - (top + height) / page[1], width / page[0], height / page[1]
+
+    boxes, top = [], _HEAD
+    for (_, across), tall in zip(sizes, heights, strict=True):
+        boxes.append([box(_LEFT + k * (wide + _GAP), top, across / DPI, tall) for k in range(columns)])
+        top += tall + _FOOT + _LABEL
+    return figure, boxes, box(page[0] - _BAR + 0.08, _HEAD, 0.13, min(max(heights[0], 1.4), 2.6))
+
+
+def _rounded_up(value: float) -> float:
+    """1, 2 or 5 times a power of ten; 1e-6 where nothing differs."""
+    power = 10.0 ** math.floor(math.log10(max(value, 1e-6)))
+    return next(step * power for step in (1, 2, 5, 10) if step * power >= max(value, 1e-6) * (1 - 1e-9))
+
+
+def _scale_colours() -> list[int]:
+    """R, G, B of the scale of the difference and of white, one after the other."""
+    from matplotlib import colormaps
+
+    scale = 255 * colormaps["magma"](np.linspace(0, 1, _SCALE_COLOURS - 1))[:, :3]
+    return [*(int(v) for v in scale.round().ravel()), 255, 255, 255]  # and the page's white
+
+
+def _save_small(figure: Any, path: Path) -> None:
+    """Write the figure in all its colours, or where that is too large with as many as keep it small, 256 to 32."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=DPI, facecolor="white", format="png")
+    picture = Pictures.open(drawn).convert("RGB")
+    for colours in (None, 256, 128, 64, 48, 32):
+        packed = io.BytesIO()
+        (picture if colours is None else _reduced(picture, colours)).save(packed, "PNG", optimize=True)
+        if packed.tell() <= MOST_BYTES:
+            with atomic_path(path) as temporary:
+                temporary.write_bytes(packed.getvalue())
+            return
+    size = f"{packed.tell()} bytes at 32 colours"
+    raise InputError(path, "size", f"({size})", f"at most {MOST_BYTES} bytes: smaller or fewer pictures")
+
+
+def _reduced(picture: Any, colours: int) -> Any:
+    """A picture of so many colours."""
+    # The pictures would crowd out the scale of the difference, which must stay what the bar says.
+    palette = Pictures.new("P", (1, 1))
+    own = picture.quantize(colours - _SCALE_COLOURS).getpalette() or []
+    palette.putpalette([*own[: 3 * (colours - _SCALE_COLOURS)], *_scale_colours()])
+    few = picture.quantize(palette=palette, dither=Pictures.Dither.NONE)
+    page = Pictures.fromarray((np.asarray(picture) == 255).all(axis=2))
+    few.paste(colours - 1, mask=page)  # the library finds near colours only
+    return few

@@ -1,0 +1,336 @@
+"""Renders and measures the effects of the gallery, and writes their page; what an earlier run finished is kept."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from experiments import lab
+from experiments.gallery.cameras import (
+    CAMERAS,
+    TITLES,
+    Shot,
+    Surrogate,
+    View,
+    Window,
+    camera_of,
+    same_state,
+    shot_of,
+    surrogate_of,
+)
+from experiments.gallery.figure import Row, difference_of, draw, exposure_of
+from experiments.gallery.measures import MEASURES
+from experiments.gallery.settings import Effect, Panel, find_effects, read_effect
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_write_text
+from neurolens.base.progress import Progress, Report
+from neurolens.commands.arguments import add_json, whole
+from neurolens.commands.output import print_json, table
+from neurolens.evaluate.train import versions
+from neurolens.render.renderer import render
+from neurolens.render.scene import load_scene
+
+SCHEMA = 1
+
+
+def run_effect(
+    effect: Effect, out: Path, cache: Path, *, samples: int | None = None, threads: int = 2, progress: Progress
+) -> dict[str, Any]:
+    """Render and measure an effect: NAME.png and NAME.json in `out`, fitted models in `cache`.
+
+    Args:
+        samples: a pixel; None takes each panel's own.
+
+    Returns:
+        The record, as in NAME.json; that of an earlier run where nothing has changed since.
+
+    Raises:
+        InputError: whatever is wrong with lenses, scenes, columns or the measure's name.
+    """
+    check(effect)
+    fingerprint = fingerprint_of(effect, samples)
+    known = finished(effect, out)
+    if known is not None and known["fingerprint"] == fingerprint:
+        progress.note(f"{effect.name}: done by an earlier run")
+        return known
+    shots = [shot_of(panel, load_scene(panel.scene)) for panel in effect.panel]
+    surrogates = _surrogates(effect, shots, cache, progress)
+    rows, panels = [], []
+    with progress.stage(f"{effect.name}: render") as report:
+        for k, (shot, surrogate) in enumerate(zip(shots, surrogates, strict=True)):
+            views = _views(effect, shot, surrogate, samples, threads, _part(report, k, len(shots)))
+            row = _row(shot, views)
+            rows.append(row)
+            panels.append(_record(effect, shot, surrogate, views, row))
+    record = {
+        "schema": SCHEMA,
+        "name": effect.name,
+        "title": effect.title,
+        "text": effect.text,
+        "source": effect.source,
+        "command": f"python -m experiments gallery {effect.name}",
+        "panels": panels,
+        "samples": samples,
+        "versions": versions(),
+        "fingerprint": fingerprint,
+    }
+    draw(effect.title, rows, out / f"{effect.name}.png")
+    atomic_write_text(out / f"{effect.name}.json", json.dumps(_plain(record), indent=1, allow_nan=False) + "\n")
+    return record
+
+
+def check(effect: Effect) -> None:
+    """Refuse names of columns and of a measure that do not exist, before anything is rendered."""
+    if effect.measure not in MEASURES:
+        raise InputError(effect.path, "measure", effect.measure, f"one of: {', '.join(MEASURES)}")
+    for column in effect.columns:
+        if column not in CAMERAS:
+            raise InputError(effect.path, "columns", column, f"one of: {', '.join(CAMERAS)}")
+    if not effect.columns:
+        raise InputError(effect.path, "columns", "(none)", f"some of: {', '.join(CAMERAS)}")
+
+
+def fingerprint_of(effect: Effect, samples: int | None) -> str:
+    """A hash of everything that a figure depends on: files and pictures named, settings, versions, samples."""
+    fits = [asdict(panel.fit) for panel in effect.panel]  # where the file says nothing, the defaults of this version
+    found = hashlib.sha256(json.dumps([SCHEMA, versions(), samples, fits], sort_keys=True).encode())
+    for file in [effect.path, *(file for panel in effect.panel for file in panel.files())]:
+        found.update(file.read_bytes())
+    for scene in dict.fromkeys(panel.scene for panel in effect.panel):
+        for image in load_scene(scene).images.values():
+            found.update(image.tobytes())
+    return found.hexdigest()[:16]
+
+
+def finished(effect: Effect, out: Path) -> dict[str, Any] | None:
+    """The record that an earlier run left, with its figure."""
+    try:
+        record = json.loads((out / f"{effect.name}.json").read_text(encoding="utf-8"))
+        return record if record["schema"] == SCHEMA and (out / f"{effect.name}.png").is_file() else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _part(report: Report, k: int, count: int) -> Report:
+    """Progress of the k-th of so many equal parts."""
+    return lambda fraction, _left=None: report((k + fraction) / count)
+
+
+def _surrogates(effect: Effect, shots: Sequence[Shot], cache: Path, progress: Progress) -> list[Surrogate | None]:
+    """One for each shot; shots through one state of the lens share theirs."""
+    if "surrogate" not in effect.columns:
+        return [None] * len(shots)
+    made: list[tuple[Shot, Surrogate]] = []
+    for shot in shots:
+        if not any(same_state(shot, other) for other, _ in made):
+            alike = [s for s in shots if same_state(shot, s)]
+            with progress.stage(f"{effect.name}: surrogate of {shot.lens.lens_id}") as report:
+                surrogate = surrogate_of(alike, cache, report)
+            progress.note(f"{effect.name}: {surrogate.file.stem}, {_error(surrogate.record)}")
+            made.append((shot, surrogate))
+    return [next(s for other, s in made if same_state(shot, other)) for shot in shots]
+
+
+def _error(record: dict[str, Any]) -> str:
+    if record.get("rms_um") is not None:
+        return f"RMS {record['rms_um']:.3g} um on the film"
+    return f"RMS {record.get('direction_rms_deg') or math.nan:.3g} degrees"
+
+
+def _views(
+    effect: Effect, shot: Shot, surrogate: Surrogate | None, samples: int | None, threads: int, report: Report
+) -> dict[str, View]:
+    """What every camera of a panel saw."""
+    panel, views = shot.panel, {}
+    window = panel.window_mm or (0.0, 0.0, *shot.film_mm)
+    for k, column in enumerate(effect.columns):
+        camera = camera_of(column, shot, surrogate)
+        # One wavelength a path where the lens disperses: exact lens and surrogate then share their random numbers.
+        film = replace(shot.scene.settings.film, wavelengths="one" if camera.dispersive else "hero")
+        done = render(
+            shot.scene,
+            Window(camera_of(column, shot, surrogate, compiled=True), window),
+            width=panel.width,
+            height=height_of(panel, window),
+            samples=samples or panel.samples,
+            threads=threads,
+            film=film,
+        )
+        views[column] = View(shot, camera, column, done.rgb)
+        report((k + 1) / len(effect.columns))
+    return views
+
+
+def height_of(panel: Panel, window_mm: tuple[float, float, float, float]) -> int:
+    """Of the picture, in pixels."""
+    return max(1, round(panel.width * window_mm[3] / window_mm[2]))
+
+
+def _row(shot: Shot, views: dict[str, View]) -> Row:
+    first = next(iter(views.values()))
+    exposure = exposure_of(views.get("exact", first).rgb, shot.panel.exposure)
+    difference = None
+    if "exact" in views and "surrogate" in views:
+        difference = difference_of(views["surrogate"].rgb, views["exact"].rgb, exposure)
+    return Row(shot.panel.label, first.window_mm, {c: v.rgb for c, v in views.items()}, exposure, difference)
+
+
+def _record(
+    effect: Effect, shot: Shot, surrogate: Surrogate | None, views: dict[str, View], row: Row
+) -> dict[str, Any]:
+    measured = {column: MEASURES[effect.measure](view) for column, view in views.items()}
+    names = list(dict.fromkeys(name for found in measured.values() for name in found))
+    return {
+        "label": shot.panel.label,
+        "lens": shot.lens.lens_id,
+        "f_number": shot.f_number,
+        "surrogate": None
+        if surrogate is None
+        else {
+            "name": surrogate.file.stem,
+            **{k: surrogate.record.get(k) for k in ("rms_um", "direction_rms_deg", "false_pass", "false_block")},
+        },
+        "difference_mean": None if row.difference is None else float(row.difference.mean()),
+        "measured": {name: {c: found.get(name) for c, found in measured.items()} for name in names},
+    }
+
+
+def _plain(value: Any) -> Any:
+    """JSON-able: numbers of four digits, those that are none as null."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return float(f"{value:.4g}") if math.isfinite(value) else None
+    return value
+
+
+_HEAD = """\
+# What real lenses do
+
+Small scenes after the figures of two theses (Steinert 2009, Willi 2021), each through the exact lens, a surrogate of it
+and a thin lens of the same focal length and f-number; the last column is the difference of surrogate and exact in
+luminance, the same random numbers in both. Below each figure stands what is measured of the effect. Axes are
+millimetres of film, pictures upright. Made by `python -m experiments gallery`; one effect by the command beside it.
+"""
+
+
+def write_page(records: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Write README.md of the records (see `run.run_effect`), whose figures lie beside it."""
+    atomic_write_text(path, "\n".join([_HEAD, *(section(record) for record in records)]))
+
+
+def section(record: Mapping[str, Any]) -> str:
+    """One effect, in Markdown."""
+    name = record["name"]
+    return "\n".join(
+        [
+            f"## {record['title']}\n",
+            f"{record['text'].strip()}\n",
+            f"![{record['title']}]({name}.png)\n",
+            effect_table(record),
+            f"\nAfter {record['source'].strip()} [experiments/gallery/{name}.toml]"
+            f"(../../gallery/{name}.toml), `{record['command']}`.\n",
+        ]
+    )
+
+
+def effect_table(record: Mapping[str, Any]) -> str:
+    """The measured numbers: a row a panel and quantity, a column a camera, and the surrogate's error."""
+    panels = record["panels"]
+    columns = list(dict.fromkeys(c for p in panels for found in p["measured"].values() for c in found))
+    head = ["panel", "measured", *(TITLES.get(c, c) for c in columns)]
+    lines = [f"| {' | '.join(head)} | RMS of the surrogate |", f"|{'---|' * (len(head) + 1)}"]
+    for panel in panels:
+        for k, (quantity, found) in enumerate(panel["measured"].items()):
+            cells = [panel["label"] if k == 0 else "", quantity_name(quantity)]
+            cells += [_number(found.get(c)) for c in columns] + [_page_error(panel["surrogate"]) if k == 0 else ""]
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def quantity_name(key: str) -> str:
+    """A key with its unit last, in words: "radius_um" is "radius (um)"."""
+    for unit in ("um", "mm", "deg", "percent", "nm", "stops"):
+        if key.endswith(f"_{unit}"):
+            return f"{key[: -len(unit) - 1].replace('_', ' ')} ({'%' if unit == 'percent' else unit})"
+    return key.replace("_", " ")
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3g}"
+
+
+def _page_error(surrogate: Mapping[str, Any] | None) -> str:
+    if surrogate is None:
+        return "–"
+    if surrogate["rms_um"] is not None:
+        return f"{surrogate['rms_um']:.2g} um ({surrogate['name'].rpartition('.')[2]})"
+    degrees = surrogate.get("direction_rms_deg")
+    return "–" if degrees is None else f"{degrees:.2g} deg"
+
+
+ABOUT = """\
+Render small scenes that show what real lenses do, each through the exact lens, a surrogate and a
+thin lens, and measure the effect in each. An effect is a file of experiments/gallery; its figure,
+its numbers and a page of all are written to experiments/results/gallery. What an earlier run
+finished is not done again; fitted models are kept in runs/gallery."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `python -m experiments gallery`."""
+    parser.add_argument("effects", metavar="EFFECT", nargs="*", help="names of effects (default: all)")
+    parser.add_argument("--list", action="store_true", help="list the effects and stop")
+    parser.add_argument(
+        "--effects-in", metavar="DIR", type=Path, default=lab.ROOT / "experiments" / "gallery",
+        help="effect files (default: experiments/gallery)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--samples", metavar="N", type=whole(1, 1 << 16), help="samples a pixel (default: the effect's own)"
+    )
+    parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=2, help="workers (default: 2)")
+    lab.add_out(parser, lab.RESULTS / "gallery", "folder")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Render and measure the effects asked for, then write the page of all that are there."""
+    folder, out = args.effects_in, args.out
+    effects = [read_effect(path) for path in find_effects(folder, args.effects)]
+    for effect in effects:
+        check(effect)
+    if args.list:
+        print(table(("effect", "title"), [(effect.name, effect.title) for effect in effects], left=2))
+        return 0
+    out.mkdir(parents=True, exist_ok=True)
+    progress, records = Progress(quiet=args.quiet), []
+    for effect in effects:
+        cache = lab.ROOT / "runs" / "gallery"
+        records.append(run_effect(effect, out, cache, samples=args.samples, threads=args.threads, progress=progress))
+        everything = [finished(read_effect(path), out) for path in find_effects(folder)]
+        write_page([record for record in everything if record is not None], out / "README.md")
+    if args.json:
+        print_json({"effects": records})
+        return 0
+    columns = ("exact", "surrogate", "thin")
+    rows = [
+        (
+            record["name"],
+            panel["label"],
+            quantity_name(name),
+            *("-" if found.get(c) is None else f"{found[c]:.4g}" for c in columns),
+        )
+        for record in records
+        for panel in record["panels"]
+        for name, found in panel["measured"].items()
+    ]
+    print(table(("effect", "panel", "measured", *columns), rows, left=3))
+    print(out / "README.md")
+    return 0

@@ -1,0 +1,298 @@
+"""How often inverse maps arrive: a direct fit with limited Newton steps, beside Newton's method as published.
+
+As published (Hanika and Dachsbacher 2014; Schrade et al. 2016): from the first-order map, undamped, a fixed number of
+steps, with the Jacobian of the polynomial. Both work on the same model, so that only the iteration differs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from experiments import lab
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.progress import Progress
+from neurolens.commands.arguments import whole
+from neurolens.evaluate.experiment import LensChoice
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph
+from neurolens.graph.newton import solve, with_jacobian
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.optics.surfaces import Rays
+from neurolens.surrogates.domain import Domain, FilmRays, domain_of, sample_domain
+from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
+from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, front_rays, scene_system, stop_system
+from neurolens.surrogates.inverse_fit import convergence, fit_inverse
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.threads import pinned_threads
+
+PUBLISHED_STEPS = (3, 5, 10, 20)
+# A residual beyond this (in stop radii; of the front's radius, in radians) has run away, not merely missed.
+AWAY = 1.0
+# Points a side of the grid of starts that looks for rays which an inverse map says are not there.
+_STARTS = 7
+
+
+@dataclass(frozen=True)
+class BenchSettings:
+    """What is measured: `rays` that pass a lens (a tenth otherwise than by three steps), `uniform` stop points.
+
+    `raw`: whether a model as published too, of raw monomials chosen by matching pursuit, is inverted both ways.
+    """
+
+    rays: int = 100_000
+    uniform: int = 10_000
+    terms: int = 64
+    raw: bool = False
+
+
+def measure_lens(file: Path, settings: BenchSettings) -> dict[str, Any]:
+    """One record: lens, focus_m, passing share of rays, and for "stop" and "scene" the shares of `_Shares`.
+
+    Raises:
+        InputError: a lens that cannot be fitted.
+    """
+    with pinned_threads(), warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore", NeurolensWarning)
+        lens = LensChoice(file).read()
+        domain = _domain(lens)
+        known = prepare(make_pairs(lens, domain, PairSettings(train=15000, held_out=settings.rays, rim=15000)))
+        model = fit_model(known, ModelSettings("ols", terms=settings.terms))
+        inverse = fit_inverse(model, known.pairs)
+        rays = known.pairs.held_out.inputs
+        few = rays.select(slice(0, settings.rays // 10))
+        record: dict[str, Any] = {
+            "lens": file.stem,
+            "focus_m": ["inf" if math.isinf(f) else f for f in domain.focus_m],
+            "fit": inverse.report,
+            "ours": {
+                dtype: convergence(inverse, FilmRays(*(c.to(getattr(torch, dtype)) for c in rays.columns())))
+                for dtype in ("float64", "float32")
+            },
+            "two_steps": convergence(inverse, few, steps=2),
+            "published": _published(inverse, few),
+            "uniform": _uniform(inverse, settings.uniform),
+            "rays": settings.rays,
+        }
+        if settings.raw:
+            raw = fit_inverse(fit_model(known, ModelSettings("omp", basis="raw", terms=40)), known.pairs)
+            record["raw"] = {"published": _published(raw, few), "ours": convergence(raw, few)}
+        return record
+
+
+def _domain(lens: Lens) -> Domain:
+    """From infinity to 14 focal lengths, or infinity alone where that is nearer than the near limit."""
+    try:
+        return domain_of(lens, focus_m=(math.inf, 14e-3 * abs(first_order(lens).efl_mm)))
+    except InputError:
+        return domain_of(lens)
+
+
+def _published(inverse: InverseModel, rays: FilmRays) -> dict[str, Any]:
+    """For both maps: shares of the model's passing rays not found after each count of steps, and run away."""
+    model = inverse.model
+    forward = model.predict(rays)
+    passed = forward.status == st.PASSED
+    rays = rays.select(passed)
+    x, y = forward.stop_x[passed], forward.stop_y[passed]
+    *position, v, _ = front_rays(model, Rays(*(c[passed] for c in forward.rays)), torch.float64)
+    wanted = torch.cat([torch.stack(position) / model.scales.position_mm, v])
+    scene = _plain(scene_system(model), {"wanted": wanted, "wavelength_nm": rays.wavelength_nm[None]})
+    return {"stop": _plain(stop_system(model), _stop_inputs(model, rays, x, y)), "scene": scene}
+
+
+def _stop_inputs(model: LensModel, rays: FilmRays, x: Tensor, y: Tensor) -> dict[str, Tensor]:
+    return {
+        "film": torch.stack([rays.film_x, rays.film_y]),
+        "wanted": torch.stack([x, y]) / model.scales.stop_mm,
+        "wavelength_nm": rays.wavelength_nm[None],
+        "film_z_mm": rays.film_z[None],
+    }
+
+
+def _plain(system: Graph, given: dict[str, Tensor]) -> dict[str, Any]:
+    """Newton's method without limits; the system's inputs but the unknowns are given."""
+    both, step = with_jacobian(system), Graph()
+    unknowns = both.outputs["residual"].rows
+    residual, *columns = (step.input(name, value.rows) for name, value in both.outputs.items())
+    step.outputs["step"] = solve(columns, residual)
+    x = torch.zeros((unknowns, given["wavelength_nm"].shape[1]), dtype=torch.float64)
+    # The first-order map's own solution is the start: linear, it takes one step from the axis.
+    axis = {name: 0 * value if name in ("film", "wanted") else value for name, value in given.items()}
+    jacobian = evaluate(both, {"unknown": x, **axis})
+    residual_there = evaluate(system, {"unknown": x, **given})
+    x = x - evaluate(step, jacobian | residual_there)["step"]
+    found: dict[str, Any] = {"missed": {}, "away": {}}
+    for count in range(1, max(PUBLISHED_STEPS) + 1):
+        x = x - evaluate(step, evaluate(both, {"unknown": x, **given}))["step"]
+        if count in PUBLISHED_STEPS:
+            size = evaluate(system, {"unknown": x, **given})["residual"].norm(dim=0)
+            found["missed"][str(count)] = float((~(size < TOLERANCE)).double().mean())  # NaN is missed
+            found["away"][str(count)] = float((~(size < AWAY)).double().mean())
+    return found
+
+
+def _uniform(inverse: InverseModel, count: int) -> dict[str, Any]:
+    """Stop points uniform over the stop, for film points uniform over the film: what becomes of them.
+
+    Returns shares: passed, blocked, outside (the ray leaves the domain), unsolved; `missed`: unsolved although a ray
+    that passes is found from one of a grid of starts; and of the solved ones what the published iteration misses, by
+    number of steps.
+    """
+    domain = inverse.model.domain
+    rays = sample_domain(domain, count, seed=31)
+    scale = 0.9999 * domain.stop_radius_mm / domain.pupil_radius_mm
+    x, y = rays.pupil_x * scale, rays.pupil_y * scale
+    out = inverse.through_stop(rays.film_x, rays.film_y, rays.film_z, x, y, rays.wavelength_nm)
+    status = out.prediction.status
+    unsolved = status == st.NO_SOLUTION
+    part = rays.select(~unsolved)
+    there = x[~unsolved], y[~unsolved]
+    plain = _plain(stop_system(inverse.model), _stop_inputs(inverse.model, part, *there))
+    some = unsolved.nonzero()[:500, 0]
+    lost = _reachable(inverse, rays.select(some), x[some], y[some])
+    share = float(lost.double().mean()) * float(unsolved.double().mean()) if len(some) else 0.0
+    return {
+        "passed": float((status == st.PASSED).double().mean()),
+        "blocked": float((status >= 4).double().mean()),
+        "outside": float((status == st.OUTSIDE_DOMAIN).double().mean()),
+        "unsolved": float(unsolved.double().mean()),
+        "missed": share,
+        "published_missed": plain["missed"],
+        "published_away": plain["away"],
+    }
+
+
+def _reachable(inverse: InverseModel, rays: FilmRays, x: Tensor, y: Tensor) -> Tensor:
+    """[N] bool: whether a passing ray goes from each film point through each stop point, from many starts."""
+    asked = (rays.film_x, rays.film_y, rays.film_z, x, y, rays.wavelength_nm)
+    side = torch.linspace(-0.9, 0.9, _STARTS, dtype=torch.float64)
+    found = torch.zeros(len(rays), dtype=torch.bool)
+    for a in side:
+        for b in side:
+            start = torch.stack([a.expand(len(rays)), b.expand(len(rays))])
+            found |= inverse.through_stop(*asked, steps=15, start=start).prediction.status == st.PASSED
+    return found
+
+
+def write_records(records: Sequence[dict[str, Any]], folder: Path) -> str:
+    """Write inverse.json and inverse.md; returns the page."""
+    rows = sorted(records, key=lambda r: str(r["lens"]))
+    text = page(rows)
+    lab.write_results(folder, "inverse", text, {"lenses": rows})
+    return text
+
+
+def page(records: Sequence[dict[str, Any]]) -> str:
+    """The tables in Markdown."""
+    done = [r for r in records if "ours" in r]
+    lines = [_INTRODUCTION.format(steps=STEPS, tolerance=TOLERANCE), ""]
+    lines += [*_table(done, "stop"), "", *_table(done, "scene")]
+    lines += ["", "## Stop points uniform over the stop", "", _UNIFORM, ""]
+    rows = []
+    for r in done:
+        u = r["uniform"]
+        shares = [u[k] for k in ("passed", "blocked", "outside", "unsolved", "missed")]
+        shares += [*u["published_missed"].values(), u["published_away"][str(max(PUBLISHED_STEPS))]]
+        rows.append([r["lens"], *map(_percent, shares)])
+    head = "lens|passed|blocked|outside|no ray|missed|published: 3|5|10|20|away"
+    lines.append(lab.table(head, rows))
+    raw = [r for r in done if "raw" in r]
+    lines += ["", *_raw_table(raw)] if raw else []
+    refused = [f"- {r['lens']}: {r['refused']}" for r in records if "refused" in r]
+    return "\n".join([*lines, *(["", "Not measured:", "", *refused] if refused else [])]) + "\n"
+
+
+_INTRODUCTION = """\
+# Inverse maps
+
+`python -m experiments inverse`
+
+Rays that pass each lens (full aperture and field, 400-700 nm, infinity to 14 focal lengths);
+share of them, in percent, that an iteration does not find ({tolerance:g} of the stop's radius; of the front's radius
+and in radians). Published: Newton from the first-order map, undamped, 3 / 5 / 10 / 20 steps; "away": residual above 1
+after 20. Ours: direct fit, then {steps} limited steps (two for comparison). "other": another ray through the same point
+(the map is folded in the lens itself, and one ray of two is found). Both on the same model (64 coefficients)."""
+_UNIFORM = """\
+Shares in percent for film points uniform over the film. "no ray": no ray of the model's domain goes through the point,
+or none was found; "missed": of those, where one of 49 other starts leads to a ray that passes. Published: of the points
+that have a ray, those that it does not find."""
+
+
+_RAW = """\
+The same where the model is as published: raw monomials, 20 coefficients a component, orthogonal matching pursuit.
+Its polynomials are wilder off the data, and full steps from the first-order map leave the data."""
+
+
+def _raw_table(done: Sequence[dict[str, Any]]) -> list[str]:
+    rows = []
+    for r in done:
+        for which in ("stop", "scene"):
+            p = r["raw"]["published"][which]
+            shares = [*p["missed"].values(), p["away"][str(max(PUBLISHED_STEPS))]]
+            shares.append(1 - r["raw"]["ours"][which]["converged"])
+            rows.append([r["lens"], which, *map(_percent, shares)])
+    table = lab.table("lens|map|published: 3|5|10|20|away|ours: 3", rows)
+    return ["## A model of raw monomials", "", _RAW, "", table]
+
+
+def _table(done: Sequence[dict[str, Any]], which: str) -> list[str]:
+    title = {"stop": "Film point and stop point to ray", "scene": "Scene ray to film"}[which]
+    rows = []
+    for r in done:
+        p = r["published"][which]
+        ours = [1 - r["two_steps"][which]["converged"]]
+        ours += [1 - r["ours"][dtype][which]["converged"] for dtype in ("float64", "float32")]
+        other = r["ours"]["float64"][which]["other"]
+        cells = [*p["missed"].values(), p["away"][str(max(PUBLISHED_STEPS))], *ours, other]
+        rows.append([r["lens"], r["rays"], *map(_percent, cells), f"{r['fit']['seconds']:.1f}"])
+    head = "lens|rays|published: 3|5|10|20|away|ours: 2|3|3, float32|other|fit s"
+    return [f"## {title}", "", lab.table(head, rows)]
+
+
+def _percent(share: float) -> str:
+    return "0" if share < 5e-7 else f"{100 * share:.4f}" if share < 0.01 else f"{100 * share:.2f}"
+
+
+ABOUT = """\
+Fit a model and its inverse maps to every lens file and count the rays that three Newton steps do not
+find, beside Newton's method as published (10 to 30 s a lens). Lenses that are in the table are kept.
+Writes inverse.md and inverse.json."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `python -m experiments inverse`."""
+    lab.add_only(parser)
+    parser.add_argument("--rays", metavar="N", type=whole(1000), default=100_000, help="rays a lens (default: 100000)")
+    parser.add_argument("--raw", action="store_true", help="invert a model of raw monomials too (half a minute a lens)")
+    parser.add_argument("--again", action="store_true", help="measure the chosen lenses again")
+    lab.add_out(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure what is missing, and write the tables after each lens."""
+    files = lab.chosen(sorted(lab.LENSES.glob("*.toml")), lambda f: f.stem, args.only, "inverse")
+    records = lab.kept_rows(args.out / "inverse.json", "lenses", "lens", "experiments inverse")
+    missing = [f for f in files if args.again or f.stem not in records]
+    progress = Progress({f.stem: 20.0 for f in missing}, quiet=args.quiet)
+    text = page(list(records.values()))
+    for file in missing:
+        with progress.stage(file.stem):
+            try:
+                records[file.stem] = measure_lens(file, BenchSettings(rays=args.rays, raw=args.raw))
+            except InputError as error:
+                records[file.stem] = {"lens": file.stem, "refused": str(error).removeprefix(f"{lab.ROOT}/")}
+        text = write_records(list(records.values()), args.out)
+    print(text)
+    return 0

@@ -1,0 +1,447 @@
+"""Makes the models that ship, as experiments/models.toml lists them: `python -m experiments models`, `make models`.
+
+Entry by entry: fit, check the card on fresh rays, race the exact tracer, write the files, then the index (index.json
+for programs, README.md for people). An entry whose files are there as they were written by the same settings and
+version is not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import hashlib
+import json
+import os
+import sys
+import tempfile
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from experiments import lab
+from experiments.promises import read_index
+from neurolens import __version__
+from neurolens.base.config import read_config
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.base.files import atomic_path, atomic_write_text
+from neurolens.base.progress import Progress
+from neurolens.cameras.model import load_model
+from neurolens.evaluate.candidates import exact_candidates, model_candidate
+from neurolens.evaluate.check import check_model, check_states
+from neurolens.evaluate.describe import lens_files
+from neurolens.evaluate.experiment import DomainChoice, Experiment, LensChoice, check_names
+from neurolens.evaluate.measure import Measured, fit_and_measure, shared_rays
+from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
+from neurolens.evaluate.speed import race
+from neurolens.evaluate.train import versions
+from neurolens.evaluate.train_states import fit_and_measure_states, state_settings
+from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import image_radius_mm
+from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.fit import NETWORKS, ModelSettings, prepare
+from neurolens.surrogates.pairs import PairSettings, make_pairs
+
+
+def _default_models() -> tuple[ModelSettings, ...]:
+    return ModelSettings("ols", terms=100), ModelSettings("mlp", units=32)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One lens in one state and the models made of it.
+
+    Attributes:
+        models: what is fitted.
+        best: keep the best polynomial and the best network only; else all.
+        promise: whether the index promises a speed-up, to which `make bench` holds the models.
+    """
+
+    lens: LensChoice
+    domain: DomainChoice = field(default_factory=DomainChoice)
+    models: tuple[ModelSettings, ...] = field(default_factory=_default_models)
+    best: bool = False
+    promise: bool = True
+
+    def __post_init__(self) -> None:
+        check_names("lens", [self.state])
+        check_names("models", [m.label for m in self.models])
+
+    @property
+    def state(self) -> str:
+        """Name of the lens and its state, as model files carry it."""
+        c = self.lens
+        parts = [c.file.stem, c.configuration or "", f"{c.efl_mm:g}mm" if c.efl_mm else "", c.zoom or ""]
+        parts += ["internal"] if c.focusing == "internal" else []
+        return "-".join(p for p in parts if p)
+
+    def file(self, settings: ModelSettings) -> str:
+        """Name of the file of a model."""
+        return f"{self.state}.{settings.label}.onnx"
+
+
+@dataclass(frozen=True)
+class WholeFolder:
+    """Every lens file of a folder in its default state, unless an entry has it: best polynomial, best network."""
+
+    folder: Path
+    models: tuple[ModelSettings, ...] = field(default_factory=_default_models)
+
+
+@dataclass(frozen=True)
+class Library:
+    """All entries, the ray pairs of each, and whether the compiled exact tracer is timed (half a minute a lens)."""
+
+    entry: tuple[Entry, ...] = ()
+    lenses: WholeFolder | None = None
+    pairs: PairSettings = field(default_factory=PairSettings)
+    compile_exact: bool = True
+
+    def __post_init__(self) -> None:
+        files = [e.file(m) for e in self.entry for m in e.models]
+        twice = sorted({f for f in files if files.count(f) > 1})
+        if not (files or self.lenses) or twice:
+            raise InputError("settings", "entry", twice or "(none)", "at least one model, each of a file of its own")
+
+
+def read_list(path: str | Path) -> Library:
+    """The list of a file, with every lens of its folder as an entry; files lie relative to the list.
+
+    Raises:
+        InputError: as `config.read_config`; no such folder of lenses; a file that two entries would write.
+    """
+    library, folder = read_config(Library, path), Path(path).parent
+    entries = [replace(e, lens=replace(e.lens, file=folder / e.lens.file)) for e in library.entry]
+    if library.lenses is not None:
+        models = library.lenses.models
+        named = {e.state for e in entries}
+        for file in lens_files(folder / library.lenses.folder):
+            if file.stem not in named:
+                entries.append(Entry(LensChoice(file), models=models, best=True, promise=False))
+    return replace(library, entry=tuple(entries), lenses=None)
+
+
+def chosen(library: Library, names: Sequence[str]) -> tuple[Entry, ...]:
+    """The entries whose state starts with one of the names; all without names.
+
+    Raises:
+        InputError: a name that no entry has.
+    """
+    for name in names:
+        if not any(e.state.startswith(name) for e in library.entry):
+            known = ", ".join(dict.fromkeys(e.state for e in library.entry))
+            raise InputError("experiments models", "LENS", name, f"the start of one of: {known}")
+    return tuple(e for e in library.entry if not names or any(e.state.startswith(n) for n in names))
+
+
+_HEAD = """# Models that ship
+
+Made by `python -m experiments models` from experiments/models.toml: of every lens of lenses/ the best polynomial of at most
+64 coefficients a vector output and the best network of two layers of 16 units, each fitted within half a minute,
+over the whole lit film, full aperture, focus from infinity to near and all wavelengths for which the glasses are known;
+of a few lenses also faster ones. Errors on held-out rays (`neurolens.evaluate.rays`), micrometres at an image radius of
+21.6 mm; every card was checked on fresh rays. Times on one core in onnxruntime, with stop, rims and transmittance;
+speed-up over the compiled exact tracer doing the same work in the same run. Check a model with
+`neurolens evaluate models/FILE`; `make bench` holds those of the first lenses to the speed-ups that the index promises.
+
+| model | RMS um | p99 um | direction deg | position um | T RMS | false pass / block % | coefficients | kB | ns per ray | speed-up |
+|---|---|---|---|---|---|---|---|---|---|---|
+"""  # noqa: E501
+
+
+def write_index(rows: Sequence[Mapping[str, Any]], left_out: Mapping[str, str], out: Path) -> None:
+    """Write both; `left_out` gives the reason for each entry that has no models."""
+    index = {
+        "schema": 2,
+        "command": "python -m experiments models",
+        "versions": versions(),
+        "models": list(rows),
+        "left_out": dict(left_out),
+    }
+    atomic_write_text(out / "index.json", json.dumps(index, indent=1, allow_nan=False) + "\n")
+    lines = [_line(row) for row in rows]
+    if left_out:
+        lines += ["", "Not made:", "", *(f"- {state}: {reason}" for state, reason in left_out.items())]
+    atomic_write_text(out / "README.md", _HEAD + "\n".join(lines) + "\n")
+
+
+def _line(row: Mapping[str, Any]) -> str:
+    um, p99, position = (
+        row.get(f"{key}_at_21_6", row.get(key)) for key in ("rms_um", "p99_um", "position_rms_um")
+    )  # fmt: skip
+    cells = [
+        row["file"] + (" (card does not hold)" if row.get("broken") else ""),
+        _n(um),
+        _n(p99),
+        _n(row["direction_rms_deg"]),
+        _n(position),
+        _n(row["transmittance_rms"]),
+        f"{_n(row['false_pass'], 100)} / {_n(row['false_block'], 100)}",
+        str(row["coefficients_per_vector"] or row["parameters"]),
+        f"{row['bytes'] / 1000:.0f}",
+        _n((row["ns_per_ray"] or {}).get("min")),
+        _n(row["speedup_over_compiled"]),
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def _n(value: float | None, factor: float = 1.0) -> str:
+    return "–" if value is None else f"{value * factor:.3g}"
+
+
+# The bench fails below this share of the speed-up measured here: machines and days differ, regressions differ more.
+PROMISE = 0.8
+_VIGNETTING_RAYS = 200_000
+_KEPT = tuple(
+    "rms_um p99_um direction_rms_deg position_rms_um transmittance_rms false_pass false_block "
+    "coefficients_per_vector parameters bytes fit_s".split()
+)
+
+
+def make_models(
+    library: Library, entries: Sequence[Entry], out: Path, progress: Progress, *, again: bool = False
+) -> list[str]:
+    """Make what is missing of some entries; returns in words what failed or does not hold.
+
+    The index is whole at any time: rows are replaced one entry at a time, and rows of entries that the library no
+    longer has go when all of it was asked for and is done.
+    """
+    known, left_out = _known(out)
+    todo = [e for e in entries if again or not _stands(e, library.pairs, known, out)]
+    for entry in todo:
+        progress.plan({f"{entry.state}: {m.label}": 40.0 if m.method in NETWORKS else 10.0 for m in entry.models})
+        progress.plan({f"{entry.state}: race": 60.0})
+    for entry in todo:
+        made, reason = list[dict[str, Any]](), ""
+        try:
+            made = make_entry(entry, library, out, progress)
+        except NeurolensError as error:
+            reason = " ".join(str(error).split())
+        known, left_out = _known(out)  # anew: another process may have made other entries meanwhile
+        left_out.pop(entry.state, None)
+        left_out |= {entry.state: reason} if reason else {}
+        written = {row["file"] for row in made}
+        for row in known:
+            if row["entry"] == entry.state and row["file"] not in written:
+                (out / row["file"]).unlink(missing_ok=True)
+        known = [*(row for row in known if row["entry"] != entry.state), *made]
+        write_index(_ordered(known, library), left_out, out)
+    if {e.state for e in entries} == {e.state for e in library.entry}:
+        states = {e.state for e in library.entry}
+        for row in known:
+            if row["entry"] not in states:
+                (out / row["file"]).unlink(missing_ok=True)
+        known = [row for row in known if row["entry"] in states]
+        left_out = {state: reason for state, reason in left_out.items() if state in states}
+    write_index(_ordered(known, library), left_out, out)
+    broken = [f"{row['file']}: does not hold: {', '.join(row['broken'])}" for row in known if row.get("broken")]
+    return [*(f"{state}: left out: {reason}" for state, reason in left_out.items()), *broken]
+
+
+def _known(out: Path) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """Rows and what was left out of an index that is there; nothing of one that cannot be read, which is replaced."""
+    try:
+        rows = [row for row in read_index(out) if row.keys() >= {*_KEPT, "ns_per_ray", "speedup_over_compiled"}]
+        left_out = json.loads((out / "index.json").read_text(encoding="utf-8")).get("left_out", {})
+    except (InputError, OSError, ValueError):
+        return [], {}
+    for row in rows:  # one of before entries were named
+        row.setdefault("entry", row["file"].removesuffix(".onnx").rpartition(".")[0])
+    return rows, dict(left_out)
+
+
+def _ordered(rows: Sequence[dict[str, Any]], library: Library) -> list[dict[str, Any]]:
+    """In the order of the list; what it does not name last."""
+    place = {entry.state: i for i, entry in enumerate(library.entry)}
+    return sorted(rows, key=lambda row: place.get(row["entry"], len(place)))
+
+
+def fingerprint(entry: Entry, pairs: PairSettings) -> str:
+    """Of all that decides the models of an entry.
+
+    Raises:
+        InputError: a lens that cannot be read.
+    """
+    c = entry.lens
+    lens = c.read()
+    glass = [lens.sha256, lens.stop_radius_mm, lens.image_radius_mm]
+    state = [*glass, c.efl_mm, c.configuration, c.f_number, c.zoom, c.focusing]
+    settings = [asdict(m) for m in entry.models]
+    asked = [__version__, state, asdict(entry.domain), settings, entry.best, asdict(pairs)]
+    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+
+
+def _stands(entry: Entry, pairs: PairSettings, known: Sequence[dict[str, Any]], out: Path) -> bool:
+    """Whether the models of an entry are there as they were written, by the same settings and version."""
+    mine = [row for row in known if row["entry"] == entry.state]
+    try:
+        mark = fingerprint(entry, pairs)
+        return bool(mine) and all(
+            r.get("fingerprint") == mark and r["sha256"] == _sha256(out / r["file"]) for r in mine
+        )
+    except (NeurolensError, OSError):
+        return False
+
+
+def _sha256(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def make_entry(entry: Entry, library: Library, out: Path, progress: Progress) -> list[dict[str, Any]]:
+    """Fit, check and time the models of one lens; writes their files and returns their rows of the index."""
+    make = _make_of_one_state
+    if entry.lens.many_states:
+        make = functools.partial(make_state_entry, kept=_KEPT)
+    common = {
+        "entry": entry.state,
+        "fingerprint": fingerprint(entry, library.pairs),
+        "lens_file": Path(os.path.relpath(entry.lens.file.resolve(), lab.ROOT.resolve())).as_posix(),
+    }
+    return [{**row, **common} for row in make(entry, library, out, progress)]
+
+
+def _make_of_one_state(entry: Entry, library: Library, out: Path, progress: Progress) -> list[dict[str, Any]]:
+    with warnings.catch_warnings(), tempfile.TemporaryDirectory() as scratch:
+        warnings.simplefilter("ignore", NeurolensWarning)
+        lens = entry.lens.read()
+        domain = entry.domain.of(lens)
+        prepared = prepare(make_pairs(lens, domain, library.pairs))
+        fresh = functools.cache(lambda: shared_rays(prepared, _VIGNETTING_RAYS))
+        measured: list[Measured] = []
+        for settings in entry.models:
+            with progress.stage(f"{entry.state}: {settings.label}") as report:
+                made = fit_and_measure(prepared, settings, Path(scratch), _VIGNETTING_RAYS, report, fresh)
+                measured.append(made)
+        measured = best_of_each_kind(measured) if entry.best else measured
+        candidates = exact_candidates(lens, domain, compiled=library.compile_exact and entry.promise)
+        candidates += [model_candidate(m.settings.label, load_model(m.file), domain.stop_radius_mm) for m in measured]
+        with progress.stage(f"{entry.state}: race") as report:
+            timed = race(candidates, domain, report=report)
+        rows = []
+        for m in measured:
+            row = _row(entry, lens, domain, m)
+            label, speedup = m.settings.label, timed.speedup(m.settings.label, "exact compiled")
+            row |= {
+                "ns_per_ray": timed.timing(label),
+                "exact_compiled_ns_per_ray": timed.timing("exact compiled"),
+                "speedup_over_compiled": speedup["min"] if speedup else None,
+                "promised_speedup": round(PROMISE * speedup["min"], 2) if speedup and entry.promise else None,
+            }
+            with atomic_path(out / row["file"]) as temporary:
+                temporary.write_bytes(m.file.read_bytes())
+            rows.append(row)
+    return rows
+
+
+def best_of_each_kind(measured: Sequence[Measured]) -> list[Measured]:
+    """The polynomial and the network of the smallest error."""
+    kinds: dict[bool, Measured] = {}
+    for m in sorted(measured, key=lambda m: m.error):
+        kinds.setdefault(m.settings.method in NETWORKS, m)
+    return [kinds[kind] for kind in (False, True) if kind in kinds]
+
+
+def _row(entry: Entry, lens: Lens, domain: Domain, m: Measured) -> dict[str, Any]:
+    """What the index says of a model but its times; its card is checked on fresh rays."""
+    scale = REFERENCE_RADIUS_MM / image_radius_mm(lens)[0]
+    widest = lens.with_stop_radius(domain.stop_radius_mm)
+    broken = [p.key for p in check_model(load_model(m.file), widest)[1] if not p.holds]
+    scaled = {f"{k}_at_21_6": None if m.record.get(k) is None else scale * m.record[k] for k in ("rms_um", "p99_um")}
+    return {
+        "file": entry.file(m.settings),
+        "sha256": _sha256(m.file),
+        "lens": lens.name,
+        "configuration": entry.lens.configuration,
+        "efl_mm": entry.lens.efl_mm,
+        "model": m.settings.label,
+        "wavelength_nm": list(domain.wavelength_nm),
+        "focus_m": ["inf" if f == float("inf") else f for f in domain.focus_m],
+        **{k: m.record.get(k) for k in _KEPT},
+        **scaled,
+        "position_rms_um_at_21_6": scale * m.record["position_rms_um"],
+        "broken": broken,
+    }
+
+
+_CHECKED = 4  # states at which a card is checked on fresh rays
+
+
+def make_state_entry(
+    entry: Entry, library: Library, out: Path, progress: Progress, kept: tuple[str, ...]
+) -> list[dict[str, Any]]:
+    """Fit, check and time the models of one lens in many states; figures are the worst over states at random.
+
+    Args:
+        kept: figures of a record that the index has.
+    """
+    experiment = Experiment(entry.state, entry.lens, entry.models, entry.domain, library.pairs)
+    rows = []
+    with warnings.catch_warnings(), tempfile.TemporaryDirectory() as scratch:
+        warnings.simplefilter("ignore", NeurolensWarning)
+        space = experiment.states()
+        for m in entry.models:
+            settings = state_settings(m, library.pairs.train, library.pairs.seed)
+            with progress.stage(f"{entry.state}: {m.label}") as report:
+                record = fit_and_measure_states(space, settings, Path(scratch), report=report)
+            file = Path(scratch) / f"{settings.label}.onnx"
+            model = load_model(file)
+            with progress.stage(f"{entry.state}: check and time"):
+                broken = [p.key for p in check_states(model, space, count=_CHECKED)[1] if not p.holds]
+                domain = Domain.from_dict(model.card["domain"])
+                candidate = model_candidate(m.label, model, domain.stop_radius_mm)
+                timed = race([candidate], domain, rounds=10).timing(m.label)
+            name = f"{entry.state}.{settings.label}.onnx"
+            rows.append(
+                {
+                    "file": name,
+                    "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+                    "lens": space.lens.name,
+                    "configuration": entry.lens.configuration,
+                    "efl_mm": None,
+                    "model": settings.label,
+                    "axes": [axis.to_dict() for axis in space.axes],
+                    "wavelength_nm": list(domain.wavelength_nm),
+                    **{key: record.get(key) for key in kept},
+                    "rms_um_at_21_6": record.get("rms_um_at_21_6"),
+                    "broken": broken,
+                    "ns_per_ray": timed,
+                    "exact_compiled_ns_per_ray": None,
+                    "speedup_over_compiled": None,
+                    "promised_speedup": None,
+                }
+            )
+            with atomic_path(out / name) as temporary:
+                temporary.write_bytes(file.read_bytes())
+    return rows
+
+
+ABOUT = """\
+Fit, check on fresh rays and time the models that experiments/models.toml lists, and write them with
+index.json and README.md. Models that are there, made by the same settings and version, are kept: a
+run that was interrupted goes on where it stopped.
+Exit code 1 where a lens could not be done or a card does not hold."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `python -m experiments models`."""
+    parser.add_argument("lenses", metavar="LENS", nargs="*", help="entries whose name starts so (default: all)")
+    parser.add_argument(
+        "--list", metavar="FILE", type=Path, default=lab.ROOT / "experiments" / "models.toml",
+        help="list (default: experiments/models.toml)",
+    )  # fmt: skip
+    parser.add_argument("--again", action="store_true", help="make the chosen entries again")
+    lab.add_out(parser, lab.MODELS, "folder")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make what is missing; 1 where something failed."""
+    library = read_list(args.list)
+    args.out.mkdir(parents=True, exist_ok=True)
+    failed = make_models(
+        library, chosen(library, args.lenses), args.out, Progress(quiet=args.quiet), again=args.again
+    )  # fmt: skip
+    print((args.out / "README.md").read_text(encoding="utf-8"))
+    for line in failed:
+        print(f"experiments: {line}", file=sys.stderr)
+    return 1 if failed else 0

@@ -1,0 +1,506 @@
+"""Speed of the renderer beside Mitsuba 3: the same Cornell box, picture, samples, depth and roulette, in one run.
+
+The scene is Mitsuba's own, unmodified but for the depth at which Russian roulette begins, which is ours. Each renderer
+makes a picture in turn, repeat after repeat, so that a busy machine slows all alike; compiling is not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import math
+import pstats
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import neurolens
+from experiments import lab
+from experiments.renderer_speed import thin_camera
+from neurolens import mitsuba
+from neurolens.base.errors import NeurolensError
+from neurolens.base.progress import Progress
+from neurolens.cameras.contract import Camera, FloatArray
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.commands.arguments import whole
+from neurolens.evaluate.records import plain
+from neurolens.mitsuba import require_mitsuba
+from neurolens.mitsuba.library import libraries
+from neurolens.mitsuba.scenes import our_scene, with_our_spectra
+from neurolens.render.film import FilmSettings
+from neurolens.render.renderer import render
+from neurolens.render.scene import Scene, load_scene
+
+FOCAL_MM = 50.0
+FOCUS_M, F_NUMBER = 3.9, 2.0
+ROULETTE_FROM = 3  # segments in Mitsuba's count: what our integrator does after two surfaces
+_TRIANGLES = f"triangles ({'Embree' if find_spec('embreex') else 'own tree'})"
+VARIANTS = ("scalar_rgb", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_spectral")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all renderers do: a picture of size x size pixels, samples a pixel, threads, repeats."""
+
+    size: int = 256
+    samples: int = 16
+    threads: int = 2
+    repeats: int = 5
+
+    @property
+    def paths(self) -> int:
+        """Of one picture."""
+        return self.size * self.size * self.samples
+
+
+@dataclass
+class Row:
+    """One renderer: name, what a path carries, camera; seconds of each repeat, first_s of the first (with compiling).
+
+    `pictures`: of the repeats, [H, W, 3] each, free of what cameras do to a white card.
+    """
+
+    name: str
+    carries: str
+    camera: str
+    draw: Callable[[int], FloatArray]
+    white: FloatArray
+    first_s: float = 0.0
+    seconds: list[float] = field(default_factory=list)
+    pictures: list[FloatArray] = field(default_factory=list)
+
+    def run(self, seed: int) -> None:
+        """Make and time one picture; the first is kept apart."""
+        began = time.perf_counter()
+        picture = self.draw(seed)
+        seconds = time.perf_counter() - began
+        if not self.first_s:
+            self.first_s = seconds
+            return
+        self.seconds.append(seconds)
+        self.pictures.append(picture / self.white)
+
+
+def cornell_box(size: int) -> dict[str, Any]:
+    """Mitsuba's Cornell box at a picture size, box-filtered, with our beginning of roulette."""
+    mi, _ = libraries()
+    box: dict[str, Any] = mi.cornell_box()
+    box["sensor"]["film"] |= {"width": size, "height": size, "rfilter": {"type": "box"}}
+    box["integrator"]["rr_depth"] = ROULETTE_FROM
+    return box
+
+
+def film_mm(box: dict[str, Any]) -> tuple[float, float]:
+    """The film on which a 50 mm pinhole sees what Mitsuba's camera sees."""
+    side = 2 * FOCAL_MM * math.tan(math.radians(box["sensor"]["fov"] / 2))
+    return side, side
+
+
+def rows(model: Path, settings: Settings) -> list[Row]:
+    """Every renderer that this machine can run; a variant without its compiler is left out.
+
+    Raises:
+        NeurolensError: no Mitsuba at all.
+    """
+    mi = require_mitsuba("scalar_rgb")
+    libraries()[1].set_thread_count(settings.threads)
+    box = cornell_box(settings.size)
+    pinhole = Pinhole(FOCAL_MM, film_mm(box))
+    lens = mitsuba.camera(model, film_mm=(28.0, 28.0), focus_m=FOCUS_M, f_number=F_NUMBER)
+    behind, meshes = (
+        our_scene(box, pinhole.film_mm, back_m=1e-3 * FOCAL_MM, triangles=triangles) for triangles in (False, True)
+    )
+    found = [
+        _ours(behind, pinhole, "hero", settings),
+        _ours(behind, pinhole, "one", settings),
+        _ours(meshes, pinhole, "hero", settings, _TRIANGLES),
+        _ours(our_scene(box, lens.film_mm), lens, "one", settings),
+    ]
+    cos4 = _cos4(settings.size, pinhole)
+    for variant in VARIANTS:
+        try:
+            require_mitsuba(variant)
+        except NeurolensError:
+            continue
+        found.append(_theirs(variant, None, settings, np.reciprocal(cos4)))
+        if variant.startswith("llvm"):
+            found.append(_theirs(variant, lens, settings, np.ones((1, 1, 1), np.float32)))
+    mi.set_variant("scalar_rgb")
+    return found
+
+
+def _ours(scene: Scene, chosen: Camera, wavelengths: Any, settings: Settings, how: str = "rectangles") -> Row:
+    film = FilmSettings(wavelengths=wavelengths)
+
+    def draw(seed: int) -> FloatArray:
+        done = render(
+            scene, chosen, samples=settings.samples, threads=settings.threads, seed=seed, film=film
+        )  # fmt: skip
+        return done.rgb
+
+    carries = {"hero": "4 wavelengths", "one": "1 wavelength"}[wavelengths]
+    return Row(f"neurolens, {how}", carries, _word(chosen), draw, np.ones((1, 1, 1), np.float32))
+
+
+def _theirs(variant: str, chosen: Camera | None, settings: Settings, white: FloatArray) -> Row:
+    """Mitsuba in a variant, through its own pinhole or a camera of ours."""
+    spectral = variant.endswith("spectral")
+
+    def prepared() -> Any:
+        mi = require_mitsuba(variant)
+        box = cornell_box(settings.size)
+        return mi, mitsuba.load_scene(with_our_spectra(box) if spectral else box)
+
+    scene = prepared()[1]
+
+    def draw(seed: int) -> FloatArray:
+        mi = require_mitsuba(variant)
+        if chosen is not None:
+            return mitsuba.render(scene, chosen, spp=settings.samples, seed=seed)
+        return np.array(mi.render(scene, spp=settings.samples, seed=seed), np.float32)
+
+    lanes = "RGB" if not spectral else "1 wavelength" if chosen is not None else "4 wavelengths"
+    return Row(f"Mitsuba {variant}", lanes, _word(chosen), draw, white)
+
+
+def _word(chosen: Camera | None) -> str:
+    return "pinhole" if chosen is None or chosen.name == "pinhole" else "lens model"
+
+
+def _cos4(size: int, pinhole: Pinhole) -> FloatArray:
+    """Natural vignetting of the pinhole, [size, size, 1], which Mitsuba's has not."""
+    place = (np.arange(size) + 0.5) / size - 0.5
+    tangent2 = (place[:, None] ** 2 + place[None, :] ** 2) * (pinhole.film_mm[0] / pinhole.focal_mm) ** 2
+    return ((1 + tangent2) ** -2.0).astype(np.float32)[..., None]
+
+
+def measure(found: list[Row], settings: Settings, report: Callable[[float], None]) -> None:
+    """Run every renderer once to warm up, then in turn `repeats` times."""
+    total = len(found) * (settings.repeats + 1)
+    for repeat in range(settings.repeats + 1):
+        for k, row in enumerate(found):
+            row.run(seed=repeat)
+            report((repeat * len(found) + k + 1) / total)
+
+
+def record(row: Row, settings: Settings, base: Row) -> dict[str, Any]:
+    """Figures of a row: Mpath/s of the fastest and of the median repeat, time over that of `base`, and the picture.
+
+    `mean_rgb`: of the picture. `noise`: variance of a pixel's luminance between the repeats over its square, both
+    means over the picture, at the settings' samples.
+    """
+    low, middle = min(row.seconds), statistics.median(row.seconds)
+    pictures = np.stack(row.pictures)
+    grey = pictures @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+    noise = float(np.mean(grey.var(axis=0, ddof=1)) / np.mean(grey**2)) if len(grey) > 1 else None
+    return {
+        "name": row.name,
+        "carries": row.carries,
+        "camera": row.camera,
+        "mpaths_per_s": settings.paths / low * 1e-6,
+        "mpaths_per_s_median": settings.paths / middle * 1e-6,
+        "seconds_min": low,
+        "seconds_median": middle,
+        "first_s": row.first_s,
+        "time_over_ours": middle / statistics.median(base.seconds),
+        "mean_rgb": [float(v) for v in pictures.mean(axis=(0, 1, 2))],
+        "noise": noise,
+    }
+
+
+STAGES = ("camera", "intersection", "lights", "shading", "random numbers", "integrator", "film, set-up")
+_ROOT = str(Path(neurolens.__file__).parent)
+# Module of the renderer to stage; some functions are told apart by name.
+_STAGE = {
+    "primitives": "intersection",
+    "mesh": "intersection",
+    "lights": "lights",
+    "environment": "lights",
+    "materials": "shading",
+    "directions": "shading",
+    "textures": "shading",
+    "world": "shading",
+    "sampler": "random numbers",
+    "integrator": "integrator",
+}
+_FUNCTIONS = {
+    "world": dict.fromkeys(("nearest", "visible", "surfaces"), "intersection"),
+    "integrator": {
+        "aim_at_lights": "lights",
+        **dict.fromkeys(("lit", "deposit", "scatter", "_scatter_rough", "_scatter_glass"), "shading"),
+        **dict.fromkeys(("__init__", "_lobes", "_absorb", "start", "evaluate", "index"), "shading"),  # of a vertex
+    },
+    "spectrum": dict.fromkeys(("colour", "reflectance", "absorption", "light", "look_up", "_row", "freeze"), "shading"),
+}
+_HELPERS = {"dot", "take", "cut"}  # which count as part of those who call them
+
+Function = tuple[str, int, str]
+
+
+def profile(scene: Scene, camera: Camera, width: int, height: int, samples: int) -> dict[str, float]:
+    """Share of the time of each of `STAGES` in a render by one worker, adding up to 1."""
+    profiler = cProfile.Profile()
+    profiler.enable()
+    render(scene, camera, width=width, height=height, samples=samples, threads=1)
+    profiler.disable()
+    return shares(pstats.Stats(profiler))
+
+
+def shares(stats: pstats.Stats) -> dict[str, float]:
+    """Own time of every function by stage; that of numpy and of helpers belongs to those who called them."""
+    table: dict[Function, Any] = stats.stats  # type: ignore[attr-defined]
+    path: set[Function] = set()
+
+    @cache
+    def split(function: Function) -> tuple[float, ...]:
+        own = _stage_of(function)
+        if own is not None:
+            return tuple(float(stage == own) for stage in STAGES)
+        callers = {k: v[2] + 1e-12 for k, v in table[function][4].items() if k not in path and k != function}
+        total = sum(callers.values())
+        if not total:
+            return tuple(float(stage == STAGES[-1]) for stage in STAGES)
+        path.add(function)
+        parts = [(seconds / total, split(caller)) for caller, seconds in callers.items()]
+        path.discard(function)
+        return tuple(sum(share * part[k] for share, part in parts) for k in range(len(STAGES)))
+
+    spent = dict.fromkeys(STAGES, 0.0)
+    for function, (_, _, own_s, _, _) in table.items():
+        for stage, share in zip(STAGES, split(function), strict=True):
+            spent[stage] += own_s * share
+    total = sum(spent.values())
+    return {stage: seconds / total for stage, seconds in spent.items()}
+
+
+def _stage_of(function: Function) -> str | None:
+    """Stage of a function of ours; None for helpers and for all others."""
+    file, _, name = function
+    if not file.startswith(_ROOT) or name in _HELPERS:
+        return None
+    part, module = Path(file).parent.name, Path(file).stem
+    if part == "cameras" or name in ("_hero_rays", "_camera_rays"):
+        return "camera"
+    if part != "render":
+        return STAGES[-1]
+    return _FUNCTIONS.get(module, {}).get(name) or _STAGE.get(module, STAGES[-1])
+
+
+def memory_of(scene_file: str, width: int, samples: int) -> dict[str, Any]:
+    """Render a scene, in a fresh process.
+
+    Returns: width, height, samples, growth_mb (highest resident memory while rendering, less that before).
+    """
+    scene = load_scene(scene_file)
+    camera = thin_camera(scene)
+    height = round(width * camera.film_mm[1] / camera.film_mm[0])
+    render(scene, camera, width=64, height=36, samples=1, threads=1)  # what numpy sets up once
+    grown = lab.memory_growth(
+        lambda: render(scene, camera, width=width, height=height, samples=samples, threads=1)
+    )[1]  # fmt: skip
+    return {"width": width, "height": height, "samples": samples, "growth_mb": grown / 1e6}
+
+
+@dataclass
+class Found:
+    """What was measured: rows of `record`, of scenes and of memory; `missing`: what was not, and why."""
+
+    settings: Settings
+    versions: dict[str, str]
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    scenes: list[dict[str, Any]] = field(default_factory=list)
+    memory: list[dict[str, Any]] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+
+
+def page(found: Found) -> str:
+    """The tables as Markdown."""
+    s = found.settings
+    versions = ", ".join(f"{name} {version}" for name, version in found.versions.items())
+    parts = [
+        "# Speed of the renderer",
+        f"One run of `python -m experiments mitsuba` ({versions}); {s.threads} threads.",
+    ]
+    if found.rows:
+        parts += [
+            "## Beside Mitsuba 3",
+            f"Its own Cornell box, {s.size} x {s.size} pixels, {s.samples} samples, at most seven surfaces, roulette "
+            f"after two in all; {s.repeats} repeats in turn, compiling and warming up left out. Time: median, over "
+            "that of our first row. Mean: of the picture's R, G and B; the lens sees another part of the box than the "
+            "pinhole, and RGB paths mix colours otherwise than spectra. Noise: variance of a pixel's luminance over "
+            "its square at these samples; our samples are low-discrepancy, those of Mitsuba's scene independent. A "
+            "lens that disperses leaves a path one wavelength, in Mitsuba four times the same.",
+            _speed_table(found.rows),
+        ]
+    if found.scenes:
+        parts += [
+            "## Scenes, and where the time goes",
+            "Paths per second through a thin lens, four wavelengths a path, the scene's own depth; beside it the share "
+            "of the time by what the code is for (profile of one worker).",
+            _scene_table(found.scenes),
+        ]
+    if found.memory:
+        parts += ["## Memory", _memory_text(found.memory), _memory_table(found.memory)]
+    parts += [f"Not measured: {reason}" for reason in found.missing]
+    return "\n\n".join(parts) + "\n"
+
+
+def _speed_table(rows: list[dict[str, Any]]) -> str:
+    header = ("renderer", "a path carries", "camera", "Mpath/s, fastest", "median", "time", "mean R G B", "noise")
+    return lab.table(
+        header,
+        [
+            (
+                row["name"],
+                row["carries"],
+                row["camera"],
+                f"{row['mpaths_per_s']:.3g}",
+                f"{row['mpaths_per_s_median']:.3g}",
+                f"{row['time_over_ours']:.2f}",
+                " ".join(f"{v:.4f}" for v in row["mean_rgb"]),
+                "–" if row["noise"] is None else f"{row['noise']:.2g}",
+            )
+            for row in rows
+        ],
+    )
+
+
+def _scene_table(rows: list[dict[str, Any]]) -> str:
+    header = ("scene", "surfaces a path", "Mpath/s, fastest", "median", *(f"{stage} %" for stage in STAGES))
+    return lab.table(
+        header,
+        [
+            (
+                row["scene"],
+                str(row["max_depth"]),
+                f"{row['mpaths_per_s']:.3g}",
+                f"{row['mpaths_per_s_median']:.3g}",
+                *(f"{100 * row['shares'][stage]:.0f}" for stage in STAGES),
+            )
+            for row in rows
+        ],
+    )
+
+
+def _memory_text(rows: list[dict[str, Any]]) -> str:
+    """What grows with the picture, from the two largest at equal samples, and what does not."""
+    small, large = sorted((r for r in rows if r["samples"] == rows[0]["samples"]), key=_pixels)[-2:]
+    each = (large["growth_mb"] - small["growth_mb"]) * 1e6 / (_pixels(large) - _pixels(small))
+    rest = large["growth_mb"] - each * _pixels(large) * 1e-6
+    return (
+        "Highest resident memory of one worker while it renders, less that before. It grows by "
+        f"{each:.0f} bytes a pixel, the film; the paths under way take {rest:.0f} MB whatever the picture's size and "
+        "samples."
+    )
+
+
+def _pixels(row: dict[str, Any]) -> int:
+    return int(row["width"] * row["height"])
+
+
+def _memory_table(rows: list[dict[str, Any]]) -> str:
+    cells = [(f"{r['width']} x {r['height']}", str(r["samples"]), f"{r['growth_mb']:.0f}") for r in rows]
+    return lab.table(("picture", "samples", "MB"), cells)
+
+
+def write(found: Found, out: Path) -> str:
+    """Write render_speed.md and .json into `out`; returns the page."""
+    text = page(found)
+    data = {k: getattr(found, k) for k in ("versions", "rows", "scenes", "memory", "missing")}
+    lab.write_results(out, "render_speed", text, plain(data | {"settings": vars(found.settings)}))
+    return text
+
+
+ABOUT = """\
+Paths per second of the renderer beside the scalar and LLVM variants of Mitsuba 3, on Mitsuba's own
+Cornell box, with its pinhole and through a lens model; then of our scenes, where their time goes, and
+the memory that a render takes by picture size. Without the extra "mitsuba", our side alone.
+Writes render_speed.md and render_speed.json."""
+SCENES = ("cornell", "room", "lights", "grid")
+MODEL = "laikin_double_gauss_50.ols-60.onnx"
+SCENE_SAMPLES, SCENE_WIDTH = 16, 240
+WIDTHS, MANY_SAMPLES = (256, 512, 1024, 2048), 64
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `python -m experiments mitsuba`."""
+    parser.add_argument("--size", metavar="PIXELS", type=whole(16, 2048), default=256, help="side (default: 256)")
+    parser.add_argument("--samples", metavar="N", type=whole(1, 4096), default=16, help="a pixel (default: 16)")
+    parser.add_argument("--repeats", metavar="N", type=whole(1, 100), default=5, help="default: 5")
+    parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=2, help="of all (default: 2)")
+    lab.add_out(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, writing the page after each part."""
+    settings = Settings(args.size, args.samples, args.threads, args.repeats)
+    found = Found(settings, _versions())
+    parts = {"beside Mitsuba": _beside, "scenes": _scenes, "memory": _memory}
+    progress = Progress(dict(zip(parts, (120.0, 60.0, 40.0), strict=True)), quiet=args.quiet)
+    for name, part in parts.items():
+        with progress.stage(name) as report:
+            try:
+                part(found, report)
+            except NeurolensError as error:
+                found.missing.append(f"{name} ({error})")
+        write(found, args.out)
+    print(page(found))
+    return 0
+
+
+def _versions() -> dict[str, str]:
+    known = {}
+    for package in ("numpy", "mitsuba", "drjit", "embreex"):
+        try:
+            known[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return known
+
+
+def _beside(found: Found, report: Callable[[float], None]) -> None:
+    made = rows(lab.MODELS / MODEL, found.settings)
+    measure(made, found.settings, report)
+    found.rows = [record(row, found.settings, made[0]) for row in made]
+
+
+def _scenes(found: Found, report: Callable[[float], None]) -> None:
+    """Each scene: timed with all threads, then profiled with one."""
+    files = [file for name in SCENES if (file := lab.SCENES / f"{name}.toml").is_file()]
+    repeats = min(found.settings.repeats, 5)
+    for k, file in enumerate(files):
+        scene = load_scene(file)
+        camera = thin_camera(scene)
+        height = round(SCENE_WIDTH * camera.film_mm[1] / camera.film_mm[0])
+        speeds = []
+        for seed in range(repeats):
+            done = render(
+                scene, camera, width=SCENE_WIDTH, height=height, samples=SCENE_SAMPLES,
+                threads=found.settings.threads, seed=seed,
+            )  # fmt: skip
+            speeds.append(float(done.stats["mpaths_per_s"]))
+            report((k + (seed + 1) / (repeats + 1)) / len(files))
+        found.scenes.append(
+            {
+                "scene": file.stem,
+                "max_depth": scene.settings.camera.max_depth,
+                "mpaths_per_s": max(speeds),
+                "mpaths_per_s_median": sorted(speeds)[len(speeds) // 2],
+                "shares": profile(scene, camera, SCENE_WIDTH, height, SCENE_SAMPLES),
+            }
+        )
+
+
+def _memory(found: Found, report: Callable[[float], None]) -> None:
+    cases = [*((width, 1) for width in WIDTHS), (WIDTHS[0], MANY_SAMPLES)]
+    for k, (width, samples) in enumerate(cases):
+        found.memory.append(lab.in_child(memory_of, str(lab.SCENES / "room.toml"), width, samples))
+        report((k + 1) / len(cases))

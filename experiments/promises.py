@@ -1,0 +1,306 @@
+"""Speed against the promises: `python -m experiments promises` (`make bench`).
+
+Races each model of which models/index.json promises a speed-up against the exact tracer of its lens, the thin lens and
+the pinhole, all in one run, writes the table to experiments/results/, and fails when a model is slower, relative to the
+compiled exact tracer, than promised, or when tracer or renderer fall below their floors (`floors`). `python -m
+experiments trace` times the exact tracer alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from experiments import lab
+from experiments.renderer_speed import measure
+from neurolens.base.errors import InputError
+from neurolens.cameras.model import load_model
+from neurolens.commands.arguments import whole
+from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
+from neurolens.evaluate.speed import Race, race
+from neurolens.optics.lensfile import read_lens
+from neurolens.surrogates.domain import Domain, domain_of
+
+
+@dataclass
+class Outcome:
+    """Rows of the table, and what failed.
+
+    Attributes:
+        rows: one a candidate, with units in the keys.
+        missed: promises that were not kept, in words.
+        checked, unchecked: promises held against a measurement, and those that could not be.
+        floors: of the tracer and the renderer.
+    """
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    missed: list[str] = field(default_factory=list)
+    checked: int = 0
+    unchecked: list[str] = field(default_factory=list)
+    floors: list[Floor] = field(default_factory=list)
+
+
+Save = Callable[[Outcome], None]
+
+
+def read_index(folder: Path) -> list[dict[str, Any]]:
+    """Rows of models/index.json.
+
+    Raises:
+        InputError: no such file, not JSON, rows without a model file or a lens file, or a model elsewhere.
+    """
+    path = folder / "index.json"
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))["models"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            path, "file", f"({type(error).__name__}: {error})", "the index that `python -m experiments models` writes"
+        ) from error
+    if not isinstance(rows, list):
+        raise InputError(path, "models", type(rows).__name__, "a list")
+    for i, row in enumerate(rows):
+        for key in ("file", "lens_file"):
+            if not isinstance(row, dict) or not isinstance(row.get(key), str):
+                raise InputError(path, f"models {i}, {key}", "(missing)", "the name of a file")
+        if Path(row["file"]).name != row["file"]:  # files that an index names may be removed
+            raise InputError(path, f"models {i}, file", row["file"], "the name of a file beside the index")
+    return rows
+
+
+def bench_models(root: Path, folder: Path, only: str, threads: int, rounds: int, save: Save) -> Outcome:
+    """Race the models of an index, lens by lens, their lens files below `root`; `save` what there is after each.
+
+    Without `only`, those of which the index promises a speed-up.
+    """
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in read_index(folder):
+        if only in row["file"] and (only or row.get("promised_speedup") is not None):
+            groups.setdefault((row["lens_file"], row.get("configuration"), row.get("efl_mm")), []).append(row)
+    if not groups:
+        raise InputError(folder / "index.json", "models", "(none)", f"models with {only!r} in the file's name")
+    outcome = Outcome()
+    for (lens_file, configuration, efl_mm), rows in groups.items():
+        state = " ".join([Path(lens_file).stem, *([str(configuration)] if configuration else [])])
+        _say(f"{state}: compiling and timing, {len(rows)} models ...")
+        lens = read_lens(root / lens_file).at(zoom=configuration, focal_length_mm=efl_mm)
+        models = {row["file"]: load_model(folder / row["file"], lens.sha256) for row in rows}
+        domain = Domain.from_dict(next(iter(models.values())).card["domain"])
+        lens = lens.with_stop_radius(domain.stop_radius_mm)
+        candidates = exact_candidates(lens, domain)
+        for name, model in models.items():
+            candidates.append(model_candidate(name, model, domain.stop_radius_mm))
+        candidates += ideal_cameras(lens, domain)
+        timed = race(candidates, domain, threads=threads, rounds=rounds)
+        outcome.rows += table_rows(state, timed)
+        hold_to_promises(rows, timed, outcome)
+        save(outcome)
+    return outcome
+
+
+def hold_to_promises(rows: Sequence[dict[str, Any]], timed: Race, outcome: Outcome) -> None:
+    """Add to `outcome` what became of each row's `promised_speedup` over the compiled exact tracer.
+
+    The larger of the two ratios counts (by minima, median within rounds): a busy machine spoils one of them at a time.
+    """
+    for row in rows:
+        promised = row.get("promised_speedup")
+        if promised is None:
+            continue
+        found = timed.speedup(row["file"], COMPILED)
+        if found is None:
+            reason = timed.unavailable.get(COMPILED) or timed.unavailable.get(row["file"]) or "not timed"
+            outcome.unchecked.append(f"{row['file']}: {reason}")
+            continue
+        outcome.checked += 1
+        best = max(found.values())
+        if not best >= promised:
+            outcome.missed.append(f"{row['file']}: {best:.3g} times the compiled exact tracer, promised {promised:g}")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def report_outcome(outcome: Outcome) -> int:
+    """Print what was kept, missed and not checked; 1 where a promise or a floor was missed."""
+    for line in outcome.unchecked:
+        print(f"not checked: {line}")
+    for line in outcome.missed:
+        print(f"SLOWER THAN PROMISED: {line}", file=sys.stderr)
+    below = [f for f in outcome.floors if f.verdict == "FAIL"]
+    for f in below:
+        print(f"BELOW ITS FLOOR: {f.name}: {f.measured:.3g} {f.unit}, at least {f.floor:g}", file=sys.stderr)
+    print(f"{outcome.checked - len(outcome.missed)} of {outcome.checked + len(outcome.unchecked)} promises kept")
+    if outcome.unchecked and not outcome.checked:
+        reason = outcome.unchecked[0].partition(": ")[2]
+        print(f"UNCHECKED: no promise could be checked here ({reason})", file=sys.stderr)
+    return 1 if outcome.missed or below else 0
+
+
+LENS, SCENE = "lenses/laikin_double_gauss_50.toml", "experiments/scenes/room.toml"
+TRACER_MRAY_S = {"eager": 6.0, "compiled": 20.0}  # one core, float32, 12 refractions, stop, rims and dispersion
+RENDER_MPATH_S = 1.0  # the room, depth 3, two cores
+
+
+@dataclass(frozen=True)
+class Floor:
+    """One speed against its floor; `measured` is None, with a `reason`, where it could not be taken."""
+
+    name: str
+    floor: float
+    measured: float | None
+    unit: str
+    reason: str = ""
+
+    @property
+    def verdict(self) -> str:
+        if self.measured is None:
+            return "UNCHECKED"
+        return "pass" if self.measured >= self.floor else "FAIL"
+
+
+def check_floors(root: Path, rounds: int = 20) -> list[Floor]:
+    """Measure all of them; the best of the rounds counts, as a busy machine only ever slows.
+
+    Args:
+        root: the project's folder.
+
+    Raises:
+        InputError: the lens or the scene is not there.
+    """
+    lens = read_lens(root / LENS).at()
+    domain = domain_of(lens)
+    candidates = exact_candidates(lens, domain, transmittance=False, build_rays=False, label="trace")
+    timed = race(candidates, domain, rounds=rounds)
+    found = []
+    for kind, floor in TRACER_MRAY_S.items():
+        timing = timed.timing(f"trace {kind}")
+        speed = None if timing is None else 1000 / timing["min"]
+        reason = timed.unavailable.get(f"trace {kind}", "")
+        found.append(Floor(f"exact tracer, {kind}, one core, float32", floor, speed, "Mray/s", reason))
+    room = measure(root / SCENE, threads=2, depth=3)
+    found.append(Floor("render of the room, two cores, depth 3", RENDER_MPATH_S, room["mpaths_per_s"], "Mpath/s"))
+    return found
+
+
+def floor_table(floors: Sequence[Floor]) -> str:
+    """The floors as a table in Markdown."""
+    rows = []
+    for f in floors:
+        shown = f"({f.reason})" if f.measured is None else f"{f.measured:.3g}"
+        rows.append([f.name, shown, f"{f.floor:g}", f.unit, f.verdict])
+    return lab.table("what|measured|floor|unit|verdict", rows) + "\n"
+
+
+COMPILED, EAGER = "exact compiled", "exact eager"
+
+
+def table_rows(state: str, timed: Race) -> list[dict[str, Any]]:
+    """One row a candidate of a race.
+
+    Returns: tables of lens (`state`), name, ns_per_ray, speedup_over_compiled and speedup_over_eager ({"min", "median"}
+        as of `Race.speedup`; None where that tracer did not run), reason where unavailable, load of the machine.
+        Where several exact tracers raced, each is held against those of its own kind.
+    """
+    rows: list[dict[str, Any]] = []
+    for name in (*timed.ns, *timed.unavailable):
+        own = name.rsplit(" ", 1)[0]
+        compiled, eager = (n if n in timed.ns else f"{own} {n.split()[-1]}" for n in (COMPILED, EAGER))
+        rows.append(
+            {
+                "lens": state,
+                "name": name,
+                "ns_per_ray": timed.timing(name),
+                "speedup_over_compiled": timed.speedup(name, compiled),
+                "speedup_over_eager": timed.speedup(name, eager),
+                "reason": timed.unavailable.get(name),
+                "load": [timed.load_before, timed.load_after],
+            }
+        )
+    return rows
+
+
+def markdown(title: str, conditions: str, rows: Sequence[dict[str, Any]]) -> str:
+    """A page with the rows as a table."""
+    lines: list[list[Any]] = []
+    for row in rows:
+        t = row["ns_per_ray"]
+        if t is None:
+            lines.append([row["lens"], row["name"], f"unavailable: {row['reason']}", *[""] * 6])
+            continue
+        figures = [f"{v:.1f}" for v in (t["min"], t["median"], 1000 / t["min"])]
+        ratios = [_ratio(row[key]) for key in ("speedup_over_compiled", "speedup_over_eager")]
+        lines.append([row["lens"], row["name"], *figures, t["batch"], t["threads"], *ratios])
+    loads = [v for row in rows for v in row["load"] if v is not None]
+    if loads:
+        conditions += f" Load average of the machine meanwhile: up to {max(loads):.1f} on {os.cpu_count()} cores."
+    head = "lens|candidate|ns per ray, best|median|Mray/s|batch|threads|over compiled|over eager"
+    return f"# {title}\n\n{conditions}\n\n{lab.table(head, lines)}\n"
+
+
+def _ratio(found: dict[str, float] | None) -> str:
+    return "" if found is None else f"{found['min']:.2f} ({found['median']:.2f})"
+
+
+def notes(threads: str, rounds: int) -> str:
+    """What a reader must know of the conditions."""
+    return (
+        f"Rays uniform over film and pupil disc of each domain, blocked ones included; {threads}, {rounds} rounds in "
+        "turn, each the best of a few short samples; float32 unless told. Exact tracer and models do the same work: "
+        "film and pupil points in; scene ray, transmittance and status out, with stop, rims and dispersion; "
+        "models add the crossing with the stop. Thin lens and pinhole give ray and weight. Ratios: by the best times "
+        "(median within rounds), above 1 is faster. "
+        f"Python {platform.python_version()}, torch {torch.__version__}, {platform.machine()}."
+    )
+
+
+ABOUT = """\
+Race each model of which models/index.json promises a speed-up against the exact tracer of its lens, the
+thin lens and the pinhole, all in one run; then the floors of the tracer and the renderer.
+Exit code 1 where a model is slower than promised or a floor is missed. Writes bench.md and bench.json."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `python -m experiments promises`."""
+    parser.add_argument(
+        "--models", metavar="DIR", type=Path, default=lab.MODELS, help="folder with index.json (default: models)"
+    )
+    parser.add_argument(
+        "--only", metavar="TEXT", default="",
+        help="models whose names hold this text, promised or not; no floors then",
+    )  # fmt: skip
+    parser.add_argument("--threads", metavar="N", type=whole(1), default=1, help="that share out batches (default 1)")
+    parser.add_argument("--rounds", metavar="N", type=whole(1), default=20, help="of each candidate (default 20)")
+    lab.add_out(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """0 where all that could be checked is kept, 1 where something is not."""
+    warnings.simplefilter("ignore")
+    threads = f"{args.threads} thread" + "s" * (args.threads > 1)
+
+    def page(outcome: Outcome) -> str:
+        floors = f"\n## Floors\n\n{floor_table(outcome.floors)}" if outcome.floors else ""
+        return markdown("Models against the exact tracer", notes(threads, args.rounds), outcome.rows) + floors
+
+    def save(outcome: Outcome) -> None:
+        data = {"rows": outcome.rows, "floors": [{**asdict(f), "verdict": f.verdict} for f in outcome.floors]}
+        lab.write_results(args.out, "bench", page(outcome), data)
+
+    outcome = bench_models(lab.ROOT, args.models, args.only, args.threads, args.rounds, save)
+    if not args.only:
+        _say("floors of the tracer and the renderer ...")
+        outcome.floors = check_floors(lab.ROOT, args.rounds)
+        save(outcome)
+    print(page(outcome))
+    return report_outcome(outcome)

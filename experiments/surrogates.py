@@ -1,0 +1,35 @@
+"""Every method on a set of lenses, or on the whole library: `neurolens bench surrogates` with lenses chosen here."""
+
+from __future__ import annotations
+
+import argparse
+
+from experiments import lab
+from neurolens.base.errors import InputError
+from neurolens.commands import bench
+from neurolens.evaluate.describe import lens_files
+
+# A standard lens, a long zoom, one that is hard for its aperture, a fisheye, and one of steep aspheres.
+DEFAULT_LENSES = (
+    "laikin_double_gauss_50", "ogawa_zoom_70_200", "schaefter_primoplan_100", "horimoto_fisheye_16", "phone_lens_6"
+)  # fmt: skip
+ABOUT = f"""\\
+{bench.SURROGATES}
+
+Without LENS: {", ".join(DEFAULT_LENSES)}."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `python -m experiments surrogates`: those of `neurolens bench surrogates`, and --library."""
+    bench.add_surrogate_arguments(parser, "*")
+    parser.add_argument("--library", action="store_true", help="every lens file of lenses/")
+
+
+def run(args: argparse.Namespace) -> int:
+    """As `neurolens bench surrogates` on the lenses chosen."""
+    if args.library:
+        if args.lenses:
+            raise InputError("experiments surrogates", "LENS", args.lenses, "none beside --library")
+        args.lenses = [str(file) for file in lens_files(lab.LENSES)]
+    args.lenses = args.lenses or list(DEFAULT_LENSES)
+    return bench.run_surrogates(args)

@@ -1,0 +1,240 @@
+"""The benchmark of models of many states: every zoom of the library over its whole range, and internal focus.
+
+One model a case, measured at random states against the exact lens, beside models that were each fitted to one state.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from experiments import lab
+from neurolens import __version__
+from neurolens.analysis.plot_style import FIELD_COLOURS, INK, new_figure, save, style
+from neurolens.base.errors import InputError
+from neurolens.base.progress import Progress, Report
+from neurolens.commands.arguments import whole
+from neurolens.evaluate.experiment import near_limit_m, wavelengths_nm
+from neurolens.evaluate.rays import ray_errors
+from neurolens.evaluate.train_states import AXIS_LABELS, error_axes, error_line, fit_and_measure_states
+from neurolens.modelfile.axes import Axis
+from neurolens.optics.lensfile import read_lens
+from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
+from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.states.fit import StateSettings
+from neurolens.surrogates.states.space import StateSpace, axes_of
+from neurolens.surrogates.threads import pinned_threads
+
+# Coefficients per vector, rays of a node, rays of a single fit's test.
+TERMS, RAYS, TESTS = 64, 15_000, 8_000
+# Places in the range, of the first axis, at which models are fitted to one state.
+FIXED = (0.0, 0.15, 0.4, 0.7, 1.0)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A lens and the states that one model is of; `position` is the zoom position where zoom is no axis."""
+
+    lens: str
+    zoom: bool = True
+    internal: bool = False
+    position: str | None = None
+
+    @property
+    def name(self) -> str:
+        """For files and commands: "nikon_zoom_70_200", "nikon_zoom_70_200-focus-71mm"."""
+        focus = "-focus" if self.internal else ""
+        return f"{self.lens}{focus}{'' if self.position is None else '-' + self.position}"
+
+    def space(self, lenses: Path) -> StateSpace:
+        """The states, with the domain that `neurolens train` takes where nothing is stated."""
+        lens = read_lens(lenses / f"{self.lens}.toml").with_aperture(None)
+        return StateSpace(
+            lens,
+            axes_of(lens, zoom=self.zoom, internal=self.internal, state=self.position),
+            zoom=self.position,
+            focus_m=lambda state: (math.inf, near_limit_m(state)),
+            wavelength_nm=wavelengths_nm(lens),
+        )
+
+
+CASES = (
+    Case("nikon_zoom_70_200"),
+    Case("ogawa_zoom_70_200"),
+    Case("nikon_zoom_80_200"),
+    Case("nikon_zoom_14_24"),
+    Case("itoh_zoom_100_146"),
+    Case("nikon_zoom_70_200", zoom=False, internal=True, position="71mm"),
+    Case("nikon_zoom_70_200", zoom=False, internal=True, position="196mm"),
+    Case("nikon_zoom_70_200", internal=True),
+)
+
+
+def measure_case(case: Case, lenses: Path, folder: Path, states: int, report: Report) -> dict[str, Any]:
+    """Fit and measure one case.
+
+    Args:
+        folder: for the model, which is kept; see `train_states.fit_and_measure_states`.
+        states: random states of the measurement.
+    """
+    space = case.space(lenses)
+    settings = StateSettings(terms=TERMS, rays=RAYS, name=case.name)
+    record = fit_and_measure_states(space, settings, folder, states=states, report=lambda done: report(0.8 * done))
+    fixed = []
+    for place in FIXED if len(space.axes) == 1 else ():
+        fixed.append(_fixed(space, place))
+        report(0.8 + 0.2 * len(fixed) / len(FIXED))
+    return {
+        "case": case.name,
+        "lens": space.lens.name,
+        "version": __version__,
+        "axes": [a.to_dict() for a in space.axes],
+        "fixed": fixed,
+        **record,
+    }
+
+
+def _fixed(space: StateSpace, place: float) -> dict[str, float]:
+    """Errors of a model with as many coefficients, fitted to one state."""
+    axis = space.axes[0]
+    value = axis.range[0] + (axis.range[1] - axis.range[0]) * place
+    lens, domain = space.lens_at((value,)), space.domain_at((value,))
+    pairs = make_pairs(lens, domain, PairSettings(RAYS, TESTS, RAYS))
+    model = fit_model(prepare(pairs), ModelSettings("ols", terms=TERMS))
+    errors = ray_errors(lens, domain, pairs.held_out, model.predict)
+    return {axis.name: value, "rms_um": errors["rms_um"], "direction_rms_deg": errors["direction_rms_deg"]}
+
+
+def write_records(records: Mapping[str, Mapping[str, Any]], out: Path) -> str:
+    """Write zoom.json, zoom.md and zoom.png; returns the page."""
+    order = [c.name for c in CASES]
+    rows = sorted(records.values(), key=lambda r: order.index(r["case"]) if r["case"] in order else len(order))
+    out.mkdir(parents=True, exist_ok=True)
+    panels_plot([(r["case"], Axis.from_dict(r["axes"][0]), r["states"], r["fixed"]) for r in rows], out / "zoom.png")
+    text = page(rows)
+    lab.write_results(out, "zoom", text, {"cases": rows})
+    return text
+
+
+_HEAD = """\
+# Models of many states
+
+One ONNX model over the whole range of a zoom, or over internal focus, or both; the state is one more input (focal
+length in mm, 1 / distance in 1/m). {terms} coefficients per vector at every node; the full lit film, full aperture,
+and where the film focuses, focus from infinity to the near limit (14 focal lengths or more) in every state. Worst and
+median of {states} random states, rays that no fit saw, micrometres on the film; the goal is 3 um RMS anywhere.
+*One state*: median of models of as many coefficients that were each fitted to one state.
+Made by `python -m experiments zoom`.
+
+| model | state | nodes | RMS um, median | worst | at 21.6 mm | p99 worst | direction deg, worst | position um, worst \
+| transmittance, worst | false pass %, worst | false block %, worst | one state, RMS um | kB | fit s |
+|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|
+"""
+
+
+def page(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The table."""
+
+    def number(value: float | None, scale: float = 1.0) -> str:
+        return "–" if value is None else f"{scale * value:.2g}"
+
+    lines = []
+    for r in rows:
+        ranges = ", ".join(f"{a['name']} {a['range'][0]:.4g}–{a['range'][1]:.4g} {a['unit']}" for a in r["axes"])
+        single = sorted(f["rms_um"] for f in r["fixed"])
+        cells = [
+            r["case"],
+            ranges,
+            str(r["nodes"]),
+            number(r["median"]["rms_um"]),
+            number(r["rms_um"]),
+            number(r["rms_um_at_21_6"]),
+            number(r["p99_um"]),
+            number(r["direction_rms_deg"]),
+            number(r["position_rms_um"]),
+            number(r["transmittance_rms"]),
+            number(r["false_pass"], 100),
+            number(r["false_block"], 100),
+            number(single[len(single) // 2]) if single else "–",
+            f"{r['bytes'] / 1000:.0f}",
+            f"{r['fit_s']:.0f}",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    states = max((len(r["states"]) for r in rows), default=0)
+    return _HEAD.format(terms=TERMS, states=states) + "\n".join(lines) + "\n\n![error over the state](zoom.png)\n"
+
+
+Panel = tuple[str, Axis, Sequence[Mapping[str, Any]], Sequence[Mapping[str, Any]]]
+
+
+def panels_plot(panels: Sequence[Panel], path: str | Path) -> Path:
+    """A panel for each model: its error over the first state axis, and those of models fitted to one state each.
+
+    Args:
+        panels: title, first axis, rows of the model, rows of the others.
+        path: PNG, PDF or SVG to write.
+    """
+    columns = 2 if len(panels) > 1 else 1
+    with style():
+        rows = -(-len(panels) // columns)
+        figure = new_figure(5.2 * columns, 3.0 * rows)
+        places = figure.subplots(rows, columns, squeeze=False).ravel()
+        for place, (title, axis, states, fixed) in zip(places, panels, strict=False):
+            error_line(place, axis, states, FIELD_COLOURS[0], "one model of all states")
+            if fixed:
+                x = [r[axis.name] for r in fixed]
+                place.plot(x, [r["rms_um"] for r in fixed], "s", ms=5, mfc="none", color=INK, label="one state each")
+            error_axes(place, axis, [r["rms_um"] for r in (*states, *fixed)])
+            place.set_title(title, loc="left", fontsize="medium")
+            place.set_xlabel(AXIS_LABELS.get(axis.name, f"{axis.name} ({axis.unit})"))
+            place.set_ylabel("RMS (um)")
+            place.legend(loc="best", fontsize="small")
+        for place in places[len(panels) :]:
+            place.set_visible(False)
+        return save(figure, path)
+
+
+ABOUT = """\
+Fit one model for the whole range of each zoom of the library, for internal focus, and for both, and
+measure it at random states against the exact lens, beside models fitted to one state each. A minute
+or two for each of the eight, ten for the last; those that are in the table are kept.
+Writes zoom.md, zoom.json and zoom.png."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `python -m experiments zoom`."""
+    parser.add_argument("cases", metavar="CASE", nargs="*", help="cases by name, as in the table (default: all)")
+    parser.add_argument("--states", metavar="N", type=whole(2, 1000), default=25, help="random states (default: 25)")
+    parser.add_argument("--again", action="store_true", help="measure the chosen cases again")
+    parser.add_argument(
+        "--models",
+        metavar="DIR",
+        type=Path,
+        default=Path("runs/zoom"),
+        help="folder for the models (default: runs/zoom)",
+    )
+    lab.add_out(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure what is missing, and write the table after each case."""
+    known = {c.name: c for c in CASES}
+    unknown = [name for name in args.cases if name not in known]
+    if unknown:
+        raise InputError("experiments zoom", "CASE", unknown[0], f"one of: {', '.join(known)}")
+    args.models.mkdir(parents=True, exist_ok=True)
+    records = lab.kept_rows(args.out / "zoom.json", "cases", "case", "experiments zoom")
+    missing = [known[n] for n in args.cases or known if args.again or n not in records]
+    progress = Progress(dict.fromkeys((c.name for c in missing), 60.0), quiet=args.quiet)
+    text = page(list(records.values()))
+    with pinned_threads():
+        for case in missing:
+            with progress.stage(case.name) as report:
+                records[case.name] = measure_case(case, lab.LENSES, args.models, args.states, report)
+            text = write_records(records, args.out)
+    print(text)
+    return 0

@@ -1,1 +1,0 @@
-"""Benchmarks: what `neurolens bench` measures and writes."""

@@ -1,0 +1,301 @@
+"""Figures of renders and lenses: pictures beside their errors, light over the film, breathing, a sheet of lenses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from neurolens.analysis.layout import (
+    checked_rays,
+    checked_surfaces,
+    draw_film,
+    draw_glass,
+    draw_rays,
+    draw_rims,
+    z_range,
+)
+from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, new_figure, plain_log_ticks, save, style
+from neurolens.base.errors import InputError
+from neurolens.evaluate.image import checked_image, to_srgb
+from neurolens.optics.focusing import Breath, breathing, field_change, focus_states, nearest_focus_m
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Focus, Lens
+
+_Box = tuple[float, float, float, float]  # left, bottom, width, height in shares of the figure
+
+_COLUMNS = 4  # more would leave each picture too small to judge
+
+
+def side_by_side(
+    images: Mapping[str, ArrayLike],
+    error_maps: Mapping[str, ArrayLike],
+    path: str | Path,
+    captions: Mapping[str, str] | None = None,
+    exposure: float = 1.0,
+    error_label: str = "FLIP (0 to 1)",
+    error_max: float | None = None,
+    title: str = "",
+) -> Path:
+    """Renders in rows of four, each with its error image below; one colour bar serves all of them.
+
+    Args:
+        images: name to linear RGB [H, W, 3], shown with `exposure` through `image.to_srgb`; all of one shape.
+        error_maps: name to error [H, W]; a name without one (the reference) keeps its place below for its caption.
+        path: PNG, PDF or SVG to write.
+        captions: name to one or two lines shown below its picture, for example `image_caption(...)`.
+        error_label: quantity and unit beside the colour bar.
+        error_max: top of the colour scale; by default the 99.5th percentile of all maps, rounded up.
+    Raises:
+        InputError: no image, shapes that differ, values that are not finite, a map without its image.
+    """
+    pictures = {name: checked_image(image, name) for name, image in images.items()}
+    maps = {name: np.asarray(error, dtype=np.float64) for name, error in error_maps.items()}
+    _check_shapes(pictures, maps)
+    scale = error_max or _rounded_up(maps)
+    height, width = next(iter(pictures.values())).shape[:2]
+    with style():
+        figure, places, bar_place = _page(len(pictures), height / width, bool(maps), title)
+        shown = None
+        for (name, picture), (top, below) in zip(pictures.items(), places, strict=True):
+            axes = _picture_axes(figure, top)
+            axes.imshow(to_srgb(picture, exposure), interpolation="nearest")
+            axes.set_title(name, fontsize=10.5, fontweight="bold", pad=4)
+            if name in maps:
+                axes = _picture_axes(figure, below)
+                shown = axes.imshow(maps[name], cmap="magma", vmin=0, vmax=scale, interpolation="nearest")
+            _caption(axes, (captions or {}).get(name, ""))
+        if shown is not None:
+            bar = figure.colorbar(shown, cax=figure.add_axes(bar_place))
+            bar.set_label(error_label)
+            bar.outline.set_visible(False)
+        return save(figure, path)
+
+
+def image_caption(figures: Mapping[str, Any]) -> str:
+    """Two lines from the result of `image.compare`: FLIP and relative MSE, each beside its noise floor."""
+    parts = []
+    for name, key in (("FLIP", "flip"), ("relMSE", "rel_mse")):
+        value, floor = figures.get(key), figures.get(f"noise_floor_{key}")
+        if value is not None:
+            parts.append(f"{name} {value:.3g}" + ("" if floor is None else f" (noise {floor:.3g})"))
+    return "\n".join(parts)
+
+
+def _check_shapes(pictures: Mapping[str, Any], maps: Mapping[str, Any]) -> None:
+    if not pictures:
+        raise InputError("side by side", "images", "(none)", "at least one image")
+    first = next(iter(pictures.values())).shape
+    for name, picture in pictures.items():
+        if picture.shape != first:
+            raise InputError("side by side", f"image {name}", f"({picture.shape})", f"the shape of the first, {first}")
+    for name, error in maps.items():
+        if name not in pictures:
+            raise InputError("side by side", "error map", name, "the name of an image: " + ", ".join(pictures))
+        if error.shape != first[:2] or not np.isfinite(error).all():
+            raise InputError("side by side", f"error map {name}", f"({error.shape})", f"finite values, {first[:2]}")
+
+
+def _page(count: int, aspect: float, maps: bool, title: str) -> tuple[Any, list[tuple[_Box, _Box]], _Box]:
+    """A figure, the (picture, error image) boxes of each of `count` pictures, and the box of the colour bar.
+
+    Laid out in inches by hand: pictures keep their aspect and fill their width, which automatic layouts do not promise.
+    """
+    rows = math.ceil(count / _COLUMNS)
+    columns = math.ceil(count / rows)
+    wide = max(2.45, 7.6 / columns)
+    tall, gap, name, words = wide * aspect, 0.12, 0.3, 0.46
+    band = name + tall + (gap / 2 + tall if maps else 0) + words
+    head, bar = (0.4 if title else 0.08), (0.95 if maps else gap)
+    page = (gap + columns * (wide + gap) + bar, head + rows * band)
+    figure = new_figure(*page)
+    figure.set_layout_engine("none")
+    if title:
+        figure.text(gap / page[0], 1 - 0.12 / page[1], title, fontsize=12.5, fontweight="bold", va="top")
+
+    def box(left: float, top: float, width: float, height: float) -> _Box:
+        return left / page[0], 1 - (top + height) / page[1], width / page[0], height / page[1]
+
+    places = []
+    for index in range(count):
+        left, top = gap + (index % columns) * (wide + gap), head + (index // columns) * band + name
+        places.append((box(left, top, wide, tall), box(left, top + tall + gap / 2, wide, tall)))
+    return figure, places, box(page[0] - bar + 0.08, head + name, 0.14, page[1] - head - name - words)
+
+
+def _picture_axes(figure: Any, box: _Box) -> Any:
+    axes = figure.add_axes(box)
+    axes.set_axis_off()
+    return axes
+
+
+def _rounded_up(maps: Mapping[str, Any]) -> float:
+    """99.5th percentile of all maps (not the maximum: fireflies), rounded up to 1, 2 or 5 times a power of ten."""
+    if not maps:
+        return 1.0
+    value = float(np.percentile(np.concatenate([m.ravel() for m in maps.values()]), 99.5))
+    if value <= 0:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(step * power for step in (1, 2, 5, 10) if step * power >= value * (1 - 1e-9))
+
+
+def _caption(axes: Any, text: str) -> None:
+    axes.annotate(
+        text, (0.5, 0), xycoords="axes fraction", xytext=(0, -5), textcoords="offset points", ha="center", va="top",
+        fontsize=8.6, color="#444444",
+    )  # fmt: skip
+
+
+def illumination_plot(light: Mapping[str, Any], path: str | Path, title: str = "Relative illumination") -> Path:
+    """Relative illumination against film radius: the exact lens as a line, models dashed on it, differences below.
+
+    Args:
+        light: film_radius_mm [N]; exact [N] and models (name to [N]), shares of the exact value on the axis.
+        path: PNG, PDF or SVG to write.
+    Raises:
+        InputError: no radius, curves of another length, values that are not finite.
+    """
+    radius = np.asarray(light["film_radius_mm"], dtype=np.float64)
+    exact = _curve("exact", light["exact"], radius)
+    curves = {name: _curve(name, values, radius) for name, values in light["models"].items()}
+    with style():
+        figure = new_figure(7.6, 5.4)
+        upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": (3, 1.2)})
+        upper.plot(radius, exact, color=INK, lw=2.6, alpha=0.45, label="exact")
+        for number, (name, values) in enumerate(curves.items()):
+            colour = FIELD_COLOURS[number % len(FIELD_COLOURS)]
+            upper.plot(radius, values, color=colour, lw=1.4, ls=(0, (4, 2 + number)), label=name)
+            lower.plot(radius, 100 * (values - exact), color=colour, lw=1.4, marker=".", ms=4)
+        upper.set_ylim(0, 1.04 * max(1.0, float(exact.max()), *(float(v.max()) for v in curves.values())))
+        upper.set_ylabel("illumination (share of the axis)")
+        upper.set_title(title, loc="left", fontweight="bold")
+        upper.legend(loc="lower left")
+        lower.axhline(0, color=INK, lw=0.9)
+        lower.set_ylabel("model - exact\n(% of the axis)")
+        lower.set_xlabel("film radius (mm)")
+        for axes in (upper, lower):
+            axes.grid(True)
+        return save(figure, path)
+
+
+def _curve(name: str, values: Any, radius: Any) -> Any:
+    curve = np.asarray(values, dtype=np.float64)
+    if radius.size == 0 or curve.shape != radius.shape or not np.isfinite(curve).all():
+        raise InputError(
+            "illumination plot", name, f"({curve.shape})", f"finite values, one a film radius, {radius.shape}"
+        )
+    return curve
+
+
+_DASHES = ((0, ()), (0, (5, 2)), (0, (1.5, 1.5)))
+
+
+def breathing_plot(ways: Mapping[str, Sequence[Breath]], path: str | Path, title: str = "Focus breathing") -> Path:
+    """Three panels over one logarithmic axis of distance; one line for each way of focusing.
+
+    Args:
+        ways: name of the way ("film moves", "groups move") to its states. Infinity is left out: it has no place on the
+            axis.
+        path: PNG, PDF or SVG to write.
+
+    Raises:
+        InputError: a way with fewer than two finite distances.
+    """
+    if not ways:
+        raise InputError("breathing plot", "ways", "(none)", "at least one way of focusing")
+    with style():
+        figure = new_figure(7.6, 7.4)
+        panels = figure.subplots(3, 1, sharex=True)
+        for number, (name, breaths) in enumerate(ways.items()):
+            near = sorted((b for b in breaths if b.focus_m < 1e9), key=lambda b: b.focus_m)
+            if len(near) < 2:
+                raise InputError("breathing plot", name, f"({len(near)} distances)", "two finite distances or more")
+            look = {
+                "color": FIELD_COLOURS[number % len(FIELD_COLOURS)],
+                "ls": _DASHES[number % len(_DASHES)],
+                "lw": 1.8,
+            }
+            distance = [b.focus_m for b in near]
+            change = f"{name} (picture grows by {100 * field_change(breaths):.1f}%)"
+            panels[0].plot(distance, [b.field_deg for b in near], label=change, **look)
+            panels[1].plot(distance, [b.efl_mm for b in near], **look)
+            panels[2].plot(distance, [abs(b.magnification) for b in near], **look)
+        panels[0].set_title(title, loc="left", fontweight="bold")
+        panels[0].legend(loc="best")
+        labels = ("field of view (degrees,\nacross the image circle)", "focal length (mm)", "magnification")
+        for axes, label in zip(panels, labels, strict=True):
+            axes.set_ylabel(label)
+            axes.grid(True)
+            axes.ticklabel_format(axis="y", useOffset=False)
+        panels[2].set_xscale("log")
+        panels[2].set_yscale("log")
+        panels[2].set_xlabel("distance from object to film (m)")
+        plain_log_ticks(panels[2].xaxis)
+        plain_log_ticks(panels[2].yaxis)
+        return save(figure, path)
+
+
+def draw_breathing(lens: Lens, path: str | Path, count: int = 48) -> dict[str, list[Breath]]:
+    """Compute and draw a lens's breathing from its nearest focus to a thousand focal lengths.
+
+    Both ways of focusing are drawn where the lens file has focus states. Returns what is drawn, infinity first.
+    """
+    data = first_order(lens.at())
+    nearest = 1.05 * (4 * abs(data.efl_mm) + data.rear_principal_z_mm - data.front_principal_z_mm) / 1000
+    ways: dict[str, Focus] = {"film moves": "film"}
+    if focus_states(lens):
+        ways["groups move"] = "internal"
+        nearest = max(nearest, 1.0001 * nearest_focus_m(lens))
+    far = max(abs(data.efl_mm), 10 * nearest)
+    distances = [nearest * (far / nearest) ** (k / (count - 1)) for k in range(count)]
+    found = {name: breathing(lens, [math.inf, *distances], way) for name, way in ways.items()}
+    breathing_plot(found, path, f"Focus breathing of {lens.name}")
+    return found
+
+
+_LIBRARY_COLUMNS = 6
+_CELL_IN = (2.6, 2.0)  # width and height of one section with its title
+
+
+def sheet(profiles: Sequence[Mapping[str, Any]], path: str | Path) -> Path:
+    """Draw lenses in section, light from left to right, each as large as its cell allows, axes of equal scale.
+
+    Args:
+        profiles: as `plot_layout.lens_layout` takes them, with title and subtitle.
+        path: PNG, PDF or SVG to write.
+    Raises:
+        InputError: no lens at all.
+    """
+    if not profiles:
+        raise InputError("lens sheet", "profiles", "(none)", "at least one lens")
+    columns = min(_LIBRARY_COLUMNS, len(profiles))
+    rows = math.ceil(len(profiles) / columns)
+    with style():
+        figure = new_figure(_CELL_IN[0] * columns, _CELL_IN[1] * rows)
+        for place, profile in enumerate(profiles):
+            _cell(figure.add_subplot(rows, columns, place + 1), profile)
+        return save(figure, path)
+
+
+def _cell(axes: Any, profile: Mapping[str, Any]) -> None:
+    surfaces = checked_surfaces(profile)
+    height = max(float(s["semi_diameter_mm"]) for s in surfaces)
+    z = z_range(profile, surfaces, height)
+    top = max(height * 1.18, 1.06 * float(profile.get("film_half_height_mm") or 0))
+    axes.set(xlim=z, ylim=(-top, top), aspect="equal")
+    axes.axis("off")
+    axes.plot(z, (0, 0), color=FAINT, lw=0.4, zorder=1)
+    draw_glass(axes, surfaces)
+    draw_rims(axes, surfaces, height)
+    draw_film(axes, profile)
+    draw_rays(axes, checked_rays(profile))
+    for line in axes.lines:
+        line.set_linewidth(0.6 * line.get_linewidth())
+    for patch in axes.patches:
+        patch.set_linewidth(0.5)
+    axes.set_title(f"{profile.get('title', '')}\n{profile.get('subtitle', '')}", fontsize=6, loc="left")

@@ -1,0 +1,375 @@
+"""Every method on the same rays of a lens: the rows of `neurolens bench surrogates`, their records, errors and times.
+
+A record that is there, made by the same settings and version, is kept.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any, get_args
+
+from neurolens import __version__
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.base.files import atomic_write_text
+from neurolens.base.progress import Progress, Report
+from neurolens.cameras.model import load_model
+from neurolens.evaluate.candidates import exact_candidates, fused_candidate, model_candidate
+from neurolens.evaluate.experiment import DomainChoice, LensChoice
+from neurolens.evaluate.measure import FreshRays, measure, onnx_predictor, shared_rays
+from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
+from neurolens.evaluate.records import break_even_rays, plain
+from neurolens.evaluate.speed import Race, race
+from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import image_radius_mm
+from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model, prepare
+from neurolens.surrogates.fits.ablations import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.precision import Precision, store_weights
+from neurolens.surrogates.published import PUBLISHED
+
+GROUPS = {
+    "paraxial": "what renderers use today",
+    "published": "published methods, as their papers have them",
+    "ours": "this project's",
+    "ablations": "ours with one thing changed",
+}
+DEFAULT_GROUPS = ("paraxial", "published", "ours")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method with its settings.
+
+    Attributes:
+        name: of the table's row and of files.
+        group: of `GROUPS`.
+        settings: of the fit.
+        source: the paper, or what an ablation changes.
+        weights: how a network's weights are stored in the file, where not in float32.
+    """
+
+    name: str
+    group: str
+    settings: ModelSettings
+    source: str = ""
+    weights: Precision | None = None
+
+
+def _ours() -> tuple[ModelSettings, ...]:
+    polynomials = tuple(ModelSettings("ols", terms=terms) for terms in (20, 40, 64, 100))
+    networks = tuple(ModelSettings("mlp", units=n, layers=k) for n, k in ((8, 1), (10, 1), (8, 2), (16, 2), (32, 2)))
+    return *polynomials, *networks, *(ModelSettings("ols+mlp", terms=n, units=u) for n, u in ((40, 8), (64, 16)))
+
+
+def _ablations() -> Iterator[Row]:
+    """Our polynomial of 64 terms and our network with one part left out."""
+    for whole, parts in (
+        (ModelSettings("ols", terms=64), POLYNOMIAL_ABLATIONS),
+        (ModelSettings("mlp"), NETWORK_ABLATIONS),
+    ):
+        for text in parts:
+            name = f"{whole.label}-{text.replace(' ', '-')}"
+            yield Row(name, "ablations", replace(ablated(whole, text), name=name), text)
+
+
+@cache
+def all_rows() -> tuple[Row, ...]:
+    """Every row that this version can fit, group by group."""
+    rows = [Row(name, "paraxial", ModelSettings(name)) for name in ("thin", "thick")]
+    for method in PUBLISHED.values():
+        rows += [Row(s.label, "published", s, method.citation) for s in method.presets]
+    rows += [Row(s.label, "ours", s) for s in _ours()]
+    network = ModelSettings("mlp")
+    rows += [Row(f"{network.label}-{p}", "ours", network, weights=p) for p in get_args(Precision)]
+    return tuple([*rows, *_ablations()])
+
+
+def chosen_rows(names: Sequence[str]) -> tuple[Row, ...]:
+    """Rows by name, by group, or by method ("ols", "schrade"; without ablations); none named: all but the ablations.
+
+    Raises:
+        InputError: a name that is none of these.
+    """
+    rows, wanted = all_rows(), names or DEFAULT_GROUPS
+    picked: dict[str, Row] = {}
+    for name in wanted:
+        found = [r for r in rows if name in (r.name, r.group) or (name == r.settings.method and r.group != "ablations")]
+        if not found and name not in GROUPS:
+            known = ", ".join((*GROUPS, *(r.name for r in rows)))
+            raise InputError("neurolens bench surrogates", "--methods", name, f"one of: {known}")
+        picked |= {r.name: r for r in found}
+    return tuple(picked.values())
+
+
+_FIGURES = (
+    "rms_um p99_um max_um rms_infinity_um rms_px p99_px max_px rms_um_at_21_6 direction_rms_deg direction_p99_deg "
+    "direction_max_deg position_rms_um position_p99_um transmittance_rms transmittance_max false_pass false_block "
+    "false_pass_near_rim false_block_near_rim rays share_beyond_60_deg"
+).split()
+
+
+@dataclass(frozen=True)
+class BenchSettings:
+    """What is the same for all rows.
+
+    Attributes:
+        domain: of the models; None for focus_m: infinity only.
+        pairs: rays of the fits and of the errors.
+        vignetting_rays: that test what passes.
+        rounds, threads: of the race; none without rounds.
+        compile_exact: whether the compiled exact tracer races.
+    """
+
+    domain: DomainChoice = field(default_factory=lambda: DomainChoice(focus_m=(math.inf, math.inf)))
+    pairs: PairSettings = field(default_factory=PairSettings)
+    vignetting_rays: int = 200_000
+    rounds: int = 10
+    threads: int = 1
+    compile_exact: bool = True
+
+
+@dataclass(frozen=True)
+class Bench:
+    """One lens of the benchmark and the folder of its records; what costs time is made when it is first wanted."""
+
+    choice: LensChoice
+    settings: BenchSettings
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        parts = [self.choice.file.stem, self.choice.configuration or ""]
+        return "-".join(p for p in parts if p)
+
+    @cached_property
+    def lens(self) -> Lens:
+        return self.choice.read()
+
+    @cached_property
+    def domain(self) -> Domain:
+        return self.settings.domain.of(self.lens)
+
+    @cached_property
+    def prepared(self) -> Prepared:
+        return prepare(make_pairs(self.lens, self.domain, self.settings.pairs))
+
+    @cached_property
+    def rays(self) -> FreshRays:
+        return shared_rays(self.prepared, self.settings.vignetting_rays)
+
+    @cached_property
+    def per_reference(self) -> float:
+        """Micrometres at an image radius of 21.6 mm for one of this lens."""
+        return REFERENCE_RADIUS_MM / image_radius_mm(self.lens)[0]
+
+    def record_file(self, row: Row) -> Path:
+        return self.folder / "records" / self.name / f"{row.name}.json"
+
+    def model_file(self, row: Row) -> Path:
+        return self.folder / "models" / self.name / f"{row.name}.onnx"
+
+    def fingerprint(self, row: Row) -> str:
+        """Of all that decides a record but its times."""
+        asked = [
+            __version__, self.lens.sha256, self.lens.stop_radius_mm, self.lens.image_radius_mm,
+            asdict(self.settings.domain), asdict(self.settings.pairs), self.settings.vignetting_rays,
+            asdict(row.settings), *([row.weights] if row.weights else []),
+        ]  # fmt: skip
+        return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+
+
+def run_bench(
+    benches: Sequence[Bench],
+    rows: Sequence[Row],
+    *,
+    again: bool = False,
+    progress: Progress,
+    done: Callable[[Bench, list[dict[str, Any]]], None] = lambda bench, records: None,
+) -> dict[str, list[dict[str, Any]]]:
+    """Records of every lens, by its name; `done` hears of each lens as soon as it is through.
+
+    Args:
+        again: make all records again, those that are there too.
+    """
+    for bench in benches:
+        progress.plan({f"{bench.name}: {row.name}": _expected_s(row) for row in rows})
+        progress.plan({f"{bench.name}: race": 60.0 if bench.settings.compile_exact else 15.0})
+    found = {}
+    for bench in benches:
+        records = []
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NeurolensWarning)
+            for row in rows:
+                with progress.stage(f"{bench.name}: {row.name}") as report:
+                    records.append(_record(bench, row, again, report))
+            with progress.stage(f"{bench.name}: race") as report:
+                _add_times(bench, rows, records, report)
+        found[bench.name] = records
+        done(bench, records)
+    return found
+
+
+def _expected_s(row: Row) -> float:
+    return 30.0 if row.settings.method in (*NETWORKS, "neurolens2017") else 4.0
+
+
+def _record(bench: Bench, row: Row, again: bool, report: Report) -> dict[str, Any]:
+    """A record that is there and was made by the same settings, or a new one; its failure where it fails."""
+    file = bench.record_file(row)
+    head = {"lens": bench.name, "method": row.name, "group": row.group, "source": row.source}
+    try:
+        mark = bench.fingerprint(row)
+        known = None if again else read_record(file, mark)
+        if known is not None and (known["failed"] or known["not_exported"] or bench.model_file(row).is_file()):
+            return known
+        file.unlink(missing_ok=True)  # a run that is interrupted now leaves no record of what is gone
+        made = {"failed": None, **_fit_and_measure(bench, row, report)}
+    except Exception as error:  # a row with the reason: the other methods and lenses go on
+        # What was refused will be again; what was not foreseen is tried again by the next run.
+        mark = _mark(bench, row) if isinstance(error, NeurolensError) else ""
+        made = {"failed": _reason(error), "not_exported": None}
+    record = plain({"fingerprint": mark, **head, "settings": asdict(row.settings), **made})
+    _write(file, record)
+    return record
+
+
+def _mark(bench: Bench, row: Row) -> str:
+    try:
+        return bench.fingerprint(row)
+    except NeurolensError:  # no such lens
+        return ""
+
+
+def _reason(error: Exception) -> str:
+    text = " ".join(str(error).split()).replace(f"{Path.cwd()}/", "")[:300]
+    return text if isinstance(error, NeurolensError) else f"{type(error).__name__}: {text}"
+
+
+def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
+    """Errors of the exported graph in onnxruntime; of the float64 model where a method has no graph."""
+    prepared, file = bench.prepared, bench.model_file(row)
+    model = fit_model(prepared, row.settings, report)
+    refused = _export(model, file)
+    if row.weights and refused is None:
+        store_weights(file, file, row.weights, {})
+    predict: Any = model.predict
+    load_s = None
+    if refused is None:
+        start = time.perf_counter()
+        predict = onnx_predictor(load_model(file))
+        load_s = time.perf_counter() - start
+    found = measure(bench.rays, predict)
+    figures = {key: found.figures[key] for key in _FIGURES}
+    scaled = {
+        f"{key}_at_21_6": None if figures[key] is None else bench.per_reference * figures[key]  # type: ignore[operator]
+        for key in ("p99_um", "max_um", "position_rms_um")
+    }
+    network = row.settings.method in NETWORKS
+    return {
+        **figures,
+        **scaled,
+        "stopped_down": found.stopped_down,
+        "zones": found.zones,
+        "coefficients_per_vector": None if network else model.core.coefficients_per_vector,
+        "parameters": model.core.coefficients,
+        "rims": len(model.gates),
+        "bytes": file.stat().st_size if refused is None else None,
+        "fit_s": model.fit_s,
+        "load_s": load_s,
+        "not_exported": refused,
+        "film_radius_mm": bench.domain.film_radius_mm,
+        "passing_share": float(bench.rays.passes.double().mean()),
+    }
+
+
+def _export(model: LensModel, file: Path) -> str | None:
+    """Write the model; why not, where its kind has no graph."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        export_onnx(model, file, {})
+    except (NeurolensError, NotImplementedError, TypeError) as error:
+        return _reason(error)
+    return None
+
+
+def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]], report: Report) -> None:
+    """Race all models of one lens and the exact tracer, and add the times to the records, unless that was done."""
+    s, files = bench.settings, {}
+    for row, record in zip(rows, records, strict=True):
+        if not record["failed"] and not record["not_exported"]:
+            files[row.name] = bench.model_file(row)
+    if not s.rounds or not files:
+        return
+    hashes = {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in sorted(files.items())}
+    mark = hashlib.sha256(json.dumps([hashes, s.rounds, s.threads, s.compile_exact]).encode()).hexdigest()
+    if all(record.get("race") == mark for record in records if record["method"] in files):
+        return
+    timed = race_models(bench.lens, bench.domain, files, s.rounds, s.threads, s.compile_exact, report)
+    for i, (row, record) in enumerate(zip(rows, records, strict=True)):
+        if row.name in files:
+            records[i] = plain({**record, **times_of(record, timed), "race": mark})
+            _write(bench.record_file(row), records[i])
+
+
+def read_record(file: Path, fingerprint: str | None = None) -> dict[str, Any] | None:
+    """A record, None where there is none, none that can be read, or one of other settings."""
+    try:
+        record = json.loads(file.read_text(encoding="utf-8"))
+        good = isinstance(record, dict) and {"lens", "method", "failed", "not_exported"} <= record.keys()
+    except (OSError, ValueError):
+        return None
+    return record if good and fingerprint in (None, record.get("fingerprint")) else None
+
+
+def _write(file: Path, record: dict[str, Any]) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    atomic_write_text(file, json.dumps(record, indent=1, allow_nan=False) + "\n")
+
+
+EXACT = ("exact eager", "exact compiled")
+
+
+def race_models(
+    lens: Lens, domain: Domain, files: Mapping[str, Path], rounds: int, threads: int, compiled: bool, report: Report
+) -> Race:
+    """Race exported models, by name, and the exact tracer; "NAME fused" where a C compiler makes one."""
+    candidates = exact_candidates(lens.with_stop_radius(domain.stop_radius_mm), domain, compiled=compiled)
+    for name, file in files.items():
+        candidates.append(model_candidate(name, load_model(file), domain.stop_radius_mm))
+        fused = fused_candidate(f"{name} fused", file, domain) if threads == 1 else None
+        if fused is not None:
+            candidates.append(fused)
+    return race(candidates, domain, rounds=rounds, threads=threads, report=report)
+
+
+def times_of(record: Mapping[str, Any], timed: Race) -> dict[str, Any]:
+    """Times of one model for its record, held against the fastest exact tracer of the same race.
+
+    Returns: ns_per_ray, speedup (by the minima), break_even_rays (after which fitting and loading have paid; "never"
+        where the exact tracer is as fast), the same with "fused_" before, and exact: the tracers' times.
+    """
+    name, found = record["method"], dict[str, Any]()
+    best = EXACT[1] if EXACT[1] in timed.ns else EXACT[0]
+    exact = timed.timing(best)
+    for prefix, candidate in (("", name), ("fused_", f"{name} fused")):
+        timing, ratio = timed.timing(candidate), timed.speedup(candidate, best)
+        pays: float | str | None = None
+        if exact and timing:
+            pays = break_even_rays(record["fit_s"], record["load_s"], exact["min"], timing["min"]) or "never"
+        found |= {
+            f"{prefix}ns_per_ray": timing,
+            f"{prefix}speedup": ratio["min"] if ratio else None,
+            f"{prefix}break_even_rays": pays,
+        }
+    return {**found, "exact": [timed.record(n) for n in EXACT if n in timed.ns or n in timed.unavailable]}

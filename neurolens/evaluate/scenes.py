@@ -1,0 +1,250 @@
+"""What an experiment does with scenes: renders through every camera, compared with the exact lens's, and the gain of a
+domain that holds only what one shot requires.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neurolens.base.progress import Progress, Report
+from neurolens.cameras.contract import Camera, FloatArray
+from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.thin import ThinLens
+from neurolens.evaluate.candidates import model_candidate
+from neurolens.evaluate.experiment import Experiment, RenderChoice
+from neurolens.evaluate.figures import image_caption, side_by_side
+from neurolens.evaluate.image import compare, flip_map
+from neurolens.evaluate.measure import fit_and_measure
+from neurolens.evaluate.speed import Candidate, race
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.render.job import camera_axes
+from neurolens.render.pictures import write_exr, write_png
+from neurolens.render.primitives import Rays
+from neurolens.render.renderer import render
+from neurolens.render.scene import CameraSettings, Scene, load_scene
+from neurolens.render.spectrum import SpectralRange
+from neurolens.render.world import World
+from neurolens.surrogates.domain import Domain, domain_from_camera
+from neurolens.surrogates.fit import prepare
+from neurolens.surrogates.pairs import make_pairs
+
+EXACT = "exact"
+
+
+@dataclass
+class Pictures:
+    """Records for `results.json`: pictures, cameras, figures."""
+
+    images: list[dict[str, Any]] = field(default_factory=list)
+    cameras: list[dict[str, Any]] = field(default_factory=list)
+    figures: list[dict[str, Any]] = field(default_factory=list)
+
+
+def scene_cameras(lens: Lens, domain: Domain, models: Mapping[str, Path], shot: CameraSettings) -> dict[str, Camera]:
+    """Exact lens, each model, thin lens and pinhole, set as a scene's [camera] asks; no wider than the lens opens."""
+    film = (shot.film_width_mm, shot.film_height_mm)
+    data = first_order(lens)
+    f_number = max(shot.f_number or data.f_number, data.f_number)
+    # The same light for all: exposures are for it.
+    real: dict[str, Any] = {"film_mm": film, "focus_m": shot.focus_m, "f_number": f_number}
+    real["wavelength_nm"] = shot.wavelengths_nm
+    cameras: dict[str, Camera] = {EXACT: ExactCamera(lens, bounds=domain.bounds, **real)}
+    for name, file in models.items():
+        cameras[name] = OnnxCamera(load_model(file), **real)
+    cameras["thin lens"] = ThinLens(data.efl_mm, f_number, shot.focus_m, film)
+    cameras["pinhole"] = Pinhole(data.efl_mm, film, f_number)
+    return cameras
+
+
+def render_all(
+    choice: RenderChoice, lens: Lens, domain: Domain, models: Mapping[str, Path], folder: Path, report: Report
+) -> Pictures:
+    """Every scene through every camera; the exact lens and the models with several seeds, for the noise floor."""
+    found = Pictures()
+    scenes = [load_scene(path) for path in choice.scenes]
+    done, total = 0, len(scenes) * ((1 + len(models)) * choice.seeds + 2)
+    for scene in scenes:
+        film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
+        renders: dict[str, list[FloatArray]] = {}
+        for name, camera in scene_cameras(lens, domain, models, scene.settings.camera).items():
+            seeds = choice.seeds if name == EXACT or name in models else 1
+            for seed in range(seeds):
+                result = render(
+                    scene,
+                    camera,
+                    width=choice.width,
+                    height=choice.height,
+                    samples=choice.samples,
+                    seed=seed,
+                    threads=choice.threads,
+                    film=film,
+                )
+                renders.setdefault(name, []).append(result.rgb)
+                if seed == 0:
+                    found.cameras.append(_camera_record(scene, name, result.stats))
+                    _save(folder, scene, name, result.rgb, {"render": result.stats, "camera": camera.settings})
+                done += 1
+                report(done / total)
+        _compare_scene(found, scene, choice, renders, folder)
+    return found
+
+
+def _camera_record(scene: Scene, name: str, stats: Mapping[str, Any]) -> dict[str, Any]:
+    share = stats["camera_fraction"]
+    return {
+        "name": name,
+        "scene": scene.name,
+        "render_s": stats["seconds"],
+        "camera_s": share * stats["seconds"],
+        "camera_share": share,
+        "samples": stats["samples"],
+        "width": stats["width"],
+        "height": stats["height"],
+        "threads": stats["threads"],
+    }
+
+
+def _stem(scene: Scene, name: str) -> str:
+    return f"{scene.name}-{name.replace(' ', '-')}"
+
+
+def _save(folder: Path, scene: Scene, name: str, rgb: FloatArray, metadata: dict[str, Any]) -> None:
+    write_exr(folder / f"{_stem(scene, name)}.exr", rgb, half=True, metadata=metadata)
+    write_png(folder / f"{_stem(scene, name)}.png", rgb)
+
+
+def _compare_scene(
+    found: Pictures, scene: Scene, choice: RenderChoice, renders: Mapping[str, list[FloatArray]], folder: Path
+) -> None:
+    exact = renders[EXACT]
+    captions, maps = {}, {}
+    for name, pictures in renders.items():
+        record: dict[str, Any] = {
+            "name": f"{scene.name}, {name}",
+            "scene": scene.name,
+            "camera": name,
+            "file_png": f"{folder.name}/{_stem(scene, name)}.png",
+            "file_exr": f"{folder.name}/{_stem(scene, name)}.exr",
+            "samples": choice.samples,
+        }
+        if name != EXACT:
+            figures = compare(pictures, exact)
+            record.update({k: figures[k] for k in figures if k in _COMPARED})
+            captions[name] = image_caption(figures)
+            # The second exact seed, so that what shows is the noise of two renders and not the shared random numbers.
+            maps[name] = flip_map(pictures[0], exact[1])
+        found.images.append(record)
+    maps[EXACT] = flip_map(exact[0], exact[1])
+    captions[EXACT] = "two seeds: the noise floor"
+    file = folder / f"{scene.name}-side-by-side.png"
+    side_by_side(
+        {n: r[0] for n, r in renders.items()}, maps, file, captions, title=f"{scene.name}, error against exact"
+    )
+    found.figures.append(
+        {
+            "file": f"{folder.name}/{file.name}",
+            "title": f"{scene.name}: every camera",
+            "caption": "Below each render its FLIP difference from an exact render with another seed.",
+            "wide": True,
+        }
+    )
+
+
+_COMPARED = ("flip", "rel_mse", "noise_floor_flip", "noise_floor_rel_mse", "flip_ratio", "pairs")
+
+
+def scene_gain(experiment: Experiment, folder: Path, progress: Progress) -> dict[str, Any] | None:
+    """One model for the whole lens, the same for one shot, and for the shot half of it: error, size and time.
+
+    Returns a `records.DomainGain`, None where the experiment names no scene.
+    """
+    choice = experiment.scene_domain
+    if choice is None:
+        return None
+    scene = load_scene(choice.scene)
+    shot = scene.settings.camera
+    lens = experiment.lens.read()
+    data = first_order(lens)
+    widest = data.f_number
+    shot_lens, shot_domain = domain_from_camera(
+        lens,
+        film_mm=(shot.film_width_mm, shot.film_height_mm),
+        focus_m=shot.focus_m,
+        f_number=max(shot.f_number or widest, widest),
+        wavelength_nm=shot.wavelengths_nm,
+        nearest_m=nearest_depth_m(scene, abs(data.efl_mm)),
+    )
+    half = replace(choice.model, name="", terms=max(choice.model.terms // 2, 2), units=max(choice.model.units // 2, 2))
+    states = (
+        ("whole lens", lens, experiment.domain_of(lens), (choice.model,)),
+        (scene.name, shot_lens, shot_domain, (choice.model, half)),
+    )
+    rows: list[dict[str, Any]] = []
+    candidates: list[Candidate] = []
+    with progress.stage("fit the scene's domain") as report:
+        for name, state, domain, models in states:
+            prepared = prepare(make_pairs(state, domain, experiment.pairs))
+            place = folder / f"for-{name.replace(' ', '-')}"
+            place.mkdir(parents=True, exist_ok=True)
+            for settings in models:
+                m = fit_and_measure(prepared, settings, place, experiment.evaluation.vignetting_rays, report)
+                rows.append({**m.record, "domain": name, **domain_facts(state, domain)})
+                rows[-1]["file"] = f"models/{place.name}/{m.file.name}"
+                candidate = model_candidate(f"{name}: {settings.label}", load_model(m.file), domain.stop_radius_mm)
+                candidates.append(replace(candidate, domain=domain))
+        # One race, so that the times can be set against each other.
+        chosen = experiment.evaluation
+        timed = race(candidates, shot_domain, threads=chosen.threads, rounds=chosen.rounds)
+        for row, candidate in zip(rows, candidates, strict=True):
+            row["ns_per_ray"] = timed.timing(candidate.name)
+    return {"scene": scene.name, "text": _words(rows), "rows": rows}
+
+
+def nearest_depth_m(scene: Scene, efl_mm: float, across: int = 96) -> float | None:
+    """Depth of the nearest thing in view, in m from the film plane along the axis; None where nothing is in view.
+
+    Rays of a pinhole of the lens's focal length through a grid of `across` x `across` points of the film: a thing
+    smaller than a step of the grid may be missed.
+    """
+    shot = scene.settings.camera
+    film = (shot.film_width_mm, shot.film_height_mm)
+    steps = np.linspace(-0.5, 0.5, across, dtype=np.float32)
+    points = np.stack(np.meshgrid(steps * film[0], steps * film[1])).reshape(2, -1).astype(np.float32)
+    nanometres = np.full(points.shape[1], np.mean(shot.wavelengths_nm), np.float32)
+    rays = Pinhole(efl_mm, film).sample(points, np.full_like(points, 0.5), nanometres)
+    axes, position = camera_axes(shot), np.array(shot.position_m, np.float32)[:, None]
+    world = World(scene, SpectralRange(*shot.wavelengths_nm))
+    distance, _ = world.nearest(Rays.of(axes @ rays.origin_m + position, axes @ rays.direction))
+    depth = -(rays.origin_m[2] + distance * rays.direction[2])  # the camera looks along -z
+    nearest = float(depth.min())
+    return nearest if np.isfinite(nearest) else None
+
+
+def domain_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
+    """A domain as a flat table, units in the keys."""
+    return {
+        "film_radius_mm": domain.film_radius_mm,
+        "f_number": first_order(lens).f_number,
+        "wavelength_nm": list(domain.wavelength_nm),
+        "focus_m": ["infinity" if f == float("inf") else f for f in domain.focus_m],
+        "nearest_m": domain.nearest_m,
+    }
+
+
+def _words(rows: Sequence[Mapping[str, Any]]) -> str:
+    whole, same, half = rows
+    if not all(row.get("rms_um") for row in rows):
+        return ""
+    return (
+        f"{whole['name']} has {whole['rms_um']:.3g} um RMS over the whole lens, "
+        f"{same['rms_um']:.3g} um over this shot; "
+        f"{half['name']} has {half['rms_um']:.3g} um over the shot."
+    )

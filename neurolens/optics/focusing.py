@@ -1,0 +1,379 @@
+"""What focusing does: groups that move inside a lens, the film plane of best focus, and breathing.
+
+Internal focusing: the groups move as the source's focus states say, between infinity and the nearest; film fixed. The
+source lists a few states: infinity, sometimes one between, and the nearest, for every zoom position. One parameter
+moves all gaps from state to state linearly (as a focus ring on straight cams would), and is solved for so that the
+paraxial image of the object lies on the film.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from neurolens.base.errors import InputError
+from neurolens.optics import paraxial
+from neurolens.optics.glass import LINE_D_NM
+from neurolens.optics.prescription import Configuration, Focus, Lens
+from neurolens.optics.pupils import image_radius_mm
+from neurolens.optics.surfaces import Rays
+from neurolens.optics.trace import trace
+
+
+def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) -> list[float]:
+    """Values at a place between rows of values: exactly the row at its own place, linear between two rows.
+
+    Piecewise cubic with the derivatives of Fritsch and Butland (1984), "A method for constructing local monotone
+    piecewise cubic interpolants": between two rows a value stays between theirs, so that no gap can turn negative.
+
+    Args:
+        x: [R] ascending places. rows: [R][M] values. place: from x[0] to x[-1].
+
+    Returns [M] values.
+    """
+    if len(x) == 1:
+        return list(rows[0])
+    i = min(max(bisect_right(x, place) - 1, 0), len(x) - 2)
+    step = x[i + 1] - x[i]
+    t = (place - x[i]) / step
+    if t in (0, 1):
+        return list(rows[i + int(t)])
+    found = []
+    for values in zip(*rows, strict=True):
+        d = _derivatives(x, values)
+        low, high = values[i], values[i + 1]
+        bump = t * (1 - t) * ((1 - t) * (d[i] * step - (high - low)) - t * (d[i + 1] * step - (high - low)))
+        found.append(low + t * (high - low) + bump)
+    return found
+
+
+def _derivatives(x: Sequence[float], values: Sequence[float]) -> list[float]:
+    """Derivative at every place: a weighted harmonic mean of those beside it, 0 at a turning point."""
+    steps = [b - a for a, b in zip(x, x[1:], strict=False)]
+    secants = [(b - a) / h for a, b, h in zip(values, values[1:], steps, strict=False)]
+    if len(secants) == 1:
+        return secants * 2
+    inner = []
+    for h0, h1, d0, d1 in zip(steps, steps[1:], secants, secants[1:], strict=False):
+        w0, w1 = 2 * h1 + h0, h1 + 2 * h0
+        inner.append((w0 + w1) / (w0 / d0 + w1 / d1) if d0 * d1 > 0 else 0.0)
+    return [_end(steps, secants), *inner, _end(steps[::-1], secants[::-1])]
+
+
+def _end(steps: Sequence[float], secants: Sequence[float]) -> float:
+    """Derivative at an end: of the parabola through three values, kept within what stays monotone."""
+    (h0, h1), (d0, d1) = steps[:2], secants[:2]
+    derivative = ((2 * h0 + h1) * d0 - h0 * d1) / (h0 + h1)
+    if derivative * d0 <= 0:
+        return 0.0
+    return 3 * d0 if d0 * d1 <= 0 and abs(derivative) > 3 * abs(d0) else derivative
+
+
+SAME_MM = 0.005  # gaps of two states that differ by less are the same: sources give two decimals
+
+
+def at_infinity(lens: Lens) -> Lens:
+    """The lens with its groups where they stand at infinity focus."""
+    if not lens.infinity_mm:
+        return lens
+    return replace(lens.with_gaps(dict(lens.infinity_mm)), infinity_mm=())
+
+
+def infinity_states(lens: Lens) -> list[Configuration]:
+    """The zoom states of the source: those with the object at infinity."""
+    return [c for c in lens.configurations if c.object_distance_mm is None]
+
+
+def focus_states(lens: Lens) -> list[Configuration]:
+    """The focus states of the source: those with an object at a distance."""
+    return [c for c in lens.configurations if c.object_distance_mm is not None]
+
+
+def zoom_state_of(lens: Lens, near: Configuration) -> Configuration | None:
+    """The infinity state of the zoom position of a focus state; None where the file has none: its table then.
+
+    Few gaps that differ, then small differences, tell which it is.
+    """
+
+    def unlikeness(base: Configuration) -> tuple[int, float]:
+        gaps = gaps_mm(lens, base)
+        differences = [abs(gaps[k] - t) for k, t in near.thickness_mm]
+        return sum(d > SAME_MM for d in differences), sum(differences)
+
+    return min(infinity_states(lens), key=unlikeness, default=None)
+
+
+def gaps_mm(lens: Lens, *states: Configuration | None) -> dict[int, float]:
+    """All thicknesses, by surface index, with those of the states on top of the lens's own, in that order."""
+    gaps = {k: s.thickness_mm for k, s in enumerate(lens.surfaces)}
+    for state in states:
+        gaps.update(() if state is None else state.thickness_mm)
+    return gaps
+
+
+@dataclass(frozen=True)
+class FocusPath:
+    """How the gaps move while focusing: `steps[j]` holds what is added to each gap at the state j, 0 at infinity.
+
+    `film` is the surface whose thickness is the distance to the film.
+    """
+
+    steps: tuple[Mapping[int, float], ...]
+    film: int
+
+    def moved(self, s: float) -> dict[int, float]:
+        """What is added to the gaps at the parameter s, from 0 (infinity) to the number of states beyond."""
+        j = min(int(s), len(self.steps) - 2)
+        share = s - j
+        low, high = self.steps[j], self.steps[j + 1]
+        return {k: low[k] * (1 - share) + high[k] * share for k in low}
+
+
+def focus_path(lens: Lens) -> FocusPath:
+    """The path of a lens at infinity focus, at a state of its zoom or between (then interpolated in log EFL).
+
+    Raises:
+        InputError: a file without focus states.
+    """
+    if not focus_states(lens):
+        raise InputError(lens.path, "focus", "internal", '"film" or "best": the file has no focus states')
+    film = len(lens.surfaces) - 1
+    moved = sorted({film, *(k for c in focus_states(lens) for k, _ in c.thickness_mm)})
+    by_zoom: dict[Configuration | None, list[Configuration]] = {}
+    for c in focus_states(lens):
+        by_zoom.setdefault(zoom_state_of(lens, c), []).append(c)
+    stages = min(len(found) for found in by_zoom.values())
+    rows = []
+    for base, found in by_zoom.items():
+        start = gaps_mm(lens, base)
+        near = sorted(found, key=lambda c: -(c.object_distance_mm or math.inf))[-stages:]
+        ends = [gaps_mm(lens, base, c) for c in near]
+        efl = paraxial.first_order(lens.with_gaps(start)).efl_mm
+        rows.append((math.log(efl), [end[k] - start[k] for end in ends for k in moved]))
+    rows.sort()
+    place = math.log(paraxial.first_order(lens).efl_mm)
+    place = min(max(place, rows[0][0]), rows[-1][0])
+    flat = monotone([r[0] for r in rows], [r[1] for r in rows], place)
+    steps = [dict.fromkeys(moved, 0.0)]
+    for j in range(stages):
+        steps.append(dict(zip(moved, flat[j * len(moved) :], strict=False)))
+    return FocusPath(tuple(steps), film)
+
+
+def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = None) -> Lens:
+    """The lens focused by moving its groups.
+
+    Args:
+        lens: at infinity focus; or in a focus state of its file, which is kept where `focus_m` is None.
+        focus_m: distance from object to film; None is infinity.
+        object_mm: from object to front vertex, of a focus state that was chosen by its name.
+
+    Raises:
+        InputError: a file without focus states, or a distance below the nearest, which it names.
+    """
+    if focus_m is None and object_mm is not None:
+        return replace(lens, film_z_mm=paraxial.image_z_mm(lens, -object_mm))
+    lens = at_infinity(lens)
+    path = focus_path(lens)
+    back_mm = paraxial.first_order(lens).back_focus_mm
+    wanted = 0.0 if focus_m is None else 1 / (1000 * focus_m)
+
+    def place(s: float) -> Lens:
+        return _placed(lens, path, back_mm, s)
+
+    furthest = len(path.steps) - 1
+    nearest = _vergence(place(furthest))
+    if not nearest > 0:
+        raise InputError(lens.path, "focus", "internal", "focus states that focus nearer than infinity")
+    if wanted > nearest * (1 + 1e-9):
+        limit = f"at least {_rounded_up(1 / nearest / 1000):g} m, the nearest focus of the source's states"
+        raise InputError(lens.path, "focus_m", focus_m, limit)
+    s = _solve(lambda s: _vergence(place(s)) - wanted, furthest) if wanted else 0.0
+    return replace(place(s), infinity_mm=tuple((k, lens.surfaces[k].thickness_mm) for k in path.steps[0]))
+
+
+def _rounded_up(value: float) -> float:
+    """A positive number with four digits, never below itself: a distance printed as the limit must be allowed."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 3)
+    return math.ceil(value / step - 1e-9) * step
+
+
+def nearest_focus_m(lens: Lens) -> float:
+    """Nearest distance from object to film that internal focusing reaches."""
+    lens = at_infinity(lens)
+    path = focus_path(lens)
+    back_mm = paraxial.first_order(lens).back_focus_mm
+    return 1 / _vergence(_placed(lens, path, back_mm, len(path.steps) - 1)) / 1000
+
+
+def _placed(lens: Lens, path: FocusPath, back_mm: float, s: float) -> Lens:
+    """The lens with its groups moved; the film stays where it is beside the groups that stand still."""
+    added = path.moved(s)
+    gaps = {k: lens.surfaces[k].thickness_mm + v for k, v in added.items() if k != path.film}
+    moved = lens.with_gaps(gaps)
+    return replace(moved, film_z_mm=moved.vertices_mm[path.film] + back_mm + added[path.film])
+
+
+def _vergence(lens: Lens) -> float:
+    """1 / distance (1/mm) from the film to the object that is in focus on it; 0 for infinity (Newton: x x' = -f^2)."""
+    data = paraxial.first_order(lens)
+    assert lens.film_z_mm is not None
+    extension = lens.film_z_mm - data.rear_focal_z_mm
+    return float(extension / (data.efl_mm**2 + extension * (lens.film_z_mm - data.front_focal_z_mm)))
+
+
+def _solve(excess: Callable[[float], float], furthest: float) -> float:
+    """Root between 0 (below) and `furthest` (above): regula falsi with halving (Illinois), to rounding."""
+    low, high, f_low, f_high = 0.0, float(furthest), excess(0.0), excess(float(furthest))
+    for _ in range(100):
+        s = high - f_high * (high - low) / (f_high - f_low) if f_high != f_low else high
+        f = excess(s)
+        if f == 0 or abs(high - low) < 1e-14:
+            return s
+        if f > 0:
+            high, f_high, f_low = s, f, f_low / 2
+        else:
+            low, f_low, f_high = s, f, f_high / 2
+    return s
+
+
+_RINGS, _SPOKES = 512, 24
+_WIDER = 1.1  # the disc of rays over the paraxial entrance pupil: aberrations of the pupil move its edge
+_ROUNDS = 4  # an object at a distance from the film moves with it: each round leaves a hundredth of the step
+
+
+def best_focus_z_mm(
+    lens: Lens, focus_m: float = math.inf, weights: Sequence[tuple[float, float]] = ((LINE_D_NM, 1.0),)
+) -> float:
+    """Film plane (lens frame, mm) of least RMS spot for the axial point `focus_m` metres from it.
+
+    Rays are spread evenly over the entrance pupil, those pass that the stop and the rims let through, and the plane
+    follows in closed form: the spot's second moment is a parabola in z. With pure third-order spherical aberration it
+    lies two thirds of the way from the paraxial to the marginal focus. A pinhole's film stays where it is.
+
+    Args:
+        weights: (wavelength in nm, weight) pairs; the spot is that of all colours together.
+
+    Raises:
+        InputError: no ray passes, weights that are not positive, or focus nearer than four focal lengths.
+    """
+    if not weights or not all(w > 0 for pair in weights for w in pair):
+        raise InputError("best focus", "weights", tuple(weights), "(wavelength in nm, weight) pairs above 0")
+    film_z = paraxial.film_z_mm(lens, focus_m)
+    if paraxial.is_pinhole(lens):
+        return film_z
+    for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
+        film_z = _least_spot_z_mm(lens, film_z - 1000 * focus_m, weights)
+    return film_z
+
+
+def axial_rays(lens: Lens, object_z_mm: float) -> Rays:
+    """Rays towards the film from a point of the axis (-inf allowed), of equal areas of the entrance pupil."""
+    data = paraxial.first_order(lens)
+    ring = torch.sqrt((torch.arange(_RINGS, dtype=torch.float64) + 0.5) / _RINGS)
+    spoke = 2 * math.pi * (torch.arange(_SPOKES, dtype=torch.float64) + 0.5) / _SPOKES
+    radius = _WIDER / 2 * data.entrance_pupil_diameter_mm * ring[:, None]
+    x, y = (radius * torch.cos(spoke)).reshape(-1), (radius * torch.sin(spoke)).reshape(-1)
+    # Started well in front of every lens, so that a front surface bulging towards the scene is still ahead.
+    start = -max(10.0, lens.surfaces[0].diameter_mm if math.isfinite(lens.surfaces[0].diameter_mm) else 10.0)
+    if math.isinf(object_z_mm):
+        zero = torch.zeros_like(x)
+        return Rays(x, y, zero + start, zero, zero, zero + 1)
+    depth = data.entrance_pupil_z_mm - object_z_mm
+    length = torch.sqrt(x * x + y * y + depth * depth) * math.copysign(1.0, depth)
+    dx, dy, dz = x / length, y / length, depth / length
+    t = (start - object_z_mm) / dz
+    if object_z_mm > start:
+        t = torch.zeros_like(t)
+    return Rays(dx * t, dy * t, object_z_mm + dz * t, dx, dy, dz)
+
+
+def _least_spot_z_mm(lens: Lens, object_z_mm: float, weights: Sequence[tuple[float, float]]) -> float:
+    """Plane where sum w (x^2 + y^2) is least; x = x0 + z tx, so z = -sum w (x0 tx + y0 ty) / sum w (tx^2 + ty^2)."""
+    rays = axial_rays(lens, object_z_mm)
+    along, across = 0.0, 0.0
+    for wavelength_nm, weight in weights:
+        with torch.no_grad():
+            out = trace(lens, rays, wavelength_nm, towards="film")
+        passed = out.status == 0
+        r = Rays(*(c[passed] for c in out.rays))
+        tx, ty = r.dx / r.dz, r.dy / r.dz
+        along += weight * _sum((r.x - r.z * tx) * tx + (r.y - r.z * ty) * ty)
+        across += weight * _sum(tx * tx + ty * ty)
+    if not across > 0:
+        raise InputError(lens.path, "focus", "best", "a lens that axial light passes and bends")
+    return -along / across
+
+
+def _sum(values: Tensor) -> float:
+    return float(values.sum())
+
+
+@dataclass(frozen=True)
+class Breath:
+    """A lens at one focus distance, to first order (distortion is left out).
+
+    Attributes:
+        focus_m: from object to film.
+        efl_mm: focal length of the groups as they stand.
+        magnification: image over object height, negative for an inverted image; 0 at infinity.
+        field_deg: full field of view across the image circle, seen from the entrance pupil.
+        film_z_mm: film plane, lens frame.
+        working_f_number: 1 / (2 tan theta') of the paraxial marginal ray.
+    """
+
+    focus_m: float
+    efl_mm: float
+    magnification: float
+    field_deg: float
+    film_z_mm: float
+    working_f_number: float
+
+
+def breathing(lens: Lens, focus_m: Sequence[float], focus: Focus = "film") -> list[Breath]:
+    """The lens at several focus distances.
+
+    With h the radius of the image circle at infinity focus (the film does not grow), x' the film's distance behind the
+    rear focal point and e that of the entrance pupil behind the front one: the magnification is -x'/f, and the chief
+    ray of the film's edge leaves at atan(h / (f + x' e / f)).
+
+    Args:
+        lens: in the zoom position wanted.
+        focus_m: distances from object to film, `inf` allowed.
+
+    Raises:
+        InputError: no distance, or one that the lens does not reach; "internal" for a lens without focus states.
+    """
+    if not focus_m:
+        raise InputError("breathing", "focus_m", "(none)", "distances in m")
+    radius, _ = image_radius_mm(lens.at())
+    found = []
+    for distance in focus_m:
+        state = lens.at(focus_m=distance, focus=focus)
+        data = paraxial.first_order(state)
+        assert state.film_z_mm is not None
+        extension = state.film_z_mm - data.rear_focal_z_mm
+        pupil = data.entrance_pupil_z_mm - data.front_focal_z_mm
+        reach = data.efl_mm + extension * pupil / data.efl_mm
+        found.append(
+            Breath(
+                focus_m=float(distance),
+                efl_mm=float(data.efl_mm),
+                magnification=float(-extension / data.efl_mm),
+                field_deg=2 * math.degrees(math.atan2(radius, reach)),
+                film_z_mm=float(state.film_z_mm),
+                working_f_number=float(abs(reach) / data.entrance_pupil_diameter_mm),
+            )
+        )
+    return found
+
+
+def field_change(breaths: Sequence[Breath]) -> float:
+    """Largest size of the picture over the smallest, less 1: 0 for a lens that does not breathe."""
+    tangents = [math.tan(math.radians(b.field_deg / 2)) for b in breaths]
+    return max(tangents) / min(tangents) - 1

@@ -1,0 +1,186 @@
+"""The shape of surfaces: depth and its derivatives, where rays from the scene meet it, where it ends, what touches.
+
+Numbers, numpy arrays and torch tensors alike; torch is not needed, for cameras without it aim at the front of a lens.
+The tracer has a form of its own (`shapes`): by Horner's rule, held finite beyond the end of a conic.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError
+
+if TYPE_CHECKING:
+    from neurolens.optics.prescription import Surface
+
+Array = NDArray[np.float64]
+
+TOUCH_MM = 1e-6  # edge contact is common in patents; only rounding is forgiven
+
+# Newton's steps along the ray from the sphere of the vertex to a conic, asphere or cylinder.
+_STEPS = 8
+
+
+class Shape(Protocol):
+    """A surface of revolution, or a cylinder bent in x or y only: c h^2 / (1 + sqrt(1 - (1 + k) c^2 h^2)) + sum a h^p.
+
+    Attributes:
+        curvature: 1/mm. conic: k. asphere: pairs (p, a). cylinder: the axis that is bent, or None.
+    """
+
+    @property
+    def curvature(self) -> Any: ...
+    @property
+    def conic(self) -> Any: ...
+    @property
+    def asphere(self) -> Any: ...
+    @property
+    def cylinder(self) -> str | None: ...
+
+
+def sag_mm(shape: Shape, x: Any, y: Any, *, held: bool = False) -> Any:
+    """Depth z (mm) of a surface at points x, y (mm) relative to its vertex, towards +z.
+
+    Args:
+        x, y: floats, numpy arrays or torch tensors.
+        held: whether a conic goes on as a plane beyond its end, where the depth is else NaN; arrays and tensors only.
+    """
+    h2, c = _height2(shape, x, y), float(shape.curvature)
+    under_root = 1 - (1 + float(shape.conic)) * c * c * h2
+    sag = c * h2 / (1 + _root(under_root.clip(0.0) if held else under_root))
+    h = _root(h2) if len(shape.asphere) else 0.0
+    return sag + sum(float(a) * h**p for p, a in shape.asphere)
+
+
+def sag_and_derivatives(shape: Shape, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Depth (mm) at points x, y and its derivatives by x and y; NaN beyond the end of a conic."""
+    c, k = float(shape.curvature), float(shape.conic)
+    h2 = _height2(shape, x, y)
+    root = np.sqrt(1 - (1 + k) * c * c * h2)
+    z, by_h2 = c * h2 / (1 + root), c / (2 * root)
+    for power, a in shape.asphere:
+        z = z + float(a) * h2 ** (power / 2)
+        by_h2 = by_h2 + float(a) * (power / 2) * h2 ** (power / 2 - 1)
+    gx, gy = _bent(shape)
+    return z, 2 * gx * x * by_h2, 2 * gy * y * by_h2
+
+
+def _bent(shape: Shape) -> tuple[float, float]:
+    """1.0 for the axes, x and y, along which a surface is bent, 0.0 for the one along which a cylinder is straight."""
+    return float(shape.cylinder != "y"), float(shape.cylinder != "x")
+
+
+def _height2(shape: Shape, x: Any, y: Any) -> Any:
+    gx, gy = _bent(shape)
+    return gx * x * x + gy * y * y
+
+
+def _root(square: Any) -> Any:
+    if isinstance(square, float):
+        return math.sqrt(square) if square >= 0 else math.nan
+    with np.errstate(invalid="ignore"):
+        return square**0.5
+
+
+def meet_front(
+    shape: Shape | None, x: Array, y: Array, z: Array, dx: Array, dy: Array, dz: Array
+) -> tuple[Array, Array]:
+    """(x, y) where the line of each ray meets the front surface next to its vertex; NaN where it does not.
+
+    Args:
+        shape: None is the plane z = 0. The rest: points (mm) and directions of either sense, float64 [N].
+    """
+    # Before the lens light travels towards +z, or from the side and beyond: the sense is that of the camera ray's end.
+    dx, dy, dz = -dx, -dy, -dz
+    c = 0.0 if shape is None else float(shape.curvature)
+    with np.errstate(all="ignore"):
+        # The point nearest to the vertex, then c |m + t d|^2 = 2 (m_z + t d_z), its root next to the vertex.
+        along = x * dx + y * dy + z * dz
+        mx, my, mz = x - along * dx, y - along * dy, z - along * dz
+        f = c * (mx * mx + my * my + mz * mz) - 2 * mz
+        root = np.sqrt(dz * dz - c * f)
+        t = np.where(dz > 0, f / (dz + root), (dz - root) / c if c else np.nan)
+        px, py, pz = mx + t * dx, my + t * dy, mz + t * dz
+        if shape is not None and (float(shape.conic) or len(shape.asphere) or shape.cylinder):
+            lost = ~np.isfinite(t)
+            px, py, pz = (np.where(lost, m, p) for m, p in ((mx, px), (my, py), (mz, pz)))
+            for _ in range(_STEPS):
+                sag, sx, sy = sag_and_derivatives(shape, px, py)
+                t = (sag - pz) / (dz - sx * dx - sy * dy)
+                px, py, pz = px + t * dx, py + t * dy, pz + t * dz
+    return px, py
+
+
+def end_mm(surface: Surface) -> float:
+    """Distance from the axis at which a surface's conic ends: the radius of a sphere; inf where it goes on."""
+    stretch = 1 + float(surface.conic)
+    return abs(float(surface.radius_mm)) / math.sqrt(stretch) if stretch > 0 else math.inf
+
+
+def check_clearance(surfaces: Sequence[Surface], file: str, state: str = "") -> None:
+    """Raise for a rim larger than its radius of curvature and for neighbours that overlap inside their rims.
+
+    The gap between two spheres grows or shrinks steadily from the axis outwards, so that axis and the smaller of the
+    two rims decide; other shapes are looked at in between too. A stop that bends nothing (one medium on both sides) may
+    lie inside an element, in front of which (or behind which) it is then listed; what stands on both sides of it must
+    be clear of each other. A stop on a glass surface is a surface like any other.
+
+    Args:
+        state: words in front of the surface in messages, for a zoom state of the file.
+
+    Raises:
+        InputError: names the file, the surface and by how much.
+    """
+    for k, s in enumerate(surfaces):
+        if s.semi_diameter_mm > end_mm(s):
+            limit = f"at most {2 * end_mm(s):g} mm, where its {'conic' if s.conic else 'sphere'} ends"
+            raise InputError(file, f"{state}surface {k}, diameter_mm", s.diameter_mm, limit)
+    for k, after, axis_gap_mm in neighbours(surfaces):
+        if axis_gap_mm < -TOUCH_MM:
+            expected = "at least 0, except beside a stop with the same medium before and behind it"
+            raise InputError(file, f"{state}surface {k}, thickness_mm", axis_gap_mm, expected)
+        gap_mm, height_mm = _narrowest(surfaces[k], surfaces[after], axis_gap_mm)
+        if gap_mm < -TOUCH_MM:
+            found = f"(an overlap of {-gap_mm:.4g} mm with surface {after}, {height_mm:.4g} mm from the axis)"
+            raise InputError(file, f"{state}surface {k}, thickness_mm", found, "surfaces that are clear of each other")
+
+
+def _narrowest(before: Surface, after: Surface, axis_gap_mm: float) -> tuple[float, float]:
+    """The smallest gap between two surfaces inside the smaller of their rims, and its distance from the axis, mm."""
+    rim = min(before.semi_diameter_mm, after.semi_diameter_mm)
+    spheres = all(not s.conic and not s.asphere and not s.cylinder for s in (before, after))
+    steps = 1 if spheres else 32
+    azimuths = [(1.0, 0.0), (0.0, 1.0)] if before.cylinder or after.cylinder else [(1.0, 0.0)]
+    found = (axis_gap_mm, 0.0)
+    for cos, sin in azimuths:
+        for i in range(1, steps + 1):
+            h = rim * i / steps
+            x, y = h * cos, h * sin
+            gap = axis_gap_mm + sag_mm(after, x, y) - sag_mm(before, x, y)
+            found = min(found, (gap, h))
+    return found
+
+
+def neighbours(surfaces: Sequence[Surface]) -> Iterator[tuple[int, int, float]]:
+    """Pairs of surfaces that may collide, a stop that bends nothing aside, with the distance of their vertices."""
+    idle = [s.stop and _same_medium(surfaces, k) for k, s in enumerate(surfaces)]
+    for k in range(len(surfaces) - 1):
+        if not idle[k] and not idle[k + 1]:
+            yield k, k + 1, surfaces[k].thickness_mm
+    for k in range(1, len(surfaces) - 1):
+        if idle[k] and math.isinf(surfaces[k].radius_mm):
+            yield k - 1, k + 1, surfaces[k - 1].thickness_mm + surfaces[k].thickness_mm
+
+
+def _same_medium(surfaces: Sequence[Surface], k: int) -> bool:
+    """Whether a surface has the same medium before and behind it."""
+    after = surfaces[k]
+    if not k:
+        return after.n_d == 1
+    before = surfaces[k - 1]
+    return (before.n_d, before.V_d, before.glass) == (after.n_d, after.V_d, after.glass)

@@ -1,0 +1,285 @@
+"""The parts of a CODE V file while it is read: commands and media as they are written, surfaces, zoom positions.
+
+What the lens model cannot hold is an error by name and line."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from neurolens.optics import catalogue
+from neurolens.readers.assemble import UNKNOWN, named_glass
+from neurolens.readers.draft import State
+from neurolens.readers.source import Line
+
+_MAX_COMMAND = 100_000  # characters of one command with all its continuation lines
+# Fraunhofer lines to which a private glass is reduced, nm.
+_D, _F, _C, _SAME_LINE = 587.56, 486.13, 656.27, 0.1
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command: its name as written, three letters of it (which is all that counts), its words, where it begins."""
+
+    word: str
+    name: str
+    words: tuple[str, ...]
+    line: Line
+
+    def numbers(self, words: Sequence[str] | None = None, least: int = 1) -> list[float]:
+        """Its values as numbers."""
+        return self.line.numbers(self.name, self.words if words is None else words, least)
+
+
+def commands(lines: Sequence[Line]) -> Iterator[Command]:
+    """The commands of a file: "!" begins a comment, ";" ends a command, "&" at the end of a line continues it."""
+    text, start = "", None
+    for line in lines:
+        bare = _outside_quotes(line.text, "!")[0]
+        start = start or line
+        if bare.rstrip().endswith("&"):
+            text += bare.rstrip()[:-1] + " "
+            if len(text) > _MAX_COMMAND:
+                raise start.error("&", f"({len(text)} characters)", f"at most {_MAX_COMMAND} characters in a command")
+            continue
+        for part in _outside_quotes(text + bare, ";"):
+            words = _words(part)
+            if words:
+                yield Command(words[0], words[0].upper()[:3], tuple(words[1:]), start)
+        text, start = "", None
+    if text.strip():
+        raise lines[-1].error("&", "(the file ends)", "a line that continues the command")
+
+
+def _outside_quotes(text: str, mark: str) -> list[str]:
+    """A text split at a mark that stands outside quotes."""
+    parts, quote, begin = [], "", 0
+    for place, letter in enumerate(text):
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "'\"":
+            quote = letter
+        elif letter == mark:
+            parts.append(text[begin:place])
+            begin = place + 1
+    return [*parts, text[begin:]]
+
+
+def _words(text: str) -> list[str]:
+    return [m[1] or m[2] or m[0] for m in re.finditer(r"'([^']*)'|\"([^\"]*)\"|\S+", text)]
+
+
+def medium(command: Command, words: Sequence[str], private: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    """Fields of a surface for the medium behind it: a name, "NAME_MAKER", a code, n:V, n V, or nothing for air.
+
+    A code is the fraction of the index and the Abbe number without its point: 517.642, 517642 or 516800.641700.
+    """
+    if not words or words[0].upper() in ("AIR", ""):
+        return {}
+    word = words[0]
+    if word.upper() == "REFL":
+        raise command.line.error(command.name, word, "a glass: the lens model has no mirrors")
+    if word in private:
+        return dict(private[word])
+    pair = word.split(":")
+    if len(pair) == 2:
+        n_d, V_d = command.numbers(pair, 2)
+        return {"n_d": n_d, "V_d": V_d}
+    code = re.fullmatch(r"([0-9]{3,6})\.([0-9]{3,6})|([0-9]{3})([0-9]{3})", word)
+    if code:
+        index, abbe = (code[1], code[2]) if code[1] else (code[3], code[4])
+        return {"n_d": 1 + int(index) / 10 ** len(index), "V_d": int(abbe) / 10 ** (len(abbe) - 2)}
+    if re.fullmatch(r"[0-9.]+(e[+-]?[0-9]+)?", word, re.IGNORECASE):
+        numbers = command.numbers(words[:2])
+        return {"n_d": numbers[0], "V_d": numbers[1] if len(numbers) > 1 else None}
+    name, _, maker = word.rpartition("_")
+    qualified = f"{maker}:{name}" if name else word
+    if name and not catalogue.same_name(qualified):
+        # Other names of a glass ("BK7") are listed without their maker.
+        alias = [g for g in catalogue.same_name(name) if g.maker.upper() == maker.upper()]
+        # Glasses that their makers dropped are replaced by those with "N-" in front.
+        replacing = catalogue.same_name(f"{maker}:N-{name}")
+        qualified = str((*alias, *replacing)[0]) if alias or replacing else qualified
+    known = named_glass(qualified, command.line.file, f"line {command.line.number}, glass", said=word if name else None)
+    return {**known, "material": word}
+
+
+def private_glass(command: Command, wavelengths_nm: Sequence[float]) -> dict[str, Any]:
+    """Fields of a surface from a row of a PRV block: indices at the wavelengths of its PWL line.
+
+    Raises:
+        InputError: not one index a wavelength, or not the lines d, F and C among them, to which it is reduced.
+    """
+    indices = command.numbers(least=len(wavelengths_nm))
+    found = {}
+    for name, line_nm in (("d", _D), ("F", _F), ("C", _C)):
+        near = [k for k, nm in enumerate(wavelengths_nm) if abs(nm - line_nm) <= _SAME_LINE]
+        if not near:
+            expected = f"an index at the {name} line ({line_nm} nm), to reduce the glass to n_d and V_d"
+            raise command.line.error("PRV", f"(wavelengths {wavelengths_nm})", expected)
+        found[name] = indices[near[0]]
+    dispersion = found["F"] - found["C"]
+    return {"n_d": found["d"], "V_d": (found["d"] - 1) / dispersion if dispersion > 0 else None}
+
+
+# Coefficients of an ASP surface: r^4, r^6, ... r^20.
+LETTERS = {letter: 4 + 2 * k for k, letter in enumerate("ABCDEFGHJ")}
+NONE_BUT_0 = ("CUF", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE")
+
+
+@dataclass
+class Block:
+    """One surface while it is read, in the file's unit."""
+
+    start: Line
+    curvature: float = 0.0
+    thickness: float = 0.0
+    kind: str = "SPH"
+    curvature_x: float | None = None
+    conic: float = 0.0
+    terms: dict[str, float] = field(default_factory=dict)
+    semi_diameter: float = UNKNOWN
+    medium: dict[str, Any] = field(default_factory=dict)
+    stop: bool = False
+    solved: bool = False  # whether the thickness is solved for the paraxial image
+
+    def put(self, command: Command, value: float) -> None:
+        """Set one figure of the surface by the name of its command."""
+        match command.name:
+            case "RDY" | "RDX" | "CUY" | "CUX":
+                curvature = value if command.name.startswith("C") or value == 0 else 1 / value
+                if command.name.endswith("Y"):
+                    self.curvature = curvature
+                else:
+                    self.curvature_x = curvature
+            case "THI":
+                self.thickness = value
+            case "K":
+                self.conic = value
+            case name if name in NONE_BUT_0:
+                if value:
+                    raise command.line.error(name, value, "0: Fresnel surfaces, tilts and decentres are not read")
+            case letter:
+                self.terms[letter] = value
+
+
+def shape_of(block: Block) -> dict[str, Any]:
+    """Radius, conic, asphere and cylinder of a surface, for `Surface`.
+
+    CYL, YTO and XTO with one of their curvatures CUY and CUX zero are cylinders; a torus is an error.
+    """
+    terms = {LETTERS[letter]: value for letter, value in block.terms.items() if value}
+    if block.kind in ("SPH", "CON") and terms:
+        raise block.start.error(block.kind, f"(with coefficients {', '.join(block.terms)})", "ASP before coefficients")
+    if block.kind == "SPH" and block.conic:
+        raise block.start.error("K", block.conic, "CON or ASP before a conic constant")
+    if block.kind in ("SPH", "CON", "ASP"):
+        if block.curvature_x not in (None, block.curvature):
+            raise block.start.error("CUX", block.curvature_x, "a cylinder (CYL, YTO or XTO)")
+        conic = block.conic if block.curvature else 0.0
+        return {"radius_mm": _radius(block.curvature), "conic": conic, "asphere": tuple(sorted(terms.items()))}
+    x, y = block.curvature_x or 0.0, block.curvature
+    if terms or (x and y):
+        found = f"(curvatures {y:g} in y and {x:g} in x{', coefficients' if terms else ''})"
+        raise block.start.error(block.kind, found, "a plain cylinder: a torus or an aspheric cylinder is not read")
+    # K belongs to the curve that is turned: y of YTO and CYL, x of XTO.
+    if block.conic and (block.kind == "XTO") != bool(x):
+        raise block.start.error("K", block.conic, "0, as this cylinder's curve is a circle")
+    return {"radius_mm": _radius(x or y), "conic": block.conic, "cylinder": "x" if x else "y" if y else None}
+
+
+def _radius(curvature: float) -> float:
+    return 1 / curvature if curvature else math.inf
+
+
+MAX_POSITIONS = 200
+ZOOMED = ("THI", "EPD", "FNO", "CIR", "TIT")
+# Control codes, fields, vignetting factors, weights, wavelengths.
+NOT_ZOOMED = frozenset(
+    """THC CCY GLC KC VUX VLX VUY VLY XAN YAN XIM YIM XRI YRI XOB YOB WTF WTW WTA WL REF DER""".split()
+)
+
+
+@dataclass
+class Zoom:
+    """The positions while they are read; values by position (from 0)."""
+
+    count: int = 0
+    titles: dict[int, str] = field(default_factory=dict)
+    thickness: dict[int, list[float]] = field(default_factory=dict)
+    pupil: list[float] = field(default_factory=list)
+    f_number: list[float] = field(default_factory=list)
+    semi_diameter: dict[int, tuple[list[float], Command]] = field(default_factory=dict)
+    waiting: dict[tuple[int, int], float] = field(default_factory=dict)
+
+    def read(self, command: Command, n_blocks: int) -> None:
+        """One ZOO command: the count of positions, or a quantity with one value a position."""
+        words, line = command.words, command.line
+        if words and words[0].isdecimal():
+            self.count = int(words[0])
+            if not 1 <= self.count <= MAX_POSITIONS:
+                raise line.error("ZOO", words[0], f"1 to {MAX_POSITIONS} positions")
+            return
+        name = words[0].upper()[:3] if words else ""
+        if name in NOT_ZOOMED or (name == "TIT" and self.count):
+            return
+        if name not in ZOOMED or not self.count:
+            expected = f"the count of positions first, then one of {', '.join(ZOOMED)}: other zooms are not read"
+            raise line.error("ZOO", name, expected)
+        surface, values = -1, words[1:]
+        if name in ("THI", "CIR"):
+            match = re.fullmatch(r"S([0-9]{1,4}|O)", values[0].upper()) if values else None
+            if match is None or int(match[1].replace("O", "0")) >= n_blocks:
+                raise line.error(f"ZOO {name}", " ".join(values[:1]), f"a surface from S0 to S{n_blocks - 1}")
+            surface, values = int(match[1].replace("O", "0")), values[1:]
+            if name == "THI" and not values:
+                return  # the values come one by one: THI Sk Zn value
+        numbers = command.numbers(values, self.count)
+        if len(numbers) != self.count or (name != "THI" and min(numbers) <= 0):
+            raise line.error(f"ZOO {name}", " ".join(values), f"{self.count} values, one a position")
+        match name:
+            case "THI":
+                self.thickness[surface] = numbers
+            case "EPD":
+                self.pupil = numbers
+            case "FNO":
+                self.f_number = numbers
+            case "CIR":
+                self.semi_diameter[surface] = (numbers, command)
+
+    def title(self, command: Command) -> None:
+        """TIT Zk "name"."""
+        self.titles[int(command.words[0][1:]) - 1] = " ".join(command.words[1:]).strip("\"' ")
+
+    def one_thickness(self, command: Command, n_blocks: int) -> None:
+        """THI Sk Zn value."""
+        surface, place = command.words[0][1:], command.words[1][1:]
+        good = surface.isdecimal() and place.isdecimal() and int(surface) < n_blocks and 1 <= int(place) <= self.count
+        if not good:
+            raise command.line.error("THI", " ".join(command.words[:2]), f"Sk Zn with n from 1 to {self.count}")
+        self.waiting[int(surface), int(place) - 1] = command.numbers(command.words[2:])[0]
+
+    def states(self, middle: Sequence[Block], object_distance: float, defocus: float) -> Iterator[State]:
+        """The positions of a file, by rows of the draft (surface numbers less one)."""
+        for surface, (_, command) in self.semi_diameter.items():
+            if not (0 < surface <= len(middle) and middle[surface - 1].stop):
+                raise command.line.error("ZOO CIR", f"S{surface}", "the stop: other rims cannot change")
+        for place in range(self.count if self.count > 1 else 0):
+            gaps = {k: values[place] for k, values in self.thickness.items()}
+            gaps.update({k: value for (k, there), value in self.waiting.items() if there == place})
+            distance = gaps.pop(0, object_distance)
+            last = len(middle)
+            gaps.pop(last + 1, None)  # the defocus of the image surface
+            opening = next((2 * values[place] for values, _ in self.semi_diameter.values()), None)
+            yield State(
+                name=self.titles.get(place) or f"position {place + 1}",
+                thickness={k - 1: gap + (defocus if k == last else 0.0) for k, gap in gaps.items()},
+                pupil=self.pupil[place] if self.pupil else None,
+                f_number=self.f_number[place] if self.f_number else None,
+                stop_diameter=opening,
+                object_distance=math.inf if distance >= 1e9 else distance,
+                film_given=not middle[-1].solved or last in gaps,
+            )

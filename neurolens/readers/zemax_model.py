@@ -1,0 +1,245 @@
+"""The parts of a Zemax file while it is read: surfaces, configurations, and the keywords that move no ray.
+
+What the lens model cannot hold is an error by name and line."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from neurolens.base.errors import InputError
+from neurolens.readers.assemble import UNKNOWN
+from neurolens.readers.draft import State
+from neurolens.readers.source import Line
+
+# Settings of the program and of its analyses.
+IGNORED_SYSTEM = frozenset(
+    """VERS PFIL LANG GFAC RAIM PUSH SDMA OMMA ROPD PICB PZUP FWGN FWGT WAVL WAVN WAVM WWGT WWGN PWAV POLS GLRS
+    GSTD NSCD COFN LUID EFFL""".split()
+)
+# Of the system, and ignored: rims and stop decide which rays pass, not the factors that a designer chose.
+VIGNETTING = frozenset("VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN".split())
+# Of a surface: what the editor shows and hides, substrates, mechanical edges, variables, pickups carried out.
+IGNORED_SURFACE = frozenset("HIDE MIRR SLAB POPS FIMP MEMA OEMA VDSZ VPAR PPAR GLCZ".split())
+# Of a surface, and worth a warning: coatings are named, not given.
+COATING = frozenset(["COAT"])
+# Operands of the merit function.
+MERIT = frozenset(
+    """AMAG ENPP EFFL EFLX EFLY EPDI EXPD EXPP ISFN ISNA LINV OBSN PIMH PMAG POWF POWP POWR SFNO TFNO WFNO GCOS GTCE
+    INDX MNAB MNIN MNPD MXAB MXIN MXPD RGLA PANA PANB PANC PARA PARB PARC PARR PARX PARY PARZ PATX PATY YNIP CEHX
+    CEHY CENX CENY CNAX CNAY CNPX CNPY DXDX DXDY DYDX DYDY HHCN IMAE MNRE MNRI MXRE MXRI OPTH PLEN RAED RAEN RAGA
+    RAGB RAGC RAGX RAGY RAGZ RAID RAIN RANG REAA REAB REAC REAR REAX REAY REAZ RENA RENB RENC RETX RETY GLCA GLCB
+    GLCC GLCR GLCX GLCY GLCZ CONF IMSF PRIM SVIG WLEN CVIG FDMO FDRE ABSO ACOS ASIN ATAN CONS COSI DIFF DIVB DIVI
+    EQUA LOGE LOGT MAXX MINN OPGT OPLT OPVA OSUM PROB PROD QSUM RECI SQRT SUMM SINE TANG ABGT ABLT MCOG MCOL MCOV
+    ZTHI GBPD GBPP GBPR GBPS GBPW GBPZ GBSD GBSP GBSR GBSS GBSW DLTN GRMN GRMX LPTD FOUC ABCD ANAC ANAR ANAX ANAY
+    ANCX ANCY ASTI AXCL BIOC BIOD BSER COMA DIMX DISA DISC DISG DIST FCGS FCGT FCUR LACL LONA OPDC OPDM OPDX OSCD
+    PETC PETZ RSCE RSCH RSRE RSRH RWCE RWCH RWRE RWRH SMIA SPCH SPHA TRAC TRAD TRAE TRAI TRAR TRAX TRAY TRCX TRCY
+    ZERN GPIM GPRT GPRX GPRY GPSX GPSY FICL FICP POPD ZPLM UDOC UDOP UDOF RELI EFNO BLNK DMFS ENDX GOTO OOFF SKIN
+    SKIS USYM FREZ NPGT NPLT NPVA NPXG NPXL NPXV NPYG NPYL NPYV NPZG NPZL NPZV NSRM NTXG NTXL NTXV NTYG NTYL NTYV
+    NTZG NTZL NTZV NSDC NSDD NSDE NSDP NSLT NSRA NSRD NSRW NSST NSTR NSTW REVR CMFV CMGT CMLT CMVA CODA CEGT CELT
+    CEVA CIGT CILT CIVA GMTA GMTN GMTS GMTT GMTX MECA MECS MECT MSWA MSWN MSWS MSWT MSWX MTFA MTFN MTFS MTFT MTFX
+    MTHA MTHN MTHS MTHT MTHX POPI BFSD TOLR TCGT TCLT TCVA STRH DENC DENF ERFP GENC GENF XENC XENF COGT COLT COVA
+    CTGT CTLT CTVA CVGT CVLT CVVA BLTH DMGT DMLT DMVA ETGT ETLT ETVA FTGT FTLT MNCA MNCG MNCT MNCV MNEA MNEG MNET
+    MXCA MXCG MXCT MXCV MXEA MXEG MXET MNSD MXSD OMMI OMMX OMSD TGTH TTGT TTHI TTLT TTVA XNEA XNET XNEG XXEA XXEG
+    XXET CVOL MNDT MXDT SAGX SAGY SSAG STHI TMAS TOTR VOLU NORX NORY NORZ NORD SCUR SDRV PMGT PMLT PMVA XDGT XDLT
+    XDVA""".split()
+)
+# Operands of the multi-configuration editor that move no ray: fields, wavelengths, vignetting factors, comments.
+CONFIGURATION = frozenset("MOFF MCOM XFIE YFIE FLWT FVDX FVDY FVCX FVCY FVAN WAVE WLWT PRWV GCRS".split())
+
+
+TYPES = ("STANDARD", "EVENASPH", "ODDASPHE", "TOROIDAL", "BICONICX", "COORDBRK")
+INFINITE = 1e9  # in any unit: what programs write for an object at infinity starts at 1e10
+
+
+@dataclass
+class Block:
+    """One SURF block while it is read, in the file's unit. Numbers stay with the line they come from."""
+
+    start: Line
+    kind: str = "STANDARD"
+    curvature: float = 0.0
+    conic: float = 0.0
+    thickness: float = math.nan  # until DISZ has been read
+    semi_diameter: float = UNKNOWN
+    automatic: bool = True  # whether the program sized the rim from the rays
+    medium: dict[str, Any] = field(default_factory=dict)
+    bends: Line | None = None  # where a curvature other than 0 is given
+    glass: Line | None = None  # where the medium is given
+    stop: bool = False
+    clear: float | None = None  # semi-diameter of an aperture, which rules over the former
+    aperture: bool = False
+    parameters: dict[int, tuple[float, Line]] = field(default_factory=dict)
+    extra: dict[int, tuple[float, Line]] = field(default_factory=dict)
+    solve: tuple[str, list[float], Line] | None = None
+
+    def parameter(self, n: int) -> float:
+        return self.parameters.pop(n, (0.0, self.start))[0]
+
+
+def thickness(line: Line, word: str, rest: list[str], *, is_object: bool) -> float:
+    """A thickness; that of the object may be infinite, in words or as a number from 1e9."""
+    if is_object and rest == ["INFINITY"]:
+        return math.inf
+    value = line.numbers(word, rest)[0]
+    return math.inf if is_object and value >= INFINITE else value
+
+
+def shape_of(block: Block) -> dict[str, Any]:
+    """Radius, conic, asphere and cylinder of a surface, for `Surface`.
+
+    Even asphere: sum of PARM i r^(2 i); odd asphere: sum of PARM i r^i. Toroidal: CURV and CONI in the y-z plane,
+    turned about an axis at PARM 1 (0 is infinity: a cylinder). Biconic: CURV, CONI in y, PARM 1 (a radius, 0 is
+    infinity) and PARM 2 (a conic) in x.
+
+    Raises:
+        InputError: a type, a parameter or a combination of them that the lens model cannot hold; by name and line.
+    """
+    match block.kind:
+        case "STANDARD":
+            shape = _round(block, ())
+        case "EVENASPH":
+            shape = _round(block, tuple((2 * i, block.parameter(i)) for i in range(1, 9)))
+        case "ODDASPHE":
+            shape = _round(block, tuple((i, block.parameter(i)) for i in range(1, 9)))
+        case "TOROIDAL" | "BICONICX":
+            shape = _crossed(block)
+        case "COORDBRK":
+            shape = _round(block, ())  # harmless where every tilt and decentre is 0, which is checked below
+    for name, table in (("PARM", block.parameters), ("XDAT", block.extra)):
+        for n, (value, line) in table.items():
+            # The second extra value of a toroid is a normalisation radius, with nothing to normalise.
+            if value != 0 and not (block.kind == "TOROIDAL" and name == "XDAT" and n == 2):
+                raise line.error(f"{name} {n} of {block.kind}", value, "0: the lens model has no such term")
+    for word, given in (("CURV", block.bends), ("GLAS", block.glass)):
+        if block.kind == "COORDBRK" and given is not None:
+            raise given.error(f"{word} of COORDBRK", given.text.strip(), "none: a coordinate break is no surface")
+    return shape
+
+
+def _radius(curvature: float) -> float:
+    return 1 / curvature if curvature else math.inf
+
+
+def _round(block: Block, terms: tuple[tuple[int, float], ...]) -> dict[str, Any]:
+    for power, value in terms:
+        if power == 1 and value:
+            raise block.start.error("PARM 1 of ODDASPHE", value, "0: a cone's tip has no normal")
+    # The conic of a plane without other terms has no effect.
+    conic = block.conic if block.curvature else 0.0
+    asphere = tuple((power, value) for power, value in terms if value)
+    return {"radius_mm": _radius(block.curvature), "conic": conic, "asphere": asphere}
+
+
+def _crossed(block: Block) -> dict[str, Any]:
+    """A toroidal or biconic surface that is a cylinder, or round; PARM 1 and 2 are radius and conic in x."""
+    biconic = block.kind == "BICONICX"
+    radius_x, conic_x = block.parameter(1), block.parameter(2) if biconic else 0.0
+    if radius_x == 0 and block.curvature == 0:
+        return {"radius_mm": math.inf}
+    if radius_x == 0:
+        return {"radius_mm": _radius(block.curvature), "conic": block.conic, "cylinder": "y"}
+    if block.curvature == 0:
+        return {"radius_mm": radius_x, "conic": conic_x, "cylinder": "x"}
+    if math.isclose(radius_x * block.curvature, 1.0, rel_tol=1e-12) and conic_x == block.conic:
+        return {"radius_mm": radius_x, "conic": conic_x}
+    found = f"(radii {_radius(block.curvature):g} in y and {radius_x:g} in x)"
+    expected = "a cylinder: one of the two radii infinite" + ("" if biconic else " (a torus is not read)")
+    raise block.start.error(block.kind, found, expected)
+
+
+MAX_CONFIGURATIONS = 200
+OPERANDS = ("THIC", "APER", "SDIA", "LTTL")
+
+
+@dataclass
+class Zoom:
+    """The configurations while they are read; operand values by configuration (from 0)."""
+
+    begun: bool = False
+    count: int = 1
+    titles: dict[int, str] = field(default_factory=dict)
+    thickness: dict[tuple[int, int], float] = field(default_factory=dict)  # (surface, configuration)
+    aperture: dict[int, float] = field(default_factory=dict)
+    semi_diameter: dict[tuple[int, int], tuple[float, Line]] = field(default_factory=dict)
+
+    def begin(self, line: Line) -> None:
+        """MNUM: how many configurations, and which is the one in the table."""
+        self.count, self.begun = int(line.numbers("MNUM", line.words[1:2])[0]), True
+        if not 1 <= self.count <= MAX_CONFIGURATIONS:
+            raise line.error("MNUM", self.count, f"1 to {MAX_CONFIGURATIONS} configurations")
+
+    def read(self, line: Line, n_blocks: int) -> None:
+        """One operand: name, surface, configuration (from 1), value."""
+        word, rest = line.words[0].upper(), line.words[1:]
+        if word in CONFIGURATION or word == "BLNK":
+            return
+        if word not in OPERANDS:
+            if self.count == 1:
+                raise line.unknown(word, OPERANDS)
+            expected = f"one of {', '.join(OPERANDS)}: other things that change with the configuration are not read"
+            raise line.error(word, "(unknown operand)", expected)
+        numbers = line.numbers(word, rest[:2], 2)
+        surface, place = int(numbers[0]), int(numbers[1]) - 1
+        if not 0 <= place < self.count or not 0 <= surface < n_blocks:
+            raise line.error(word, " ".join(rest[:2]), f"a surface below {n_blocks}, a configuration to {self.count}")
+        if word == "LTTL":
+            quoted = re.search('"([^"]*)"', line.text)
+            self.titles[place] = (quoted[1] if quoted else " ".join(rest[2:3])).strip() or f"configuration {place + 1}"
+            return
+        is_object = word == "THIC" and surface == 0
+        value = thickness(line, word, rest[2:3], is_object=is_object)
+        if word == "THIC":
+            self.thickness[surface, place] = value
+        elif value <= 0:
+            raise line.error(word, value, "a number above 0")
+        elif word == "APER":
+            self.aperture[place] = value
+        else:
+            self.semi_diameter[surface, place] = (value, line)
+
+
+def draft_states(zoom: Zoom, blocks: Sequence[Block], aperture_is_f_number: bool) -> Iterator[State]:
+    """The configurations of a file, thickness solves carried out in each.
+
+    Raises:
+        InputError: a semi-diameter that changes anywhere but at the stop.
+    """
+    if zoom.count == 1:
+        return
+    for place in range(zoom.count):
+        full = [zoom.thickness.get((k, place), b.thickness) for k, b in enumerate(blocks)]
+        solved = {k for k, b in enumerate(blocks) if b.solve}
+        film_given = True
+        for k in sorted(solved):
+            word, numbers, line = blocks[k].solve or ("", [], blocks[k].start)
+            if word == "MAZH":
+                if k != len(blocks) - 2:
+                    raise line.error(word, f"(on surface {k})", "the last surface, in a file with configurations")
+                film_given = False
+                continue
+            reference, total = int(numbers[0]), numbers[1]
+            if not 0 < reference < k:
+                raise line.error(word, reference, f"a surface in front of surface {k}")
+            full[k] = total - (full[reference] if word == "TCOM" else sum(full[reference:k]))
+        stop_diameter = None
+        for (surface, there), (value, line) in zoom.semi_diameter.items():
+            if not blocks[surface].stop:
+                raise line.error("SDIA", f"(surface {surface})", "the stop: other rims cannot change")
+            stop_diameter = 2 * value if there == place else stop_diameter
+        changing = {k for k, _ in zoom.thickness} | solved
+        size = zoom.aperture.get(place)
+        if not all(map(math.isfinite, full[1:])):
+            raise InputError(blocks[0].start.file, "THIC", "(infinite)", "finite thicknesses behind the object")
+        yield State(
+            name=zoom.titles.get(place, f"configuration {place + 1}"),
+            thickness={k - 1: full[k] for k in sorted(changing) if 0 < k < len(blocks) - 1},
+            pupil=None if aperture_is_f_number else size,
+            f_number=size if aperture_is_f_number else None,
+            stop_diameter=stop_diameter,
+            object_distance=full[0],
+            film_given=film_given,
+        )

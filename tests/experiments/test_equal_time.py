@@ -1,0 +1,281 @@
+"""Equal time: bias and variance of synthetic renders of known bias and variance, laws of time, kept renders."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from experiments import equal_time, equal_time_page
+from experiments.__main__ import main
+from experiments.equal_time import CameraResult, Counts, Rendered, SceneResult, camera_result
+from experiments.equal_time_errors import (
+    Estimate,
+    FilmMap,
+    Law,
+    bias_and_variance,
+    crossover_s,
+    paired_bias,
+    reference_variance,
+    squared_error,
+    weights,
+)
+from neurolens.base.errors import InputError
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.thin import ThinLens
+from neurolens.render.film import FilmSettings
+from neurolens.render.scene import CameraSettings, load_scene
+
+SHAPE = (12, 20, 3)
+Picture = NDArray[np.float64]
+
+
+def truth() -> Picture:
+    return np.random.default_rng(1).random(SHAPE) + 0.2
+
+
+def noise(count: int, sigma: float, seed: int) -> Picture:
+    return sigma * np.random.default_rng(seed).normal(size=(count, *SHAPE))
+
+
+# Estimators
+
+
+@pytest.mark.parametrize(("bias", "sigma", "reference"), [(0.3, 0.5, 0.4), (0.02, 0.4, 0.3), (0.0, 1.0, 0.5)])
+def test_bias_and_variance_of_known_pictures_with_a_noisy_reference(
+    bias: float, sigma: float, reference: float
+) -> None:
+    """Without the two halves, the reference's own variance (0.16 at most) would count as bias."""
+    wrong = bias * np.sign(np.random.default_rng(2).normal(size=SHAPE))
+    halves = truth() + noise(2, reference, 3)
+    found, variance = bias_and_variance(truth() + wrong + noise(24, sigma, 4), halves, np.ones(SHAPE))
+    # What the reference's own noise adds to the jackknife's deviation: a product of two normal numbers a pixel.
+    spread = math.hypot(found.sd, reference**2 / math.sqrt(720), bias * reference * math.sqrt(2 / 720))
+    assert abs(found.value - bias**2) < 4 * spread
+    assert abs(variance.value - sigma**2) < 4 * variance.sd < 0.2 * sigma**2
+
+
+def test_the_jackknife_tells_how_far_estimates_spread() -> None:
+    sets = [bias_and_variance(0.2 + noise(8, 0.5, s), noise(2, 1e-9, 0), np.ones(SHAPE)) for s in range(40)]
+    for pick in (0, 1):
+        values, told = [s[pick].value for s in sets], [s[pick].sd for s in sets]
+        assert 0.7 < np.std(values) / np.mean(told) < 1.4
+
+
+def test_shared_random_numbers_resolve_a_bias_that_independent_passes_cannot() -> None:
+    exact = truth() + noise(8, 1.0, 5)
+    other = exact + 1e-3 + noise(8, 1e-3, 6)
+    alone, _ = bias_and_variance(other, truth() + noise(2, 0.1, 7), np.ones(SHAPE))
+    paired = paired_bias(other, exact, np.ones(SHAPE))
+    assert not alone.resolved and paired.resolved
+    assert abs(paired.value - 1e-6) < 4 * paired.sd
+    assert paired_bias(exact, exact, np.ones(SHAPE)) == Estimate(0.0, 0.0)
+
+
+def test_errors_are_weighted_as_the_relative_mse_is() -> None:
+    halves = [np.full(SHAPE, 2.0), np.full(SHAPE, 2.0)]
+    weight = weights(halves[0], 0.01)
+    assert squared_error(halves[0] + 0.5, halves, weight) == pytest.approx(0.25 / 4.01)
+    assert paired_bias(noise(3, 0, 0) + 0.5, noise(3, 0, 0), weight).value == pytest.approx(0.25 / 4.01)
+    found, variance = bias_and_variance(np.full((3, *SHAPE), 2.5), halves, weight)
+    assert (found.value, variance.value) == (pytest.approx(0.25 / 4.01), pytest.approx(0, abs=1e-12))
+    assert squared_error(halves[0] + 0.5, halves, weights(halves[0], None)) == pytest.approx(0.25)
+
+
+def test_squared_error_is_free_of_the_references_noise_and_that_noise_is_known() -> None:
+    sets = [truth() + noise(2, 0.3, seed) for seed in range(60)]
+    errors = [squared_error(truth() + 0.1, halves, np.ones(SHAPE)) for halves in sets]
+    assert np.mean(errors) == pytest.approx(0.01, abs=4 * np.std(errors) / math.sqrt(60))
+    assert np.mean([reference_variance(h, np.ones(SHAPE)) for h in sets]) == pytest.approx(0.09 / 2, rel=0.03)
+
+
+@pytest.mark.parametrize("passes", [np.zeros((2, *SHAPE)), np.zeros(3), np.zeros((0, *SHAPE))])
+def test_too_few_passes_are_refused(passes: Picture) -> None:
+    with pytest.raises(InputError, match="at least three pictures"):
+        bias_and_variance(passes, [np.zeros(SHAPE)] * 2, np.ones(SHAPE))
+
+
+def test_passes_that_do_not_pair_are_refused() -> None:
+    with pytest.raises(InputError, match="those of the other camera"):
+        paired_bias(np.zeros((4, *SHAPE)), np.zeros((3, *SHAPE)), np.ones(SHAPE))
+
+
+# Laws of time
+
+EXACT = Law(0.0, 4.0, 2.0, ((0.5, 12.0), (1.0, 8.0)))
+
+
+def test_after_n_passes_the_variance_is_an_nth() -> None:
+    law = Law(0.5, 4.0, 2.0)
+    assert [law.at(2.0 * n) - 0.5 for n in (1, 2, 8)] == [4.0, 2.0, 0.5]
+    assert EXACT.at(0.7) == pytest.approx(12 * (8 / 12) ** (math.log(1.4) / math.log(2)))
+    assert EXACT.at(0.4) == math.inf
+
+
+def test_both_errors_are_equal_where_the_exact_lens_gets_ahead() -> None:
+    fast = Law(1e-4, 4.0, 1.0, ((0.25, 12.0),))
+    t = crossover_s(EXACT, fast)
+    assert t == pytest.approx((4.0 * 2.0 - 4.0 * 1.0) / 1e-4)
+    assert fast.at(t) == pytest.approx(EXACT.at(t))
+    assert fast.at(0.5 * t) < EXACT.at(0.5 * t) and fast.at(2 * t) > EXACT.at(2 * t)
+
+
+def test_a_crossover_within_the_first_pass_is_found_on_the_measured_points() -> None:
+    biased = Law(6.0, 1.0, 0.5, ((0.1, 20.0), (0.2, 9.0)))
+    t = crossover_s(EXACT, biased)
+    assert 0.5 < t < 2.0
+    assert EXACT.at(t) == pytest.approx(biased.at(t), rel=0.02)
+
+
+def test_no_crossover() -> None:
+    assert crossover_s(EXACT, Law(0.0, 4.0, 1.0, ((0.25, 12.0),))) == math.inf  # as good and faster: for ever
+    assert crossover_s(EXACT, Law(1.0, 40.0, 3.0, ((1.0, 90.0),))) == 0.0  # worse at all times
+
+
+# Results of one scene
+
+COUNTS = Counts((SHAPE[1], SHAPE[0]), short=(1, 2), repeats=2, pass_samples=4, passes=4, reference=64)
+
+
+def rendered(bias: float, seconds_a_sample: float, sigma: float = 0.4) -> Rendered:
+    """Pictures of a camera whose variance is sigma^2 / samples; all cameras draw the same noise."""
+    own: list[Picture] = []
+    for k, (samples, _) in enumerate(COUNTS.jobs):
+        own.append(truth() + bias + noise(1, sigma / math.sqrt(samples), 50 + k)[0])
+    return Rendered(own, [seconds_a_sample * n for n, _ in COUNTS.jobs])
+
+
+def result(cameras: Sequence[tuple[str, float, float]]) -> SceneResult:
+    halves = list(truth() + noise(2, 0.01, 9))
+    by = {m: weights(truth(), eps) for m, eps in equal_time.MEASURES.items()}
+    film = FilmMap(np.full((4, 6), 2.0), 2.0, 3.0)
+    exact = rendered(0.0, cameras[0][2])
+    found: dict[str, CameraResult] = {
+        name: camera_result(name, rendered(bias, seconds), exact, halves, by, COUNTS, film)
+        for name, bias, seconds in cameras
+    }
+    noise2 = {m: reference_variance(halves, w) for m, w in by.items()}
+    shot = CameraSettings((0, 0, 1), (0, 0, 0), 1.0)
+    return SceneResult("wall", shot, 1.8, COUNTS, 1, truth(), noise2, 0.01, found)
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneResult:
+    return result([("exact", 0.0, 0.02), ("mlp-16x2", 0.0, 0.01), ("thin lens", 0.2, 0.01)])
+
+
+def test_levels_hold_the_error_of_their_samples(scene: SceneResult) -> None:
+    exact = scene.cameras["exact"]
+    assert [level.samples for level in exact.levels] == [1, 2, 4, 8, 16]
+    for level in exact.levels:
+        assert level.mse == pytest.approx(0.16 / level.samples, rel=0.15)
+        assert level.seconds_min == pytest.approx(0.02 * level.samples)
+    assert [level.flip for level in exact.levels] == sorted((level.flip for level in exact.levels), reverse=True)
+
+
+def test_a_camera_that_gives_the_exact_pictures_has_neither_bias_nor_flip(scene: SceneResult) -> None:
+    found = scene.cameras["mlp-16x2"]
+    assert found.bias2["mse"] == Estimate(0.0, 0.0) and found.flip_same == 0.0
+    biased = scene.cameras["thin lens"]
+    assert biased.bias2["mse"].value == pytest.approx(0.04, rel=1e-6)  # the noise is the same and cancels
+    assert biased.flip_same > 0.05
+
+
+def test_the_exact_lens_is_ahead_when_its_law_says_so(scene: SceneResult) -> None:
+    """The law gives 0.16 (0.02 s - 0.01 s) / 0.2^2 = 40 ms for the absolute error."""
+    law, other = scene.cameras["exact"].law("mse"), scene.cameras["thin lens"].law("mse")
+    assert crossover_s(law, other) == pytest.approx(0.04, rel=0.5)
+    assert equal_time_page.equal_time_s(scene) == pytest.approx(0.16)
+
+
+def test_everything_is_written_small(scene: SceneResult, tmp_path: Path) -> None:
+    equal_time_page.write([scene], tmp_path)
+    assert len((tmp_path / "equal_time.csv").read_text().splitlines()) == 1 + 3 * 5
+    pictures = sorted(tmp_path.glob("*.png"))
+    assert len(pictures) == 3 and all(p.stat().st_size < 150_000 for p in pictures)
+
+
+# Kept renders
+
+SCENE = """
+[camera]
+position_m = [0, 0, 2]
+look_at_m = [0, 0, 0]
+focus_m = 2.0
+film_width_mm = 36.0
+film_height_mm = 18.0
+width = 8
+height = 4
+[environment]
+colour = [1.0, 1.0, 1.0]
+[textures.wall]
+kind = "image"
+file = "wall.png"
+size_m = [1.0, 1.0]
+[materials]
+wall = { kind = "diffuse", texture = "wall" }
+[[planes]]
+point_m = [0.0, 0.0, 0.0]
+normal = [0.0, 0.0, 1.0]
+material = "wall"
+"""
+
+
+@pytest.fixture
+def scene_file(tmp_path: Path) -> Path:
+    from PIL import Image
+
+    Image.new("RGB", (4, 4), (200, 30, 30)).save(tmp_path / "wall.png")
+    file = tmp_path / "wall.toml"
+    file.write_text(SCENE)
+    return file
+
+
+def shelf(file: Path, camera: object = None) -> equal_time.Shelf:
+    camera = camera or Pinhole(50.0, (36.0, 18.0))
+    return equal_time.shelf(
+        file.parent / "run", file, load_scene(file), "a camera", camera, FilmSettings(wavelengths="one"), (8, 4)
+    )  # type: ignore[arg-type]
+
+
+def test_a_finished_render_is_not_repeated(scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = shelf(scene_file).take(2, 7, 1)
+    again = shelf(scene_file)
+    monkeypatch.setattr(equal_time, "render", None)
+    kept = again.take(2, 7, 1)
+    assert np.array_equal(first[0], kept[0]) and first[1] == kept[1]
+    for samples, seed, threads in ((4, 7, 1), (2, 8, 1), (2, 7, 2)):
+        with pytest.raises(TypeError):
+            again.take(samples, seed, threads)
+
+
+@pytest.mark.parametrize("damage", [b"", b"no archive", None])
+def test_a_broken_file_is_rendered_again(scene_file: Path, damage: bytes | None) -> None:
+    mine = shelf(scene_file)
+    picture, _ = mine.take(2, 7, 1)
+    file = mine.file(2, 7, 1)
+    file.write_bytes(file.read_bytes()[:-200] if damage is None else damage)
+    assert np.array_equal(mine.take(2, 7, 1)[0], picture)
+
+
+def test_whatever_changes_the_picture_changes_the_shelf(scene_file: Path) -> None:
+    from PIL import Image
+
+    before = shelf(scene_file).folder
+    assert shelf(scene_file).folder == before
+    assert shelf(scene_file, ThinLens(50.0, 2.0, 2.0, (36.0, 18.0))).folder != before
+    Image.new("RGB", (4, 4), (30, 30, 200)).save(scene_file.parent / "wall.png")
+    painted = shelf(scene_file).folder
+    assert painted != before
+    scene_file.write_text(SCENE.replace("width = 8", "width = 16"))
+    assert shelf(scene_file).folder not in (before, painted)
+
+
+def test_a_scene_that_is_not_there_is_one_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["equal-time", "--scene", "nowhere.toml"]) != 0
+    said = capsys.readouterr().err
+    assert "nowhere.toml" in said and "Traceback" not in said

@@ -1,0 +1,153 @@
+"""The table of numerics: what it may never show, on every case with few rays; its reference against closed forms."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import mpmath
+import pytest
+import torch
+
+from experiments import extreme_cases as cases
+from experiments.__main__ import main
+from experiments.extremes import Row, both_precisions, failures, measure, trace_reference
+from neurolens.base import status as st
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.trace import trace
+
+pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
+LENSES = Path(__file__).parents[2] / "lenses"
+COUNT = 300
+ALL = [
+    *cases.apertures(LENSES, COUNT),
+    *cases.wide_fields(LENSES, COUNT),
+    *cases.radii(COUNT),
+    *cases.grazing(COUNT),
+    *cases.total_reflection(COUNT),
+    *cases.near_equal_indices(COUNT),
+    *cases.wavelengths(LENSES, COUNT),
+    *cases.object_distances(LENSES, COUNT),
+    *cases.shapes(COUNT),
+]
+
+
+@pytest.mark.parametrize("case", ALL, ids=lambda c: f"{c.group}: {c.name}")
+def test_no_nan_and_no_status_that_depends_on_the_precision(case: cases.Case) -> None:
+    row = measure(case)
+    assert failures([row]) == []
+    assert row.rays >= COUNT and row.passed + row.within > 0
+    # float32 keeps five digits of the largest coordinate at the worst; float64 thirteen.
+    assert row.relative < 2e-5
+    assert row.exact_mm < 1e-11
+
+
+def test_the_whole_library_once() -> None:
+    rows = [measure(c, exact_rays=2) for c in cases.library(LENSES, 60)]
+    assert len(rows) >= 2 * len(list(LENSES.glob("*.toml")))
+    assert failures(rows) == []
+    assert max(r.relative for r in rows) < 1e-5
+
+
+def row(**changes: object) -> Row:
+    return replace(Row("g", "n", 10, 5, 1e-6, 1e-7, 1e-6, 0, 0, 0, 4, 1e-15, 1e-15, 0), **changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"within": 3}, ""),
+        ({"beyond": 1}, "away from any edge"),
+        ({"not_finite": 2}, "finite"),
+        ({"exact_status": 1}, "50"),
+    ],
+)
+def test_what_never_may_be_is_told(changes: dict[str, int], told: str) -> None:
+    bad = failures([row(**changes)])
+    assert bool(bad) == bool(told)
+    assert not told or told in bad[0]
+
+
+def test_a_status_that_is_wrong_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tracer that loses float32 rays in the middle of the lens is caught."""
+    from experiments import extremes
+
+    def broken(lens: Lens, rays: object, *args: object, **options: object) -> object:
+        out = trace(lens, rays, *args, **options)  # type: ignore[arg-type]
+        lost = out.status.clone()
+        if out.rays.x.dtype == torch.float32:
+            lost[:5] = st.blocked(0, st.MISSED)
+        return out._replace(status=lost)
+
+    monkeypatch.setattr(extremes, "trace", broken)
+    assert measure(next(cases.near_equal_indices(COUNT))).beyond == 5
+
+
+def test_both_precisions_trace_the_same_rays() -> None:
+    coarse, fine = both_precisions(ALL[0].rays)
+    for a, b in zip(coarse[:3], fine[:3], strict=True):
+        assert torch.equal(a.double(), b)
+    length = torch.sqrt(fine.dx**2 + fine.dy**2 + fine.dz**2)
+    assert (length - 1).abs().max() < 1e-15
+
+
+# ---- the reference ----
+
+
+def one(surface: Surface) -> Lens:
+    return Lens("one", "", (replace(surface, stop=True),), 1.0)
+
+
+def test_reference_images_the_points_of_cartesian_ovals() -> None:
+    """A hyperboloid of K = -n^2 sends rays from within the glass, parallel to the axis, to one point (Descartes)."""
+    n, r = 1.5, -20.0
+    lens = one(Surface(r, 1.0, 40.0, conic=-(n**2)))
+    focus = -r / (n - 1)
+    for height in (0.0, 3.0, 19.0):
+        out = trace_reference(lens, [0.6 * height, 0.8 * height, -30.0, 0, 0, 1], [n, 1.0], "film")
+        assert out.status == st.PASSED and out.point is not None and out.direction is not None
+        with mpmath.mp.workdps(50):
+            reach = (focus - out.point[2]) / out.direction[2]
+            assert all(abs(p + reach * d) < 1e-40 for p, d in zip(out.point[:2], out.direction[:2], strict=True))
+
+
+def test_reference_meets_aspheres_and_cylinders_where_they_are() -> None:
+    shapes = [
+        Surface(-20.0, 1.0, 20.0, 1.5, asphere=((3, 1e-3), (4, 2e-5))),
+        Surface(math.inf, 1.0, 20.0, 1.5, asphere=((2, 0.01),)),
+        Surface(15.0, 1.0, 20.0, 1.5, conic=-0.7, cylinder="x"),
+    ]
+    for s in shapes:
+        out = trace_reference(one(s), [1.0, 2.0, -5.0, 0.3, -0.2, 1.0], [1.0, 1.5], "film")
+        assert out.point is not None
+        x, y, z = (mpmath.mpf(v) for v in out.point)
+        h = abs(x) if s.cylinder else mpmath.sqrt(x * x + y * y)
+        c = 0 if math.isinf(s.radius_mm) else 1 / mpmath.mpf(s.radius_mm)
+        sag = c * h**2 / (1 + mpmath.sqrt(1 - (1 + mpmath.mpf(s.conic)) * c**2 * h**2))
+        assert abs(sag + sum(mpmath.mpf(a) * h**p for p, a in s.asphere) - z) < 1e-13
+
+
+def test_reference_names_what_ends_a_ray() -> None:
+    ball = Lens("ball", "", (Surface(10.0, 20.0, 19.0, 1.6), Surface(-10.0, 1.0, 19.0, stop=True)), 1.0)
+    media = [1.0, 1.6, 1.0]
+    ends = [trace_reference(ball, [x, 0, -5, 0, 0, 1], media, "film").status for x in (0.0, 9.8, 11.0)]
+    assert ends == [st.PASSED, st.blocked(0, st.RIM), st.blocked(0, st.MISSED)]
+    plate = Lens("plate", "", (Surface(math.inf, 1.0, 100.0, stop=True),), 1.0)
+    assert trace_reference(plate, [0, 0, -1, 1, 0, 1], [1.6, 1.0], "film").status == st.blocked(0, st.TOTAL_REFLECTION)
+
+
+# ---- the commands ----
+
+
+def test_the_table_of_extremes_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cases, "library", lambda lenses, count: cases.wavelengths(lenses, count))
+    assert main(["extremes", "--rays", "100", "--out", str(tmp_path), "--quiet"]) == 0
+    text = (tmp_path / "extremes.md").read_text()
+    assert capsys.readouterr().out.strip() == text.strip()
+    assert "FAILED" not in text
+    rows = json.loads((tmp_path / "extremes.json").read_text())
+    assert {"group", "name", "position_mm", "beyond"} <= set(rows[0])

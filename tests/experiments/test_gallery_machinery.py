@@ -1,0 +1,182 @@
+"""The gallery's files, windows, widened lenses and cache, and one small effect from its file to the page."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gallery_shots import GALLERY, ROOT, shipped, shot
+
+from experiments.__main__ import main
+from experiments.gallery.cameras import Window, exact_camera, fitted, surrogate_camera, widened
+from experiments.gallery.figure import MOST_BYTES
+from experiments.gallery.run import check, fingerprint_of
+from experiments.gallery.settings import find_effects, read_effect
+from neurolens.base.errors import InputError
+from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.thin import ThinLens
+from neurolens.optics.lensfile import read_lens
+from neurolens.surrogates.fit import ModelSettings
+from neurolens.surrogates.pairs import PairSettings
+
+EFFECT = """\
+title = "Small"
+text = "A wall of squares."
+source = "Nobody."
+measure = "edge_blur"
+
+[shot]
+lens = "{root}/lenses/laikin_double_gauss_50.toml"
+model = "{root}/models/laikin_double_gauss_50.ols-60.onnx"
+scene = "{root}/experiments/gallery/scenes/chessboard.toml"
+f_number = 4
+width = 24
+samples = 2
+options = {{ x_mm = 10.0 }}
+
+[[panel]]
+label = "one"
+
+[[panel]]
+label = "two"
+film_offset_mm = 0.5
+window_mm = [8.0, 5.0, 9.0, 6.0]
+"""
+
+
+def written(folder: Path, old: str = "", new: str = "") -> Path:
+    """The effect above as a file, with one thing in it exchanged."""
+    path = folder / "small.toml"
+    text = EFFECT.format(root=ROOT.as_posix())
+    assert old in text
+    path.write_text(text.replace(old, new) if old else text, encoding="utf-8")
+    return path
+
+
+def test_every_effect_of_the_gallery_can_be_read() -> None:
+    for path in find_effects(GALLERY):
+        effect = read_effect(path)
+        check(effect)
+        for panel in effect.panel:
+            assert all(file.is_file() for file in panel.files())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        ("width = 24", "widht = 24", "panel[0].widht"),
+        ("samples = 2", "samples = 0", "panel[0].samples"),
+        ("f_number = 4", "widen = 9", "panel[0].widen"),
+        ('"two"', '"one"', "panel"),
+        ("9.0, 6.0]", "9.0, -6.0]", "panel[1].film_mm, window_mm"),
+        ('"edge_blur"', '"blur"', "measure"),
+        ('source = "Nobody."', 'source = ""\ncolumns = ["thick"]', "columns"),
+    ],
+)
+def test_a_mistake_in_a_file_is_one_error_that_names_its_field(tmp_path: Path, old: str, new: str, field: str) -> None:
+    path = written(tmp_path, old, new)
+    with pytest.raises(InputError) as caught:
+        check(read_effect(path))
+    assert (caught.value.file, caught.value.field) == (str(path), field)
+
+
+def test_an_unknown_effect_is_refused_with_the_nearest_name(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["gallery", "comma"]) == 2
+    assert "did you mean 'coma'" in capsys.readouterr().err
+
+
+def test_a_window_sees_what_the_whole_film_sees_there() -> None:
+    whole = ThinLens(50.0, 2.0, 2.0)
+    window = Window(whole, (10.0, 4.0, 6.0, 4.0))
+    rng = np.random.default_rng(3)
+    film = (rng.uniform(-0.5, 0.5, (2, 50)) * [[6.0], [4.0]]).astype(np.float32)
+    pupil, nm = rng.random((2, 50), np.float32), np.full(50, 550, np.float32)
+    # Printed to the right and up is the film's -x and -y.
+    expected = whole.sample(film + np.array([[-10.0], [-4.0]], np.float32), pupil, nm)
+    for camera in (window, window.for_worker()):
+        found = camera.sample(film, pupil, nm)
+        np.testing.assert_array_equal(found.direction, expected.direction)
+        np.testing.assert_array_equal(found.weight, expected.weight)
+
+
+def test_widened_rims_stay_clear_of_the_centre_of_curvature() -> None:
+    lens = read_lens(ROOT / "lenses" / "laikin_double_gauss_127.toml")
+    wide = widened(lens, 3.0)
+    assert wide.stop_radius_mm == lens.stop_radius_mm
+    for before, after in zip(lens.surfaces, wide.surfaces, strict=True):
+        if not before.stop:
+            assert before.diameter_mm < after.diameter_mm <= 3 * before.diameter_mm
+            assert after.semi_diameter_mm <= 0.95 * abs(after.radius_mm) or after.diameter_mm == before.diameter_mm
+    assert widened(lens, 1.0) == lens
+
+
+def test_exact_and_surrogate_put_the_film_in_the_same_place_however_it_is_focused() -> None:
+    taken = shot(
+        "laikin_double_gauss_50", focus_m=2.0, f_number=4.0, focusing="best", film_offset_mm=0.3, model=".ols-60"
+    )
+    surrogate = shipped(taken)
+    for make in (exact_camera, surrogate_camera):
+        assert make(taken, surrogate).settings["film_z_mm"] == pytest.approx(taken.lens.film_z_mm, abs=1e-4)
+
+
+def test_a_surrogate_is_fitted_once(tmp_path: Path) -> None:
+    lens = read_lens(ROOT / "lenses" / "cooke_triplet_50.toml").at(f_number=8.0)
+    asked = {"film_radius_mm": 12.0, "focus_m": (3.0, 3.0), "wavelength_nm": (550.0, 550.0)}
+    settings = ModelSettings("dense", degree=3), tmp_path, lambda fraction, seconds_left=None: None
+    rays = PairSettings(train=1000, held_out=300, rim=1000)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        first = fitted(lens, asked, *settings, rays)
+        made = first.file.stat().st_mtime_ns
+        again = fitted(lens, asked, *settings, rays)
+    assert again.file == first.file
+    assert again.file.stat().st_mtime_ns == made
+    assert again.domain == first.domain
+    assert first.record["rms_um"] < 5
+
+
+def test_an_effect_becomes_a_figure_numbers_and_a_page_and_is_not_done_twice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out = written(tmp_path, '[[panel]]\nlabel = "one"\n', ""), tmp_path / "out"
+    command = ["gallery", "--effects-in", str(tmp_path), "--out", str(out), "--threads", "1"]
+    assert main([*command, "--json"]) == 0
+    first = json.loads(capsys.readouterr().out)["effects"][0]
+    assert (out / "small.png").stat().st_size <= MOST_BYTES
+    for panel in first["panels"]:
+        found = panel["measured"]["edge_um"]
+        assert found["surrogate"] == pytest.approx(found["exact"], abs=1)
+        assert panel["difference_mean"] < 0.02
+        assert panel["surrogate"]["rms_um"] < 1
+    # Out of focus the thin lens has a middle as unsharp as its edge.
+    moved = first["panels"][0]["measured"]
+    assert moved["edge_um"]["thin"] == pytest.approx(moved["middle_um"]["thin"], rel=0.01)
+    assert (out / "README.md").is_file()
+
+    made = (out / "small.png").stat().st_mtime_ns
+    assert main(command) == 0
+    assert "done by an earlier run" in capsys.readouterr().err
+    assert (out / "small.png").stat().st_mtime_ns == made
+    assert fingerprint_of(read_effect(path), 4) != first["fingerprint"] == fingerprint_of(read_effect(path), None)
+    path.write_text(path.read_text(encoding="utf-8").replace('"two"', '"three"'), encoding="utf-8")
+    assert fingerprint_of(read_effect(path), None) != first["fingerprint"]
+
+
+def test_a_shot_moves_the_film_of_a_thin_lens_and_of_no_pinhole() -> None:
+    moved = Shot(film_mm=(36.0, 24.0), focus_m=2.0, film_offset_mm=0.7)
+    camera = make_camera("thin", moved)
+    assert isinstance(camera, ThinLens)
+    still = make_camera("thin", replace(moved, film_offset_mm=0.0))
+    assert isinstance(still, ThinLens)
+    assert camera.image_distance_mm == pytest.approx(still.image_distance_mm + 0.7)
+    with pytest.raises(InputError, match="film_offset_mm"):
+        make_camera("pinhole", moved)
+    with pytest.raises(InputError, match="film_offset_mm"):  # beyond the lens
+        make_camera("thin", replace(moved, film_offset_mm=-60.0))
+    beyond = shot("laikin_double_gauss_50", focus_m=2.0, film_offset_mm=-3.0, model=".ols-60")
+    with pytest.raises(InputError, match="film_offset_mm"):  # before the film of infinity
+        surrogate_camera(beyond, shipped(beyond))

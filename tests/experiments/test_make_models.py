@@ -1,0 +1,168 @@
+"""The models that ship: an index that is whole at any time, entries made once, failures that are said."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lens_models import LENSES
+
+from experiments import make_models
+from experiments.__main__ import main
+from experiments.make_models import Entry, Library, chosen, fingerprint, read_list
+from experiments.promises import read_index
+from neurolens.base.config import from_dict
+from neurolens.base.errors import InputError
+from neurolens.base.progress import Progress
+from neurolens.evaluate.measure import Measured
+from neurolens.surrogates.fit import ModelSettings
+
+QUIET = Progress(quiet=True)
+
+
+@pytest.fixture
+def library(tmp_path: Path) -> Library:
+    """Three lenses of a folder, one of them named with a model of its own."""
+    (tmp_path / "lenses").mkdir()
+    for name in ("one", "three", "two"):
+        text = (LENSES / "cooke_triplet_50.toml").read_text()
+        (tmp_path / "lenses" / f"{name}.toml").write_text(text)
+    (tmp_path / "list.toml").write_text(
+        '[lenses]\nfolder = "lenses"\nmodels = [{ terms = 6 }]\n'
+        '[[entry]]\nlens = { file = "lenses/two.toml" }\nmodels = [{ terms = 4 }, { terms = 5 }]\n'
+    )
+    return read_list(tmp_path / "list.toml")
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """`made["order"]`: entries in the order in which they were made; `made["broken"]`: what those named do instead."""
+    told: dict[str, Any] = {"order": [], "broken": {}}
+
+    def make_entry(entry: Entry, library: Library, out: Path, *_: object) -> list[dict[str, Any]]:
+        if entry.state in told["broken"]:
+            raise told["broken"][entry.state]
+        told["order"].append(entry.state)
+        rows = []
+        for settings in entry.models:
+            (out / entry.file(settings)).write_bytes(b"a model")
+            rows.append(row(entry.file(settings), entry.state, fingerprint(entry, library.pairs)))
+            rows[-1]["sha256"] = make_models._sha256(out / entry.file(settings))
+        return rows
+
+    monkeypatch.setattr(make_models, "make_entry", make_entry)
+    return told
+
+
+def row(file: str, entry: str, mark: str = "", rms_um: float = 2.0) -> dict[str, Any]:
+    figures = dict.fromkeys((*make_models._KEPT, "position_rms_um_at_21_6"), 1.0)
+    timed = {"ns_per_ray": {"min": 20.0}, "speedup_over_compiled": 2.0}
+    return {"file": file, "entry": entry, "fingerprint": mark, "lens_file": "a", **figures, **timed, "rms_um": rms_um}
+
+
+def files(folder: Path) -> list[str]:
+    return [r["file"] for r in read_index(folder)]
+
+
+def test_a_list_holds_every_lens_of_its_folder_once(library: Library) -> None:
+    assert [e.state for e in library.entry] == ["two", "one", "three"]
+    assert [e.best for e in library.entry] == [False, True, True]
+    assert [e.state for e in chosen(library, ["t"])] == ["two", "three"]
+    with pytest.raises(InputError, match="three"):
+        chosen(library, ["nothing"])
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, library: Library, made: dict[str, Any]) -> None:
+    make_models.write_index([row("one.old.onnx", "one", rms_um=9.0), row("gone.x.onnx", "gone")], {}, tmp_path)
+    for name in ("one.old.onnx", "gone.x.onnx"):
+        (tmp_path / name).write_bytes(b"")
+    made["broken"]["one"] = KeyboardInterrupt()
+    with pytest.raises(KeyboardInterrupt):
+        make_models.make_models(library, library.entry, tmp_path, QUIET)
+    assert files(tmp_path) == ["two.ols-4.onnx", "two.ols-5.onnx", "one.old.onnx", "gone.x.onnx"]
+    made["broken"].clear()
+    assert make_models.make_models(library, library.entry, tmp_path, QUIET) == []
+    assert made["order"] == ["two", "one", "three"]  # two was not made again
+    assert files(tmp_path) == ["two.ols-4.onnx", "two.ols-5.onnx", "one.ols-6.onnx", "three.ols-6.onnx"]
+    assert {f.name for f in tmp_path.glob("*.onnx")} == set(files(tmp_path))  # no file without a row
+    assert "gone" not in (tmp_path / "README.md").read_text()
+
+
+def test_what_changed_is_made_again(tmp_path: Path, library: Library, made: dict[str, Any]) -> None:
+    make_models.make_models(library, library.entry, tmp_path, QUIET)
+    made["order"].clear()
+    (tmp_path / "three.ols-6.onnx").write_bytes(b"another")
+    text = (tmp_path / "lenses" / "one.toml").read_text()
+    (tmp_path / "lenses" / "one.toml").write_text(text.replace("3.25896", "3.25900"))
+    make_models.make_models(library, library.entry, tmp_path, QUIET)
+    assert made["order"] == ["one", "three"]
+    make_models.make_models(library, chosen(library, ["two"]), tmp_path, QUIET, again=True)
+    assert made["order"] == ["one", "three", "two"] and len(files(tmp_path)) == 4
+
+
+def test_a_lens_that_cannot_be_done_is_said_and_the_others_go_on(
+    tmp_path: Path, library: Library, made: dict[str, Any]
+) -> None:
+    made["broken"]["one"] = InputError("one.toml", "domain", 0, "a domain")
+    failed = make_models.make_models(library, library.entry, tmp_path, QUIET)
+    assert len(failed) == 1 and failed[0].startswith("one: left out: one.toml: domain")
+    assert "- one: one.toml: domain" in (tmp_path / "README.md").read_text() and len(files(tmp_path)) == 3
+    made["broken"].clear()
+    assert make_models.make_models(library, library.entry, tmp_path, QUIET) == []
+    assert json.loads((tmp_path / "index.json").read_text())["left_out"] == {}
+
+
+def test_a_broken_index_is_made_anew(tmp_path: Path, library: Library, made: dict[str, Any]) -> None:
+    (tmp_path / "index.json").write_text('{"models": [{"file": "two.ols-6.onnx", "lens_file": "a"}]}')
+    make_models.make_models(library, library.entry, tmp_path, QUIET)
+    assert len(files(tmp_path)) == 4
+
+
+def test_the_best_of_each_kind_has_the_smallest_error() -> None:
+    errors = {"ols-20": 3.0, "ols-40": 2.0, "mlp-8x2": 1.0, "mlp-16x2": 1.5}
+    measured = []
+    for label, error in errors.items():
+        settings = ModelSettings("mlp" if label.startswith("mlp") else "ols", name=label)
+        measured.append(Measured(settings, Path(label), {"rms_um": error}))
+    assert [m.settings.label for m in make_models.best_of_each_kind(measured)] == ["ols-40", "mlp-8x2"]
+    beyond = [Measured(m.settings, m.file, {"rms_um": None, "direction_rms_deg": m.record["rms_um"]}) for m in measured]
+    assert [m.settings.label for m in make_models.best_of_each_kind(beyond)] == ["ols-40", "mlp-8x2"]
+
+
+def test_an_entry_is_fitted_checked_and_timed(tmp_path: Path) -> None:
+    (tmp_path / "list.toml").write_text(
+        "compile_exact = false\n[pairs]\ntrain = 3000\nheld_out = 3000\nrim = 3000\n"
+        f'[[entry]]\nlens = {{ file = "{LENSES}/cooke_triplet_50.toml" }}\n'
+        "models = [{ terms = 12, degree = 4, planes = false }, { terms = 20, degree = 5, planes = false }]\n"
+        "best = true\n"
+    )
+    command = ["models", "--list", str(tmp_path / "list.toml"), "--out", str(tmp_path / "out"), "--quiet"]
+    assert main(command) == 0
+    (only,) = read_index(tmp_path / "out")
+    assert only["model"] == "ols-20" and only["broken"] == [] and only["rms_um_at_21_6"] > only["rms_um"] > 0
+    assert only["ns_per_ray"]["min"] > 0 and only["lens_file"] == "lenses/cooke_triplet_50.toml"
+    before = (tmp_path / "out" / "index.json").read_bytes()
+    assert main(command) == 0 and (tmp_path / "out" / "index.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"lens": {"file": "one.toml", "configuration": "../up"}},
+        {"lens": {"file": "one.toml"}, "models": [{"name": "a/b"}]},
+        {"lens": {"file": "one.toml"}, "models": [{"terms": 6}, {"terms": 6}]},
+        {"lens": {"file": "one.toml"}, "models": []},
+    ],
+)
+def test_names_that_are_no_file_names_are_refused(entry: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match="entry"):
+        from_dict(Library, {"entry": [entry]}, "test")
+
+
+def test_a_list_that_is_not_there_makes_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "models"
+    assert main(["models", "--list", str(tmp_path / "no.toml"), "--out", str(out)]) == 2
+    assert "no.toml" in capsys.readouterr().err
+    assert not out.exists()

@@ -1,0 +1,129 @@
+"""Vignetting of fitted models against the exact lens, and random numbers through an exported one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import lens_models
+import numpy as np
+import pytest
+import torch
+from vignetting_oracle import vignetting_errors
+
+from experiments import outside
+from experiments.__main__ import main
+from experiments.vignetting import DOMAINS, OPENINGS, opening_errors, pupil_masks
+from neurolens.base import status as st
+from neurolens.cameras.onnxlens import load_model
+from neurolens.evaluate.experiment import LensChoice
+from neurolens.evaluate.vignetting import relative_illumination
+from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.specialise import at_wavelength
+
+LENSES = Path(__file__).parents[2] / "lenses"
+
+
+@pytest.fixture(scope="module")
+def fisheye() -> LensModel:
+    """A circular fisheye, whose film is dark beyond a circle."""
+    lens = LensChoice(LENSES / "shimizu_fisheye_220.toml").read()
+    pairs = make_pairs(lens, DOMAINS["infinity"].of(lens), PairSettings(train=8000, held_out=10, rim=12000))
+    return fit_model(prepare(pairs), ModelSettings("ols", terms=50, planes=False))
+
+
+def test_every_opening_with_one_fit(fisheye: LensModel) -> None:
+    found = opening_errors(fisheye.lens, fisheye, 60_000)
+    for name in OPENINGS:
+        false_pass, false_block = found[name]["false_pass"], found[name]["false_block"]
+        assert false_pass is not None and false_pass < 0.001
+        assert false_block is not None and false_block < 0.001
+    # The exact lens stopped down, traced so, passes what crosses within.
+    radius = fisheye.domain.stop_radius_mm / 2
+    same = vignetting_errors(fisheye.lens, fisheye.domain, fisheye.predict, stop_radius_mm=radius, count=60_000)
+    assert same["passing_share"] == found["2 stops"]["passing"] / 60_000
+    assert (same["false_pass"], same["false_block"]) == (
+        found["2 stops"]["false_pass"],
+        found["2 stops"]["false_block"],
+    )
+
+
+def test_a_fisheye_darkens_as_the_exact_lens_does(fisheye: LensModel) -> None:
+    found = relative_illumination(fisheye.lens, fisheye.domain, fisheye.predict, points=4096, rows=9)
+    assert found["max_difference"] < 0.003
+    assert found["exact"][-1] < 0.9 * found["exact"][0]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.7, 1.0])
+def test_cats_eyes_have_the_same_shape(fisheye: LensModel, share: float) -> None:
+    *_, exact, said = pupil_masks(fisheye, share, points=100)
+    for name in OPENINGS:
+        assert exact[name].sum() > 50
+        outline = exact[name] ^ said[name]
+        assert outline.sum() <= 0.004 * exact[name].sum() + 2
+
+
+def test_a_table_of_something_else_is_not_written_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["vignetting", "--only", "petzval", "--domain", "infinity", "--quiet", "--out", str(tmp_path)]
+    for text in ("half a fi", "3", '[{"lens": "other"}]'):
+        (tmp_path / "vignetting.json").write_text(text)
+        assert main(command) == 2
+        assert "rows of experiments vignetting" in capsys.readouterr().err
+        assert (tmp_path / "vignetting.json").read_text() == text
+
+
+@pytest.mark.slow
+def test_the_command_writes_rows_and_keeps_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("experiments.vignetting.MODEL", ModelSettings("ols", terms=24, planes=False))
+    (tmp_path / "vignetting.json").write_text('[{"lens": "other", "domain": "infinity", "failed": "not round"}]')
+    command = ["vignetting", "--only", "petzval", "--domain", "infinity", "--rays", "4000", "--quiet"]
+    assert main([*command, "--out", str(tmp_path)]) == 0
+    rows = json.loads((tmp_path / "vignetting.json").read_text())
+    assert [r["lens"] for r in rows] == ["other", "petzval_portrait_100"]
+    assert "petzval_portrait_100" in capsys.readouterr().out
+    assert "other: not round" in (tmp_path / "vignetting.md").read_text()
+    assert (tmp_path / "vignetting.png").stat().st_size > 10_000
+    assert main([*command[:2], "no such lens", *command[3:]]) != 0
+
+
+@pytest.mark.parametrize("kind", ["invariants", "network", "fisheye"])  # the last without dispersion
+def test_nothing_passes_outside_the_domain(kind: str, tmp_path: Path) -> None:
+    """2e5 random inputs: any bits, NaN, infinities, denormals, huge and negative numbers, rays just outside."""
+    model = load_model(export_onnx(lens_models.model(kind), tmp_path / "m.onnx"))
+    found = outside.send(model, 200_000, seed=7)
+    assert found.broken == dict.fromkeys(found.broken, 0)
+    assert found.inside > 10_000 and found.passed > 3000
+
+
+def test_a_model_for_one_wavelength_takes_no_other(tmp_path: Path) -> None:
+    path = export_onnx(at_wavelength(lens_models.model("invariants"), 550.0), tmp_path / "m.onnx")
+    found = outside.send(load_model(path), 40_000, seed=7)
+    assert found.broken == dict.fromkeys(found.broken, 0)
+    assert found.inside > 2000 and found.passed > 500
+
+
+def test_broken_promises_are_counted(tmp_path: Path) -> None:
+    """A model that passes everything, with rays that are none, is caught at each."""
+    model = load_model(export_onnx(lens_models.model("invariants"), tmp_path / "m.onnx"))
+    honest = model.rays
+
+    def liar(*arguments: object) -> object:
+        out = honest(*arguments)  # type: ignore[arg-type]
+        return out._replace(status=np.full_like(out.status, st.PASSED))
+
+    model.rays = liar  # type: ignore[method-assign, assignment]
+    found = outside.send(model, 40_000, seed=7)
+    assert found.broken[outside.PASSES_OUTSIDE] > 10_000
+    assert found.broken[outside.NOT_FINITE] > 1000
+    assert torch.tensor(found.passed) == 40_000
+
+
+def test_the_outside_command_says_how_many(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = export_onnx(lens_models.model("invariants"), tmp_path / "m.onnx")
+    assert main(["outside", str(path), "--rays", "5000", "--quiet"]) == 0
+    assert "5000 rays" in capsys.readouterr().out

@@ -1,0 +1,60 @@
+"""The shipped prescriptions, read once, and rays that tests of several folders turn round or move."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from functools import cache
+from pathlib import Path
+
+import torch
+
+from neurolens.base.errors import NeurolensWarning
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens
+from neurolens.optics.trace import Rays
+
+LENSES = Path(__file__).parents[1] / "lenses"
+PATHS = sorted(LENSES.glob("*.toml"))
+NAMES = [path.stem for path in PATHS]
+
+
+@cache
+def tabled(name: str) -> Lens:
+    """A lens as its file has it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NeurolensWarning)
+        return read_lens(LENSES / f"{name}.toml")
+
+
+@cache
+def focused(name: str) -> Lens:
+    """A lens focused at infinity."""
+    return tabled(name).at()
+
+
+def rays(*rows: tuple[float, ...], dtype: torch.dtype = torch.float64) -> Rays:
+    """Rays of (x, y, z, dx, dy, dz), directions made unit."""
+    t = torch.tensor(rows, dtype=torch.float64)
+    t[:, 3:] /= t[:, 3:].norm(dim=1, keepdim=True)
+    return Rays(*t.T.to(dtype).contiguous())
+
+
+def turned(r: Rays, angle: float, mirror: bool = False) -> Rays:
+    """The rays turned about the axis by `angle` rad, after x -> -x where asked."""
+    c, s, m = math.cos(angle), math.sin(angle), -1 if mirror else 1
+    x, dx = m * r.x, m * r.dx
+    return Rays(c * x - s * r.y, s * x + c * r.y, r.z, c * dx - s * r.dy, s * dx + c * r.dy, r.dz)
+
+
+def backwards(r: Rays, travel: float = 0.0) -> Rays:
+    """The rays turned round, started `travel` mm farther along."""
+    start = [p + travel * d for p, d in zip(r[:3], r[3:], strict=True)]
+    return Rays(*start, -r.dx, -r.dy, -r.dz)
+
+
+def singlet_mm(n: float, radius_mm: float = 50.0, thickness_mm: float = 5.0) -> tuple[float, float]:
+    """Focal length and back focus of a biconvex lens of equal radii (the lensmaker's formula)."""
+    R, t = radius_mm, thickness_mm
+    efl_mm = 1 / ((n - 1) * (2 / R - (n - 1) * t / (n * R * R)))
+    return efl_mm, efl_mm * (1 - (n - 1) * t / (n * R))
