@@ -52,8 +52,7 @@ def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tupl
             names |= {(node.name, row): name for row, name in enumerate(row_names(node.name, node.rows))}
         base = _base(node, x, moves, chains)
         if base is not None:
-            factors = [None if all(d[i] is None for d in moves) else _factor(v, chains) for i, v in enumerate(x)]
-            factor = rule(node, y, x, factors)
+            factor = rule(node, y, x, _factors(x, moves, chains))
             if factor is None:
                 continue
             chains[y.number] = base, factor
@@ -61,7 +60,7 @@ def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tupl
             if node.kind == "input" and node.name == name:
                 direction[y.number] = g.constant(np.eye(node.rows)[row])
             elif any(v is not None for v in d):
-                moved = rule(node, y, x, d) if base is None else _times(direction[base], factor)
+                moved = rule(node, y, x, d) if base is None else _times(direction[base], chains[y.number][1])
                 if moved is not None and not _is_zero(moved):
                     direction[y.number] = moved
     g.outputs = {name: values[v.number] for name, v in graph.outputs.items()}
@@ -83,10 +82,8 @@ def _joined(graph: Graph) -> Graph:
         inputs = [values[k] for k in node.inputs]
         group = groups.get((node.inputs, node.static), []) if node.kind == "affine" else []
         if len(group) > 1:
-            rows, arrays = (
-                sum(n.rows for n in group),
-                [np.concatenate(a) for a in zip(*(n.arrays for n in group), strict=True)],
-            )
+            rows = sum(n.rows for n in group)
+            arrays = [np.concatenate(a) for a in zip(*(n.arrays for n in group), strict=True)]
             start = sum(n.rows for n in group[: next(k for k, n in enumerate(group) if n is node)])
             whole = found.add("affine", inputs, rows, arrays=arrays, static=node.static)
             values.append(whole[start : start + node.rows])
@@ -98,8 +95,13 @@ def _joined(graph: Graph) -> Graph:
     return found
 
 
-def _factor(x: Value, chains: dict[int, tuple[int, Value]]) -> Value:
-    return chains[x.number][1] if x.number in chains else x.graph.constant(1.0)
+def _factors(x: Sequence[Value], moves: Sequence[Sequence[Moved]], chains: dict[int, tuple[int, Value]]) -> list[Moved]:
+    """Derivatives of an operation's values by the one that they all depend on."""
+    one = x[0].graph.constant(1.0)
+    return [
+        None if all(d[i] is None for d in moves) else chains[v.number][1] if v.number in chains else one
+        for i, v in enumerate(x)
+    ]
 
 
 def _base(
@@ -235,15 +237,11 @@ def _quadratic(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> 
         base, moving = column
         change = moving and (moving[0], _linear(node, moving[1][:, 0]))
         return g.affine(_linear(node, base[:, 0]), x[0], moving=change)
-    # All products x_i dx_j in one operation, then summed.
+    # All products x_i dx_j in one operation, then summed. The twos of squares serve all directions.
     pairs = sorted({pair for form in node.static for i, j in form for pair in ((i, j), (j, i))})
-    products = g.take(x[0], [i for i, _ in pairs]) * g.take(dx, [j for _, j in pairs])
-    sums = np.zeros((node.rows, len(pairs)))
-    for r, form in enumerate(node.static):
-        for i, j in form:
-            sums[r, pairs.index((i, j))] += 1
-            sums[r, pairs.index((j, i))] += 1
-    return g.affine(sums, products)
+    left, right = (g.take(v, [pair[k] for pair in pairs]) for k, v in enumerate((x[0], dx)))
+    products = left * [1.0 + (i == j) for i, j in pairs] * right
+    return g.affine([[float(p in form or p[::-1] in form) for p in pairs] for form in node.static], products)
 
 
 def _linear(node: Node, dx: Array) -> Array:

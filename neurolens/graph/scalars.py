@@ -116,7 +116,7 @@ def _affine(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Arr
                 weight = p.literal(arrays[0][r, c])
                 if moving and arrays[2][r, c].any():
                     weight = p.fma(given[1][0], p.literal(arrays[2][r, c]), weight)
-                found[r] = p.fma(x[c], weight, found[r])
+                found[r] = p.sum(x[c], found[r]) if weight.is_literal(1) else p.fma(x[c], weight, found[r])
     return found
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,18 +22,16 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.frontsurface import meet_front
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Exponents, Graph, Value, pruned
+from neurolens.graph.ir import Exponents, Graph, Value
 from neurolens.graph.newton import determinant, limited_newton
-from neurolens.graph.onnx import write_onnx
+from neurolens.graph.passes import pruned
 from neurolens.graph.program import RAY
-from neurolens.modelfile import CARD_KEY
+from neurolens.optics.sag import meet_front
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.assemble import (
     EXACT,
-    ONNX,
     DirectionSeries,
     Form,
     add_outputs,
@@ -44,10 +41,8 @@ from neurolens.surrogates.assemble import (
     wavelength_row,
     within_domain,
 )  # fmt: skip
-from neurolens.surrogates.card import card_of, card_to_json
 from neurolens.surrogates.cores import DIRECTION, MIRROR, POSITION, ROUND, STOP, CoreValues, Field, Units
 from neurolens.surrogates.domain import FilmRays
-from neurolens.surrogates.export import check_gates, largest_angle, write_file
 from neurolens.surrogates.lightfield import Encoding, angle_vector
 from neurolens.surrogates.model import LensModel, Prediction, prediction_of
 
@@ -378,41 +373,3 @@ def _finished(
     if form.exact:
         g.outputs["residual"] = size.sqrt()
     return pruned(g)
-
-
-def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, Any] | None = None) -> tuple[Path, Path]:
-    """Write both inverse maps beside a model's file: NAME.stop.onnx and NAME.scene.onnx for NAME.onnx.
-
-    Both give rays [5, N] (film x, y, pupil x, y, wavelength), scene_ray, transmittance, stop_xy_mm and status as the
-    model does for those rays (NO_SOLUTION where they are not what was asked for), and density [N]. Inputs: see
-    `stop_graph` and `scene_graph`; per-call ones have the shape [1].
-
-    Args:
-        path: of the model's file. errors: for the card, as of `export_onnx`.
-
-    Raises:
-        InputError: as `export_onnx`.
-    """
-    model = inverse.model
-    check_gates(model)
-    base, card, front = Path(path).with_suffix(""), card_of(model, errors or {}), model.lens.surfaces[0]
-    shape = {
-        "curvature": float(front.curvature),
-        "conic": float(front.conic),
-        "asphere": [[int(p), float(a)] for p, a in front.asphere],
-        "cylinder": front.cylinder,
-    }
-    written = []
-    for name, build in (("stop", stop_graph), ("scene", scene_graph)):
-        known = {
-            "map": name,
-            "steps": STEPS,
-            "tolerance": TOLERANCE,
-            "direction": model.direction,
-            "front": shape if model.direction == "angle" else None,
-            "fit": inverse.report,
-        }
-        graph = build(inverse, ONNX, largest_angle(model))
-        proto = write_onnx(graph, {CARD_KEY: card_to_json({**card, "inverse": known})})
-        written.append(write_file(base.with_name(f"{base.name}.{name}.onnx"), proto))
-    return written[0], written[1]

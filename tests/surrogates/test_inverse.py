@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.frontsurface import sag_and_slope
+from neurolens.optics.sag import sag_and_slope
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model

@@ -24,9 +24,9 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.thin import ThinLens
 from neurolens.modelfile import CARD_KEY
 from neurolens.surrogates.domain import FilmRays, sample_domain
-from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.export import export_inverse, export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
-from neurolens.surrogates.inverse import InverseModel, export_inverse
+from neurolens.surrogates.inverse import InverseModel
 from neurolens.surrogates.inverse_fit import fit_inverse
 
 KINDS = ("invariants", "raw", "network", "thick", "fisheye")
