@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.optics.sag import sag_and_slope
+from neurolens.optics.sag import sag_and_derivatives
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
@@ -92,7 +92,7 @@ def test_a_scene_point_and_a_point_of_the_front_make_a_ray() -> None:
     lens, film_z = inv.model.lens, inv.model.domain.film_z_mm[0]
     x = torch.linspace(-8, 8, 33, dtype=torch.float64)
     y = 0.3 * x + 1
-    z = torch.from_numpy(sag_and_slope(lens.surfaces[0], x.numpy(), y.numpy())[0])
+    z = torch.from_numpy(sag_and_derivatives(lens.surfaces[0], x.numpy(), y.numpy())[0])
     point = torch.tensor([120.0, -60.0, -900.0], dtype=torch.float64)
     d = point[:, None] - torch.stack([x, y, z])
     ray = Rays(*(point[:, None] + 0 * d), *(d / d.norm(dim=0)))
@@ -141,7 +141,7 @@ def test_the_density_of_scene_rays_conserves_etendue(name: str) -> None:
     slope2 = ((rays.pupil_x - rays.film_x) ** 2 + (rays.pupil_y - rays.film_y) ** 2) / gap**2
     film_side = (1 + slope2) ** -2 / gap**2  # cos^4 / Z^2, per mm^2 of film and of pupil plane
     _, sx, sy = (
-        torch.from_numpy(v) for v in sag_and_slope(inv.model.lens.surfaces[0], scene.x.numpy(), scene.y.numpy())
+        torch.from_numpy(v) for v in sag_and_derivatives(inv.model.lens.surfaces[0], scene.x.numpy(), scene.y.numpy())
     )
     front_side = (scene.dx * sx + scene.dy * sy - scene.dz).abs()  # |d . n / n_z|, per mm^2 of (x, y) and steradian
     ratio = out.density * film_side / front_side
