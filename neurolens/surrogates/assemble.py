@@ -40,18 +40,20 @@ class Form:
     Attributes:
         gate_scale: factor on all tests of rims: in ONNX any failure then exceeds every status code.
         sag_terms: most terms of the front surface as a series, where a square root costs more; 0: never a series.
-        exact: for float64: series hold 1e-14, and no factor makes them shorter.
+        exact: for float64: series hold 1e-14.
+        monic: whether a factor on v saves a pass over the rays; where products and sums are one, nothing.
         wavelength: whether rays always come with a wavelength, which then is tested.
     """
 
     gate_scale: float = 1.0
     sag_terms: int = 12
     exact: bool = False
+    monic: bool = False
     wavelength: bool = False
 
 
 SCALARS = Form()
-ONNX = Form(gate_scale=1e30, sag_terms=5, wavelength=True)
+ONNX = Form(gate_scale=1e30, sag_terms=5, monic=True, wavelength=True)
 EXACT = Form(sag_terms=0, exact=True, wavelength=True)
 
 
@@ -186,7 +188,7 @@ class DirectionSeries:
         """That of a model: no series for slopes."""
         if model.direction == "slope":
             return DirectionSeries(1.0)
-        return DirectionSeries.exact() if form.exact else DirectionSeries.fitted(angle)
+        return DirectionSeries.exact() if form.exact else DirectionSeries.fitted(angle, form.monic)
 
     @staticmethod
     def exact() -> DirectionSeries:
@@ -196,10 +198,12 @@ class DirectionSeries:
         return DirectionSeries(1.0, cos / (2 * k + 1), -cos)
 
     @staticmethod
-    def fitted(angle: float) -> DirectionSeries:
-        """The shortest that hold float32's last bit up to an angle (rad)."""
+    def fitted(angle: float, monic: bool = True) -> DirectionSeries:
+        """The shortest that hold float32's last bit up to an angle (rad); `monic`: the factor that saves a pass."""
         sinc = fit_series(lambda t: np.sinc(np.sqrt(t) / np.pi), angle**2, _SERIES / max(angle, 0.1))
         minus_cos = fit_series(lambda t: -np.cos(np.sqrt(t)), angle**2, _SERIES)
+        if not monic:
+            return DirectionSeries(1.0, sinc, minus_cos)
         n = len(sinc) - 1
         kappa = math.copysign(abs(sinc[n]) ** (1 / (2 * n + 1)), sinc[n])
         scaled = sinc / kappa ** (2.0 * np.arange(n + 1) + 1)
