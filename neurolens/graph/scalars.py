@@ -118,7 +118,9 @@ def _affine(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Arr
     for rows in np.array_split(np.arange(node.rows), max(1, round(node.rows / _ROWS))):
         for c in range(len(x)):
             for r in rows:
-                found[r] = p.fma(x[c], p.literal(arrays[0][r, c]), found[r])
+                weight = p.literal(arrays[0][r, c])
+                # A product times 1 and the sum are one operation.
+                found[r] = p.sum(x[c], found[r]) if weight.is_literal(1) else p.fma(x[c], weight, found[r])
     return found
 
 

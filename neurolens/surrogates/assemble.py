@@ -83,11 +83,24 @@ def model_graph(model: LensModel, angle: float, form: Form, parts: Parts = ALL) 
     """
     g = Graph()
     rays, film_z = g.input("rays", 5), g.input("film_z_mm", per_call=True)
-    inside = _inside(model, rays, film_z, form)
+    inside = within_domain(model, rays, film_z, form)
     field = light_field(g, model.encoding, rays, film_z)
     series = DirectionSeries.of(model, angle, form)
-    units = Units((model.scales.position_mm, series.kappa, model.scales.stop_mm), form.gate_scale)
-    values = model.core.build(g, field, units)
+    values = model.core.build(g, field, units_of(model, series, form))
+    g.outputs["status"] = add_outputs(model, values, inside, series, form, parts).whole()
+    return g
+
+
+def units_of(model: LensModel, series: DirectionSeries, form: Form) -> Units:
+    """Of a core whose outputs `add_outputs` takes: mm, and kappa rad."""
+    return Units((model.scales.position_mm, series.kappa, model.scales.stop_mm), form.gate_scale)
+
+
+def add_outputs(
+    model: LensModel, values: CoreValues, inside: Value, series: DirectionSeries, form: Form, parts: Parts = ALL
+) -> Value:
+    """Set a model's outputs but the status, which is returned, of what its core gives (in `units_of`)."""
+    g = inside.graph
     g.outputs["scene_ray"] = scene_ray(model, values, series, form)
     if parts.transmittance:
         g.outputs["transmittance"] = values.transmittance
@@ -98,8 +111,7 @@ def model_graph(model: LensModel, angle: float, form: Form, parts: Parts = ALL) 
         radius = g.input("stop_radius_mm", per_call=True)
         inside = inside & radius.between(0.0, model.domain.stop_radius_mm * DOMAIN_SLACK)
         status = _first_failure(model, values, radius, form)
-    g.outputs["status"] = g.select(inside, status, float(st.OUTSIDE_DOMAIN)).whole()
-    return g
+    return g.select(inside, status, float(st.OUTSIDE_DOMAIN))
 
 
 def light_field(g: Graph, e: Encoding, rays: Value, film_z: Value) -> Field:
@@ -120,14 +132,18 @@ def light_field(g: Graph, e: Encoding, rays: Value, film_z: Value) -> Field:
     along = (e.film_plane_z_mm - e.pupil_plane_z_mm) / (film_z - e.pupil_plane_z_mm)
     base, change, points = rows(0.0), rows(1.0) - rows(0.0), rays[0:4]
     if e.w_half:
-        # v = 1000 / (lambda sqrt(half)), so that w = v^2 - middle / half.
-        points = g.concat(points, (1000 / math.sqrt(e.w_half)) / rays[4])
+        points = g.concat(points, wavelength_row(e, rays[4]))
         base, change = np.pad(base, ((0, 1), (0, 1))), np.pad(change, ((0, 1), (0, 1)))
         base[4, 4] = 1
     return Field(g.affine(base, points, moving=(along, change)), -e.w_middle / e.w_half if e.w_half else 0.0)
 
 
-def _inside(model: LensModel, rays: Value, film_z: Value, form: Form) -> Value:
+def wavelength_row(e: Encoding, wavelength_nm: Value) -> Value:
+    """v = 1000 / (lambda sqrt(half)), so that w = v^2 - middle / half."""
+    return (1000 / math.sqrt(e.w_half)) / wavelength_nm
+
+
+def within_domain(model: LensModel, rays: Value, film_z: Value, form: Form) -> Value:
     """Whether film point, pupil point, wavelength and film position lie in the domain; false for NaN."""
     g, d = rays.graph, model.domain
     squares = g.quadratic(rays[0:4], [((0, 0), (1, 1)), ((2, 2), (3, 3))])
