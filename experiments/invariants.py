@@ -560,6 +560,8 @@ def units_of(item: str, old: Path, new: Path, tree: Path, args: argparse.Namespa
     ends = {"fits": ".npz", "render": ".exr", "source": (".h", ".glsl")}.get(item, ".onnx")
     files = [f for f in sorted((old / folder).rglob("*")) if f.name.endswith(ends) and ".part." not in f.name]
     files = [f for f in files if not f.name.endswith((".stop.onnx", ".scene.onnx"))]
+    if item == "source":  # what is refused leaves a message alone
+        files = [f.with_suffix("") for f in sorted((old / folder).rglob("*.json"))]
     if folder in ("onnx", "source", "derivatives"):
         files = [f for f in files if fnmatch.fnmatch(f.name, args.models + "*")]
     run: Callable[[Path, Path], Any] = {
