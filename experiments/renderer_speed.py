@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.thin import ThinLens
+from neurolens.cameras.ideal import ThinLens
 from neurolens.commands.arguments import whole
 from neurolens.render.mesh import EmbreeMesh, Mesh
 from neurolens.render.primitives import Primitive, Rays

@@ -19,7 +19,7 @@ from command_line import failure, run_json
 from PIL import Image
 
 from neurolens.cameras.contract import CameraRays
-from neurolens.cameras.thin import ThinLens
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cli import main
 from neurolens.render.pictures import read_exr, read_layers, write_exr
 

@@ -61,10 +61,9 @@ EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
     "neurolens.optics.apertures": (set(), {"torch"}),
     "neurolens.optics.sag": ({"optics"}, set()),  # for a type
     "neurolens.cameras.exact": ({"optics"}, {"torch"}),
-    "neurolens.cameras.exact_pupils": ({"optics"}, set()),
     "neurolens.cameras.build": ({"optics"}, set()),
 }
-NEEDS_TRAINING = {"neurolens.cameras.exact", "neurolens.cameras.exact_pupils", "neurolens.graph.onnx"}
+NEEDS_TRAINING = {"neurolens.cameras.exact", "neurolens.graph.onnx"}
 # Parts that load in a base install.
 LEAN = ("graph", "modelfile", "cameras", "render", "mitsuba", "commands", "cli", "base")
 

@@ -27,9 +27,9 @@ from neurolens.base.progress import Report
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
 from neurolens.cameras.exact import ExactCamera, FusedExactCamera
 from neurolens.cameras.fused import FusedCamera
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.cameras.vignetting import Vignetted
 from neurolens.evaluate.image import Image
 from neurolens.evaluate.measure import fit_and_measure, known_record

@@ -16,8 +16,8 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera
-from neurolens.cameras.thin import ThinLens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 

@@ -22,10 +22,8 @@ import numpy as np
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.fisheye import PROJECTIONS, Fisheye, check_field
-from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thick import ThickLens
-from neurolens.cameras.thin import ThinLens
+from neurolens.cameras.ideal import ThickLens, ThinLens
+from neurolens.cameras.pinhole import PROJECTIONS, Fisheye, Pinhole, check_field
 from neurolens.cameras.vignetting import Vignetted
 from neurolens.optics.apertures import Aperture
 
@@ -59,7 +57,7 @@ class Shot:
         clamp_f_number: an f-number wider than the lens opens becomes its widest; else it is an error of a model, and
             opens the stop of a lens file as far as the rims let light through.
         wavelength_nm: shortest and longest wavelength of the light.
-        pupil: how the pupil of an exact lens is sampled; see `exact_pupils.PUPILS`.
+        pupil: how the pupil of an exact lens is sampled; see `exact.PUPILS`.
         vignetting: what is left of it, "both", "natural", "optical" or "none"; see `neurolens.cameras.vignetting`.
     """
 

@@ -25,7 +25,7 @@ OUTPUTS = {
     "stop_xy_mm": ("tensor(float)", 2, None),
     "status": ("tensor(int32)", None),
 }
-# Outputs that a file may have besides; see `onnxderivatives`.
+# Outputs that a file may have besides; see `onnxmaps`.
 DERIVATIVES = {name: ("tensor(float)", 2, 6, None) for name in ("scene_ray_d_film", "scene_ray_d_pupil")}
 # Rays a call of onnxruntime: enough to hide the cost of its operators, few enough for the caches.
 BATCH = 16384

@@ -85,7 +85,7 @@ def whole(least: int, most: int | None = None) -> Callable[[str], int]:
     return convert
 
 
-# Kept here too, for help needs no camera; a test holds it against `cameras.exact_pupils` and `cameras.vignetting`.
+# Kept here too, for help needs no camera; a test holds it against `cameras.exact` and `cameras.vignetting`.
 PUPILS = ("outline", "rear-rim", "exit-pupil", "wu", "pixel-disc", "pixel-ellipse", "boxes", "ellipses")
 VIGNETTINGS = ("both", "natural", "optical", "none")
 CAMERAS_HELP = """\

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import Camera
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.evaluate.rays import frame_width_mm
 from neurolens.evaluate.speed import Call, Candidate, Unavailable
 from neurolens.graph import compiler

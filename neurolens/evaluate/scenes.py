@@ -14,9 +14,9 @@ import numpy as np
 from neurolens.base.progress import Progress, Report
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.evaluate.candidates import model_candidate
 from neurolens.evaluate.experiment import Experiment, RenderChoice
 from neurolens.evaluate.figures import image_caption, side_by_side

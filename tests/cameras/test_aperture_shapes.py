@@ -12,8 +12,8 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.thin import ThinLens
 from neurolens.optics.apertures import Aperture
 
 FILM = (36.0, 24.0)

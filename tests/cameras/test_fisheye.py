@@ -11,7 +11,7 @@ from camera_helpers import differences
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
-from neurolens.cameras.fisheye import PROJECTIONS, Fisheye
+from neurolens.cameras.pinhole import PROJECTIONS, Fisheye
 
 FOCAL = 10.0
 # Film radius in focal lengths, angle in degrees.

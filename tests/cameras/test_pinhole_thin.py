@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from neurolens.base.errors import InputError
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.sampling import concentric_disk
-from neurolens.cameras.thin import ThinLens
 from neurolens.optics.film_plane import film_z_mm
 
 

@@ -13,8 +13,7 @@ from camera_helpers import FILM, GAUSS, ROOT, at, camera, differences, film_rays
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
-from neurolens.cameras.thick import ThickLens
-from neurolens.cameras.thin import ThinLens
+from neurolens.cameras.ideal import ThickLens, ThinLens
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order

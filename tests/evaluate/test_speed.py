@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from neurolens.base.errors import InputError
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.evaluate.candidates import camera_candidate, exact_candidates
 from neurolens.evaluate.speed import (
     Call,

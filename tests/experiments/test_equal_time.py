@@ -25,8 +25,8 @@ from experiments.equal_time_errors import (
     weights,
 )
 from neurolens.base.errors import InputError
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.render.film import FilmSettings
 from neurolens.render.scene import CameraSettings, load_scene
 

@@ -17,11 +17,10 @@ from onnx import ModelProto
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import FloatArray
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.onnxderivatives import OnnxDerivatives
-from neurolens.cameras.onnxinverse import load_inverse
+from neurolens.cameras.onnxmaps import OnnxDerivatives, load_inverse
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.modelfile import CARD_KEY
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_inverse, export_onnx

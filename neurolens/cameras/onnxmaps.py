@@ -1,4 +1,7 @@
-"""Exported inverse maps: camera rays through stop points, and of scene rays; numpy and onnxruntime alone."""
+"""Derivatives and inverse maps of exported models that were written with them: numpy and onnxruntime alone.
+
+Inverse maps lead from stop points, and from scene rays, back to camera rays.
+"""
 
 from __future__ import annotations
 
@@ -13,17 +16,55 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.onnxlens import OUTPUTS
-from neurolens.cameras.onnxsession import open_session, run_session
+from neurolens.cameras.onnxlens import DERIVATIVES, INPUTS, OUTPUTS, LensRays, OnnxLens
+from neurolens.cameras.onnxsession import open_session, run_batches
 from neurolens.modelfile.cardcheck import check_card, is_number
 from neurolens.modelfile.onnxfile import read_checked
 from neurolens.optics.sag import meet_front
 
-# Rays a call: the Newton steps have more rows than a model.
-BATCH = 4096
+# Rays a call: these graphs have more rows than those of models alone.
+_DERIVATIVES_BATCH, _INVERSE_BATCH = 8192, 4096
 _CALL = {"film_z_mm": ("tensor(float)", 1), "stop_radius_mm": ("tensor(float)", 1)}
 _OUTPUTS = {"rays": ("tensor(float)", 5, None), **OUTPUTS, "density": ("tensor(float)", None)}
 _GIVEN = {"stop": "stop_rays", "scene": "front_rays"}
+
+
+class LensDerivatives(NamedTuple):
+    """A model's rays, and their derivatives [6, 2, N]: x, y, z (mm) and direction by x and y of a point, per mm.
+
+    `d_film`: the pupil point held; `d_pupil`: the film point held.
+    """
+
+    rays: LensRays
+    d_film: FloatArray
+    d_pupil: FloatArray
+
+
+class OnnxDerivatives:
+    """The derivatives of a loaded model; its session is one of its own, so that others do not pay for it.
+
+    Raises:
+        InputError: a model that was exported without derivatives, or one of many states.
+    """
+
+    def __init__(self, model: OnnxLens) -> None:
+        self.model = model
+        try:
+            if model.axes:
+                raise ModelError(f"{model.path}: a model of many states")
+            self._session = open_session(model.path, model.data, model.threads, INPUTS, {**OUTPUTS, **DERIVATIVES})
+        except ModelError as error:
+            raise InputError(model.path, "derivatives", f"({error})", "a model exported with derivatives") from error
+
+    def __call__(
+        self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray, film_z_mm: float, stop_radius_mm: float
+    ) -> LensDerivatives:
+        """Rays and derivatives for film and pupil points [2, N] mm and wavelengths [N] nm, as `OnnxLens.rays`."""
+        rays = np.concatenate([film, pupil, wavelength_nm[None]]).astype(np.float32)
+        call = {"film_z_mm": film_z_mm, "stop_radius_mm": stop_radius_mm}
+        names = (*OUTPUTS, *DERIVATIVES)
+        out = run_batches(self.model.path, self._session, names, ("rays", rays), call, _DERIVATIVES_BATCH)
+        return LensDerivatives(LensRays(*out[:4]), *(np.moveaxis(d, 0, 1) for d in out[4:]))
 
 
 class InverseRays(NamedTuple):
@@ -128,19 +169,9 @@ class OnnxInverse:
             "film_z_mm": domain["film_z_mm"][0] if film_z_mm is None else film_z_mm,
             "stop_radius_mm": domain["stop_radius_mm"] if stop_radius_mm is None else stop_radius_mm,
         }
-        feeds = {key: np.array([value], np.float32) for key, value in call.items()}
         with np.errstate(over="ignore"):
-            rays = given.astype(np.float32)
-        parts = [
-            run_session(
-                self.path,
-                session,
-                InverseRays._fields,
-                {_GIVEN[name]: np.ascontiguousarray(rays[:, i : i + BATCH]), **feeds},
-            )
-            for i in range(0, max(rays.shape[1], 1), BATCH)
-        ]
-        return InverseRays(*(np.concatenate(columns, -1) for columns in zip(*parts, strict=True)))
+            rays = (_GIVEN[name], given.astype(np.float32))
+        return InverseRays(*run_batches(self.path, session, InverseRays._fields, rays, call, _INVERSE_BATCH))
 
 
 def load_inverse(path: str | Path, lens: str | None = None, threads: int = 1) -> OnnxInverse:
