@@ -46,7 +46,7 @@ from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.source import Fixed, fused_program
+from neurolens.surrogates.source import fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 
 WITHIN_UM = 1.0
@@ -172,17 +172,17 @@ def _add_exact(add: Callable[..., None], lens: Lens, domain: Domain, torch_compi
             add("exact torch", work, exact_candidates(lens, domain, transmittance=work == "whole")[1])
 
 
-def _forms(model: LensModel) -> list[tuple[str, tuple[LensModel, ...], Fixed]]:
+def _forms(model: LensModel) -> list[tuple[str, tuple[LensModel, ...], Fix]]:
     """Nothing fixed; one wavelength; wavelength, film position and stop."""
     d = model.domain
-    found: list[tuple[str, tuple[LensModel, ...], Fixed]] = [(f"{model.method}, C", (model,), Fixed())]
+    found: list[tuple[str, tuple[LensModel, ...], Fix]] = [(f"{model.method}, C", (model,), Fix())]
     if not model.encoding.w_half:
         return found
     z, stop = d.film_z_mm[0], _STOPPED * d.stop_radius_mm
     one = fixed_models(model, Fix((WAVELENGTH_NM,)))
     every = fixed_models(model, Fix((WAVELENGTH_NM,), z, stop))
-    found.append((f"{model.method}, C, one wavelength", one, Fixed()))
-    found.append((f"{model.method}, C, wavelength, film, stop fixed", every, Fixed(z, stop)))
+    found.append((f"{model.method}, C, one wavelength", one, Fix()))
+    found.append((f"{model.method}, C, wavelength, film, stop fixed", every, Fix((), z, stop)))
     return found
 
 
@@ -193,10 +193,10 @@ def _add_fused(
     models: tuple[LensModel, ...],
     domain: Domain,
     parts: Parts,
-    fixed: Fixed,
+    fixed: Fix,
     known: dict[str, Any],
 ) -> None:
-    candidate = fused_candidate(name, models, domain, parts=parts, fixed=fixed)
+    candidate = fused_candidate(name, models, domain, parts=parts, fix=fixed)
     if candidate is not None:
         add(name, work, candidate, fused_program(models, parts, fixed), **known)
 

@@ -109,7 +109,7 @@ class ExactCamera:
             bounds = pupil_bounds(
                 self.lens, 1.0001 * corner, (film_z, film_z), used, rows=rows, points=points, film_mm=self.film_mm
             )
-        self._pupil_z_mm = bounds.pupil_z_mm
+        self._film_z_mm, self._pupil_z_mm = film_z, bounds.pupil_z_mm
         self._dtype = torch.float32 if dtype == "float32" else torch.float64
         self.film = LensFilm(PupilTable.of(asdict(bounds)), float(film_z), used, self._scene, self._passes, detail)
         if pupil != OUTLINE:
@@ -182,9 +182,7 @@ class ExactCamera:
         fx, fy, px, py, wavelength = (
             torch.from_numpy(np.ascontiguousarray(a)).to(self._dtype) for a in (*film, *pupil, wavelength_nm)
         )
-        film_z = self.lens.film_z_mm
-        assert film_z is not None
-        rays = camera_rays(fx, fy, film_z, px, py, self._pupil_z_mm)
+        rays = camera_rays(fx, fy, self._film_z_mm, px, py, self._pupil_z_mm)
         with torch.no_grad():
             done = trace(self.lens, rays, wavelength, transmittance=True)
         assert done.transmittance is not None
@@ -195,10 +193,8 @@ class ExactCamera:
         fx, fy, px, py, wavelength = (
             torch.from_numpy(np.ascontiguousarray(a)).double() for a in (*film, *pupil, wavelength_nm)
         )
-        film_z = self.lens.film_z_mm
-        assert film_z is not None
-        rays = camera_rays(fx, fy, film_z, px, py, self._pupil_z_mm)
-        gap = film_z - self._pupil_z_mm
+        rays = camera_rays(fx, fy, self._film_z_mm, px, py, self._pupil_z_mm)
+        gap = self._film_z_mm - self._pupil_z_mm
         distance = torch.sqrt((fx - px) ** 2 + (fy - py) ** 2 + gap * gap)
         moves = trace_differentials(self.lens, rays, film_derivatives(rays, distance), wavelength).derivatives
         d_film = torch.stack([torch.stack(list(m)) for m in moves], 1).to(torch.float32).numpy()
@@ -207,12 +203,9 @@ class ExactCamera:
     def _passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
         """Whether light passes from film points (r, 0) through pupil points; see `passes_at_any_azimuth`."""
         r, u, v = (torch.from_numpy(np.ascontiguousarray(a)).to(self._dtype) for a in (film[0], *pupil))
-        film_z = self.lens.film_z_mm
-        assert film_z is not None
         with torch.no_grad():
-            return passes_at_any_azimuth(
-                self.lens, r, film_z, u, v, self._pupil_z_mm, wavelength_nm, self.film_mm
-            ).numpy()
+            film_z, pupil_z = self._film_z_mm, self._pupil_z_mm
+            return passes_at_any_azimuth(self.lens, r, film_z, u, v, pupil_z, wavelength_nm, self.film_mm).numpy()
 
 
 class FusedExactCamera(ExactCamera):

@@ -1,10 +1,10 @@
 """Ideal lenses: the thin lens, and the thick lens with the principal planes and pupils of a real one.
 
-The thin lens has perfect focus on one plane and no aberration. The thick lens is the approximation of Kolb, Mitchell and
-Hanrahan 1995, "A Realistic Camera Model for Computer Graphics": a ray of a film point through the exit pupil goes on
-from the rear principal plane H' at the same height on the front one H, towards the object point conjugate to the film
-point. No aberration and no rims; but where the film's picture is, how large, and how its light falls off (cos^4 about
-the exit pupil) are the real lens's to first order.
+The thin lens has perfect focus on one plane and no aberration. The thick lens is that of Kolb, Mitchell and Hanrahan
+1995, "A Realistic Camera Model for Computer Graphics": a ray of a film point through the exit pupil goes on from the
+rear principal plane H' at the same height on the front one H, towards the object point conjugate to the film point. No
+aberration and no rims; but where the film's picture is, how large, and how its light falls off (cos^4 about the exit
+pupil) are the real lens's to first order.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("neurolens export", "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
     check_writable(args.out)
     from neurolens.cameras.model import load_model
-    from neurolens.surrogates.source import Fixed, Parts, export_source
+    from neurolens.surrogates.source import Parts, export_source
     from neurolens.surrogates.specialise import fixed_models
     from neurolens.surrogates.stored import load_fitted
 
@@ -96,8 +96,7 @@ def run(args: argparse.Namespace) -> int:
         about: dict[str, Any] = _write_inverse(models[0], args.out) if args.inverse else {}
     else:
         asked = Parts(*(name in parts for name in _PARTS[1:]))
-        fixed = Fixed(fix.film_z_mm, fix.stop_radius_mm)
-        written = export_source(models, args.out, args.to, card, parts=asked, fixed=fixed, name=args.name)
+        written = export_source(models, args.out, args.to, card, parts=asked, fix=fix, name=args.name)
         s = written.signature
         bands = [m.domain.wavelength_nm[0] for m in models] if s.bands > 1 else []
         about = {"function": s.name, "inputs": s.inputs, "outputs": [*s.outputs, "status"], "bands_nm": bands}

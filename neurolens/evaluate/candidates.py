@@ -31,7 +31,8 @@ from neurolens.optics.trace import Traced, trace
 from neurolens.surrogates.assemble import ALL, Parts
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.source import FREE, Fixed, fused_program
+from neurolens.surrogates.source import FREE, fused_program
+from neurolens.surrogates.specialise import Fix
 from neurolens.surrogates.stored import load_fitted
 
 EAGER_BATCHES = (8192, 16384, 32768)
@@ -243,7 +244,7 @@ def program_candidate(name: str, program: Program, domain: Domain, stop_radius_m
 
 
 def fused_candidate(
-    name: str, model: LensModel | Sequence[LensModel] | Path, domain: Domain, *, parts: Parts = ALL, fixed: Fixed = FREE
+    name: str, model: LensModel | Sequence[LensModel] | Path, domain: Domain, *, parts: Parts = ALL, fix: Fix = FREE
 ) -> Candidate | None:
     """A model, or that of an exported file, as compiled C; None where there is no compiler, or no form in C.
 
@@ -254,7 +255,7 @@ def fused_candidate(
         find_compiler()
         found = load_fitted(model) if isinstance(model, Path) else model
         models = [found] if isinstance(found, LensModel) else found
-        program = fused_program(models, parts, fixed)
+        program = fused_program(models, parts, fix)
     except (Unavailable, ModelError, TypeError):
         return None
-    return program_candidate(name, program, domain, fixed.stop_radius_mm)
+    return program_candidate(name, program, domain, fix.stop_radius_mm)

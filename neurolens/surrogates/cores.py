@@ -104,8 +104,7 @@ class CoreValues:
         g = truth.graph
         a, b = self.vectors, other.vectors
         vectors = tuple(g.select(truth, x, y) for x, y in zip(a, b, strict=True))
-        both = self.gates is not None and other.gates is not None
-        gates = g.select(truth, self.gates, other.gates) if both else None  # type: ignore[arg-type]
+        gates = None if self.gates is None or other.gates is None else g.select(truth, self.gates, other.gates)
         return CoreValues(vectors, g.select(truth, self.transmittance, other.transmittance), gates)  # type: ignore[arg-type]
 
 
@@ -192,6 +191,12 @@ class _Polynomial(Core):
     def coefficients(self) -> int:
         return int((getattr(self, self._vectors) != 0).sum() + (self.scalars != 0).sum())
 
+    def _tables(self, units: Units) -> tuple[Array, Array]:
+        """Vectors' coefficients and scalars in units."""
+        vectors = getattr(self, self._vectors)
+        factors = np.array(units.vectors).reshape(3, *[1] * (vectors.ndim - 1))
+        return vectors * factors, self.scalars * units.scalars(len(self.scalars))[:, None]
+
     def _terms(self, g: Graph, field: Field, weight: Array, forms: Sequence[Form] | None) -> Value:
         """weight [R, M] times the terms; those in w are left out where it is 0."""
         x = field.raw() if forms is None else field.products(forms)
@@ -199,8 +204,25 @@ class _Polynomial(Core):
         return g.polynomial(self.exponents[used][:, : x.rows], weight[:, used], x)
 
 
+class _Symmetric(_Polynomial):
+    """A p + B u, with A, B and the scalars polynomials in invariants: `ab` [3, 2, .., M] and `scalars` [S, M]."""
+
+    ab: Array
+    _vectors = "ab"
+    _forms: ClassVar[tuple[Form, ...]]
+
+    def rows(self, g: Graph, field: Field, units: Units) -> Value:
+        """Rows A of the three vectors, B of them, scalars."""
+        ab, scalars = self._tables(units)
+        a, b = (ab[:, k].reshape(-1, len(self.exponents)) for k in (0, 1))
+        return self._terms(g, field, np.concatenate([a, b, scalars]), self._forms)
+
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        return symmetric(self.rows(g, field, units), field, len(self.scalars))
+
+
 @dataclass(frozen=True, eq=False)
-class InvariantPolynomial(_Polynomial):
+class InvariantPolynomial(_Symmetric):
     """out = A p + B u, with A, B and the scalars polynomials in rho, sigma, tau, w.
 
     Attributes:
@@ -212,13 +234,7 @@ class InvariantPolynomial(_Polynomial):
     exponents: Exponents
     ab: Array
     scalars: Array
-    _vectors = "ab"
-
-    def rows(self, g: Graph, field: Field, units: Units) -> Value:
-        """Rows A of the three vectors, B of them, scalars."""
-        ab = self.ab * np.array(units.vectors)[:, None, None]
-        scalars = self.scalars * units.scalars(len(self.scalars))[:, None]
-        return self._terms(g, field, np.concatenate([ab[:, 0], ab[:, 1], scalars]), ROUND)
+    _forms = ROUND
 
     def plus(self, ab: Array, scalars: Array) -> InvariantPolynomial:
         """With constants [3, 2] and [S] added."""
@@ -233,16 +249,13 @@ class InvariantPolynomial(_Polynomial):
             np.concatenate([self.scalars, scalars[:, None]], 1),
         )
 
-    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
-        return symmetric(self.rows(g, field, units), field, len(self.scalars))
-
     @cached_property
     def coefficients_per_vector(self) -> int:
         return int((self.ab[:2] != 0).any(0).sum())
 
 
 @dataclass(frozen=True, eq=False)
-class MirrorPolynomial(_Polynomial):
+class MirrorPolynomial(_Symmetric):
     """Of a lens with two planes of symmetry: out_x = A_x p_x + B_x u_x, and y likewise.
 
     Attributes:
@@ -255,13 +268,7 @@ class MirrorPolynomial(_Polynomial):
     ab: Array
     scalars: Array
     basis = "mirror"
-    _vectors = "ab"
-
-    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
-        ab = self.ab * np.array(units.vectors)[:, None, None, None]
-        scalars = self.scalars * units.scalars(len(self.scalars))[:, None]
-        weight = np.concatenate([ab[:, 0].reshape(6, -1), ab[:, 1].reshape(6, -1), scalars])
-        return symmetric(self._terms(g, field, weight, MIRROR), field, len(scalars))
+    _forms = MIRROR
 
     @cached_property
     def coefficients_per_vector(self) -> int:
@@ -286,9 +293,8 @@ class RawPolynomial(_Polynomial):
     _vectors = "components"
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
-        components = (self.components * np.array(units.vectors)[:, None, None]).reshape(6, -1)
-        scalars = self.scalars * units.scalars(len(self.scalars))[:, None]
-        rows = self._terms(g, field, np.concatenate([components, scalars]), None)
+        components, scalars = self._tables(units)
+        rows = self._terms(g, field, np.concatenate([components.reshape(6, -1), scalars]), None)
         *vectors, transmittance, gates = g.split(rows, [2, 2, 2, 1, len(scalars) - 1])
         return CoreValues(tuple(vectors), transmittance, gates if len(scalars) > 1 else None)  # type: ignore[arg-type]
 

@@ -16,28 +16,16 @@ from neurolens.graph.c import Signature, write_c
 from neurolens.graph.glsl import write_glsl
 from neurolens.graph.program import FILM_Z, STOP_RADIUS, Program
 from neurolens.graph.scalars import lower
-from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.surrogates.assemble import ALL, SCALARS, Parts, model_graph
 from neurolens.surrogates.export import largest_angle
 from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.specialise import Fix
 
+# Nothing fixed. Wavelengths are fixed in the models themselves, one model a table; film plane and stop here too.
+FREE = Fix()
 WRITERS = {"c": write_c, "glsl": write_glsl}
 _WIDTH = 110
 _ERRORS = ("rms_um", "p99_um", "max_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
-
-
-@dataclass(frozen=True)
-class Fixed:
-    """Call arguments that a scene fixes; None leaves them to the caller.
-
-    A wavelength is fixed in the models themselves (`specialise.at_wavelength`), one model a table.
-    """
-
-    film_z_mm: float | None = None
-    stop_radius_mm: float | None = None
-
-
-FREE = Fixed()
 
 
 @dataclass(frozen=True)
@@ -56,7 +44,7 @@ def export_source(
     card: Mapping[str, Any],
     *,
     parts: Parts = ALL,
-    fixed: Fixed = FREE,
+    fix: Fix = FREE,
     name: str | None = None,
 ) -> Written:
     """Write a model, or one for each of several fixed wavelengths, as one function.
@@ -75,9 +63,9 @@ def export_source(
     own = identifier(models[0].lens.lens_id) if name is None else name
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,99}", own) or "__" in own:
         raise InputError("export", "name", own, "letters, digits and single underscores, a letter first")
-    program = fused_program(models, parts, fixed)
+    program = fused_program(models, parts, fix)
     try:
-        comment = comment_of(models, card, fixed)
+        comment = comment_of(models, card, fix)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
             "export", "card", f"({type(error).__name__}: {error})", "a card of neurolens, whole"
@@ -87,7 +75,7 @@ def export_source(
     return Written(target, Signature.of(program, own), sum(program.count().values()))
 
 
-def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fixed: Fixed = FREE) -> Program:
+def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FREE) -> Program:
     """The program of a model, or of several that differ only in their coefficients (one for each wavelength).
 
     Inputs: `program.RAY`, then wavelength_nm where rays depend on it, film_z_mm unless fixed, and stop_radius_mm unless
@@ -97,14 +85,11 @@ def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fixed: Fixed 
     Raises:
         InputError: weights that float32 cannot hold; a fixed film position or stop outside the domain.
     """
-    (near, far), widest = models[0].domain.film_z_mm, models[0].domain.stop_radius_mm
-    z, radius = fixed.film_z_mm, fixed.stop_radius_mm
-    if z is not None and not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
-        raise InputError("fix", "film_z", z, f"{near:.6g} to {far:.6g} mm, the film positions of the fit")
-    if radius is not None and not 0 <= radius <= widest * DOMAIN_SLACK:
-        raise InputError("fix", "stop", radius, f"0 to {widest:.6g} mm, the widest stop of the fit")
+    fix.check(models[0].domain)
     angle = max(largest_angle(model) for model in models)
-    known = {name: value for name, value in ((FILM_Z, z), (STOP_RADIUS, radius)) if value is not None}
+    known = {
+        name: value for name, value in ((FILM_Z, fix.film_z_mm), (STOP_RADIUS, fix.stop_radius_mm)) if value is not None
+    }
     return lower([model_graph(model, angle, SCALARS, parts) for model in models], known)
 
 
@@ -114,7 +99,7 @@ def identifier(text: str) -> str:
     return word if word[:1].isalpha() else f"lens_{word}"
 
 
-def comment_of(models: Sequence[LensModel], card: Mapping[str, Any], fixed: Fixed) -> list[str]:
+def comment_of(models: Sequence[LensModel], card: Mapping[str, Any], fix: Fix) -> list[str]:
     """What the card says, in lines."""
     model, lens, fit = models[0], card["lens"], card["fit"]
     d = model.domain
@@ -131,7 +116,7 @@ def comment_of(models: Sequence[LensModel], card: Mapping[str, Any], fixed: Fixe
     if len(models) > 1:
         bands = ", ".join(f"{k}: {w[0]:g} nm" for k, w in enumerate(waves))
         lines.append(f"Argument band: {bands}.")
-    for what, value in (("film plane z", fixed.film_z_mm), ("stop radius", fixed.stop_radius_mm)):
+    for what, value in (("film plane z", fix.film_z_mm), ("stop radius", fix.stop_radius_mm)):
         if value is not None:
             lines.append(f"Fixed: {what} {value:.9g} mm.")
     errors = card.get("errors") or {}

@@ -16,7 +16,7 @@ from neurolens.base.errors import InputError
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.optics.glass import inverse_square_um
 from neurolens.surrogates.cores import STOP
-from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.domain import Domain, sample_domain
 from neurolens.surrogates.model import LensModel
 
 # A gate goes where at most this share of the domain's rays is blocked by it and by nothing else.
@@ -32,6 +32,18 @@ class Fix:
     wavelengths_nm: tuple[float, ...] = ()
     film_z_mm: float | None = None
     stop_radius_mm: float | None = None
+
+    def check(self, domain: Domain) -> None:
+        """Refuse a film position or a stop outside a domain.
+
+        Raises:
+            InputError: as it says.
+        """
+        z, stop, (near, far), widest = self.film_z_mm, self.stop_radius_mm, domain.film_z_mm, domain.stop_radius_mm
+        if z is not None and not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
+            raise InputError("fix", "film_z", z, f"{near:.6g} to {far:.6g} mm, the film positions of the fit")
+        if stop is not None and not 0 < stop <= widest * DOMAIN_SLACK:
+            raise InputError("fix", "stop", stop, f"above 0, up to {widest:.6g} mm, the widest stop of the fit")
 
 
 def fixed_models(model: LensModel, fix: Fix) -> tuple[LensModel, ...]:
@@ -50,19 +62,15 @@ def fixed_models(model: LensModel, fix: Fix) -> tuple[LensModel, ...]:
 
 def _narrowed(model: LensModel, fix: Fix) -> LensModel:
     """The same model over one film position, with one stop as its widest."""
+    fix.check(model.domain)
     domain, lens, settings = model.domain, model.lens, dict(model.settings)
-    (near, far), widest = domain.film_z_mm, domain.stop_radius_mm
-    z, stop = fix.film_z_mm, fix.stop_radius_mm
-    if z is not None:
-        if not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
-            raise InputError("fix", "film_z", z, f"{near:.6g} to {far:.6g} mm, the film positions of the fit")
-        domain = replace(domain, film_z_mm=(z, z))
-        settings["film_z_mm"] = z
-    if stop is not None:
-        if not 0 < stop <= widest * DOMAIN_SLACK:
-            raise InputError("fix", "stop", stop, f"above 0, up to {widest:.6g} mm, the widest stop of the fit")
-        domain, lens = replace(domain, stop_radius_mm=stop), lens.with_stop_radius(stop)
-        settings["stop_radius_mm"] = stop
+    if fix.film_z_mm is not None:
+        domain = replace(domain, film_z_mm=(fix.film_z_mm, fix.film_z_mm))
+        settings["film_z_mm"] = fix.film_z_mm
+    if fix.stop_radius_mm is not None:
+        domain = replace(domain, stop_radius_mm=fix.stop_radius_mm)
+        lens = lens.with_stop_radius(fix.stop_radius_mm)
+        settings["stop_radius_mm"] = fix.stop_radius_mm
     return replace(model, domain=domain, lens=lens, settings=settings)
 
 

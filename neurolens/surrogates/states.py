@@ -94,28 +94,23 @@ class StateSpace:
         return self._domain(state, float(weights(self._knots, state) @ np.array(self._planes_mm)))
 
     def _domain(self, state: Sequence[float], pupil_z_mm: float | None) -> Domain:
-        values, lens = self._values(state), self.lens_at(state)
+        values, lens, radius, film_z = self._values(state), self.lens_at(state), self.film_radius_mm, None
         if "focus" not in values:
             focus = self.focus_m if isinstance(self.focus_m, tuple) else self.focus_m(lens)
-            return domain_of(
-                lens,
-                film_radius_mm=self.film_radius_mm,
-                focus_m=focus,
-                wavelength_nm=self.wavelength_nm,
-                pupil_z_mm=pupil_z_mm,
-            )
-        # The picture's size is that of the lens at infinity focus: it breathes, the film does not.
-        radius = self.film_radius_mm
-        if radius is None:
-            radius = image_radius_mm(self.lens_at([0.0 if k == "focus" else v for k, v in values.items()]))[0]
-        assert lens.film_z_mm is not None
-        distance = 1 / values["focus"] if values["focus"] > 0 else math.inf
+        else:
+            # The picture's size is that of the lens at infinity focus: it breathes, the film does not.
+            if radius is None:
+                radius = image_radius_mm(self.lens_at([0.0 if k == "focus" else v for k, v in values.items()]))[0]
+            assert lens.film_z_mm is not None
+            film_z = (lens.film_z_mm, lens.film_z_mm)
+            distance = 1 / values["focus"] if values["focus"] > 0 else math.inf
+            focus = (distance, distance)
         return domain_of(
             lens,
             film_radius_mm=radius,
-            focus_m=(distance, distance),
+            focus_m=focus,
             wavelength_nm=self.wavelength_nm,
-            film_z_mm=(lens.film_z_mm, lens.film_z_mm),
+            film_z_mm=film_z,
             pupil_z_mm=pupil_z_mm,
         )
 

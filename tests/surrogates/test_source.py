@@ -24,7 +24,7 @@ from neurolens.surrogates.card import card_of
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel, Prediction
-from neurolens.surrogates.source import Fixed, export_source, fused_program
+from neurolens.surrogates.source import export_source, fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 
 COUNT = 50_000
@@ -160,7 +160,7 @@ def test_wavelengths_film_and_stop_fixed(kind: str) -> None:
     waves, d = (450.0, 550.0, 650.0), model.domain
     film_z, stop = float(np.mean(d.film_z_mm)), 0.5 * d.stop_radius_mm
     models = fixed_models(model, Fix(waves, film_z, stop))
-    program = fused_program(models, ALL, Fixed(film_z, stop))
+    program = fused_program(models, ALL, Fix((), film_z, stop))
     whole, free = built(program), sum(fused_program([model]).count().values())
     assert whole.signature.inputs == COLUMNS[:4] and whole.signature.bands == 3
     assert sum(program.count().values()) < (free if kind == "network" else 0.9 * free)
@@ -202,7 +202,7 @@ def test_fixed_values_outside_the_domain_are_refused() -> None:
         with pytest.raises(InputError, match=field):
             fixed_models(model, fix)
     with pytest.raises(InputError, match="film_z"):
-        fused_program([model], ALL, Fixed(film_z_mm=1.0))
+        fused_program([model], ALL, Fix(film_z_mm=1.0))
 
 
 def test_tanh() -> None:

@@ -22,7 +22,7 @@ from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.assemble import ALL
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.source import FREE, Fixed, fused_program
+from neurolens.surrogates.source import FREE, fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 
 COUNT = 20_000
@@ -64,14 +64,14 @@ def run(program: Program, columns: dict[str, np.ndarray], tmp_path: Path, band: 
 
 
 @cache
-def programs() -> dict[str, tuple[Program, tuple[LensModel, ...], Fixed]]:
+def programs() -> dict[str, tuple[Program, tuple[LensModel, ...], Fix]]:
     """Every kind of core, and one with tables for three wavelengths."""
     found = {}
     for kind in lens_models.KINDS:
         models = (lens_models.model(kind),)
         found[kind] = (fused_program(models), models, FREE)
     model = lens_models.model("invariants")
-    fixed = Fixed(model.domain.film_z_mm[0], 0.6 * model.domain.stop_radius_mm)
+    fixed = Fix((), model.domain.film_z_mm[0], 0.6 * model.domain.stop_radius_mm)
     models = fixed_models(model, Fix((450.0, 550.0, 650.0), fixed.film_z_mm, fixed.stop_radius_mm))
     found["fixed"] = (fused_program(models, ALL, fixed), models, fixed)
     return found
