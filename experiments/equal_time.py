@@ -153,7 +153,6 @@ def _read(file: Path, shape: tuple[int, ...]) -> tuple[NDArray[np.float32], floa
 
 
 def _source() -> str:
-    """Hash of the code that makes pictures."""
     digest = hashlib.sha256()
     package = Path(neurolens.__file__).parent
     for file in sorted(f for part in _SOURCES for f in (package / part).rglob("*.py")):
@@ -172,7 +171,6 @@ def _scene_bytes(file: Path) -> str:
 
 
 def _strings(value: Any) -> list[str]:
-    """Every string in tables of tables."""
     if isinstance(value, str):
         return [value]
     inner = list(value.values()) if isinstance(value, Mapping) else value if isinstance(value, list) else []

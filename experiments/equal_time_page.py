@@ -31,7 +31,7 @@ from experiments.equal_time import (
     scene_file,
 )
 from experiments.equal_time_errors import Estimate, crossover_s, log_interpolate
-from neurolens.analysis.plot_style import FAINT, INK, heading, new_figure, plain_log_ticks, save, style
+from neurolens.analysis.plot_style import FAINT, INK, drawing, heading, plain_log_ticks
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text
 from neurolens.base.progress import Progress
@@ -353,15 +353,14 @@ def error_over_time_plot(panels: Sequence[Panel], path: str | Path, title: str, 
     """
     if not panels or not any(panel.curves for panel in panels):
         raise InputError("error over time", "panels", "(none)", "at least one panel with a curve")
-    with style():
-        figure = new_figure(3.5 * len(panels), 4.1)
+    with drawing(path, 3.5 * len(panels), 4.1) as figure:
         row = figure.subplots(1, len(panels), squeeze=False)[0]
         handles: dict[str, Any] = {}
         for axes, panel in zip(row, panels, strict=True):
             handles |= _draw(axes, panel)
         heading(figure, title, subtitle)
         figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
-        return save(figure, path)
+    return Path(path)
 
 
 def _draw(axes: Any, panel: Panel) -> dict[str, Any]:
@@ -385,8 +384,7 @@ def _draw(axes: Any, panel: Panel) -> dict[str, Any]:
         if level > low:
             handles[f"bias of {name}"] = axes.axhline(level, color=_colour(name), lw=1.0, ls=":")
     axes.grid(True, which="major")
-    plain_log_ticks(axes.xaxis)
-    plain_log_ticks(axes.yaxis)
+    plain_log_ticks(axes.xaxis, axes.yaxis)
     return handles
 
 
@@ -411,8 +409,7 @@ def film_maps_plot(
         raise InputError("film maps", "maps", "(none)", "at least one map")
     columns = 2 if len(maps) in (2, 4) else min(len(maps), 3)
     rows = -(-len(maps) // columns)
-    with style():
-        figure = new_figure(4.0 * columns, 0.7 + 2.3 * rows)
+    with drawing(path, 4.0 * columns, 0.7 + 2.3 * rows) as figure:
         places = figure.subplots(rows, columns, squeeze=False).ravel()
         across, up = film_mm[0] / 2, film_mm[1] / 2
         for axes, (name, values) in zip(places, maps.items(), strict=False):
@@ -426,7 +423,7 @@ def film_maps_plot(
         for axes in places[len(maps) :]:
             axes.set_axis_off()
         heading(figure, title, subtitle)
-        return save(figure, path)
+    return Path(path)
 
 
 def _colour(name: str) -> str:

@@ -257,7 +257,6 @@ def _weights(s: Surface) -> tuple[int, int]:
 
 
 def _shape(s: Surface) -> tuple[Any, Any]:
-    """Curvature at the vertex (without polynomial) and 1 + conic constant."""
     radius = mpf(float(s.radius_mm))
     return (mpf(0) if mp.isinf(radius) else 1 / radius), 1 + mpf(float(s.conic))
 
@@ -314,7 +313,6 @@ def _newton(s: Surface, p: Vector, d: Vector, t: Any) -> Any:
 
 
 def _sag(s: Surface, u: Any) -> Any:
-    """Depth at squared height u."""
     c, k1 = _shape(s)
     r = sqrt(u)
     polynomial = sum((mpf(float(a)) * r**power for power, a in s.asphere), mpf(0))

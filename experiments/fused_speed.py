@@ -202,7 +202,6 @@ def _add_fused(
 
 
 def _floor(program: Program) -> dict[str, Any]:
-    """What a ray costs at least: operations and bytes."""
     count = program.count()
     inputs = sum(s.kind == "input" for s in (program.steps[k] for k in program.live()))
     return {

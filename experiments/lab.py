@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
+from neurolens.evaluate.records import markdown_table
 
 ROOT = Path(__file__).parents[1]
 LENSES, SCENES, MODELS = ROOT / "lenses", ROOT / "experiments" / "scenes", ROOT / "models"
@@ -67,9 +68,7 @@ def kept_rows(path: Path, listed: str, named: str, maker: str) -> dict[str, dict
 
 def table(header: str | Sequence[str], rows: Iterable[Sequence[Any]], missing: str = "") -> str:
     """A table in Markdown; a header in one string is cut at "|", `missing` stands for cells that are None."""
-    heads = header.split("|") if isinstance(header, str) else list(header)
-    lines = [heads, ["---"] * len(heads), *([missing if c is None else str(c) for c in row] for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join(markdown_table(header.split("|") if isinstance(header, str) else header, rows, missing))
 
 
 @dataclass(frozen=True)
@@ -99,12 +98,9 @@ class Goal:
 
 def goal_table(heading: str, goals: Iterable[Goal]) -> str:
     """Goals as a table, and whether they are reached."""
-    rows = ([g.text, f"{g.bound} {g.wanted:g}", _three(g.measured), g.verdict] for g in goals)
+    measured = ((g, "" if g.measured is None else f"{g.measured:.3g}") for g in goals)
+    rows = ([g.text, f"{g.bound} {g.wanted:g}", value, g.verdict] for g, value in measured)
     return table([heading, "wanted", "measured", ""], rows)
-
-
-def _three(value: float | None) -> str:
-    return "" if value is None else f"{value:.3g}"
 
 
 def chosen(items: Sequence[T], name: Callable[[T], str], only: str, what: str) -> list[T]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import functools
-import hashlib
 import json
 import os
 import sys
@@ -25,7 +24,7 @@ from experiments.promises import read_index
 from neurolens import __version__
 from neurolens.base.config import read_config
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.base.files import atomic_path, atomic_write_text
+from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of, sha256_of
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import exact_candidates, model_candidate
@@ -269,7 +268,7 @@ def fingerprint(entry: Entry, pairs: PairSettings) -> str:
     state = [*glass, c.efl_mm, c.configuration, c.f_number, c.zoom, c.focusing]
     settings = [asdict(m) for m in entry.models]
     asked = [__version__, state, asdict(entry.domain), settings, entry.best, asdict(pairs)]
-    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+    return fingerprint_of(asked)
 
 
 def _stands(entry: Entry, pairs: PairSettings, known: Sequence[dict[str, Any]], out: Path) -> bool:
@@ -278,14 +277,10 @@ def _stands(entry: Entry, pairs: PairSettings, known: Sequence[dict[str, Any]], 
     try:
         mark = fingerprint(entry, pairs)
         return bool(mine) and all(
-            r.get("fingerprint") == mark and r["sha256"] == _sha256(out / r["file"]) for r in mine
+            r.get("fingerprint") == mark and r["sha256"] == sha256_of(out / r["file"]) for r in mine
         )
     except (NeurolensError, OSError):
         return False
-
-
-def _sha256(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def make_entry(entry: Entry, library: Library, out: Path, progress: Progress) -> list[dict[str, Any]]:
@@ -350,7 +345,7 @@ def _row(entry: Entry, lens: Lens, domain: Domain, m: Measured) -> dict[str, Any
     scaled = {f"{k}_at_21_6": None if m.record.get(k) is None else scale * m.record[k] for k in ("rms_um", "p99_um")}
     return {
         "file": entry.file(m.settings),
-        "sha256": _sha256(m.file),
+        "sha256": sha256_of(m.file),
         "lens": lens.name,
         "configuration": entry.lens.configuration,
         "efl_mm": entry.lens.efl_mm,
@@ -395,7 +390,7 @@ def make_state_entry(
             rows.append(
                 {
                     "file": name,
-                    "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+                    "sha256": sha256_of(file),
                     "lens": space.lens.name,
                     "configuration": entry.lens.configuration,
                     "efl_mm": None,

@@ -245,7 +245,6 @@ def _irradiance(camera: ExactCamera, pupil: Any, film: Any, square: Any, wavelen
 
 
 def _nanoseconds(sample: SampleFunction, film: Any, square: Any, wavelength: Any, batch: int = 16384) -> float:
-    """The least of several times of a sample in a batch."""
     part = slice(0, batch)
     film, square, wavelength = (np.ascontiguousarray(a[..., part]) for a in (film, square, wavelength))
     least = math.inf
@@ -257,7 +256,6 @@ def _nanoseconds(sample: SampleFunction, film: Any, square: Any, wavelength: Any
 
 
 def _profile(radius: Any, passed: Any, end: float, bins: int = 24) -> NDArray[np.float64]:
-    """Share that passes in equal intervals of the film radius."""
     place = np.minimum((radius / end * bins).astype(int), bins - 1)
     count = np.bincount(place, minlength=bins)
     return np.bincount(place, weights=passed, minlength=bins) / np.maximum(count, 1)

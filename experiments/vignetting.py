@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from experiments import lab
-from neurolens.analysis.plot_style import FIELD_COLOURS, INK, new_figure, save, style
+from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.progress import Progress
@@ -196,8 +196,7 @@ _SHOWN = ("full", "6 blades")
 
 def cats_eyes(models: Sequence[LensModel], path: Path) -> Path:
     """Draw one row a model: exact passing pupils filled, the model's outlined, open and with blades two stops down."""
-    with style():
-        figure = new_figure(2.1 * len(_RADII), 2.2 * len(models) + 0.5)
+    with drawing(path, 2.1 * len(_RADII), 2.2 * len(models) + 0.5) as figure:
         grid = figure.subplots(len(models), len(_RADII), squeeze=False)
         for axes_row, model in zip(grid, models, strict=True):
             for axes, share in zip(axes_row, _RADII, strict=True):
@@ -207,7 +206,7 @@ def cats_eyes(models: Sequence[LensModel], path: Path) -> Path:
         figure.suptitle(
             "Passing pupil by film radius: exact (filled), model (outline); open, and 6 blades 2 stops down", fontsize=9
         )
-        return save(figure, path)
+    return Path(path)
 
 
 def _draw(axes: Any, model: LensModel, share: float) -> None:

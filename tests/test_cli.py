@@ -343,7 +343,7 @@ def test_a_full_disk_is_one_line(
 
     monkeypatch.setattr("neurolens.render.pictures.write_exr", full)
     line = failure(capsys, "render", scene, "--camera", "thin", "-o", tmp_path / "a.exr", "--quiet")
-    kept = f"the render is kept: the same command goes on from {tmp_path / 'a.exr'}.part"
+    kept = f"the render is kept: the same command resumes from {tmp_path / 'a.exr'}.part"
     assert line == f"neurolens: No space left on device; {kept}"
 
 

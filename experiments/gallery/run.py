@@ -123,7 +123,6 @@ def _part(report: Report, k: int, count: int) -> Report:
 
 
 def _surrogates(effect: Effect, shots: Sequence[Shot], cache: Path, progress: Progress) -> list[Surrogate | None]:
-    """One for each shot; shots through one state of the lens share theirs."""
     if "surrogate" not in effect.columns:
         return [None] * len(shots)
     made: list[tuple[Shot, Surrogate]] = []
