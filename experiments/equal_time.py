@@ -1,4 +1,4 @@
-"""Equal time and equal samples: what each camera's picture is worth after so many seconds, against the exact lens.
+"""Equal time and equal samples: error of each camera's picture after given seconds, against the exact lens.
 
 Renders are kept, one file a render, named by everything that it depends on, so that a run may be resumed.
 """
@@ -125,7 +125,7 @@ class Shelf:
         return found.rgb, float(found.stats["seconds"])
 
     def warm_up(self) -> None:
-        """A sample a pixel that nobody counts: the first render of a camera loads code and fills caches."""
+        """An untimed sample per pixel: the first render of a camera loads code and fills caches."""
         width, height = self.size
         render(self.scene, self.camera, width=width, height=height, samples=1, threads=1, film=self.film)
 
@@ -305,7 +305,7 @@ class Rendered:
 def _render(
     shelves: Mapping[str, Shelf], counts: Counts, threads: int, report: Callable[[float], None]
 ) -> tuple[list[Floats], dict[str, Rendered]]:
-    """The reference's halves, and every camera's renders: the cameras in turn, so that none has the quiet minutes."""
+    """The reference's halves, and every camera's renders; the cameras take turns, so that load affects all equally."""
     jobs = counts.jobs
     total = 2 * counts.reference + len(shelves) * sum(n for n, _ in jobs)
     done, halves = 0, []
@@ -380,7 +380,8 @@ def _levels(own: Rendered, halves: list[Floats], by: Mapping[str, Floats], count
 
 
 def scene_file(name: str, root: Path) -> Path:
-    """The file of a scene of the project by name, or of any by its path; read, so that mistakes show before the work.
+    """The file of a scene of the project by name, or of any by its path; read, so that mistakes are found before the
+    work.
 
     Raises:
         InputError: as `load_scene`.

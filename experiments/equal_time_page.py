@@ -1,4 +1,4 @@
-"""`python -m experiments equal-time`, and what it writes: the page, every point as CSV, records, the pictures."""
+"""`python -m experiments equal-time` and its output: the page, every point as CSV, records, the pictures."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _INTRO = """\
 
 `python -m experiments equal-time`: {lens} exact in torch, through surrogates in onnxruntime, both as compiled
 C (fused), and as a thin lens of its focal length and f-number. Against the exact lens with other seeds and {reference}
-samples a pixel, in two halves. Every camera draws the same random numbers, one wavelength a path. Times are the
+samples per pixel, in two halves. Every camera draws the same random numbers, one wavelength per path. Times are the
 render's own seconds (best; median in brackets), {threads} thread{s}, {size} pixels; making a camera, its fit and the
 scene's tables are not in them.
 
@@ -190,7 +190,7 @@ def _crossover_text(result: SceneResult, camera: CameraResult, exact: str) -> st
 
 
 def _time(seconds: float) -> str:
-    """Two figures in a unit that suits, from milliseconds to years."""
+    """Two digits in a suitable unit, from milliseconds to years."""
     if math.isinf(seconds):
         return "never"
     units = ((1e-3, "ms"), (1.0, "s"), (60.0, "min"), (3600.0, "h"), (86400.0, "days"), (31557600.0, "years"))
@@ -256,7 +256,7 @@ def draw(result: SceneResult, folder: Path) -> list[Path]:
         [*(_root_panel(result, measure) for measure in MEASURES), _flip_panel(result)],
         folder / f"{result.name}-error.png",
         f"Error against render time: {where}",
-        f"{size}, {threads}; markers: 1, 2, 4 ... samples a pixel; the reference has {2 * counts.reference}",
+        f"{size}, {threads}; markers: 1, 2, 4 ... samples per pixel; the reference has {2 * counts.reference}",
     )
     total = counts.pass_samples * counts.passes
     shown = {n: c for n, c in result.cameras.items() if not n.startswith("fused")}  # whose pictures are their models'
@@ -346,7 +346,7 @@ class Panel:
 
 
 def error_over_time_plot(panels: Sequence[Panel], path: str | Path, title: str, subtitle: str) -> Path:
-    """Panels side by side, log-log, one line a camera, with the reference's own noise and the biases.
+    """Panels side by side, log-log, one line per camera, with the reference's own noise and the biases.
 
     Raises:
         InputError: nothing to draw.
@@ -436,10 +436,10 @@ def _colour(name: str) -> str:
 
 ABOUT = """\
 Error over time of the exact lens, a polynomial, a network and a thin lens in three scenes, against a
-converged exact render with other seeds: bias and variance told apart, seconds a sample, from when the
+converged exact render with other seeds: bias and variance told apart, seconds per sample, from when the
 exact lens is ahead, equal time and equal samples, FLIP maps and film-space error maps in micrometres.
 Best and median seconds; the exact lens and the network as compiled C, too.
-Renders are kept in the run folder: a run that was interrupted goes on where it was, and what would give
+Renders are kept in the run folder: an interrupted run resumes, and what would give
 another picture is rendered again. Needs the extra "train" (torch, matplotlib, flip-evaluator) and a C
 compiler. Writes README.md, equal_time.csv, equal_time.json and three pictures a scene (about ten minutes)."""
 

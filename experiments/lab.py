@@ -1,4 +1,4 @@
-"""What the measurements share: folders, arguments, the machine, tables and goals, files written whole."""
+"""Shared by the measurements: folders, arguments, the machine, tables and goals, atomic files."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def add_only(parser: argparse.ArgumentParser) -> None:
 
 
 def quiet_glasses() -> None:
-    """No warning of glasses of unknown dispersion: it changes nothing here."""
+    """Ignore warnings of glasses of unknown dispersion, which do not matter here."""
     warnings.simplefilter("ignore", NeurolensWarning)
 
 
 def write_results(folder: Path, name: str, page: str, data: Any) -> None:
-    """Write NAME.md and NAME.json, each whole or not at all."""
+    """Write NAME.md and NAME.json, each atomically."""
     folder.mkdir(parents=True, exist_ok=True)
     atomic_write_text(folder / f"{name}.md", page)
     atomic_write_text(folder / f"{name}.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
@@ -73,7 +73,7 @@ def table(header: str | Sequence[str], rows: Iterable[Sequence[Any]], missing: s
 
 @dataclass(frozen=True)
 class Goal:
-    """A figure that is asked for; `worst` names the case that decides, where several are covered."""
+    """A goal for a figure; `worst` names the deciding case, where several are covered."""
 
     text: str
     wanted: float
@@ -152,7 +152,7 @@ class Unmeasured(NeurolensError):
 
 
 def in_child(function: Callable[..., dict[str, Any]], *args: str | float) -> dict[str, Any]:
-    """What a function of a module of this folder returns for plain arguments, called in a process of its own.
+    """Result of a function of a module of this folder for plain arguments, called in a new process.
 
     Raises:
         Unmeasured: the process failed.
@@ -168,7 +168,7 @@ def in_child(function: Callable[..., dict[str, Any]], *args: str | float) -> dic
 
 
 def memory_growth(work: Callable[[], T]) -> tuple[T, float]:
-    """What some work returns, and by how many bytes the highest resident memory meanwhile exceeds that before.
+    """Result of `work`, and by how many bytes the highest resident memory meanwhile exceeds that before.
 
     Raises:
         OSError: no /proc (other than Linux).

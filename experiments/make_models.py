@@ -90,7 +90,7 @@ class WholeFolder:
 
 @dataclass(frozen=True)
 class Library:
-    """All entries, the ray pairs of each, and whether the compiled exact tracer is timed (half a minute a lens)."""
+    """All entries, the ray pairs of each, and whether the compiled exact tracer is timed (half a minute per lens)."""
 
     entry: tuple[Entry, ...] = ()
     lenses: WholeFolder | None = None
@@ -137,7 +137,7 @@ def chosen(library: Library, names: Sequence[str]) -> tuple[Entry, ...]:
 _HEAD = """# Models that ship
 
 Made by `python -m experiments models` from experiments/models.toml: of every lens of lenses/ the best polynomial of at most
-64 coefficients a vector output and the best network of two layers of 16 units, each fitted within half a minute,
+64 coefficients per vector output and the best network of two layers of 16 units, each fitted within half a minute,
 over the whole lit film, full aperture, focus from infinity to near and all wavelengths for which the glasses are known;
 of a few lenses also faster ones. Errors on held-out rays (`neurolens.evaluate.rays`), micrometres at an image radius of
 21.6 mm; every card was checked on fresh rays. Times on one core in onnxruntime, with stop, rims and transmittance;
@@ -201,10 +201,10 @@ _KEPT = tuple(
 def make_models(
     library: Library, entries: Sequence[Entry], out: Path, progress: Progress, *, again: bool = False
 ) -> list[str]:
-    """Make what is missing of some entries; returns in words what failed or does not hold.
+    """Make missing models of some entries; returns failures and promises that do not hold, as sentences.
 
-    The index is whole at any time: rows are replaced one entry at a time, and rows of entries that the library no
-    longer has go when all of it was asked for and is done.
+    The index is complete at any time: rows are replaced one entry at a time, and rows of entries that the library no
+    longer has are removed once the whole library is done.
     """
     known, left_out = _known(out)
     todo = [e for e in entries if again or not _stands(e, library.pairs, known, out)]
@@ -239,7 +239,7 @@ def make_models(
 
 
 def _known(out: Path) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """Rows and what was left out of an index that is there; nothing of one that cannot be read, which is replaced."""
+    """Rows and left-out entries of an existing index; empty for an unreadable one, which is replaced."""
     try:
         rows = [row for row in read_index(out) if row.keys() >= {*_KEPT, "ns_per_ray", "speedup_over_compiled"}]
         left_out = json.loads((out / "index.json").read_text(encoding="utf-8")).get("left_out", {})
@@ -251,7 +251,7 @@ def _known(out: Path) -> tuple[list[dict[str, Any]], dict[str, str]]:
 
 
 def _ordered(rows: Sequence[dict[str, Any]], library: Library) -> list[dict[str, Any]]:
-    """In the order of the list; what it does not name last."""
+    """In the order of the list, others last."""
     place = {entry.state: i for i, entry in enumerate(library.entry)}
     return sorted(rows, key=lambda row: place.get(row["entry"], len(place)))
 
@@ -272,7 +272,7 @@ def fingerprint(entry: Entry, pairs: PairSettings) -> str:
 
 
 def _stands(entry: Entry, pairs: PairSettings, known: Sequence[dict[str, Any]], out: Path) -> bool:
-    """Whether the models of an entry are there as they were written, by the same settings and version."""
+    """Whether the models of an entry exist unchanged, made by the same settings and version."""
     mine = [row for row in known if row["entry"] == entry.state]
     try:
         mark = fingerprint(entry, pairs)
@@ -413,8 +413,8 @@ def make_state_entry(
 
 ABOUT = """\
 Fit, check on fresh rays and time the models that experiments/models.toml lists, and write them with
-index.json and README.md. Models that are there, made by the same settings and version, are kept: a
-run that was interrupted goes on where it stopped.
+index.json and README.md. Existing models of the same settings and version are kept: an
+interrupted run resumes where it stopped.
 Exit code 1 where a lens could not be done or a card does not hold."""
 
 

@@ -1,6 +1,6 @@
 """The benchmark of models of many states: every zoom of the library over its whole range, and internal focus.
 
-One model a case, measured at random states against the exact lens, beside models that were each fitted to one state.
+One model per case, measured at random states against the exact lens, beside models that were each fitted to one state.
 """
 
 from __future__ import annotations

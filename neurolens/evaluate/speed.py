@@ -81,8 +81,13 @@ class Race:
         ns = self.ns.get(name)
         if ns is None:
             return None
-        best = {"min": min(ns), "median": statistics.median(ns)}
-        return {**best, "threads": self.threads, "batch": self.batch[name], "repeats": len(ns)}  # type: ignore[typeddict-item]
+        return {
+            "min": min(ns),
+            "median": statistics.median(ns),
+            "threads": self.threads,
+            "batch": self.batch[name],
+            "repeats": len(ns),
+        }
 
     def speedup(self, name: str, over: str) -> dict[str, float] | None:
         """How many times faster `name` is than `over`: "min" by the minima, "median" of the ratios within rounds."""
