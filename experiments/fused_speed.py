@@ -119,7 +119,7 @@ def small_enough(prepared: Prepared, choices: Sequence[ModelSettings]) -> tuple[
 def measure(
     case: Case, folder: Path, *, rounds: int, torch_compiled: bool, report: Callable[[float], None] = lambda share: None
 ) -> list[Row]:
-    """Fit, race and hold against the exact tracers; one row a candidate."""
+    """Fit, race and hold against the exact tracers; one row per candidate."""
     lens = case.lens(folder)
     domain = domain_of(lens, film_radius_mm=case.film_radius_mm, focus_m=(math.inf, case.near_m))
     prepared = prepare(make_pairs(lens, domain, PairSettings()))
@@ -202,7 +202,6 @@ def _add_fused(
 
 
 def _floor(program: Program) -> dict[str, Any]:
-    """What a ray costs at least: operations and bytes."""
     count = program.count()
     inputs = sum(s.kind == "input" for s in (program.steps[k] for k in program.live()))
     return {
@@ -234,7 +233,8 @@ the front surface, direction and domain guard out. "whole": with stop, rims and 
   surface waits for the one before it (a division and two roots in a row), which costs more than its operations.
 - exact torch: the project's own tracer compiled by torch, rims tested in both kinds of work.
 - onnxruntime, "ray": the part of the exported graph that gives position and direction, without the domain guard.
-- Operations: float operations a ray, a fused multiply-add is one; in brackets, how many are divisions and square roots.
+- Operations: float operations per ray, a fused multiply-add is one; in brackets, how many are divisions and square
+roots.
   A core with two 512-bit pipes does 32 a cycle. Bytes: what a ray reads and writes.
 - Fixed: {wavelength:g} nm; film at the farthest focus, one stop down. These do less: one wavelength is no white light.
 
@@ -262,7 +262,7 @@ def earlier(folder: Path, names: Collection[str]) -> list[Row]:
 
 
 def goals(rows: Sequence[Row]) -> list[lab.Goal]:
-    """What is asked of the fastest model within 1 um, against the rows."""
+    """Goals of the fastest model within 1 um."""
     found = []
 
     for words, ending, work, wanted in (
@@ -342,9 +342,9 @@ def _table(rows: Sequence[Row]) -> str:
 ABOUT = """\
 Fit the smallest polynomial within 1 um RMS and a small network to a few lenses, write them as C, with and
 without what a scene fixes, and race them against the exact trace: written as C by the same means, and
-compiled by torch (a minute a lens more), and against onnxruntime. One thread, float32. Needs a C compiler
-and the extra "train" (torch). Writes fused_speed.md and fused_speed.json; lenses that are not asked for
-keep their rows."""
+compiled by torch (a minute per lens more), and against onnxruntime. One thread, float32. Needs a C compiler
+and the extra "train" (torch). Writes fused_speed.md and fused_speed.json; rows of other lenses
+are kept."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""How often inverse maps arrive: a direct fit with limited Newton steps, beside Newton's method as published.
+"""Convergence of inverse maps: a direct fit with limited Newton steps, beside Newton's method as published.
 
 As published (Hanika and Dachsbacher 2014; Schrade et al. 2016): from the first-order map, undamped, a fixed number of
 steps, with the Jacobian of the polynomial. Both work on the same model, so that only the iteration differs.
@@ -38,9 +38,9 @@ from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 PUBLISHED_STEPS = (3, 5, 10, 20)
-# A residual beyond this (in stop radii; of the front's radius, in radians) has run away, not merely missed.
+# A residual beyond this (in stop radii; of the front's radius, in radians) counts as diverged, not just missed.
 AWAY = 1.0
-# Points a side of the grid of starts that looks for rays which an inverse map says are not there.
+# Points per side of the grid of starts in the search for rays that an inverse map did not find.
 _STARTS = 7
 
 
@@ -144,7 +144,7 @@ def _plain(system: Graph, given: dict[str, Tensor]) -> dict[str, Any]:
 
 
 def _uniform(inverse: InverseModel, count: int) -> dict[str, Any]:
-    """Stop points uniform over the stop, for film points uniform over the film: what becomes of them.
+    """Outcome for stop points uniform over the stop and film points uniform over the film.
 
     Returns shares: passed, blocked, outside (the ray leaves the domain), unsolved; `missed`: unsolved although a ray
     that passes is found from one of a grid of starts; and of the solved ones what the published iteration misses, by
@@ -231,8 +231,8 @@ that have a ray, those that it does not find."""
 
 
 _RAW = """\
-The same where the model is as published: raw monomials, 20 coefficients a component, orthogonal matching pursuit.
-Its polynomials are wilder off the data, and full steps from the first-order map leave the data."""
+The same where the model is as published: raw monomials, 20 coefficients per component, orthogonal matching pursuit.
+Its polynomials vary more off the data, and full steps from the first-order map leave the data."""
 
 
 def _raw_table(done: Sequence[dict[str, Any]]) -> list[str]:
@@ -274,8 +274,8 @@ Writes inverse.md and inverse.json."""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `python -m experiments inverse`."""
     lab.add_only(parser)
-    parser.add_argument("--rays", metavar="N", type=whole(1000), default=100_000, help="rays a lens (default: 100000)")
-    parser.add_argument("--raw", action="store_true", help="invert a model of raw monomials too (half a minute a lens)")
+    parser.add_argument("--rays", metavar="N", type=whole(1000), default=100_000, help="per lens (default: 100000)")
+    parser.add_argument("--raw", action="store_true", help="also invert a model of raw monomials (30 s per lens)")
     parser.add_argument("--again", action="store_true", help="measure the chosen lenses again")
     lab.add_out(parser)
 

@@ -131,7 +131,7 @@ def test_a_mistake_is_one_line(args: list[object], words: list[str], capsys: pyt
         (["--camera", "pinhole", "--blades", "5"], ["aperture", "point"]),
         (["--camera", "thin", "--blades", "2"], ["--blades", "from 3 to 100"]),
         (["--camera", "thin", "--blade-rotation", "10"], ["blades", "missing"]),
-        (["--camera", "thin", "--aperture-mask", "no.png"], ["no.png", "missing"]),
+        (["--camera", "thin", "--aperture-mask", "no.png"], ["no.png", "exists"]),
         (["--camera", "thin", "--focusing", "internal"], ["focus", "lens files"]),
         (["--camera", "thin", "--efl", "50", "--field", "40"], ["--field", "not allowed"]),
         (["--camera", "thin", "--width", "32", "--height", "32"], ["shape of the film"]),
@@ -343,7 +343,7 @@ def test_a_full_disk_is_one_line(
 
     monkeypatch.setattr("neurolens.render.pictures.write_exr", full)
     line = failure(capsys, "render", scene, "--camera", "thin", "-o", tmp_path / "a.exr", "--quiet")
-    kept = f"the render is kept: the same command goes on from {tmp_path / 'a.exr'}.part"
+    kept = f"the render is kept: the same command resumes from {tmp_path / 'a.exr'}.part"
     assert line == f"neurolens: No space left on device; {kept}"
 
 

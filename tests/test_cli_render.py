@@ -95,9 +95,9 @@ def test_a_signal_in_mid_render_loses_nothing(
         assert process.returncode == -signal.SIGKILL and said == "" and not out.exists()
     else:
         assert process.returncode == 128 + number
-        count = r"[\d.e+]+ of 100000 samples a pixel( \(\d+ to \d+\))?"
+        count = r"[\d.e+]+ of 100000 samples per pixel( \(\d+ to \d+\))?"
         assert re.fullmatch(
-            rf"neurolens: interrupted; a\.exr holds {count}; the same command goes on from a\.exr\.part", said
+            rf"neurolens: interrupted; a\.exr holds {count}; the same command resumes from a\.exr\.part", said
         )
         samples = read_layers(out)["samples"]
         assert samples.max() >= 16 and samples.max() - samples.min() <= 16
@@ -161,7 +161,7 @@ def test_a_picture_that_cannot_be_written_keeps_the_render_and_the_older_picture
                 patch.setattr(f"neurolens.render.{writer}", full)
             line = failure(capsys, *common)
         assert line == (
-            f"neurolens: {out}: No space left on device; the render is kept: the same command goes on from {out}.part"
+            f"neurolens: {out}: No space left on device; the render is kept: the same command resumes from {out}.part"
         )
         assert np.all(read_exr(out)[0] == 7)
     data = run_json(capsys, *common)
@@ -190,7 +190,7 @@ def test_a_disk_without_room_for_picture_and_checkpoint_is_told_as_it_is(
     why = f"({out}.part: No space left on device)"
     assert said() == (
         f"neurolens: {out}: No space left on device; only a part of the render is kept {why}: "
-        f"the same command goes on from {out}.part"
+        f"the same command resumes from {out}.part"
     )
     (tmp_path / "a.exr.part").unlink()
     assert said() == (

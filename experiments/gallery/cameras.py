@@ -177,7 +177,7 @@ def fitted(
 Array = NDArray[np.float64]
 
 NEAR_CORNER = 0.95  # of the way to the film's corner, where falloff is matched and measured
-_SQUARE = 64  # pupil samples a side
+_SQUARE = 64  # pupil samples per side
 
 
 def illumination(camera: Camera, radii_mm: Array, azimuth_deg: float = 33.7) -> Array:

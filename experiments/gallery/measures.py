@@ -52,7 +52,7 @@ def against_post(view: View) -> dict[str, float]:
 
 Array = NDArray[np.float64]
 
-_SQUARE = 16  # pupil samples a side, whose mean direction is taken
+_SQUARE = 16  # pupil samples per side, whose mean direction is taken
 # Film radius over focal length of an angle to the axis.
 PROJECTIONS: dict[str, Callable[[Any], Any]] = {
     "rectilinear": np.tan,

@@ -1,8 +1,8 @@
 """The exact lens as a graph, from which C is written: the best that tracing can do.
 
-A surrogate is only worth what it saves over this one. Surfaces of every shape, stop, rims, missed surfaces, total
+Surrogates are compared with it. Surfaces of every shape, stop, rims, missed surfaces, total
 reflection, dispersion; transmittance of bare surfaces (Fresnel, unpolarised, averaged at each surface) and of coated
-ones as if they were bare: no lens is slower for its coatings here. Ray tracing after Feder, J. Opt. Soc. Am. 41 (1951);
+ones as if they were bare: coatings cost no time here. Ray tracing after Feder, J. Opt. Soc. Am. 41 (1951);
 conics, cylinders and aspheres as in `shapes`.
 """
 
@@ -20,7 +20,7 @@ from neurolens.optics.shapes import LAST_STEP, STEEPEST, is_plain, start_of
 
 # The index is a polynomial in 1 / lambda^2 that holds it to float32's last bit.
 _INDEX = 3e-8
-_TINY = 1e-30  # what stands under a root is to be above it
+_TINY = 1e-30  # least value under a root
 Test = tuple[Value, Value]  # passed where the first is at most the second
 
 
@@ -134,7 +134,7 @@ class _Meeting(NamedTuple):
 
 
 def _above(square: Value) -> Test:
-    """Passed where `square` is positive; not by NaN."""
+    """Passed where `square` is positive; NaN does not pass."""
     return square.graph.constant(_TINY), square
 
 
