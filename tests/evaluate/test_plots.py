@@ -55,11 +55,7 @@ def biconvex(**changes: Any) -> dict[str, Any]:
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Every figure made, so that a test can read its axes."""
     made: list[Any] = []
-    for name in (
-        "neurolens.evaluate.plots",
-        "neurolens.evaluate.figures",
-        "neurolens.analysis.layout",
-    ):
+    for name in ("neurolens.evaluate.plots", "neurolens.evaluate.figures", "neurolens.analysis.layout"):
         monkeypatch.setattr(f"{name}.new_figure", lambda *size: made.append(style.new_figure(*size)) or made[-1])
     return made
 
