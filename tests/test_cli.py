@@ -100,7 +100,7 @@ def test_a_mistake_is_one_line(args: list[object], words: list[str], capsys: pyt
         (["--camera", "pinhole", "--blades", "5"], ["aperture", "point"]),
         (["--camera", "thin", "--blades", "2"], ["--blades", "from 3 to 100"]),
         (["--camera", "thin", "--blade-rotation", "10"], ["blades", "missing"]),
-        (["--camera", "thin", "--aperture-mask", "no.png"], ["no.png", "missing"]),
+        (["--camera", "thin", "--aperture-mask", "no.png"], ["no.png", "a picture that exists"]),
         (["--camera", "thin", "--focusing", "internal"], ["focus", "lens files"]),
         (["--camera", "thin", "--efl", "50", "--field", "40"], ["--field", "not allowed"]),
         (["--camera", "thin", "--width", "32", "--height", "32"], ["shape of the film"]),
