@@ -193,8 +193,8 @@ def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] |
 def _write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
     """Both inverse maps beside the model's file: their files, and the share of fresh rays that each finds."""
     from neurolens.cameras.model import load_model
-    from neurolens.surrogates.inversion.fit import convergence, fit_inverse
-    from neurolens.surrogates.onnx.inverse import export_inverse
+    from neurolens.surrogates.export import export_inverse
+    from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 
     pairs = _pairs(model, train=_TRAIN)
     inverse = fit_inverse(model, pairs)

@@ -133,6 +133,8 @@ class Value:
 
 
 Operand = Value | ArrayLike
+# Done at once on numbers.
+_FOLDED: dict[str, Any] = {"add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative}
 
 
 @dataclass(eq=False)
@@ -181,6 +183,8 @@ class Graph:
         rows = max(v.rows for v in values)
         if any(v.rows not in (1, rows) for v in values):
             raise ValueError(f"{kind} of {[v.rows for v in values]} rows")
+        if kind in _FOLDED and all(v.node.kind == "constant" for v in values):
+            return self.constant(_FOLDED[kind](*(v.node.arrays[0] for v in values)))
         return self.add(kind, values, rows)
 
     def take(self, x: Value, rows: Sequence[int]) -> Value:
@@ -205,7 +209,12 @@ class Graph:
         return [x[int(a) : int(b)] for a, b in zip(ends, ends[1:], strict=False)]
 
     def concat(self, *parts: Value) -> Value:
-        return parts[0] if len(parts) == 1 else self.add("concat", parts, sum(p.rows for p in parts))
+        if len(parts) == 1:
+            return parts[0]
+        if all(p.node.kind == "constant" for p in parts):
+            return self.constant(np.concatenate([p.node.arrays[0] for p in parts]))
+        flat = [q for p in parts for q in (self.inputs_of(p.number) if p.node.kind == "concat" else [p])]
+        return self.add("concat", flat, sum(p.rows for p in flat))
 
     def affine(
         self,
@@ -268,6 +277,13 @@ class Graph:
         flat = [v for pair in tests for v in pair]
         return self.add("first_failure", flat, 1, static=tuple(int(c) for c in codes))
 
+    def like(self, node: Node, inputs: Sequence[Value]) -> Value:
+        """Append the operation of a node of any graph."""
+        per_call = node.per_call if node.kind in ("input", "constant") else None
+        return self.add(
+            node.kind, inputs, node.rows, name=node.name, arrays=node.arrays, static=node.static, per_call=per_call
+        )
+
     def inline(self, other: Graph, given: Mapping[str, Value]) -> dict[str, Value]:
         """Append all of another graph, these values as its inputs (others stay inputs); returns its outputs."""
         values: list[Value] = []
@@ -275,14 +291,7 @@ class Graph:
             if node.kind == "input" and node.name in given:
                 values.append(given[node.name])
                 continue
-            inputs = [values[k] for k in node.inputs]
-            per_call = node.per_call if node.kind in ("input", "constant") else None
-            values.append(
-                self.add(
-                    node.kind, inputs, node.rows, name=node.name, arrays=node.arrays, static=node.static,
-                    per_call=per_call,
-                )
-            )  # fmt: skip
+            values.append(self.like(node, [values[k] for k in node.inputs]))
         return {name: values[v.number] for name, v in other.outputs.items()}
 
     def inputs_of(self, number: int) -> list[Value]:

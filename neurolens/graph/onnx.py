@@ -290,7 +290,15 @@ def _affine(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str | _
             np.concatenate([m[:, :at], *(m[:, [i]] + m[:, [j]] for i, j in sums), m[:, at:]], 1)
             for m in (weight, arrays[2])
         )
+        column = w.graphs[0].nodes[node.inputs[0]].kind == "constant"
+        if column:  # times the weight before the state or the call is known
+            columns = np.stack([g.nodes[node.inputs[0]].arrays[0] for g in w.graphs])[:, :, None]
+            base, change = base @ columns, change @ columns
         matrix = w.op("Add", w.op("Mul", w.name(node.inputs[1]), w.numbers(change)), w.numbers(base))
+        if column:
+            return matrix
+        if added:
+            return w.op("Gemm", matrix, w.name(node.inputs[0]), w.name(node.inputs[-1]))
         whole = w.op("MatMul", matrix, w.name(node.inputs[0]))
         if not sums:
             return whole

@@ -109,15 +109,26 @@ def _affine(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Arr
     found = [p.literal(bias) for bias in arrays[1]]
     if added:
         found = [total + row for total, row in zip(found, given[-1], strict=True)]
-    columns = range(len(x) - 1, -1, -1) if moving else range(len(x))
+    if moving:
+        for r, (base, change) in enumerate(zip(arrays[0], arrays[2], strict=True)):
+            # The largest product comes last: it is rounded once, with the sum.
+            for c in np.argsort(np.abs(base + change).max(-1), kind="stable"):
+                found[r] = p.fma(x[c], _moved(p, given[1][0], base[c], change[c]), found[r])
+        return found
     for rows in np.array_split(np.arange(node.rows), max(1, round(node.rows / _ROWS))):
-        for c in columns:
+        for c in range(len(x)):
             for r in rows:
                 weight = p.literal(arrays[0][r, c])
-                if moving and arrays[2][r, c].any():
-                    weight = p.fma(given[1][0], p.literal(arrays[2][r, c]), weight)
-                found[r] = p.fma(x[c], weight, found[r])
+                # A product times 1 and the sum are one operation.
+                found[r] = p.sum(x[c], found[r]) if weight.is_literal(1) else p.fma(x[c], weight, found[r])
     return found
+
+
+def _moved(p: Program, s: Expr, base: Array, change: Array) -> Expr:
+    """base + s change; from s = 1 where it can cancel: the film at infinity focus, where 1 - s is exact."""
+    if not base.any():
+        return s * p.literal(change)
+    return p.fma(p.literal(1.0) - s, p.literal(-change), p.literal(base + change)) if change.any() else p.literal(base)
 
 
 def _quadratic(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:

@@ -40,18 +40,20 @@ class Form:
     Attributes:
         gate_scale: factor on all tests of rims: in ONNX any failure then exceeds every status code.
         sag_terms: most terms of the front surface as a series, where a square root costs more; 0: never a series.
-        exact: for float64: series hold 1e-14, and no factor makes them shorter.
+        exact: for float64: series hold 1e-14.
+        monic: whether a factor on v saves a pass over the rays; where products and sums are one, nothing.
         wavelength: whether rays always come with a wavelength, which then is tested.
     """
 
     gate_scale: float = 1.0
     sag_terms: int = 12
     exact: bool = False
+    monic: bool = False
     wavelength: bool = False
 
 
 SCALARS = Form()
-ONNX = Form(gate_scale=1e30, sag_terms=5, wavelength=True)
+ONNX = Form(gate_scale=1e30, sag_terms=5, monic=True, wavelength=True)
 EXACT = Form(sag_terms=0, exact=True, wavelength=True)
 
 
@@ -81,11 +83,24 @@ def model_graph(model: LensModel, angle: float, form: Form, parts: Parts = ALL) 
     """
     g = Graph()
     rays, film_z = g.input("rays", 5), g.input("film_z_mm", per_call=True)
-    inside = _inside(model, rays, film_z, form)
+    inside = within_domain(model, rays, film_z, form)
     field = light_field(g, model.encoding, rays, film_z)
     series = DirectionSeries.of(model, angle, form)
-    units = Units((model.scales.position_mm, series.kappa, model.scales.stop_mm), form.gate_scale)
-    values = model.core.build(g, field, units)
+    values = model.core.build(g, field, units_of(model, series, form))
+    g.outputs["status"] = add_outputs(model, values, inside, series, form, parts).whole()
+    return g
+
+
+def units_of(model: LensModel, series: DirectionSeries, form: Form) -> Units:
+    """Of a core whose outputs `add_outputs` takes: mm, and kappa rad."""
+    return Units((model.scales.position_mm, series.kappa, model.scales.stop_mm), form.gate_scale)
+
+
+def add_outputs(
+    model: LensModel, values: CoreValues, inside: Value, series: DirectionSeries, form: Form, parts: Parts = ALL
+) -> Value:
+    """Set a model's outputs but the status, which is returned, of what its core gives (in `units_of`)."""
+    g = inside.graph
     g.outputs["scene_ray"] = scene_ray(model, values, series, form)
     if parts.transmittance:
         g.outputs["transmittance"] = values.transmittance
@@ -96,8 +111,7 @@ def model_graph(model: LensModel, angle: float, form: Form, parts: Parts = ALL) 
         radius = g.input("stop_radius_mm", per_call=True)
         inside = inside & radius.between(0.0, model.domain.stop_radius_mm * DOMAIN_SLACK)
         status = _first_failure(model, values, radius, form)
-    g.outputs["status"] = g.select(inside, status, float(st.OUTSIDE_DOMAIN)).whole()
-    return g
+    return g.select(inside, status, float(st.OUTSIDE_DOMAIN))
 
 
 def light_field(g: Graph, e: Encoding, rays: Value, film_z: Value) -> Field:
@@ -118,14 +132,18 @@ def light_field(g: Graph, e: Encoding, rays: Value, film_z: Value) -> Field:
     along = (e.film_plane_z_mm - e.pupil_plane_z_mm) / (film_z - e.pupil_plane_z_mm)
     base, change, points = rows(0.0), rows(1.0) - rows(0.0), rays[0:4]
     if e.w_half:
-        # v = 1000 / (lambda sqrt(half)), so that w = v^2 - middle / half.
-        points = g.concat(points, (1000 / math.sqrt(e.w_half)) / rays[4])
+        points = g.concat(points, wavelength_row(e, rays[4]))
         base, change = np.pad(base, ((0, 1), (0, 1))), np.pad(change, ((0, 1), (0, 1)))
         base[4, 4] = 1
     return Field(g.affine(base, points, moving=(along, change)), -e.w_middle / e.w_half if e.w_half else 0.0)
 
 
-def _inside(model: LensModel, rays: Value, film_z: Value, form: Form) -> Value:
+def wavelength_row(e: Encoding, wavelength_nm: Value) -> Value:
+    """v = 1000 / (lambda sqrt(half)), so that w = v^2 - middle / half."""
+    return (1000 / math.sqrt(e.w_half)) / wavelength_nm
+
+
+def within_domain(model: LensModel, rays: Value, film_z: Value, form: Form) -> Value:
     """Whether film point, pupil point, wavelength and film position lie in the domain; false for NaN."""
     g, d = rays.graph, model.domain
     squares = g.quadratic(rays[0:4], [((0, 0), (1, 1)), ((2, 2), (3, 3))])
@@ -170,7 +188,7 @@ class DirectionSeries:
         """That of a model: no series for slopes."""
         if model.direction == "slope":
             return DirectionSeries(1.0)
-        return DirectionSeries.exact() if form.exact else DirectionSeries.fitted(angle)
+        return DirectionSeries.exact() if form.exact else DirectionSeries.fitted(angle, form.monic)
 
     @staticmethod
     def exact() -> DirectionSeries:
@@ -180,10 +198,12 @@ class DirectionSeries:
         return DirectionSeries(1.0, cos / (2 * k + 1), -cos)
 
     @staticmethod
-    def fitted(angle: float) -> DirectionSeries:
-        """The shortest that hold float32's last bit up to an angle (rad)."""
+    def fitted(angle: float, monic: bool = True) -> DirectionSeries:
+        """The shortest that hold float32's last bit up to an angle (rad); `monic`: the factor that saves a pass."""
         sinc = fit_series(lambda t: np.sinc(np.sqrt(t) / np.pi), angle**2, _SERIES / max(angle, 0.1))
         minus_cos = fit_series(lambda t: -np.cos(np.sqrt(t)), angle**2, _SERIES)
+        if not monic:
+            return DirectionSeries(1.0, sinc, minus_cos)
         n = len(sinc) - 1
         kappa = math.copysign(abs(sinc[n]) ** (1 / (2 * n + 1)), sinc[n])
         scaled = sinc / kappa ** (2.0 * np.arange(n + 1) + 1)

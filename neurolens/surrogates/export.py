@@ -25,6 +25,7 @@ from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.assemble import ONNX, model_graph
 from neurolens.surrogates.card import card_of, card_to_json, lens_facts, reference_rays
 from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, scene_graph, stop_graph
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.stored import model_to_text, storable
 
@@ -97,6 +98,44 @@ def largest_angle(model: LensModel, count: int = 32768) -> float:
     passed = out.status == st.PASSED
     angle = torch.atan2(torch.hypot(out.rays.dx, out.rays.dy), -out.rays.dz)
     return 1.03 * float(angle[passed].max()) if bool(passed.any()) else math.pi / 2
+
+
+def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, Any] | None = None) -> tuple[Path, Path]:
+    """Write both inverse maps beside a model's file: NAME.stop.onnx and NAME.scene.onnx for NAME.onnx.
+
+    Both give rays [5, N] (film x, y, pupil x, y, wavelength), scene_ray, transmittance, stop_xy_mm and status as the
+    model does for those rays (NO_SOLUTION where they are not what was asked for), and density [N]. Inputs: see
+    `stop_graph` and `scene_graph`; per-call ones have the shape [1].
+
+    Args:
+        path: of the model's file. errors: for the card, as of `export_onnx`.
+
+    Raises:
+        InputError: as `export_onnx`.
+    """
+    model = inverse.model
+    check_gates(model)
+    base, card, front = Path(path).with_suffix(""), card_of(model, errors or {}), model.lens.surfaces[0]
+    shape = {
+        "curvature": float(front.curvature),
+        "conic": float(front.conic),
+        "asphere": [[int(p), float(a)] for p, a in front.asphere],
+        "cylinder": front.cylinder,
+    }
+    written = []
+    for name, build in (("stop", stop_graph), ("scene", scene_graph)):
+        known = {
+            "map": name,
+            "steps": STEPS,
+            "tolerance": TOLERANCE,
+            "direction": model.direction,
+            "front": shape if model.direction == "angle" else None,
+            "fit": inverse.report,
+        }
+        graph = build(inverse, ONNX, largest_angle(model))
+        proto = write_onnx(graph, {CARD_KEY: card_to_json({**card, "inverse": known})})
+        written.append(_write(base.with_name(f"{base.name}.{name}.onnx"), proto))
+    return written[0], written[1]
 
 
 def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | None = None) -> Path:

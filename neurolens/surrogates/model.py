@@ -7,6 +7,7 @@ round it is written once, in `assemble`; here it is evaluated on torch tensors.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -16,8 +17,10 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
+from neurolens.graph.program import RAY, WAVELENGTH
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
@@ -27,6 +30,7 @@ from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.lightfield import Encoding
 
 OUTPUTS = ("scene_ray", "transmittance", "stop_xy_mm", "status")
+_DIFFERENTIATED = ("scene_ray", "stop_xy_mm")
 # Positive and finite, in float32 too.
 ANY_WAVELENGTH_NM = (1e-30, 3e38)
 
@@ -64,6 +68,31 @@ class Prediction(NamedTuple):
     status: Tensor
 
 
+class Derivatives(NamedTuple):
+    """A model's prediction and its derivatives; lens frame. Rows of a ray: x, y, z (mm), dx, dy, dz.
+
+    Attributes:
+        prediction: as `LensModel.predict` gives it.
+        d_film, d_pupil: [6, 2, N] per mm of the film point's and of the pupil point's x and y, the other point held.
+        d_wavelength: [6, N] per nm.
+        stop_d_film, stop_d_pupil: [2, 2, N] of the stop crossing, mm per mm. stop_d_wavelength: [2, N] mm per nm.
+    """
+
+    prediction: Prediction
+    d_film: Tensor
+    d_pupil: Tensor
+    d_wavelength: Tensor
+    stop_d_film: Tensor
+    stop_d_pupil: Tensor
+    stop_d_wavelength: Tensor
+
+
+def prediction_of(out: Mapping[str, Tensor], count: int) -> Prediction:
+    """The outputs of a model's graph for `count` rays."""
+    scene, power, stop, status = (out[n].expand(-1, count) for n in OUTPUTS)
+    return Prediction(Rays(*scene), power[0], stop[0], stop[1], status[0])
+
+
 @dataclass(frozen=True)
 class LensModel:
     """A fitted surrogate of one lens over one domain.
@@ -99,19 +128,46 @@ class LensModel:
         Raises:
             InputError: a stop wider than the model was fitted for.
         """
+        return prediction_of(evaluate(self.graph, self._inputs(rays, stop_radius_mm)), len(rays))
+
+    def differentiate(self, rays: FilmRays, stop_radius_mm: float | None = None) -> Derivatives:
+        """Evaluate the model with its derivatives; arguments and errors as `predict`.
+
+        The wavelength's derivative is at fixed film and pupil point. Where the status is not 0 the figures mean
+        nothing.
+        """
+        out = evaluate(self._derivative_graph, self._inputs(rays, stop_radius_mm))
+        scene, stop = (
+            torch.stack([out[derivative(name, row)].expand(-1, len(rays)) for row in (*RAY, WAVELENGTH)], 1)
+            for name in _DIFFERENTIATED
+        )
+        parts = [block for d in (scene, stop) for block in (d[:, :2], d[:, 2:4], d[:, 4])]
+        return Derivatives(prediction_of(out, len(rays)), *parts)
+
+    def _inputs(self, rays: FilmRays, stop_radius_mm: float | None) -> dict[str, Tensor]:
+        columns = torch.stack([rays.film_x, rays.film_y, rays.pupil_x, rays.pupil_y, rays.wavelength_nm])
+        radius = columns.new_full((1, 1), self.checked_radius_mm(stop_radius_mm))
+        return {"rays": columns, "film_z_mm": rays.film_z[None], "stop_radius_mm": radius}
+
+    def checked_radius_mm(self, stop_radius_mm: float | None) -> float:
+        """The stop radius asked for, or the domain's.
+
+        Raises:
+            InputError: a stop wider than the model was fitted for.
+        """
         if stop_radius_mm is not None and not 0 <= stop_radius_mm <= DOMAIN_SLACK * self.domain.stop_radius_mm:
             expected = f"0 to {self.domain.stop_radius_mm:.6g} mm, the widest stop of the fit"
             raise InputError(self.method, "stop_radius_mm", stop_radius_mm, expected)
-        radius = self.domain.stop_radius_mm if stop_radius_mm is None else stop_radius_mm
-        columns = torch.stack([rays.film_x, rays.film_y, rays.pupil_x, rays.pupil_y, rays.wavelength_nm])
-        inputs = {"rays": columns, "film_z_mm": rays.film_z[None], "stop_radius_mm": columns.new_full((1, 1), radius)}
-        out = evaluate(self._graph, inputs)
-        scene, power, stop, status = (out[n].expand(-1, len(rays)) for n in OUTPUTS)
-        return Prediction(Rays(*scene), power[0], stop[0], stop[1], status[0])
+        return self.domain.stop_radius_mm if stop_radius_mm is None else stop_radius_mm
 
     @cached_property
-    def _graph(self) -> Graph:
+    def graph(self) -> Graph:
+        """For evaluation in float64: inputs and outputs as `assemble` says."""
         return model_graph(self, math.pi, EXACT)
+
+    @cached_property
+    def _derivative_graph(self) -> Graph:
+        return with_derivatives(self.graph, _DIFFERENTIATED, [("rays", k) for k in range(5)])
 
     @property
     def wavelength_limits_nm(self) -> tuple[float, float]:
