@@ -466,8 +466,8 @@ def check_source(old: Path, new: Path, cache: Path, count: int) -> dict[str, Any
     runs = [compiled(t, info, cache) for t, info in zip(texts, (one, other), strict=True)]
     for band in range(max(1, len(one["bands_nm"]))):
         for kind, n in (("inside", count), ("outside", count // 4), ("wild", count // 4)):
-            calls = [functools.partial(r, band=band) for r in runs]
-            found = total([found, held(*calls, batches(card, n, kind, stem))])
+            calls = [functools.partial(r, band=band) for r in runs]  # type: ignore
+            found = total([found, held(*calls, batches(card, n, kind, stem))])  # type: ignore
     return found
 
 
@@ -558,13 +558,13 @@ def units_of(item: str, old: Path, new: Path, tree: Path, args: argparse.Namespa
         return {"start": lambda: check_start(Path(json.loads((old / "tree.json").read_text())["tree"]), tree)}
     folder = SOURCES.get(item, item)
     ends = {"fits": ".npz", "render": ".exr", "source": (".h", ".glsl")}.get(item, ".onnx")
-    files = [f for f in sorted((old / folder).rglob("*")) if f.name.endswith(ends) and ".part." not in f.name]
+    files = [f for f in sorted((old / folder).rglob("*")) if f.name.endswith(ends) and ".part." not in f.name]  # type: ignore
     files = [f for f in files if not f.name.endswith((".stop.onnx", ".scene.onnx"))]
     if item == "source":  # what is refused leaves a message alone
         files = [f.with_suffix("") for f in sorted((old / folder).rglob("*.json"))]
     if folder in ("onnx", "source", "derivatives"):
         files = [f for f in files if fnmatch.fnmatch(f.name, args.models + "*")]
-    run: Callable[[Path, Path], Any] = {
+    run: Callable[[Path, Path], Any] = {  # type: ignore
         "onnx": functools.partial(check_onnx, count=args.rays),
         "fits-onnx": functools.partial(check_onnx, count=args.rays // 10),
         "onnx-speed": check_speed,

@@ -23,33 +23,15 @@ from neurolens.cameras.ideal import ThinLens
 from neurolens.cli import main
 from neurolens.render.pictures import read_exr, read_layers, write_exr
 
-SCENE = """\
-[camera]
-position_m = [0.0, 0.0, 2.0]
-look_at_m = [0.0, 0.0, 0.0]
-focus_m = 2.0
-width = 64
-height = 36
-samples = 16
-
-[environment]
-colour = [1.0, 1.0, 1.0]
-
-[materials]
-grey = { kind = "diffuse", reflectance = [0.5, 0.4, 0.3] }
-
-[[spheres]]
-centre_m = [0.1, 0.0, 0.0]
-radius_m = 0.2
-material = "grey"
-"""
-
 
 @pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    path = tmp_path / "ball.toml"
-    path.write_text(SCENE)
-    return path
+def scene(scene: Path) -> Path:
+    """Larger, and of more than one pass."""
+    text = scene.read_text()
+    for old, new in (("width = 32", "width = 64"), ("height = 18", "height = 36"), ("samples = 2", "samples = 16")):
+        text = text.replace(old, new)
+    scene.write_text(text)
+    return scene
 
 
 def children(process: subprocess.Popen[str]) -> list[int]:
@@ -237,7 +219,7 @@ def test_a_texture_with_the_name_of_the_preview_is_not_written_over(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Image.new("RGB", (4, 2), "white").save(tmp_path / "ball.png")
-    scene.write_text(SCENE.replace("colour = [1.0, 1.0, 1.0]", 'file = "ball.png"'))
+    scene.write_text(scene.read_text().replace("colour = [1.0, 1.0, 1.0]", 'file = "ball.png"'))
     before = (tmp_path / "ball.png").read_bytes()
     said = failure(capsys, "render", scene, "--camera", "pinhole", "--quiet", "-o", tmp_path / "ball.exr")
     assert "--out" in said and "ball.png" in said and (tmp_path / "ball.png").read_bytes() == before

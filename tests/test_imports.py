@@ -34,7 +34,7 @@ PARTS = {
     "render": {"cameras"},
     "mitsuba": {"cameras", "render"},
     "evaluate": {
-        *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba"),
+        *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba")
     },
     "commands": {
         *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba"),

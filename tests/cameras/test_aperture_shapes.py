@@ -89,7 +89,6 @@ def test_a_shot_shapes_every_camera_but_a_point() -> None:
         make_camera("pinhole", shot)
 
 
-@pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 def test_a_shot_zooms_and_focuses_inside() -> None:
     zoom = lens_models.LENSES / "nikon_zoom_70_200.toml"
     near = make_camera(zoom, Shot(FILM, 3.0, zoom=100.0, focus="internal"))

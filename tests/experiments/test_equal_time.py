@@ -192,13 +192,6 @@ def test_the_exact_lens_is_ahead_when_its_law_says_so(scene: SceneResult) -> Non
     assert equal_time_page.equal_time_s(scene) == pytest.approx(0.16)
 
 
-def test_everything_is_written_small(scene: SceneResult, tmp_path: Path) -> None:
-    equal_time_page.write([scene], tmp_path)
-    assert len((tmp_path / "equal_time.csv").read_text().splitlines()) == 1 + 3 * 5
-    pictures = sorted(tmp_path.glob("*.png"))
-    assert len(pictures) == 3 and all(p.stat().st_size < 150_000 for p in pictures)
-
-
 # Kept renders
 
 SCENE = """

@@ -100,7 +100,6 @@ def test_the_seed_decides_every_bit_on_any_number_of_threads(singlet):
     assert not torch.equal(first, _weights(fit_network(singlet, units=4, steps=6, seed=6)))
 
 
-@pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 def test_a_lens_without_dispersion_ignores_the_wavelength():
     data = _setup("muller_fisheye_100.toml")
     pairs, encoding = data.pairs, data.encoding

@@ -149,18 +149,6 @@ def test_nearly_parallel_variables_do_not_spoil_the_table(seed: int) -> None:
     assert found == sorted(found, reverse=True)
 
 
-def test_a_copy_of_a_chosen_column_is_not_taken_in() -> None:
-    rng = np.random.default_rng(0)
-    base = rng.normal(size=(3, 100))
-    sweep = sweep_of(np.vstack([base, 2 * base[:1], np.zeros((1, 100))]), rng.normal(size=(2, 100)))
-    for k in range(5):
-        sweep.add(k)
-    assert sweep.chosen == [0, 1, 2]
-    before = sweep.residual
-    sweep.drop(3)
-    assert sweep.chosen == [0, 1, 2] and sweep.residual == before
-
-
 def test_omp_looks_at_correlation_and_ols_at_what_is_left() -> None:
     """The candidate that correlates best with the residual may hardly be new: OLS divides by what is left of it."""
     e = np.eye(4)

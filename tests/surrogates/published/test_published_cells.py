@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import lens_models
 import numpy as np
@@ -13,12 +12,9 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.model import load_model
-from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import ray_errors
 from neurolens.surrogates.cores import RawPolynomial
 from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
@@ -135,21 +131,3 @@ def test_the_clock_ends_a_training() -> None:
     model = fit_model(lens_models.prepared(), replace(NETWORKS, steps=100_000, seconds=0.5))
     assert model.fit_s < 60
     assert rms_um(model) > 0
-
-
-@pytest.mark.parametrize("method", ("zheng-adaptive", "neurolens2017"))
-@pytest.mark.parametrize("name", ("laikin_double_gauss_50", "muller_fisheye_100"))
-def test_graphs_give_what_the_models_give(method: str, name: str, tmp_path: Path) -> None:
-    settings = ModelSettings("zheng-adaptive", basis="raw", terms=6, partitions=2)
-    model = fit_model(lens_models.prepared(name), NETWORKS if method == "neurolens2017" else settings)
-    predict = onnx_predictor(load_model(export_onnx(model, tmp_path / "model.onnx", {})))
-    drawn = sample_domain(model.domain, 4000, 5)
-    rays = replace(drawn, film_z=torch.full_like(drawn.film_z, model.domain.film_z_mm[1]))
-    exact, graph = model.predict(rays), predict(rays)
-    passed = (exact.status == st.PASSED) & (graph.status == st.PASSED)
-    assert int((exact.status != graph.status).sum()) <= 4
-    assert int(passed.sum()) > 1000
-    for a, b in zip(exact.rays, graph.rays, strict=True):
-        close = (a - b)[passed].abs() < 5e-5 * max(1.0, float(a[passed].abs().max()))
-        # A ray within rounding of a cut may take the other cell.
-        assert int((~close).sum()) <= 2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from pathlib import Path
 
 import lens_models
 import numpy as np
@@ -15,13 +14,10 @@ from hypothesis import strategies as some
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.model import load_model
-from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import ray_errors
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.lightfield import fit_encoding
 from neurolens.surrogates.pairs import trace_pairs
@@ -154,19 +150,3 @@ def test_pupil_tests_are_those_of_the_exact_rims(label: str) -> None:
         known = (rays.status == st.PASSED) | (rays.status % 4 == st.RIM)
         clear = known & (exact.abs() > 0.15)  # the inner pupil is a disc in the vertex's plane
         assert float(((values > 0) == (exact > 0))[clear].double().mean()) > 0.995
-
-
-@pytest.mark.parametrize("name", ("laikin_double_gauss_50", "muller_fisheye_100"))
-@pytest.mark.parametrize("label", FAST)
-def test_graphs_give_what_the_models_give(label: str, name: str, tmp_path: Path) -> None:
-    model = fit_model(lens_models.prepared(name), FAST[label])
-    predict = onnx_predictor(load_model(export_onnx(model, tmp_path / "model.onnx", {})))
-    drawn = sample_domain(model.domain, 5000, 5)
-    rays = replace(drawn, film_z=torch.full_like(drawn.film_z, model.domain.film_z_mm[1]))
-    exact, graph = model.predict(rays), predict(rays)
-    passed = (exact.status == st.PASSED) & (graph.status == st.PASSED)
-    assert int((exact.status != graph.status).sum()) <= 5
-    assert int(passed.sum()) > 2000
-    for a, b in zip(exact.rays, graph.rays, strict=True):
-        assert float((a - b)[passed].abs().max()) < 2e-5 * max(1.0, float(a[passed].abs().max()))
-    assert float((exact.transmittance - graph.transmittance)[passed].abs().max()) < 1e-5

@@ -1,4 +1,4 @@
-"""An error asked for: the fewest terms that reach it, and a warning with the best where nothing does."""
+"""Settings of a fit, what is refused before anything is computed, and an error asked for instead of a size."""
 
 from __future__ import annotations
 
@@ -6,15 +6,42 @@ import math
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from lens_models import prepared
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.surrogates import fit
+from neurolens.surrogates.bases import invariant_exponents, raw_exponents
 from neurolens.surrogates.card import card_of
 from neurolens.surrogates.fit import TERMS_LADDER, ModelSettings, fit_model
 from neurolens.surrogates.fits import checkpoint
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *(("degree", v) for v in (-1, 17, 10**9)),
+        *(("terms", v) for v in (0, -3, 2001)),
+        *(("partitions", v) for v in (0, 65)),
+        *(("units", v) for v in (0, 513)),
+        *(("layers", v) for v in (0, 9)),
+        *(("steps", v) for v in (0, 10**9)),
+        *(("seconds", v) for v in (0.0, -1.0, math.nan)),
+    ],
+)
+def test_numbers_without_bounds_are_refused(field: str, value: Any) -> None:
+    with pytest.raises(InputError, match=field):
+        ModelSettings(**{field: value})
+
+
+def test_raw_candidates_are_bounded_by_their_number() -> None:
+    with pytest.raises(InputError, match="degree"):
+        ModelSettings(basis="raw", degree=12)
+    assert len(raw_exponents(ModelSettings(basis="raw", degree=11).degree)) <= 5000
+    assert 2 * len(invariant_exponents(ModelSettings(degree=16).degree)) <= 5000
+
 
 # The plainest polynomial: what is tested here is the choice of its size.
 PLAIN = ModelSettings("omp", degree=4)

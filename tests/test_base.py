@@ -1,7 +1,8 @@
-"""Settings: what is read is what was written, and every mistake is one clear error."""
+"""The base: files that are whole or not there, settings, what progress says of the time left."""
 
 from __future__ import annotations
 
+import io
 import math
 import tomllib
 from dataclasses import dataclass, field
@@ -14,6 +15,41 @@ from hypothesis import strategies as st
 
 from neurolens.base.config import apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path, atomic_write_text
+from neurolens.base.progress import Progress, duration
+
+
+def test_writes_and_replaces(tmp_path: Path) -> None:
+    target = tmp_path / "results.json"
+    for text in ("first", "zweite, größer: α"):
+        atomic_write_text(target, text)
+        assert target.read_text(encoding="utf-8") == text
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_failure_leaves_the_old_file_and_no_other(tmp_path: Path) -> None:
+    target = tmp_path / "model.onnx"
+    target.write_bytes(b"old")
+    with pytest.raises(RuntimeError, match="stopped"), atomic_path(target) as temporary:
+        temporary.write_bytes(b"half")
+        raise RuntimeError("stopped")
+    assert target.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_nothing_is_at_the_name_before_the_end(tmp_path: Path) -> None:
+    target = tmp_path / "film.exr"
+    with atomic_path(target) as temporary:
+        assert temporary.suffix == ".exr" and temporary.parent == tmp_path
+        temporary.write_bytes(b"film")
+        assert not target.exists()
+    assert target.read_bytes() == b"film"
+
+
+def test_a_writer_that_wrote_nothing_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), atomic_path(tmp_path / "empty.png"):
+        pass
+    assert list(tmp_path.iterdir()) == []
 
 
 @dataclass(frozen=True)
@@ -218,3 +254,60 @@ numbers = st.floats(allow_nan=False)
 def test_the_resolved_settings_read_back_bit_for_bit(settings: Experiment) -> None:
     assert from_dict(Experiment, tomllib.loads(to_toml(settings)), "memory") == settings
     assert from_dict(Experiment, to_dict(settings), "memory") == settings
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0, "0.0 s"), (-1, "0.0 s"), (0.44, "0.4 s"), (9.96, "10 s"), (59.7, "1 min 00 s"), (185, "3 min 05 s")],
+)
+def test_durations_read_well(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def test_time_left_follows_the_pace_of_the_stage_and_the_plan_of_the_rest() -> None:
+    clock, stream = Clock(), io.StringIO()
+    progress = Progress({"trace": 10, "fit": 60}, stream=stream, interval_s=5, clock=clock)
+    with progress.stage("trace") as report:
+        clock.now += 6
+        report(0.25)
+    assert stream.getvalue().splitlines()[0] == "trace:  25%, 6.0 s, 18 s left (in all 1 min 18 s left)"
+
+
+def test_a_slow_stage_corrects_the_plan() -> None:
+    clock, stream = Clock(), io.StringIO()
+    progress = Progress({"trace": 10, "fit": 60}, stream=stream, clock=clock)
+    with progress.stage("trace"):
+        clock.now += (
+            40  # four times as long as planned: the 60 s to come take longer too, though not for sure four times
+        )
+    words = stream.getvalue().split("in all ")[1].split()
+    assert 60 < 60 * int(words[0]) + int(words[2]) <= 240
+
+
+@pytest.mark.parametrize("fraction", [-1.0, 0.0, 1.0, 7.0])
+def test_any_fraction_is_taken(fraction: float) -> None:
+    stream = io.StringIO()
+    with Progress({"a": 0, "b": 0}, stream=stream, interval_s=0).stage("a") as report:
+        report(fraction)
+    assert "%" in stream.getvalue()
+
+
+def test_quiet_prints_nothing() -> None:
+    stream = Terminal()
+    progress = Progress(quiet=True, stream=stream)
+    progress.note("hello")
+    with progress.stage("fit") as report:
+        report(0.5)
+    assert stream.getvalue() == ""

@@ -1,23 +1,59 @@
-"""A polynomial and a network added: less error than the polynomial, the same in every form that a model has."""
+"""Cores of several parts: zones of the film with fits of their own, and a network added to a polynomial."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from lens_models import prepared
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.model import load_model
 from neurolens.surrogates.cores import Partitioned, Residual
-from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.specialise import at_wavelength
-from neurolens.surrogates.stored import load_fitted
 from neurolens.surrogates.targets import film_equivalent, targets_of
+
+
+@pytest.fixture(scope="module")
+def zoned() -> LensModel:
+    return fit_model(prepared(), ModelSettings(method="adaptive", terms=16, partitions=3))
+
+
+def rms_deg(model: LensModel) -> float:
+    held = prepared().pairs.held_out
+    out = model.predict(held.inputs).rays
+    return math.degrees(float(((out.dx - held.scene.dx) ** 2 + (out.dy - held.scene.dy) ** 2).mean().sqrt()))
+
+
+def test_zones_lower_the_error(zoned: LensModel) -> None:
+    whole = fit_model(prepared(), ModelSettings(method="adaptive", terms=16))
+    assert isinstance(zoned.core, Partitioned) and len(zoned.core.parts) == 3
+    assert rms_deg(zoned) < 0.8 * rms_deg(whole)
+
+
+def test_zones_keep_the_rotational_symmetry(zoned: LensModel) -> None:
+    rays = prepared().pairs.held_out.inputs.select(slice(0, 500))
+    c, s = math.cos(0.7), math.sin(0.7)
+    turned = FilmRays(
+        c * rays.film_x - s * rays.film_y,
+        s * rays.film_x + c * rays.film_y,
+        rays.film_z,
+        c * rays.pupil_x - s * rays.pupil_y,
+        s * rays.pupil_x + c * rays.pupil_y,
+        rays.wavelength_nm,
+    )
+    a, b = zoned.predict(rays).rays, zoned.predict(turned).rays
+    assert torch.allclose(c * a.dx - s * a.dy, b.dx, atol=1e-12)
+
+
+def test_more_zones_than_rays_can_fill_are_refused() -> None:
+    with pytest.raises(InputError, match="partitions"):
+        fit_model(prepared(), ModelSettings(terms=16, partitions=10_000))
+
 
 SETTINGS = ModelSettings("ols+mlp", terms=12, degree=5, planes=False, units=8, layers=1, steps=60)
 
@@ -46,20 +82,6 @@ def test_it_is_the_sum_of_its_parts(model: LensModel) -> None:
         torch.testing.assert_close(total, one + other, rtol=0, atol=1e-13)
 
 
-def test_the_exported_graph_gives_the_same_rays(model: LensModel, tmp_path) -> None:
-    file = export_onnx(model, tmp_path / "residual.onnx")
-    onnx, inputs = load_model(file), prepared().pairs.held_out.inputs.select(slice(0, 500))
-    columns = [c.numpy().astype(np.float32) for c in inputs.columns()]
-    out = onnx.rays(np.stack(columns[:2]), np.stack(columns[3:5]), columns[5], columns[2])
-    wanted = model.predict(inputs)
-    assert np.array_equal(out.status, wanted.status.numpy())
-    mm = 2e-6 * abs(onnx.card["lens"]["efl_mm"])
-    for k, c in enumerate(wanted.rays):
-        assert np.abs(out.scene_ray[k] - c.numpy()).max() < (mm if k < 3 else 2e-6)
-    assert np.abs(out.transmittance - wanted.transmittance.numpy()).max() < 1e-5
-    assert isinstance(load_fitted(file).core, Residual)
-
-
 def test_one_wavelength_of_it(model: LensModel) -> None:
     inputs = prepared().pairs.held_out.inputs
     inputs = type(inputs)(*inputs.columns()[:5], torch.full_like(inputs.film_x, 550.0))
@@ -73,7 +95,3 @@ def test_zones_and_what_is_refused() -> None:
     assert all(isinstance(part, Residual) for part in zoned.core.parts)
     with pytest.raises(InputError, match="basis"):
         fit_model(prepared(), replace(SETTINGS, basis="raw", degree=3))
-
-
-def test_its_name_is_that_of_a_file() -> None:
-    assert SETTINGS.label == "ols-12-mlp-8x1"
