@@ -89,8 +89,10 @@ def lens_page(name: str, records: Sequence[Record], facts: str) -> str:
     """The table of one lens, group by group."""
     rows = []
     for record in _ordered(records):
-        failed = [f"failed: {_cell(record['failed'])}", *[""] * (len(COLUMNS) - 1)]
-        rows.append([record["method"], *(failed if record["failed"] else (c.cell(record) for c in COLUMNS))])
+        cells = [c.cell(record) for c in COLUMNS] if not record["failed"] else [""] * len(COLUMNS)
+        if record["failed"]:
+            cells[0] = f"failed: {_cell(record['failed'])}"
+        rows.append([record["method"], *cells])
     for exact in _exact(records):
         time = number(exact, "ns_per_ray.min")
         cells = ["–" if c.key != "ns_per_ray.min" or time is None else _digits(time, 3) for c in COLUMNS]
