@@ -47,7 +47,7 @@ LENS = lab.LENSES / "laikin_double_gauss_50.toml"
 FOCAL_MM = 50.0
 BATCHES = (4096, 16384, 65536)
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
-GOAL = 5.0  # times Optiland's rays a second, eager
+GOAL = 5.0  # times Optiland's rays per second, eager
 
 
 def light(lens: Lens, rays: FilmRays, dtype: torch.dtype) -> Rays:

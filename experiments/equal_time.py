@@ -1,4 +1,4 @@
-"""Equal time and equal samples: what each camera's picture is worth after so many seconds, against the exact lens.
+"""Equal time and equal samples: error of each camera's picture after given seconds, against the exact lens.
 
 Renders are kept, one file a render, named by everything that it depends on, so that a run may be resumed.
 """
@@ -35,8 +35,7 @@ from neurolens.base.files import atomic_path
 from neurolens.base.tomlfile import read_toml
 from neurolens.cameras.build import FUSED, Shot, make_camera
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.fusedexact import FusedExactCamera
+from neurolens.cameras.exact import ExactCamera, FusedExactCamera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.evaluate.image import DEFAULT, flip, flip_map
 from neurolens.evaluate.records import plain
@@ -126,7 +125,7 @@ class Shelf:
         return found.rgb, float(found.stats["seconds"])
 
     def warm_up(self) -> None:
-        """A sample a pixel that nobody counts: the first render of a camera loads code and fills caches."""
+        """An untimed sample per pixel: the first render of a camera loads code and fills caches."""
         width, height = self.size
         render(self.scene, self.camera, width=width, height=height, samples=1, threads=1, film=self.film)
 
@@ -154,7 +153,6 @@ def _read(file: Path, shape: tuple[int, ...]) -> tuple[NDArray[np.float32], floa
 
 
 def _source() -> str:
-    """Hash of the code that makes pictures."""
     digest = hashlib.sha256()
     package = Path(neurolens.__file__).parent
     for file in sorted(f for part in _SOURCES for f in (package / part).rglob("*.py")):
@@ -173,7 +171,6 @@ def _scene_bytes(file: Path) -> str:
 
 
 def _strings(value: Any) -> list[str]:
-    """Every string in tables of tables."""
     if isinstance(value, str):
         return [value]
     inner = list(value.values()) if isinstance(value, Mapping) else value if isinstance(value, list) else []
@@ -308,7 +305,7 @@ class Rendered:
 def _render(
     shelves: Mapping[str, Shelf], counts: Counts, threads: int, report: Callable[[float], None]
 ) -> tuple[list[Floats], dict[str, Rendered]]:
-    """The reference's halves, and every camera's renders: the cameras in turn, so that none has the quiet minutes."""
+    """The reference's halves, and every camera's renders; the cameras take turns, so that load affects all equally."""
     jobs = counts.jobs
     total = 2 * counts.reference + len(shelves) * sum(n for n, _ in jobs)
     done, halves = 0, []
@@ -383,7 +380,8 @@ def _levels(own: Rendered, halves: list[Floats], by: Mapping[str, Floats], count
 
 
 def scene_file(name: str, root: Path) -> Path:
-    """The file of a scene of the project by name, or of any by its path; read, so that mistakes show before the work.
+    """The file of a scene of the project by name, or of any by its path; read, so that mistakes are found before the
+    work.
 
     Raises:
         InputError: as `load_scene`.

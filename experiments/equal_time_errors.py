@@ -144,7 +144,6 @@ def _rows(passes: ArrayLike) -> Floats:
 
 
 def _apart(gram: Floats) -> float:
-    """Mean of the products of different passes."""
     count = len(gram)
     return float(gram.sum() - np.trace(gram)) / (count * (count - 1))
 

@@ -1,4 +1,4 @@
-"""`python -m experiments equal-time`, and what it writes: the page, every point as CSV, records, the pictures."""
+"""`python -m experiments equal-time` and its output: the page, every point as CSV, records, the pictures."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from experiments.equal_time import (
     scene_file,
 )
 from experiments.equal_time_errors import Estimate, crossover_s, log_interpolate
-from neurolens.analysis.plot_style import FAINT, INK, heading, new_figure, plain_log_ticks, save, style
+from neurolens.analysis.plot_style import FAINT, INK, drawing, heading, plain_log_ticks
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text
 from neurolens.base.progress import Progress
@@ -45,7 +45,7 @@ _INTRO = """\
 
 `python -m experiments equal-time`: {lens} exact in torch, through surrogates in onnxruntime, both as compiled
 C (fused), and as a thin lens of its focal length and f-number. Against the exact lens with other seeds and {reference}
-samples a pixel, in two halves. Every camera draws the same random numbers, one wavelength a path. Times are the
+samples per pixel, in two halves. Every camera draws the same random numbers, one wavelength per path. Times are the
 render's own seconds (best; median in brackets), {threads} thread{s}, {size} pixels; making a camera, its fit and the
 scene's tables are not in them.
 
@@ -190,7 +190,7 @@ def _crossover_text(result: SceneResult, camera: CameraResult, exact: str) -> st
 
 
 def _time(seconds: float) -> str:
-    """Two figures in a unit that suits, from milliseconds to years."""
+    """Two digits in a suitable unit, from milliseconds to years."""
     if math.isinf(seconds):
         return "never"
     units = ((1e-3, "ms"), (1.0, "s"), (60.0, "min"), (3600.0, "h"), (86400.0, "days"), (31557600.0, "years"))
@@ -256,7 +256,7 @@ def draw(result: SceneResult, folder: Path) -> list[Path]:
         [*(_root_panel(result, measure) for measure in MEASURES), _flip_panel(result)],
         folder / f"{result.name}-error.png",
         f"Error against render time: {where}",
-        f"{size}, {threads}; markers: 1, 2, 4 ... samples a pixel; the reference has {2 * counts.reference}",
+        f"{size}, {threads}; markers: 1, 2, 4 ... samples per pixel; the reference has {2 * counts.reference}",
     )
     total = counts.pass_samples * counts.passes
     shown = {n: c for n, c in result.cameras.items() if not n.startswith("fused")}  # whose pictures are their models'
@@ -346,22 +346,21 @@ class Panel:
 
 
 def error_over_time_plot(panels: Sequence[Panel], path: str | Path, title: str, subtitle: str) -> Path:
-    """Panels side by side, log-log, one line a camera, with the reference's own noise and the biases.
+    """Panels side by side, log-log, one line per camera, with the reference's own noise and the biases.
 
     Raises:
         InputError: nothing to draw.
     """
     if not panels or not any(panel.curves for panel in panels):
         raise InputError("error over time", "panels", "(none)", "at least one panel with a curve")
-    with style():
-        figure = new_figure(3.5 * len(panels), 4.1)
+    with drawing(path, 3.5 * len(panels), 4.1) as figure:
         row = figure.subplots(1, len(panels), squeeze=False)[0]
         handles: dict[str, Any] = {}
         for axes, panel in zip(row, panels, strict=True):
             handles |= _draw(axes, panel)
         heading(figure, title, subtitle)
         figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
-        return save(figure, path)
+    return Path(path)
 
 
 def _draw(axes: Any, panel: Panel) -> dict[str, Any]:
@@ -385,8 +384,7 @@ def _draw(axes: Any, panel: Panel) -> dict[str, Any]:
         if level > low:
             handles[f"bias of {name}"] = axes.axhline(level, color=_colour(name), lw=1.0, ls=":")
     axes.grid(True, which="major")
-    plain_log_ticks(axes.xaxis)
-    plain_log_ticks(axes.yaxis)
+    plain_log_ticks(axes.xaxis, axes.yaxis)
     return handles
 
 
@@ -411,8 +409,7 @@ def film_maps_plot(
         raise InputError("film maps", "maps", "(none)", "at least one map")
     columns = 2 if len(maps) in (2, 4) else min(len(maps), 3)
     rows = -(-len(maps) // columns)
-    with style():
-        figure = new_figure(4.0 * columns, 0.7 + 2.3 * rows)
+    with drawing(path, 4.0 * columns, 0.7 + 2.3 * rows) as figure:
         places = figure.subplots(rows, columns, squeeze=False).ravel()
         across, up = film_mm[0] / 2, film_mm[1] / 2
         for axes, (name, values) in zip(places, maps.items(), strict=False):
@@ -426,7 +423,7 @@ def film_maps_plot(
         for axes in places[len(maps) :]:
             axes.set_axis_off()
         heading(figure, title, subtitle)
-        return save(figure, path)
+    return Path(path)
 
 
 def _colour(name: str) -> str:
@@ -439,10 +436,10 @@ def _colour(name: str) -> str:
 
 ABOUT = """\
 Error over time of the exact lens, a polynomial, a network and a thin lens in three scenes, against a
-converged exact render with other seeds: bias and variance told apart, seconds a sample, from when the
+converged exact render with other seeds: bias and variance told apart, seconds per sample, from when the
 exact lens is ahead, equal time and equal samples, FLIP maps and film-space error maps in micrometres.
 Best and median seconds; the exact lens and the network as compiled C, too.
-Renders are kept in the run folder: a run that was interrupted goes on where it was, and what would give
+Renders are kept in the run folder: an interrupted run resumes, and what would give
 another picture is rendered again. Needs the extra "train" (torch, matplotlib, flip-evaluator) and a C
 compiler. Writes README.md, equal_time.csv, equal_time.json and three pictures a scene (about ten minutes)."""
 

@@ -143,7 +143,7 @@ def _against_reference(case: Case, rays: Rays, fine: Traced, count: int) -> tupl
 
 
 def failures(rows: Sequence[Row]) -> list[str]:
-    """What may never happen, in words: numbers that are none, statuses that differ away from any edge."""
+    """Violations as sentences: numbers that are not finite, statuses that differ away from any edge."""
     found = []
     for r in rows:
         where = f"{r.group}, {r.name}"
@@ -161,12 +161,12 @@ _NOTES = """\
 Largest errors over the rays that pass. float32 is held against float64 on the same rays (rounded to float32 first):
 mm at the last surface, the same over the largest coordinate that occurs, and rad of the direction. A status may differ
 only within the tolerance of an edge, which is the case's own float32 error, or four units in the last place of its
-largest coordinate. float64 is held against 50 decimal digits on a few rays a case. NaN counts every number of every
+largest coordinate. float64 is held against 50 decimal digits on a few rays per case. NaN counts every number of every
 result that is not finite."""
 
 
 def page(rows: Sequence[Row], bad: Sequence[str]) -> str:
-    """The whole page: notes, totals, what failed, and a table a group in Markdown."""
+    """The whole page: notes, totals, what failed, and a table per group in Markdown."""
     rays, within = sum(r.rays for r in rows), sum(r.within for r in rows)
     beyond, nan, exact = (sum(getattr(r, k) for r in rows) for k in ("beyond", "not_finite", "exact_status"))
     totals = (
@@ -185,7 +185,7 @@ def page(rows: Sequence[Row], bad: Sequence[str]) -> str:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """The rows as tables in Markdown, one a group."""
+    """The rows as tables in Markdown, one per group."""
     lines: list[str] = []
     for group in dict.fromkeys(r.group for r in rows):
         cells = []
@@ -257,7 +257,6 @@ def _weights(s: Surface) -> tuple[int, int]:
 
 
 def _shape(s: Surface) -> tuple[Any, Any]:
-    """Curvature at the vertex (without polynomial) and 1 + conic constant."""
     radius = mpf(float(s.radius_mm))
     return (mpf(0) if mp.isinf(radius) else 1 / radius), 1 + mpf(float(s.conic))
 
@@ -314,7 +313,6 @@ def _newton(s: Surface, p: Vector, d: Vector, t: Any) -> Any:
 
 
 def _sag(s: Surface, u: Any) -> Any:
-    """Depth at squared height u."""
     c, k1 = _shape(s)
     r = sqrt(u)
     polynomial = sum((mpf(float(a)) * r**power for power, a in s.asphere), mpf(0))
@@ -360,12 +358,12 @@ Writes extremes.md and extremes.json."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `python -m experiments extremes`."""
-    parser.add_argument("--rays", metavar="N", type=whole(100), default=20000, help="rays a case (default 20000)")
+    parser.add_argument("--rays", metavar="N", type=whole(100), default=20000, help="rays per case (default 20000)")
     lab.add_out(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure every case; 1 where something happened that never may."""
+    """Measure every case; 1 where there are violations."""
     lab.quiet_glasses()
     with Progress(quiet=args.quiet).stage("extremes") as report:
         cases = list(all_cases(lab.LENSES, args.rays))

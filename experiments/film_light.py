@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from neurolens.analysis.plot_style import FIELD_COLOURS, INK, new_figure, save, style
+from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing
 from neurolens.base.errors import NeurolensWarning
 from neurolens.base.files import atomic_write_text
 from neurolens.optics.lensfile import read_lens
@@ -69,8 +69,7 @@ _PIXELS = 360  # across the white card
 
 def film_light_picture(lights: Mapping[str, FilmLight], path: Path) -> Path:
     """Relative illumination and its factors, each over its value on the axis, a column for every lens named."""
-    with style():
-        figure = new_figure(3.3 * len(lights), 3.5)
+    with drawing(path, 3.3 * len(lights), 3.5) as figure:
         columns = figure.subplots(1, len(lights), sharey=True, squeeze=False)[0]
         for axes, (name, light) in zip(columns, lights.items(), strict=True):
             lit = light.irradiance > 0
@@ -83,7 +82,7 @@ def film_light_picture(lights: Mapping[str, FilmLight], path: Path) -> Path:
             axes.grid(axis="y")
         columns[0].set_ylabel("over the axis")
         columns[0].legend(loc="lower left", fontsize=7.8)
-        return save(figure, path)
+    return Path(path)
 
 
 def white_card_picture(light: FilmLight, film_mm: tuple[float, float], title: str, path: Path) -> Path:
@@ -91,8 +90,7 @@ def white_card_picture(light: FilmLight, film_mm: tuple[float, float], title: st
     width, height = film_mm
     y, x = np.mgrid[0 : round(_PIXELS * height / width), 0:_PIXELS]
     radius = np.hypot((x + 0.5) / _PIXELS * width - width / 2, (y + 0.5) / _PIXELS * width - height / 2)
-    with style():
-        figure = new_figure(8.4, 6.6)
+    with drawing(path, 8.4, 6.6) as figure:
         for axes, (way, values) in zip(figure.subplots(2, 2).flat, white_card(light).items(), strict=True):
             picture = np.interp(radius, light.radius_mm, values, right=0)
             shown = axes.imshow(
@@ -113,7 +111,7 @@ def white_card_picture(light: FilmLight, film_mm: tuple[float, float], title: st
         figure.suptitle(f"{title}\n", x=0.01, ha="left", fontweight="bold", fontsize=12)
         curve = "curve: irradiance along +x, 0 at the film's lower edge, 1 at its upper edge"
         figure.text(0.01, 0.945, curve, ha="left", fontsize=9, color=FIELD_COLOURS[3])
-        return save(figure, path)
+    return Path(path)
 
 
 def _profile_on(axes: Any, radius: Any, values: Any, film_mm: tuple[float, float]) -> None:

@@ -35,16 +35,18 @@ from neurolens.evaluate.describe import refractions
 from neurolens.evaluate.experiment import LensChoice
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.speed import Call, Candidate, Race, race
+from neurolens.graph.compiler import FLAGS
+from neurolens.graph.program import Program
+from neurolens.graph.scalars import lower
 from neurolens.optics.prescription import Lens
-from neurolens.optics.traceprogram import exact_program
-from neurolens.programs.compiler import FLAGS
-from neurolens.programs.expressions import Program
+from neurolens.optics.tracegraph import exact_graph
+from neurolens.surrogates.assemble import ALL, RAY_ONLY, Parts
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.source.fused import ALL, RAY_ONLY, Fixed, Parts, fused_program
+from neurolens.surrogates.source import fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 
 WITHIN_UM = 1.0
@@ -117,7 +119,7 @@ def small_enough(prepared: Prepared, choices: Sequence[ModelSettings]) -> tuple[
 def measure(
     case: Case, folder: Path, *, rounds: int, torch_compiled: bool, report: Callable[[float], None] = lambda share: None
 ) -> list[Row]:
-    """Fit, race and hold against the exact tracers; one row a candidate."""
+    """Fit, race and hold against the exact tracers; one row per candidate."""
     lens = case.lens(folder)
     domain = domain_of(lens, film_radius_mm=case.film_radius_mm, focus_m=(math.inf, case.near_m))
     prepared = prepare(make_pairs(lens, domain, PairSettings()))
@@ -164,23 +166,23 @@ def ray_candidate(name: str, file: Path) -> Candidate:
 
 def _add_exact(add: Callable[..., None], lens: Lens, domain: Domain, torch_compiled: bool) -> None:
     for work in ("ray", "whole"):
-        program = exact_program(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=work == "whole")
+        program = lower(exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=work == "whole"))
         add("exact C", work, program_candidate("", program, domain), program)
         if torch_compiled:
             add("exact torch", work, exact_candidates(lens, domain, transmittance=work == "whole")[1])
 
 
-def _forms(model: LensModel) -> list[tuple[str, tuple[LensModel, ...], Fixed]]:
+def _forms(model: LensModel) -> list[tuple[str, tuple[LensModel, ...], Fix]]:
     """Nothing fixed; one wavelength; wavelength, film position and stop."""
     d = model.domain
-    found: list[tuple[str, tuple[LensModel, ...], Fixed]] = [(f"{model.method}, C", (model,), Fixed())]
+    found: list[tuple[str, tuple[LensModel, ...], Fix]] = [(f"{model.method}, C", (model,), Fix())]
     if not model.encoding.w_half:
         return found
     z, stop = d.film_z_mm[0], _STOPPED * d.stop_radius_mm
     one = fixed_models(model, Fix((WAVELENGTH_NM,)))
     every = fixed_models(model, Fix((WAVELENGTH_NM,), z, stop))
-    found.append((f"{model.method}, C, one wavelength", one, Fixed()))
-    found.append((f"{model.method}, C, wavelength, film, stop fixed", every, Fixed(z, stop)))
+    found.append((f"{model.method}, C, one wavelength", one, Fix()))
+    found.append((f"{model.method}, C, wavelength, film, stop fixed", every, Fix((), z, stop)))
     return found
 
 
@@ -191,16 +193,15 @@ def _add_fused(
     models: tuple[LensModel, ...],
     domain: Domain,
     parts: Parts,
-    fixed: Fixed,
+    fixed: Fix,
     known: dict[str, Any],
 ) -> None:
-    candidate = fused_candidate(name, models, domain, parts=parts, fixed=fixed)
+    candidate = fused_candidate(name, models, domain, parts=parts, fix=fixed)
     if candidate is not None:
         add(name, work, candidate, fused_program(models, parts, fixed), **known)
 
 
 def _floor(program: Program) -> dict[str, Any]:
-    """What a ray costs at least: operations and bytes."""
     count = program.count()
     inputs = sum(s.kind == "input" for s in (program.steps[k] for k in program.live()))
     return {
@@ -232,7 +233,8 @@ the front surface, direction and domain guard out. "whole": with stop, rims and 
   surface waits for the one before it (a division and two roots in a row), which costs more than its operations.
 - exact torch: the project's own tracer compiled by torch, rims tested in both kinds of work.
 - onnxruntime, "ray": the part of the exported graph that gives position and direction, without the domain guard.
-- Operations: float operations a ray, a fused multiply-add is one; in brackets, how many are divisions and square roots.
+- Operations: float operations per ray, a fused multiply-add is one; in brackets, how many are divisions and square
+roots.
   A core with two 512-bit pipes does 32 a cycle. Bytes: what a ray reads and writes.
 - Fixed: {wavelength:g} nm; film at the farthest focus, one stop down. These do less: one wavelength is no white light.
 
@@ -260,7 +262,7 @@ def earlier(folder: Path, names: Collection[str]) -> list[Row]:
 
 
 def goals(rows: Sequence[Row]) -> list[lab.Goal]:
-    """What is asked of the fastest model within 1 um, against the rows."""
+    """Goals of the fastest model within 1 um."""
     found = []
 
     for words, ending, work, wanted in (
@@ -340,9 +342,9 @@ def _table(rows: Sequence[Row]) -> str:
 ABOUT = """\
 Fit the smallest polynomial within 1 um RMS and a small network to a few lenses, write them as C, with and
 without what a scene fixes, and race them against the exact trace: written as C by the same means, and
-compiled by torch (a minute a lens more), and against onnxruntime. One thread, float32. Needs a C compiler
-and the extra "train" (torch). Writes fused_speed.md and fused_speed.json; lenses that are not asked for
-keep their rows."""
+compiled by torch (a minute per lens more), and against onnxruntime. One thread, float32. Needs a C compiler
+and the extra "train" (torch). Writes fused_speed.md and fused_speed.json; rows of other lenses
+are kept."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""How often inverse maps arrive: a direct fit with limited Newton steps, beside Newton's method as published.
+"""Convergence of inverse maps: a direct fit with limited Newton steps, beside Newton's method as published.
 
 As published (Hanika and Dachsbacher 2014; Schrade et al. 2016): from the first-order map, undamped, a fixed number of
 steps, with the Jacobian of the polynomial. Both work on the same model, so that only the iteration differs.
@@ -23,21 +23,24 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import whole
 from neurolens.evaluate.experiment import LensChoice
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph
+from neurolens.graph.newton import solve, with_jacobian
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
+from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.inversion.fit import convergence, fit_inverse
-from neurolens.surrogates.inversion.maps import LIMIT, STEPS, TOLERANCE, InverseModel, SceneSystem, StopSystem
-from neurolens.surrogates.inversion.newton import Solved, limited_newton, solve_small
+from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, front_rays, scene_system, stop_system
+from neurolens.surrogates.inverse_fit import convergence, fit_inverse
+from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.threads import pinned_threads
 
 PUBLISHED_STEPS = (3, 5, 10, 20)
-# A residual beyond this (in stop radii; of the front's radius, in radians) has run away, not merely missed.
+# A residual beyond this (in stop radii; of the front's radius, in radians) counts as diverged, not just missed.
 AWAY = 1.0
-# Points a side of the grid of starts that looks for rays which an inverse map says are not there.
+# Points per side of the grid of starts in the search for rays that an inverse map did not find.
 _STARTS = 7
 
 
@@ -103,28 +106,45 @@ def _published(inverse: InverseModel, rays: FilmRays) -> dict[str, Any]:
     passed = forward.status == st.PASSED
     rays = rays.select(passed)
     x, y = forward.stop_x[passed], forward.stop_y[passed]
-    stop = StopSystem(model, rays.film_x, rays.film_y, rays.film_z, x, y, rays.wavelength_nm)
-    scene = SceneSystem(model, Rays(*(c[passed] for c in forward.rays)), rays.film_z, rays.wavelength_nm)
-    return {"stop": _plain(stop, 2), "scene": _plain(scene, 4)}
+    *position, v, _ = front_rays(model, Rays(*(c[passed] for c in forward.rays)), torch.float64)
+    wanted = torch.cat([torch.stack(position) / model.scales.position_mm, v])
+    scene = _plain(scene_system(model), {"wanted": wanted, "wavelength_nm": rays.wavelength_nm[None]})
+    return {"stop": _plain(stop_system(model), _stop_inputs(model, rays, x, y)), "scene": scene}
 
 
-def _plain(system: StopSystem | SceneSystem, unknowns: int) -> dict[str, Any]:
+def _stop_inputs(model: LensModel, rays: FilmRays, x: Tensor, y: Tensor) -> dict[str, Tensor]:
+    return {
+        "film": torch.stack([rays.film_x, rays.film_y]),
+        "wanted": torch.stack([x, y]) / model.scales.stop_mm,
+        "wavelength_nm": rays.wavelength_nm[None],
+        "film_z_mm": rays.film_z[None],
+    }
+
+
+def _plain(system: Graph, given: dict[str, Tensor]) -> dict[str, Any]:
+    """Newton's method without limits; the system's inputs but the unknowns are given."""
+    both, step = with_jacobian(system), Graph()
+    unknowns = both.outputs["residual"].rows
+    residual, *columns = (step.input(name, value.rows) for name, value in both.outputs.items())
+    step.outputs["step"] = solve(columns, residual)
+    x = torch.zeros((unknowns, given["wavelength_nm"].shape[1]), dtype=torch.float64)
     # The first-order map's own solution is the start: linear, it takes one step from the axis.
-    x = torch.zeros((unknowns, *system.film_z.shape), dtype=torch.float64)
-    x = x - solve_small(system.on_axis(), system(x)[0])
+    axis = {name: 0 * value if name in ("film", "wanted") else value for name, value in given.items()}
+    jacobian = evaluate(both, {"unknown": x, **axis})
+    residual_there = evaluate(system, {"unknown": x, **given})
+    x = x - evaluate(step, jacobian | residual_there)["step"]
     found: dict[str, Any] = {"missed": {}, "away": {}}
-    for step in range(1, max(PUBLISHED_STEPS) + 1):
-        residual, jacobian = system(x)
-        x = x - solve_small(jacobian, residual)
-        if step in PUBLISHED_STEPS:
-            size = system(x)[0].norm(dim=0)
-            found["missed"][str(step)] = float((~(size < TOLERANCE)).double().mean())  # NaN is missed
-            found["away"][str(step)] = float((~(size < AWAY)).double().mean())
+    for count in range(1, max(PUBLISHED_STEPS) + 1):
+        x = x - evaluate(step, evaluate(both, {"unknown": x, **given}))["step"]
+        if count in PUBLISHED_STEPS:
+            size = evaluate(system, {"unknown": x, **given})["residual"].norm(dim=0)
+            found["missed"][str(count)] = float((~(size < TOLERANCE)).double().mean())  # NaN is missed
+            found["away"][str(count)] = float((~(size < AWAY)).double().mean())
     return found
 
 
 def _uniform(inverse: InverseModel, count: int) -> dict[str, Any]:
-    """Stop points uniform over the stop, for film points uniform over the film: what becomes of them.
+    """Outcome for stop points uniform over the stop and film points uniform over the film.
 
     Returns shares: passed, blocked, outside (the ray leaves the domain), unsolved; `missed`: unsolved although a ray
     that passes is found from one of a grid of starts; and of the solved ones what the published iteration misses, by
@@ -139,7 +159,7 @@ def _uniform(inverse: InverseModel, count: int) -> dict[str, Any]:
     unsolved = status == st.NO_SOLUTION
     part = rays.select(~unsolved)
     there = x[~unsolved], y[~unsolved]
-    plain = _plain(StopSystem(inverse.model, part.film_x, part.film_y, part.film_z, *there, part.wavelength_nm), 2)
+    plain = _plain(stop_system(inverse.model), _stop_inputs(inverse.model, part, *there))
     some = unsolved.nonzero()[:500, 0]
     lost = _reachable(inverse, rays.select(some), x[some], y[some])
     share = float(lost.double().mean()) * float(unsolved.double().mean()) if len(some) else 0.0
@@ -156,14 +176,13 @@ def _uniform(inverse: InverseModel, count: int) -> dict[str, Any]:
 
 def _reachable(inverse: InverseModel, rays: FilmRays, x: Tensor, y: Tensor) -> Tensor:
     """[N] bool: whether a passing ray goes from each film point through each stop point, from many starts."""
-    system = StopSystem(inverse.model, rays.film_x, rays.film_y, rays.film_z, x, y, rays.wavelength_nm)
+    asked = (rays.film_x, rays.film_y, rays.film_z, x, y, rays.wavelength_nm)
     side = torch.linspace(-0.9, 0.9, _STARTS, dtype=torch.float64)
     found = torch.zeros(len(rays), dtype=torch.bool)
     for a in side:
         for b in side:
             start = torch.stack([a.expand(len(rays)), b.expand(len(rays))])
-            solved: Solved = limited_newton(system, start, 15, LIMIT)
-            found |= system.result(solved, None).prediction.status == st.PASSED
+            found |= inverse.through_stop(*asked, steps=15, start=start).prediction.status == st.PASSED
     return found
 
 
@@ -212,8 +231,8 @@ that have a ray, those that it does not find."""
 
 
 _RAW = """\
-The same where the model is as published: raw monomials, 20 coefficients a component, orthogonal matching pursuit.
-Its polynomials are wilder off the data, and full steps from the first-order map leave the data."""
+The same where the model is as published: raw monomials, 20 coefficients per component, orthogonal matching pursuit.
+Its polynomials vary more off the data, and full steps from the first-order map leave the data."""
 
 
 def _raw_table(done: Sequence[dict[str, Any]]) -> list[str]:
@@ -255,8 +274,8 @@ Writes inverse.md and inverse.json."""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `python -m experiments inverse`."""
     lab.add_only(parser)
-    parser.add_argument("--rays", metavar="N", type=whole(1000), default=100_000, help="rays a lens (default: 100000)")
-    parser.add_argument("--raw", action="store_true", help="invert a model of raw monomials too (half a minute a lens)")
+    parser.add_argument("--rays", metavar="N", type=whole(1000), default=100_000, help="per lens (default: 100000)")
+    parser.add_argument("--raw", action="store_true", help="also invert a model of raw monomials (30 s per lens)")
     parser.add_argument("--again", action="store_true", help="measure the chosen lenses again")
     lab.add_out(parser)
 

@@ -1,4 +1,4 @@
-"""What the measurements share: folders, arguments, the machine, tables and goals, files written whole."""
+"""Shared by the measurements: folders, arguments, the machine, tables and goals, atomic files."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
+from neurolens.evaluate.records import markdown_table
 
 ROOT = Path(__file__).parents[1]
 LENSES, SCENES, MODELS = ROOT / "lenses", ROOT / "experiments" / "scenes", ROOT / "models"
@@ -37,12 +38,12 @@ def add_only(parser: argparse.ArgumentParser) -> None:
 
 
 def quiet_glasses() -> None:
-    """No warning of glasses of unknown dispersion: it changes nothing here."""
+    """Ignore warnings of glasses of unknown dispersion, which do not matter here."""
     warnings.simplefilter("ignore", NeurolensWarning)
 
 
 def write_results(folder: Path, name: str, page: str, data: Any) -> None:
-    """Write NAME.md and NAME.json, each whole or not at all."""
+    """Write NAME.md and NAME.json, each atomically."""
     folder.mkdir(parents=True, exist_ok=True)
     atomic_write_text(folder / f"{name}.md", page)
     atomic_write_text(folder / f"{name}.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
@@ -67,14 +68,12 @@ def kept_rows(path: Path, listed: str, named: str, maker: str) -> dict[str, dict
 
 def table(header: str | Sequence[str], rows: Iterable[Sequence[Any]], missing: str = "") -> str:
     """A table in Markdown; a header in one string is cut at "|", `missing` stands for cells that are None."""
-    heads = header.split("|") if isinstance(header, str) else list(header)
-    lines = [heads, ["---"] * len(heads), *([missing if c is None else str(c) for c in row] for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join(markdown_table(header.split("|") if isinstance(header, str) else header, rows, missing))
 
 
 @dataclass(frozen=True)
 class Goal:
-    """A figure that is asked for; `worst` names the case that decides, where several are covered."""
+    """A goal for a figure; `worst` names the deciding case, where several are covered."""
 
     text: str
     wanted: float
@@ -99,12 +98,9 @@ class Goal:
 
 def goal_table(heading: str, goals: Iterable[Goal]) -> str:
     """Goals as a table, and whether they are reached."""
-    rows = ([g.text, f"{g.bound} {g.wanted:g}", _three(g.measured), g.verdict] for g in goals)
+    measured = ((g, "" if g.measured is None else f"{g.measured:.3g}") for g in goals)
+    rows = ([g.text, f"{g.bound} {g.wanted:g}", value, g.verdict] for g, value in measured)
     return table([heading, "wanted", "measured", ""], rows)
-
-
-def _three(value: float | None) -> str:
-    return "" if value is None else f"{value:.3g}"
 
 
 def chosen(items: Sequence[T], name: Callable[[T], str], only: str, what: str) -> list[T]:
@@ -156,7 +152,7 @@ class Unmeasured(NeurolensError):
 
 
 def in_child(function: Callable[..., dict[str, Any]], *args: str | float) -> dict[str, Any]:
-    """What a function of a module of this folder returns for plain arguments, called in a process of its own.
+    """Result of a function of a module of this folder for plain arguments, called in a new process.
 
     Raises:
         Unmeasured: the process failed.
@@ -172,7 +168,7 @@ def in_child(function: Callable[..., dict[str, Any]], *args: str | float) -> dic
 
 
 def memory_growth(work: Callable[[], T]) -> tuple[T, float]:
-    """What some work returns, and by how many bytes the highest resident memory meanwhile exceeds that before.
+    """Result of `work`, and by how many bytes the highest resident memory meanwhile exceeds that before.
 
     Raises:
         OSError: no /proc (other than Linux).

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import functools
-import hashlib
 import json
 import os
 import sys
@@ -25,7 +24,7 @@ from experiments.promises import read_index
 from neurolens import __version__
 from neurolens.base.config import read_config
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.base.files import atomic_path, atomic_write_text
+from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of, sha256_of
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import exact_candidates, model_candidate
@@ -91,7 +90,7 @@ class WholeFolder:
 
 @dataclass(frozen=True)
 class Library:
-    """All entries, the ray pairs of each, and whether the compiled exact tracer is timed (half a minute a lens)."""
+    """All entries, the ray pairs of each, and whether the compiled exact tracer is timed (half a minute per lens)."""
 
     entry: tuple[Entry, ...] = ()
     lenses: WholeFolder | None = None
@@ -138,7 +137,7 @@ def chosen(library: Library, names: Sequence[str]) -> tuple[Entry, ...]:
 _HEAD = """# Models that ship
 
 Made by `python -m experiments models` from experiments/models.toml: of every lens of lenses/ the best polynomial of at most
-64 coefficients a vector output and the best network of two layers of 16 units, each fitted within half a minute,
+64 coefficients per vector output and the best network of two layers of 16 units, each fitted within half a minute,
 over the whole lit film, full aperture, focus from infinity to near and all wavelengths for which the glasses are known;
 of a few lenses also faster ones. Errors on held-out rays (`neurolens.evaluate.rays`), micrometres at an image radius of
 21.6 mm; every card was checked on fresh rays. Times on one core in onnxruntime, with stop, rims and transmittance;
@@ -202,10 +201,10 @@ _KEPT = tuple(
 def make_models(
     library: Library, entries: Sequence[Entry], out: Path, progress: Progress, *, again: bool = False
 ) -> list[str]:
-    """Make what is missing of some entries; returns in words what failed or does not hold.
+    """Make missing models of some entries; returns failures and promises that do not hold, as sentences.
 
-    The index is whole at any time: rows are replaced one entry at a time, and rows of entries that the library no
-    longer has go when all of it was asked for and is done.
+    The index is complete at any time: rows are replaced one entry at a time, and rows of entries that the library no
+    longer has are removed once the whole library is done.
     """
     known, left_out = _known(out)
     todo = [e for e in entries if again or not _stands(e, library.pairs, known, out)]
@@ -240,7 +239,7 @@ def make_models(
 
 
 def _known(out: Path) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """Rows and what was left out of an index that is there; nothing of one that cannot be read, which is replaced."""
+    """Rows and left-out entries of an existing index; empty for an unreadable one, which is replaced."""
     try:
         rows = [row for row in read_index(out) if row.keys() >= {*_KEPT, "ns_per_ray", "speedup_over_compiled"}]
         left_out = json.loads((out / "index.json").read_text(encoding="utf-8")).get("left_out", {})
@@ -252,7 +251,7 @@ def _known(out: Path) -> tuple[list[dict[str, Any]], dict[str, str]]:
 
 
 def _ordered(rows: Sequence[dict[str, Any]], library: Library) -> list[dict[str, Any]]:
-    """In the order of the list; what it does not name last."""
+    """In the order of the list, others last."""
     place = {entry.state: i for i, entry in enumerate(library.entry)}
     return sorted(rows, key=lambda row: place.get(row["entry"], len(place)))
 
@@ -269,23 +268,19 @@ def fingerprint(entry: Entry, pairs: PairSettings) -> str:
     state = [*glass, c.efl_mm, c.configuration, c.f_number, c.zoom, c.focusing]
     settings = [asdict(m) for m in entry.models]
     asked = [__version__, state, asdict(entry.domain), settings, entry.best, asdict(pairs)]
-    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+    return fingerprint_of(asked)
 
 
 def _stands(entry: Entry, pairs: PairSettings, known: Sequence[dict[str, Any]], out: Path) -> bool:
-    """Whether the models of an entry are there as they were written, by the same settings and version."""
+    """Whether the models of an entry exist unchanged, made by the same settings and version."""
     mine = [row for row in known if row["entry"] == entry.state]
     try:
         mark = fingerprint(entry, pairs)
         return bool(mine) and all(
-            r.get("fingerprint") == mark and r["sha256"] == _sha256(out / r["file"]) for r in mine
+            r.get("fingerprint") == mark and r["sha256"] == sha256_of(out / r["file"]) for r in mine
         )
     except (NeurolensError, OSError):
         return False
-
-
-def _sha256(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def make_entry(entry: Entry, library: Library, out: Path, progress: Progress) -> list[dict[str, Any]]:
@@ -350,7 +345,7 @@ def _row(entry: Entry, lens: Lens, domain: Domain, m: Measured) -> dict[str, Any
     scaled = {f"{k}_at_21_6": None if m.record.get(k) is None else scale * m.record[k] for k in ("rms_um", "p99_um")}
     return {
         "file": entry.file(m.settings),
-        "sha256": _sha256(m.file),
+        "sha256": sha256_of(m.file),
         "lens": lens.name,
         "configuration": entry.lens.configuration,
         "efl_mm": entry.lens.efl_mm,
@@ -395,7 +390,7 @@ def make_state_entry(
             rows.append(
                 {
                     "file": name,
-                    "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+                    "sha256": sha256_of(file),
                     "lens": space.lens.name,
                     "configuration": entry.lens.configuration,
                     "efl_mm": None,
@@ -418,8 +413,8 @@ def make_state_entry(
 
 ABOUT = """\
 Fit, check on fresh rays and time the models that experiments/models.toml lists, and write them with
-index.json and README.md. Models that are there, made by the same settings and version, are kept: a
-run that was interrupted goes on where it stopped.
+index.json and README.md. Existing models of the same settings and version are kept: an
+interrupted run resumes where it stopped.
 Exit code 1 where a lens could not be done or a card does not hold."""
 
 

@@ -48,7 +48,7 @@ VARIANTS = ("scalar_rgb", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_spectral")
 
 @dataclass(frozen=True)
 class Settings:
-    """What all renderers do: a picture of size x size pixels, samples a pixel, threads, repeats."""
+    """What all renderers do: a picture of size x size pixels, samples per pixel, threads, repeats."""
 
     size: int = 256
     samples: int = 16
@@ -343,8 +343,8 @@ def page(found: Found) -> str:
     if found.scenes:
         parts += [
             "## Scenes, and where the time goes",
-            "Paths per second through a thin lens, four wavelengths a path, the scene's own depth; beside it the share "
-            "of the time by what the code is for (profile of one worker).",
+            "Paths per second through a thin lens, four wavelengths per path, the scene's own depth; beside it the "
+            "share of the time by what the code is for (profile of one worker).",
             _scene_table(found.scenes),
         ]
     if found.memory:
@@ -397,7 +397,7 @@ def _memory_text(rows: list[dict[str, Any]]) -> str:
     rest = large["growth_mb"] - each * _pixels(large) * 1e-6
     return (
         "Highest resident memory of one worker while it renders, less that before. It grows by "
-        f"{each:.0f} bytes a pixel, the film; the paths under way take {rest:.0f} MB whatever the picture's size and "
+        f"{each:.0f} bytes per pixel, the film; the paths under way take {rest:.0f} MB whatever the picture's size and "
         "samples."
     )
 

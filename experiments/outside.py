@@ -1,4 +1,4 @@
-"""Random numbers through an exported model: what lies outside its domain must say so, and what passes must be a ray."""
+"""Random inputs to an exported model: outside its domain the status must say so, and what passes must be a ray."""
 
 from __future__ import annotations
 

@@ -37,8 +37,8 @@ class Outcome:
     """Rows of the table, and what failed.
 
     Attributes:
-        rows: one a candidate, with units in the keys.
-        missed: promises that were not kept, in words.
+        rows: one per candidate, with units in the keys.
+        missed: promises that were not kept, as sentences.
         checked, unchecked: promises held against a measurement, and those that could not be.
         floors: of the tracer and the renderer.
     """
@@ -108,9 +108,9 @@ def bench_models(root: Path, folder: Path, only: str, threads: int, rounds: int,
 
 
 def hold_to_promises(rows: Sequence[dict[str, Any]], timed: Race, outcome: Outcome) -> None:
-    """Add to `outcome` what became of each row's `promised_speedup` over the compiled exact tracer.
+    """Add to `outcome` the result for each row's `promised_speedup` over the compiled exact tracer.
 
-    The larger of the two ratios counts (by minima, median within rounds): a busy machine spoils one of them at a time.
+    The larger of the two ratios counts (by minima, median within rounds): a busy machine affects one of them at a time.
     """
     for row in rows:
         promised = row.get("promised_speedup")
@@ -206,7 +206,7 @@ COMPILED, EAGER = "exact compiled", "exact eager"
 
 
 def table_rows(state: str, timed: Race) -> list[dict[str, Any]]:
-    """One row a candidate of a race.
+    """One row per candidate of a race.
 
     Returns: tables of lens (`state`), name, ns_per_ray, speedup_over_compiled and speedup_over_eager ({"min", "median"}
         as of `Race.speedup`; None where that tracer did not run), reason where unavailable, load of the machine.

@@ -1,4 +1,4 @@
-"""What share of the rays that a pupil sends pass the lens, method by method, beside the figures of the theses."""
+"""Share of the rays from a pupil that pass the lens, by method, beside the figures of the theses."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ def measure(case: Case, folder: Path, samples: int = SAMPLES) -> Passage:
 
 def true_irradiance(camera: ExactCamera, samples: int) -> float:
     """Mean irradiance of the lit film through an axial disc 1.3 times that of all rays found on a grid, with four times
-    the samples: what is known of the lens's pupil plays no part in it."""
+    the samples: independent of what is known of the lens's pupil."""
     lens, radius = camera.lens, camera.film.outline.film_radius_mm
     disc = known.hull_disc(lens, radius)
     wide = replace(disc, along=1.3 * disc.along, across=1.3 * disc.across)
@@ -245,7 +245,6 @@ def _irradiance(camera: ExactCamera, pupil: Any, film: Any, square: Any, wavelen
 
 
 def _nanoseconds(sample: SampleFunction, film: Any, square: Any, wavelength: Any, batch: int = 16384) -> float:
-    """The least of several times of a sample in a batch."""
     part = slice(0, batch)
     film, square, wavelength = (np.ascontiguousarray(a[..., part]) for a in (film, square, wavelength))
     least = math.inf
@@ -257,7 +256,6 @@ def _nanoseconds(sample: SampleFunction, film: Any, square: Any, wavelength: Any
 
 
 def _profile(radius: Any, passed: Any, end: float, bins: int = 24) -> NDArray[np.float64]:
-    """Share that passes in equal intervals of the film radius."""
     place = np.minimum((radius / end * bins).astype(int), bins - 1)
     count = np.bincount(place, minlength=bins)
     return np.bincount(place, weights=passed, minlength=bins) / np.maximum(count, 1)
@@ -281,7 +279,7 @@ _INTRO = """\
 
 `python -m experiments pupils`
 
-{width:g} x {height:g} mm film, focus at infinity, 400 to 700 nm, {samples} rays a method.
+{width:g} x {height:g} mm film, focus at infinity, 400 to 700 nm, {samples} rays per method.
 Rates are percent of the rays sent from lit film points; the dark share of the film costs nothing and stands apart.
 In brackets what the theses say of their lens. *Light* is the irradiance found through the pupil over that found
 through a disc that is surely wide enough, in percent: below 100 the pupil is too small (its noise is about 0.2).
@@ -289,7 +287,7 @@ through a disc that is surely wide enough, in percent: below 100 the pupil is to
 """
 _METHODS = """\
 rear rim: its disc, Steinert's and Willi's global pupil. exit pupil: the paraxial one at this stop. Wu: one disc by a
-search in two steps. pixel disc, ellipse: about 128 probe rays a pixel (Steinert). radial boxes: pbrt's bounds, 50
+search in two steps. pixel disc, ellipse: about 128 probe rays per pixel (Steinert). radial boxes: pbrt's bounds, 50
 intervals of the film radius, 2000 samples each; radial ellipses: the ellipses inside them. interpolated boxes: those of
 this project before, between 33 film radii. outlines (ours): `neurolens.cameras.pupil_outline`.
 """
@@ -455,7 +453,7 @@ Writes passage.md, passage.json and passage.png."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `python -m experiments pupils`."""
-    parser.add_argument("--rays", metavar="N", type=whole(1000), default=2**17, help="rays a method (default 131072)")
+    parser.add_argument("--rays", metavar="N", type=whole(1000), default=2**17, help="rays per method (default 131072)")
     lab.add_only(parser)
     lab.add_out(parser)
 

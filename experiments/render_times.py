@@ -1,8 +1,8 @@
 """Render time by camera and scene: Willi's Tables 6.2 and 6.3, with surrogates beside the lenses.
 
-All cameras see the same 20 degrees at f/4, focused at 5 m: the film grows with the focal length. One wavelength a path
-for all, for ideal cameras could share a path between four. Renders run in turn, camera after camera, in one process on
-one thread, and the whole round again; a figure is the best of the rounds, ratios are of one run.
+All cameras see the same 20 degrees at f/4, focused at 5 m: the film grows with the focal length. One wavelength per
+path for all, for ideal cameras could share a path between four. Renders run in turn, camera after camera, in one
+process on one thread, and the whole round again; a figure is the best of the rounds, ratios are of one run.
 
 Source of the tables: Willi 2021 (multi-lens cameras in appleseed).
 """
@@ -53,7 +53,7 @@ _ALONE_ROUNDS, _SLOW_S = 15, 0.1
 
 @dataclass(frozen=True)
 class Size:
-    """How much is rendered: pixels, samples a pixel, rounds."""
+    """How much is rendered: pixels, samples per pixel, rounds."""
 
     width: int = 128
     height: int = 72

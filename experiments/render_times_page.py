@@ -36,7 +36,7 @@ from neurolens.base.progress import Progress
 
 ABOVE_THIN, MOVES, PER_REFRACTION = 0.05, 0.30, 0.10  # the goals, as shares
 _NOTES = """\
-Every camera sees the same 20 degrees at f/4, focused at 5 m, one wavelength a path, {width} x {height} pixels,
+Every camera sees the same 20 degrees at f/4, focused at 5 m, one wavelength per path, {width} x {height} pixels,
 {samples} samples, one thread, {rounds} rounds of all cameras in turn ({more} times as many in the cheap scene);
 seconds are the best round (the median in brackets), what differentials add is the median of the rounds' ratios.
 `cheap` is a textured wall and one bounce ({cheap}.toml), `middle` small lights and three ({middle}.toml), `dear`
@@ -150,7 +150,7 @@ def _percent(share: float | None) -> str | None:
 
 
 def _scene_table(found: Found, scene: str) -> str:
-    """One row a lens, one column a kind: seconds, overhead a refraction, share of the camera."""
+    """One row per lens, one column per kind: seconds, overhead a refraction, share of the camera."""
     kinds = (TORCH, EXACT_C, *GRAPHS, *FUSED_MODELS)
     rows = []
     for s in found.subjects:
@@ -186,7 +186,7 @@ def _camera_table(found: Found) -> str:
         known += [_percent(s.moves_error), passed, made]
         rows.append(known)
     head = (
-        "camera|refractions|ns a ray, alone|with differentials|ns a ray in the cheap render|with differentials|"
+        "camera|refractions|ns per ray, alone|with differentials|ns per ray in the cheap render|with differentials|"
         "differentials add|their error|rays that pass|made in s"
     )
     missing = [f"{s.name}: {s.reason}." for s in found.subjects if s.reason]

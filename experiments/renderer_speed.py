@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.thin import ThinLens
+from neurolens.cameras.ideal import ThinLens
 from neurolens.commands.arguments import whole
 from neurolens.render.mesh import EmbreeMesh, Mesh
 from neurolens.render.primitives import Primitive, Rays
@@ -34,8 +34,8 @@ def measure(
     """Speed of a scene file at its own picture size, through a thin lens with the scene's focus and aperture.
 
     Returns:
-        mpaths_per_s of the fastest and of the median render, their seconds, threads, depth, lanes (wavelengths a path)
-        and paths a render.
+        mpaths_per_s of the fastest and of the median render, their seconds, threads, depth, lanes (wavelengths per
+        path) and paths a render.
 
     Raises:
         InputError: a scene that cannot be read, a count below 1.
@@ -111,7 +111,7 @@ def _rays_around(vertices: NDArray[np.float64]) -> Rays:
 
 ABOUT = """\
 Paths per second of the renderer through a thin lens with the scene's focus and aperture, fastest and
-median of the repeats; with --meshes, instead, nanoseconds a ray of each mesh of the scene."""
+median of the repeats; with --meshes, instead, nanoseconds per ray of each mesh of the scene."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -126,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the speeds."""
     if args.meshes:
         for row in measure_meshes(args.scene, args.repeats):
-            line = f"{row['triangles']} triangles, {row['hit']:.0%} of rays hit: tree {row['tree']:.0f} ns a ray"
+            line = f"{row['triangles']} triangles, {row['hit']:.0%} of rays hit: tree {row['tree']:.0f} ns per ray"
             if "embree" in row:
                 line += f", Embree {row['embree']:.0f} ns, {row['tree'] / row['embree']:.1f} times as fast"
             print(line if "embree" in row else f"{line} (Embree is not installed: pip install neurolens[embree])")

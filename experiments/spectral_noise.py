@@ -96,7 +96,7 @@ def main() -> None:
         "# Noise of the ways to sample wavelengths",
         "",
         f"`python experiments/spectral_noise.py --seeds {args.seeds} --samples {args.samples}`. The last four columns "
-        "say how many times less the variance is than with one uniform wavelength a path.",
+        "say how many times less the variance is than with one uniform wavelength per path.",
         "",
         f"| {header} | {gains} |",
         "|" + "---|" * 10,

@@ -130,7 +130,7 @@ def time_lens(
     dtypes: Sequence[torch.dtype] = DTYPES,
     report: Callable[[float], None] = lambda share: None,
 ) -> list[dict[str, Any]]:
-    """Race the tracer on one lens, and beside it on one with aspheres, a race a thread count, compiled once.
+    """Race the tracer on one lens, and beside it on one with aspheres, a race per thread count, compiled once.
 
     Returns: rows with units in their keys.
 
@@ -179,7 +179,7 @@ def _row(name: str, lens: Lens, timed: Race, passing: float) -> dict[str, Any]:
 
 
 def goals(rows: Sequence[dict[str, Any]]) -> list[lab.Goal]:
-    """What the tracer is meant to reach, against the rows of the main lens on one thread in float32."""
+    """Goals of the tracer, for the main lens on one thread in float32."""
     main = [r for r in rows if r["threads"] == 1 and r["refractions"] == MAIN and r["dtype"] == "float32"]
     found = []
     for kind, wanted in (("eager", 10.0), ("compiled", 30.0)):
@@ -235,7 +235,7 @@ class Found:
 
     Attributes:
         rows: of `time_lens`. memory: of `memory_of`.
-        missing: lenses without a file, and what could not be measured, in words.
+        missing: lenses without a file, and what could not be measured, as sentences.
     """
 
     rounds: int
@@ -276,7 +276,7 @@ def _conditions(found: Found) -> str:
 
 
 def speed_table(rows: Sequence[dict[str, Any]]) -> str:
-    """One line a lens and thread count; Mray/s by the best time (by the median)."""
+    """One line per lens and thread count; Mray/s by the best time (by the median)."""
     kinds = [(kind, dtype) for dtype in ("float32", "float64") for kind in ("eager", "compiled")]
     kinds = [k for k in kinds if any((r["kind"], r["dtype"]) == k for r in rows)]
     columns = ["lens", "refractions", "aspheres", "cylinders", "threads", *(f"{k} {d}, Mray/s" for k, d in kinds), ""]

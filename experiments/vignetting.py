@@ -1,6 +1,6 @@
 """Vignetting of the library's surrogates: false passes and blocks at several openings, and relative illumination.
 
-One fit a lens and domain serves every opening. The exact lens closed by some stops, or with blades, passes what it
+One fit per lens and domain serves every opening. The exact lens closed by some stops, or with blades, passes what it
 passes open and what crosses the stop within the smaller opening; so does the model, by its own stop crossing, as
 cameras test it outside the graph.
 """
@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from experiments import lab
-from neurolens.analysis.plot_style import FIELD_COLOURS, INK, new_figure, save, style
+from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.progress import Progress
@@ -136,12 +136,12 @@ def measure_all(
 _INTRO = """\
 # Vignetting of surrogates
 
-`python -m experiments vignetting`: orthogonal least squares, 64 coefficients a vector, one fit a lens and domain. False
-passes over the rays that the model passes / false blocks over those that the exact lens passes, in percent, of rays
-uniform over the film and over the bounding disc of passing rays enlarged by 5%; closed by two and four stops, and by
-two with six straight blades. *Light*: largest difference of the relative illumination from the exact lens's, in percent
-of the exact value on the axis. *Passing*: share of the disc's rays that pass. *Terms*: monomials computed for all
-outputs.
+`python -m experiments vignetting`: orthogonal least squares, 64 coefficients per vector, one fit per lens and domain.
+False passes over the rays that the model passes / false blocks over those that the exact lens passes, in percent, of
+rays uniform over the film and over the bounding disc of passing rays enlarged by 5%; closed by two and four stops, and
+by two with six straight blades. *Light*: largest difference of the relative illumination from the exact lens's, in
+percent of the exact value on the axis. *Passing*: share of the disc's rays that pass. *Terms*: monomials computed for
+all outputs.
 """
 _ABOUT = {
     "infinity": "Focused at infinity, 400-700 nm",
@@ -195,9 +195,8 @@ _SHOWN = ("full", "6 blades")
 
 
 def cats_eyes(models: Sequence[LensModel], path: Path) -> Path:
-    """Draw one row a model: exact passing pupils filled, the model's outlined, open and with blades two stops down."""
-    with style():
-        figure = new_figure(2.1 * len(_RADII), 2.2 * len(models) + 0.5)
+    """Draw a row per model: exact passing pupils filled, the model's outlined, open and with blades two stops down."""
+    with drawing(path, 2.1 * len(_RADII), 2.2 * len(models) + 0.5) as figure:
         grid = figure.subplots(len(models), len(_RADII), squeeze=False)
         for axes_row, model in zip(grid, models, strict=True):
             for axes, share in zip(axes_row, _RADII, strict=True):
@@ -207,7 +206,7 @@ def cats_eyes(models: Sequence[LensModel], path: Path) -> Path:
         figure.suptitle(
             "Passing pupil by film radius: exact (filled), model (outline); open, and 6 blades 2 stops down", fontsize=9
         )
-        return save(figure, path)
+    return Path(path)
 
 
 def _draw(axes: Any, model: LensModel, share: float) -> None:

@@ -1,6 +1,6 @@
 """The benchmark of models of many states: every zoom of the library over its whole range, and internal focus.
 
-One model a case, measured at random states against the exact lens, beside models that were each fitted to one state.
+One model per case, measured at random states against the exact lens, beside models that were each fitted to one state.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from typing import Any
 
 from experiments import lab
 from neurolens import __version__
-from neurolens.analysis.plot_style import FIELD_COLOURS, INK, new_figure, save, style
-from neurolens.axes import Axis
+from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress, Report
 from neurolens.commands.arguments import whole
 from neurolens.evaluate.experiment import near_limit_m, wavelengths_nm
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.train_states import AXIS_LABELS, error_axes, error_line, fit_and_measure_states
+from neurolens.modelfile.axes import Axis
 from neurolens.optics.lensfile import read_lens
+from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.states.fit import StateSettings
-from neurolens.surrogates.states.space import StateSpace, axes_of
-from neurolens.surrogates.threads import pinned_threads
+from neurolens.surrogates.states import StateSpace, axes_of
+from neurolens.surrogates.states_fit import StateSettings
 
 # Coefficients per vector, rays of a node, rays of a single fit's test.
 TERMS, RAYS, TESTS = 64, 15_000, 8_000
@@ -130,10 +130,11 @@ median of {states} random states, rays that no fit saw, micrometres on the film;
 *One state*: median of models of as many coefficients that were each fitted to one state.
 Made by `python -m experiments zoom`.
 
-| model | state | nodes | RMS um, median | worst | at 21.6 mm | p99 worst | direction deg, worst | position um, worst \
-| transmittance, worst | false pass %, worst | false block %, worst | one state, RMS um | kB | fit s |
-|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|
 """
+_COLUMNS = (
+    "model|state|nodes|RMS um, median|worst|at 21.6 mm|p99 worst|direction deg, worst|position um, worst|"
+    "transmittance, worst|false pass %, worst|false block %, worst|one state, RMS um|kB|fit s"
+)
 
 
 def page(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -163,9 +164,13 @@ def page(rows: Sequence[Mapping[str, Any]]) -> str:
             f"{r['bytes'] / 1000:.0f}",
             f"{r['fit_s']:.0f}",
         ]
-        lines.append("| " + " | ".join(cells) + " |")
+        lines.append(cells)
     states = max((len(r["states"]) for r in rows), default=0)
-    return _HEAD.format(terms=TERMS, states=states) + "\n".join(lines) + "\n\n![error over the state](zoom.png)\n"
+    return (
+        _HEAD.format(terms=TERMS, states=states)
+        + lab.table(_COLUMNS, lines)
+        + "\n\n![error over the state](zoom.png)\n"
+    )
 
 
 Panel = tuple[str, Axis, Sequence[Mapping[str, Any]], Sequence[Mapping[str, Any]]]
@@ -179,9 +184,8 @@ def panels_plot(panels: Sequence[Panel], path: str | Path) -> Path:
         path: PNG, PDF or SVG to write.
     """
     columns = 2 if len(panels) > 1 else 1
-    with style():
-        rows = -(-len(panels) // columns)
-        figure = new_figure(5.2 * columns, 3.0 * rows)
+    rows = -(-len(panels) // columns)
+    with drawing(path, 5.2 * columns, 3.0 * rows) as figure:
         places = figure.subplots(rows, columns, squeeze=False).ravel()
         for place, (title, axis, states, fixed) in zip(places, panels, strict=False):
             error_line(place, axis, states, FIELD_COLOURS[0], "one model of all states")
@@ -195,7 +199,7 @@ def panels_plot(panels: Sequence[Panel], path: str | Path) -> Path:
             place.legend(loc="best", fontsize="small")
         for place in places[len(panels) :]:
             place.set_visible(False)
-        return save(figure, path)
+    return Path(path)
 
 
 ABOUT = """\
@@ -211,11 +215,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--states", metavar="N", type=whole(2, 1000), default=25, help="random states (default: 25)")
     parser.add_argument("--again", action="store_true", help="measure the chosen cases again")
     parser.add_argument(
-        "--models",
-        metavar="DIR",
-        type=Path,
-        default=Path("runs/zoom"),
-        help="folder for the models (default: runs/zoom)",
+        "--models", metavar="DIR", type=Path, default=Path("runs/zoom"), help="for the models (default: runs/zoom)"
     )
     lab.add_out(parser)
 

@@ -32,26 +32,15 @@ examples:
   neurolens render experiments/scenes/room.toml --camera models/NAME.onnx -o room.exr
 
 exit codes: 0 done, 1 a promise of a model does not hold, 2 bad input, 130 interrupted.
-Each command explains itself: neurolens COMMAND --help"""
+Help of a command: neurolens COMMAND --help"""
 
 
 def build_parser() -> Parser:
     """The whole command line.
 
-    Commands are imported here, so that `main` hears an interrupt while they are being read.
+    Commands are imported here, so that `main` handles an interrupt of the imports.
     """
-    from neurolens.commands import (
-        analyse,
-        bench,
-        convert,
-        evaluate,
-        export,
-        glass,
-        lens,
-        mitsuba,
-        render,
-        train,
-    )
+    from neurolens.commands import analyse, bench, convert, evaluate, export, glass, lens, mitsuba, render, train
 
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
@@ -64,7 +53,7 @@ def build_parser() -> Parser:
 def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_parser) -> int:
     """Run one command and return its exit code; a wrong command line exits with code 2 as argparse does.
 
-    `build` makes the parser; it runs where its errors and an interrupt are reported like the command's.
+    `build` makes the parser; its errors and interrupts are reported like the command's.
     """
     args = argparse.Namespace(kept="nothing was done")
     try:
@@ -81,11 +70,11 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_
             raise
         return _fail(f"this needs {package}, which is not installed: pip install '.[train]' in the project's folder")
     except BrokenPipeError:
-        # The reader (head, less) has left; the interpreter must not complain again while it flushes stdout.
+        # The reader (head, less) has exited; avoid a second error when the interpreter flushes stdout.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _BROKEN_PIPE
     except OSError as error:
-        # A full disk names no file.
+        # The error of a full disk names no file.
         place = "" if error.filename is None else f"{error.filename}: "
         return _fail(f"{place}{error.strerror or error}")
     except KeyboardInterrupt:

@@ -1,7 +1,32 @@
 """Order of the tests: those marked slow run last, so that a mistake shows within seconds."""
 
+from pathlib import Path
+
 import pytest
 from hypothesis import settings
+
+# A ball in white light.
+SCENE = """\
+[camera]
+position_m = [0.0, 0.0, 2.0]
+look_at_m = [0.0, 0.0, 0.0]
+focus_m = 2.0
+f_number = 4.0
+width = 32
+height = 18
+samples = 2
+
+[environment]
+colour = [1.0, 1.0, 1.0]
+
+[materials]
+grey = { kind = "diffuse", reflectance = [0.5, 0.5, 0.5] }
+
+[[spheres]]
+centre_m = [0.4, 0.0, 0.0]
+radius_m = 0.1
+material = "grey"
+"""
 
 # A busy machine is no failure: no example has a time limit.
 settings.register_profile("neurolens", settings.get_profile("default"), deadline=None)
@@ -15,3 +40,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """A small scene file, for the command line."""
+    path = tmp_path / "ball.toml"
+    path.write_text(SCENE)
+    return path

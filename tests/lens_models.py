@@ -14,27 +14,46 @@ from torch import Tensor
 from neurolens.base.errors import NeurolensWarning
 from neurolens.cameras.exact import ExactCamera
 from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens
+from neurolens.optics.prescription import Lens, Surface
 from neurolens.surrogates.cores import Network
 from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.gates import gate_values
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs
+from neurolens.surrogates.specialise import at_wavelength
 from neurolens.surrogates.targets import scales_of, targets_of
 
 LENSES = Path(__file__).parents[1] / "lenses"
+GAUSS, FISHEYE = "laikin_double_gauss_50", "muller_fisheye_100"
 KINDS = ("invariants", "raw", "network", "thick", "fisheye")
+GATED = ("singlet", "hemisphere")  # lenses whose rays are lost at surfaces, too
+PUBLISHED = ("hanika", "schrade", "rtf", "taylor", "cells", "neurolens2017")
+_FITS = {
+    "invariants": ModelSettings("dense", degree=4),
+    "raw": ModelSettings("dense", basis="raw", degree=3),
+    "thick": ModelSettings("thick"),
+    "zones": ModelSettings("ols", terms=16, partitions=2, planes=False),
+    "residual": ModelSettings("ols+mlp", terms=12, degree=5, planes=False, units=8, layers=1, steps=60),
+    "hanika": ModelSettings("hanika", basis="raw", degree=3),
+    "schrade": ModelSettings("schrade", basis="raw", degree=5, terms=12),
+    "rtf": ModelSettings("rtf", basis="raw", degree=4),
+    "taylor": ModelSettings("taylor", basis="raw", degree=3),
+    "cells": ModelSettings("zheng-adaptive", basis="raw", terms=6, partitions=2),
+    "neurolens2017": ModelSettings(
+        "neurolens2017", basis="raw", units=16, layers=2, steps=60, seconds=600.0, partitions=2
+    ),
+}
 
 
 @cache
-def lens(name: str = "laikin_double_gauss_50") -> Lens:
+def lens(name: str = GAUSS) -> Lens:
     return read_lens(LENSES / f"{name}.toml").at(focal_length_mm=14.0 if "muller" in name else None)
 
 
 @cache
-def domain(name: str = "laikin_double_gauss_50") -> Domain:
+def domain(name: str = GAUSS) -> Domain:
     return domain_of(lens(name), focus_m=(math.inf, 0.7))
 
 
@@ -45,7 +64,7 @@ def exact_camera(focus_m: float, f_number: float | None) -> ExactCamera:
 
 
 @cache
-def prepared(name: str = "laikin_double_gauss_50") -> Prepared:
+def prepared(name: str = GAUSS) -> Prepared:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NeurolensWarning)
         return prepare(make_pairs(lens(name), domain(name), PairSettings(train=6000, held_out=100, rim=6000)))
@@ -60,19 +79,46 @@ def anamorphic() -> Prepared:
 
 
 @cache
+def gated(name: str) -> Prepared:
+    """Pairs of one of `GATED`: rays that miss a surface or are totally reflected have gates of their own."""
+    lens, radius_mm = hemisphere(), 12.0
+    if name == "singlet":
+        lens, radius_mm = read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml"), None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", NeurolensWarning)  # every lost ray is told by a gate
+        domain = domain_of(lens, film_radius_mm=radius_mm, focus_m=(2.0, 2.0))
+        return prepare(make_pairs(lens, domain, PairSettings(train=5000, held_out=100, rim=5000)))
+
+
+def hemisphere() -> Lens:
+    """A half ball with its flat side to the scene, lit far off its axis: rays miss the ball, or never leave."""
+    surfaces = (
+        Surface(math.inf, 2.0, 16.0, stop=True),
+        Surface(math.inf, 9.9, 19.8, 1.6, 40.0),
+        Surface(-10.0, 12.0, 19.8),
+    )
+    return Lens("half ball", "", surfaces, 2.0, path="half_ball.toml").at(focus_m=2.0)
+
+
+@cache
 def model(kind: str) -> LensModel:
-    """One of `KINDS`: each kind of core, first order, a lens that sees beyond 75 degrees; or "zones" of the film."""
-    if kind == "invariants":
-        return fit_model(prepared(), ModelSettings("dense", degree=4))
-    if kind == "raw":
-        return fit_model(prepared(), ModelSettings("dense", basis="raw", degree=3))
-    if kind == "thick":
-        return fit_model(prepared(), ModelSettings("thick"))
-    if kind == "zones":
-        return fit_model(prepared(), ModelSettings("ols", terms=16, partitions=2, planes=False))
+    """A model of each kind.
+
+    `KINDS` (each kind of core, first order, a lens that sees beyond 75 degrees), `GATED`, `PUBLISHED` (after which
+    " fisheye" takes that lens), or "zones" of the film, "residual" network, "laser" (one wavelength), "cylinders".
+    """
     if kind == "fisheye":
-        return fit_model(prepared("muller_fisheye_100"), ModelSettings("dense", degree=4))
-    return _network(prepared(), 12)
+        return fit_model(prepared(FISHEYE), _FITS["invariants"])
+    if kind == "network":
+        return _network(prepared(), 12)
+    if kind == "laser":
+        return at_wavelength(model("invariants"), 550.0)
+    if kind == "cylinders":
+        return fit_model(anamorphic(), ModelSettings(terms=48, degree=4, planes=False))
+    if kind in GATED:
+        return fit_model(gated(kind), ModelSettings("ols", terms=40, planes=False))
+    method, _, other = kind.partition(" ")
+    return fit_model(prepared(FISHEYE if other else GAUSS), _FITS[method])
 
 
 @cache
@@ -115,5 +161,6 @@ def _network(known: Prepared, units: int) -> LensModel:
     ab = ridge(both, targets.vectors.reshape(3, -1)).reshape(6, -1)
     gates = ridge(features(pairs.rim), gate_values(pairs.lens, known.gates, pairs.rim))
     out = torch.cat([ab, ridge(m, targets.transmittance[None]), gates])
-    core = Network(hidden, (out[:, :-1].contiguous(), out[:, -1].contiguous()), shift, scale)
+    layers = tuple((w.numpy(), b.numpy()) for w, b in hidden)
+    core = Network(layers, (out[:, :-1].numpy(), out[:, -1].numpy()), shift.numpy(), scale.numpy())
     return LensModel(pairs.lens, pairs.domain, encoding, scales_of(pairs.lens), known.gates, core, "random network")

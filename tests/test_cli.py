@@ -28,59 +28,16 @@ DESCRIBED = [
 ]
 GAUSS = ROOT / "lenses" / "laikin_double_gauss_50.toml"
 SINGLET = ROOT / "lenses" / "thorlabs_lb1471_biconvex_50.toml"
+PHONE = ROOT / "lenses" / "phone_lens_6.toml"
 ZOOM = ROOT / "lenses" / "ogawa_zoom_70_200.toml"
 COMMANDS = ("lens", "analyse", "glass", "convert", "train", "evaluate", "export", "render")
 
-SCENE = """\
-[camera]
-position_m = [0.0, 0.0, 2.0]
-look_at_m = [0.0, 0.0, 0.0]
-focus_m = 2.0
-f_number = 4.0
-width = 32
-height = 18
-samples = 2
 
-[environment]
-colour = [1.0, 1.0, 1.0]
-
-[materials]
-grey = { kind = "diffuse", reflectance = [0.5, 0.5, 0.5] }
-
-[[spheres]]
-centre_m = [0.4, 0.0, 0.0]
-radius_m = 0.1
-material = "grey"
-"""
-
-
-@pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    path = tmp_path / "ball.toml"
-    path.write_text(SCENE)
-    return path
-
-
-# Help
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_explains_every_option_and_shows_examples(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("command", [[], *([c] for c in COMMANDS)])
+def test_every_command_has_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
-        main([command, "--help"])
-    text = capsys.readouterr().out
-    assert stopped.value.code == 0
-    assert "examples:\n" in text and f"  neurolens {command} " in text and "--json" in text
-    assert max(map(len, text.splitlines())) <= 110
-    for line in text.splitlines():  # an option without a help text stands alone and is followed by another option
-        assert "None" not in line and "SUPPRESS" not in line
-
-
-def test_main_help_lists_the_commands_and_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["--help"])
-    text = capsys.readouterr().out
-    assert all(f"  {command} " in text for command in COMMANDS) and "exit codes" in text
+        main([*command, "--help"])
+    assert stopped.value.code == 0 and "examples:" in capsys.readouterr().out
 
 
 # Bad input
@@ -104,6 +61,18 @@ def test_main_help_lists_the_commands_and_exit_codes(capsys: pytest.CaptureFixtu
         (["lens", GAUSS, "--layout", "a.exr"], ["--layout", ".png"]),
         (["lens", GAUSS, "--layout", "/no/such/folder/a.png"], ["--layout", "folder"]),
         (["lens", GAUSS, "--foc", "1"], ["--foc"]),
+        (["lens", GAUSS, "--layouts", "a.png"], ["--layouts"]),
+        (["lens", GAUSS, "-o", "a.toml"], ["-o"]),
+        (["lens", GAUSS, "--half-field", "10"], ["--half-field"]),
+        (["lens", GAUSS, "--derive-rims", "--layout", "a.png"], ["--layout"]),
+        (["lens", GAUSS, "lenses"], ["FOLDER"]),
+        (["lens", "list", "--focus", "2", "--blades", "5", "--efl", "20"], ["--efl"]),
+        (["lens", "list", "--focusing", "best"], ["--focusing"]),
+        (["lens", "list", "--breathing", "a.png"], ["--breathing"]),
+        (["lens", "list", GAUSS], ["(a file)"]),
+        (["lens", PHONE, "--vignetting", "0.4"], ["--vignetting"]),
+        (["lens", PHONE, "--derive-rims", "--f-number", "8"], ["--f-number"]),
+        (["lens", PHONE, "--efl", "1e300"], ["0.001 to 1e+06"]),
         (["train"], ["EXPERIMENT.toml", "--lens"]),
         (["train", "a.toml", "--lens", GAUSS], ["both"]),
         (["train", "--lens", "no.toml"], ["no.toml"]),
@@ -131,7 +100,7 @@ def test_a_mistake_is_one_line(args: list[object], words: list[str], capsys: pyt
         (["--camera", "pinhole", "--blades", "5"], ["aperture", "point"]),
         (["--camera", "thin", "--blades", "2"], ["--blades", "from 3 to 100"]),
         (["--camera", "thin", "--blade-rotation", "10"], ["blades", "missing"]),
-        (["--camera", "thin", "--aperture-mask", "no.png"], ["no.png", "exists"]),
+        (["--camera", "thin", "--aperture-mask", "no.png"], ["no.png", "a picture that exists"]),
         (["--camera", "thin", "--focusing", "internal"], ["focus", "lens files"]),
         (["--camera", "thin", "--efl", "50", "--field", "40"], ["--field", "not allowed"]),
         (["--camera", "thin", "--width", "32", "--height", "32"], ["shape of the film"]),
@@ -205,22 +174,6 @@ def test_lens_derives_rims_and_writes_only_where_asked(tmp_path: Path, capsys: p
     assert diameters == [rim["derived_mm"] for rim in data["rims"]]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--layouts", "a.png"), "--layouts"),
-        (("-o", "a.toml"), "-o"),
-        (("--half-field", "10"), "--half-field"),
-        (("--derive-rims", "--layout", "a.png"), "--layout"),
-        (("lenses",), "FOLDER"),
-    ],
-)
-def test_lens_refuses_what_it_would_ignore(
-    arguments: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert words in failure(capsys, "lens", GAUSS, *arguments)
-
-
 def test_lens_counts_refractions_and_reaches_the_field() -> None:
     """The Laikin double Gauss has 12 refractions and is a 50 mm lens that covers 24 x 36 mm."""
     data = described(GAUSS)
@@ -239,7 +192,6 @@ def test_lens_state_is_applied(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_json(capsys, "lens", GAUSS, "--efl", "35")["efl_mm"] == pytest.approx(35)
 
 
-@pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 def test_lens_zooms_between_states_focuses_inside_and_shows_its_breathing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -252,14 +204,6 @@ def test_lens_zooms_between_states_focuses_inside_and_shows_its_breathing(
     assert inside[0]["efl_mm"] == pytest.approx(100, rel=1e-6) and inside[1]["efl_mm"] < 95
     seen = run_json(capsys, "lens", GAUSS, "--field", "40")
     assert seen["image_radius_mm"] == 21.6 and seen["half_field_reached_deg"] == pytest.approx(20, abs=0.5)
-
-
-def test_lens_text_and_layout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    picture = tmp_path / "layout.png"
-    assert main(["lens", str(GAUSS), "--layout", str(picture)]) == 0
-    text = capsys.readouterr().out
-    assert "focal length" in text and "49.6" in text and "12" in text
-    assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 # render
@@ -343,7 +287,7 @@ def test_a_full_disk_is_one_line(
 
     monkeypatch.setattr("neurolens.render.pictures.write_exr", full)
     line = failure(capsys, "render", scene, "--camera", "thin", "-o", tmp_path / "a.exr", "--quiet")
-    kept = f"the render is kept: the same command goes on from {tmp_path / 'a.exr'}.part"
+    kept = f"the render is kept: the same command resumes from {tmp_path / 'a.exr'}.part"
     assert line == f"neurolens: No space left on device; {kept}"
 
 
@@ -395,8 +339,8 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from neurolens.evaluate.measure import measure_errors
     from neurolens.optics.lensfile import read_lens
     from neurolens.surrogates.domain import domain_of
+    from neurolens.surrogates.export import export_onnx
     from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-    from neurolens.surrogates.onnx.export import export_onnx
     from neurolens.surrogates.pairs import PairSettings, make_pairs
 
     lens = read_lens(SINGLET).at(f_number=8, focal_length_mm=50)

@@ -11,8 +11,7 @@ import pytest
 from command_line import failure
 
 from neurolens.cameras.model import load_model
-from neurolens.cameras.onnxderivatives import OnnxDerivatives
-from neurolens.cameras.onnxinverse import load_inverse
+from neurolens.cameras.onnxmaps import OnnxDerivatives, load_inverse
 from neurolens.cli import main
 from neurolens.modelfile import MODEL_KEY
 

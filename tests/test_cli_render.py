@@ -19,37 +19,19 @@ from command_line import failure, run_json
 from PIL import Image
 
 from neurolens.cameras.contract import CameraRays
-from neurolens.cameras.thin import ThinLens
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cli import main
 from neurolens.render.pictures import read_exr, read_layers, write_exr
 
-SCENE = """\
-[camera]
-position_m = [0.0, 0.0, 2.0]
-look_at_m = [0.0, 0.0, 0.0]
-focus_m = 2.0
-width = 64
-height = 36
-samples = 16
-
-[environment]
-colour = [1.0, 1.0, 1.0]
-
-[materials]
-grey = { kind = "diffuse", reflectance = [0.5, 0.4, 0.3] }
-
-[[spheres]]
-centre_m = [0.1, 0.0, 0.0]
-radius_m = 0.2
-material = "grey"
-"""
-
 
 @pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    path = tmp_path / "ball.toml"
-    path.write_text(SCENE)
-    return path
+def scene(scene: Path) -> Path:
+    """Larger, and of more than one pass."""
+    text = scene.read_text()
+    for old, new in (("width = 32", "width = 64"), ("height = 18", "height = 36"), ("samples = 2", "samples = 16")):
+        text = text.replace(old, new)
+    scene.write_text(text)
+    return scene
 
 
 def children(process: subprocess.Popen[str]) -> list[int]:
@@ -95,9 +77,9 @@ def test_a_signal_in_mid_render_loses_nothing(
         assert process.returncode == -signal.SIGKILL and said == "" and not out.exists()
     else:
         assert process.returncode == 128 + number
-        count = r"[\d.e+]+ of 100000 samples a pixel( \(\d+ to \d+\))?"
+        count = r"[\d.e+]+ of 100000 samples per pixel( \(\d+ to \d+\))?"
         assert re.fullmatch(
-            rf"neurolens: interrupted; a\.exr holds {count}; the same command goes on from a\.exr\.part", said
+            rf"neurolens: interrupted; a\.exr holds {count}; the same command resumes from a\.exr\.part", said
         )
         samples = read_layers(out)["samples"]
         assert samples.max() >= 16 and samples.max() - samples.min() <= 16
@@ -161,7 +143,7 @@ def test_a_picture_that_cannot_be_written_keeps_the_render_and_the_older_picture
                 patch.setattr(f"neurolens.render.{writer}", full)
             line = failure(capsys, *common)
         assert line == (
-            f"neurolens: {out}: No space left on device; the render is kept: the same command goes on from {out}.part"
+            f"neurolens: {out}: No space left on device; the render is kept: the same command resumes from {out}.part"
         )
         assert np.all(read_exr(out)[0] == 7)
     data = run_json(capsys, *common)
@@ -190,7 +172,7 @@ def test_a_disk_without_room_for_picture_and_checkpoint_is_told_as_it_is(
     why = f"({out}.part: No space left on device)"
     assert said() == (
         f"neurolens: {out}: No space left on device; only a part of the render is kept {why}: "
-        f"the same command goes on from {out}.part"
+        f"the same command resumes from {out}.part"
     )
     (tmp_path / "a.exr.part").unlink()
     assert said() == (
@@ -237,7 +219,7 @@ def test_a_texture_with_the_name_of_the_preview_is_not_written_over(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Image.new("RGB", (4, 2), "white").save(tmp_path / "ball.png")
-    scene.write_text(SCENE.replace("colour = [1.0, 1.0, 1.0]", 'file = "ball.png"'))
+    scene.write_text(scene.read_text().replace("colour = [1.0, 1.0, 1.0]", 'file = "ball.png"'))
     before = (tmp_path / "ball.png").read_bytes()
     said = failure(capsys, "render", scene, "--camera", "pinhole", "--quiet", "-o", tmp_path / "ball.exr")
     assert "--out" in said and "ball.png" in said and (tmp_path / "ball.png").read_bytes() == before

@@ -18,26 +18,7 @@ LENSES = Path(__file__).parents[1] / "lenses"
 SINGLET, PHONE = LENSES / "thorlabs_lb1471_biconvex_50.toml", LENSES / "phone_lens_6.toml"
 ANAMORPHIC, NIKON = LENSES / "cooke_anamorphic_42.toml", LENSES / "nikon_zoom_70_200.toml"
 TAJIMA, TRIPLET = LENSES / "tajima_retrofocus_24.toml", LENSES / "cooke_triplet_50.toml"
-SCENE = """\
-[camera]
-position_m = [0.0, 0.0, 2.0]
-look_at_m = [0.0, 0.0, 0.0]
-focus_m = 2.0
-width = 32
-height = 18
-samples = 1
-
-[environment]
-colour = [1.0, 1.0, 1.0]
-"""
 _NOWHERE = Path("/proc/q.exr")  # nobody, root neither, makes a file there
-
-
-@pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    path = tmp_path / "scene.toml"
-    path.write_text(SCENE)
-    return path
 
 
 def test_a_focus_state_is_focused_at_its_object(capsys: pytest.CaptureFixture[str]) -> None:
@@ -85,22 +66,6 @@ def test_the_surface_table_hides_nothing(tmp_path: Path, capsys: pytest.CaptureF
     assert index * nanometres == pytest.approx(550 / 4, rel=0.1) and row["absorption_per_mm"] == 0.01
     assert main(["lens", str(path)]) == 0
     assert "asphere 4-6, K -1.1, coating quarter-wave, absorbs 0.01/mm" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("args", "word"),
-    [
-        (("list", "--focus", "2", "--blades", "5", "--efl", "20"), "--efl"),
-        (("list", "--focusing", "best"), "--focusing"),
-        (("list", "--breathing", "a.png"), "--breathing"),
-        (("list", PHONE), "(a file)"),
-        ((PHONE, "--vignetting", "0.4"), "--vignetting"),
-        ((PHONE, "--derive-rims", "--f-number", "8"), "--f-number"),
-        ((PHONE, "--efl", "1e300"), "0.001 to 1e+06"),
-    ],
-)
-def test_nothing_is_ignored_in_silence(args: tuple[object, ...], word: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert word in failure(capsys, "lens", *args)
 
 
 # render

@@ -1,15 +1,13 @@
-"""False passes and blocks at one stop, traced at that stop: what `evaluate.measure` finds is held to it."""
+"""False passes and blocks at one stop, traced at that stop: `evaluate.measure` is held to it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from neurolens.base import status as st
-from neurolens.base.errors import InputError
 from neurolens.evaluate.vignetting import NEAR_RIM, SEED, ZONES, deciding_rim_ratio, false_shares
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
@@ -18,43 +16,23 @@ from neurolens.surrogates.pairs import trace_pairs
 _BATCH = 65536
 
 
-class Gated(Protocol):
-    """What `predict` gives for N rays: status [N], 0 where the ray passes."""
-
-    @property
-    def status(self) -> Tensor: ...
-
-
 def vignetting_errors(
     lens: Lens,
     domain: Domain,
-    predict: Callable[[FilmRays, float | None], Gated],
+    predict: Callable[[FilmRays, float | None], Any],
     *,
     stop_radius_mm: float | None = None,
     count: int = 300_000,
     seed: int = SEED,
 ) -> dict[str, Any]:
-    """False passes and false blocks at one stop.
+    """False passes and blocks at one stop: false_shares in all, near a rim, and by zone; the share that passes.
 
     Args:
-        lens: the exact lens in the model's state.
-        domain: of the model.
-        predict: takes rays and the stop radius in mm.
+        predict: takes rays and the stop radius in mm, gives what has a status [N], 0 where the ray passes.
         stop_radius_mm: None takes the domain's, full aperture; a smaller one tests the same fit stopped down.
-        count, seed: rays, scrambled Sobol points; a seed other than the fit's, so that they are fresh.
-
-    Returns: false_pass, false_block (shares of 1; None where no ray counts), false_pass_near_rim, false_block_near_rim
-        (rays whose nearest deciding rim, the stop included, they cross within 2% of its radius), stop_radius_mm, rays,
-        passing_share (of the exact lens over the disc), zones: the first two by third of the film radius.
-
-    Raises:
-        InputError: a stop wider than the domain's, or not positive.
+        seed: of scrambled Sobol points; other than the fit's, so that rays are fresh.
     """
     radius = domain.stop_radius_mm if stop_radius_mm is None else stop_radius_mm
-    if not 0 < radius <= domain.stop_radius_mm:
-        raise InputError(
-            "vignetting_errors", "stop_radius_mm", radius, f"above 0, up to {domain.stop_radius_mm:.6g} mm"
-        )
     stopped = lens.with_stop_radius(radius)
     passes, model, near, place = [], [], [], []
     for start in range(0, count, _BATCH):

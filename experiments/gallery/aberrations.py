@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from experiments.gallery.cameras import View
 from neurolens.cameras.contract import Camera
 
-_SIDE = 64  # pupil points a side
+_SIDE = 64  # pupil points per side
 _STEP_MM = 0.02  # on the film, of the derivative
 
 Floats = NDArray[np.float64]

@@ -25,7 +25,7 @@ _STEP_MM = 0.02  # of the finite differences: float32 rays resolve a thousandth 
 _STEPS = 4  # of Newton's method, which stops moving after three
 _FOUND_MM = 2e-3  # a film point that the last step moved by less
 _FAR_MM = 100.0  # no step is longer: rays that are lost must not carry the film point to infinity
-_COARSE = 24  # film points a side of the search for a start
+_COARSE = 24  # film points per side of the search for a start
 _FEW = 7  # of the pupil's points one in so many finds the disc
 _R2 = (0.7548776662466927, 0.5698402909980532)  # 1 / g and 1 / g^2 with g^3 = g + 1
 _MARGIN = 1.1  # of the pupil's box, for rims that cut it differently across the disc
@@ -216,7 +216,7 @@ def _across(target: Array) -> Array:
 
 EDGE = 0.8  # of the way to the film's corner: a disc there still lies on the film as a whole
 _CELLS = 24  # a side of the grid on which two discs are laid over each other
-_SQUARE = 128  # pupil samples a side of a passage rate
+_SQUARE = 128  # pupil samples per side of a passage rate
 
 
 def stop_shape(view: View) -> dict[str, float]:

@@ -25,12 +25,11 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.progress import Report
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
-from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.exact import ExactCamera, FusedExactCamera
 from neurolens.cameras.fused import FusedCamera
-from neurolens.cameras.fusedexact import FusedExactCamera
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.cameras.vignetting import Vignetted
 from neurolens.evaluate.image import Image
 from neurolens.evaluate.measure import fit_and_measure, known_record
@@ -178,7 +177,7 @@ def fitted(
 Array = NDArray[np.float64]
 
 NEAR_CORNER = 0.95  # of the way to the film's corner, where falloff is matched and measured
-_SQUARE = 64  # pupil samples a side
+_SQUARE = 64  # pupil samples per side
 
 
 def illumination(camera: Camera, radii_mm: Array, azimuth_deg: float = 33.7) -> Array:

@@ -1,4 +1,4 @@
-"""The figure of an effect: a row a panel, a column a camera, their difference last; axes in millimetres of film."""
+"""The figure of an effect: a row a panel, a column per camera, their difference last; axes in millimetres of film."""
 
 from __future__ import annotations
 

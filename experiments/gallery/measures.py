@@ -16,8 +16,8 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera
-from neurolens.cameras.thin import ThinLens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 
@@ -52,7 +52,7 @@ def against_post(view: View) -> dict[str, float]:
 
 Array = NDArray[np.float64]
 
-_SQUARE = 16  # pupil samples a side, whose mean direction is taken
+_SQUARE = 16  # pupil samples per side, whose mean direction is taken
 # Film radius over focal length of an angle to the axis.
 PROJECTIONS: dict[str, Callable[[Any], Any]] = {
     "rectilinear": np.tan,

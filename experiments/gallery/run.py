@@ -123,7 +123,6 @@ def _part(report: Report, k: int, count: int) -> Report:
 
 
 def _surrogates(effect: Effect, shots: Sequence[Shot], cache: Path, progress: Progress) -> list[Surrogate | None]:
-    """One for each shot; shots through one state of the lens share theirs."""
     if "surrogate" not in effect.columns:
         return [None] * len(shots)
     made: list[tuple[Shot, Surrogate]] = []
@@ -146,12 +145,12 @@ def _error(record: dict[str, Any]) -> str:
 def _views(
     effect: Effect, shot: Shot, surrogate: Surrogate | None, samples: int | None, threads: int, report: Report
 ) -> dict[str, View]:
-    """What every camera of a panel saw."""
+    """The views of a panel's cameras."""
     panel, views = shot.panel, {}
     window = panel.window_mm or (0.0, 0.0, *shot.film_mm)
     for k, column in enumerate(effect.columns):
         camera = camera_of(column, shot, surrogate)
-        # One wavelength a path where the lens disperses: exact lens and surrogate then share their random numbers.
+        # One wavelength per path where the lens disperses: exact lens and surrogate then share their random numbers.
         film = replace(shot.scene.settings.film, wavelengths="one" if camera.dispersive else "hero")
         done = render(
             shot.scene,
@@ -202,7 +201,7 @@ def _record(
 
 
 def _plain(value: Any) -> Any:
-    """JSON-able: numbers of four digits, those that are none as null."""
+    """JSON-able: numbers of four digits, null if not finite."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -243,7 +242,7 @@ def section(record: Mapping[str, Any]) -> str:
 
 
 def effect_table(record: Mapping[str, Any]) -> str:
-    """The measured numbers: a row a panel and quantity, a column a camera, and the surrogate's error."""
+    """The measured numbers: a row a panel and quantity, a column per camera, and the surrogate's error."""
     panels = record["panels"]
     columns = list(dict.fromkeys(c for p in panels for found in p["measured"].values() for c in found))
     head = ["panel", "measured", *(TITLES.get(c, c) for c in columns)]
@@ -257,7 +256,7 @@ def effect_table(record: Mapping[str, Any]) -> str:
 
 
 def quantity_name(key: str) -> str:
-    """A key with its unit last, in words: "radius_um" is "radius (um)"."""
+    """Text of a key, with its unit last: "radius_um" is "radius (um)"."""
     for unit in ("um", "mm", "deg", "percent", "nm", "stops"):
         if key.endswith(f"_{unit}"):
             return f"{key[: -len(unit) - 1].replace('_', ' ')} ({'%' if unit == 'percent' else unit})"
@@ -280,8 +279,8 @@ def _page_error(surrogate: Mapping[str, Any] | None) -> str:
 ABOUT = """\
 Render small scenes that show what real lenses do, each through the exact lens, a surrogate and a
 thin lens, and measure the effect in each. An effect is a file of experiments/gallery; its figure,
-its numbers and a page of all are written to experiments/results/gallery. What an earlier run
-finished is not done again; fitted models are kept in runs/gallery."""
+its numbers and a page of all are written to experiments/results/gallery. Finished
+effects are kept, fitted models in runs/gallery."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -293,7 +292,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="effect files (default: experiments/gallery)",
     )  # fmt: skip
     parser.add_argument(
-        "--samples", metavar="N", type=whole(1, 1 << 16), help="samples a pixel (default: the effect's own)"
+        "--samples", metavar="N", type=whole(1, 1 << 16), help="samples per pixel (default: the effect's own)"
     )
     parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=2, help="workers (default: 2)")
     lab.add_out(parser, lab.RESULTS / "gallery", "folder")

@@ -1,1 +1,1 @@
-"""What lens designers look at: spots, fans, colour, curvature, distortion, illumination, MTF, Seidel sums, PSF."""
+"""Analyses of a lens: spots, fans, colour, curvature, distortion, illumination, MTF, Seidel sums, PSF."""

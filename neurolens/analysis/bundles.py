@@ -46,8 +46,8 @@ class Pattern(NamedTuple):
 def hexapolar(rings: int) -> Pattern:
     """The centre and `rings` rings of 6, 12, 18, ... points, the last on the stop's edge; 1 + 3 n (n + 1) points.
 
-    The weights start from the area nearest to each ring, and are moved as little as makes the means of r^2, r^4, ...,
-    r^12 right: spots of steep aberrations are decided near the edge, where areas alone would be far off.
+    The weights are the areas nearest to each ring, with the least change that makes the means of r^2, r^4, ...,
+    r^12 exact: spots of steep aberrations depend on the edge, where areas alone would be inaccurate.
     """
     radius = [k / rings for k in range(rings + 1)]
     weight = _ring_weights(rings)
@@ -63,7 +63,6 @@ def hexapolar(rings: int) -> Pattern:
 
 
 def _ring_weights(rings: int) -> list[float]:
-    """Shares of the disc for rings of radius 0, 1/n, ..., 1, all above 0."""
     k = torch.arange(rings + 1, dtype=torch.float64)
     inner, outer = ((k - 0.5).clamp_min(0) / rings) ** 2, ((k + 0.5).clamp_max(rings) / rings) ** 2
     area = outer - inner
@@ -101,7 +100,7 @@ def _tensor(values: list[float]) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-_DIRECT, _STRIDES, _PER_STRIDE = 5, 8, 3  # Newton steps; strides of the careful walk
+_DIRECT, _STRIDES, _PER_STRIDE = 5, 8, 3  # Newton steps; steps of the continuation from the chief ray
 _AIMED = 1e-8  # how near to its point, in stop radii, a ray must come
 _DIFFERENCE = 3e-6  # step of the derivative, in stop radii
 
@@ -231,7 +230,7 @@ class Bundle:
         tangential_mm, sagittal_mm: film points relative to the chief ray of the first wavelength.
         status: of the trace with all rims and the stop; rays that could not be aimed count as missing surface 0.
         weight: energy of each ray: beam area in mm^2 (distant object) or solid angle in sr; 0 where it is blocked.
-        open_weight: the same as if nothing but the stop were in the way.
+        open_weight: the same without the rims.
         path_mm: optical path from the wavefront (or object point) to the film.
         chief_height_mm: [F], image height of the chief ray of the first wavelength, positive.
     """
@@ -310,7 +309,7 @@ def bundle(
 
 
 def check_light(scene: Scene, field_deg: Sequence[float] | None, wavelength_nm: float) -> None:
-    """Raise InputError for a field asked for from which no ray reaches the film, or a lens that passes none at all.
+    """Raise InputError for a requested field from which no ray reaches the film, or a lens that passes no ray.
 
     Of the default fields (None) some may be dark.
     """

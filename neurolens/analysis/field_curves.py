@@ -1,4 +1,4 @@
-"""What changes over the field: colour, field curvature and astigmatism, distortion, vignetting and illumination."""
+"""Curves over the field: colour, field curvature and astigmatism, distortion, vignetting and illumination."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class Curvature(Result):
 def curvature(
     scene: Scene, *, wavelength_nm: float = LINE_D_NM, fields: int = 31, edge_deg: float | None = None
 ) -> Curvature:
-    """Sagittal and tangential foci up to the edge of the field, rims left out of account.
+    """Sagittal and tangential foci up to the edge of the field, rims ignored.
 
     Raises:
         InputError: a pinhole, which has no focus.
@@ -151,7 +151,7 @@ class Distortion(Result):
         scale_mm: image height per radian at the axis: the focal length for a distant object.
         error_percent: projection to [F], 100 (height / ideal - 1); 0 on the axis, NaN where the projection ends.
         best: the projection of least root mean square error over the whole field.
-        reference: the one to judge the lens by: rectilinear below 60 degrees of half field, `best` from there on.
+        reference: rectilinear below 60 degrees of half field, `best` from there on.
         edge_percent: error of `reference` at the edge of the field.
     """
 
@@ -168,7 +168,7 @@ class Distortion(Result):
 def distortion(
     scene: Scene, *, wavelength_nm: float = LINE_D_NM, fields: int = 41, edge_deg: float | None = None
 ) -> Distortion:
-    """Distortion against every projection. The object of a near rectilinear picture is a plane: its heights count."""
+    """Distortion against every projection. For a near object of a rectilinear lens, object heights are used."""
     angles = np.linspace(0, scene.edge_deg() if edge_deg is None else edge_deg, fields)
     chief = scene.chief_rays(np.concatenate([[_SMALL_DEG], angles]), wavelength_nm)
     height = chief.height_mm.numpy()
@@ -197,7 +197,7 @@ def _rms(error: Array) -> float:
     return float(np.sqrt(np.mean(error**2))) if np.isfinite(error).all() else math.inf
 
 
-_MARGIN = 0.08  # what the grid is wider than the bundle, for film points beside the chief ray see another pupil
+_MARGIN = 0.08  # margin of the grid around the bundle, as film points beside the chief ray see another pupil
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,7 @@ class Illumination(Result):
     Attributes:
         field_deg, height_mm: [F] of the chief ray.
         relative: [F] film irradiance over that on the axis.
-        unvignetted: [F] the same if only the stop were in the way: natural falloff, pupil growth and distortion.
+        unvignetted: [F] the same without rims: natural falloff, pupil growth and distortion.
         passed: [F] share of the stop's light that no rim takes.
         cos4: [F] cos^4 of the field angle, 0 from 90 degrees on.
     """

@@ -31,10 +31,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Result:
-    """Base of the results. Arrays are numpy float64 with NaN where there is nothing; keys carry their unit."""
+    """Base of the results. Arrays are numpy float64, NaN where undefined; keys carry their unit."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain lists, numbers and texts by field name; NaN and infinities stay as floats."""
+        """Plain lists, numbers and strings by field name; NaN and infinities stay floats."""
         return {f.name: _plain(getattr(self, f.name)) for f in fields(self)}
 
 
@@ -61,7 +61,7 @@ _SEARCH = 121  # fields tried for the edge of the film
 
 @dataclass(frozen=True)
 class ChiefRays:
-    """Chief rays of F fields, traced as if no rim were in the way.
+    """Chief rays of F fields, traced without rims.
 
     Attributes:
         start: [F] just before the front surface, travelling to the film.
@@ -78,7 +78,7 @@ class ChiefRays:
 
 @dataclass(frozen=True)
 class Scene:
-    """A lens in a state, with the object it looks at.
+    """A lens in a state, with its object.
 
     Attributes:
         lens: placed by `Lens.at`; where it is not, the table's last thickness places the film.
@@ -171,17 +171,17 @@ class Scene:
         if len(angles) < 2:
             return [0.0 if h == 0 else math.nan for h in height_mm]
         found = np.interp(height_mm, height, angles)
-        # The end of the search forgives rounding, no more.
+        # The end of the search is extended by rounding only.
         return [float(f) if h <= height[-1] * 1.001 else math.nan for h, f in zip(height_mm, found, strict=True)]
 
     @property
     def open(self) -> Scene:
-        """The same scene without rims: where rays would go if only the stop were in the way."""
+        """The same scene without rims."""
         return replace(self, rims=False)
 
     @property
     def round(self) -> Scene:
-        """The same scene with a round stop: what is measured at its edge."""
+        """The same scene with a round stop."""
         return replace(self, lens=replace(self.lens, aperture=None))
 
     @property

@@ -99,14 +99,14 @@ def _fan_lines(scene: Scene, field: float) -> list[list[list[float]]]:
     passing = torch.nonzero(rays.passed[0, 0])[:, 0]
     if len(passing) == 0:
         return []
-    # A hair inside the ends: the outermost rays touch a rim.
+    # Slightly inside the ends: the outermost rays touch a rim.
     places = torch.linspace(0.01, 0.99, RAYS_A_FIELD, dtype=torch.float64) * (len(passing) - 1)
     chosen = passing[places.round().long()]
     start = Rays(*(c[0, 0][chosen] for c in rays.start))
     with torch.no_grad():
         path = trace(scene.lens, start, towards="film", path=True).path
     film = Rays(*(c[0, 0][chosen] for c in rays.film))
-    # From a plane in front of everything, or for a fisheye from as far off.
+    # From a plane in front of all surfaces, or for a fisheye from the same distance.
     reach = 4 * max(d for d in scene.lens.semi_diameters_mm if math.isfinite(d))
     first = path[0]
     far = first._replace(x=first.x - reach * start.dx, y=first.y - reach * start.dy, z=first.z - reach * start.dz)
@@ -151,7 +151,7 @@ def lens_layout(profile: Mapping[str, Any], path: str | Path) -> Path:
         draw_film(axes, profile)
         draw_rays(axes, rays)
         subtitle = str(profile.get("subtitle") or "")
-        # The empty second line of the title keeps room for the subtitle, which has a lighter look of its own.
+        # The empty second line of the title keeps room for the subtitle, which has a lighter style.
         axes.set_title(str(profile.get("title", "")) + ("\n" if subtitle else ""), loc="left", fontweight="bold")
         axes.annotate(
             subtitle, (0, 1), xycoords="axes fraction", xytext=(0, 6), textcoords="offset points",

@@ -1,4 +1,4 @@
-"""Pictures of the analyses: one function each. All but the Seidel sums are curves, or one panel a field."""
+"""Plots of the analyses: one function each. All but the Seidel sums are curves, or one panel per field."""
 
 from __future__ import annotations
 
@@ -9,17 +9,7 @@ from typing import Any
 import numpy as np
 
 from neurolens.analysis.field_curves import Colour, Curvature, Distortion, Illumination
-from neurolens.analysis.plot_style import (
-    FAINT,
-    FIELD_COLOURS,
-    INK,
-    field_name,
-    heading,
-    new_figure,
-    save,
-    style,
-    wavelength_colour,
-)
+from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, drawing, field_name, heading, wavelength_colour
 from neurolens.analysis.seidel import Seidel
 from neurolens.analysis.spots import Fans, Mtf, Spots
 from neurolens.analysis.wavefront import Psf
@@ -27,9 +17,7 @@ from neurolens.analysis.wavefront import Psf
 
 def plot_colour(data: Colour, path: str | Path, title: str, subtitle: str) -> Path:
     """Longitudinal colour by zones against wavelength, and lateral colour against field."""
-    with style():
-        figure = new_figure(9.4, 4.6)
-        heading(figure, title, f"Colour; {subtitle}")
+    with drawing(path, 9.4, 4.6, title, f"Colour; {subtitle}") as figure:
         left, right = figure.subplots(1, 2)
         names = ("paraxial", f"zone {data.zone[1]:.2f}", "edge of the stop")
         for k, name in enumerate(names):
@@ -43,14 +31,14 @@ def plot_colour(data: Colour, path: str | Path, title: str, subtitle: str) -> Pa
         for axes in (left, right):
             axes.grid(True)
             axes.legend()
-        return save(figure, path)
+    return Path(path)
 
 
 def plot_curvature(data: Curvature, path: str | Path, title: str, subtitle: str) -> Path:
     """Sagittal, tangential and Petzval foci (across) against image height (up), as lens catalogues draw them."""
-    with style():
-        figure = new_figure(6.4, 5.2)
-        heading(figure, title, f"Field curvature and astigmatism, {data.wavelength_nm:.0f} nm\n{subtitle}")
+    with drawing(
+        path, 6.4, 5.2, title, f"Field curvature and astigmatism, {data.wavelength_nm:.0f} nm\n{subtitle}"
+    ) as figure:
         axes = figure.add_subplot()
         axes.plot(data.sagittal_mm, data.height_mm, color=FIELD_COLOURS[0], label="sagittal")
         axes.plot(data.tangential_mm, data.height_mm, color=FIELD_COLOURS[3], label="tangential")
@@ -61,14 +49,12 @@ def plot_curvature(data: Curvature, path: str | Path, title: str, subtitle: str)
         axes.set(xlabel="focus from the film, away from the lens (mm)", ylabel="image height (mm)")
         _degrees(axes, data.height_mm, data.field_deg)
         axes.legend()
-        return save(figure, path)
+    return Path(path)
 
 
 def plot_distortion(data: Distortion, path: str | Path, title: str, subtitle: str) -> Path:
-    """Distortion against the projections that come near, the reference drawn thick."""
-    with style():
-        figure = new_figure(7.4, 4.8)
-        heading(figure, title, f"Distortion, {data.wavelength_nm:.0f} nm; {subtitle}")
+    """Distortion against the closest projections, the reference drawn thick."""
+    with drawing(path, 7.4, 4.8, title, f"Distortion, {data.wavelength_nm:.0f} nm; {subtitle}") as figure:
         axes = figure.add_subplot()
         limit = max(2.0, 1.25 * float(np.nan_to_num(np.abs(data.error_percent[data.reference])).max()))
         for k, (name, error) in enumerate(data.error_percent.items()):
@@ -82,14 +68,12 @@ def plot_distortion(data: Distortion, path: str | Path, title: str, subtitle: st
         axes.grid(True)
         axes.set(xlabel="field (degrees)", ylabel="distortion (%)", ylim=(-limit, limit))
         figure.legend(loc="outside lower center", ncols=2)
-        return save(figure, path)
+    return Path(path)
 
 
 def plot_vignetting(data: Illumination, path: str | Path, title: str, subtitle: str) -> Path:
     """Relative illumination and what it is made of, against image height."""
-    with style():
-        figure = new_figure(7.4, 4.8)
-        heading(figure, title, f"Vignetting and relative illumination; {subtitle}")
+    with drawing(path, 7.4, 4.8, title, f"Vignetting and relative illumination; {subtitle}") as figure:
         axes = figure.add_subplot()
         rows = (
             (data.relative, "relative illumination", FIELD_COLOURS[0], "-", 2.2),
@@ -104,15 +88,13 @@ def plot_vignetting(data: Illumination, path: str | Path, title: str, subtitle: 
         axes.set_ylim(0, max(105.0, 105 * float(np.nan_to_num([data.relative, data.unvignetted]).max())))
         _degrees(axes, data.height_mm, data.field_deg, across=True)
         axes.legend(loc="lower left")
-        return save(figure, path)
+    return Path(path)
 
 
 def plot_mtf(data: Mtf, path: str | Path, title: str, subtitle: str) -> Path:
-    """MTF against frequency: a colour a field, tangential solid, sagittal dashed."""
+    """MTF against frequency: a colour per field, tangential solid, sagittal dashed."""
     waves = ", ".join(f"{nm:.0f}" for nm in data.wavelength_nm)
-    with style():
-        figure = new_figure(8.4, 6.0)
-        heading(figure, title, f"Geometric MTF at {waves} nm, without diffraction; {subtitle}")
+    with drawing(path, 8.4, 6.0, title, f"Geometric MTF at {waves} nm, without diffraction; {subtitle}") as figure:
         axes = figure.add_subplot()
         for k, field in enumerate(data.field_deg):
             colour = FIELD_COLOURS[k % len(FIELD_COLOURS)]
@@ -132,13 +114,12 @@ def plot_mtf(data: Mtf, path: str | Path, title: str, subtitle: str) -> Path:
         axes.set(xlabel="frequency (cycles/mm)", ylabel="contrast", ylim=(0, 1.02))
         axes.set_xlim(0, data.frequency_per_mm[-1])
         figure.legend(loc="outside lower center", ncols=4)
-        return save(figure, path)
+    return Path(path)
 
 
 def plot_seidel(data: Seidel, path: str | Path, title: str, subtitle: str) -> Path:
     """Seidel sums as bars, surface by surface, with their total apart."""
-    with style():
-        figure = new_figure(max(8.4, 0.3 * len(data.surfaces) + 3), 10.0)
+    with drawing(path, max(8.4, 0.3 * len(data.surfaces) + 3), 10.0) as figure:
         text = f"Seidel sums at {data.image_height_mm:.1f} mm image height, {data.wavelength_nm:.0f} nm; {subtitle}"
         heading(figure, title, text)
         rows = figure.subplots(len(data.names), 1, sharex=True)
@@ -153,11 +134,10 @@ def plot_seidel(data: Seidel, path: str | Path, title: str, subtitle: str) -> Pa
         rows[-1].set_xticks([*place[::step], len(place) + 0.5], [*map(str, place[::step]), "total"])
         rows[-1].set_xlabel("surface, counted from the scene")
         figure.legend(*rows[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-        return save(figure, path)
+    return Path(path)
 
 
 def _degrees(axes: Any, height: Any, field: Any, across: bool = False) -> None:
-    """A second axis with the field in degrees beside the image height."""
     sound = np.isfinite(height)
     height, field = (_lengthened(v[sound]) for v in (height, field))
 
@@ -175,7 +155,7 @@ def _degrees(axes: Any, height: Any, field: Any, across: bool = False) -> None:
 
 
 def _lengthened(values: Any) -> Any:
-    """The values with their ends carried on straight, so that ticks beyond them are right."""
+    """The values extrapolated linearly at both ends, for ticks beyond them."""
     if len(values) < 2:
         return values
     before, after = values[0] - 100 * (values[1] - values[0]), values[-1] + 100 * (values[-1] - values[-2])
@@ -186,13 +166,11 @@ _SHIFTS = 5
 
 
 def plot_spots(data: Spots, path: str | Path, title: str, subtitle: str) -> Path:
-    """Spots: rows are fields, columns the film moved through focus, the middle one as it stands; Airy disc beside."""
+    """Spots: rows are fields, columns the film moved through focus, the middle one unshifted, with the Airy disc."""
     shifts = np.linspace(data.shift_mm[0], data.shift_mm[-1], _SHIFTS)
     rows = len(data.field_deg)
     half = _half_width(data)
-    with style():
-        figure = new_figure(9.4, 1.75 * rows + 1.3)
-        heading(figure, title, f"Spots through focus; {subtitle}")
+    with drawing(path, 9.4, 1.75 * rows + 1.3, title, f"Spots through focus; {subtitle}") as figure:
         grid = figure.subplots(rows, _SHIFTS, sharex=True, sharey=True, squeeze=False)
         for i, j in np.ndindex(rows, _SHIFTS):
             axes = grid[i, j]
@@ -200,7 +178,7 @@ def plot_spots(data: Spots, path: str | Path, title: str, subtitle: str) -> Path
             axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
             axes.tick_params(labelsize=8)
             if i == 0:
-                axes.set_title(f"film {1000 * shifts[j]:+.0f} µm" if abs(shifts[j]) > 1e-12 else "film as it stands")
+                axes.set_title(f"film {1000 * shifts[j]:+.0f} µm" if abs(shifts[j]) > 1e-12 else "film in place")
             if j == 0:
                 axes.set_ylabel(
                     f"{field_name(float(data.field_deg[i]))}, {data.height_mm[i]:.1f} mm\ntangential (µm)", size=8.5
@@ -209,7 +187,7 @@ def plot_spots(data: Spots, path: str | Path, title: str, subtitle: str) -> Path
                 axes.set_xlabel("sagittal (µm)", size=8.5)
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), markerscale=4)
-        return save(figure, path)
+    return Path(path)
 
 
 def _spot(axes: Any, data: Spots, field: int, shift_mm: float) -> None:
@@ -241,7 +219,7 @@ def _middle(values: np.ndarray) -> float:
 
 
 def _half_width(data: Spots) -> float:
-    """Half width that holds nearly all rays at every focus shown."""
+    """Half width that contains nearly all rays at every focus shown."""
     reach = [data.airy_um * 1.5] if math.isfinite(data.airy_um) else []
     for shift in (data.shift_mm[0], 0.0, data.shift_mm[-1]):
         t = data.tangential_um + 1000 * shift * data.slope_tangential
@@ -254,13 +232,17 @@ def _half_width(data: Spots) -> float:
 
 
 def plot_fans(data: Fans, path: str | Path, title: str, subtitle: str) -> Path:
-    """Ray fans: a row a field, tangential left and sagittal right, one scale for all."""
+    """Ray fans: a row per field, tangential left and sagittal right, one scale for all."""
     rows = len(data.field_deg)
     both = np.concatenate([data.tangential_um.ravel(), data.sagittal_um.ravel()])
     reach = 1.1 * float(np.nanmax(np.abs(both))) if np.isfinite(both).any() else 1.0
-    with style():
-        figure = new_figure(8.6, 1.55 * rows + 1.5)
-        heading(figure, title, f"Ray fans, from the chief ray at {data.wavelength_nm[0]:.0f} nm; {subtitle}")
+    with drawing(
+        path,
+        8.6,
+        1.55 * rows + 1.5,
+        title,
+        f"Ray fans, from the chief ray at {data.wavelength_nm[0]:.0f} nm; {subtitle}",
+    ) as figure:
         grid = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False)
         for i in range(rows):
             for axes, values, name in zip(
@@ -278,15 +260,15 @@ def plot_fans(data: Fans, path: str | Path, title: str, subtitle: str) -> Path:
             axes.set_xlabel("height in the stop / its radius")
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-        return save(figure, path)
+    return Path(path)
 
 
 def plot_psf(data: Psf, path: str | Path, title: str, subtitle: str) -> Path:
     """Point spread: geometric above, diffraction below, square root of the values so that faint light shows."""
     columns = len(data.field_deg)
-    with style():
-        figure = new_figure(max(9.0, 2.25 * columns), 6.0)
-        heading(figure, title, f"Point spread, brightness as square root; {subtitle}")
+    with drawing(
+        path, max(9.0, 2.25 * columns), 6.0, title, f"Point spread, brightness as square root; {subtitle}"
+    ) as figure:
         grid = figure.subplots(2, columns, squeeze=False)
         for i in range(columns):
             half = float(np.nan_to_num(data.half_width_um[i], nan=1.0))
@@ -297,7 +279,7 @@ def plot_psf(data: Psf, path: str | Path, title: str, subtitle: str) -> Path:
                     shown = np.sqrt(np.maximum(image, 0))
                     axes.imshow(shown, origin="lower", extent=(-half, half, -half, half), cmap="magma", vmin=0)
                 else:
-                    why = "aberrations far larger\nthan diffraction" if data.pupil_points[i] else "next to no light"
+                    why = "aberrations far larger\nthan diffraction" if data.pupil_points[i] else "almost no light"
                     axes.text(0, 0, why, ha="center", va="center", fontsize=8)
             grid[0, i].set_title(field_name(float(data.field_deg[i])))
             if np.isfinite(data.strehl[i]):
@@ -306,4 +288,4 @@ def plot_psf(data: Psf, path: str | Path, title: str, subtitle: str) -> Path:
         waves = ", ".join(f"{nm:.0f}" for nm in data.wavelength_nm)
         grid[0, 0].set_ylabel(f"geometric ({waves} nm)\ntangential (µm)", size=8.5)
         grid[1, 0].set_ylabel(f"diffraction ({data.wavelength_nm[0]:.0f} nm)\ntangential (µm)", size=8.5)
-        return save(figure, path)
+    return Path(path)

@@ -1,8 +1,8 @@
 """Third-order (Seidel) sums and the two of colour, surface by surface.
 
 Welford 1986, "Aberrations of Optical Systems", ch. 8 and 10; y and u are height and slope of the paraxial marginal ray,
-barred those of the chief ray, A = n (u + y c), H = n (u ybar - ubar y). The fifth sum is written so that nothing is
-divided by A, which is 0 at a surface that the marginal ray meets head on.
+barred those of the chief ray, A = n (u + y c), H = n (u ybar - ubar y). The fifth sum avoids a division
+by A, which is 0 at a surface that the marginal ray meets at normal incidence.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ NAMES = ("S1 spherical", "S2 coma", "S3 astigmatism", "S4 Petzval", "S5 distorti
 
 @dataclass(frozen=True)
 class Seidel(Result):
-    """Seidel sums in mm, for the stop as it stands and one image height.
+    """Seidel sums in mm, for the present stop and one image height.
 
     As wavefront aberrations at the edge of pupil and field: W040 = S1/8, W131 = S2/2, W222 = S3/2, W220 = (S3 + S4)/4,
     W311 = S5/2; of colour, F against C: C1/2 and C2.
 
     Attributes:
-        surfaces: [S, 7], one row a surface; columns as in `NAMES`.
+        surfaces: [S, 7], one row per surface; columns as in `NAMES`.
         total: [7].
         image_height_mm: the paraxial image height that the sums are for.
         lagrange_mm: H, the Lagrange invariant.
@@ -123,7 +123,7 @@ def _rays(scene: Scene, n: list[float], image_height_mm: float) -> tuple[_Ray, _
     scale = lens.stop_radius_mm / unit.y[stop]
     marginal = _march(lens, n, scale, scale * near)
     level, tilted = _march(lens, n, 1.0, 0.0), _march(lens, n, 0.0, 1.0)
-    # The mixture of the two that meets the middle of the stop.
+    # The linear combination of the two through the middle of the stop.
     y, u = -tilted.y[stop], level.y[stop]
     chief = _march(lens, n, y, u)
     image = -marginal.y[-1] / marginal.after[-1]
@@ -132,7 +132,6 @@ def _rays(scene: Scene, n: list[float], image_height_mm: float) -> tuple[_Ray, _
 
 
 def _row(s: Surface, k: int, n: list[float], spread: list[float], m: _Ray, b: _Ray) -> list[float]:
-    """The seven contributions of one surface."""
     before, after, c = n[k], n[k + 1], _curvature(s)
     y, y_bar = m.y[k], b.y[k]
     a, a_bar = before * (m.before[k] + y * c), before * (b.before[k] + y_bar * c)

@@ -1,4 +1,4 @@
-"""Ray aberrations: spot diagrams over field and focus, ray fans, and the geometric MTF that the spots leave."""
+"""Ray aberrations: spot diagrams over field and focus, ray fans, and the geometric MTF of the spots."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Spots(Result):
         field_deg, height_mm: [F], of the chief ray of the first wavelength.
         tangential_um, sagittal_um: [F, W, P] relative to that chief ray, NaN where blocked.
         slope_tangential, slope_sagittal: [F, W, P], for spots at another focus.
-        rms_um: [F] root mean square distance from the centroid, all wavelengths alike, weighted by energy.
+        rms_um: [F] root mean square distance from the centroid, over all wavelengths, weighted by energy.
         geometric_um: [F] the largest distance from the centroid; NaN, as all sizes, where no ray passes.
         rms_by_wavelength_um: [F, W], each from its own centroid.
         passed: [F] share of the stop's light that no rim takes.
@@ -103,7 +103,7 @@ class _Moments:
             self.steep = self.steep + (weight * (b - mean_b) ** 2).sum(along)
 
     def best_shift(self) -> Tensor:
-        # Rays parallel but for rounding meet nowhere.
+        # Rays parallel up to rounding have no best focus.
         return torch.where(self.steep > 1e-20, -self.mixed / self.steep, math.nan)
 
     def rms_um(self, shift_mm: Tensor) -> Tensor:
@@ -136,7 +136,7 @@ def working_f_number(scene: Scene, wavelength_nm: float) -> float:
 
 
 def _span(best: Tensor, f_number: float, wavelength_nm: float) -> Array:
-    """Shifts about the film that hold the best foci of the fields, and a few depths of focus in any case."""
+    """Shifts about the film that include the best foci of the fields, and at least a few depths of focus."""
     depth = 4e-6 * wavelength_nm * f_number**2 if math.isfinite(f_number) else 0.0  # Rayleigh's, +- 2 lambda N^2
     reach = max(2 * depth, 1.5 * float(torch.nan_to_num(best).abs().median()))
     return np.linspace(-reach, reach, _SHIFTS) if reach > 0 else np.linspace(-0.1, 0.1, _SHIFTS)
@@ -234,7 +234,6 @@ def diffraction_mtf(frequency_per_mm: Array, wavelength_nm: float, f_number: flo
 
 
 def _contrast(x_mm: torch.Tensor, weight: torch.Tensor, frequency: Array) -> Array:
-    """|sum of weight exp(2 pi i f x)| for x and weight [F, N]: [F, K]."""
     found = []
     for f in frequency.tolist():
         phase = x_mm * (2 * np.pi * f)

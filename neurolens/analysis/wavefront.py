@@ -101,7 +101,7 @@ class Psf(Result):
         geometric: [F, 49, 49] share of all wavelengths' energy in each square; what lies outside is missing; NaN
             without light.
         diffraction: [F, 97, 97] at the first wavelength, 1 at the peak of the same pupil without aberrations; NaN where
-            the aberrations are too large for it (then diffraction does not matter, and `geometric` rules) or next to
+            the aberrations are too large for it (then diffraction is negligible against `geometric`) or almost
             no light arrives.
         strehl: [F], greatest value of `diffraction`.
         pupil_points: [F], points across the pupil that the diffraction image needs; 0 without light.

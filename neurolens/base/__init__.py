@@ -1,1 +1,1 @@
-"""Small foundations that everything may import: errors, ray status, files, settings, progress."""
+"""Foundations that every other package may import: errors, ray status, files, settings, progress."""

@@ -47,7 +47,7 @@ def read_config(cls: type[T], path: str | Path, overrides: Sequence[str] = ()) -
 
 
 def apply_overrides(data: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """A copy of `data` with each "dotted.key=value" set. Values are TOML; a bare word is a text.
+    """A copy of `data` with each "dotted.key=value" set. Values are TOML; a bare word is a string.
 
     Raises:
         InputError: no "=", an empty key, broken TOML, or a key inside something that is not a table.
@@ -57,7 +57,7 @@ def apply_overrides(data: Mapping[str, Any], overrides: Sequence[str]) -> dict[s
         dotted, equals, value = (part.strip() for part in text.partition("="))
         keys = dotted.split(".")
         if not equals or not all(keys):
-            raise InputError("--set", text, "(no such form)", "key=value or table.key=value")
+            raise InputError("--set", text, "(not of this form)", "key=value or table.key=value")
         table: Any = result
         for depth, key in enumerate(keys[:-1]):
             table = table.setdefault(key, {})
@@ -83,7 +83,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
     """An instance of the dataclass `cls` from the tables of a TOML file.
 
     Args:
-        file: where the data came from, for messages.
+        file: source of the data, for messages.
         prefix: dotted place of `data` in the file, "" for the top.
 
     Raises:
@@ -175,7 +175,6 @@ def _convert_collection(value: Any, kind: Any, file: str | Path, place: str) -> 
 
 
 def _describe(kind: Any) -> str:
-    """A type in words, for messages."""
     origin, args = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
         return " or ".join(_describe(a) for a in args)

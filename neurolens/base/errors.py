@@ -1,4 +1,4 @@
-"""Errors that users see: one line that names the file, the field, the value and what was expected."""
+"""User-facing errors: one line with the file, the field, the value and the expected value."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from pathlib import Path
 
 
 class NeurolensError(Exception):
-    """Base class of every error that neurolens raises on purpose."""
+    """Base class of all neurolens errors."""
 
 
 class InputError(NeurolensError, ValueError):
     """Bad input: a file, a field, a shape, a unit or a domain.
 
     Args:
-        file: the file at fault, or a word for where the value came from ("--set", "argument").
-        field: the place inside it, for example "surface 3, radius_mm".
-        value: what was found there.
-        expected: what should have been there.
+        file: the file, or another source of the value ("--set", "argument").
+        field: location in the file, for example "surface 3, radius_mm".
+        value: the value found.
+        expected: description of a valid value.
     """
 
     def __init__(self, file: str | Path, field: str, value: object, expected: str) -> None:
@@ -30,4 +30,4 @@ class ModelError(NeurolensError, ValueError):
 
 
 class NeurolensWarning(UserWarning):
-    """Something that works but that a user should know, such as a glass without dispersion data."""
+    """A condition that is not an error but affects results, such as a glass without dispersion data."""

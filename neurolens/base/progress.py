@@ -1,4 +1,4 @@
-"""Progress on stderr: one line a stage, with the time left for the stage and for the whole run."""
+"""Progress on stderr: one line per stage, with the time left for the stage and for the whole run."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _TRUST_S = 20.0
 
 
 class Report(Protocol):
-    """What a stage calls now and then with the fraction done, and the seconds left where it knows better."""
+    """Called by a stage with the fraction done and, if the stage has its own estimate, the seconds left."""
 
     def __call__(self, fraction: float, seconds_left: float | None = None) -> None: ...
 
 
 def duration(seconds: float) -> str:
-    """A time in words: "0.4 s", "12 s", "3 min 05 s", "2 h 10 min"."""
+    """A time as text: "0.4 s", "12 s", "3 min 05 s", "2 h 10 min"."""
     if seconds < 9.95:
         return f"{max(seconds, 0.0):.1f} s"
     whole = round(seconds)
@@ -43,11 +43,11 @@ class Progress:
     the stage ends.
 
     Args:
-        plan: stages to come with the seconds they may take; what they really take corrects the rest of the plan.
+        plan: expected seconds of the coming stages; measured times correct the remaining plan.
         quiet: print nothing.
-        stream: None takes stderr as it is at each call.
+        stream: None uses the current sys.stderr at each call.
         interval_s: seconds between lines where there is no terminal.
-        clock: seconds, never going back.
+        clock: monotonic seconds.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Progress:
         self._printed_at = -float("inf")
 
     def plan(self, stages: Mapping[str, float]) -> None:
-        """Add stages to come, with the seconds expected of each."""
+        """Add coming stages with their expected seconds."""
         self._waiting.update(stages)
 
     @contextmanager
@@ -74,7 +74,7 @@ class Progress:
         """Time one stage; gives the function that reports the fraction done, from 0 to 1.
 
         Args:
-            seconds_expected: replaces that of the plan; a stage may be in no plan.
+            seconds_expected: replaces the planned time; also for unplanned stages.
         """
         expected = self._waiting.pop(name, None)
         if seconds_expected is not None:
@@ -102,7 +102,7 @@ class Progress:
         self._show(f"{name}: done in {duration(taken)}{self._total(0.0)}", last=True)
 
     def note(self, text: str) -> None:
-        """Print a line that stays."""
+        """Print a permanent line."""
         self._show(text, last=True)
 
     def _left(self, share: float, elapsed: float, expected: float | None) -> float | None:
@@ -112,7 +112,7 @@ class Progress:
         return None if expected is None else max(expected * self._pace() - elapsed, 0.0)
 
     def _pace(self) -> float:
-        """Seconds taken over seconds expected, of what is done; a few short stages say little of long ones to come."""
+        """Measured over expected seconds of the finished stages; a few short stages predict long ones poorly."""
         return (self._taken_s + _TRUST_S) / (self._expected_s + _TRUST_S)
 
     def _line(self, name: str, share: float, elapsed: float, left: float | None) -> str:
@@ -150,7 +150,6 @@ class Progress:
         stream.flush()
 
     def _end_line(self) -> None:
-        """Leave the line as it stands, so that what is printed next does not overwrite it."""
         if self._open_line:
             stream = self._stream or sys.stderr
             stream.write("\n")

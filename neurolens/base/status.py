@@ -1,10 +1,10 @@
-"""The status that every ray carries: passed, or what ended it and where.
+"""Status of a ray: passed, or the reason and the surface that ended it.
 
-One integer a ray, the same code for the exact tracer and for exported models:
+One integer per ray, the same codes for the exact tracer and for exported models:
 
     0                 passed
     1                 outside the domain of a model (exact tracing never returns it)
-    2                 no ray found that is as asked for (inverse maps of models only)
+    2                 no solution found (inverse maps of models only)
     4 (k + 1) + r     ended at surface k (0-based, counted from the scene), for reason r:
                       1 missed the surface, 2 blocked by its rim (or by the stop), 3 total reflection
 
@@ -40,11 +40,11 @@ def reason_of(status: int) -> int | None:
 
 
 def describe(status: int) -> str:
-    """A status in words, for messages and tables."""
+    """Text of a status, for messages and tables."""
     if status == PASSED:
         return "passed"
     if status == OUTSIDE_DOMAIN:
         return "outside the model's domain"
     if status == NO_SOLUTION:
-        return "no ray found that is as asked for"
+        return "no solution found"
     return f"{_REASONS[status % 4]} {status // 4 - 1}"

@@ -1,4 +1,4 @@
-"""TOML in and out: every file that is read or written by hand goes through here, with one clear error a mistake."""
+"""Reading and writing of TOML, with one error message per mistake."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def read_toml(path: str | Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
 
 
 def suggestion(word: str, known: Sequence[str]) -> str:
-    """A "did you mean" for the nearest known key, else nothing; a key that only lacks its unit counts as near."""
+    """ "; did you mean ...?" for the nearest known key, else empty; a key that only lacks its unit counts as near."""
     near = [key for key in known if key.startswith(word + "_")] or get_close_matches(word, known, n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
 
@@ -99,7 +99,7 @@ def format_toml(data: Mapping[str, Any], table: str = "") -> str:
         if key not in plain:
             name = f"{table}.{format_key(key)}" if table else format_key(key)
             body = format_toml(value, name)
-            # A table that holds only tables needs no heading of its own.
+            # A table that holds only tables needs no heading.
             only_tables = value and all(isinstance(v, Mapping) for v in value.values())
             lines.append(body if only_tables else f"\n[{name}]\n{body}")
     return "".join(lines)

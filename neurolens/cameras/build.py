@@ -22,10 +22,8 @@ import numpy as np
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.fisheye import PROJECTIONS, Fisheye, check_field
-from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thick import ThickLens
-from neurolens.cameras.thin import ThinLens
+from neurolens.cameras.ideal import ThickLens, ThinLens
+from neurolens.cameras.pinhole import PROJECTIONS, Fisheye, Pinhole, check_field
 from neurolens.cameras.vignetting import Vignetted
 from neurolens.optics.apertures import Aperture
 
@@ -59,7 +57,7 @@ class Shot:
         clamp_f_number: an f-number wider than the lens opens becomes its widest; else it is an error of a model, and
             opens the stop of a lens file as far as the rims let light through.
         wavelength_nm: shortest and longest wavelength of the light.
-        pupil: how the pupil of an exact lens is sampled; see `exact_pupils.PUPILS`.
+        pupil: how the pupil of an exact lens is sampled; see `exact.PUPILS`.
         vignetting: what is left of it, "both", "natural", "optical" or "none"; see `neurolens.cameras.vignetting`.
     """
 
@@ -176,8 +174,7 @@ def _thick(path: Path, shot: Shot) -> Camera:
 
 
 def _exact(path: Path, shot: Shot, fused: bool) -> Camera:
-    from neurolens.cameras.exact import ExactCamera
-    from neurolens.cameras.fusedexact import FusedExactCamera
+    from neurolens.cameras.exact import ExactCamera, FusedExactCamera
     from neurolens.optics.lenscheck import check_lens, doubts
     from neurolens.optics.lensfile import read_lens
     from neurolens.optics.paraxial import first_order
@@ -219,7 +216,7 @@ def _dark_film(lens: Lens, film_mm: tuple[float, float]) -> list[str]:
 def _model(path: Path, shot: Shot, fused: bool) -> Camera:
     from neurolens.cameras.fused import FusedCamera
     from neurolens.cameras.model import OnnxCamera, load_model
-    from neurolens.cameras.states import state_for
+    from neurolens.modelfile.states import state_for
 
     for field, value in {"efl_mm": shot.efl_mm, "field_deg": shot.field_deg}.items():
         _refuse(str(path), field, value, "left out: a model is of one size of its lens")

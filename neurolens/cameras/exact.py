@@ -1,10 +1,16 @@
-"""The exact lens as a camera: every ray traced through every surface. The one camera that needs torch."""
+"""The exact lens as a camera, traced or compiled: every ray through every surface. The cameras that need torch.
+
+Its pupil is the outline of what passes, or one of the literature's, widened until it holds that outline. Found at one
+wavelength, some of them lose light (a paraxial exit pupil up to 12% of it; `python -m experiments pupils`): then
+pictures would differ in brightness. Widened, they differ in the share of rays that pass, and in noise.
+"""
 
 from __future__ import annotations
 
 import math
 import os
-from dataclasses import asdict, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -12,18 +18,38 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
-from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
-from neurolens.cameras.exact_pupils import OUTLINE, pupil_named
+from neurolens.base.errors import InputError
+from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
+from neurolens.cameras.fused import FusedFilm
 from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.pupil_boxes import PupilTable
+from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import COARSE, FINE
 from neurolens.cameras.sampling import arrived, check_film, positive
-from neurolens.optics.glass import LINE_D_NM
+from neurolens.optics import pupil_methods as known
+from neurolens.optics.glass import LINE_D_NM, absorption_of
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
+from neurolens.optics.pupil_methods import RadialPupil
 from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds
 from neurolens.optics.trace import Rays, film_derivatives, trace, trace_differentials
+from neurolens.optics.tracegraph import exact_graph
+
+OUTLINE = "outline"
+_MAKERS: dict[str, Callable[[Lens, float], RadialPupil]] = {
+    "rear-rim": known.rear_rim,
+    "exit-pupil": known.global_exit_pupil,
+    "wu": known.wu_exit_pupil,
+    "pixel-disc": lambda lens, end: known.pixel_pupils(lens, end, "disc"),
+    "pixel-ellipse": lambda lens, end: known.pixel_pupils(lens, end, "ellipse"),
+    "boxes": lambda lens, end: known.radial_bounds(lens, end, "box"),
+    "ellipses": lambda lens, end: known.radial_bounds(lens, end, "ellipse"),
+}
+PUPILS = (OUTLINE, *_MAKERS)
+
+_HAIR = 1.001  # between the film radii at which a pupil is held against the outline
+_BETWEEN = 4  # film radii of the outline between two of its rows
 
 
 class ExactCamera:
@@ -40,7 +66,7 @@ class ExactCamera:
         film_offset_mm: moves the film away from the lens (negative: towards it) after focusing.
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
-        pupil: how the pupil is sampled, one of `exact_pupils.PUPILS`. All give the same picture in expectation; fewer
+        pupil: how the pupil is sampled, one of `PUPILS`. All give the same picture in expectation; fewer
             rays pass through any but the outline, by which the others are widened where they would lose light.
 
     Raises:
@@ -83,7 +109,7 @@ class ExactCamera:
             bounds = pupil_bounds(
                 self.lens, 1.0001 * corner, (film_z, film_z), used, rows=rows, points=points, film_mm=self.film_mm
             )
-        self._pupil_z_mm = bounds.pupil_z_mm
+        self._film_z_mm, self._pupil_z_mm = film_z, bounds.pupil_z_mm
         self._dtype = torch.float32 if dtype == "float32" else torch.float64
         self.film = LensFilm(PupilTable.of(asdict(bounds)), float(film_z), used, self._scene, self._passes, detail)
         if pupil != OUTLINE:
@@ -156,9 +182,7 @@ class ExactCamera:
         fx, fy, px, py, wavelength = (
             torch.from_numpy(np.ascontiguousarray(a)).to(self._dtype) for a in (*film, *pupil, wavelength_nm)
         )
-        film_z = self.lens.film_z_mm
-        assert film_z is not None
-        rays = camera_rays(fx, fy, film_z, px, py, self._pupil_z_mm)
+        rays = camera_rays(fx, fy, self._film_z_mm, px, py, self._pupil_z_mm)
         with torch.no_grad():
             done = trace(self.lens, rays, wavelength, transmittance=True)
         assert done.transmittance is not None
@@ -169,10 +193,8 @@ class ExactCamera:
         fx, fy, px, py, wavelength = (
             torch.from_numpy(np.ascontiguousarray(a)).double() for a in (*film, *pupil, wavelength_nm)
         )
-        film_z = self.lens.film_z_mm
-        assert film_z is not None
-        rays = camera_rays(fx, fy, film_z, px, py, self._pupil_z_mm)
-        gap = film_z - self._pupil_z_mm
+        rays = camera_rays(fx, fy, self._film_z_mm, px, py, self._pupil_z_mm)
+        gap = self._film_z_mm - self._pupil_z_mm
         distance = torch.sqrt((fx - px) ** 2 + (fy - py) ** 2 + gap * gap)
         moves = trace_differentials(self.lens, rays, film_derivatives(rays, distance), wavelength).derivatives
         d_film = torch.stack([torch.stack(list(m)) for m in moves], 1).to(torch.float32).numpy()
@@ -181,9 +203,120 @@ class ExactCamera:
     def _passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
         """Whether light passes from film points (r, 0) through pupil points; see `passes_at_any_azimuth`."""
         r, u, v = (torch.from_numpy(np.ascontiguousarray(a)).to(self._dtype) for a in (film[0], *pupil))
-        film_z = self.lens.film_z_mm
-        assert film_z is not None
         with torch.no_grad():
-            return passes_at_any_azimuth(
-                self.lens, r, film_z, u, v, self._pupil_z_mm, wavelength_nm, self.film_mm
-            ).numpy()
+            film_z, pupil_z = self._film_z_mm, self._pupil_z_mm
+            return passes_at_any_azimuth(self.lens, r, film_z, u, v, pupil_z, wavelength_nm, self.film_mm).numpy()
+
+
+class FusedExactCamera(ExactCamera):
+    """A prescription without coatings and absorption as a compiled camera: the rays of `ExactCamera` to rounding.
+
+    Args and attributes are those of `ExactCamera`, whose `dtype` is float32 here; for differentials see `FusedFilm`.
+
+    Raises:
+        InputError: as `ExactCamera`; no C compiler; coatings or glass that absorbs.
+    """
+
+    rays_a_call = MANY_RAYS_A_CALL
+
+    def __init__(self, lens: Lens, **kwargs: Any) -> None:
+        _check_bare(lens)
+        super().__init__(lens, **kwargs)
+        waves = self.wavelength_nm or (LINE_D_NM, LINE_D_NM)
+        graph = exact_graph(self.lens, self._pupil_z_mm, waves)
+        stop, surface = float(self.lens.stop_radius_mm), self.lens.stop_index
+        self._fused = FusedFilm(self.film, graph, stop, self.film_mm, self.lens.aperture, surface)
+        self.settings |= {"runtime": "fused"}
+
+    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
+        return self._fused.sample(film_mm, pupil, wavelength_nm)
+
+    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """As `sample`, with the differentials of the rays, which come from the same pass."""
+        return self._fused.sample(film_mm, pupil, wavelength_nm, True)
+
+    @property
+    def differentials_error(self) -> float | None:
+        """See `FusedFilm.moves_error`."""
+        return self._fused.moves_error
+
+
+def _check_bare(lens: Lens) -> None:
+    for k, s in enumerate(lens.surfaces):
+        coated = s.coating is not None and bool(s.coating.layers)
+        absorbs = (s.glass is not None or s.absorption_per_mm) and absorption_of(s, LINE_D_NM) is not None
+        if coated or absorbs:
+            found = "(a coating)" if coated else "(glass that absorbs)"
+            raise InputError(lens.path, f"surface {k}", found, "a bare, clear lens for a C tracer: leave out fused:")
+
+
+@dataclass(frozen=True)
+class HeldPupil:
+    """A pupil on a plane of its own, sampled as the outline is, on the outline's plane.
+
+    Attributes:
+        pupil: what is sampled. film_z_mm, plane_z_mm: of the film, and of the plane that points are wanted on.
+    """
+
+    pupil: RadialPupil
+    film_z_mm: float
+    plane_z_mm: float
+
+    def sample(
+        self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """As `PupilOutline.sample`; every wavelength has the same pupil."""
+        finite = np.isfinite(film_mm).all(0)
+        film = np.where(finite, film_mm, np.float32(0)).astype(np.float64)
+        points, area = self.pupil.sample(film, square.astype(np.float64))
+        stretch = (self.film_z_mm - self.plane_z_mm) / (self.film_z_mm - self.pupil.pupil_z_mm)
+        held = (film + stretch * (points - film)).astype(np.float32)
+        return held, (area * stretch**2 * finite).astype(np.float32)
+
+
+def pupil_named(name: str, lens: Lens, outline: PupilOutline, film_z_mm: float) -> HeldPupil:
+    """One of `PUPILS` other than the outline, for a focused lens.
+
+    Raises:
+        InputError: an unknown name, or a paraxial exit pupil at infinity.
+    """
+    if name not in _MAKERS:
+        raise InputError("camera", "pupil", name, f"one of: {', '.join(PUPILS)}")
+    found = _MAKERS[name](lens, outline.film_radius_mm)
+    return HeldPupil(_holding(found, outline, film_z_mm), film_z_mm, outline.pupil_z_mm)
+
+
+def _holding(pupil: RadialPupil, outline: PupilOutline, film_z_mm: float) -> RadialPupil:
+    """The pupil with each of its shapes enlarged about its centre until it holds the outline at its film radii."""
+    radius, x, y = _corners(outline)
+    stretch = (film_z_mm - pupil.pupil_z_mm) / (film_z_mm - outline.pupil_z_mm)
+    x, y = radius[:, None] + stretch * (x - radius[:, None]), stretch * y
+    count = pupil.centre.size
+    place = radius / pupil.film_radius_mm * count
+    centre, along, across = pupil.centre.copy(), pupil.along.copy(), pupil.across.copy()
+    for row in range(count):
+        # The ends of the interval belong to it, and their nearest radii of the outline on either side.
+        inside = np.flatnonzero((place >= row) & (place <= row + 1))
+        first, last = np.searchsorted(place, [row, row + 1])
+        rows = np.unique(np.clip(np.concatenate([inside, [first - 1, last]]), 0, radius.size - 1))
+        u, v = x[rows], np.abs(y[rows])
+        if along[row] <= 0 or across[row] <= 0:  # no ray was found, where the outline holds some
+            centre[row] = (u.max() + u.min()) / 2
+            along[row], across[row] = max((u.max() - u.min()) / 2, 1e-9), max(float(v.max()), 1e-9)
+        u, v = np.abs(u - centre[row]) / along[row], v / across[row]
+        reach = np.maximum(u, v) if pupil.shape == "box" else np.hypot(u, v)
+        scale = max(_HAIR * float(reach.max()), 1.0)
+        along[row], across[row] = along[row] * scale, across[row] * scale
+    return replace(pupil, centre=centre, along=along, across=across)
+
+
+def _corners(outline: PupilOutline) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Film radii [R'] and corners x, y [R', V] of the outline there, all its wavelengths together."""
+    last = outline.centre.size - 1
+    place = np.linspace(0, last, last * _BETWEEN + 1)
+    row = np.minimum(place.astype(int), last - 1)
+    step = (place - row)[:, None, None]
+    x, y = (c.transpose(1, 0, 2).astype(np.float64) for c in (outline.centre[None, :, None] + outline.x, outline.y))
+    x, y = ((1 - step) * c[row] + step * c[row + 1] for c in (x, y))
+    return outline.radii(place), x.reshape(place.size, -1), y.reshape(place.size, -1)

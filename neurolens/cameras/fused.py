@@ -1,7 +1,7 @@
 """Lenses as compiled C cameras: everything between the random numbers and the weighted ray in one call.
 
 The system's C compiler makes the code when the camera is made (1 to 10 s, kept for the next time; see
-`programs.compiler`). It runs in float32 on the thread that calls it; workers that are forked share it.
+`graph.compiler`). It runs in float32 on the thread that calls it; workers that are forked share it.
 """
 
 from __future__ import annotations
@@ -16,35 +16,36 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FloatArray, RayDifferentials
 from neurolens.cameras.fusedsource import Setting, camera_source
-from neurolens.cameras.graphprogram import program_of
 from neurolens.cameras.lens_film import LensFilm
 from neurolens.cameras.model import UNIT_SLACK, ModelScene, OnnxCamera
+from neurolens.graph.compiler import load_compiled
+from neurolens.graph.derive import derivative
+from neurolens.graph.ir import Graph
+from neurolens.graph.loworder import with_film_derivatives, with_low_order_derivatives
+from neurolens.graph.program import FILM_X_Y
+from neurolens.graph.scalars import lower
+from neurolens.modelfile.graph import graph_of
 from neurolens.optics.apertures import Aperture
-from neurolens.programs.compiler import load_compiled
-from neurolens.programs.contract import FILM_X_Y, FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH, derivative
-from neurolens.programs.expressions import Program
-from neurolens.programs.loworder import with_low_order_derivatives
-from neurolens.programs.tangents import with_derivatives
 
 _SAMPLES = 4096  # rays that low-order derivatives are fitted to
 
 
 class FusedFilm:
-    """A lens's film and pupil, and the lens itself as a program, as one compiled function.
+    """A lens's film and pupil, and the lens itself as a graph, as one compiled function.
 
-    Differentials are polynomials fitted to those of the program, within `loworder.WORST` of them, or else the program's
+    Differentials are polynomials fitted to those of the graph, within `loworder.WORST` of them, or else the graph's
     own, which cost as much as its rays.
 
     Args:
         film: of the same lens, focus and stop.
-        program: inputs and outputs of `programs.contract`.
-        stop_radius_mm: of the round stop that the program knows.
+        graph: of the lens.
+        stop_radius_mm: of its round stop.
         film_mm: width and height of the film whose rays differentials are fitted to.
         aperture: the shape of the opening, tested on the rays' crossings with the stop; None is round.
         stop_surface: of the lens, for the status of rays that the shape blocks.
 
     Attributes:
-        moves_error: RMS error of fitted differentials over their size; None where they are the program's own, or were
+        moves_error: RMS error of fitted differentials over their size; None where they are the graph's own, or were
             not asked for yet.
 
     Raises:
@@ -54,7 +55,7 @@ class FusedFilm:
     def __init__(
         self,
         film: LensFilm,
-        program: Program,
+        graph: Graph,
         stop_radius_mm: float,
         film_mm: tuple[float, float],
         aperture: Aperture | None = None,
@@ -62,7 +63,7 @@ class FusedFilm:
     ) -> None:
         if film.pupil is not film.outline:
             raise InputError("camera", "pupil", "(another)", "outline: the only one that fused cameras sample")
-        self._program = program.in_order_of_need()
+        self._graph = graph
         self._aperture, self._stop_radius_mm = aperture, stop_radius_mm
         self._stopped = np.int32(st.blocked(stop_surface, st.RIM))
         self._outline, self._film_mm = film.outline, film_mm
@@ -83,7 +84,7 @@ class FusedFilm:
             stop_radius_mm,
             1e-3 * film.film_z_mm,
         )
-        self._rays: Any = _compiled(self._program)
+        self._rays: Any = _compiled(graph)
         self._rays_and_moves: Any = None
         self.moves_error: float | None = None
 
@@ -112,28 +113,28 @@ class FusedFilm:
         if not differentials:
             return self._rays
         if self._rays_and_moves is None:
-            self._rays_and_moves = _compiled(self._program_with_moves())
+            self._rays_and_moves = _compiled(self._with_differentials())
         return self._rays_and_moves
 
-    def _program_with_moves(self) -> Program:
-        """With differentials, points in metres."""
-        fitted = with_low_order_derivatives(self._program, self._samples())
+    def _with_differentials(self) -> Graph:
+        """The graph with differentials, points in metres."""
+        fitted = with_low_order_derivatives(self._graph, self._samples())
         self.moves_error = None if fitted is None else fitted.error
-        program = with_derivatives(self._program, SCENE_RAY, FILM_X_Y) if fitted is None else fitted.program
-        for name in (derivative(output, by) for output in SCENE_RAY[:3] for by in FILM_X_Y):
-            program.outputs[name] = program.outputs[name] * 1e-3
-        return program
+        graph = with_film_derivatives(self._graph) if fitted is None else fitted.graph
+        for name in (derivative("scene_ray", by) for by in FILM_X_Y):
+            graph.outputs[name] = graph.outputs[name] * [1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0]
+        return graph
 
     def _samples(self) -> dict[str, FloatArray]:
-        """Inputs of the program for rays all over film, pupil and wavelengths."""
+        """Inputs of the graph for rays all over film, pupil and wavelengths."""
         rng, outline = np.random.default_rng(0), self._outline
         film = (rng.random((2, _SAMPLES)) - 0.5) * np.array(self._film_mm)[:, None]
         film *= np.minimum(1, 0.99 * outline.film_radius_mm / np.hypot(*film))
         wavelength = rng.uniform(outline.wavelength_nm[0], outline.wavelength_nm[-1], _SAMPLES).astype(np.float32)
         film, square = film.astype(np.float32), rng.random((2, _SAMPLES), np.float32)
-        given = dict(zip(RAY, (*film, *outline.sample(film, square, wavelength)[0]), strict=True))
-        per_call = {FILM_Z: self._setting.film_z_mm, STOP_RADIUS: self._setting.stop_radius_mm}
-        return given | {WAVELENGTH: wavelength} | {name: np.float32(value) for name, value in per_call.items()}
+        rays = np.stack([*film, *outline.sample(film, square, wavelength)[0], wavelength])
+        per_call = {"film_z_mm": self._setting.film_z_mm, "stop_radius_mm": self._setting.stop_radius_mm}
+        return {"rays": rays} | {name: np.array([[value]], np.float32) for name, value in per_call.items()}
 
 
 class FusedCamera(OnnxCamera):
@@ -150,11 +151,11 @@ class FusedCamera(OnnxCamera):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        program = program_of(self.model.path, self.model.data, self.model.state if self.model.axes else ())
+        graph = graph_of(self.model.path, self.model.data, self.model.state if self.model.axes else ())
         scene = self.film.scene
         assert isinstance(scene, ModelScene)
         surface = int(self.model.card["lens"].get("stop_surface", 0))
-        self._fused = FusedFilm(self.film, program, scene.stop_radius_mm, self.film_mm, scene.aperture, surface)
+        self._fused = FusedFilm(self.film, graph, scene.stop_radius_mm, self.film_mm, scene.aperture, surface)
         self.settings |= {"runtime": "fused"}
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
@@ -184,7 +185,8 @@ def _tables(film: LensFilm) -> tuple[FloatArray, FloatArray]:
     return np.ascontiguousarray(both.reshape(16, -1).T), np.ascontiguousarray(outline.centres.T)
 
 
-def _compiled(program: Program) -> Any:
+def _compiled(graph: Graph) -> Any:
+    program = lower(graph).in_order_of_need()
     function = load_compiled(camera_source(program, st.PASSED, st.OUTSIDE_DOMAIN, UNIT_SLACK)).neurolens_camera
     function.argtypes, function.restype = [ctypes.c_size_t] + [ctypes.c_void_p] * 10, None
     return function

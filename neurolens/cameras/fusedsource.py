@@ -1,15 +1,16 @@
 """A whole camera as C: pupil outline, lens, weight and status of a block of rays after the other, in the first cache.
 
 The same arithmetic as `pupil_outline.PupilOutline.sample` and `lens_film.LensFilm.sample`, around the function of a
-lens that `programs.c` writes.
+lens that `graph.c` writes.
 """
 
 from __future__ import annotations
 
 import ctypes
 
-from neurolens.programs.c import Signature, literal, write_c
-from neurolens.programs.contract import (
+from neurolens.graph.c import Signature, literal, write_c
+from neurolens.graph.derive import derivative
+from neurolens.graph.program import (
     FILM_X_Y,
     FILM_Z,
     RAY,
@@ -19,9 +20,8 @@ from neurolens.programs.contract import (
     STOP_RADIUS,
     TRANSMITTANCE,
     WAVELENGTH,
-    derivative,
+    Program,
 )
-from neurolens.programs.expressions import Program
 
 BLOCK = 256  # rays: their numbers between the stages fit the first cache
 _NAME = "lens"

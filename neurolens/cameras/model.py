@@ -16,13 +16,12 @@ from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
 from neurolens.cameras.lens_film import LensFilm, SceneRays
-from neurolens.cameras.onnxderivatives import OnnxDerivatives
-from neurolens.cameras.onnxinverse import OnnxInverse, load_inverse
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
+from neurolens.cameras.onnxmaps import OnnxDerivatives, OnnxInverse, load_inverse
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.sampling import arrived, check_film, positive
-from neurolens.cameras.states import state_for
 from neurolens.modelfile import DOMAIN_SLACK
+from neurolens.modelfile.states import state_for
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.film_plane import film_z_mm
 

@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
-from neurolens.cameras.cardcheck import check_card
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.onnxfile import read_checked, without_outputs
 from neurolens.cameras.onnxsession import open_session, run_session
-from neurolens.cameras.states import STATE, axes_of, card_at, default_state, state_numbers
+from neurolens.modelfile.cardcheck import check_card
+from neurolens.modelfile.onnxfile import read_checked, without_outputs
+from neurolens.modelfile.states import STATE, axes_of, card_at, default_state, state_numbers
 
 INPUTS = {"rays": ("tensor(float)", 5, None), "film_z_mm": ("tensor(float)", 1), "stop_radius_mm": ("tensor(float)", 1)}
 OUTPUTS = {
@@ -25,7 +25,7 @@ OUTPUTS = {
     "stop_xy_mm": ("tensor(float)", 2, None),
     "status": ("tensor(int32)", None),
 }
-# Outputs that a file may have besides; see `onnxderivatives`.
+# Outputs that a file may have besides; see `onnxmaps`.
 DERIVATIVES = {name: ("tensor(float)", 2, 6, None) for name in ("scene_ray_d_film", "scene_ray_d_pupil")}
 # Rays a call of onnxruntime: enough to hide the cost of its operators, few enough for the caches.
 BATCH = 16384

@@ -52,5 +52,31 @@ def run_session(
     return found
 
 
+def run_batches(
+    path: Path,
+    session: Any,
+    outputs: Sequence[str],
+    rays: tuple[str, NDArray[np.float32]],
+    call: Mapping[str, float],
+    batch: int,
+) -> list[NDArray[Any]]:
+    """The outputs for any number of rays.
+
+    Args:
+        rays: name of the input, and its columns [K, N]. call: the other inputs, a number each.
+        batch: rays a call of onnxruntime.
+
+    Raises:
+        ModelError: as of `run_session`.
+    """
+    name, columns = rays
+    numbers = {key: np.array([value], np.float32) for key, value in call.items()}
+    parts = [
+        run_session(path, session, outputs, {name: np.ascontiguousarray(columns[:, i : i + batch]), **numbers})
+        for i in range(0, max(columns.shape[1], 1), batch)
+    ]
+    return [np.concatenate(of_one, -1) for of_one in zip(*parts, strict=True)]
+
+
 def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]

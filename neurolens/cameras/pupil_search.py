@@ -12,8 +12,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from neurolens.cameras.pupil_boxes import Passes, PupilTable, tightened
-from neurolens.cameras.pupil_lattice import Ask, Float64Array, Frame, asking, end_of_light, frame_of
+from neurolens.cameras.pupil_boxes import (
+    Ask,
+    Float64Array,
+    Frame,
+    Passes,
+    PupilTable,
+    asking,
+    end_of_light,
+    frame_of,
+    tightened,
+)
 from neurolens.cameras.pupil_outline import PupilOutline, wavelength_between
 
 # Directions in which the first outline is sought; steps outwards, and halvings of the step that crosses the boundary.

@@ -1,4 +1,4 @@
-"""`neurolens analyse LENS [WHAT ...]`: what lens designers look at, as tables, JSON and pictures."""
+"""`neurolens analyse LENS [WHAT ...]`: spots, MTF, distortion and other analyses as tables, JSON and pictures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between, focus_of
+from neurolens.commands.arguments import add_json, add_lens_state, between, focus_of, state_of
 from neurolens.commands.output import number, print_json, table
 
 if TYPE_CHECKING:
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 WHATS = ("layout", "spots", "fans", "colour", "curvature", "distortion", "vignetting", "mtf", "seidel", "psf")
 _OF_FIELDS = ("spots", "fans", "mtf", "psf")  # take --fields and --wavelengths
-_BULK = {  # left out of the JSON unless asked for: a number a ray or a pixel
+_BULK = {  # left out of the JSON unless asked for: a number per ray or a pixel
     "layout": ("rays", "surfaces"),
     "spots": ("tangential_um", "sagittal_um", "slope_tangential", "slope_sagittal"),
     "psf": ("geometric", "diffraction"),
 }
 
 _DESCRIPTION = """\
-Trace a lens from the scene and show what designers look at. WHAT is any of:
+Trace a lens from the scene and analyse its image. WHAT is any of:
 
   layout      the section of the lens with rays
   spots       spot diagrams over field and focus, RMS and geometric radius, Airy disc
@@ -41,7 +41,7 @@ Trace a lens from the scene and show what designers look at. WHAT is any of:
   seidel      Seidel sums S1 to S5 and the colour sums C1 and C2, surface by surface
   psf         point spread, geometric and by diffraction
 
-Without WHAT all are shown. Rays fill the real stop, whatever the pupils do; fields are angles
+Without WHAT all are shown. Rays fill the real stop, not a paraxial pupil; fields are angles
 from the axis in degrees, of the chief ray in the scene. Needs the extra "train" (torch)."""
 _EPILOG = """\
 examples:
@@ -51,8 +51,6 @@ examples:
 
 
 class _Analysis(NamedTuple):
-    """How one WHAT is computed, drawn and printed."""
-
     compute: Callable[..., Any]
     draw: Callable[..., Path]
     table: Callable[[dict[str, Any]], str]
@@ -82,11 +80,11 @@ def add_parser(subparsers: Any) -> None:
     add_json(parser)
     parser.add_argument("--full", action="store_true", help="with --json: also every ray and every pixel")
     parser.intermixed = True
-    parser.set_defaults(run=run, kept="pictures that are finished stay")
+    parser.set_defaults(run=run, kept="finished pictures are kept")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the analyses asked for, and draw them where a folder is given."""
+    """Print the requested analyses, and draw them if a folder is given."""
     unknown = [w for w in args.what if w not in WHATS]
     if unknown:
         raise InputError("neurolens analyse", "WHAT", unknown[0], f"any of: {', '.join(WHATS)}")
@@ -127,20 +125,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def scene_of(args: argparse.Namespace) -> tuple[Scene, list[str]]:
-    """The lens in the state that the arguments of `add_lens_state` ask for with its object, and what is doubtful."""
+    """The lens with its object in the state of the arguments of `add_lens_state`, and warnings."""
     from neurolens.analysis.fields import DEFAULT_NM, Scene
 
-    tabled, told = read_told(args.file)
-    lens = tabled.at(
-        zoom=args.zoom,
-        focal_length_mm=args.efl,
-        field_deg=args.field,
-        f_number=args.f_number,
-        focus_m=args.focus,
-        focus=args.focusing,
-    ).with_aperture(aperture_of(args) or tabled.aperture)
-    told += table_warnings(tabled, lens, args.zoom) + wavelength_warnings(lens, args.wavelengths or DEFAULT_NM)
-    return Scene(lens, focus_of(args, tabled, lens), args.axis), told
+    tabled, notes = read_with_warnings(args.file)
+    lens = state_of(args, tabled)
+    notes += table_warnings(tabled, lens, args.zoom) + wavelength_warnings(lens, args.wavelengths or DEFAULT_NM)
+    return Scene(lens, focus_of(args, tabled, lens), args.axis), notes
 
 
 def _one(what: str, scene: Scene, args: argparse.Namespace) -> tuple[dict[str, Any], Path | None]:
@@ -171,7 +162,7 @@ def _subtitle(scene: Scene) -> str:
 
 
 def _analysis(what: str) -> _Analysis:
-    """Looked up by name; torch and matplotlib are loaded here, not when the command line starts."""
+    """The analysis of a name; torch and matplotlib are imported here, not when the command line starts."""
     from neurolens.analysis import plots
     from neurolens.analysis.field_curves import colour, curvature, distortion, illumination
     from neurolens.analysis.layout import layout_profile, lens_layout
@@ -193,8 +184,8 @@ def _analysis(what: str) -> _Analysis:
     }[what]
 
 
-def read_told(path: str | Path) -> tuple[Lens, list[str]]:
-    """A lens file, and what its reader warns of: glasses that contradict the catalogue, indices taken as constant."""
+def read_with_warnings(path: str | Path) -> tuple[Lens, list[str]]:
+    """A lens file and the reader's warnings: glasses that contradict the catalogue, indices taken as constant."""
     from neurolens.optics.lensfile import read_lens
 
     with warnings.catch_warnings(record=True) as caught:
@@ -204,12 +195,9 @@ def read_told(path: str | Path) -> tuple[Lens, list[str]]:
 
 
 def table_warnings(tabled: Lens, lens: Lens, zoom: str | None) -> list[str]:
-    """Doubts about the table and, where one of its states is used, about them; see `neurolens.optics.lenscheck`.
+    """Doubts about the table and, if `zoom` selects a state, about its states; see `neurolens.optics.lenscheck`.
 
-    Args:
-        tabled: as the file has it.
-        lens: the state that is analysed.
-        zoom: the name or focal length in mm of a state, if one was asked for.
+    `tabled` is the lens of the file, `lens` the analysed state.
     """
     from neurolens.optics.lenscheck import check_lens, doubts
 
@@ -217,7 +205,7 @@ def table_warnings(tabled: Lens, lens: Lens, zoom: str | None) -> list[str]:
         "estimated": ["rim diameters are estimated, not the source's: vignetting is a guess"],
         "derived": ["rim diameters are derived by a rule, the source has none: vignetting follows that rule"],
     }.get(lens.rims, [])
-    # A stop that is smaller than stated is a choice, not a doubt; `neurolens lens` says so too.
+    # A smaller stop than stated is a choice, not a doubt.
     checks = [c for c in check_lens(tabled) if c.quantity != "f-number" or (c.computed or 0.0) > (c.stated or 0.0)]
     return found + doubts([c for c in checks if zoom or not c.state])
 
@@ -240,12 +228,11 @@ def wavelength_warnings(lens: Lens, wavelength_nm: Iterable[float]) -> list[str]
     return list(found.values())
 
 
-_ROWS = 6  # of curves over the field: enough to see their shape
+_ROWS = 6  # of tables over the field
 _MTF_PER_MM = (10, 20, 30, 40, 50)
 
 
 def _layout_text(data: dict[str, Any]) -> str:
-    """Which fields the drawn rays belong to."""
     counts: dict[str, int] = {}
     for ray in data["rays"]:
         counts[ray["label"]] = counts.get(ray["label"], 0) + 1
@@ -349,7 +336,7 @@ def _over_field(
     cells: Callable[[int], Sequence[str]],
     fields: Iterable[int] | None = None,
 ) -> str:
-    """A table with a row a field: its angle, its height and `cells` of it; some fields where none are given."""
+    """A table with a row per field: its angle, its height and `cells` of it; some fields where none are given."""
     chosen = _some(len(data["field_deg"])) if fields is None else fields
     rows = [(_angle(data, i), _fixed(data["height_mm"][i], 2), *cells(i)) for i in chosen]
     return f"{head}\n{table(('field', 'height mm', *header), rows)}"
@@ -371,7 +358,6 @@ def _some(count: int, rows: int = _ROWS) -> list[int]:
 
 
 def _fixed(value: float, places: int = 3) -> str:
-    """So many places, "-" where there is no value."""
     return "-" if math.isnan(value) else f"{value + 0.0:.{places}f}"
 
 
@@ -385,5 +371,5 @@ def _largest(values: Sequence[float]) -> float:
 
 
 def _three(value: float) -> str:
-    """Three digits; what rounding leaves of a zero is a zero."""
+    """Three digits; rounding errors of a zero are 0."""
     return number(0.0 if abs(value) < 1e-6 else value, 3)

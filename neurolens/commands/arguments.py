@@ -1,4 +1,4 @@
-"""What the commands' arguments share: numbers with their range and unit, the state of a lens, help with examples."""
+"""Shared arguments of commands: numbers with range and unit, the state of a lens, help with examples."""
 
 from __future__ import annotations
 
@@ -6,24 +6,26 @@ import argparse
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 if TYPE_CHECKING:
     from neurolens.optics.apertures import Aperture
     from neurolens.optics.prescription import Lens
 
+T = TypeVar("T")
+
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose mistakes are one line, and whose help keeps its line breaks."""
+    """A parser with one-line error messages, whose help keeps its line breaks."""
 
     def __init__(self, **options: Any) -> None:
         options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
-        # An abbreviation that works today would break a script when an option is added.
+        # An abbreviation can become ambiguous when an option is added.
         super().__init__(allow_abbrev=False, **options)
         self.intermixed = False  # True: options may stand before and between the arguments of a list
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As argparse has it, but a command complains itself of what it does not know."""
+        """As in argparse, but an intermixed command reports unknown arguments itself."""
         if self.intermixed:
             self.intermixed = False  # argparse comes back here for its two passes
             try:
@@ -40,52 +42,36 @@ class Parser(argparse.ArgumentParser):
 
 
 def positive(unit: str, *, infinite: bool = False) -> Callable[[str], float]:
-    """Type of an argument that is a number above 0; "inf" only where it makes sense."""
-
-    def convert(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not value > 0 or (math.isinf(value) and not infinite):
-            raise argparse.ArgumentTypeError(f"got {text!r}, expected {unit} above 0{', or inf' if infinite else ''}")
-        return value
-
-    return convert
+    """Type of an argument that is a number above 0; "inf" only if `infinite`."""
+    expected = f"{unit} above 0{', or inf' if infinite else ''}"
+    return _number(float, lambda value: value > 0 and (infinite or not math.isinf(value)), expected)
 
 
 def between(low: float, high: float, unit: str) -> Callable[[str], float]:
     """Type of an argument that is a number from `low` to `high`."""
-
-    def convert(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not low <= value <= high:  # false for NaN
-            raise argparse.ArgumentTypeError(f"got {text!r}, expected {unit} from {low:g} to {high:g}")
-        return value
-
-    return convert
+    return _number(float, lambda value: low <= value <= high, f"{unit} from {low:g} to {high:g}")
 
 
 def whole(least: int, most: int | None = None) -> Callable[[str], int]:
     """Type of an argument that is an integer from `least` to `most`."""
+    span = f"from {least}" + ("" if most is None else f" to {most}")
+    return _number(int, lambda value: value >= least and (most is None or value <= most), f"an integer {span}")
 
-    def convert(text: str) -> int:
+
+def _number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) -> Callable[[str], T]:
+    def convert(text: str) -> T:
         try:
-            value = int(text)
+            value = kind(text)
+            if good(value):  # false for NaN
+                return value
         except ValueError:
-            value = least - 1
-        if value < least or (most is not None and value > most):
-            span = f"from {least}" + ("" if most is None else f" to {most}")
-            raise argparse.ArgumentTypeError(f"got {text!r}, expected an integer {span}")
-        return value
+            pass
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}")
 
     return convert
 
 
-# Kept here too, for help needs no camera; a test holds it against `cameras.exact_pupils` and `cameras.vignetting`.
+# Repeated here, so that help imports no camera; a test compares with `cameras.exact` and `cameras.vignetting`.
 PUPILS = ("outline", "rear-rim", "exit-pupil", "wu", "pixel-disc", "pixel-ellipse", "boxes", "ellipses")
 VIGNETTINGS = ("both", "natural", "optical", "none")
 CAMERAS_HELP = """\
@@ -93,7 +79,7 @@ cameras:
   LENS.toml                    the lens, traced exactly, every ray through every surface
   MODEL.onnx                   an exported model of a lens
   fused:LENS.toml, fused:MODEL.onnx
-                               the same, compiled by the system's C compiler: many times as fast
+                               the same, compiled by the system's C compiler: many times faster
   thick:LENS.toml              its principal planes and pupils: ideal imaging, no rims
   thin, pinhole                a thin lens; a point
   fisheye-equidistant, fisheye-equisolid, fisheye-stereographic, fisheye-orthographic
@@ -118,14 +104,14 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--vignetting", choices=VIGNETTINGS, default="both",
-        help="what is left of it: both; natural, the cos^4 law; optical, the effective aperture; none (default: both)",
+        help="parts that are kept: both; natural, the cos^4 law; optical, the effective aperture; none (default: both)",
     )  # fmt: skip
 
 
 def add_lens_state(parser: argparse.ArgumentParser, defaults: dict[str, str]) -> None:
     """Add --efl, --field, --zoom, --f-number, --focus, --focusing and the stop's shape.
 
-    `defaults` says in words what efl, f_number and focus are when left out.
+    `defaults` describes the defaults of efl, f_number and focus for the help.
     """
     group = parser.add_argument_group("state of the lens")
     size = group.add_mutually_exclusive_group()
@@ -140,7 +126,7 @@ def add_lens_state(parser: argparse.ArgumentParser, defaults: dict[str, str]) ->
     group.add_argument(
         "--zoom", "--configuration", metavar="STATE", dest="zoom",
         help="state of the lens file by name, or a focal length in mm between its states (derived: its table and "
-        "interpolated gaps); default: the table as it stands",
+        "interpolated gaps); default: the state of the table",
     )  # fmt: skip
     group.add_argument(
         "--f-number", metavar="N", type=positive("an f-number"),
@@ -175,7 +161,7 @@ def add_lens_state(parser: argparse.ArgumentParser, defaults: dict[str, str]) ->
 
 
 def aperture_of(args: argparse.Namespace) -> Aperture | None:
-    """The stop's shape that the arguments of `add_lens_state` ask for; None where they say nothing.
+    """The stop's shape by the arguments of `add_lens_state`; None if not given.
 
     Raises:
         InputError: shapes that exclude each other, a picture that cannot be read.
@@ -185,10 +171,18 @@ def aperture_of(args: argparse.Namespace) -> Aperture | None:
     return make_aperture(args.blades, args.blade_rotation, args.blade_curvature, args.aperture_mask)
 
 
-def focus_of(args: argparse.Namespace, tabled: Lens, lens: Lens) -> float:
-    """Film to object in metres: as the arguments of `add_lens_state` ask, or that of the focus state they name.
+def state_of(args: argparse.Namespace, tabled: Lens) -> Lens:
+    """The lens of a file in the state of the arguments of `add_lens_state`; raises InputError as `Lens.at`."""
+    return tabled.at(
+        zoom=args.zoom, focal_length_mm=args.efl, field_deg=args.field, f_number=args.f_number,
+        focus_m=args.focus, focus=args.focusing,
+    ).with_aperture(aperture_of(args) or tabled.aperture)  # fmt: skip
 
-    `tabled` is the lens of the file, `lens` its state. inf where nothing says otherwise.
+
+def focus_of(args: argparse.Namespace, tabled: Lens, lens: Lens) -> float:
+    """Film to object in metres by the arguments of `add_lens_state` or the focus state they name, else inf.
+
+    `tabled` is the lens of the file, `lens` its state.
     """
     if args.focus is not None:
         return float(args.focus)
@@ -201,7 +195,7 @@ def focus_of(args: argparse.Namespace, tabled: Lens, lens: Lens) -> float:
 
 
 def given_options(args: argparse.Namespace) -> list[str]:
-    """Which options of `add_lens_state` were given, for commands that have no use for them."""
+    """The options of `add_lens_state` that were given, for modes without a lens state."""
     names = ("efl", "field", "zoom", "f_number", "focus", "blades", "blade_rotation", "blade_curvature")
     given = [f"--{n.replace('_', '-')}" for n in (*names, "aperture_mask") if getattr(args, n) is not None]
     return given + (["--focusing"] if args.focusing != "film" else [])

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 SURROGATES = """\
 Fit every method for every lens on the same rays, measure errors, size and time against the exact
-tracer, and write one JSON record a lens and method, one table and plot a lens, and a summary over
+tracer, and write one JSON record per lens and method, one table and plot per lens, and a summary over
 the lenses with the median and the worst.
 
-A record that is there, made by the same settings and version, is not made again: a run that was
-interrupted goes on where it stopped. A method that fails on a lens is a row with the reason."""
+Existing records of the same settings and version are kept: an interrupted run resumes where it
+stopped. A method that fails on a lens is a row with the reason."""
 _EPILOG = """\
 examples:
   neurolens bench surrogates my_lens.toml
@@ -36,14 +36,14 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "bench",
         help="every kind of surrogate on a lens, against its exact trace",
-        description='Race the methods on lenses of your own. Needs the extra "train" (torch).',
+        description='Compare the methods on your lenses. Needs the extra "train" (torch).',
     )
     kinds = parser.add_subparsers(metavar="WHAT", required=True, parser_class=Parser)
     parser = kinds.add_parser(
         "surrogates", help="all methods on all axes of the trade", description=SURROGATES, epilog=_EPILOG
     )
     add_surrogate_arguments(parser, "+")
-    parser.set_defaults(run=run_surrogates, kept="finished records are kept; the same command goes on")
+    parser.set_defaults(run=run_surrogates, kept="finished records are kept; the same command resumes")
 
 
 def add_surrogate_arguments(parser: argparse.ArgumentParser, lenses: str) -> None:
@@ -54,12 +54,12 @@ def add_surrogate_arguments(parser: argparse.ArgumentParser, lenses: str) -> Non
         help="rows by name, or groups: paraxial, published, ours, ablations (default: the first three)",
     )  # fmt: skip
     parser.add_argument("--near", action="store_true", help="focus from infinity to the near limit, not infinity alone")
-    parser.add_argument("--quick", action="store_true", help="6000 rays, 3 rounds, no compiled tracer: a rough look")
+    parser.add_argument("--quick", action="store_true", help="6000 rays, 3 rounds, no compiled tracer: rough figures")
     parser.add_argument("--rays", metavar="N", type=whole(1000, 10**6), help="rays of fits and errors (default 30000)")
     parser.add_argument("--seed", metavar="N", type=whole(0), default=1, help="of the rays (default 1)")
     parser.add_argument("--rounds", metavar="N", type=whole(0), help="of the race, 0 for none (default 10)")
     parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=1, help="of the race (default 1)")
-    parser.add_argument("--again", action="store_true", help="make the chosen records again")
+    parser.add_argument("--again", action="store_true", help="recompute the chosen records")
     parser.add_argument(
         "--out", metavar="DIR", type=Path, default=Path("runs/surrogates"), help="folder (default: runs/surrogates)"
     )
@@ -67,7 +67,7 @@ def add_surrogate_arguments(parser: argparse.ArgumentParser, lenses: str) -> Non
 
 
 def run_surrogates(args: argparse.Namespace) -> int:
-    """Make what is missing, and write the pages after every lens."""
+    """Make missing records, and write the pages after every lens."""
     from neurolens.base.files import atomic_write_text
     from neurolens.base.progress import Progress
     from neurolens.evaluate.experiment import LensChoice

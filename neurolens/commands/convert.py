@@ -23,8 +23,8 @@ Read a lens file of another program and write it as a lens file of neurolens (.t
 
 Formats: Zemax (.zmx), CODE V (.seq), OSLO (.len, the simple ones), plain tables of four
 columns as in pbrt and appleseed (.dat, .txt), and JSON (our own, DeepLens, ISET). The content decides.
-What neurolens cannot hold or does not know is an error that names the line; what was left
-out, computed, assumed or doubtful is printed as a warning. Needs the extra "train" (torch)."""
+Unsupported content is an error that names the line; what was left out, computed, assumed or
+doubtful is printed as a warning. Needs the extra "train" (torch)."""
 _EPILOG = """\
 examples:
   neurolens convert double_gauss.zmx -o lenses/double_gauss.toml
@@ -39,7 +39,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("file", metavar="FILE", type=Path, help="lens file of another program")
     parser.add_argument("-o", "--output", metavar="OUT.toml", type=Path, required=True, help="lens file to write")
-    parser.add_argument("--force", action="store_true", help="replace a file that is there")
+    parser.add_argument("--force", action="store_true", help="replace an existing file")
     group = parser.add_argument_group("what the file does not say")
     group.add_argument("--name", help="name of the lens (default: the title in the file, else its file name)")
     group.add_argument("--source", help="where the figures come from (default: the file's name)")
@@ -57,11 +57,11 @@ def add_parser(subparsers: Any) -> None:
     )
     group.add_argument("--semi-diameters", action="store_true", help="plain table: the last column holds rim radii")
     add_json(parser)
-    parser.set_defaults(run=run, kept="nothing is written but a finished lens file")
+    parser.set_defaults(run=run, kept="only a finished lens file is written")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Convert one file and say what was read."""
+    """Convert one file and print what was read."""
     check_output(args.output, args.force)
     from neurolens.readers.any_format import read_any
     from neurolens.readers.draft import Given
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _doubts(lens: Lens) -> list[str]:
-    """Where the lens read does not do what its file states, in sentences: what `neurolens lens` says too."""
+    """Contradictions between the lens and statements of its file, as sentences."""
     from neurolens.optics.lenscheck import check_lens, doubts
 
     try:
@@ -102,24 +102,24 @@ def _doubts(lens: Lens) -> list[str]:
 
 
 def check_output(path: Path, force: bool) -> None:
-    """Refuse a file that could not be written, or that is there, before any work is done for it.
+    """Refuse an output file that cannot be written, or that exists, before the work.
 
     Raises:
-        InputError: another suffix, no such folder, a file that is there and no --force.
+        InputError: another suffix, no such folder, an existing file without --force.
     """
     if path.suffix.lower() != ".toml":
         raise InputError(path, "--output", path.suffix or "(no suffix)", ".toml")
     if not path.parent.is_dir():
         raise InputError(path, "--output", str(path.parent), "a folder that exists")
     if path.exists() and not force:
-        raise InputError(path, "--output", "(a file that is there)", "a new file, or --force to replace it")
+        raise InputError(path, "--output", "(an existing file)", "a new file, or --force to replace it")
 
 
 def write_checked(lens: Lens, path: Path) -> None:
     """Write a lens file, and keep it only if it reads back to the same lens.
 
     Raises:
-        InputError: it does not; names the file to be written and what was wrong.
+        InputError: it does not; with the file to be written.
     """
     from neurolens.optics.lensfile import read_lens
     from neurolens.optics.lenswriter import format_lens
@@ -127,7 +127,7 @@ def write_checked(lens: Lens, path: Path) -> None:
     with atomic_path(path) as temporary:
         temporary.write_text(format_lens(lens), encoding="utf-8")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NeurolensWarning)  # said by the reader of the other format
+            warnings.simplefilter("ignore", NeurolensWarning)  # already reported by the reader of the other format
             try:
                 back = read_lens(temporary)
             except InputError as error:
@@ -137,7 +137,7 @@ def write_checked(lens: Lens, path: Path) -> None:
 
 
 def summary(lens: Lens, told: list[str]) -> dict[str, Any]:
-    """What was read, for people and for --json; mm."""
+    """Figures of the lens for text and --json; mm."""
     from neurolens.optics import paraxial
     from neurolens.readers.assemble import first_order
 

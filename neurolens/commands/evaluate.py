@@ -1,4 +1,4 @@
-"""`neurolens evaluate MODEL`: does a model keep what its card promises?"""
+"""`neurolens evaluate MODEL`: a model against the promises of its card."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from neurolens.evaluate.check import Promise
 
 _DESCRIPTION = """\
-Measure an exported model anew: fresh rays of its card's domain, traced through the exact lens in
+Measure an exported model on fresh rays of its card's domain, traced through the exact lens in
 float64 and through the ONNX model in onnxruntime. Prints each figure beside the card's promise and
 exits with code 1 if one does not hold. Needs the extra "train" (torch).
 
@@ -29,9 +29,9 @@ film's centre, mid and edge, its thirds by radius ("full.edge.rms_um").
 A model of many states (zoom, internal focus) is measured at six random states; its figures are the
 worst of them, and hold while they are at most 25% above the promise.
 
-Since the rays are others than the card's, an error holds while it is above the promise by at most
-4 standard deviations of what so many rays can tell, at least 10% and at most 50%; a share by at most
-4 standard deviations of the root of its count. A largest error is only shown."""
+As the rays differ from the card's, an error holds while it is above the promise by at most 4 standard
+deviations of its estimate from so many rays, at least 10% and at most 50%; a share by at most 4
+standard deviations of the root of its count. A largest error is only shown."""
 _EPILOG = """\
 examples:
   neurolens evaluate models/NAME.onnx
@@ -40,6 +40,9 @@ examples:
 
 The lens file is looked for by the card's lens id: lenses/ beside the model and its folder, where a run
 keeps its own; ./lenses; the project's."""
+
+# Shown of a card without promises.
+_UNPROMISED = ("rms_um", "p99_um", "max_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
 
 
 def add_parser(subparsers: Any) -> None:
@@ -53,7 +56,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument(
         "--rays", metavar="N", type=whole(1000, 1_000_000), default=30_000,
-        help="rays that the lens passes, eight times as many where a few bad ones decide an error; "
+        help="rays that the lens passes, eight times as many if a few bad ones dominate an error; "
         "four times as many test the vignetting (default: 30000)",
     )  # fmt: skip
     parser.add_argument(
@@ -70,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.cameras.model import load_model
     from neurolens.evaluate.check import check_model, lens_of_card
 
-    model = load_model(args.model)  # on one thread: the race shares out batches
+    model = load_model(args.model)  # on one thread: the race distributes batches
     space = None
     if model.axes:
         from neurolens.evaluate.check import check_states, space_of_card
@@ -120,15 +123,16 @@ def _time(model: OnnxLens, name: str, threads: int) -> Any:
 
 
 def _text(data: dict[str, Any], promises: list[Promise]) -> str:
-    """The table of promises, the speed, and the verdict."""
-    header = ("figure", "promised", "measured", "allowed", "")
-    rows = [
+    header: tuple[str, ...] = ("figure", "promised", "measured", "allowed", "")
+    rows: list[tuple[str, ...]] = [
         (p.key, number(p.promised), number(p.measured), number(p.allowed), "" if p.holds else "does not hold")
         for p in promises
     ]
+    if not rows:
+        header, rows = ("figure", "measured"), [(key, number(data[key])) for key in _UNPROMISED]
     timing = data["ns_per_ray"]
     broken = [p.key for p in promises if not p.holds]
-    verdict = "The card promises nothing." if not promises else "All promises hold."
+    verdict = "The card has no promises." if not promises else "All promises hold."
     if broken:
         verdict = f"Does not hold: {', '.join(broken)}."
     lens = data["lens"]
@@ -136,15 +140,10 @@ def _text(data: dict[str, Any], promises: list[Promise]) -> str:
         [
             f"{data['model']}: {data['method']} of {lens['name']} ({lens['file']})\n"
             f"{data['rays']} fresh rays, seed {data['seed']}",
-            table(header, rows) if rows else _figures(data),
+            table(header, rows),
             f"{timing['min']:.1f} ns per ray (median {timing['median']:.1f}), {timing['threads']} thread(s), "
             f"batches of {timing['batch']}",
             *([f"Poor, as the card says: {', '.join(data['poor'])}."] if data["poor"] else []),
             verdict,
         ]
     )
-
-
-def _figures(data: dict[str, Any]) -> str:
-    keys = ("rms_um", "p99_um", "max_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
-    return table(("figure", "measured"), [(key, number(data[key])) for key in keys])

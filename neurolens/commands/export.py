@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 Write an exported model in another form: a self-contained C99 header (one function for a ray, one for
 arrays that compilers vectorise), a GLSL function, or an ONNX file. Domain guard, stop, rims,
-transmittance and status codes are those of the model; the card stands on top as a comment.
+transmittance and status codes are those of the model; the card is a comment at the top.
 Needs the extra "train" (torch)."""
 _EPILOG = """\
-what a scene fixes is folded into fewer operations (--fix, as often as needed):
-  wavelengths=450,550,650   one coefficient table a wavelength, chosen by the argument band (one: no argument;
-                            an ONNX file takes one)
+values fixed by a scene are folded into fewer operations (--fix, repeatable):
+  wavelengths=450,550,650   one coefficient table per wavelength, chosen by the argument band (a single one:
+                            no argument; an ONNX file takes one)
   film_z=59.2 | focus=2.0   film plane z in mm, or the object distance from the film in m that it focuses
   stop=4.5 | f_number=5.6   stop radius in mm, or the f-number it gives
 
@@ -38,7 +38,7 @@ examples:
   neurolens export models/NAME.onnx --to onnx -o a.onnx --inverse         # and a.stop.onnx, a.scene.onnx"""
 _PARTS = ("ray", "transmittance", "stop", "vignetting")
 _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
-# Rays that measure the errors of an ONNX file for what is fixed; those that teach inverse maps.
+# Rays for the errors of an ONNX file with fixed inputs; rays to fit inverse maps.
 _HELD_OUT, _VIGNETTING, _TRAIN = 20_000, 100_000, 15_000
 
 
@@ -54,16 +54,14 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--to", choices=("c", "glsl", "onnx"), required=True, help="form to write")
     parser.add_argument("-o", "--out", metavar="FILE", type=Path, required=True, help="file to write")
     parser.add_argument(
-        "--fix", metavar="KEY=VALUE", action="append", default=[], help="what the scene fixes (see below)"
+        "--fix", metavar="KEY=VALUE", action="append", default=[], help="a value fixed by the scene (see below)"
     )
     parser.add_argument(
         "--only", metavar="PARTS", default=",".join(_PARTS),
         help=f"comma-separated: {', '.join(_PARTS)} (default: all; the domain guard is always there)",
     )  # fmt: skip
     parser.add_argument("--name", metavar="WORD", help="of the function (default: the lens's id)")
-    parser.add_argument(
-        "--derivatives", action="store_true", help="of ONNX: outputs for ray differentials too, for who asks for them"
-    )
+    parser.add_argument("--derivatives", action="store_true", help="of ONNX: additional outputs for ray differentials")
     parser.add_argument(
         "--inverse", action="store_true",
         help="of ONNX: the inverse maps too (film and stop point to ray; scene ray to film), fitted and checked",
@@ -83,8 +81,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("neurolens export", "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
     check_writable(args.out)
     from neurolens.cameras.model import load_model
-    from neurolens.surrogates.source.fused import Fixed, Parts
-    from neurolens.surrogates.source.writer import export_source
+    from neurolens.surrogates.source import Parts, export_source
     from neurolens.surrogates.specialise import fixed_models
     from neurolens.surrogates.stored import load_fitted
 
@@ -97,8 +94,7 @@ def run(args: argparse.Namespace) -> int:
         about: dict[str, Any] = _write_inverse(models[0], args.out) if args.inverse else {}
     else:
         asked = Parts(*(name in parts for name in _PARTS[1:]))
-        fixed = Fixed(fix.film_z_mm, fix.stop_radius_mm)
-        written = export_source(models, args.out, args.to, card, parts=asked, fixed=fixed, name=args.name)
+        written = export_source(models, args.out, args.to, card, parts=asked, fix=fix, name=args.name)
         s = written.signature
         bands = [m.domain.wavelength_nm[0] for m in models] if s.bands > 1 else []
         about = {"function": s.name, "inputs": s.inputs, "outputs": [*s.outputs, "status"], "bands_nm": bands}
@@ -121,7 +117,7 @@ def model_file(path: Path) -> Path:
     if not path.is_dir():
         return path
     files = sorted(p for folder in (path, path / "models") for p in folder.glob("*.onnx"))
-    # Beside models lie their inverse maps, and files that an interrupted run has not finished.
+    # Inverse maps and unfinished files of an interrupted run lie beside models.
     found = [p for p in files if not p.name.startswith(".") and not p.name.endswith((".stop.onnx", ".scene.onnx"))]
     if len(found) != 1:
         names = ", ".join(str(p) for p in found) or "(none)"
@@ -138,7 +134,6 @@ def _parts(text: str) -> list[str]:
 
 
 def _given(texts: list[str]) -> dict[str, list[float]]:
-    """--fix as numbers by key."""
     found: dict[str, list[float]] = {}
     for text in texts:
         key, _, value = text.partition("=")
@@ -175,7 +170,7 @@ def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] |
     """The graph with its card: the errors of the card given, or measured anew for what was fixed."""
     from neurolens.cameras.model import load_model
     from neurolens.evaluate.measure import measure_errors
-    from neurolens.surrogates.onnx.export import export_onnx
+    from neurolens.surrogates.export import export_onnx
 
     if len(models) > 1:
         wavelengths = [m.domain.wavelength_nm[0] for m in models]
@@ -185,7 +180,7 @@ def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] |
         export_onnx(model, out, card["errors"], derivatives=derivatives)
         return
     seed, held_out = _seed(model), _pairs(model, train=1).held_out
-    with atomic_path(out) as measured:  # a file without its errors never stands under the name asked for
+    with atomic_path(out) as measured:  # a file without its errors never has the final name
         export_onnx(model, measured, {})
         errors = measure_errors(load_model(measured), model.lens, model.domain, held_out, _VIGNETTING, seed + 1)
         export_onnx(model, measured, errors, derivatives=derivatives)
@@ -194,8 +189,8 @@ def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] |
 def _write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
     """Both inverse maps beside the model's file: their files, and the share of fresh rays that each finds."""
     from neurolens.cameras.model import load_model
-    from neurolens.surrogates.inversion.fit import convergence, fit_inverse
-    from neurolens.surrogates.onnx.inverse import export_inverse
+    from neurolens.surrogates.export import export_inverse
+    from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 
     pairs = _pairs(model, train=_TRAIN)
     inverse = fit_inverse(model, pairs)
@@ -205,7 +200,6 @@ def _write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
 
 
 def _seed(model: LensModel) -> int:
-    """Of rays that the model was not fitted to."""
     from neurolens.evaluate.measure import FRESH
 
     return int(model.settings.get("rays_seed") or 0) + FRESH

@@ -41,7 +41,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the glasses asked for."""
+    """Print the requested glasses."""
     from neurolens.optics import catalogue
 
     found: list[Glass] = []

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between, focus_of, given_options
+from neurolens.commands.arguments import add_json, add_lens_state, between, focus_of, given_options, state_of
 from neurolens.commands.output import number, print_json, table
 
 if TYPE_CHECKING:
@@ -61,11 +61,10 @@ def add_parser(subparsers: Any) -> None:
         help="draw field of view, focal length and magnification against the focus distance (.png, .pdf, .svg)",
     )  # fmt: skip
     add_json(parser)
-    parser.set_defaults(run=run, kept="nothing is written but a finished --layout picture")
+    parser.set_defaults(run=run, kept="only a finished --layout picture is written")
 
 
 def _check_mode(args: argparse.Namespace, listing: bool) -> None:
-    """Refuse an option that the chosen table would silently ignore."""
     alone = not listing and not args.derive_rims
     kinds = {
         "--layouts": (args.layouts is not None, listing, 'with "list"'),
@@ -84,7 +83,7 @@ def _check_mode(args: argparse.Namespace, listing: bool) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the data of a lens, and draw it where asked; or the table of a folder; or derived rims."""
+    """Print and draw the data of a lens, or the table of a folder, or derived rims."""
     listing = str(args.file) == "list"
     _check_mode(args, listing)
     if listing:
@@ -100,16 +99,9 @@ def run(args: argparse.Namespace) -> int:
 
     began = time.perf_counter()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NeurolensWarning)  # `describe_lens` says the same among its warnings
+        warnings.simplefilter("ignore", NeurolensWarning)  # repeated by `describe_lens`
         tabled = read_lens(args.file)
-    lens = tabled.at(
-        zoom=args.zoom,
-        focal_length_mm=args.efl,
-        field_deg=args.field,
-        f_number=args.f_number,
-        focus_m=args.focus,
-        focus=args.focusing,
-    ).with_aperture(aperture_of(args) or tabled.aperture)
+    lens = state_of(args, tabled)
     focus, film_z = focus_of(args, tabled, lens), float(lens.film_z_mm or 0.0)
     domain = domain_of(lens, focus_m=(focus, focus), film_z_mm=(film_z, film_z))
     configurations = [
@@ -146,7 +138,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def check_layout_path(path: Path, option: str = "--layout") -> None:
-    """Refuse a picture that could not be written before any work is done for it.
+    """Refuse a picture that cannot be written before the work.
 
     Raises:
         InputError: another suffix, or no such folder.
@@ -159,7 +151,9 @@ def check_layout_path(path: Path, option: str = "--layout") -> None:
 
 def lens_text(data: dict[str, Any]) -> str:
     """The data of `neurolens lens` as a page of text."""
-    parts = [_head(data), _first_order(data), _light(data), _surfaces(data)]
+    by = f", {data['designer']}" if data["designer"] else ""
+    head = f"{data['name']}{by}\n{data['source']}"
+    parts = [head, _first_order(data), _light(data), _surfaces(data)]
     if data["configurations"]:
         zoom = [f"{c['name']} ({number(c['efl_mm'])} mm)" for c in data["configurations"] if not _near(c)]
         near = [f"{c['name']} ({number(c['object_distance_mm'])} mm)" for c in data["configurations"] if _near(c)]
@@ -177,11 +171,6 @@ def lens_text(data: dict[str, Any]) -> str:
 
 def _near(configuration: dict[str, Any]) -> bool:
     return configuration["object_distance_mm"] is not None
-
-
-def _head(data: dict[str, Any]) -> str:
-    by = f", {data['designer']}" if data["designer"] else ""
-    return f"{data['name']}{by}\n{data['source']}"
 
 
 def _first_order(data: dict[str, Any]) -> str:
@@ -248,7 +237,7 @@ def _surfaces(data: dict[str, Any]) -> str:
 
 
 def surface_words(row: dict[str, Any]) -> str:
-    """What a row of `evaluate.describe.glass_table` has beside radius and glass, in a few words; empty of a sphere."""
+    """Properties of a row of `evaluate.describe.glass_table` besides radius and glass; empty for a sphere."""
     powers = sorted(map(int, row["asphere"]))
     span = "" if not powers else f"asphere {powers[0]}" + (f"-{powers[-1]}" if len(powers) > 1 else "")
     words = [
@@ -265,7 +254,6 @@ HEADER = ("lens", "name", "EFL mm", "f/", "half field", "refr.", "asph.", "cyl."
 
 
 def _run_list(args: argparse.Namespace) -> int:
-    """Print the table; draw the sheet where asked."""
     from neurolens.evaluate.describe import lens_files, library, project_root, sections
 
     if args.layouts is not None and not args.layouts.parent.is_dir():
@@ -286,7 +274,6 @@ def _run_list(args: argparse.Namespace) -> int:
 
 
 def _list_text(rows: list[dict[str, Any]]) -> str:
-    """The table, and below it every doubt."""
     text = table(HEADER, [_cells(row) for row in rows], left=2)
     doubtful = [row for row in rows if row["doubts"]]
     found = f"\n\n{len(rows)} lenses, {len(doubtful)} of them doubtful"
@@ -304,7 +291,6 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 
 def _add_rims(parser: argparse.ArgumentParser) -> None:
-    """Add --derive-rims and what goes with it."""
     rims = parser.add_argument_group("rims")
     rims.add_argument(
         "--derive-rims", action="store_true",
@@ -352,7 +338,6 @@ def _run_rims(args: argparse.Namespace) -> int:
 
 
 def _notes(lens: Lens, rule: RimRule, field: float) -> str:
-    """The lens's notes and how its rims came about."""
     said = (
         f"Rims are derived by neurolens lens --derive-rims: the stop from the f-number, the whole axial beam, "
         f"{100 * rule.vignetting:g}% of the pupil's height kept at {field:.4g} degrees, "
@@ -364,9 +349,7 @@ def _notes(lens: Lens, rule: RimRule, field: float) -> str:
 def _rims_text(lens: Lens, data: dict[str, Any], rims: list[Rim]) -> str:
     rows = []
     for rim in rims:
-        note = (
-            "stop" if lens.surfaces[rim.surface].stop else "trimmed: a neighbour is in the way" if rim.trimmed else ""
-        )
+        note = "stop" if lens.surfaces[rim.surface].stop else "trimmed: limited by a neighbour" if rim.trimmed else ""
         share = f"{100 * (rim.derived_mm / rim.tabled_mm - 1):+.1f}%"
         cells = (f"{v:.3f}" for v in (rim.tabled_mm, rim.axis_mm, rim.field_mm, rim.derived_mm))
         rows.append((str(rim.surface), *cells, share, note))

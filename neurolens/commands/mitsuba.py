@@ -1,4 +1,4 @@
-"""`neurolens mitsuba SCENE --camera ...`: a scene of Mitsuba 3, as it stands, through a camera of ours."""
+"""`neurolens mitsuba SCENE --camera ...`: an unmodified scene of Mitsuba 3 through a neurolens camera."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ examples:
 def add_parser(subparsers: Any) -> None:
     """Add the command to the command line."""
     parser = subparsers.add_parser(
-        "mitsuba", help="render a scene of Mitsuba 3 through a camera of ours",
+        "mitsuba", help="render a scene of Mitsuba 3 through a neurolens camera",
         description=_DESCRIPTION, epilog=_EPILOG,
     )  # fmt: skip
     parser.add_argument("scene", metavar="SCENE", help="scene file (.xml), or cornell-box")
@@ -72,7 +72,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Render, write both pictures, say how it went."""
+    """Render, write both pictures, print a summary."""
     preview = Files.of(args.out).preview
     from neurolens.cameras.build import make_camera
     from neurolens.mitsuba import load_scene, render

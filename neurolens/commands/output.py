@@ -1,4 +1,4 @@
-"""What the commands print: JSON that every parser takes, and tables of aligned columns."""
+"""Output of commands: strict JSON, and tables of aligned columns."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def print_json(data: Mapping[str, Any]) -> None:
 
 
 def number(value: Any, digits: int = 4) -> str:
-    """A number with so many significant digits, "-" where there is none."""
+    """A number with significant digits, "-" for None and NaN."""
     if value is None or isinstance(value, str):
         return value or "-"
     if isinstance(value, int):

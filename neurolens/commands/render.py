@@ -38,12 +38,12 @@ Path-trace a scene (experiments/scenes/*.toml) and write OpenEXR, linear sRGB or
 a PNG preview beside it. The settings, the camera and the card of a model are kept in the EXR's
 metadata, attribute "neurolens", as JSON.
 
-The same seed gives the same picture, whatever the number of threads; all cameras share its
+The same seed gives the same picture for any number of threads; all cameras share its
 random numbers. A model (.onnx), the thin lens and the points need no torch; a lens file
 (.toml) does (extra "train").
 
-The preview follows the render. Ctrl-C (and SIGTERM) writes the picture so far; the same command
-then goes on from OUT.exr.part and ends with the same picture, bit for bit."""
+The preview is updated during the render. Ctrl-C (and SIGTERM) writes the picture so far; the same
+command then resumes from OUT.exr.part and ends with the same picture, bit for bit."""
 _EPILOG = """\
 examples:
   neurolens render experiments/scenes/room.toml --camera pinhole --samples 4 -o quick.exr
@@ -68,7 +68,7 @@ def add_parser(subparsers: Any) -> None:
         "-o", "--out", metavar="OUT.exr", type=Path, required=True, help="picture to write; the preview is OUT.png"
     )
     picture = parser.add_argument_group("picture")
-    picture.add_argument("--samples", metavar="N", type=whole(1, 2**20), help="samples a pixel (default: the scene's)")
+    picture.add_argument("--samples", metavar="N", type=whole(1, 2**20), help="per pixel (default: the scene's)")
     picture.add_argument(
         "--width", metavar="PIXELS", type=whole(1, 16384),
         help="width (default: the scene's, or from --height and the film's shape)",
@@ -104,7 +104,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument(
         "--threads", metavar="N", type=whole(1, 256), default=2,
-        help="workers, each kept on a core of its own where there are as many as cores (default: 2)",
+        help="workers, each pinned to a core if there are as many as cores (default: 2)",
     )  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     add_json(parser)
@@ -112,7 +112,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def _add_colour(parser: argparse.ArgumentParser) -> None:
-    """Options that stand in for the scene's [film] table."""
     colour = parser.add_argument_group("colour (left out: the scene's [film] table)")
     colour.add_argument(
         "--colour-space", choices=COLOUR_SPACE_NAMES,
@@ -134,14 +133,14 @@ def _add_colour(parser: argparse.ArgumentParser) -> None:
 
 
 def film_of(settings: FilmSettings, args: argparse.Namespace) -> FilmSettings:
-    """The scene's [film] table with the command line's on top."""
+    """The scene's [film] table with the command line's options."""
     names = ("colour_space", "white_balance", "wavelengths", "wavelength_sampling")
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     return replace(settings, **given)
 
 
 def run_kept(args: argparse.Namespace) -> int:
-    """As `run`; what memory cannot hold is one line, too."""
+    """As `run`, with running out of memory as a one-line error."""
     try:
         return run(args)
     except MemoryError as error:
@@ -149,7 +148,7 @@ def run_kept(args: argparse.Namespace) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Render, write both pictures, say how it went."""
+    """Render, write both pictures, print a summary."""
     files = Files.of(args.out)
     from neurolens.cameras.build import make_camera
     from neurolens.render.film import PixelGrid
@@ -167,7 +166,7 @@ def run(args: argparse.Namespace) -> int:
         if args.width is None and args.height is None:
             args.width = settings.width
     width, height = picture_size(settings, args.width, args.height)
-    PixelGrid(width, height, (settings.film_width_mm, settings.film_height_mm))  # before the slow making of a camera
+    PixelGrid(width, height, (settings.film_width_mm, settings.film_height_mm))  # before the slow make_camera
     camera = make_camera(args.camera, shot_of(settings, args, scene.aperture))
     for note in camera.settings.get("notes", ()):
         warn(note)
@@ -185,7 +184,7 @@ def run(args: argparse.Namespace) -> int:
 def _deliver(
     args: argparse.Namespace, files: Files, result: RenderResult, camera: Camera, film: FilmSettings, stopping: Stopping
 ) -> int:
-    """Write the pictures, whole or as far as they got, and say what they are; the exit code."""
+    """Write the pictures, complete or not, and print a summary; the exit code."""
     if stopping():
         args.kept = files.kept()
     if not result.stats["paths"]:
@@ -207,7 +206,7 @@ def _deliver(
 
 
 def shot_of(settings: CameraSettings, args: argparse.Namespace, aperture: Aperture | None = None) -> Shot:
-    """The scene's camera settings (and shape of the stop) with the command line's on top."""
+    """The scene's camera settings (and shape of the stop) with the command line's options."""
     from neurolens.cameras.build import Shot
 
     return Shot(
@@ -220,7 +219,7 @@ def shot_of(settings: CameraSettings, args: argparse.Namespace, aperture: Apertu
         focus=args.focusing,
         aperture=aperture_of(args) or aperture,
         wavelength_nm=settings.wavelengths_nm,
-        # A scene's f-number is for any lens; one that is asked for must be had.
+        # A scene's f-number is clamped to the lens; one of the command line must be possible.
         clamp_f_number=args.f_number is None,
         film_offset_mm=args.film_offset,
         pupil=args.pupil,
@@ -229,7 +228,7 @@ def shot_of(settings: CameraSettings, args: argparse.Namespace, aperture: Apertu
 
 
 def picture_size(settings: CameraSettings, width: int | None, height: int | None) -> tuple[int, int]:
-    """Pixels; one that is left out follows from the other and the film's shape."""
+    """Width and height; a missing one follows from the other and the film's shape."""
     shape = settings.film_width_mm / settings.film_height_mm
     if width is None and height is None:
         return settings.width, settings.height

@@ -1,4 +1,4 @@
-"""What `neurolens render` keeps: the picture, its preview, the checkpoint; and how it stops when asked to."""
+"""Files of `neurolens render` (picture, preview, checkpoint) and its reaction to signals."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def add_safety(parser: argparse.ArgumentParser) -> None:
         "--checkpoint-every", metavar="S", type=positive("seconds", infinite=True), default=30.0,
         help="seconds between checkpoints, OUT.exr.part; inf: only when the render is stopped (default: 30)",
     )  # fmt: skip
-    group.add_argument("--restart", action="store_true", help="begin again, whatever OUT.exr.part holds")
+    group.add_argument("--restart", action="store_true", help="start anew, ignoring OUT.exr.part")
     group.add_argument(
         "--keep-checkpoint", action="store_true",
         help="keep OUT.exr.part, so that the same command with more --samples adds them (from a multiple of 16)",
@@ -42,7 +42,7 @@ def add_safety(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class Files:
-    """Where a render goes: the EXR, the PNG beside it, and the checkpoint while it lasts."""
+    """Files of a render: the EXR, the PNG beside it, and the temporary checkpoint."""
 
     out: Path
     preview: Path
@@ -66,27 +66,23 @@ class Files:
         return files
 
     def spare(self, inputs: Iterable[Path]) -> None:
-        """Refuse to write over what the render reads, such as a texture beside the scene that has the preview's name.
-
-        Raises:
-            InputError: one of `inputs` would be lost.
-        """
+        """Raise InputError if an output is one of `inputs`, such as a texture with the preview's name."""
         for read in inputs:
             for written in (self.out, self.preview, self.checkpoint):
                 if written.exists() and read.exists() and written.samefile(read):
                     raise InputError(self.out, "--out", written.name, f"another name: the scene reads {read}")
 
     def kept(self) -> str:
-        """What a render that ended early can go on from."""
+        """How to resume a render that ended early."""
         if self.checkpoint.exists():
-            return f"the same command goes on from {self.checkpoint}"
-        return "there is no checkpoint to go on from"
+            return f"the same command resumes from {self.checkpoint}"
+        return "there is no checkpoint to resume from"
 
 
 class Stopping:
-    """Ctrl-C and SIGTERM ask for a stop while the block lasts; one that comes later is not asked but obeyed.
+    """Inside the block, Ctrl-C and SIGTERM first request a stop; a second signal takes its usual effect.
 
-    `timeout` and others send a signal twice at once, to the process and to its group: that is one.
+    `timeout` and others send a signal twice at once, to the process and to its group: that counts as one.
     """
 
     def __init__(self) -> None:
@@ -95,7 +91,7 @@ class Stopping:
         self._at = 0.0
 
     def __enter__(self) -> Stopping:
-        if threading.current_thread() is threading.main_thread():  # others cannot hear signals
+        if threading.current_thread() is threading.main_thread():  # others cannot handle signals
             for number in (signal.SIGINT, signal.SIGTERM):
                 before = signal.getsignal(number)
                 if before not in (signal.SIG_IGN, None):
@@ -109,7 +105,7 @@ class Stopping:
         return kind is Unfinished
 
     def __call__(self) -> bool:
-        """Whether somebody asked."""
+        """Whether a stop was requested."""
         return self._number is not None
 
     def _asked(self, number: int, _: object) -> None:
@@ -120,22 +116,22 @@ class Stopping:
             signal.raise_signal(number)
 
     def say(self, what: str) -> int:
-        """Say on stderr what is left of an interrupted render; its exit code, 128 plus the signal's number."""
+        """Print what remains of an interrupted render to stderr; the exit code, 128 plus the signal's number."""
         print(f"\nneurolens: interrupted; {what}", file=sys.stderr)
         return 128 + (self._number or signal.SIGINT)
 
 
 class Unfinished(Exception):
-    """Leaves the block of a `Stopping`, and so a stage of the progress without a word of its end."""
+    """Leaves the block of a `Stopping`, and a stage of the progress without its final line."""
 
 
 def warn(text: str) -> None:
-    """Say a doubt on stderr."""
+    """Print a warning to stderr."""
     print(f"neurolens: warning: {text}", file=sys.stderr)
 
 
 def watch_of(args: argparse.Namespace, files: Files, stop: Callable[[], bool]) -> Watch:
-    """What the command line asks for beside the render."""
+    """Preview, checkpoint and stop of the command line."""
     from neurolens.render.pictures import write_png
     from neurolens.render.renderer import Watch
 
@@ -153,10 +149,10 @@ def watch_of(args: argparse.Namespace, files: Files, stop: Callable[[], bool]) -
 def write_pictures(
     files: Files, result: RenderResult, metadata: dict[str, Any], film: FilmSettings, args: argparse.Namespace
 ) -> None:
-    """Write EXR and PNG; where they cannot be written, the checkpoint.
+    """Write EXR and PNG; if they cannot be written, the checkpoint.
 
     Raises:
-        NeurolensError: they cannot be written; it says what there is to go on from.
+        NeurolensError: they cannot be written; with the way to resume.
     """
     from neurolens.render.colour import COLOUR_SPACES
     from neurolens.render.job import MEANING
@@ -176,10 +172,10 @@ def write_pictures(
 
 
 def _rescued(files: Files, result: RenderResult) -> str:
-    """Save a render whose picture cannot be written; what there is to go on from.
+    """Save a render whose picture cannot be written; returns how to resume.
 
-    A checkpoint takes more than the picture (64 bytes a pixel), but the place may be full only for a moment, or it is
-    the picture itself that is refused.
+    A checkpoint is larger than the picture (64 bytes per pixel), but the disk may be full only for a moment, or the
+    picture itself may be refused.
     """
     try:
         assert result.save is not None
@@ -192,7 +188,6 @@ def _rescued(files: Files, result: RenderResult) -> str:
 
 
 def _said(error: BaseException) -> str:
-    """What went wrong, and with which file."""
     if not isinstance(error, OSError):
         return str(error) or type(error).__name__
     place = "" if error.filename is None else f"{error.filename}: "
@@ -200,15 +195,16 @@ def _said(error: BaseException) -> str:
 
 
 def so_far(result: RenderResult, files: Files) -> str:
-    """How much of an interrupted picture is there."""
+    """How much of an interrupted picture is done."""
     samples = result.layers.samples
     least, most = int(samples.min()), int(samples.max())
     spread = f" ({least} to {most})" if least < most else ""
-    return f"{files.out} holds {result.stats['samples_done']:.3g} of {result.stats['samples']} samples a pixel{spread}"
+    done, asked = result.stats["samples_done"], result.stats["samples"]
+    return f"{files.out} holds {done:.3g} of {asked} samples per pixel{spread}"
 
 
 def summary(stats: dict[str, Any], files: Files) -> str:
-    """What was rendered, how fast, and where it is."""
+    """Summary of a finished render."""
     return (
         f"{stats['scene']} through {stats['camera']}: {stats['width']} x {stats['height']}, {stats['samples']} samples "
         f"in {duration(stats['seconds'])} ({stats['mpaths_per_s']:.2f} Mpath/s, "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,7 @@ for less; one where no dispersion is known), focus from infinity to 14 focal len
 lens is too long for that). A file of another program (Zemax, CODE V, ...) is read as "neurolens convert"
 reads it; where that lacks something, convert first, with its options.
 
-A run that was interrupted goes on where it stopped: models that are there, made by the same
-settings, are kept."""
+An interrupted run resumes where it stopped: existing models of the same settings are kept."""
 _EPILOG = """\
 examples:
   neurolens train experiments/quickstart.toml
@@ -66,11 +65,11 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     add_json(parser)
-    parser.set_defaults(run=run, kept="models already fitted are kept in the run folder; the same command goes on")
+    parser.set_defaults(run=run, kept="fitted models are kept in the run folder; the same command resumes")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the experiment and say where to look."""
+    """Run the experiment and print a summary."""
     folder = _run_folder(args)
     from neurolens.evaluate.experiment import default_experiment, read_experiment
     from neurolens.evaluate.train import run_experiment
@@ -108,11 +107,7 @@ def _run_folder(args: argparse.Namespace) -> Path:
 
 
 def _own_format(file: Path, folder: Path) -> Path:
-    """The lens file, or what it converts to, kept in the run folder.
-
-    Raises:
-        InputError: as `read_any`; nothing is left behind then.
-    """
+    """The lens file, or its conversion, kept in the run folder; raises InputError as `read_any`."""
     if file.suffix.lower() == ".toml" or not file.is_file():
         return file
     from neurolens.commands.convert import write_checked
@@ -125,7 +120,6 @@ def _own_format(file: Path, folder: Path) -> Path:
 
 
 def _command(args: argparse.Namespace) -> str:
-    """The command line, for the report."""
     parts = ["neurolens", "train"]
     parts += ["--lens", str(args.lens)] if args.lens is not None else [str(args.experiment)]
     parts += ["--out", str(args.out)] if args.out is not None else []
@@ -135,11 +129,10 @@ def _command(args: argparse.Namespace) -> str:
 
 
 def _text(results: Mapping[str, Any], folder: Path) -> str:
-    """A short table of the models, what the run warned of, and where to look."""
     header = ("model", "rms um", "p99 um", "angle rms deg", "false pass", "false block", "ns/ray", "x exact", "fit s")
     rows = [_row(model) for model in results.get("models", ())]
     parts = [str(results.get("title") or folder.name), table(header, rows)]
-    parts += [f"Warning: {text}" for text in _sequence(results.get("warnings"))]
+    parts += [f"Warning: {text}" for text in results.get("warnings", ())]
     places = [f"  {folder / 'report.html'}  everything on one page", f"  {folder / 'models'}  the ONNX models"]
     if (folder / "pictures").is_dir():
         places.append(f"  {folder / 'pictures'}  renders, lens layout, plots")
@@ -165,7 +158,3 @@ def _row(model: Mapping[str, Any]) -> tuple[str, ...]:
         number(model.get("speedup_over_compiled"), 3),
         number(model.get("fit_s"), 3),
     )
-
-
-def _sequence(value: Any) -> Sequence[str]:
-    return value if isinstance(value, list | tuple) else ()

@@ -1,4 +1,4 @@
-"""What races on the clock (`speed`): the exact tracer eager and compiled, exported models, and the simple cameras."""
+"""Candidates of speed races (`speed`): the exact tracer eager and compiled, exported models, and simple cameras."""
 
 from __future__ import annotations
 
@@ -16,25 +16,27 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import Camera
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.evaluate.rays import frame_width_mm
 from neurolens.evaluate.speed import Call, Candidate, Unavailable
+from neurolens.graph import compiler
+from neurolens.graph.c import Signature, write_c
+from neurolens.graph.compiler import FLAGS, compile_c
+from neurolens.graph.program import Program
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import Traced, trace
-from neurolens.programs import compiler
-from neurolens.programs.c import Signature, write_c
-from neurolens.programs.compiler import FLAGS, compile_c
-from neurolens.programs.expressions import Program
+from neurolens.surrogates.assemble import ALL, Parts
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.source.fused import ALL, FREE, Fixed, Parts, fused_program
+from neurolens.surrogates.source import FREE, fused_program
+from neurolens.surrogates.specialise import Fix
 from neurolens.surrogates.stored import load_fitted
 
 EAGER_BATCHES = (8192, 16384, 32768)
-COMPILED_BATCHES = (16384,)  # each further size would compile anew, for half a minute
+COMPILED_BATCHES = (16384,)  # each further size costs half a minute of compilation
 
 
 def exact_candidates(
@@ -52,7 +54,7 @@ def exact_candidates(
     Args:
         transmittance: whether to follow it, as surrogates do.
         build_rays: start from film and pupil points, as surrogates do; else from camera rays made beforehand.
-        compiled: whether the compiled one is wanted.
+        compiled: whether to include the compiled one.
         label: names are "{label} eager" and "{label} compiled".
     """
 
@@ -81,7 +83,7 @@ def exact_candidates(
             fast(*given)
         except (
             Exception
-        ) as error:  # torch raises its own kinds: no compiler, a compiler that fails, an unsupported platform
+        ) as error:  # torch raises many types: no compiler, a compiler that fails, an unsupported platform
             raise Unavailable(f"torch cannot compile here: {_first_line(error)}") from error
         return lambda: fast(*given)
 
@@ -90,7 +92,7 @@ def exact_candidates(
 
 
 def _first_line(error: BaseException) -> str:
-    # Torch wraps the reason: the innermost cause is the one worth reading.
+    # Torch wraps the reason: the innermost cause is the informative one.
     while error.__cause__ is not None:
         error = error.__cause__
     text = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
@@ -137,7 +139,7 @@ def find_compiler() -> str:
     """A C compiler: $CC, else cc, gcc or clang.
 
     Raises:
-        Unavailable: none is there.
+        Unavailable: none is found.
     """
     try:
         return compiler.find_compiler()
@@ -146,7 +148,7 @@ def find_compiler() -> str:
 
 
 class CompiledSource:
-    """A program as a shared library in a temporary folder of its own.
+    """A program as a shared library in its own temporary folder.
 
     Raises:
         Unavailable: there is no compiler, or it fails; the message says how.
@@ -157,7 +159,7 @@ class CompiledSource:
         self._folder = tempfile.TemporaryDirectory(prefix="neurolens-source-")
         folder = Path(self._folder.name)
         library = folder / "lens.so"
-        text = write_c(program, _NAME, ["A model on the clock."]) + self._wrapper()
+        text = write_c(program, _NAME, ["A timed model."]) + self._wrapper()
         find_compiler()
         try:
             self.warnings = compile_c(text, library, flags)
@@ -167,7 +169,7 @@ class CompiledSource:
         self._run.argtypes, self._run.restype = [ctypes.c_size_t, ctypes.c_void_p], None
 
     def _wrapper(self) -> str:
-        """All arguments as one array of pointers: ctypes takes long over each argument."""
+        """All arguments as one array of pointers: ctypes is slow per argument."""
         s = self.signature
         kinds = ["(const float *)a[{}]"] * len(s.per_ray) + ["*(const float *)a[{}]"] * len(s.per_call)
         kinds += ["*(const int *)a[{}]"] * (s.bands > 1) + ["(float *)a[{}]"] * len(s.outputs) + ["(int *)a[{}]"]
@@ -180,7 +182,7 @@ class CompiledSource:
         return {**found, "status": np.empty(count, np.int32)}
 
     def prepared(self, inputs: Mapping[str, ArrayLike], out: Mapping[str, NDArray[Any]], band: int = 0) -> Call:
-        """A call that computes rays into `out`; inputs by name, arrays [N] or numbers, others are passed over."""
+        """A call that computes rays into `out`; inputs by name, arrays [N] or numbers; others are ignored."""
         s = self.signature
         count = len(out["status"])
         arrays = [np.ascontiguousarray(inputs[name], np.float32) for name in (*s.per_ray, *s.per_call)]
@@ -228,7 +230,7 @@ def program_candidate(name: str, program: Program, domain: Domain, stop_radius_m
         calls: dict[int, Call] = {}
 
         def call() -> None:
-            # A thread writes where it wrote before, as tracers and onnxruntime do with the memory that they get back.
+            # A thread reuses its output memory, as tracers and onnxruntime do.
             thread = get_ident()
             if thread not in calls:
                 if (thread, count) not in room:
@@ -242,9 +244,9 @@ def program_candidate(name: str, program: Program, domain: Domain, stop_radius_m
 
 
 def fused_candidate(
-    name: str, model: LensModel | Sequence[LensModel] | Path, domain: Domain, *, parts: Parts = ALL, fixed: Fixed = FREE
+    name: str, model: LensModel | Sequence[LensModel] | Path, domain: Domain, *, parts: Parts = ALL, fix: Fix = FREE
 ) -> Candidate | None:
-    """A model, or that of an exported file, as compiled C; None where there is no compiler, or no form in C.
+    """A model, or that of an exported file, as compiled C; None without a compiler or a form in C.
 
     Args:
         model: one, or one for each fixed wavelength (of which the first is timed).
@@ -253,7 +255,7 @@ def fused_candidate(
         find_compiler()
         found = load_fitted(model) if isinstance(model, Path) else model
         models = [found] if isinstance(found, LensModel) else found
-        program = fused_program(models, parts, fixed)
+        program = fused_program(models, parts, fix)
     except (Unavailable, ModelError, TypeError):
         return None
-    return program_candidate(name, program, domain, fixed.stop_radius_mm)
+    return program_candidate(name, program, domain, fix.stop_radius_mm)

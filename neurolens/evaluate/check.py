@@ -1,4 +1,4 @@
-"""Does a model keep what its card promises? Fresh rays through the exact lens and through the ONNX model itself."""
+"""Check of a model against the promises of its card, on fresh rays through the exact lens and the ONNX model."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 import neurolens
-from neurolens.axes import Axis
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.cameras.model import OnnxLens
@@ -33,19 +32,19 @@ from neurolens.evaluate.measure import (
 )
 from neurolens.evaluate.rays import EachRay, ray_errors
 from neurolens.evaluate.vignetting import ZONES, false_shares
+from neurolens.modelfile.axes import Axis
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.readers.any_format import read_any
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.states.model import State
-from neurolens.surrogates.states.space import StateSpace
+from neurolens.surrogates.states import State, StateSpace
 
-# How much worse than promised a figure may be, for the rays are others: so many standard deviations of what a sample of
-# its size can tell, at least a tenth, at most a half. A largest error has no such bound: more rays find larger ones.
+# How much worse than promised a figure may be on other rays: standard deviations of the estimate from a sample of this
+# size, at least a tenth, at most a half. A largest error has no such bound: more rays find larger ones.
 SIGMAS, LEAST, MOST = 4.0, 0.10, 0.50
-# The errors, ray by ray, that a figure is made of.
+# The errors per ray from which a figure is computed.
 _RMS = {
     "rms_um": "focus_um",
     "rms_infinity_um": "infinity_um",
@@ -56,7 +55,7 @@ _RMS = {
 }
 _P99 = {"p99_um": "focus_um"}
 SHARES = ("false_pass", "false_block")
-# Below this, float32 itself is the error: half a nanometre, a microdegree.
+# Below this, float32 rounding dominates: half a nanometre, a microdegree.
 _FLOOR = 5e-7
 _FRESH = 7919  # added to the seed of the fit
 
@@ -86,7 +85,7 @@ def check_model(
         lens: the exact lens, as `lens_of_card` gives it.
         rays: rays that the lens passes, eight times as many where a few bad ones decide an error; four times as many
             test what passes and what is blocked.
-        seed: None takes one that is not the fit's.
+        seed: None takes one that differs from the fit's.
 
     Returns the figures (those of `measure.Findings`, flat, with stopped_down, zones, rays and seed) and the promises of
         the card: over the whole film, stopped down ("2_stops.false_pass") and of zones ("full.edge.rms_um").
@@ -126,7 +125,7 @@ def _promises(errors: Mapping[str, Any], fresh: FreshRays, found: Findings) -> I
             yield _error(key, promised, measured, found.each, _count(errors, "rays"))
     for state, shares in _tables(errors.get("stopped_down")):
         for key, promised in _numbers(shares) if state in found.stopped_down else ():
-            closed = 2 ** STOPS[state]  # so many times fewer rays pass
+            closed = 2 ** STOPS[state]  # factor by which fewer rays pass
             said = found.stopped_down[state].get(key)
             yield share_promise(f"{state}.{key}", promised, said, passing / closed, (promised_of or passing) / closed)
 
@@ -141,7 +140,7 @@ def _zone_promises(errors: Mapping[str, Any], fresh: FreshRays, found: Findings)
             for key, promised in _numbers(promises):
                 place, said = f"{state}.{zone}.{key}", measured.get(key)
                 if said is None:
-                    continue  # too few rays to tell
+                    continue  # too few rays
                 if key in SHARES:
                     yield share_promise(place, promised, said, measured["passing"], _count(promises, "passing"))
                 elif key in _RMS:
@@ -149,14 +148,13 @@ def _zone_promises(errors: Mapping[str, Any], fresh: FreshRays, found: Findings)
 
 
 def _tables(value: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """The tables within a table; what is none promises nothing."""
     for name, inner in value.items() if isinstance(value, Mapping) else ():
         if isinstance(inner, Mapping):
             yield name, inner
 
 
 def _numbers(table: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    """Figures; one that was not measured promises nothing."""
+    """The finite numbers of a table."""
     for key, value in table.items():
         if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
             yield key, float(value)
@@ -167,7 +165,7 @@ def _count(table: Mapping[str, Any], key: str) -> int | None:
 
 
 def _error(place: str, promised: float, measured: float | None, each: EachRay, promised_of: float | None) -> Promise:
-    """A promised error against fresh rays, whose own spread tells how well so many can know it."""
+    """A promised error against fresh rays, with a tolerance from their spread."""
     key = place.rpartition(".")[2]
     value = math.nan if measured is None else float(measured)
     if key not in _RMS and key not in _P99:
@@ -205,7 +203,7 @@ def share_promise(
 def lens_of_card(
     card: Mapping[str, Any], lens_file: str | Path | None = None, model_file: str | Path = "model"
 ) -> Lens:
-    """The exact lens that a model stands for, in the model's zoom state, size and stop.
+    """The exact lens of a model, in the model's zoom state, size and stop.
 
     Args:
         lens_file: None looks for the card's lens id in lenses/: beside the model, beside its folder (a run keeps its
@@ -248,7 +246,7 @@ def _states(tabled: Lens, efl_mm: float) -> Iterator[Lens]:
     for configuration in (None, *(c.name for c in tabled.configurations)):
         lens = tabled.at(zoom=configuration)
         yield lens
-        # The card has the focal length that came out; the one asked for, whose bits count, had fewer digits.
+        # The card has the computed focal length; the requested one, needed bit by bit, had fewer digits.
         for digits in (9, 12, 15):
             asked = float(f"{efl_mm:.{digits}g}")
             if abs(first_order(lens).efl_mm / asked - 1) > 1e-12:
@@ -259,7 +257,7 @@ RAY_KEYS = (
     "rms_um", "rms_um_at_21_6", "p99_um", "max_um", "rms_infinity_um", "direction_rms_deg", "position_rms_um",
     "transmittance_rms",
 )  # fmt: skip
-# An error that is the worst of other states and other rays may be so much worse, relatively.
+# Relative tolerance of an error that is the worst of other states and other rays.
 TOLERANCE = 0.25
 _VIGNETTING = 4  # rays that test it, for every ray that passes
 
@@ -299,7 +297,7 @@ def errors_at(model: OnnxLens, space: StateSpace, state: State, rays: int, seed:
 
 
 def card_errors(rows: Sequence[Mapping[str, Any]], rays: int) -> dict[str, Any]:
-    """What a card promises: the worst over the states measured, their median, and every state."""
+    """The errors for a card: the worst over the measured states, their median, and every state."""
 
     def over(key: str, how: Any) -> float | None:
         values = [r[key] for r in rows]

@@ -26,11 +26,11 @@ from neurolens.optics.trace import trace
 from neurolens.surrogates.domain import Domain, sample_domain
 
 _RAYS = 65536
-_NEGLIGIBLE = 1e-4  # share of the rays below which a blocking surface is not worth a line
+_NEGLIGIBLE = 1e-4  # share of the rays below which a blocking surface is not listed
 
 
 def describe_lens(lens: Lens, domain: Domain) -> dict[str, Any]:
-    """Figures of a lens placed by `Lens.at`, over a domain; d line where no other wavelength is named.
+    """Figures of a lens placed by `Lens.at`, over a domain; d line unless stated otherwise.
 
     Returns: name, designer, source, rims, sha256; the first-order data of `paraxial.FirstOrder`, of an anamorphic lens
         in the y-z plane; efl_x_mm in its x-z plane, None of a round lens; working_f_number of the real marginal ray
@@ -44,7 +44,7 @@ def describe_lens(lens: Lens, domain: Domain) -> dict[str, Any]:
     radius, radius_from = image_radius_mm(lens)
     film_z = float(lens.film_z_mm if lens.film_z_mm is not None else domain.film_z_mm[0])
     passing, ended = passing_share(lens, domain)
-    # A round lens sees as far along y, and the mean over its rays along x is what the project has always stated.
+    # A round lens has the same field along y; the mean over rays along x is used.
     reached = field_reached_deg(lens, domain, film_z, "y" if lens.anamorphic else "x")
     reached_x = field_reached_deg(lens, domain, film_z, "x") if lens.anamorphic else reached
     notes = warnings_of(lens, first_order(at_infinity(lens)).f_number, reached, math.isinf(domain.focus_m[0]))
@@ -156,16 +156,16 @@ def passing_share(lens: Lens, domain: Domain, seed: int = 5) -> tuple[float, lis
 
 
 def file_doubts(tabled: Lens) -> list[str]:
-    """What is doubtful about a lens as its file has it, in sentences; a stop too wide is said by `warnings_of`."""
+    """Doubts about a lens file as sentences; for a stop that is too wide see `warnings_of`."""
     checks = check_lens(tabled)
     return doubts([c for c in checks if c.quantity != "f-number" or (c.computed or 0.0) > (c.stated or 0.0)])
 
 
 def warnings_of(lens: Lens, f_number: float, reached_deg: float | None, far: bool) -> list[str]:
-    """What a user of this lens in its state should know, in sentences; see `file_doubts` for its file.
+    """Warnings about a lens in its state, as sentences; see `file_doubts` for its file.
 
     Args:
-        f_number: of the lens focused at infinity: what the source states, whatever the lens does when focused near.
+        f_number: of the lens focused at infinity, as the source states it.
         reached_deg: half field that reaches the edge of the film.
         far: whether the lens is focused at infinity, where its source states the field.
     """
@@ -219,14 +219,14 @@ def lens_files(folder: Path) -> list[Path]:
 
 
 def read_quietly(path: Path) -> Lens:
-    """A lens without the warnings of reading it, which its check repeats."""
+    """A lens read without warnings, which its check repeats."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NeurolensWarning)
         return read_lens(path)
 
 
 def library(files: list[Path]) -> list[dict[str, Any]]:
-    """One row a lens file.
+    """One row per lens file.
 
     Returns: lens, file, name, efl_mm and efl_x_mm computed (the latter of an anamorphic lens only), stated_efl_mm,
         f_number of the stop, half_field_deg as stated, image_radius_mm as stated, refractions, aspheres, cylinders,

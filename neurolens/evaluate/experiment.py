@@ -1,4 +1,4 @@
-"""An experiment: one TOML file, one run. Strict dataclasses; see `base.config` for what is read and refused."""
+"""Settings of an experiment: one TOML file per run, read by `base.config`."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain, domain_of
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
-from neurolens.surrogates.states.space import StateSpace, axes_of
+from neurolens.surrogates.states import StateSpace, axes_of
 
 # Near limit where none is stated: 14 focal lengths from the film (0.7 m for a 50 mm lens), and the object 8 before the
 # front vertex, where a long lens of short focus has less room than that.
 NEAR_LIMIT_FOCAL_LENGTHS, NEAREST_OBJECT_FOCAL_LENGTHS = 14, 8
 # Wavelengths where none are stated, as far as the formulas of the lens's glasses reach.
 VISIBLE_NM = (380.0, 780.0)
-# A film that no light reaches beyond this share of its radius was stated too large.
+# A film that is dark beyond this share of its radius was stated too large.
 DARK_FROM = 0.9
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 def check_names(field: str, names: Sequence[str]) -> None:
-    """Refuse names that could not be those of files: a name becomes part of a path.
+    """Refuse names that are not valid in file names.
 
     Raises:
         InputError: a name with other than letters, digits, dots, underscores and dashes, or that starts with a mark.
@@ -68,10 +68,10 @@ class LensChoice:
         return self.zoom is not None or self.focusing == "internal"
 
     def read(self) -> Lens:
-        """The lens at infinity focus, its stop round: models know no other, and cameras shape it outside them.
+        """The lens at infinity focus with a round stop; cameras apply blades outside the models.
 
         Raises:
-            InputError: a length or f-number that is not positive, and whatever `read_lens` and `Lens.at` refuse.
+            InputError: a length or f-number that is not positive, and as `read_lens` and `Lens.at`.
         """
         for name, value in (("lens.efl_mm", self.efl_mm), ("lens.f_number", self.f_number)):
             if value is not None and not value > 0:
@@ -82,7 +82,7 @@ class LensChoice:
 
 @dataclass(frozen=True)
 class DomainChoice:
-    """What the models must know.
+    """The domain of the models.
 
     Attributes:
         film_radius_mm: None takes the lit film.
@@ -96,13 +96,13 @@ class DomainChoice:
     wavelength_nm: tuple[float, float] | None = None
 
     def of(self, lens: Lens) -> Domain:
-        """The domain of a lens, what is not stated taken from it.
+        """The domain of a lens, with defaults from the lens.
 
         Raises:
             InputError: as `domain_of`; a lens whose image is virtual, so that no film can lie there.
 
         Warns:
-            NeurolensWarning: a film whose outer part no light reaches; one that was not asked for ends there then.
+            NeurolensWarning: a film whose outer part is dark; a default film then ends there.
         """
         behind = first_order(lens).rear_focal_z_mm
         if not behind > lens.vertices_mm[len(lens.surfaces) - 1]:
@@ -122,7 +122,7 @@ class DomainChoice:
 
 
 def near_limit_m(lens: Lens) -> float:
-    """Distance from the film of the nearest object that a lens is asked to focus, where nobody says: see above."""
+    """Default distance from the film to the nearest object in focus; see above."""
     data = first_order(lens)
     f, film_z = abs(data.efl_mm), data.rear_focal_z_mm
     separation = data.rear_principal_z_mm - data.front_principal_z_mm
@@ -177,7 +177,7 @@ class RenderChoice:
 
 @dataclass(frozen=True)
 class SceneDomainChoice:
-    """A scene whose camera settings alone are modelled, to show what that gains; the settings of the model to refit."""
+    """A scene for whose camera settings alone a model is fitted, to measure the gain; the settings of that model."""
 
     scene: Path
     model: ModelSettings = field(default_factory=ModelSettings)
@@ -185,7 +185,7 @@ class SceneDomainChoice:
 
 @dataclass(frozen=True)
 class Experiment:
-    """One run, resolved: lens, domain, ray pairs, models, what is measured and rendered."""
+    """One resolved run: lens, domain, ray pairs, models, measurements and renders."""
 
     title: str
     lens: LensChoice
@@ -210,7 +210,7 @@ class Experiment:
             raise InputError("settings", "render.models", unknown, f"names of models: {', '.join(labels)}")
 
     def states(self) -> StateSpace:
-        """The states that the models are of, where the lens asks for many.
+        """The state space of the models, if the lens has many states.
 
         Raises:
             InputError: a rescaled lens, or states that the file does not have.
@@ -234,7 +234,7 @@ class Experiment:
         )
 
     def domain_of(self, lens: Lens) -> Domain:
-        """The domain of the lens as this experiment asks for it."""
+        """The domain of the lens in this experiment."""
         return self.domain.of(lens)
 
 
@@ -277,7 +277,7 @@ def relative_to(experiment: Experiment, folder: Path) -> Experiment:
 
 
 def keep_lens(experiment: Experiment, folder: Path) -> None:
-    """Leave the lens file in lenses/ of a run folder, where `check.find_lens` looks: the run's models need no other."""
+    """Copy the lens file to lenses/ of a run folder, where `check.find_lens` looks for it."""
     source, kept = experiment.lens.file, folder / "lenses" / experiment.lens.file.name
     kept.parent.mkdir(parents=True, exist_ok=True)
     if not (kept.exists() and kept.samefile(source)):
@@ -285,7 +285,7 @@ def keep_lens(experiment: Experiment, folder: Path) -> None:
 
 
 def default_experiment(lens_file: str | Path, overrides: Sequence[str] = ()) -> Experiment:
-    """What `neurolens train --lens FILE` runs: a good polynomial and a network, no renders."""
+    """The experiment of `neurolens train --lens FILE`: a polynomial and a network, no renders."""
     from neurolens.base.config import apply_overrides
 
     tables = {

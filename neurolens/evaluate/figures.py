@@ -19,7 +19,7 @@ from neurolens.analysis.layout import (
     draw_rims,
     z_range,
 )
-from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, new_figure, plain_log_ticks, save, style
+from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, drawing, new_figure, plain_log_ticks, save, style
 from neurolens.base.errors import InputError
 from neurolens.evaluate.image import checked_image, to_srgb
 from neurolens.optics.focusing import Breath, breathing, field_change, focus_states, nearest_focus_m
@@ -28,7 +28,7 @@ from neurolens.optics.prescription import Focus, Lens
 
 _Box = tuple[float, float, float, float]  # left, bottom, width, height in shares of the figure
 
-_COLUMNS = 4  # more would leave each picture too small to judge
+_COLUMNS = 4  # with more, each picture would be too small
 
 
 def side_by_side(
@@ -103,7 +103,8 @@ def _check_shapes(pictures: Mapping[str, Any], maps: Mapping[str, Any]) -> None:
 def _page(count: int, aspect: float, maps: bool, title: str) -> tuple[Any, list[tuple[_Box, _Box]], _Box]:
     """A figure, the (picture, error image) boxes of each of `count` pictures, and the box of the colour bar.
 
-    Laid out in inches by hand: pictures keep their aspect and fill their width, which automatic layouts do not promise.
+    Explicit layout in inches: pictures keep their aspect and fill their width, which automatic layouts do not
+    guarantee.
     """
     rows = math.ceil(count / _COLUMNS)
     columns = math.ceil(count / rows)
@@ -163,8 +164,7 @@ def illumination_plot(light: Mapping[str, Any], path: str | Path, title: str = "
     radius = np.asarray(light["film_radius_mm"], dtype=np.float64)
     exact = _curve("exact", light["exact"], radius)
     curves = {name: _curve(name, values, radius) for name, values in light["models"].items()}
-    with style():
-        figure = new_figure(7.6, 5.4)
+    with drawing(path, 7.6, 5.4) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": (3, 1.2)})
         upper.plot(radius, exact, color=INK, lw=2.6, alpha=0.45, label="exact")
         for number, (name, values) in enumerate(curves.items()):
@@ -180,14 +180,14 @@ def illumination_plot(light: Mapping[str, Any], path: str | Path, title: str = "
         lower.set_xlabel("film radius (mm)")
         for axes in (upper, lower):
             axes.grid(True)
-        return save(figure, path)
+    return Path(path)
 
 
 def _curve(name: str, values: Any, radius: Any) -> Any:
     curve = np.asarray(values, dtype=np.float64)
     if radius.size == 0 or curve.shape != radius.shape or not np.isfinite(curve).all():
         raise InputError(
-            "illumination plot", name, f"({curve.shape})", f"finite values, one a film radius, {radius.shape}"
+            "illumination plot", name, f"({curve.shape})", f"finite values, one per film radius, {radius.shape}"
         )
     return curve
 
@@ -208,8 +208,7 @@ def breathing_plot(ways: Mapping[str, Sequence[Breath]], path: str | Path, title
     """
     if not ways:
         raise InputError("breathing plot", "ways", "(none)", "at least one way of focusing")
-    with style():
-        figure = new_figure(7.6, 7.4)
+    with drawing(path, 7.6, 7.4) as figure:
         panels = figure.subplots(3, 1, sharex=True)
         for number, (name, breaths) in enumerate(ways.items()):
             near = sorted((b for b in breaths if b.focus_m < 1e9), key=lambda b: b.focus_m)
@@ -235,9 +234,8 @@ def breathing_plot(ways: Mapping[str, Sequence[Breath]], path: str | Path, title
         panels[2].set_xscale("log")
         panels[2].set_yscale("log")
         panels[2].set_xlabel("distance from object to film (m)")
-        plain_log_ticks(panels[2].xaxis)
-        plain_log_ticks(panels[2].yaxis)
-        return save(figure, path)
+        plain_log_ticks(panels[2].xaxis, panels[2].yaxis)
+    return Path(path)
 
 
 def draw_breathing(lens: Lens, path: str | Path, count: int = 48) -> dict[str, list[Breath]]:
@@ -275,11 +273,10 @@ def sheet(profiles: Sequence[Mapping[str, Any]], path: str | Path) -> Path:
         raise InputError("lens sheet", "profiles", "(none)", "at least one lens")
     columns = min(_LIBRARY_COLUMNS, len(profiles))
     rows = math.ceil(len(profiles) / columns)
-    with style():
-        figure = new_figure(_CELL_IN[0] * columns, _CELL_IN[1] * rows)
+    with drawing(path, _CELL_IN[0] * columns, _CELL_IN[1] * rows) as figure:
         for place, profile in enumerate(profiles):
             _cell(figure.add_subplot(rows, columns, place + 1), profile)
-        return save(figure, path)
+    return Path(path)
 
 
 def _cell(axes: Any, profile: Mapping[str, Any]) -> None:

@@ -1,7 +1,7 @@
-"""Image error: relative MSE on linear radiance, FLIP as seen on a display, and the noise floor both are judged by.
+"""Image error: relative MSE on linear radiance, FLIP on a display, and the noise floor of both.
 
-A render through a surrogate is never equal to the exact render, because Monte Carlo noise differs with the seed. What
-counts is whether it differs by more than exact renders of different seeds differ from each other: `compare`.
+Renders through a surrogate and the exact lens differ by Monte Carlo noise. `compare` tests whether they differ by more
+than exact renders of different seeds differ from each other.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from neurolens.base.errors import InputError, NeurolensError
 
 Image = NDArray[np.float64]
 
-MIN_PAIRS = 4  # fewer pairs leave the noise floor itself too noisy to divide by
+MIN_PAIRS = 4  # with fewer pairs the noise floor is too noisy to divide by
 
 
 @dataclass(frozen=True)
 class ImageSettings:
-    """How two linear pictures are compared; stated beside every figure.
+    """Settings of the comparison of two linear pictures.
 
     Attributes:
         exposure: factor on linear RGB before the sRGB curve and the clip to [0, 1], for FLIP only.
         pixels_per_degree: of visual angle, for FLIP; 67 is its authors' default (0.7 m from a 0.7 m wide 4K display).
-        eps: in the denominator of the relative MSE, in squared radiance, so that dark pixels do not rule the mean.
+        eps: in the denominator of the relative MSE, in squared radiance, so that dark pixels do not dominate the mean.
         trim: share of pixels dropped from the relative MSE, those of largest error (fireflies); 0 keeps all.
     """
 
@@ -52,7 +52,7 @@ def checked_image(image: ArrayLike, name: str) -> Image:
     """`image` as float64 [H, W, 3].
 
     Raises:
-        InputError: another shape, an empty picture, or values that are not finite; `name` says which picture.
+        InputError: another shape, an empty picture, or values that are not finite; `name` names the picture.
     """
     array = np.asarray(image)
     if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
@@ -146,8 +146,8 @@ def compare(
 
     Render i of the surrogate is compared with exact render j != i of `seed_pairs`, never with its own seed: noise
     that both share would cancel and flatter the surrogate. The floor of the pair is exact i against the same exact j,
-    so a surrogate without error has a ratio of exactly 1 where it draws the same random numbers, and of 1 but for
-    noise where it does not.
+    so a surrogate without error has a ratio of exactly 1 if it uses the same random numbers, else of 1 up to
+    noise.
 
     Args:
         renders: one or more [H, W, 3] linear renders; number i has the seed of exact render i.

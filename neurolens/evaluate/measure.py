@@ -1,4 +1,4 @@
-"""Rays that no fit has seen, traced once through the exact lens, and every model's errors on them, zone by zone.
+"""Errors of models by zone, on rays not used in any fit, traced once through the exact lens.
 
 Zones are thirds of the film radius (`vignetting.ZONES`), at full aperture and stopped down. A smaller stop changes no
 ray, only which of them pass: the crossing with the stop, kept from the one exact trace, tells.
@@ -6,7 +6,6 @@ ray, only which of them pass: the crossing with the stop, kept from the one exac
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import time
@@ -21,7 +20,7 @@ from torch import Tensor
 
 from neurolens import __version__
 from neurolens.base import status as st
-from neurolens.base.files import atomic_write_text
+from neurolens.base.files import atomic_write_text, fingerprint_of, sha256_of
 from neurolens.base.progress import Report
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.evaluate.rays import PIXELS_ACROSS, EachRay, each_ray, ray_errors, ray_figures
@@ -29,20 +28,20 @@ from neurolens.evaluate.vignetting import NEAR_RIM, ZONES, deciding_rim_ratio, f
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model
 from neurolens.surrogates.fits import checkpoint
 from neurolens.surrogates.model import LensModel, Prediction
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSet, PairSettings, join_pairs, make_pairs, trace_pairs
 
 # Whole stops closed, by the name of the state.
 STOPS = {"full": 0, "2_stops": 2, "4_stops": 4}
-# States whose zones a card tells.
+# States whose zones a card contains.
 ZONED = ("full", "2_stops")
-# Fewer rays than this say nothing of a zone.
+# Fewest rays of a zone for a figure.
 LEAST_RAYS = 100
-# A root mean square that a few bad rays decide is measured on more rays: so many times as many as asked for, where its
-# relative standard deviation is above this.
+# A root mean square dominated by a few bad rays is measured on MORE times as many rays, if its relative standard
+# deviation is above KNOWN.
 MORE, MOST, KNOWN = 8, 1_000_000, 0.08
 _BATCH = 65536
 
@@ -52,7 +51,7 @@ Predict = Callable[..., Any]
 
 @dataclass(frozen=True)
 class FreshRays:
-    """What models of one lens and domain are measured on.
+    """Test rays of the models of one lens and domain.
 
     Attributes:
         lens, domain: the exact lens at its widest stop, and the domain of the models.
@@ -111,7 +110,7 @@ def _stop_square(lens: Lens, pairs: PairSet) -> Tensor:
 
 
 def _without_crossings(pairs: PairSet) -> PairSet:
-    """The same rays without what is known of each surface, which is most of what they take."""
+    """The same rays without the data per surface, which is most of their memory."""
     names = ("cross_x", "cross_y", "meets", "refracts")
     return replace(pairs, **{name: getattr(pairs, name)[:0] for name in names})
 
@@ -124,7 +123,7 @@ class Findings:
         figures: those of `rays.ray_errors`, false_pass, false_block and both near rims at full aperture.
         stopped_down: false_pass and false_block of the states of `STOPS` but the first.
         zones: by state of `ZONED` and zone: rms_um, direction_rms_deg of `rays` rays, and false_pass, false_block of
-            `passing` rays that the exact lens passes. None where fewer than `LEAST_RAYS` tell, or where an RMS is not
+            `passing` rays that the exact lens passes. None with fewer than `LEAST_RAYS`, or where an RMS is not
             known to `KNOWN`.
         each: errors ray by ray, of the rays of `held_out`.
     """
@@ -135,7 +134,7 @@ class Findings:
     each: EachRay
 
     def errors(self, keys: tuple[str, ...]) -> dict[str, Any]:
-        """What a card and a record hold: figures of `keys`, what is not finite as None, then `zones`."""
+        """Data for card and record: figures of `keys`, None if not finite, then `zones`."""
         plain = {key: _finite(self.figures[key]) for key in keys}
         return {**plain, "stopped_down": self.stopped_down, "zones": self.zones}
 
@@ -153,7 +152,7 @@ def measure(fresh: FreshRays, predict: Predict) -> Findings:
 
 
 def well_known(fresh: FreshRays, each: EachRay) -> bool:
-    """Whether so many rays know the errors over the film and of its zones to `KNOWN`."""
+    """Whether the rays determine the errors over the film and of its zones to `KNOWN`."""
     whole = (each.focus_um, each.infinity_um, each.direction_deg, each.position_um, each.transmittance)
     parts = [zone_of(fresh, each, s, z) for s in ZONED for z in ZONES]
     zones = [v for part in parts for v in (part.focus_um, part.direction_deg) if len(v) >= LEAST_RAYS]
@@ -161,7 +160,7 @@ def well_known(fresh: FreshRays, each: EachRay) -> bool:
 
 
 def rms_deviation(values: Tensor) -> float:
-    """Relative standard deviation of a root mean square of so many values."""
+    """Relative standard deviation of the root mean square of values."""
     square = values * values
     mean = float(square.mean()) if len(values) > 1 else 0.0
     return float(square.std()) / (2 * mean * math.sqrt(len(values))) if mean > 0 else 0.0
@@ -195,7 +194,7 @@ def _zone(fresh: FreshRays, each: EachRay, state: str, zone: str, exact: Tensor,
 
 
 def _rms(values: Tensor) -> float | None:
-    """Four digits are more than so many rays can know; None where too few tell, or a few of them decide."""
+    """RMS with four digits; None with too few rays, or if a few of them dominate."""
     if len(values) < LEAST_RAYS or rms_deviation(values) > KNOWN:
         return None
     return _finite(float(f"{float(torch.sqrt((values * values).mean())):.4g}"))
@@ -210,9 +209,9 @@ CARD_KEYS = tuple(
     "rms_um p99_um max_um rms_infinity_um rms_px direction_rms_deg position_rms_um transmittance_rms transmittance_max "
     "false_pass false_block false_pass_near_rim false_block_near_rim".split()
 )
-# Worth a word: false passes or blocks beyond this share, an RMS error beyond so many pixels of 4000 across.
+# Reported as poor: false passes or blocks beyond this share, an RMS error beyond so many pixels of 4000 across.
 POOR_SHARE, POOR_PX = 0.01, 1.0
-# Added to the seed of the fit's rays: the same seed would give the very rays that the rims were fitted to.
+# Added to the seed of the fit's rays: the same seed would give the rays that the rims were fitted to.
 FRESH = 104729
 
 
@@ -249,7 +248,7 @@ def onnx_predictor(model: OnnxLens) -> Any:
 def measure_errors(
     model: OnnxLens, lens: Lens, domain: Domain, held_out: PairSet, vignetting_rays: int, seed: int
 ) -> dict[str, Any]:
-    """Errors of an exported model on held-out rays, as a card holds them; keys with units, what is not finite as None.
+    """Errors of an exported model on held-out rays for a card; keys with units, None if not finite.
 
     `seed` is of the rays that test the vignetting; it must not be that of the fit's pairs.
     """
@@ -258,8 +257,8 @@ def measure_errors(
 
 
 def shared_rays(prepared: Prepared, vignetting_rays: int) -> FreshRays:
-    """The rays on which all models of one lens and domain are measured: many, for a card's errors are to be found
-    again on others, and a few bad rays, one in ten thousand, may decide them.
+    """The test rays of all models of one lens and domain: many, as a card's errors must be reproducible on other rays,
+    and a few bad rays, one in ten thousand, may dominate them.
     """
     pairs = prepared.pairs
     seed = pairs.settings.seed + FRESH
@@ -274,7 +273,7 @@ def measure_on(rays: FreshRays, model: OnnxLens) -> dict[str, Any]:
 
 
 def what_is_poor(errors: Mapping[str, Any]) -> list[str]:
-    """What of a model's errors shows in a picture, for its card and its maker: true promises that few would want."""
+    """Errors of a model that are visible in a picture, as sentences for its card."""
     said = [
         f"{key.replace('_', ' ')} {100 * errors[key]:.2g}%"
         for key in ("false_pass", "false_block")
@@ -292,78 +291,68 @@ def fit_and_measure(
     report: Report,
     rays: Callable[[], FreshRays] | None = None,
 ) -> Measured:
-    """Fit, export and measure one model, or take what the folder holds if it was made by the same settings and version.
+    """Fit, export and measure one model, or take an existing one of the same settings and version from the folder.
 
     `rays`, where several models share them, gives `shared_rays(prepared, vignetting_rays)`.
 
-    The errors are those of the exported float32 graph, in onnxruntime: what ships is what is measured.
+    The errors are those of the exported float32 graph in onnxruntime.
     """
     file, note = folder / f"{settings.label}.onnx", folder / f"{settings.label}.json"
     fingerprint = _fingerprint(prepared, settings, vignetting_rays)
     known = known_record(note, file, fingerprint)
     if known is not None:
         return Measured(settings, file, known)
-    training = folder / f"{settings.label}.training.npz"  # what a killed run left
-    model = fit_model(prepared, settings, report, checkpoint=training, error_um=_error_um(prepared))
+    training = folder / f"{settings.label}.training.npz"  # left by a killed run
+
+    def error_um(model: LensModel) -> float:
+        pairs = prepared.pairs
+        return ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict)["rms_um"]
+
+    model = fit_model(prepared, settings, report, checkpoint=training, error_um=error_um)
     export_onnx(model, file, errors={})
     on = rays() if rays else shared_rays(prepared, vignetting_rays)
     errors = measure_on(on, load_model(file))
     export_onnx(model, file, errors=errors)
-    start = time.perf_counter()
-    load_model(file)
-    load_s = time.perf_counter() - start
-    network = settings.method in NETWORKS
     record: dict[str, Any] = {
         "name": settings.label,
         "family": settings.family,
         "variables": settings.basis,
         "file": f"models/{file.name}",
         **errors,
-        "coefficients_per_vector": None if network else model.core.coefficients_per_vector,
+        "coefficients_per_vector": None if settings.method in NETWORKS else model.core.coefficients_per_vector,
         "parameters": model.core.coefficients,
         "bytes": file.stat().st_size,
         "fit_s": model.fit_s,
-        "load_s": load_s,
+        "load_s": seconds_to_load(file),
     }
     note_record(note, file, fingerprint, record)
     checkpoint.clear(training)
     return Measured(settings, file, record)
 
 
-def _error_um(prepared: Prepared) -> Callable[[LensModel], float]:
-    """Film-equivalent RMS of models, as their cards will give it."""
-    pairs = prepared.pairs
-    return lambda model: ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict)["rms_um"]
-
-
 def _fingerprint(prepared: Prepared, settings: ModelSettings, vignetting_rays: int) -> str:
     pairs = prepared.pairs
-    asked = [
-        __version__,
-        pairs.lens.sha256,
-        pairs.domain.to_dict(),
-        asdict(pairs.settings),
-        asdict(settings),
-        vignetting_rays,
-    ]
-    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+    made_of = (pairs.domain.to_dict(), asdict(pairs.settings), asdict(settings), vignetting_rays)
+    return fingerprint_of([__version__, pairs.lens.sha256, *made_of])
 
 
-def _sha256(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+def seconds_to_load(file: Path) -> float:
+    start = time.perf_counter()
+    load_model(file)
+    return time.perf_counter() - start
 
 
 def note_record(note: Path, file: Path, fingerprint: str, record: dict[str, Any]) -> None:
-    """Leave the record of a finished fit beside its model, for `known_record`."""
-    made = {"fingerprint": fingerprint, "sha256": _sha256(file), "record": record}
+    """Write the record of a finished fit beside its model, for `known_record`."""
+    made = {"fingerprint": fingerprint, "sha256": sha256_of(file), "record": record}
     atomic_write_text(note, json.dumps(made, indent=1, allow_nan=False))
 
 
 def known_record(note: Path, file: Path, fingerprint: str) -> dict[str, Any] | None:
-    """The record of an earlier, finished fit of the very same settings, whose model is still as it was written."""
+    """The record of an earlier finished fit of the same settings whose model file is unchanged."""
     try:
         data = json.loads(note.read_text(encoding="utf-8"))
-        same = data["fingerprint"] == fingerprint and data["sha256"] == _sha256(file)
+        same = data["fingerprint"] == fingerprint and data["sha256"] == sha256_of(file)
         return data["record"] if same else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -1,14 +1,12 @@
 """Every method on the same rays of a lens: the rows of `neurolens bench surrogates`, their records, errors and times.
 
-A record that is there, made by the same settings and version, is kept.
+Existing records of the same settings and version are kept.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -18,25 +16,25 @@ from typing import Any, get_args
 
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.base.files import atomic_write_text
+from neurolens.base.files import atomic_write_text, fingerprint_of, sha256_of
 from neurolens.base.progress import Progress, Report
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import exact_candidates, fused_candidate, model_candidate
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
-from neurolens.evaluate.measure import FreshRays, measure, onnx_predictor, shared_rays
+from neurolens.evaluate.measure import FreshRays, measure, onnx_predictor, seconds_to_load, shared_rays
 from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
 from neurolens.evaluate.records import break_even_rays, plain
 from neurolens.evaluate.speed import Race, race
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
 from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model, prepare
-from neurolens.surrogates.fits.ablations import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.precision import Precision, store_weights
 from neurolens.surrogates.published import PUBLISHED
+from neurolens.surrogates.settings import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
 
 GROUPS = {
     "paraxial": "what renderers use today",
@@ -73,7 +71,7 @@ def _ours() -> tuple[ModelSettings, ...]:
 
 
 def _ablations() -> Iterator[Row]:
-    """Our polynomial of 64 terms and our network with one part left out."""
+    """Our polynomial of 64 terms and our network, each without one part."""
     for whole, parts in (
         (ModelSettings("ols", terms=64), POLYNOMIAL_ABLATIONS),
         (ModelSettings("mlp"), NETWORK_ABLATIONS),
@@ -99,7 +97,7 @@ def chosen_rows(names: Sequence[str]) -> tuple[Row, ...]:
     """Rows by name, by group, or by method ("ols", "schrade"; without ablations); none named: all but the ablations.
 
     Raises:
-        InputError: a name that is none of these.
+        InputError: an unknown name.
     """
     rows, wanted = all_rows(), names or DEFAULT_GROUPS
     picked: dict[str, Row] = {}
@@ -121,7 +119,7 @@ _FIGURES = (
 
 @dataclass(frozen=True)
 class BenchSettings:
-    """What is the same for all rows.
+    """Settings common to all rows.
 
     Attributes:
         domain: of the models; None for focus_m: infinity only.
@@ -141,7 +139,7 @@ class BenchSettings:
 
 @dataclass(frozen=True)
 class Bench:
-    """One lens of the benchmark and the folder of its records; what costs time is made when it is first wanted."""
+    """One lens of the benchmark and the folder of its records; expensive parts are computed on first use."""
 
     choice: LensChoice
     settings: BenchSettings
@@ -180,13 +178,13 @@ class Bench:
         return self.folder / "models" / self.name / f"{row.name}.onnx"
 
     def fingerprint(self, row: Row) -> str:
-        """Of all that decides a record but its times."""
+        """Hash of everything that decides a record except its times."""
         asked = [
             __version__, self.lens.sha256, self.lens.stop_radius_mm, self.lens.image_radius_mm,
             asdict(self.settings.domain), asdict(self.settings.pairs), self.settings.vignetting_rays,
             asdict(row.settings), *([row.weights] if row.weights else []),
         ]  # fmt: skip
-        return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+        return fingerprint_of(asked)
 
 
 def run_bench(
@@ -197,13 +195,14 @@ def run_bench(
     progress: Progress,
     done: Callable[[Bench, list[dict[str, Any]]], None] = lambda bench, records: None,
 ) -> dict[str, list[dict[str, Any]]]:
-    """Records of every lens, by its name; `done` hears of each lens as soon as it is through.
+    """Records of every lens, by its name; `done` is called after each lens.
 
     Args:
-        again: make all records again, those that are there too.
+        again: recompute existing records, too.
     """
     for bench in benches:
-        progress.plan({f"{bench.name}: {row.name}": _expected_s(row) for row in rows})
+        slow = (*NETWORKS, "neurolens2017")
+        progress.plan({f"{bench.name}: {r.name}": 30.0 if r.settings.method in slow else 4.0 for r in rows})
         progress.plan({f"{bench.name}: race": 60.0 if bench.settings.compile_exact else 15.0})
     found = {}
     for bench in benches:
@@ -220,12 +219,8 @@ def run_bench(
     return found
 
 
-def _expected_s(row: Row) -> float:
-    return 30.0 if row.settings.method in (*NETWORKS, "neurolens2017") else 4.0
-
-
 def _record(bench: Bench, row: Row, again: bool, report: Report) -> dict[str, Any]:
-    """A record that is there and was made by the same settings, or a new one; its failure where it fails."""
+    """An existing record of the same settings, or a new one, with its failure if it fails."""
     file = bench.record_file(row)
     head = {"lens": bench.name, "method": row.name, "group": row.group, "source": row.source}
     try:
@@ -233,10 +228,10 @@ def _record(bench: Bench, row: Row, again: bool, report: Report) -> dict[str, An
         known = None if again else read_record(file, mark)
         if known is not None and (known["failed"] or known["not_exported"] or bench.model_file(row).is_file()):
             return known
-        file.unlink(missing_ok=True)  # a run that is interrupted now leaves no record of what is gone
+        file.unlink(missing_ok=True)  # an interruption must not leave a record of removed files
         made = {"failed": None, **_fit_and_measure(bench, row, report)}
-    except Exception as error:  # a row with the reason: the other methods and lenses go on
-        # What was refused will be again; what was not foreseen is tried again by the next run.
+    except Exception as error:  # a row with the reason; other methods and lenses continue
+        # Expected errors are permanent; unexpected ones are retried by the next run.
         mark = _mark(bench, row) if isinstance(error, NeurolensError) else ""
         made = {"failed": _reason(error), "not_exported": None}
     record = plain({"fingerprint": mark, **head, "settings": asdict(row.settings), **made})
@@ -266,9 +261,7 @@ def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
     predict: Any = model.predict
     load_s = None
     if refused is None:
-        start = time.perf_counter()
-        predict = onnx_predictor(load_model(file))
-        load_s = time.perf_counter() - start
+        load_s, predict = seconds_to_load(file), onnx_predictor(load_model(file))
     found = measure(bench.rays, predict)
     figures = {key: found.figures[key] for key in _FIGURES}
     scaled = {
@@ -294,7 +287,6 @@ def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
 
 
 def _export(model: LensModel, file: Path) -> str | None:
-    """Write the model; why not, where its kind has no graph."""
     file.parent.mkdir(parents=True, exist_ok=True)
     try:
         export_onnx(model, file, {})
@@ -311,8 +303,8 @@ def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]],
             files[row.name] = bench.model_file(row)
     if not s.rounds or not files:
         return
-    hashes = {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in sorted(files.items())}
-    mark = hashlib.sha256(json.dumps([hashes, s.rounds, s.threads, s.compile_exact]).encode()).hexdigest()
+    hashes = {name: sha256_of(file) for name, file in sorted(files.items())}
+    mark = fingerprint_of([hashes, s.rounds, s.threads, s.compile_exact])
     if all(record.get("race") == mark for record in records if record["method"] in files):
         return
     timed = race_models(bench.lens, bench.domain, files, s.rounds, s.threads, s.compile_exact, report)
@@ -323,7 +315,7 @@ def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]],
 
 
 def read_record(file: Path, fingerprint: str | None = None) -> dict[str, Any] | None:
-    """A record, None where there is none, none that can be read, or one of other settings."""
+    """A record; None if missing, unreadable or of other settings."""
     try:
         record = json.loads(file.read_text(encoding="utf-8"))
         good = isinstance(record, dict) and {"lens", "method", "failed", "not_exported"} <= record.keys()
@@ -356,7 +348,7 @@ def race_models(
 def times_of(record: Mapping[str, Any], timed: Race) -> dict[str, Any]:
     """Times of one model for its record, held against the fastest exact tracer of the same race.
 
-    Returns: ns_per_ray, speedup (by the minima), break_even_rays (after which fitting and loading have paid; "never"
+    Returns: ns_per_ray, speedup (by the minima), break_even_rays (after which fitting and loading pay off; "never"
         where the exact tracer is as fast), the same with "fused_" before, and exact: the tracers' times.
     """
     name, found = record["method"], dict[str, Any]()

@@ -13,7 +13,7 @@ from neurolens.analysis.plot_style import INK, new_figure, plain_log_ticks, save
 from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.methods import GROUPS
 from neurolens.evaluate.plots import place_labels
-from neurolens.evaluate.records import number, pareto_front
+from neurolens.evaluate.records import markdown_table, number, pareto_front
 
 Record = Mapping[str, Any]
 
@@ -61,7 +61,7 @@ COLUMNS = (
     Column("break-even Mray", "break_even_rays", 1e-6, 2),
     Column("fused", "fused_break_even_rays", 1e-6, 2),
 )
-# Of the overall page: figures where smaller is better, and one where larger is.
+# Figures of the overall page; larger is better for the speed-ups, smaller for the others.
 SUMMED = tuple(
     c for c in COLUMNS if c.key in
     "rms_um_at_21_6 direction_rms_deg position_rms_um_at_21_6 transmittance_rms false_pass false_block "
@@ -87,17 +87,17 @@ NOTES = (
 
 def lens_page(name: str, records: Sequence[Record], facts: str) -> str:
     """The table of one lens, group by group."""
-    head = ["method", *(c.heading for c in COLUMNS)]
-    lines = _heading(head)
+    rows = []
     for record in _ordered(records):
+        cells = [c.cell(record) for c in COLUMNS] if not record["failed"] else [""] * len(COLUMNS)
         if record["failed"]:
-            lines.append(f"| {record['method']} | failed: {_cell(record['failed'])} |" + " |" * (len(head) - 2))
-        else:
-            lines.append("| " + " | ".join([record["method"], *(c.cell(record) for c in COLUMNS)]) + " |")
+            cells[0] = f"failed: {_cell(record['failed'])}"
+        rows.append([record["method"], *cells])
     for exact in _exact(records):
         time = number(exact, "ns_per_ray.min")
         cells = ["–" if c.key != "ns_per_ray.min" or time is None else _digits(time, 3) for c in COLUMNS]
-        lines.append("| " + " | ".join([exact["name"], *cells]) + " |")
+        rows.append([exact["name"], *cells])
+    lines = markdown_table(["method", *(c.heading for c in COLUMNS)], rows)
     apart = [f"- {r['method']} has no graph: {r['not_exported']}" for r in records if r["not_exported"]]
     return "\n".join([f"# {name}", "", facts, "", *lines, *([""] if apart else []), *apart, ""])
 
@@ -106,13 +106,13 @@ def summary_page(found: Mapping[str, Sequence[Record]], facts: str) -> str:
     """Median and worst lens of every method, then lens by lens."""
     every = [r for records in found.values() for r in records]
     methods = {r["method"]: r for r in _ordered(every)}
-    head = ["method", "lenses", *(c.heading for c in SUMMED)]
-    lines = _heading(head)
+    cells = []
     for method in methods:
         rows = [r for r in every if r["method"] == method]
         good = [r for r in rows if not r["failed"]]
         count = f"{len(good)}" if len(good) == len(rows) else f"{len(good)} of {len(rows)}"
-        lines.append("| " + " | ".join([method, count, *(_median_and_worst(c, good) for c in SUMMED)]) + " |")
+        cells.append([method, count, *(_median_and_worst(c, good) for c in SUMMED)])
+    lines = markdown_table(["method", "lenses", *(c.heading for c in SUMMED)], cells)
     failures = [f"- {r['method']}, {r['lens']}: {_cell(r['failed'])}" for r in every if r["failed"]]
     sources = {r["method"]: r["source"] for r in methods.values() if r["source"]}
     parts = ["# Surrogates over lenses", "", facts, "", "Each cell: median, then worst lens.", "", *lines]
@@ -132,12 +132,7 @@ def write_lens(name: str, records: Sequence[Record], facts: str, folder: Path) -
     atomic_write_text(folder / f"{name}.md", text)
 
 
-def _heading(cells: Sequence[str]) -> list[str]:
-    return ["| " + " | ".join(cells) + " |", "|---" * len(cells) + "|"]
-
-
 def _ordered(records: Sequence[Record]) -> list[Record]:
-    """Group by group, in each as given."""
     return sorted(records, key=lambda r: list(GROUPS).index(r["group"]))
 
 
@@ -157,17 +152,17 @@ def _median_and_worst(column: Column, records: Sequence[Record]) -> str:
 
 def _by_lens(found: Mapping[str, Sequence[Record]], methods: Sequence[str]) -> list[str]:
     """Every lens by every method, the worst of the first method first."""
-    lines = _heading(["lens", *methods])
     rows = {lens: {r["method"]: r for r in records if not r["failed"]} for lens, records in found.items()}
 
     def worst(lens: str) -> float:
         first = rows[lens].get(methods[0]) if methods else None
         return -((number(first, "direction_rms_deg") if first else None) or 0.0)
 
-    for lens in sorted(rows, key=worst):
-        cells = [" / ".join(c.cell(rows[lens][m]) for c in _OF_A_LENS) if m in rows[lens] else "–" for m in methods]
-        lines.append("| " + " | ".join([lens, *cells]) + " |")
-    return lines
+    def cell(record: Record | None) -> str:
+        return "–" if record is None else " / ".join(c.cell(record) for c in _OF_A_LENS)
+
+    lines = ([lens, *(cell(rows[lens].get(m)) for m in methods)] for lens in sorted(rows, key=worst))
+    return markdown_table(["lens", *methods], lines)
 
 
 def _digits(value: float, digits: int) -> str:
@@ -180,7 +175,7 @@ def _cell(text: str) -> str:
     return text.replace("|", "/")
 
 
-_LOOK = {  # Okabe and Ito's colours; shapes tell the groups apart without them
+_LOOK = {  # Okabe and Ito's colours; marker shapes distinguish the groups without them
     "paraxial": ("#7f7f7f", "D"),
     "published": ("#e69f00", "s"),
     "ours": ("#0072b2", "o"),
@@ -219,7 +214,7 @@ def trade_plot(name: str, records: Sequence[Record], exact: Sequence[Record], pa
         for axes in (left, right):
             plain_log_ticks(axes.xaxis)
             axes.grid(True, which="major")
-        figure.suptitle(f"{name}: what an error costs", x=0.01, ha="left", fontweight="bold")
+        figure.suptitle(f"{name}: error against time and size", x=0.01, ha="left", fontweight="bold")
         handles = {
             label: h for axes in (left, right) for h, label in zip(*axes.get_legend_handles_labels(), strict=True)
         }

@@ -1,4 +1,4 @@
-"""The trade in pictures: error against time, and against coefficients; families' colours, labels that keep clear."""
+"""Plots of error against time and against coefficients; colours of families, placement of labels."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neurolens.analysis.plot_style import FAINT, INK, new_figure, plain_log_ticks, save, style
+from neurolens.analysis.plot_style import FAINT, INK, drawing, plain_log_ticks
 from neurolens.base.errors import InputError
 from neurolens.evaluate.records import FAMILIES, VARIABLES, number, pareto_front
 
-# Okabe and Ito's colours, told apart by colour-blind readers too; black is kept for the exact tracer.
+# Okabe and Ito's colours, distinguishable by colour-blind readers; black is kept for the exact tracer.
 FAMILY_COLOURS = {
     "paraxial": "#7f7f7f",
     "dense": "#56b4e9",
@@ -67,7 +67,7 @@ def _places(width: float, height: float) -> list[tuple[float, float]]:
 
 
 def _cost(box: tuple[float, float, float, float], points: Sequence[Any], taken: Sequence[Any], frame: Any) -> float:
-    """How bad a label's place is: markers it covers, label area it overlaps, and leaving the axes worst of all."""
+    """Cost of a label's place: markers covered, label area overlapped, and most of all leaving the axes."""
     x, y, w, h = box
     cost = sum(2.0 for px, py in points if x - 6 < px < x + w + 6 and y - 6 < py < y + h + 6)
     for x2, y2, w2, h2 in taken:
@@ -101,9 +101,9 @@ def pareto_plot(
 ) -> Path:
     """Error against ns per ray, both logarithmic: a marker for each model, the Pareto front, the exact tracers.
 
-    Models sit at the minimum of their time, with a whisker to the median. An exact tracer has no error and so no place
-    on a log axis: it stands in a band below, with a line up to show which models are faster. Numbers beside the markers
-    are coefficients per vector output.
+    Models sit at the minimum of their time, with a whisker to the median. An exact tracer, without error, has no place
+    on a log axis: it is shown in a band below, with a line up to show which models are faster. Numbers beside the
+    markers are coefficients per vector output.
 
     Args:
         records: `records.ModelRecord`s; those with no time or no error are left out, and their number is stated.
@@ -115,8 +115,7 @@ def pareto_plot(
     """
     shown = _with_numbers(records, error, "ns_per_ray.min")
     points = [(_get(r, "ns_per_ray.min"), _get(r, error)) for r in shown]
-    with style():
-        figure = new_figure(9.6, 5.8)
+    with drawing(path, 9.6, 5.8) as figure:
         axes = figure.add_subplot()
         axes.set(xscale="log", yscale="log", xlabel=_time_label([*shown, *exact]), ylabel=ERROR_LABELS[error])
         _plot_models(axes, shown, points)
@@ -124,14 +123,15 @@ def pareto_plot(
         _set_limits(axes, [p[0] for p in points] + times, [p[1] for p in points], room=2.2 if times else 1.0)
         _plot_front(axes, points, times)
         axes.grid(True, which="major")
-        plain_log_ticks(axes.xaxis)
-        plain_log_ticks(axes.yaxis)
+        plain_log_ticks(axes.xaxis, axes.yaxis)
         _plot_exact(axes, exact)
         axes.set_title(title, loc="left", fontweight="bold")
         _note_left_out(axes, len(records) - len(shown), "without a time or an error")
         figure.legend(loc="outside right upper")
-        place_labels(axes, points, [_size_label(r) for r in shown], fontsize=7.6, color="#333333")
-        return save(figure, path)
+        counts = [number(r, "coefficients_per_vector") for r in shown]
+        labels = [f"{n:.0f}" if n else str(r.get("name", "")) for n, r in zip(counts, shown, strict=True)]
+        place_labels(axes, points, labels, fontsize=7.6, color="#333333")
+    return Path(path)
 
 
 def error_against_coefficients_plot(
@@ -151,8 +151,7 @@ def error_against_coefficients_plot(
     """
     shown = _with_numbers(records, error)
     counted = [r for r in shown if number(r, "coefficients_per_vector")]
-    with style():
-        figure = new_figure(9.6, 5.4)
+    with drawing(path, 9.6, 5.4) as figure:
         axes = figure.add_subplot()
         axes.set(yscale="log", xlabel="coefficients per vector output (count)", ylabel=ERROR_LABELS[error])
         points = [(_get(r, "coefficients_per_vector"), _get(r, error)) for r in counted]
@@ -166,17 +165,17 @@ def error_against_coefficients_plot(
         axes.set_title(title, loc="left", fontweight="bold")
         _note_left_out(axes, len(records) - len(shown), "without an error")
         figure.legend(loc="outside right upper")
-        return save(figure, path)
+    return Path(path)
 
 
 def _get(record: Record, key: str) -> float:
     value = number(record, key)
-    assert value is not None  # callers keep only records that hold it
+    assert value is not None  # callers keep only records with this key
     return value
 
 
 def _with_numbers(records: Sequence[Record], error: str, *keys: str) -> list[Record]:
-    """The records that hold a positive number at `error` and at each of `keys`: a log axis can show no other."""
+    """The records with a positive number at `error` and at each of `keys`, as log axes require."""
     if error not in ERROR_LABELS:
         raise InputError("plot", "error", error, "one of " + ", ".join(ERROR_LABELS))
     kept = [r for r in records if all((number(r, key) or 0) > 0 for key in (error, *keys))]
@@ -186,7 +185,7 @@ def _with_numbers(records: Sequence[Record], error: str, *keys: str) -> list[Rec
 
 
 def _series(records: Sequence[Record]) -> list[tuple[str, str, list[int]]]:
-    """(family, variables, indices) in the order of FAMILIES and VARIABLES; families not known come last."""
+    """(family, variables, indices) in the order of FAMILIES and VARIABLES; unknown families come last."""
     found = {(str(r.get("family")), str(r.get("variables"))) for r in records}
 
     def rank(key: tuple[str, str]) -> tuple[int, int, tuple[str, str]]:
@@ -216,7 +215,7 @@ def _plot_models(axes: Any, records: Sequence[Record], points: Sequence[tuple[fl
 
 
 def _plot_front(axes: Any, points: Sequence[tuple[float, float]], exact_times: Sequence[float]) -> None:
-    """Staircase of the models that nothing betters. The fastest exact tracer, without error, ends it at its time."""
+    """The Pareto front as a staircase. The fastest exact tracer, without error, ends it at its time."""
     fastest = [(min(exact_times), 0.0)] if exact_times else []
     every = [*points, *fastest]
     front = [every[i] for i in pareto_front(every)]
@@ -227,7 +226,7 @@ def _plot_front(axes: Any, points: Sequence[tuple[float, float]], exact_times: S
 
 
 def _set_limits(axes: Any, xs: Sequence[float], ys: Sequence[float], band: float = _BAND, room: float = 1.0) -> None:
-    """Margins of equal look on log axes; `band` of the height stays free below the smallest y, `room` at the right."""
+    """Equal margins on log axes; `band` of the height stays free below the smallest y, `room` at the right."""
     if xs:
         pad = max((max(xs) / min(xs)) ** 0.09, 1.25)
         axes.set_xlim(min(xs) / pad, max(xs) * pad**room * room**0.5)
@@ -251,7 +250,7 @@ def _plot_exact(axes: Any, exact: Sequence[Record]) -> None:
     words = "\n".join(["exact (no error)", *missing])
     axes.text(0.008, 0.82 * _BAND, words, transform=axes.transAxes, va="center", fontsize=8.2, color="#555b63")
     low, high = axes.get_ylim()
-    for minor in (False, True):  # the band is no error: no ticks beside it
+    for minor in (False, True):  # no ticks beside the band
         axes.set_yticks(
             [t for t in axes.get_yticks(minor=minor) if low * (high / low) ** _BAND < t < high], minor=minor
         )
@@ -271,7 +270,7 @@ def _plot_exact(axes: Any, exact: Sequence[Record]) -> None:
 
 
 def _plot_lines_across(axes: Any, records: Sequence[Record], error: str) -> None:
-    """Models that count no coefficients: a dotted line at their error, named on it; close lines are named in turn."""
+    """Models that count no coefficients: a dotted line at their error with its name, offset for close lines."""
     low, high = axes.get_ylim()
     last, shift = 0.0, 0
     for record in sorted(records, key=lambda r: _get(r, error)):
@@ -284,11 +283,6 @@ def _plot_lines_across(axes: Any, records: Sequence[Record], error: str) -> None
             textcoords="offset points", va="center", fontsize=8.2, color=colour, zorder=2.5,
             bbox={"fc": "white", "ec": "none", "pad": 1.2},
         )  # fmt: skip
-
-
-def _size_label(record: Record) -> str:
-    count = number(record, "coefficients_per_vector")
-    return f"{count:.0f}" if count else str(record.get("name", ""))
 
 
 def _time_label(records: Sequence[Record]) -> str:

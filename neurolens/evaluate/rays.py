@@ -1,9 +1,9 @@
-"""Ray errors of a surrogate against the exact lens, as defined once for the whole project.
+"""Ray errors of a surrogate against the exact lens.
 
-Rays are those of a domain that the exact lens passes, whatever the model's own status says of them (false blocks are
-counted by `vignetting`). Film-equivalent error: the exact and the approximate ray meet the plane in focus, and the
+Rays are those of a domain that the exact lens passes, independent of the model's status (false blocks are counted by
+`vignetting`). Film-equivalent error: the exact and the approximate ray meet the plane in focus, and the
 distance between the two points is taken back to the film with the exact lens's local Jacobian at that film point.
-It is given for rays within 60 degrees of the axis; beyond, a plane is a poor target and only angles are given.
+It is given for rays within 60 degrees of the axis; beyond, only angles are given.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def ray_errors(
     Args:
         lens: the exact lens, in the state (zoom, stop) that the model stands for.
         domain: of the model.
-        held_out: rays uniform over the domain that the lens passes, none of them seen in the fit.
+        held_out: rays uniform over the domain that the lens passes, not used in the fit.
         predict: the model.
         pitch_um: pixel pitch; None takes `pixel_um`.
 
@@ -75,7 +75,7 @@ def ray_errors(
         direction_rms_deg, direction_p99_deg, direction_max_deg: angle between the exact and the predicted direction.
         position_rms_um, position_p99_um: perpendicular distance from the predicted point to the exact ray.
         transmittance_rms, transmittance_max.
-        rays, share_beyond_60_deg: how many rays, and the share of them that the micrometres leave out.
+        rays, share_beyond_60_deg: number of rays, and the share excluded from the micrometres.
         Micrometres are NaN where all rays lie beyond 60 degrees. A NaN in a prediction makes its figures NaN; a ray
         that points away from the plane makes the micrometres infinite.
 
@@ -176,10 +176,10 @@ def distance_to_ray(exact: Rays, predicted: Rays) -> Tensor:
 
 
 def pupil_disc_share(lens: Lens, domain: Domain, count: int = 400_000, seed: int = 7) -> float:
-    """Share of the passing rays that the domain's pupil disc holds; the definition of the errors asks for 0.9999.
+    """Share of the passing rays that the domain's pupil disc contains; the definition of the errors requires 0.9999.
 
     Rays uniform over the film disc, wavelengths and film positions, and over a disc on the pupil plane that holds the
-    whole rear surface seen from the film point, whatever the domain's bounds say.
+    whole rear surface seen from the film point, independent of the domain's bounds.
 
     Raises:
         InputError: no ray passes.
@@ -219,7 +219,7 @@ def _max(values: Tensor) -> float:
 
 # Central differences over this share of the film radius: truncation and float64 rounding both stay below 1e-6.
 _STEP = 1e-4
-# The least that a Jacobian counts for, of the paraxial one.
+# Lower bound of the Jacobian, as a share of the paraxial one.
 _LEAST = 0.1
 
 
@@ -239,14 +239,14 @@ def plane_coordinates(rays: Rays, vergence: Tensor) -> Tensor:
     forward = -rays.dz
     reach = (1 + rays.z * vergence) / torch.where(forward > 0, forward, torch.nan)
     points = torch.stack([rays.x * vergence + rays.dx * reach, rays.y * vergence + rays.dy * reach])
-    # A NaN that the model itself gave stays NaN; only a ray that points backwards becomes infinite.
+    # A NaN of the model stays NaN; only a ray that points backwards becomes infinite.
     return torch.where(forward <= 0, torch.inf, points)
 
 
 def film_equivalent_mm(
     lens: Lens, domain: Domain, inputs: FilmRays, exact: Rays, rays: Rays, vergence: Tensor
 ) -> Tensor:
-    """[N] distance on the film (mm) that the distance between two rays on an object plane stands for."""
+    """[N] distance on the film (mm) equivalent to the distance between two rays on an object plane."""
     dx, dy = plane_coordinates(rays, vergence) - plane_coordinates(exact, vergence)
     least = _LEAST / abs(first_order(lens).efl_mm)
     if lens.anamorphic:
@@ -304,7 +304,7 @@ def _differences(
 ) -> tuple[Tensor, Tensor]:
     """[2, N] radial and tangential derivative at film points (radius, 0) through pupil points (u, v), four rays each.
 
-    Also [N], whether all four went on.
+    Also [N], whether all four passed.
     """
     h = _STEP * domain.film_radius_mm
     zero = torch.zeros_like(radius)

@@ -1,15 +1,15 @@
-"""The records of a run: what `results.json` holds, key by key, with units in the names.
+"""The records of a run, as in `results.json`, with units in the keys.
 
 Every key is optional but `name`: what was not measured is absent or null, never a made-up number. Shares
-(`false_pass`, `camera_share`, ...) are fractions of 1. Errors are those of surrogates.md, "Error, defined once".
-JSON has no infinity: focus at infinity is the text "infinity"; a number that is not one (NaN) is null.
+(`false_pass`, `camera_share`, ...) are fractions of 1. Errors are defined in surrogates.md, "Error, defined once".
+As JSON has no infinity, focus at infinity is the text "infinity"; NaN is null.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -53,7 +53,7 @@ class ModelRecord(TypedDict, total=False):
     false_block_near_rim: float | None
     stopped_down: dict[str, dict[str, float | None]]  # "2_stops", "4_stops" closed, same fit: false_pass, false_block
     zones: dict[str, dict[str, dict[str, Any]]]  # "full", "2_stops" by zone of the film; see `measure.Findings`
-    poor: list[str]  # what of these errors shows in a picture
+    poor: list[str]  # errors that are visible in a picture
     coefficients_per_vector: int | None  # A and B terms both count; a raw basis: all scalars of the vector
     parameters: int | None  # of the whole model: coefficients or weights, rims included
     bytes: int | None
@@ -194,6 +194,12 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None if math.isnan(value) else "infinity" if value > 0 else "-infinity"
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]], missing: str = "") -> list[str]:
+    """Lines of a table in Markdown; `missing` stands for cells that are None."""
+    lines = [header, ["---"] * len(header), *([missing if c is None else str(c) for c in row] for row in rows)]
+    return [f"| {' | '.join(line)} |" for line in lines]
 
 
 def number(record: Mapping[str, Any], key: str) -> float | None:

@@ -1,7 +1,7 @@
-"""`report.html`: one page that shows a run, from its results alone. No script, no network; light and dark.
+"""`report.html`: one page of a run, from its results alone. No script, no network; light and dark.
 
-Pictures stay files of the run folder and are referred to by relative names: the folder can be moved or zipped as it is.
-A picture or link is shown only if its file lies inside the run folder. What was not measured shows as a dash.
+Pictures are files of the run folder, referred to by relative names, so that the folder can be moved or zipped.
+A picture or link is shown only if its file lies inside the run folder. Missing values are shown as a dash.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def write_report(run_dir: str | Path, results: Mapping[str, Any]) -> Path:
 
     Args:
         run_dir: folder that holds the pictures the results name.
-        results: `records.Results`; every part may be missing, and shows as such.
+        results: `records.Results`; every part may be missing.
     Raises:
         InputError: no such folder; results of another shape.
     """
@@ -82,7 +82,7 @@ def write_report(run_dir: str | Path, results: Mapping[str, Any]) -> Path:
     if not folder.is_dir():
         raise InputError(folder, "run folder", "(missing)", "a folder that exists")
     check_results(results, folder / "results.json")
-    title = str(results.get("title") or _lens_name(results))
+    title = str(results.get("title") or (results.get("lens") or {}).get("name") or "neurolens run")
     body = [
         _header(results, title),
         section("Headline", _headline(results)),
@@ -100,10 +100,6 @@ def write_report(run_dir: str | Path, results: Mapping[str, Any]) -> Path:
     return path
 
 
-def _lens_name(results: Mapping[str, Any]) -> str:
-    return str((results.get("lens") or {}).get("name") or "neurolens run")
-
-
 def _header(results: Mapping[str, Any], title: str) -> str:
     parts = [results.get("command"), results.get("started")]
     wall = number(results, "wall_s")
@@ -113,7 +109,7 @@ def _header(results: Mapping[str, Any], title: str) -> str:
 
 
 def _headline(results: Mapping[str, Any]) -> str:
-    """Figures a reader looks for first; each names its model. Nothing is shown that no record holds."""
+    """The main figures, each with its model; missing ones are left out."""
     models: Sequence[Record] = results.get("models", ())
     close = [m for m in models if (e := number(m, "rms_um")) is not None and e <= _CLOSE_UM]
     within = f"within {_CLOSE_UM:g} µm"
@@ -136,7 +132,6 @@ def _false(model: Record) -> list[float]:
 
 
 def _worst_ratios(results: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """For each camera the largest FLIP over noise floor of its renders: one lucky scene proves nothing."""
     worst: dict[str, float] = {}
     for record in results.get("images", ()):
         ratio, camera = number(record, "flip_ratio"), str(record.get("camera", ""))
@@ -195,9 +190,8 @@ def _models(results: Mapping[str, Any]) -> str:
     notes = [f"{m['name']}: {m['note']}" for m in models if m.get("note")]
     stopped = [m for m in models if m.get("stopped_down")]
     closed = table([str(m["name"]) for m in stopped], stopped, _STOPPED_COLUMNS)
-    told = _notes([note, *notes] if models else [])
     below = f"<h3>The same fits, stopped down</h3>{closed}" if closed else ""
-    return table(names, models, _MODEL_COLUMNS) + told + below
+    return table(names, models, _MODEL_COLUMNS) + _notes([note, *notes] if models else []) + below
 
 
 def _exact(results: Mapping[str, Any]) -> str:
@@ -222,9 +216,9 @@ def _images(folder: Path, results: Mapping[str, Any]) -> str:
         " · ".join(str(r[key]) for key in ("scene", "camera") if r.get(key)) or str(r.get("name", "")) for r in records
     ]
     figures = [
-        {"file": r.get("file_png"), "title": name, "caption": r.get("caption"), "links": _links(r)}
+        {"file": png, "title": name, "caption": r.get("caption"), "links": {"EXR": r.get("file_exr"), "PNG": png}}
         for name, r in zip(names, records, strict=True)
-        if r.get("file_png")
+        if (png := r.get("file_png"))
     ]
     measured = [
         (n, r) for n, r in zip(names, records, strict=True) if number(r, "flip") is not None or number(r, "rel_mse")
@@ -234,16 +228,12 @@ def _images(folder: Path, results: Mapping[str, Any]) -> str:
     return figure_grid(folder, figures, small=True) + figures_table + _notes([note] if measured else [])
 
 
-def _links(record: Record) -> dict[str, Any]:
-    return {"EXR": record.get("file_exr"), "PNG": record.get("file_png")}
-
-
 def _domain_gain(results: Mapping[str, Any]) -> str:
     gain = results.get("domain_gain") or {}
     rows: Sequence[Record] = gain.get("rows", ())
     names = [" · ".join(str(r[key]) for key in ("domain", "name") if r.get(key)) for r in rows]
-    told = ": ".join(str(gain[key]) for key in ("scene", "text") if gain.get(key))
-    return (f"<p>{text(told)}</p>" if told else "") + table(names, rows, _GAIN_COLUMNS + _MODEL_COLUMNS)
+    said = ": ".join(str(gain[key]) for key in ("scene", "text") if gain.get(key))
+    return (f"<p>{text(said)}</p>" if said else "") + table(names, rows, _GAIN_COLUMNS + _MODEL_COLUMNS)
 
 
 def _notes(notes: Sequence[str]) -> str:
@@ -299,7 +289,7 @@ def text(value: Any) -> str:
 
 
 def show(value: float | None, digits: int) -> str:
-    """A number to so many significant digits, without an exponent where it can be read without; a dash for None."""
+    """A number with significant digits, without an exponent if it is short; a dash for None."""
     if value is None:
         return DASH
     if value == 0 or 1e-4 <= abs(value) < 10.0**digits:
@@ -308,7 +298,7 @@ def show(value: float | None, digits: int) -> str:
 
 
 def section(heading: str, body: str) -> str:
-    """A headed section, or nothing where the run has nothing to show there."""
+    """A section with a heading; empty if it has no content."""
     return f"<section><h2>{text(heading)}</h2>{body}</section>" if body else ""
 
 
@@ -375,14 +365,14 @@ def _figure(folder: Path, figure: Mapping[str, Any]) -> str:
 
 
 def local_url(folder: Path, file: Any) -> str | None:
-    """Relative URL of a file inside `folder`; None where it is absent or lies outside, whatever its name pretends."""
+    """Relative URL of a file inside `folder`; None if it is missing or its resolved path lies outside."""
     if not file:
         return None
     root = folder.resolve()
     path = (root / str(file)).resolve()
     if not path.is_relative_to(root) or not path.is_file():
         return None
-    return "./" + quote(path.relative_to(root).as_posix())  # "./": a name with a colon is not taken for a scheme
+    return "./" + quote(path.relative_to(root).as_posix())  # "./", so that a name with a colon is not read as a scheme
 
 
 def page(title: str, body: str) -> str:

@@ -1,5 +1,5 @@
-"""What an experiment does with scenes: renders through every camera, compared with the exact lens's, and the gain of a
-domain that holds only what one shot requires.
+"""Scenes of an experiment: renders through every camera, compared with the exact lens's, and the gain of a domain
+restricted to one shot.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 from neurolens.base.progress import Progress, Report
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.evaluate.candidates import model_candidate
 from neurolens.evaluate.experiment import Experiment, RenderChoice
 from neurolens.evaluate.figures import image_caption, side_by_side
@@ -53,7 +53,7 @@ def scene_cameras(lens: Lens, domain: Domain, models: Mapping[str, Path], shot: 
     film = (shot.film_width_mm, shot.film_height_mm)
     data = first_order(lens)
     f_number = max(shot.f_number or data.f_number, data.f_number)
-    # The same light for all: exposures are for it.
+    # The same light for all cameras.
     real: dict[str, Any] = {"film_mm": film, "focus_m": shot.focus_m, "f_number": f_number}
     real["wavelength_nm"] = shot.wavelengths_nm
     cameras: dict[str, Camera] = {EXACT: ExactCamera(lens, bounds=domain.bounds, **real)}
@@ -90,7 +90,10 @@ def render_all(
                 renders.setdefault(name, []).append(result.rgb)
                 if seed == 0:
                     found.cameras.append(_camera_record(scene, name, result.stats))
-                    _save(folder, scene, name, result.rgb, {"render": result.stats, "camera": camera.settings})
+                    metadata = {"render": result.stats, "camera": camera.settings}
+                    file = folder / f"{_stem(scene, name)}.exr"
+                    write_exr(file, result.rgb, half=True, metadata=metadata)
+                    write_png(file.with_suffix(".png"), result.rgb)
                 done += 1
                 report(done / total)
         _compare_scene(found, scene, choice, renders, folder)
@@ -98,27 +101,13 @@ def render_all(
 
 
 def _camera_record(scene: Scene, name: str, stats: Mapping[str, Any]) -> dict[str, Any]:
-    share = stats["camera_fraction"]
-    return {
-        "name": name,
-        "scene": scene.name,
-        "render_s": stats["seconds"],
-        "camera_s": share * stats["seconds"],
-        "camera_share": share,
-        "samples": stats["samples"],
-        "width": stats["width"],
-        "height": stats["height"],
-        "threads": stats["threads"],
-    }
+    share, seconds = stats["camera_fraction"], stats["seconds"]
+    known = {"name": name, "scene": scene.name, "render_s": seconds, "camera_s": share * seconds, "camera_share": share}
+    return known | {key: stats[key] for key in ("samples", "width", "height", "threads")}
 
 
 def _stem(scene: Scene, name: str) -> str:
     return f"{scene.name}-{name.replace(' ', '-')}"
-
-
-def _save(folder: Path, scene: Scene, name: str, rgb: FloatArray, metadata: dict[str, Any]) -> None:
-    write_exr(folder / f"{_stem(scene, name)}.exr", rgb, half=True, metadata=metadata)
-    write_png(folder / f"{_stem(scene, name)}.png", rgb)
 
 
 def _compare_scene(
@@ -209,9 +198,9 @@ def scene_gain(experiment: Experiment, folder: Path, progress: Progress) -> dict
 
 
 def nearest_depth_m(scene: Scene, efl_mm: float, across: int = 96) -> float | None:
-    """Depth of the nearest thing in view, in m from the film plane along the axis; None where nothing is in view.
+    """Depth of the nearest visible surface, in m from the film plane along the axis; None if nothing is visible.
 
-    Rays of a pinhole of the lens's focal length through a grid of `across` x `across` points of the film: a thing
+    Rays of a pinhole of the lens's focal length through a grid of `across` x `across` points of the film; surfaces
     smaller than a step of the grid may be missed.
     """
     shot = scene.settings.camera

@@ -1,9 +1,9 @@
-"""Speed in nanoseconds per ray, so that a ratio means something.
+"""Speed in nanoseconds per ray, measured in races so that ratios are meaningful.
 
 Candidates run in turn, round after round, in one process with the same number of threads, so that a machine that
 slows down slows all of them; ratios are taken within rounds. Every candidate does the same rays: uniform over the film
-and over the pupil disc of the domain, those that are blocked included, because a render pays for them too, and all from
-one film plane, as in a picture. Each candidate may choose the batch that suits it best.
+and over the pupil disc of the domain, those that are blocked included, because a render traces them too, and all from
+one film plane, as in a picture. Each candidate uses its fastest batch size.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ import torch
 
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.evaluate.records import ExactRecord, Timing
+from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
-from neurolens.surrogates.threads import pinned_threads
 
 # Rays of one pass: every batch size divides it, and float32 inputs of a pass stay in the third-level cache.
 POOL = 65536
 BATCHES = (4096, 8192, 16384)
-_SAMPLE_S = 0.001  # a sample lasts at least this long; short ones fall between the interruptions of a busy machine
-_SAMPLES = 5  # the best of so many is the time of a round
-_PREPARING = 0.7  # share of a race's time that compiling takes, about
+_SAMPLE_S = 0.001  # least time of a sample; short ones fit between the interruptions of a busy machine
+_SAMPLES = 5  # samples of a round, of which the best counts
+_PREPARING = 0.7  # approximate share of compilation in a race's time
 
 Call = Callable[[], object]
 
@@ -62,10 +62,10 @@ class Race:
 
     Attributes:
         ns: nanoseconds per ray of each round (the best of a few short samples), by candidate.
-        batch: rays a call, the best of those tried.
+        batch: rays per call, the best of those tried.
         threads, rounds: of all.
         unavailable: reason, by candidate that could not run.
-        load_before, load_after: load average of the machine, where known: above `threads`, others were working too.
+        load_before, load_after: load average of the machine, if known; above `threads` it was shared.
     """
 
     ns: dict[str, list[float]]
@@ -78,7 +78,16 @@ class Race:
 
     def timing(self, name: str) -> Timing | None:
         """Best and median of the rounds; None where the candidate could not run."""
-        return _timing(self.ns[name], self.threads, self.batch[name]) if name in self.ns else None
+        ns = self.ns.get(name)
+        if ns is None:
+            return None
+        return {
+            "min": min(ns),
+            "median": statistics.median(ns),
+            "threads": self.threads,
+            "batch": self.batch[name],
+            "repeats": len(ns),
+        }
 
     def speedup(self, name: str, over: str) -> dict[str, float] | None:
         """How many times faster `name` is than `over`: "min" by the minima, "median" of the ratios within rounds."""
@@ -104,12 +113,12 @@ def race(
     fresh: bool = True,
     report: Callable[[float], None] = lambda share: None,
 ) -> Race:
-    """Time candidates in turn on the same rays of a domain, or each on those of its own.
+    """Time candidates in turn on the same rays of a domain, or each on its own.
 
     Args:
-        domain: whose rays all do that have none of their own; or those rays, `POOL` of them.
+        domain: of the rays of candidates without their own domain; or those rays, `POOL` of them.
         fresh: forget what torch compiled before; False keeps what an earlier race of the same candidates compiled.
-        report: hears the share that is done, now and then.
+        report: called with the fraction done.
 
     Each call runs on one thread; with more threads, that many workers share out the batches, as a renderer does
     (torch and onnxruntime gain nothing from threads within an operator at batches that fit the caches).
@@ -125,17 +134,17 @@ def race(
     before = _load()
     with _workers(threads) as team, pinned_threads(1), torch.no_grad():
         if fresh:
-            torch._dynamo.reset()  # torch compiles one function only so often before it gives up
+            torch._dynamo.reset()  # torch limits the number of recompilations of a function
         for i, c in enumerate(candidates):
             try:
                 passes[c.name] = _best_batch(c, _pool(c.domain or domain, seed), team)
             except Unavailable as reason:
                 unavailable[c.name] = str(reason)
             report(_PREPARING * (i + 1) / len(candidates))
-        inner = {name: _calls_for_a_sample(each.sample_ns(1)) for name, each in passes.items()}
+        inner = {name: max(1, math.ceil(_SAMPLE_S * 1e9 / each.sample_ns(1))) for name, each in passes.items()}
         ns: dict[str, list[float]] = {name: [] for name in passes}
         for i in range(rounds):
-            order = list(passes) if i % 2 == 0 else list(reversed(passes))  # nobody always follows the same neighbour
+            order = list(passes) if i % 2 == 0 else list(reversed(passes))  # neighbours alternate
             for name in order:
                 passes[name].sample_ns(1)  # warms the caches for this candidate
                 ns[name].append(min(passes[name].sample_ns(inner[name]) for _ in range(_SAMPLES)) / POOL)
@@ -166,7 +175,7 @@ class _Pass:
         if self.workers is None:
             _repeat(self.calls, inner)
         else:
-            # A worker repeats its own share: handing it out anew for every pass would be part of the time.
+            # A worker repeats its own share, so that distribution is not timed with every pass.
             shares = [self.calls[i :: self.threads] for i in range(self.threads)]
             for done in [self.workers.submit(_repeat, share, inner) for share in shares]:
                 done.result()
@@ -182,7 +191,7 @@ def _repeat(calls: Sequence[Call], times: int) -> None:
 
 @contextmanager
 def _workers(threads: int) -> Iterator[ThreadPoolExecutor | None]:
-    """Threads that share out batches; None for one, which needs no handing over."""
+    """Threads that share out batches; None for a single one."""
     if threads < 1:
         raise InputError("race", "threads", threads, "at least 1")
     if threads == 1:
@@ -206,20 +215,6 @@ def _best_batch(candidate: Candidate, pool: FilmRays, workers: ThreadPoolExecuto
             best, found = took, each
     assert found is not None
     return found
-
-
-def _calls_for_a_sample(ns: float) -> int:
-    return max(1, math.ceil(_SAMPLE_S * 1e9 / ns))
-
-
-def _timing(samples: list[float], threads: int, batch: int) -> Timing:
-    return {
-        "min": min(samples),
-        "median": statistics.median(samples),
-        "threads": threads,
-        "batch": batch,
-        "repeats": len(samples),
-    }
 
 
 def _load() -> float | None:

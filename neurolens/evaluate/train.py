@@ -1,4 +1,4 @@
-"""One experiment from lens file to report: the whole line of the project, stage by stage, in one run folder."""
+"""One experiment from lens file to report, stage by stage, in one run folder."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from neurolens.evaluate.train_states import run_states
 from neurolens.evaluate.vignetting import relative_illumination
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.fit import NETWORKS, Prepared, prepare
 from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs
-from neurolens.surrogates.threads import pinned_threads
 
 _IDEAL = ("thin lens", "pinhole")
 _LIT_RAYS = 4096  # a film radius: a quarter of a second a model
@@ -48,16 +48,16 @@ _PACKAGES = ("neurolens", "torch", "numpy", "onnxruntime", "onnx", "OpenEXR")
 def run_experiment(
     experiment: Experiment, out: str | Path, *, progress: Progress | None = None, command: str = ""
 ) -> dict[str, Any]:
-    """Run an experiment and leave everything in one folder.
+    """Run an experiment and write everything to one folder.
 
     Writes config.toml (resolved), lenses/ (its lens file), models/*.onnx, pictures/, results.json and report.html. A
-    run that was interrupted goes on where it stopped when it is started again: what is there is not fitted again.
+    run that was interrupted resumes when it is started again: existing models are not fitted again.
 
     Returns:
         The results, as in results.json (`records.Results`).
 
     Raises:
-        InputError: whatever is wrong with the lens, the domain, the fits or the scenes.
+        InputError: mistakes in the lens, the domain, the fits or the scenes.
     """
     folder, started, clock = Path(out), datetime.now(UTC), time.perf_counter()
     progress = progress or Progress(quiet=True)
@@ -70,7 +70,7 @@ def run_experiment(
         warnings.simplefilter("always")
         lens = experiment.lens.read()
         domain = experiment.domain_of(lens)
-        for each in (models, pictures):  # only now: a lens that cannot be leaves no folder behind
+        for each in (models, pictures):  # only now, so that an invalid lens leaves no folder
             each.mkdir(parents=True, exist_ok=True)
         atomic_write_text(folder / "config.toml", to_toml(resolved))
         keep_lens(experiment, folder)
@@ -120,7 +120,6 @@ def run_experiment(
 
 
 def _say_what_is_poor(m: Measured) -> None:
-    """Warn of a fitted model whose errors show: its card is true, but few would want it."""
     poor = what_is_poor(m.record)
     if poor and m.settings.family != "paraxial":
         text = f"{m.settings.label}: {', '.join(poor)}; a smaller film or stop, or another method, may do better"
@@ -128,7 +127,7 @@ def _say_what_is_poor(m: Measured) -> None:
 
 
 def _plan(experiment: Experiment) -> dict[str, float]:
-    """Seconds that each stage may take on two cores, for the time left."""
+    """Expected seconds of each stage on two cores, for the time left."""
     plan: dict[str, float] = {"trace ray pairs": 3}
     for m in experiment.model:
         plan[f"fit {m.label}"] = m.seconds if m.method in NETWORKS else 3
@@ -176,7 +175,7 @@ def _illumination(measured: Sequence[Measured], lens: Lens, domain: Domain, seed
     """Curves at full aperture for `illumination_plot`: film_radius_mm, exact, models (name to list).
 
     Args:
-        seed: of the rays of the fit, so that these are others.
+        seed: of the rays of the fit, which is avoided.
     """
     light: dict[str, Any] = {"film_radius_mm": [], "exact": [], "models": {}}
     for m in measured:
@@ -205,7 +204,7 @@ def best_models(measured: Sequence[Measured]) -> tuple[str, ...]:
 def _draw(
     lens: Lens, domain: Domain, measured: Sequence[Measured], timed: Race, light: dict[str, Any], folder: Path
 ) -> list[dict[str, Any]]:
-    """Plots of the trade, the lens and its light; `light` as of `_illumination`."""
+    """Plots of errors, the lens and its illumination; `light` as of `_illumination`."""
     records = [m.record for m in measured]
     exact = [timed.record(n) for n in ("exact eager", "exact compiled") if n in timed.ns]
     error = "rms_um" if any(r.get("rms_um") for r in records) else "direction_rms_deg"
@@ -213,7 +212,7 @@ def _draw(
     error_against_coefficients_plot(records, folder / "coefficients.png", error, title=f"{lens.name}: error, size")
     lens_layout(layout_profile(lens, domain), folder / "layout.png")
     texts = [
-        ("pareto", "Error against speed", "Held-out rays, full aperture; choose from the Pareto front."),
+        ("pareto", "Error against speed", "Held-out rays, full aperture, with the Pareto front."),
         ("coefficients", "Error against coefficients", "Coefficients per vector output, A and B terms both counted."),
         ("layout", "The lens", "Rays of three fields, traced exactly."),
     ]
@@ -255,7 +254,7 @@ def _describe_domain(lens: Lens, pairs: RayPairs) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
+    """Versions of the packages that a result depends on."""
     found = {"python": platform.python_version()}
     for name in _PACKAGES:
         try:

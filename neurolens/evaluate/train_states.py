@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 import warnings
@@ -13,24 +12,24 @@ from pathlib import Path
 from typing import Any
 
 from neurolens import __version__
-from neurolens.analysis.plot_style import FIELD_COLOURS, INK, new_figure, plain_log_ticks, save, style
-from neurolens.axes import Axis
+from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing, plain_log_ticks
 from neurolens.base.config import to_dict, to_toml
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_write_text
+from neurolens.base.files import atomic_write_text, fingerprint_of
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import model_candidate
 from neurolens.evaluate.check import card_errors, errors_at, random_states
 from neurolens.evaluate.experiment import Experiment, keep_lens, relative_to
-from neurolens.evaluate.measure import known_record, note_record
+from neurolens.evaluate.measure import known_record, note_record, seconds_to_load
 from neurolens.evaluate.records import plain
 from neurolens.evaluate.speed import race
+from neurolens.modelfile.axes import Axis
 from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.export import export_states
 from neurolens.surrogates.fit import ModelSettings
-from neurolens.surrogates.onnx.states import export_states
-from neurolens.surrogates.states.fit import StateSettings, fit_states
-from neurolens.surrogates.states.space import StateSpace
+from neurolens.surrogates.states import StateSpace
+from neurolens.surrogates.states_fit import StateSettings, fit_states
 
 # States at which a model is measured for its card, and the rays of each (that pass).
 STATES, RAYS = 16, 8_000
@@ -58,7 +57,7 @@ def fit_and_measure_states(
     states: int = STATES,
     report: Callable[[float], None] | None = None,
 ) -> dict[str, Any]:
-    """Fit, export and measure one model, or take what the folder holds if it was made by the same settings and version.
+    """Fit, export and measure one model, or take an existing one of the same settings and version from the folder.
 
     Errors are those of the exported float32 graph, in onnxruntime, at random states: the record's own are the worst.
     """
@@ -76,8 +75,6 @@ def fit_and_measure_states(
         tell(0.6 + 0.4 * len(rows) / states)
     errors = card_errors(rows, RAYS)
     export_states(model, file, errors)
-    start = time.perf_counter()
-    load_model(file)
     core = model.nodes[0].core
     record = {
         "name": settings.label,
@@ -90,7 +87,7 @@ def fit_and_measure_states(
         "parameters": len(model.nodes) * core.coefficients,
         "bytes": file.stat().st_size,
         "fit_s": model.fit_s,
-        "load_s": time.perf_counter() - start,
+        "load_s": seconds_to_load(file),
     }
     note_record(note, file, fingerprint, record)
     return record
@@ -103,7 +100,7 @@ def run_states(experiment: Experiment, folder: Path, *, progress: Progress, comm
     the table and the plot).
 
     Raises:
-        InputError: no model that can be of many states, and whatever is wrong with lens or domain.
+        InputError: no model that supports many states, and mistakes in lens or domain.
     """
     started, clock = datetime.now(UTC), time.perf_counter()
     models = folder / "models"
@@ -137,7 +134,7 @@ def run_states(experiment: Experiment, folder: Path, *, progress: Progress, comm
         "started": started.isoformat(timespec="seconds"),
         "wall_s": time.perf_counter() - clock,
         "warnings": sorted({str(w.message) for w in heard if issubclass(w.category, UserWarning)})
-        + [f"left out, polynomials alone can be of many states: {label}" for label in left_out],
+        + [f"left out, only polynomials support many states: {label}" for label in left_out],
     }
     atomic_write_text(folder / "results.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
     atomic_write_text(folder / "report.html", _page(results))
@@ -151,7 +148,6 @@ def _time(file: Path, name: str) -> Any:
 
 
 def _page(results: Mapping[str, Any]) -> str:
-    """A page with the table of states and the plot."""
     from neurolens.evaluate import report as markup
 
     keys = ("rms_um", "p99_um", "direction_rms_deg", "false_pass", "false_block")
@@ -166,7 +162,7 @@ def _page(results: Mapping[str, Any]) -> str:
     title = markup.text(results["title"])
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><h1>{title}</h1>'
-        f"<p>{markup.text(results['lens']['name'])}, one model of many states, at random states; rays that no fit saw."
+        f"<p>{markup.text(results['lens']['name'])}, one model of many states, at random states; rays not fitted."
         f'</p><p><img src="states.png" alt="error over the state" style="max-width:100%"></p>'
         f"<table border=1 cellpadding=4><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></html>\n"
     )
@@ -174,17 +170,8 @@ def _page(results: Mapping[str, Any]) -> str:
 
 def _fingerprint(space: StateSpace, settings: StateSettings, states: int) -> str:
     first = space.domain_at(tuple(a.range[0] for a in space.axes))
-    asked: Sequence[Any] = [
-        __version__,
-        space.lens.sha256,
-        [a.to_dict() for a in space.axes],
-        space.zoom,
-        space.f_number,
-        first.to_dict(),
-        asdict(settings),
-        states,
-    ]
-    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+    made_of = ([a.to_dict() for a in space.axes], space.zoom, space.f_number, first.to_dict(), asdict(settings), states)
+    return fingerprint_of([__version__, space.lens.sha256, *made_of])
 
 
 AXIS_LABELS = {"zoom": "focal length (mm)", "focus": "1 / distance in focus (1/m)"}
@@ -204,8 +191,7 @@ def states_plot(
         axis: the first axis.
         path: PNG, PDF or SVG to write.
     """
-    with style():
-        figure = new_figure(7.2, 5.6)
+    with drawing(path, 7.2, 5.6) as figure:
         top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
         for number, (name, rows) in enumerate(models.items()):
             colour = FIELD_COLOURS[number % len(FIELD_COLOURS)]
@@ -222,13 +208,13 @@ def states_plot(
         bottom.set_xlabel(AXIS_LABELS.get(axis.name, f"{axis.name} ({axis.unit})"))
         bottom.grid(True)
         bottom.legend(loc="best", fontsize="small")
-        return save(figure, path)
+    return Path(path)
 
 
 def error_line(axes: Any, axis: Axis, rows: Sequence[Mapping[str, Any]], colour: str, label: str) -> None:
     """Film-equivalent RMS of rows over a state axis; a line where no other axis varies."""
     ordered = sorted(rows, key=lambda r: r[axis.name])
-    several = any(set(r) & set(AXIS_LABELS) - {axis.name} for r in rows)  # another axis varies too: no line
+    several = any(set(r) & set(AXIS_LABELS) - {axis.name} for r in rows)  # no line if another axis varies, too
     y = [r["rms_um"] or float("nan") for r in ordered]
     axes.plot([r[axis.name] for r in ordered], y, "o" if several else "o-", ms=4, color=colour, label=label)
 
@@ -243,6 +229,6 @@ def error_axes(axes: Any, axis: Axis, errors: Sequence[float | None]) -> None:
     axes.set_yscale("log")
     plain_log_ticks(axes.yaxis)
     known = [e for e in errors if e]
-    if known:  # at least a decade, so that noise does not look like a trend
+    if known:  # at least a decade, so that noise is not seen as a trend
         axes.set_ylim(min(known) / 2, max(10 * min(known), 2 * max(known)))
     axes.grid(True)

@@ -23,7 +23,7 @@ from neurolens.surrogates.pairs import PairSet
 
 NEAR_RIM = 0.02  # relative distance to a rim's radius that counts as near
 ZONES = {"centre": (0.0, 1 / 3), "mid": (1 / 3, 2 / 3), "edge": (2 / 3, 1.0)}  # shares of the film radius
-SEED = 104729  # no seed that a person would give the rays of a fit
+SEED = 104729  # unlikely as the seed of a fit's rays
 
 
 class Lit(Protocol):
@@ -76,12 +76,13 @@ def relative_illumination(
     """Film irradiance of a uniform environment by film radius, of the exact lens and of the model.
 
     The weight of a ray is T cos^4(theta) / Z^2 over the pupil disc, T the transmittance; wavelengths are uniform over
-    the domain. Both curves are divided by the exact lens's value on the axis, so that a model too dark all over shows.
+    the domain. Both curves are divided by the exact lens's value on the axis, so that a uniformly dark model is
+    visible.
 
     Args:
         film_z_mm: film plane; None takes the domain's nearest to the lens (its farthest focus).
         stop_radius_mm: None takes the domain's.
-        points: rays a film radius, the same pupil points and wavelengths for all.
+        points: rays per film radius, the same pupil points and wavelengths for all.
 
     Returns: film_radius_mm, exact, model (lists of `rows`), max_difference (of the two, a share of the axis value).
     """
@@ -106,7 +107,7 @@ def relative_illumination(
     on_axis = sums[0][0]
     if not on_axis > 0:
         raise InputError(
-            lens.path, "domain", "(no ray passes on the axis)", "a lens that lights the middle of the film"
+            lens.path, "domain", "(no ray passes on the axis)", "a lens that illuminates the centre of the film"
         )
     exact, model = ([v / on_axis for v in values] for values in sums)
     difference = max(abs(a - b) for a, b in zip(exact, model, strict=True))

@@ -1,4 +1,4 @@
-"""The one place that imports Mitsuba and Dr.Jit; their numbers to numpy and back, in scalar and compiled variants."""
+"""Import of Mitsuba and Dr.Jit, and conversion of their arrays to numpy and back, in scalar and compiled variants."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DEFAULT_VARIANT = "llvm_ad_spectral"
 
 
 def libraries() -> tuple[Any, Any]:
-    """The modules mitsuba and drjit; what Mitsuba offers depends on its variant, so that no type describes it.
+    """The modules mitsuba and drjit; untyped, as the attributes of Mitsuba depend on its variant.
 
     Raises:
         NeurolensError: they are not installed.
@@ -30,7 +30,7 @@ def libraries() -> tuple[Any, Any]:
 
 
 def require_mitsuba(variant: str | None = None) -> Any:
-    """The module mitsuba with a variant set: `variant`, else the one that is set already, else llvm_ad_spectral.
+    """The module mitsuba with a variant set: `variant`, else the current one, else llvm_ad_spectral.
 
     Raises:
         NeurolensError: Mitsuba is not installed, or the variant's compiler (LLVM, CUDA) is missing.
@@ -46,7 +46,7 @@ def require_mitsuba(variant: str | None = None) -> Any:
             mi.set_variant(wanted)
         if not wanted.startswith("scalar"):
             _compile(wanted)
-    except Exception as error:  # the library's own kinds
+    except Exception as error:  # the library's exception types
         reason = " ".join(str(error).split())[:200]
         needed = "libLLVM" if wanted.startswith("llvm") else "CUDA"
         raise NeurolensError(f"mitsuba variant {wanted}: no {needed} ({reason}); a scalar variant needs none") from None
@@ -55,7 +55,7 @@ def require_mitsuba(variant: str | None = None) -> Any:
 
 @cache
 def _compile(variant: str) -> None:
-    """One small kernel: a missing LLVM shows only when the first is made."""
+    """Compile one small kernel: a missing LLVM is detected only then."""
     mi, dr = libraries()
     dr.eval(mi.Float(dr.arange(mi.UInt32, 2)) + 1)
 

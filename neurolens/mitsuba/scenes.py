@@ -1,7 +1,7 @@
-"""Scenes of Mitsuba: rendered as they stand through a camera of ours, or turned into scenes of our renderer.
+"""Scenes of Mitsuba: rendered unmodified through a neurolens camera, or converted to scenes of our renderer.
 
-Scenes of rectangles, cubes, diffuse colours and area lights can be turned into ours: enough for Mitsuba's own Cornell
-box, on which the two renderers are compared.
+Scenes of rectangles, cubes, diffuse colours and area lights can be converted, which is enough for Mitsuba's own
+Cornell box, on which the two renderers are compared.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM, PLUGIN, register
 from neurolens.render.illuminants import table
 from neurolens.render.scene import Scene, scene_from_tables
 
-PASS_RAYS = 1 << 20  # of one wavefront: numpy holds some 200 bytes a ray
+PASS_RAYS = 1 << 20  # of one wavefront: numpy holds some 200 bytes per ray
 CORNELL_BOX = "cornell-box"
 
 
@@ -41,7 +41,7 @@ def camera(
         focus_m: distance from the film to the object in focus.
         f_number: None is the widest.
 
-    For all else that can be set, see `neurolens.cameras.build`.
+    Other settings: see `neurolens.cameras.build`.
 
     Raises:
         InputError, ModelError: as `make_camera`.
@@ -55,11 +55,11 @@ def load_scene(scene: str | Path | Mapping[str, Any], variant: str | None = None
     Mitsuba reads no glTF; its Blender add-on turns such a scene into XML.
 
     Args:
-        variant: of Mitsuba; None is the one that is set, else llvm_ad_spectral.
+        variant: of Mitsuba; None is the current one, else llvm_ad_spectral.
         parameters: values for the $names of an XML file.
 
     Raises:
-        NeurolensError: no Mitsuba, no LLVM; a scene that Mitsuba refuses, in its words.
+        NeurolensError: no Mitsuba, no LLVM; a scene that Mitsuba rejects, with its message.
         InputError: no such file, or one of another format; a scene without a sensor or an integrator.
     """
     mi = require_mitsuba(variant)
@@ -99,16 +99,16 @@ def render(
     sensor: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> FloatArray:
-    """Render a scene with its own integrator, film and sampler, through `camera` where its own camera stood.
+    """Render a scene with its own integrator, film and sampler, with `camera` in the place of its camera.
 
     Args:
         scene: mi.Scene, or what `load_scene` takes.
         camera: any of our contract; the film has the shape of the scene's picture. Its plane stands at the origin of
             the scene's sensor.
-        spp: samples a pixel; None is the sampler's own number.
+        spp: samples per pixel; None is the sampler's own number.
         units_per_m: scene units in a metre.
         to_world: mi.ScalarTransform4f that places the film instead.
-        sensor: which of the scene's sensors lends film, sampler and place.
+        sensor: index of the scene's sensor that supplies film, sampler and transform.
         progress: called with the fraction done.
 
     Returns: [H, W, 3] float32, linear sRGB; white light of radiance 1 everywhere gives 1 on the axis.
@@ -174,7 +174,7 @@ def our_scene(
         triangles: a mesh for each material instead of rectangles; lights stay rectangles.
 
     Raises:
-        InputError: shapes, materials or lights that are not among the few above.
+        InputError: unsupported shapes, materials or lights.
     """
     named = {k: v for k, v in description.items() if k not in _SKIPPED}
     materials = {k: v for k, v in named.items() if v["type"] == "diffuse"}
@@ -197,7 +197,7 @@ def our_scene(
 def _camera(
     description: Mapping[str, Any], film_mm: tuple[float, float], back_m: float, wavelengths_nm: tuple[float, float]
 ) -> dict[str, Any]:
-    """The camera table: place, picture and depth of Mitsuba's sensor, film and integrator."""
+    """The camera table from Mitsuba's sensor, film and integrator."""
     sensor = description["sensor"]
     at, film, depth = matrix(sensor["to_world"]), sensor["film"], description["integrator"].get("max_depth", -1)
     position = at[:3, 3] - back_m * at[:3, 2]
@@ -229,7 +229,7 @@ def _quads(name: str, item: Mapping[str, Any], materials: Mapping[str, Any]) -> 
     for centre, u, v in _CUBE if item["type"] == "cube" else _RECTANGLE:
         corner = place[:3, :3] @ (centre - (u + v) / 2) + place[:3, 3]
         quad = {"corner_m": corner, "edge_u_m": place[:3, :3] @ u}
-        # Turns that Mitsuba keeps as float32 leave traces of 1e-8, which would cost a wall its alignment with the axes.
+        # Rotations that Mitsuba stores as float32 leave errors of 1e-8, which would misalign walls with the axes.
         quad = {k: x.round(6).tolist() for k, x in {**quad, "edge_v_m": place[:3, :3] @ v}.items()}
         light = {} if emitter is None else {"emission": _rgb(name, emitter["radiance"])}
         quads.append({**quad, "material": material, **light})

@@ -1,11 +1,11 @@
-"""The Mitsuba sensor "neurolens": any camera of our contract, one numpy call a wavefront.
+"""The Mitsuba sensor "neurolens": any camera of our contract, one numpy call per wavefront.
 
 Mitsuba's camera looks along +z with y up and x to the left of the picture, ours along -z with x to the right: half a
 turn about y. The origin is the centre of the film plane, as in our scenes.
 
 In spectral variants a ray carries four wavelengths. Where the camera's rays hardly depend on the wavelength they are
 Mitsuba's own four, each with its weight (hero wavelengths, Wilkie et al. 2014); a lens that disperses gives all four
-lanes the same wavelength, for one ray is of one.
+lanes the same wavelength.
 
 A path of an RGB renderer carries three numbers, not a wavelength; a lens that disperses needs one. Each ray takes a
 wavelength, drawn by the film's response, and its channel c is weighted by
@@ -15,7 +15,7 @@ wavelength, drawn by the film's response, and its channel c is weighted by
 the diagonal of what our film makes of light of the basis spectra B (Mallett and Yuksel 2019; `SpectralRange`), without
 its few negative values (Mitsuba's scalar variants drop samples below 0) and scaled to a mean of 1: white stays white,
 and any colour stays itself where the rays do not depend on the wavelength. The terms off the diagonal have mean 0; an
-RGB renderer has no place for them, and colour fringes of saturated objects differ by them from a spectral render.
+RGB renderer cannot represent them, and colour fringes of saturated objects differ by them from a spectral render.
 
 Weights are ours: a uniform environment of radiance 1 gives 1 on the axis, and falls off towards the edge as the lens
 vignettes. Scalar variants ask for one ray at a time, which takes a model about a millisecond: for tests.
@@ -70,8 +70,8 @@ class FilmRays:
     def sample(self, position: FloatArray, aperture: FloatArray, wavelength_nm: FloatArray) -> LocalRays:
         """Rays for film positions [2, N] and aperture samples [2, N] in [0, 1), and wavelengths [N] in nm.
 
-        Wavelengths beyond what the camera was made for become its last ones: Mitsuba draws from 360 to 830 nm, and the
-        eye sees a few thousandths of white light outside 400 to 700.
+        Wavelengths outside the camera's range are clipped to it: Mitsuba draws from 360 to 830 nm, and the
+        luminance outside 400 to 700 nm is a few thousandths of that of white light.
         """
         count = position.shape[1]
         origin, direction = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
@@ -86,14 +86,13 @@ class FilmRays:
             rays = self.camera.sample(film, pupil, np.ascontiguousarray(wavelength_nm[part], np.float32))
             passed = rays.status == 0
             weight[part] = np.where(passed, rays.weight, np.float32(0))
-            # What did not pass still needs a ray that a scene can be asked about.
+            # Blocked samples, too, need a valid ray for the intersection test.
             direction[:, part] = np.where(passed, rays.direction * _TURNED, [[0], [0], [1]])
             origin[:, part] = np.where(passed, rays.origin_m * _TURNED, np.float32(0))
         origin *= np.float32(self.units_per_m)
         return LocalRays(origin, direction, weight)
 
     def _film_points(self, position: FloatArray) -> FloatArray:
-        """Film points [2, N] in mm."""
         size = np.array([self.grid.width, self.grid.height], np.float32)[:, None]
         offset, part = (np.array(x, np.float32)[:, None] for x in (self.crop_offset, self.crop_size))
         place = (position * part + offset) * size
@@ -164,7 +163,7 @@ def _initialise(self: Any, props: Any, camera: Camera | None = None) -> None:
     Parameters in a scene: camera (a model, a lens file, "thin" or "pinhole"), focus_m (default inf), f_number, efl_mm,
     zoom, film_width_mm (default 36), film_height_mm (default: by the picture's shape), blades, blade_rotation_deg,
     blade_curvature, aperture_mask, units_per_m (default 1), to_world (of the centre of the film plane, without scale),
-    film, sampler. From Python `camera` may be an object, which brings the film's size in mm.
+    film, sampler. From Python `camera` may be an object, which has its own film size in mm.
     """
     libraries()[0].Sensor.__init__(self, props)
     film = self.film()
@@ -225,7 +224,7 @@ def _number_of(props: Any, name: str, default: float) -> float:
 
 
 def _found(name: str) -> str:
-    """The file of that name, sought beside an XML scene too."""
+    """The file of that name, relative to the working folder or to the XML scene."""
     return str(libraries()[0].file_resolver().resolve(name))
 
 

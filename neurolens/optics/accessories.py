@@ -1,7 +1,7 @@
-"""What a photographer screws on: filters before and behind the lens, hoods; and the lens without glass.
+"""Accessories: filters before and behind the lens, hoods; and the pinhole, a lens without glass.
 
-Each is a few rows of the table more, so that the tracer needs to know nothing of them. Surfaces are counted anew from
-the scene: a front filter adds 2 to the number of every surface behind it, a hood 1.
+Each adds a few rows to the table, so that the tracer needs no special case. Surfaces are renumbered from the scene: a
+front filter adds 2 to the number of every surface behind it, a hood 1.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from neurolens.optics.prescription import Configuration, Lens, Surface
 from neurolens.optics.sag import check_clearance, sag_mm
 
 BK7_N_D, BK7_V_D = 1.5168, 64.17
-_WIDEST_DEG = 75.0  # a plate that shall not vignette a wider half field would be four times as wide as it is far
+_WIDEST_DEG = 75.0  # half field; for a wider one an unvignetting plate would be over four times as wide as its distance
 
 
 def pinhole(film_distance_mm: float, radius_mm: float, *, image_radius_mm: float | None = None) -> Lens:
@@ -46,7 +46,7 @@ def with_filter(
 ) -> Lens:
     """The lens with a plane plate before its front surface, or behind its last one.
 
-    A plate shifts what lies behind it, seen through it, by t (1 - 1/n): the film of a rear filter moves back by that,
+    A plate shifts what is seen through it by t (1 - 1/n): the film of a rear filter moves back by that,
     and an object before a front filter seems as much nearer.
 
     Args:
@@ -130,7 +130,7 @@ def _before(lens: Lens, *rows: Surface) -> Lens:
 def _behind(lens: Lens, plate: Surface, air: Surface, gap_mm: float) -> Lens:
     """A plate behind the last surface; every distance from there to the film becomes one behind the plate."""
     last = len(lens.surfaces) - 1
-    taken = gap_mm + plate.thickness_mm / plate.n_d  # what the plate leaves of the distance to the film
+    taken = gap_mm + plate.thickness_mm / plate.n_d  # the rest of the distance to the film
 
     def moved(gaps: tuple[tuple[int, float], ...]) -> tuple[tuple[int, float], ...]:
         return tuple((k + 2, t - taken) if k == last else (k, t) for k, t in gaps)

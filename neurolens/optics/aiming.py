@@ -24,8 +24,8 @@ from neurolens.optics.trace import trace
 Axis = Literal["x", "y"]
 
 _WIDEST_DEG = 89.0  # of the angles tried at the stop
-_GRID = 713  # odd, so that the axis itself is among them; a step of a quarter of a degree
-_STRETCH = 1.5  # of an asphere's rim: farther out a polynomial means nothing
+_GRID = 713  # odd, so that the axis is included; a step of a quarter of a degree
+_STRETCH = 1.5  # of an asphere's rim: farther out the polynomial is meaningless
 _ZOOM, _ROUNDS = 17, 9  # each round narrows the bracket 16 times: to the last digit of a double
 
 
@@ -52,7 +52,7 @@ def without_rims(lens: Lens) -> Lens:
 def aim_at_stop(
     lens: Lens, field_rad: Tensor, height_mm: Tensor, *, axis: Axis = "x", wavelength_nm: float = LINE_D_NM
 ) -> Bundle:
-    """Meridional rays of collimated light that cross the stop at given heights, whatever the rims.
+    """Meridional rays of collimated light that cross the stop at given heights, rims ignored.
 
     Args:
         field_rad: [F] angles to the axis, from 0 to below pi. The light comes from the positive side of `axis`, and
@@ -107,7 +107,7 @@ def _bracket(grid: Tensor, field: Tensor, exists: Tensor, target: Tensor) -> tup
 def _follow(
     front: Lens, height: Tensor, angle: Tensor, axis: Axis, wavelength_nm: float
 ) -> tuple[Rays, Tensor, Tensor]:
-    """From the stop to the scene: the rays turned round, [n * G], their field angle and existence [n, G]."""
+    """From the stop to the scene: the reversed rays, [n * G], their field angle and existence [n, G]."""
     stop, z = front.surfaces[-1], float(front.vertices_mm[-2])
     h, a = height.reshape(-1), angle.reshape(-1)
     known = {float(v): sag_mm(stop, float(v), 0.0) if axis == "x" else sag_mm(stop, 0.0, float(v))
@@ -122,6 +122,6 @@ def _follow(
         out = trace(front, start, wavelength_nm)
     r = out.rays
     field = torch.atan2(r.dx if axis == "x" else r.dy, -r.dz)
-    # Turned round and set back, so that the front surface is still ahead.
+    # Reversed and moved back, so that the front surface is still ahead.
     back = Rays(r.x + r.dx, r.y + r.dy, r.z + r.dz, -r.dx, -r.dy, -r.dz)
     return back, field.reshape(angle.shape), (out.status == 0).reshape(angle.shape)

@@ -27,7 +27,7 @@ THRESHOLD = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Aperture:
-    """The opening of a stop: straight or curved blades, or a mask. Give the one or the other.
+    """The opening of a stop: straight or curved blades, or a mask; exactly one of them.
 
     Attributes:
         blades: 3 to 100; None for a mask.
@@ -38,7 +38,7 @@ class Aperture:
             side spans the stop's diameter. Numbers are taken at a threshold of one half: light passes or it does not.
 
     Raises:
-        InputError: a value out of range, neither blades nor mask or both, a mask that is too large, or shut.
+        InputError: a value out of range, neither blades nor mask or both, a mask that is too large or passes no light.
     """
 
     blades: int | None = None
@@ -125,7 +125,7 @@ class Aperture:
         edge = radius_mm * math.cos(half) + rise
         bound = edge - curvature / 2 * (x * x + y * y + edge * edge)
         scale = 1 - curvature * edge
-        within = x * scale == x * scale  # NaN is inside nothing
+        within = x * scale == x * scale  # False for NaN
         if self.curvature == 1:
             return within & (x * x + y * y <= radius_mm * radius_mm)
         for k in range(self.blades):
@@ -142,7 +142,7 @@ class Aperture:
         return height / 2 - (y * cos - x * sin), width / 2 + (x * cos + y * sin)
 
     def on_mask(self, row: Any, column: Any) -> Any:
-        """Whether such places lie on the mask at all."""
+        """Whether such places lie on the mask."""
         assert self.mask is not None
         height, width = self.mask.shape
         return (row >= 0) & (row < height) & (column >= 0) & (column < width)
@@ -187,7 +187,7 @@ def _read_only(mask: ArrayLike) -> NDArray[np.bool_]:
     if given.ndim != 2 or not 1 <= min(given.shape) <= max(given.shape) <= MAX_MASK or given.dtype.kind not in "bfiu":
         found = f"({given.dtype} {given.shape})"
         raise InputError("aperture", "mask", found, f"numbers [H, W], at most {MAX_MASK} a side")
-    whole = np.array(given >= THRESHOLD)  # a copy: what the caller does to his own later changes nothing here
+    whole = np.array(given >= THRESHOLD)  # a copy, independent of the caller's array
     if not whole.any():
         raise InputError("aperture", "mask", "(shut everywhere)", "an opening: values of at least 0.5")
     whole.flags.writeable = False

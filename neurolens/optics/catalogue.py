@@ -25,7 +25,7 @@ LINE_F_NM = 486.1327
 LINE_C_NM = 656.2725
 
 
-@dataclass(frozen=True, eq=False)  # compared as the one object that the catalogue gives
+@dataclass(frozen=True, eq=False)  # compared by identity: the catalogue has one object per glass
 class Glass:
     """Dispersion and absorption of one optical material.
 
@@ -73,7 +73,7 @@ class Glass:
         """
         if not self.absorption:
             return None
-        if not hasattr(wavelength_nm, "new_full"):  # no torch tensor
+        if not hasattr(wavelength_nm, "new_full"):  # not a torch tensor
             value = np.interp(wavelength_nm, *np.transpose(self.absorption))
             return float(value) if np.ndim(value) == 0 else value
         total = wavelength_nm.new_full(wavelength_nm.shape, self.absorption[-1][1])
@@ -82,7 +82,7 @@ class Glass:
         return total
 
     def _bends(self) -> list[tuple[float, float]]:
-        """The broken line of the absorption as hinges: wavelength, and by how much the derivative changes there.
+        """The piecewise linear absorption as hinges: wavelength, and the change of the derivative there.
 
         Several times faster than a search in a table, and torch fuses it. Counted from the red end, where absorption
         is least, so that float32 does not lose it in the far larger values of the blue.
@@ -129,13 +129,13 @@ def find(name: str, file: str | Path = "glass catalogue", where: str = "glass") 
     """The glass of a name: "N-BK7", or with its maker "Schott:N-BK7", "schott N-BK7", "N-BK7 (SCHOTT)".
 
     Case, blanks, hyphens and brackets do not count. Of several makers' glasses of one name it is that of the first in
-    `MAKERS` (`same_name` lists them). A name without the N- of today's glass is not taken for it: SK16 is Hikari's.
+    `MAKERS` (`same_name` lists them). A name without N- is not matched to the glass with it: SK16 is Hikari's.
 
     Args:
         file, where: the place to name in an error.
 
     Raises:
-        InputError: an unknown name; it suggests the nearest ones.
+        InputError: an unknown name; the nearest ones are suggested.
     """
     glasses = same_name(name)
     if not glasses:
@@ -206,17 +206,16 @@ def _alias_keys() -> dict[str, str]:
 
 
 def _suggestion(name: str) -> str:
-    """Up to five names of the table that look like this one."""
     table, (_, key) = _rows_by_key(), _split(name)
     keys = difflib.get_close_matches(key, [*table, *_alias_keys()], n=5, cutoff=0.5)
     found = [_glass(table[k][0]) if k in table else find(_alias_keys()[k]) for k in keys]
     names = ", ".join(dict.fromkeys(f"{g.name} ({g.maker})" for g in found))
-    return f"the nearest names are {names}" if names else "no name there is like it"
+    return f"the nearest names are {names}" if names else "it has no similar name"
 
 
 @lru_cache(maxsize=1)
 def _table() -> dict[str, Any]:
-    """The table as it lies in its file, read when the first glass is asked for; its rows in the order of `MAKERS`."""
+    """The rows of the table's file in the order of `MAKERS`, read at the first lookup."""
     text = (resources.files("neurolens.optics") / "data" / "glasses.json").read_text(encoding="utf-8")
     table = json.loads(text)
     table["glasses"].sort(key=lambda row: MAKERS.index(row[0]))
@@ -234,7 +233,6 @@ def _rows_by_key() -> dict[str, list[int]]:
 
 @cache
 def _glass(place: int) -> Glass:
-    """The glass of one row of the table; the same object every time."""
     maker, name, form, coefficients, low_um, high_um, *sampled = _table()["glasses"][place]
     grid_nm, per_m = (_table()["grids_nm"][sampled[0]], sampled[1]) if sampled else ((), ())
     absorption = tuple((float(nm), a * 1e-3) for nm, a in zip(grid_nm, per_m, strict=True))

@@ -9,7 +9,7 @@ Throughout: `cos_i` [N] is the cosine of incidence in [0, 1]; `n_before` and `n_
 of the media as the light meets them; `layers` are (refractive index, thickness in nm) from the scene's side, as in
 `prescription.Coating`; `sense` is +1 for light towards the film and -1 for light towards the scene; `wavelength_nm`
 (in vacuum) is a number or [N]. Results are [N] in the dtype of `cos_i`, differentiable, also with respect to layers
-given as 0-d tensors. None is NaN: beyond the critical angle T = 0 and R = 1, and a cosine that is NaN counts as that.
+given as 0-d tensors. Results are never NaN: beyond the critical angle, and for a cosine that is NaN, T = 0 and R = 1.
 
 The designs are the textbook ones (Macleod, chapter 3), computed for normal incidence with layers of constant index;
 the outermost film of a design lies on the side of the lower index.
@@ -61,7 +61,7 @@ class Response(NamedTuple):
     behind the stack, and the admittances around it; t = 2 before / plus, r = minus / plus.
 
     `passes` tells where the wave behind is not evanescent; there `after` is its admittance, else that divided by i.
-    `fade` is what the matrix was multiplied by to keep evanescent layers from overflowing, so t is to be too.
+    `fade` is the factor that kept evanescent layers from overflowing; t must be multiplied by it, too.
     """
 
     before: Tensor
@@ -83,7 +83,7 @@ def transmittance(
 def reflectance(
     cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int = 1
 ) -> Tensor:
-    """Unpolarised power reflected, (Rs + Rp) / 2 in [0, 1], [N]; 1 - transmittance but for rounding."""
+    """Unpolarised power reflected, (Rs + Rp) / 2 in [0, 1], [N]; 1 - transmittance up to rounding."""
     s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond=False)
     return 0.5 * (_reflected(s) + _reflected(p))
 
@@ -130,7 +130,7 @@ def power_amplitudes(
 def _transmitted(r: Response) -> Tensor:
     u, v = r.plus
     square = u * u + v * v
-    # NaN (a wavelength that is none) fails the comparison.
+    # NaN (an invalid wavelength) fails the comparison.
     return torch.where(r.passes & (square > 0), 4 * r.fade * r.fade * r.before * r.after / square, 0.0)
 
 
@@ -152,7 +152,7 @@ def _over_plus(r: Response, x: Any, y: Any) -> tuple[Tensor, Tensor]:
 def _reflected_amplitude(r: Response) -> tuple[Tensor, Tensor]:
     x, y = _over_plus(r, *r.minus)
     u, v = r.plus
-    # What nothing else can be said of is reflected, as grazing light is.
+    # Undefined cases count as reflected, like grazing light.
     return torch.where(u * u + v * v > 0, x, -1.0), y
 
 
@@ -166,7 +166,7 @@ def _transmitted_amplitude(r: Response) -> tuple[Tensor, Tensor]:
 def _responses(
     cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int, phase_beyond: bool
 ) -> tuple[Response, Response]:
-    """The s and the p response of the stack; `phase_beyond` the critical angle is known only where asked for.
+    """The s and the p response of the stack; `phase_beyond`: whether to compute the phase beyond the critical angle.
 
     q stands for n cos of the angle in each medium (the admittance of s).
     """
@@ -226,7 +226,7 @@ def _always_propagates(index: Any, n_before: Any, n_after: Any) -> bool:
 
 
 def _propagating(q2: Tensor, phase_per_q: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """cos, sin / q and q sin of the phase q phase_per_q; finite but without meaning where q2 <= 0."""
+    """cos, sin / q and q sin of the phase q phase_per_q; finite but meaningless where q2 <= 0."""
     q = torch.sqrt(torch.where(q2 > 0, q2, 1.0))
     phase = q * phase_per_q
     sine = torch.sin(phase)
@@ -263,9 +263,7 @@ TANTALA = 2.10  # zirconia is close
 # Pairs of (outer, inner) films in the order tried: the second where the glass is too dense for the first.
 V_PAIRS = ((MAGNESIUM_FLUORIDE, TANTALA), (MAGNESIUM_FLUORIDE, ALUMINA))
 
-KNOWN = (
-    '"bare", "quarter-wave", "v-coat" or "broadband", the last three with a wavelength in nm where wanted (550; 510)'
-)
+KNOWN = '"bare", "quarter-wave", "v-coat" or "broadband", the last three with an optional wavelength in nm (550; 510)'
 
 
 def bare() -> Coating:

@@ -1,4 +1,4 @@
-"""What focusing does: groups that move inside a lens, the film plane of best focus, and breathing.
+"""Focusing: groups that move inside a lens, the film plane of best focus, and breathing.
 
 Internal focusing: the groups move as the source's focus states say, between infinity and the nearest; film fixed. The
 source lists a few states: infinity, sometimes one between, and the nearest, for every zoom position. One parameter
@@ -78,7 +78,7 @@ SAME_MM = 0.005  # gaps of two states that differ by less are the same: sources 
 
 
 def at_infinity(lens: Lens) -> Lens:
-    """The lens with its groups where they stand at infinity focus."""
+    """The lens with its groups at their places for infinity focus."""
     if not lens.infinity_mm:
         return lens
     return replace(lens.with_gaps(dict(lens.infinity_mm)), infinity_mm=())
@@ -97,7 +97,7 @@ def focus_states(lens: Lens) -> list[Configuration]:
 def zoom_state_of(lens: Lens, near: Configuration) -> Configuration | None:
     """The infinity state of the zoom position of a focus state; None where the file has none: its table then.
 
-    Few gaps that differ, then small differences, tell which it is.
+    It is the one with the fewest different gaps, then with the smallest differences.
     """
 
     def unlikeness(base: Configuration) -> tuple[int, float]:
@@ -198,7 +198,7 @@ def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = 
 
 
 def _rounded_up(value: float) -> float:
-    """A positive number with four digits, never below itself: a distance printed as the limit must be allowed."""
+    """A positive number rounded up to four digits: a distance printed as the limit must be accepted."""
     step = 10.0 ** (math.floor(math.log10(value)) - 3)
     return math.ceil(value / step - 1e-9) * step
 
@@ -212,7 +212,7 @@ def nearest_focus_m(lens: Lens) -> float:
 
 
 def _placed(lens: Lens, path: FocusPath, back_mm: float, s: float) -> Lens:
-    """The lens with its groups moved; the film stays where it is beside the groups that stand still."""
+    """The lens with its groups moved; the film stays fixed relative to the fixed groups."""
     added = path.moved(s)
     gaps = {k: lens.surfaces[k].thickness_mm + v for k, v in added.items() if k != path.film}
     moved = lens.with_gaps(gaps)
@@ -244,7 +244,7 @@ def _solve(excess: Callable[[float], float], furthest: float) -> float:
 
 _RINGS, _SPOKES = 512, 24
 _WIDER = 1.1  # the disc of rays over the paraxial entrance pupil: aberrations of the pupil move its edge
-_ROUNDS = 4  # an object at a distance from the film moves with it: each round leaves a hundredth of the step
+_ROUNDS = 4  # the object's distance counts from the film: each round reduces the step by a factor of 100
 
 
 def best_focus_z_mm(
@@ -252,9 +252,9 @@ def best_focus_z_mm(
 ) -> float:
     """Film plane (lens frame, mm) of least RMS spot for the axial point `focus_m` metres from it.
 
-    Rays are spread evenly over the entrance pupil, those pass that the stop and the rims let through, and the plane
+    Rays are spread evenly over the entrance pupil, those that stop and rims let through count, and the plane
     follows in closed form: the spot's second moment is a parabola in z. With pure third-order spherical aberration it
-    lies two thirds of the way from the paraxial to the marginal focus. A pinhole's film stays where it is.
+    lies two thirds of the way from the paraxial to the marginal focus. A pinhole's film stays in place.
 
     Args:
         weights: (wavelength in nm, weight) pairs; the spot is that of all colours together.
@@ -320,7 +320,7 @@ class Breath:
 
     Attributes:
         focus_m: from object to film.
-        efl_mm: focal length of the groups as they stand.
+        efl_mm: focal length of the groups in this state.
         magnification: image over object height, negative for an inverted image; 0 at infinity.
         field_deg: full field of view across the image circle, seen from the entrance pupil.
         film_z_mm: film plane, lens frame.

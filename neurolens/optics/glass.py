@@ -23,10 +23,10 @@ __all__ = [
 TOLERANCE_N_D = 5e-4
 TOLERANCE_V_D = 0.5
 
-# The visible: where a formula that is extrapolated is worth a warning.
+# The visible range, nm: extrapolation of a formula inside it is worth a warning.
 VISIBLE_NM = (400.0, 700.0)
 
-# Glasses that surfaces have named. A plain dictionary, because torch.compile sees through it to the coefficients.
+# Glasses looked up so far. A plain dictionary, because torch.compile can trace through it to the coefficients.
 _FOUND: dict[str, Glass] = {}
 
 
@@ -53,7 +53,7 @@ def index_at(n_d: Any, V_d: float | None, wavelength_nm: Any) -> Any:
 
 
 def glass_of(name: str) -> Glass:
-    """`catalogue.find`, remembered. To use a glass under torch.compile, ask for it once before.
+    """`catalogue.find`, cached. Before using a glass under torch.compile, look it up once.
 
     Raises:
         InputError: a glass that the catalogue does not have.
@@ -75,14 +75,14 @@ def index_of(surface: Surface, wavelength_nm: Any) -> Any:
     if surface.glass is not None:
         if getattr(surface.n_d, "requires_grad", False):
             raise InputError(
-                f"glass {surface.glass}", "n_d", "(a tensor)", "no catalogue glass beside an index to learn"
+                f"glass {surface.glass}", "n_d", "(a tensor)", "no catalogue glass beside an index to be optimised"
             )
         return glass_of(surface.glass).index(wavelength_nm)
     return index_at(surface.n_d, surface.V_d, wavelength_nm)
 
 
 def absorption_of(surface: Surface, wavelength_nm: Any) -> Any:
-    """Napierian absorption in 1/mm of the medium after a surface: the glass's and the surface's own; None for none.
+    """Napierian absorption in 1/mm of the medium after a surface: the glass's plus the surface's own; None without any.
 
     Beer-Lambert: t mm of it transmit exp(-absorption t).
 
@@ -117,7 +117,7 @@ def check_against_table(surface: Surface, file: str | Path, where: str) -> None:
 
 
 def table_notes(surface: Surface) -> list[str]:
-    """What `check_against_table` warns of, in sentences without the place; empty where all is well.
+    """What `check_against_table` warns of, as sentences without the place; empty if all is well.
 
     Raises:
         InputError: a glass that the catalogue does not have.
@@ -142,7 +142,7 @@ def table_notes(surface: Surface) -> list[str]:
 
 
 def _contradiction(surface: Surface, glass: Glass) -> str:
-    """What a surface states that is not this glass's, in words; empty where it agrees."""
+    """Text of stated values that differ from this glass's; empty where they agree."""
     n_d, V_d = float(surface.n_d), surface.V_d
     wrong = [f"n_d = {n_d:.6g}"] if n_d != 1 and abs(glass.n_d - n_d) > TOLERANCE_N_D else []
     if V_d is not None and abs(glass.V_d - V_d) > TOLERANCE_V_D:

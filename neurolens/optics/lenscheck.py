@@ -1,4 +1,4 @@
-"""Whether a prescription does what its source says: every stated figure computed again, with the reason of any doubt.
+"""Checks of a prescription against its source: every stated figure is recomputed, with the reason of any doubt.
 
 Tables that circulate carry dropped aspheres, swapped glasses and transposed digits. Most of these show: the focal
 length or the back focus moves, the axis blurs, elements cut each other, or no light reaches the edge of the field.
@@ -23,7 +23,7 @@ from neurolens.optics.sag import end_mm, sag_mm
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
-EFL_TOLERANCE = 0.02  # relative; what rounding and the choice of a spectral line leave in patents
+EFL_TOLERANCE = 0.02  # relative; from rounding and the choice of a spectral line in patents
 FOCUS_TOLERANCE = 0.02  # of the focal length
 F_NUMBER_TOLERANCE = 0.05
 BEAM_TOLERANCE = 0.03
@@ -39,10 +39,10 @@ class Check:
     """One figure of a lens, computed and stated.
 
     Attributes:
-        quantity: in words, with its unit.
-        computed, stated: None where there is none.
+        quantity: name with its unit.
+        computed, stated: None if unknown.
         doubt: why the figure casts doubt on the table, a clause; empty where it does not.
-        state: zoom or focus state of the file, empty for the table as it stands.
+        state: zoom or focus state of the file, empty for the table itself.
     """
 
     quantity: str
@@ -77,7 +77,7 @@ def check_lens(lens: Lens) -> list[Check]:
 
 
 def doubts(checks: list[Check]) -> list[str]:
-    """The doubts as sentences without a full stop, states in front; what holds of the table is not said again."""
+    """The doubts as sentences without a full stop, prefixed by the state; those of the table are not repeated."""
     table = {c.doubt for c in checks if not c.state}
     return [
         f"{c.state}: {c.doubt}" if c.state else c.doubt
@@ -106,7 +106,6 @@ def in_state(lens: Lens, c: Configuration) -> Lens:
 
 
 def _first_order(lens: Lens, data: FirstOrder) -> Iterator[Check]:
-    """Focal length, back focus and f-number of an object at infinity."""
     yield _focal_length(lens, data.efl_mm, lens.stated_efl_mm)
     if lens.anamorphic:
         yield _focal_length(lens, first_order(lens, meridian="x").efl_mm, lens.stated_efl_x_mm, " (x-z plane)")
@@ -310,11 +309,11 @@ def corner_illumination(lens: Lens, radius_mm: float) -> float:
 
 
 def _light(lens: Lens, x_mm: float, y_mm: float) -> float:
-    """Film irradiance in a unit of its own: the passing rays' cos^4 integrated over the pupil's plane."""
+    """Film irradiance in arbitrary units: the passing rays' cos^4 integrated over the pupil's plane."""
     data = first_order(lens)
     plane, film_z = pupil_plane_z_mm(lens), data.rear_focal_z_mm
     rear = lens.surfaces[-1].semi_diameter_mm
-    # Seen from the corner the pupil is distorted, but not beyond recognition.
+    # Seen from the corner the pupil is distorted, but not by more than this.
     half = _PUPIL * data.exit_pupil_diameter_mm / 2 if plane == data.exit_pupil_z_mm else rear
     box = (-half, half, -half, half)
     total = 0.0

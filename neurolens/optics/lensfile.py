@@ -14,7 +14,7 @@ The format, complete; keys marked optional may be left out:
     rims = "source"             # where the diameters come from: "source", "estimated" (by somebody) or "derived"
     notes = "..."               # optional: what was corrected or estimated, and why
 
-    # From the scene to the film, one row a surface, numbered from 0.
+    # From the scene to the film, one row per surface, numbered from 0.
     # radius_mm: positive when the centre of curvature lies towards the film, inf for a plane.
     # thickness_mm: to the next surface; the last one to the film. diameter_mm: full clear diameter.
     # n_d, V_d: of the glass after the surface; without n_d it is air. V_d may be left out where unknown: the index
@@ -87,7 +87,7 @@ CONFIGURATION_KEYS = (
 
 @dataclass(frozen=True)
 class Table:
-    """One table of a file, read strictly: every error names the file, the place, the value and what was expected.
+    """One table of a file, read strictly.
 
     Attributes:
         where: goes in front of the key in errors, with its separator: "surface 3, ".
@@ -199,10 +199,9 @@ def read_lens(path: str | Path) -> Lens:
 
 
 def _surfaces(table: Table) -> tuple[Surface, ...]:
-    """All rows, checked one by one and together."""
     rows = table.data.get("surfaces", "(missing)")
     if not isinstance(rows, list) or not rows:
-        raise table.error("surfaces", rows, "a list of tables, one a surface")
+        raise table.error("surfaces", rows, "a list of tables, one per surface")
     if len(rows) > MAX_SURFACES:
         raise table.error("surfaces", f"({len(rows)} of them)", f"at most {MAX_SURFACES}")
     known = _coatings(table)
@@ -260,7 +259,7 @@ def _glass(row: Table) -> dict[str, Any]:
     if "absorption_per_mm" in row:
         medium["absorption_per_mm"] = row.number("absorption_per_mm", unit="1/mm")
         if medium["absorption_per_mm"] < 0:
-            raise row.error("absorption_per_mm", medium["absorption_per_mm"], "at least 0: no glass shines")
+            raise row.error("absorption_per_mm", medium["absorption_per_mm"], "at least 0")
     if "glass" in row:
         medium["glass"] = row.text("glass")
         known = catalogue.find(medium["glass"], row.file, f"{row.where}glass")
@@ -269,7 +268,6 @@ def _glass(row: Table) -> dict[str, Any]:
 
 
 def _shape(row: Table) -> dict[str, Any]:
-    """Conic, asphere and cylinder of a row."""
     shape: dict[str, Any] = {"conic": row.number("conic")} if "conic" in row else {}
     if "cylinder" in row:
         shape["cylinder"] = row.text("cylinder")
@@ -292,7 +290,6 @@ def _shape(row: Table) -> dict[str, Any]:
 
 
 def _coatings(table: Table) -> dict[str, Coating]:
-    """The coatings that the file itself defines, by name."""
     found: dict[str, Coating] = {}
     for place, given in enumerate(_tables(table, "coating")):
         one = Table(given, table.file, f"coating {place}, ")
@@ -313,7 +310,6 @@ def _coatings(table: Table) -> dict[str, Coating]:
 
 
 def _tables(table: Table, key: str) -> list[Mapping[str, Any]]:
-    """The tables under [[key]]."""
     tables = table.data.get(key, [])
     if not isinstance(tables, list) or not all(isinstance(t, Mapping) for t in tables):
         raise table.error(key, tables, f"tables under [[{key}]]")

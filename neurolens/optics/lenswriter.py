@@ -74,7 +74,7 @@ def _aperture(lens: Lens) -> str:
 
 
 def _rows(lens: Lens) -> str:
-    """One inline table a surface, keys in columns; a column that no surface uses is left out."""
+    """One inline table per surface, keys in columns; a column that no surface uses is left out."""
     surfaces = list(lens.surfaces)
     cells = [_cells(s) for s in surfaces]
     if lens.film_z_mm is not None:

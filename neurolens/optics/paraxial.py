@@ -25,7 +25,7 @@ class FirstOrder:
         rear_principal_z_mm, front_principal_z_mm: H' and H.
         entrance_pupil_z_mm, entrance_pupil_diameter_mm: paraxial image of the stop seen from the scene.
         exit_pupil_z_mm, exit_pupil_diameter_mm: seen from the film; z is infinite for an image-telecentric lens.
-        f_number: efl / entrance-pupil diameter; infinite for a shut stop.
+        f_number: efl / entrance-pupil diameter; infinite for a closed stop.
     """
 
     efl_mm: float
@@ -58,7 +58,6 @@ def _march(
 
 
 def _reversed(lens: Lens) -> Lens:
-    """The lens turned round, so that one march serves both directions."""
     rows = lens.surfaces
     turned = []
     for k in range(len(rows) - 1, -1, -1):
@@ -92,8 +91,8 @@ def _pupil(lens: Lens, indices: list[Any], meridian: Meridian) -> tuple[Any, Any
 def first_order(lens: Lens, wavelength_nm: float = LINE_D_NM, meridian: Meridian = "y") -> FirstOrder:
     """First-order data at one wavelength; of one meridian, where a lens has cylinders.
 
-    A lens that bends nothing (a pinhole, filters before or behind it) has its film for a focal point, wherever that
-    stands, and for a focal length the distance from the hole to the film, by which it maps angles to the film.
+    For a lens without power (a pinhole, filters before or behind it) the film's centre counts as the focal point, and
+    the distance from the hole to the film, by which it maps angles to the film, as the focal length.
 
     Raises:
         InputError: an afocal lens (no finite focal length).
@@ -151,14 +150,14 @@ def _pinhole(lens: Lens, indices: list[Any]) -> FirstOrder:
 
 def stop_radius_mm(lens: Lens, f_number: float) -> float:
     """Radius of the stop for f-number N = EFL / paraxial entrance-pupil diameter at infinity focus."""
-    # By an opening of 1 mm: a stop that is shut has no f-number to start from.
+    # From an opening of 1 mm: a closed stop has no f-number to scale.
     return first_order(lens.with_stop_radius(1.0)).f_number / f_number
 
 
 def film_z_mm(lens: Lens, focus_m: float) -> float:
     """Film plane that focuses an object `focus_m` metres from the film (unit focusing; see `film_plane`).
 
-    A pinhole's film stays where it is: it is as sharp at every distance.
+    A pinhole's film stays in place: it is equally sharp at every distance.
 
     Raises:
         InputError: an object nearer than four focal lengths, for which no film plane exists.

@@ -1,4 +1,4 @@
-"""The media between surfaces, and one surface passed: met, tested, refracted; how rays start and how they are lost."""
+"""Passing one surface: intersection, tests, refraction; the media between surfaces, start and loss of rays."""
 
 from __future__ import annotations
 
@@ -102,10 +102,10 @@ def check_rays(rays: Rays, wavelength_nm: Tensor | float) -> None:
 def sound_wavelength(
     lens: Lens, wavelength_nm: Tensor | float, dtype: torch.dtype
 ) -> tuple[Tensor | float, Tensor | None]:
-    """Wavelengths in the precision of the rays, with the d line in the place of what is none, and which are sound [N].
+    """Wavelengths in the precision of the rays, invalid ones replaced by the d line, and which are valid [N].
 
     A NaN in an index would reach the gradients of the prescription, and float64 would spread to float32 rays halfway.
-    None where all are sound or, without dispersion, where none matters.
+    None where all are valid or, without dispersion, irrelevant.
     """
     if not isinstance(wavelength_nm, Tensor):
         return wavelength_nm, None
@@ -116,20 +116,20 @@ def sound_wavelength(
 def start(rays: Rays, first: Medium, mode: Mode, otherwise: int, lit: Tensor | None = None) -> tuple[Rays, Survival]:
     """Rays with optical direction cosines, and the test that their directions are unit vectors.
 
-    `lit` [N] boolean ends the others before they start.
+    `lit` [N] boolean: the other rays are ended before they start.
     """
     length2 = torch.addcmul(torch.addcmul(rays.dx * rays.dx, rays.dy, rays.dy), rays.dz, rays.dz)
     sound = at_most((length2 - 1).abs(), UNIT_SLACK, spend=mode.spend)
     if lit is not None:
         sound = also(sound, lit)
     if mode.freeze:
-        # Not even a NaN that comes in may reach the gradients of the others.
+        # A NaN input must not reach the gradients of the other rays.
         sound = sound & torch.isfinite(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)
     tests = Counts(sound, otherwise) if mode.spend else Labels(sound, otherwise)
     if mode.freeze:
         rays = along_axis(rays, tests, mode.sense, 0.0)
     if mode.sense > 0:
-        # Light may come from far away: the digits of float32 near the lens keep points and directions consistent.
+        # Light may start far away; near the lens float32 keeps points and directions consistent.
         rays = Rays(*nearest_approach(rays, 1.0), *rays[3:])
     return Rays(*rays[:3], *(times(d, first.n) for d in rays[3:])), tests
 
@@ -159,7 +159,7 @@ def meet(lens: Lens, k: int, r: Rays, before: Medium, entering: bool, mode: Mode
     else:
         distance2 = (hit.x * hit.x).addcmul_(hit.y, hit.y)
         if plane:
-            # A sphere's square root turns NaN and overflow into a miss; a plane would let them go on.
+            # A sphere's square root turns NaN and overflow into a miss; a plane would pass them.
             tests.end(distance2 < math.inf)
         tests.require(at_most(distance2, surface.semi_diameter_mm**2, spend=mode.spend), k, st.RIM)
     if lens.aperture is not None and surface.stop:
@@ -186,7 +186,7 @@ def bend(
 
 
 def along_axis(r: Rays, tests: Survival, sense: int, z: Any) -> Rays:
-    """The rays that go on, and rays along the axis from z in the place of the others."""
+    """The rays that go on; the others replaced by rays along the axis from z."""
     on_axis = (0.0, 0.0, z, 0.0, 0.0, float(sense))
     return Rays(*(tests.only(c, a) for a, c in zip(on_axis, r, strict=True)))
 

@@ -1,4 +1,4 @@
-"""A lens prescription as frozen data: surfaces from the scene to the film, and what a photographer changes."""
+"""A lens prescription as frozen data: surfaces from the scene to the film, and the state of focus, zoom and stop."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Surface:
 class Configuration:
     """A zoom or focus state of the source: thicknesses that replace those of the table, by surface index.
 
-    None stands for what the source does not say: then the lens's own rules. A focus state has an `object_distance_mm`,
+    None: not stated by the source, the lens's own value holds. A focus state has an `object_distance_mm`,
     from the object to the front vertex; without one the object is at infinity.
     """
 
@@ -104,21 +104,21 @@ class Configuration:
 
 @dataclass(frozen=True)
 class Lens:
-    """A prescription with the film's place. Nothing mutates it: `at` gives a new lens.
+    """A prescription with the film's place; immutable, `at` returns a new lens.
 
     Attributes:
         name, designer, source, notes: as cited in the lens file.
         rims: whether the rim diameters are the source's own or "estimated" by somebody.
         f_number: nominal, of the source; the stop's own diameter rules the trace.
         stated_efl_mm: focal length as the source states it, to check the computed one against; of an anamorphic lens in
-            the y-z plane, and `stated_efl_x_mm` in the x-z plane. None where it states none.
+            the y-z plane, and `stated_efl_x_mm` in the x-z plane. None if not stated.
         image_radius_mm: radius of the image circle, None where only the field is known.
         half_field_deg: half field of view, None where unknown.
         film_z_mm: film plane in the lens frame; None until `at` has focused the lens: the table's thickness rules.
         configurations: zoom and focus states of the source.
         path: the file it was read from, for error messages.
         aperture: shape of the stop's opening inside its rim, None where round.
-        derived: in words, what of this state does not stand in the source (a zoom between its states).
+        derived: description of what is not from the source (a zoom between its states).
         infinity_mm: thicknesses at infinity focus, by surface index, of the groups that `at` has moved to focus.
     """
 
@@ -195,10 +195,10 @@ class Lens:
             focus_m: distance from object to film in metres, `inf` allowed; None focuses at infinity (a focus state
                 chosen by its name: at the object of the source), and leaves the focus where `f_number` alone is given.
             f_number: EFL / paraxial entrance-pupil diameter at infinity focus, of a bladed stop by the circle round it.
-                None keeps the stop, but for a zoom state with a stop of its own. A stop wider than the rims let light
+                None keeps the stop, except for a zoom state with its own stop. A stop wider than the rims let light
                 through is allowed: they then vignette.
             focal_length_mm: rescale the whole lens so that its focal length at infinity focus is this.
-            field_deg: full field of view at infinity focus that the image circle shall see: the lens is rescaled, the
+            field_deg: full field of view of the image circle at infinity focus: the lens is rescaled, the
                 image circle stays (by the traced chief ray, along x; distortion included).
             zoom: name of a state of the file, or a focal length in mm between those of its states, as a number or its
                 text (`neurolens.optics.states`; marked in `derived`).
@@ -297,7 +297,7 @@ class Lens:
 
 
 def _figures(s: Surface) -> list[Any]:
-    """What a surface does to rays, for the hash; what a plain sphere of glass has not is left out."""
+    """What a surface does to rays, for the hash; default values are left out."""
     radius = float(s.radius_mm)
     row = [
         abs(radius) if math.isinf(radius) else radius,

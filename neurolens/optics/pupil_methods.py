@@ -1,4 +1,4 @@
-"""Pupils of the literature, to sample a lens from its film: one disc, one search, a disc a pixel, bounds by radius.
+"""Pupils of the literature, to sample per lens from its film: one disc, one search, a disc per pixel, bounds by radius.
 
 All are shapes on a plane by film radius: `RadialPupil`. They differ in how they are found, in how many of the rays sent
 through them pass, and in how much light they lose. The outlines that the cameras use are in

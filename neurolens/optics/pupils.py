@@ -61,10 +61,10 @@ def passes_at_any_azimuth(
     wavelength_nm: float,
     film_mm: tuple[float, float] | None = None,
 ) -> Tensor:
-    """Whether light passes from film points on +x through pupil points, bool [N], however the whole may be turned.
+    """Whether light passes from film points on +x through pupil points at any azimuth of the whole, bool [N].
 
     Blades and masks are left out: the round opening about them holds what they let through at every azimuth. Only
-    lenses with cylinders are traced at more than one azimuth, `AZIMUTHS`, for they change with it.
+    lenses with cylinders are traced at more than one azimuth, `AZIMUTHS`.
 
     Args:
         film_radius, pupil_x, pupil_y: [N] mm. film_z, pupil_z: planes, mm, lens frame.
@@ -76,7 +76,7 @@ def passes_at_any_azimuth(
     low, high = (None, None) if round_ or film_mm is None else azimuths_on_film(film_radius, film_mm)
     planes = torch.as_tensor(film_z, dtype=film_radius.dtype).expand_as(film_radius)
     for group in ((0.0,),) if round_ else _GROUPS:
-        # Together, for few rays take nearly as long as many.
+        # In one trace: few rays take nearly as long as many.
         azimuth = torch.tensor(group, dtype=film_radius.dtype)[:, None]
         asked = (~passed).expand(len(group), -1)
         if low is not None and high is not None:
@@ -199,7 +199,7 @@ def _may_widen(passed: Tensor, u: Tensor, v: Tensor, du: Tensor, dv: Tensor) -> 
     within = (u > least - du) & (u < most + du) & (v < across + dv) & (distance < reach + torch.hypot(du, dv))
     beyond = (u < least) | (u > most) | (v > across) | (distance > reach)
     count = passed.sum((1, 2))[:, None, None]
-    # About few, all points are tried, two steps around; about none, the whole grid.
+    # With few found, all points within two steps are tried; with none, the whole grid.
     near = (u > least - 2 * du) & (u < most + 2 * du) & (v < across + 2 * dv)
     return (within & beyond) | ((count < FEW) & near) | (count == 0)
 
@@ -225,7 +225,7 @@ class PupilBounds:
     Attributes:
         pupil_z_mm: the plane.
         film_radius_mm: radius of the last row; the first row is the axis.
-        low_mm, high_mm, half_mm: one value a film radius; an empty row (low > high) where no ray passes.
+        low_mm, high_mm, half_mm: one value per film radius; an empty row (low > high) where no ray passes.
         disc_mm: radius of the axial disc that holds all passing rays.
     """
 
@@ -323,7 +323,8 @@ def _starts(lens: Lens, place: Place, plane: float, near: float, exit_z: float) 
         stretch = (place.film_z - plane) / (place.film_z - exit_z)
         centre, reach = place.radius * (1 - stretch), near * abs(stretch)
         if starts[0].high - starts[0].low > _FAR * reach:
-            # A cover glass a millimetre from the film: the pupil is a speck that falls between the points of a grid.
+            # A cover glass a millimetre from the film: the pupil is so small that it falls between the points of a
+            # grid.
             starts.append(Box(centre - reach, centre + reach, reach, 0.0))
     return starts
 
@@ -332,7 +333,7 @@ def _found(look: _Look, lens: Lens, places: list[Place], starts: list[Box]) -> l
     """Boxes of what passes, by a grid over each start and another over what it finds."""
     coarse = look(lens, places, starts)
     few = [k for k, box in enumerate(coarse) if box is None or box.points < FEW]
-    # A stop far down may hide between the points of the grid: look closer where light passes an open one.
+    # A small stop may lie between the points of the grid: refine where light passes the open one.
     wide = look(lens.with_stop_radius(math.inf), [places[k] for k in few], [starts[k] for k in few])
     seen = [(k, box) for k, box in zip(few, wide, strict=True) if box]
     closer = look(lens, [places[k] for k, _ in seen], [box for _, box in seen])
@@ -360,7 +361,7 @@ def image_radius_mm(lens: Lens) -> tuple[float, str]:
         return f * math.tan(math.radians(lens.half_field_deg)), "f tan(half field)"
     radii = torch.linspace(0, 3 * abs(f), 481, dtype=torch.float64)
     points = 48
-    if not _illumination(lens, radii[:1])[0] > 0:  # a stop nearly shut lies between the points of the grid
+    if not _illumination(lens, radii[:1])[0] > 0:  # a nearly closed stop lies between the points of the grid
         radii, points = radii[:: len(radii) // 60], 384
     on_axis = _illumination(lens, radii[:1], points)[0]
     if not on_axis > 0:

@@ -1,7 +1,7 @@
 """Light on the film: irradiance from uniform surroundings, and the factors that make it fall towards the edge.
 
 A film point at distance Z from the pupil plane receives E = L integral of T cos^4(theta) / Z^2 over the area of that
-plane through which rays pass (Kolb et al. 1995, eq. 3). The area shrinks and grows for reasons of its own, so that
+plane through which rays pass (Kolb et al. 1995, eq. 3). The area varies, too, so that
 
     E(r) / E(0) = natural x aperture x optical x mechanical x transmittance
 
@@ -110,7 +110,7 @@ def film_light(
 
 
 def white_card(light: FilmLight) -> dict[str, Array]:
-    """Four ways to show a uniformly lit white card, each relative to the axis: what each weight does by itself.
+    """A uniformly lit white card by four weights of rays, each relative to the axis.
 
     "flat": every passing ray counts the same; "cos4": each counts cos^4; "aperture": the area of the effective aperture
     alone; "both": as film sees it (glass without losses). Source: Steinert 2009, 5.2.

@@ -21,7 +21,7 @@ from neurolens.optics.prescription import Configuration, Lens, Surface
 from neurolens.optics.sag import end_mm, neighbours, sag_mm
 from neurolens.optics.trace import trace
 
-_FIELDS = 17  # from the axis to the edge; rims are widest at one of the ends, but for an oddity in between
+_FIELDS = 17  # from the axis to the edge; rims are usually widest at one of the ends
 _HEIGHTS = (-1.0, -0.75, -0.5, 0.0, 0.5, 0.75, 1.0)  # in the stop, as shares of what the rule lets through
 _STEP_MM = 1e-3  # diameters are given to a micrometre
 _STEPS = 64
@@ -113,7 +113,7 @@ def half_field_deg(lens: Lens) -> float:
 
 
 def _states(lens: Lens) -> Iterator[Lens]:
-    """The table and every zoom state of the lens with the stop that its f-number asks for."""
+    """The table and every zoom state of the lens with the stop of its f-number."""
     yield lens.with_stop_radius(round(stop_radius_mm(lens, lens.f_number), 5))
     for c in lens.configurations:
         if c.object_distance_mm is None:
@@ -122,7 +122,7 @@ def _states(lens: Lens) -> Iterator[Lens]:
 
 def _moved(lens: Lens, c: Configuration) -> Lens:
     """The table with the thicknesses, field and f-number of a state."""
-    # Without a field of its own a state has that of the image circle, where there is one.
+    # A state without its own field has that of the image circle, if known.
     field = c.half_field_deg or (None if lens.image_radius_mm else lens.half_field_deg)
     moved = lens.with_gaps(dict(c.thickness_mm))
     return replace(moved, half_field_deg=field, f_number=c.f_number or lens.f_number)
@@ -152,7 +152,7 @@ def _beams(lens: Lens, rule: RimRule, field_deg: float) -> tuple[list[float], li
     if not bundle.reached[:, len(_HEIGHTS) // 2].all():
         widest = math.degrees(float(bundle.field_rad[-1, len(_HEIGHTS) // 2]))
         expected = f"at most {widest:.3g}, where the chief ray ends"
-        if not 0 < widest < field_deg:  # a chief ray that turns back on its way tells no limit
+        if not 0 < widest < field_deg:  # a chief ray that turns back gives no limit
             expected = "a field whose chief ray meets the middle of the stop: none does (a wrong radius or thickness?)"
         raise InputError(lens.path, "half_field_deg", field_deg, expected)
     every = range(len(lens.surfaces))

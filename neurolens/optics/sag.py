@@ -1,7 +1,7 @@
 """The shape of surfaces: depth and its derivatives, where rays from the scene meet it, where it ends, what touches.
 
-Numbers, numpy arrays and torch tensors alike; torch is not needed, for cameras without it aim at the front of a lens.
-The tracer has a form of its own (`shapes`): by Horner's rule, held finite beyond the end of a conic.
+For numbers, numpy arrays and torch tensors; torch is not imported, as cameras without it use this module.
+The tracer has its own form (`shapes`): by Horner's rule, held finite beyond the end of a conic.
 """
 
 from __future__ import annotations
@@ -125,13 +125,13 @@ def end_mm(surface: Surface) -> float:
 def check_clearance(surfaces: Sequence[Surface], file: str, state: str = "") -> None:
     """Raise for a rim larger than its radius of curvature and for neighbours that overlap inside their rims.
 
-    The gap between two spheres grows or shrinks steadily from the axis outwards, so that axis and the smaller of the
-    two rims decide; other shapes are looked at in between too. A stop that bends nothing (one medium on both sides) may
+    The gap between two spheres is monotone from the axis outwards, so that axis and the smaller of the two rims
+    decide; other shapes are also tested in between. A stop that bends nothing (one medium on both sides) may
     lie inside an element, in front of which (or behind which) it is then listed; what stands on both sides of it must
     be clear of each other. A stop on a glass surface is a surface like any other.
 
     Args:
-        state: words in front of the surface in messages, for a zoom state of the file.
+        state: prefix of the surface in messages, for a zoom state of the file.
 
     Raises:
         InputError: names the file, the surface and by how much.
@@ -178,7 +178,6 @@ def neighbours(surfaces: Sequence[Surface]) -> Iterator[tuple[int, int, float]]:
 
 
 def _same_medium(surfaces: Sequence[Surface], k: int) -> bool:
-    """Whether a surface has the same medium before and behind it."""
     after = surfaces[k]
     if not k:
         return after.n_d == 1

@@ -1,6 +1,6 @@
 """Light along any sequence of surfaces, reflected or refracted at each: the paths of ghosts.
 
-The same surfaces, tests and refraction as in `trace`; what is added is that light may turn round.
+The same surfaces, tests and refraction as in `trace`; in addition, light may be reflected.
 """
 
 from __future__ import annotations

@@ -35,13 +35,13 @@ from neurolens.optics.surfaces import (
 Vector = tuple[Tensor, Tensor, Tensor]
 
 # Steps of the iteration by how far the asphere departs from the conic that it starts from, in rim radii. A fixed
-# count, for a test of convergence would make an accelerator wait for its host at every surface.
+# count: a test of convergence would make an accelerator wait for its host at every surface.
 STEPS = ((3e-4, 2), (3e-3, 3), (3e-2, 4), (math.inf, 7))
-# More steps that float64 takes after the one that decides convergence, so that both precisions decide alike.
+# Extra steps of float64 after the one that decides convergence, so that both precisions decide equally.
 POLISH = {torch.float32: 0, torch.float64: 2}
 # Length of the deciding step, in rim radii, that counts as converged: the error left is of the order of its square.
 LAST_STEP = 3e-4
-# cos^2 of the slope of the steepest conic that the iteration walks on.
+# cos^2 of the slope of the steepest conic that the iteration follows.
 STEEPEST = 1e-7
 
 
@@ -70,7 +70,7 @@ def intersect_shape(r: Rays, surface: Surface, mode: Mode, before: Medium) -> Hi
 
 
 def _weighted(a: Vector, b: Vector, w: tuple[Any, ...]) -> Tensor:
-    """Sum of the products of two vectors' components, each times its weight; a weight of 0 costs nothing."""
+    """Sum of the products of two vectors' components, each times its weight; terms of weight 0 are left out."""
     terms = [times(p * q, k) for p, q, k in zip(a, b, w, strict=False) if isinstance(k, Tensor) or k != 0]
     total = terms[0] if terms else torch.zeros_like(a[0])
     for term in terms[1:]:
@@ -93,7 +93,7 @@ def _meet_quadric(
     """
     p, (cx, cy, cz) = (r.dx, r.dy, r.dz), c
     if cx is cy or (not isinstance(cx, Tensor) and cx == cy):
-        # Round about the axis: p.p = n^2 and m.p = 0 leave little to compute.
+        # Rotationally symmetric: p.p = n^2 and m.p = 0 simplify the terms.
         a = p[2] * p[2] * (cz - cx) + before.n2 * cx
         b = p[2] * (times(m[2], cz - cx) - 1)
         f = torch.addcmul(m[0] * m[0], m[1], m[1]) * cx + m[2] * (times(m[2], cz) - 2)

@@ -229,7 +229,8 @@ def zoomed(lens: Lens, efl_mm: float) -> Lens:
     places = _solved(lens, gaps, states, efl_mm)
     inner = dict(zip(gaps, (places[:-1] - places[1:]).tolist(), strict=True))
     last = len(lens.surfaces) - 1
-    beside = _between(states, efl_mm)
+    i = sum(s.efl_mm <= efl_mm for s in states[1:-1])
+    beside = states[i], states[i + 1]
     moved = in_state(lens, Configuration("", efl_mm, (*inner.items(), (last, float(places[-1])))))
     check_clearance(moved.surfaces, lens.path, f"zoom {efl_mm:g} mm, ")
     moved = _interpolated_texts(moved, states, efl_mm)
@@ -238,7 +239,6 @@ def zoomed(lens: Lens, efl_mm: float) -> Lens:
 
 
 def _states(lens: Lens) -> list[_State]:
-    """The zoom states by ascending focal length."""
     gaps, found = _varying_gaps(lens), []
     for c in infinity_states(lens):
         data = paraxial.first_order(lens.with_gaps(gaps_mm(lens, c)))
@@ -306,11 +306,6 @@ def _directions(moving: NDArray[np.bool_], kept: int) -> Vector:
     together = [unit[kept] + unit[kept + 1]] if moving[kept] and moving[kept + 1] else []
     others = [unit[j] for j in np.flatnonzero(moving) if j not in (kept, kept + 1)]
     return np.array(together + others)
-
-
-def _between(states: list[_State], efl_mm: float) -> tuple[_State, _State]:
-    i = sum(s.efl_mm <= efl_mm for s in states[1:-1])
-    return states[i], states[i + 1]
 
 
 def _interpolated_texts(lens: Lens, states: list[_State], efl_mm: float) -> Lens:

@@ -48,10 +48,10 @@ def choose(test: Tensor, yes: Tensor, no: Tensor) -> Tensor:
 class Labels:
     """The tests at each surface (met, inside the rim, not totally reflected), in the order in which they are called.
 
-    The first failure rules. A ray goes on until it misses a surface or is totally reflected; one that a rim stops goes
-    on, too, since its crossings are learnt from. This form keeps one label a ray, written at its first failure: what a
-    compiler turns into few instructions in registers, and what gradients can be taken through. `Counts` has the same
-    methods.
+    The first failure decides. A ray goes on until it misses a surface or is totally reflected; one that a rim stops
+    goes on, too, since surrogates are fitted to its crossings. This form keeps one label per ray, written at its first
+    failure: what a compiler turns into few instructions in registers, and what gradients can be taken through. `Counts`
+    has the same methods.
     """
 
     def __init__(self, sound: Tensor, otherwise: int) -> None:
@@ -106,7 +106,7 @@ class Counts:
         bits = torch.int32 if value.dtype == torch.float32 else torch.int64
         if self._mask is None:
             self._mask = self._goes_on.to(bits).neg_()
-        # All bits or none: the only product with 0 that a NaN does not survive.
+        # All bits or none: unlike a product with 0, this removes NaN.
         kept = value.view(bits).bitwise_and(self._mask).view(value.dtype)
         return kept if otherwise == 0 else kept.add_(1 - self._goes_on, alpha=otherwise)
 
@@ -119,7 +119,7 @@ Survival = Labels | Counts
 
 @lru_cache(maxsize=256)
 def _table(meanings: tuple[int, ...], device: torch.device) -> Tensor:
-    """Kept, for sending it anew with every chunk would make the host wait for an accelerator."""
+    """Cached: transferring it with every chunk would make the host wait for an accelerator."""
     return torch.tensor(meanings, dtype=torch.int32, device=device)
 
 
@@ -251,7 +251,7 @@ def intersect_sphere(r: Rays, curvature: Any, mode: Mode, before: Medium, enteri
     add = Tensor.addcmul_ if spend else torch.addcmul
     x, y, z = add(mx, t, r.dx), add(my, t, r.dy), add(mz, t, r.dz)
     if entering:
-        # A ray from anywhere may meet the far half of the sphere, where there is no glass.
+        # A general ray may meet the far half of the sphere, where there is no glass.
         met = met & (z * curvature <= 1)
     return Hit(x, y, z, q, q2, met)
 

@@ -1,6 +1,6 @@
-"""The exact tracer: every ray through every surface, in either direction, with the same code, and ray differentials.
+"""The exact tracer, in either direction, and ray differentials.
 
-This is the truth that surrogates are measured against. Rays are separate tensors of shape [N] (a structure of
+This is the reference for surrogates. Rays are separate tensors of shape [N] (a structure of
 arrays); float64 for truth, float32 for speed. A ray that cannot go on carries a status and stays finite.
 """
 
@@ -47,12 +47,12 @@ class Traced(NamedTuple):
     Attributes:
         rays: point on the last surface met (lens frame, mm) and unit direction after it. Rays that missed a surface or
             were totally reflected are replaced by a finite ray along the axis; rays that only a rim stops go on, so
-            that their crossings can be learnt from.
+            that surrogates can be fitted to their crossings.
         status: [N] int32, see `neurolens.base.status`.
         transmittance: [N], power of unpolarised light that arrives: of surfaces (by default the product of
-            (Ts + Tp) / 2) and of absorption in the glass; None when not asked for.
-        crossings: surface index to `Crossing`, for the surfaces asked for.
-        path: the rays on and after every surface, in the order of travel, or empty when not asked for.
+            (Ts + Tp) / 2) and of absorption in the glass; None if not requested.
+        crossings: surface index to `Crossing`, for the recorded surfaces.
+        path: the rays on and after every surface, in the order of travel, or empty if not requested.
     """
 
     rays: Rays
@@ -120,7 +120,7 @@ def trace(
         lam = wavelength_nm[part] if isinstance(wavelength_nm, Tensor) and wavelength_nm.ndim else wavelength_nm
         chunk = Rays(*(c[part] for c in rays))
         traced = _trace_chunk(lens, chunk, lam, towards, wanted, False)
-        # Written where it belongs at once: chunks kept until the end would take as much memory again.
+        # Written in place: keeping the chunks until the end would double the memory.
         whole = _room(traced, count) if whole is None else whole
         _fill(whole, traced, part)
     assert isinstance(whole, Traced)
@@ -140,7 +140,7 @@ def compile_trace(
         return _trace_chunk(lens, rays, wavelength_nm, towards, _Wanted(transmittance, tuple(record), False), False)
 
     for surface in lens.surfaces:
-        # Read the catalogue now: a compiler does not look into files.
+        # Read the catalogue now: compiled code cannot read files.
         glass.index_of(surface, glass.LINE_D_NM)
         glass.absorption_of(surface, glass.LINE_D_NM)
     return torch.compile(run, dynamic=False)
@@ -150,8 +150,8 @@ def compile_trace(
 def _keep_memory() -> None:
     """Make glibc keep the memory of chunks between operators, once a process.
 
-    By default it hands blocks of 128 KiB back to the system, and half the time of a trace would go into getting them
-    again. Freeing one larger block raises that limit to its size (mallopt(3), M_MMAP_THRESHOLD); it is never touched.
+    By default it returns blocks of 128 KiB to the system, and half the time of a trace would go into reallocation.
+    Freeing one larger block raises that limit to its size (mallopt(3), M_MMAP_THRESHOLD); it is never touched.
     """
     torch.empty(30 << 20, dtype=torch.uint8)
 
@@ -164,7 +164,6 @@ def _differentiated(value: Any) -> bool:
 
 
 def _parameters(lens: Lens) -> list[Any]:
-    """Every figure of the prescription that may be a tensor."""
     found: list[Any] = []
     for s in lens.surfaces:
         found += (s.radius_mm, s.thickness_mm, s.n_d, s.V_d, s.conic, s.absorption_per_mm, *(a for _, a in s.asphere))
@@ -186,7 +185,7 @@ def _trace_chunk(
     path: list[Rays] = []
     vertex = 0.0
     for position, k in enumerate(order):
-        # Move to this surface's own frame, where float32 keeps its digits.
+        # Move to this surface's frame, where float32 keeps its precision.
         r = r._replace(z=r.z + (vertex - vertices[k]))
         vertex = vertices[k]
         before, after = (glasses[k], glasses[k + 1]) if sense > 0 else (glasses[k + 1], glasses[k])
@@ -218,7 +217,6 @@ def _room(part: Any, count: int) -> Any:
 
 
 def _fill(whole: Any, part: Any, at: slice) -> None:
-    """Write the tensors of a part into those of the whole."""
     if isinstance(part, Tensor):
         whole[at] = part
     elif isinstance(part, dict):

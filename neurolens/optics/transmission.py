@@ -86,16 +86,16 @@ def _times(along: Tensor, real: Tensor, imaginary: Tensor) -> Tensor:
 
 
 def _across(direction: Tensor, normal: Tensor) -> Tensor:
-    """Unit vectors [3, N] across direction and normal; where these agree, any that are across.
+    """Unit vectors [3, N] across direction and normal; where these agree, any perpendicular ones.
 
-    Near normal incidence the cross product is mostly rounding, and s and p are alike to within its square.
+    Near normal incidence the cross product is mostly rounding, and s and p agree to within its square.
     """
     s = _cross(direction, normal)
     length2 = (s * s).sum(0)
     aligned = ~(length2 > torch.finfo(s.dtype).eps)
     x, y, z = direction
-    nought = torch.zeros_like(x)
-    other = torch.where(x.abs() < 0.6, torch.stack([nought, z, -y]), torch.stack([-z, nought, x]))
+    zero = torch.zeros_like(x)
+    other = torch.where(x.abs() < 0.6, torch.stack([zero, z, -y]), torch.stack([-z, zero, x]))
     s = torch.where(aligned, other, s)
     length2 = torch.where(aligned, (other * other).sum(0), length2)
     return s / torch.sqrt(length2)
@@ -112,7 +112,7 @@ def _stacked(vector: Vector) -> Tensor:
 def passage(
     lens: Lens, wavelength_nm: Tensor | float, sense: int, wanted: bool | Literal["polarised"], like: Tensor
 ) -> _Averaged | _Polarised | None:
-    """What follows the power of rays of the shape of `like`, or None where it is not wanted."""
+    """The tracker of the power of rays of the shape of `like`, or None where it is not wanted."""
     if not wanted:
         return None
     return (_Polarised if wanted == "polarised" else _Averaged)(lens, wavelength_nm, sense, like)

@@ -1,1 +1,1 @@
-"""Lens files of other programs, each format read to its public definition; `any_format.read_any` takes them all."""
+"""Lens files of other programs, each read by its public format definition; `any_format.read_any` reads all of them."""

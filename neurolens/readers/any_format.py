@@ -1,4 +1,4 @@
-"""Lens files of any format: recognised by their content, else by their suffix."""
+"""Reading of lens files of any format, recognised by content, else by suffix."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ FORMATS = (
 def read_any(path: str | Path, given: Given | None = None) -> Lens:
     """The lens of a file in any format that neurolens reads, its own TOML too.
 
-    The content decides; the suffix counts where the content is not recognised.
+    The content decides; the suffix is used if the content is not recognised.
 
     Args:
-        given: what the user says where the file does not (name, source, f-number, units).
+        given: values from the user that the file lacks (name, source, f-number, units).
 
     Raises:
         InputError: a file in no known format, or the mistake in it; names file and line.
@@ -55,12 +55,12 @@ def read_any(path: str | Path, given: Given | None = None) -> Lens:
         lens = read_lens(path)
         lens = replace(lens, name=given.name or lens.name, source=given.source or lens.source)
         if given != Given(name=given.name, source=given.source):
-            raise InputError(path, "options", "(of a lens file)", "--name and --source only: it says the rest itself")
+            raise InputError(path, "options", "(of a lens file)", "--name and --source only: the file has the rest")
         return lens
     found = format_of(path)
     for option, said in (("--gap-before", given.gap_before), ("--semi-diameters", given.semi_diameters)):
         if said and found.read is not read_table:
-            raise InputError(path, option, f"(a {found.name} file)", "a plain table: other formats say what they hold")
+            raise InputError(path, option, f"(a {found.name} file)", "a plain table: other formats define it")
     return found.read(path, given)
 
 

@@ -1,4 +1,4 @@
-"""What every reader ends with: loose facts from a file become a lens that is whole and checked."""
+"""Last step of every reader: from the data of a file to a complete, checked lens."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from neurolens.readers.source import warn
 
 # A diameter that the file does not give, until `finish` has found it.
 UNKNOWN = math.nan
-NARROWER = 1e-4  # relative: by less, two figures of the stop differ by the rounding of what is printed
+NARROWER = 1e-4  # relative: smaller differences of stop diameters are rounding
 _NAMES = frozenset(m.upper() for m in catalogue.MAKERS)
-SAME_INDEX, SAME_ABBE = 2e-5, 0.005  # how near the catalogue printed figures are to be those of a named glass
+SAME_INDEX, SAME_ABBE = 2e-5, 0.005  # tolerance of printed figures against those of a catalogue glass
 
 
 def finish(
@@ -98,14 +98,13 @@ def with_rims(lens: Lens) -> Lens:
         raise InputError(lens.path, "diameter", f"(not given for surface {listed})", expected)
     trial = lens
     if any(lens.surfaces[k].asphere for k in missing):
-        # An asphere is traced inside a rim only: that of the spheres at the vertices is near enough to begin with.
+        # Aspheres need a rim before they can be traced: start with the rims of their vertex spheres.
         trial = _filled(lens, rims.derive_rims(_spherical(lens))[0])
     warn(lens.path, f"no rim is given for surface {listed}: derived from f-number and field")
     return replace(_filled(lens, rims.derive_rims(trial)[0]), rims="derived")
 
 
 def _filled(lens: Lens, other: Lens) -> Lens:
-    """The lens with the rims of another where it has none."""
     rows = (
         replace(s, diameter_mm=o.diameter_mm) if math.isnan(s.diameter_mm) else s
         for s, o in zip(lens.surfaces, other.surfaces, strict=True)
@@ -114,7 +113,6 @@ def _filled(lens: Lens, other: Lens) -> Lens:
 
 
 def _spherical(lens: Lens) -> Lens:
-    """The lens with every surface replaced by the sphere at its vertex."""
     curvatures = [s.vertex_curvature("y") for s in lens.surfaces]
     rows = (
         replace(s, radius_mm=1 / c if c else math.inf, conic=0.0, asphere=())
@@ -181,13 +179,13 @@ def _check_rows(rows: Sequence[Surface], file: str) -> None:
 def named_glass(
     name: str, file: str, field: str, makers: Sequence[str] = (), *, said: str | None = None
 ) -> dict[str, Any]:
-    """Fields of a surface whose glass the file gives by name alone; warns wherever another could be meant.
+    """Fields of a surface whose glass the file gives by name alone; warns where it is ambiguous.
 
-    Of a maker who no longer has the glass that with "N-" in front is taken, which replaced it.
+    For a discontinued glass its replacement, with the prefix "N-", is taken.
 
     Args:
         makers: the makers' catalogues that the file names; the first that has the glass is meant.
-        said: the word of the file, where that names the maker.
+        said: the file's text, if it names the maker.
 
     Raises:
         InputError: a name that the catalogue does not know; the message suggests the nearest.

@@ -1,6 +1,6 @@
 """CODE V sequence files (.seq): one lens written as commands, S lines with radius (or curvature), thickness, glass.
 
-Three letters name a command. What is not known here is an error that names command and line."""
+Three letters name a command. An unsupported command is an error with command and line."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def draft_of(file: File) -> Draft:
     """The draft of a file that has been read to its end.
 
     Raises:
-        InputError: no surface, a solve or a shape that the lens model cannot hold.
+        InputError: no surface, a solve or a shape that the lens model cannot represent.
     """
     first, *middle, image = file.blocks
     if not middle:
@@ -141,7 +141,7 @@ def read_seq(path: str | Path, given: Given | None = None) -> Lens:
     """The lens of a CODE V sequence file.
 
     Raises:
-        InputError: see the module; also tilts, mirrors, tori and everything else that the lens model cannot hold.
+        InputError: see the module; also tilts, mirrors, tori and everything else that the lens model cannot represent.
     """
     file = File(str(path))
     for command in commands(read_lines(path)):
@@ -255,7 +255,6 @@ def _named(file: File, command: Command) -> Block:
 
 
 def _new_surface(file: File, command: Command) -> None:
-    """S, SO or SI: radius or curvature, thickness, medium."""
     name, line = command.name, command.line
     if (name == "SO") != (not file.blocks) or file.closed:
         raise line.error(name, "(here)", "one object SO, then surfaces S, then one image SI")

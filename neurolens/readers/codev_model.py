@@ -1,6 +1,6 @@
-"""The parts of a CODE V file while it is read: commands and media as they are written, surfaces, zoom positions.
+"""Parser state of a CODE V file: commands, media, surfaces, zoom positions.
 
-What the lens model cannot hold is an error by name and line."""
+What the lens model cannot represent is an error with name and line."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def commands(lines: Sequence[Line]) -> Iterator[Command]:
                 raise start.error("&", f"({len(text)} characters)", f"at most {_MAX_COMMAND} characters in a command")
             continue
         for part in _outside_quotes(text + bare, ";"):
-            words = _words(part)
+            words = [m[1] or m[2] or m[0] for m in re.finditer(r"'([^']*)'|\"([^\"]*)\"|\S+", part)]
             if words:
                 yield Command(words[0], words[0].upper()[:3], tuple(words[1:]), start)
         text, start = "", None
@@ -66,10 +66,6 @@ def _outside_quotes(text: str, mark: str) -> list[str]:
             parts.append(text[begin:place])
             begin = place + 1
     return [*parts, text[begin:]]
-
-
-def _words(text: str) -> list[str]:
-    return [m[1] or m[2] or m[0] for m in re.finditer(r"'([^']*)'|\"([^\"]*)\"|\S+", text)]
 
 
 def medium(command: Command, words: Sequence[str], private: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
@@ -98,9 +94,9 @@ def medium(command: Command, words: Sequence[str], private: Mapping[str, dict[st
     name, _, maker = word.rpartition("_")
     qualified = f"{maker}:{name}" if name else word
     if name and not catalogue.same_name(qualified):
-        # Other names of a glass ("BK7") are listed without their maker.
+        # Aliases of a glass ("BK7") are listed without their maker.
         alias = [g for g in catalogue.same_name(name) if g.maker.upper() == maker.upper()]
-        # Glasses that their makers dropped are replaced by those with "N-" in front.
+        # Discontinued glasses are replaced by those with the prefix "N-".
         replacing = catalogue.same_name(f"{maker}:N-{name}")
         qualified = str((*alias, *replacing)[0]) if alias or replacing else qualified
     known = named_glass(qualified, command.line.file, f"line {command.line.number}, glass", said=word if name else None)

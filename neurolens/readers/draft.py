@@ -1,4 +1,4 @@
-"""What a reader has found in a file, and how it becomes a lens: the steps that all formats share."""
+"""The data that a reader finds in a file, and its conversion to a lens, common to all formats."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from neurolens.readers.source import unit_mm, warn
 
 @dataclass(frozen=True)
 class Given:
-    """What the user says about a file, where the file itself does not.
+    """Values from the user that the file does not give.
 
     Attributes:
         name, source: for the lens file; else the title in the file, and "FORMAT file NAME".
         f_number: nominal f-number, for a file that states none.
-        units: of a file that does not tell: "mm", "cm", "in" or "m".
+        units: of a file without units: "mm", "cm", "in" or "m".
         half_field_deg: edge of the field, for rims that have to be derived.
         gap_before: of a plain table: its second column is the distance from the surface before (Kolb's tables of 1995).
         semi_diameters: of a plain table: its last column holds radii of the rims.
@@ -37,7 +37,7 @@ class Given:
 
 @dataclass(frozen=True)
 class Row:
-    """One surface as the file has it, in the file's unit.
+    """One surface in the file's unit.
 
     Attributes:
         surface: its diameter may be `assemble.UNKNOWN`.
@@ -50,7 +50,7 @@ class Row:
 
 @dataclass(frozen=True)
 class State:
-    """A zoom or focus state, in the file's unit; None where it is as in the table.
+    """A zoom or focus state, in the file's unit; None: as in the table.
 
     Attributes:
         thickness: by row number of the draft.
@@ -70,12 +70,12 @@ class State:
 
 @dataclass(frozen=True)
 class Draft:
-    """Everything a reader has found. Lengths in the file's unit.
+    """All data found by a reader. Lengths in the file's unit.
 
     Attributes:
         kind: name of the format, for the source line.
-        pupil, f_number: what sizes the stop, where the file says so; else its diameter.
-        unit: "mm", "cm", "in", "m", or None where the format does not tell.
+        pupil, f_number: if given, they size the stop; else its diameter does.
+        unit: "mm", "cm", "in", "m", or None if unknown.
     """
 
     file: str
@@ -121,18 +121,14 @@ def lens_of(draft: Draft, given: Given | None = None) -> Lens:
         path=draft.file,
     )
     if draft.f_number is not None and draft.pupil is None and lens.surfaces:
-        # The file's f-number rules over whatever diameter it prints for the stop, an aperture set on it aside.
-        lens = _open_stop(lens)
+        # The file's f-number overrides a diameter of the stop, except for an aperture set on it.
+        rows = (replace(s, diameter_mm=math.nan) if s.stop else s for s in lens.surfaces)
+        lens = replace(lens, surfaces=tuple(rows))
     lens = finish(lens, pupil_mm=draft.pupil, film_given=draft.film_given, stop_limit_mm=_stop_aperture(draft))
     lens = replace(lens, configurations=tuple(_configuration(lens, draft, state) for state in _states(draft)))
     lens = with_rims(lens.scaled(factor) if factor != 1 else lens)
     check_states(lens)
     return lens
-
-
-def _open_stop(lens: Lens) -> Lens:
-    rows = (replace(s, diameter_mm=math.nan) if s.stop else s for s in lens.surfaces)
-    return replace(lens, surfaces=tuple(rows))
 
 
 def _stop_aperture(draft: Draft) -> float | None:
@@ -142,7 +138,7 @@ def _stop_aperture(draft: Draft) -> float | None:
 
 
 def _states(draft: Draft) -> tuple[State, ...]:
-    """The states of the file; a table without states that is focused near becomes a focus state of its own."""
+    """The states of the file; a table without states that is focused near becomes a focus state."""
     if not draft.states and math.isfinite(draft.object_distance):
         return (State("as filed", object_distance=draft.object_distance, film_given=draft.film_given),)
     return draft.states

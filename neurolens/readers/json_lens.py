@@ -1,7 +1,7 @@
 """Prescriptions as JSON, in the form that ../shared/data/README.md defines: surfaces with full diameters in mm.
 
 A radius of 0 is a plane, an index of null is air, a last thickness of 0 or null stands for the computed back focus,
-`cyl-x` is a cylinder curved along x. What the file states beside its table is checked against it: focal length and back
+`cyl-x` is a cylinder curved along x. Other statements of the file are checked against its table: focal length and back
 focus, and the object's distance of every focus state. States marked as interpolated by the transcriber are left out
 with a warning. The forms of DeepLens and ISET are read too (`json_others`).
 """
@@ -34,7 +34,7 @@ SURFACE_KEYS = (
     *("aspheric_coefficients", "shape"),
 )
 SHAPES = {"sphere": None, "asphere": None, "cyl-x": "x", "cyl-y": "y"}
-# Words of the notes that tell of diameters which are not the source's, whatever `diameters_estimated` says.
+# Words in the notes that indicate diameters not from the source, independent of `diameters_estimated`.
 _NOT_THE_SOURCE_S = re.compile(
     r"diameters?[^.;]*\b(trimmed|enlarged|chosen|estimated|inferred|computed|reduced)\b", re.IGNORECASE
 )
@@ -57,7 +57,7 @@ def read_json_lens(path: str | Path, given: Given | None = None, *, catalogue: b
             figures of the file rule over all colours.
 
     Warns:
-        NeurolensWarning: whatever was left out, computed or doubtful.
+        NeurolensWarning: for everything left out, computed or doubtful.
 
     Raises:
         InputError: the first mistake met; it names file, surface and field.
@@ -119,7 +119,7 @@ def _load(path: str | Path) -> dict[str, Any]:
         return found
 
     def refuse(word: str) -> float:
-        raise InputError(path, "file", word, "finite numbers, as JSON has no other")
+        raise InputError(path, "file", word, "finite numbers")
 
     try:
         data = json.loads(decode(read_bytes(path), path), object_pairs_hook=once, parse_constant=refuse)
@@ -187,7 +187,6 @@ def _asphere(row: Table) -> tuple[tuple[int, float], ...]:
 
 
 def _optional_text(table: Table, key: str) -> str:
-    """A text that may be null."""
     return "" if table.data.get(key) is None else table.text(key, required=False)
 
 
@@ -229,7 +228,7 @@ def check_computed(lens: Lens, data: Mapping[str, Any]) -> None:
 
 
 def image_and_field(data: Mapping[str, Any], file: str) -> dict[str, Any]:
-    """`image_radius_mm` and `half_field_deg` from the free text of `field_or_image_circle`, where it is clear.
+    """`image_radius_mm` and `half_field_deg` from the free text of `field_or_image_circle`, if unambiguous.
 
     Understood: "image radius 21.6 mm", "image circle 43.2 mm", "38 deg half field", "+-20 deg", "180 deg full field",
     "AOV 45.2 deg" (full; of several the first), and the keys fullFieldDeg and imageCircleMm. Else a warning.

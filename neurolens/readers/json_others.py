@@ -80,7 +80,7 @@ def _deeplens_surface(row: Table) -> Surface:
     given, kind, stop = row.data, row.data.get("type"), row.data.get("type") in _STOPS
     if kind not in ("Spheric", "Aspheric", *_STOPS):
         raise row.error("type", kind, "Spheric, Aspheric, Stop or Aperture")
-    # ai2, ai4, ... say the list ai once more.
+    # ai2, ai4, ... repeat the list ai.
     again = [k for k in given if _repeats(k) or (k[:2] == "ai" and k[2:].isdecimal() and "ai" in given)]
     Table({k: v for k, v in given.items() if k not in again}, row.file, row.where).only(_DEEPLENS_SURFACE)
     shape: dict[str, Any] = {}
@@ -155,7 +155,7 @@ def _iset(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: str)
 
 
 def _repeats(key: str) -> bool:
-    """Whether a key stands in brackets: what it says follows from others."""
+    """Whether a key is in brackets: it repeats other keys."""
     return key.startswith("(") and key.endswith(")")
 
 

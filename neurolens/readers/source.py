@@ -1,4 +1,4 @@
-"""Files from elsewhere, read within bounds: bytes, text in whatever encoding, numbers, each mistake named by line."""
+"""Reading of foreign text files with limits: bytes, text of unknown encoding, numbers; errors name the line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAX_BYTES = 4_000_000  # the longest real lens files, with tolerances and merit 
 MAX_LINES = 100_000
 MAX_LINE = 10_000
 
-# What one unit of length is in mm.
+# Units of length in mm.
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "in": 25.4, "m": 1000.0}
 
 
@@ -84,7 +84,7 @@ def decode(raw: bytes, path: str | Path) -> str:
     """Text of a file: UTF-16 by its byte-order mark (or by its zero bytes), else UTF-8, else Latin-1.
 
     Raises:
-        InputError: bytes that are no text.
+        InputError: bytes that are not text.
     """
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
         codes = ["utf-16"]
@@ -135,5 +135,5 @@ def unit_mm(unit: str, file: str, field: str = "--units") -> float:
 
 
 def warn(file: str, message: str) -> None:
-    """Warn of something in a file that is read nevertheless."""
+    """Warn about something in a file that is still read."""
     warnings.warn(f"{file}: {message}", NeurolensWarning, stacklevel=3)

@@ -1,6 +1,6 @@
-"""Plain tables of four columns, as renderers have them: pbrt's .dat and appleseed's lens files.
+"""Plain tables of four columns used by renderers: pbrt's .dat and appleseed's lens files.
 
-One row a surface from the scene to the film: radius of curvature, thickness to the next surface, refractive index
+One row per surface from the scene to the film: radius of curvature, thickness to the next surface, refractive index
 behind, aperture (full diameter); mm. "#" begins a comment. appleseed puts the count of rows in front. The stop is the
 row of index 0 (appleseed) or of radius 0 (pbrt, which has no other planes). Of a last thickness of 0 the film is put in
 the paraxial focus. Kolb's tables of 1995 have the separation in front of each surface instead, and some have
@@ -66,7 +66,7 @@ def read_table(path: str | Path, given: Given | None = None) -> Lens:
 
 
 def looks_like_table(head: str) -> bool:
-    """Whether the beginning of a text is that of a table: numbers in the first line that is no comment."""
+    """Whether the beginning of a text is that of a table: numbers in the first line that is not a comment."""
     for row in head.splitlines():
         words = row.partition("#")[0].split()
         if words:
@@ -85,7 +85,7 @@ def _surfaces(file: str, rows: Sequence[tuple[Line, list[float]]], factor: float
         raise InputError(file, "stop", found, "exactly one row of index 0, or else of radius 0: the aperture stop")
     surfaces: list[Surface] = []
     for k, (line, (radius, thickness, index, diameter)) in enumerate(rows):
-        # The stop does not end a medium: pbrt and appleseed have it in air.
+        # The stop does not change the medium: pbrt and appleseed have it in air.
         n_d = 1.0 if k == stops[0] and index == 0 else index
         if n_d < 1:
             raise line.error("index", index, "a refractive index of at least 1 (0 marks the stop)")

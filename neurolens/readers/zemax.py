@@ -2,7 +2,7 @@
 
 The format is a list of keywords: settings of the system, then one block "SURF n" a surface, the object first and the
 image last, then merit function, tolerances and configurations. Curvatures, semi-diameters, thickness to the next
-surface. What is not known here is an error that names keyword and line."""
+surface. Unsupported input is an error with keyword and line."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The parts of a Zemax file while it is read: surfaces, configurations, and the keywords that move no ray.
+"""Parser state of a Zemax file: surfaces, configurations, and the keywords without effect on rays.
 
-What the lens model cannot hold is an error by name and line."""
+What the lens model cannot represent is an error with name and line."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ CONFIGURATION = frozenset("MOFF MCOM XFIE YFIE FLWT FVDX FVDY FVCX FVCY FVAN WAV
 
 
 TYPES = ("STANDARD", "EVENASPH", "ODDASPHE", "TOROIDAL", "BICONICX", "COORDBRK")
-INFINITE = 1e9  # in any unit: what programs write for an object at infinity starts at 1e10
+INFINITE = 1e9  # in any unit; programs write 1e10 or more for an object at infinity
 
 
 @dataclass
@@ -96,7 +96,7 @@ def shape_of(block: Block) -> dict[str, Any]:
     infinity) and PARM 2 (a conic) in x.
 
     Raises:
-        InputError: a type, a parameter or a combination of them that the lens model cannot hold; by name and line.
+        InputError: a type, a parameter or a combination of them that the lens model cannot represent; by name and line.
     """
     match block.kind:
         case "STANDARD":

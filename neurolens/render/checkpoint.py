@@ -1,8 +1,8 @@
-"""A render kept on disk: its sums, and all that they depend on, in one file that is whole or not there.
+"""Checkpoint of a render: its sums and everything they depend on, in one file written atomically.
 
 The file is a zip of numpy arrays (an .npz), stored as they are: `sums.npy`, `done.npy` and `about.json`. Names, sizes
-and headers must be those that this render would write, before a byte reaches memory; the checksums of zip find what is
-damaged. `about.json` holds the identity of the render: what its picture depends on, as JSON that two renders can
+and headers must be those that this render would write, before a byte reaches memory; zip's checksums find damaged
+data. `about.json` holds the identity of the render: what its picture depends on, as JSON that two renders can
 compare.
 """
 
@@ -30,7 +30,7 @@ from neurolens.render.film import Film, FilmSettings, Tiling
 from neurolens.render.job import Job
 from neurolens.render.mesh import tracer
 
-# Settings of a camera that say where it was read and what was noted, not what it does.
+# Settings of a camera that do not affect its rays: where it was read and notes.
 _NO_MATTER = ("model", "notes")
 _NOTHING = "(nothing)"  # a place that one of two identities lacks
 _PROBES, _DIGITS = 1024, 16
@@ -43,13 +43,13 @@ _AGAIN = "or --restart to begin again"
 
 
 def identity(job: Job) -> dict[str, Any]:
-    """All that the sums of a film depend on, but for the number of samples.
+    """Everything that the sums of a film depend on, except the number of samples.
 
-    The scene is its tables, textures and meshes; the camera its settings and what it does with some rays. What traces
-    meshes counts, too, for a picture shall not be half of one rounding and half of another.
+    The scene is its tables, textures and meshes; the camera its settings and its results for some rays. The mesh
+    tracer is included, so that one picture does not mix two roundings.
     """
     scene, camera = job.scene, job.camera
-    # What is given apart, and may be other than the scene's.
+    # Given separately, may differ from the scene's.
     common = replace(scene.settings.camera, width=1, height=1, samples=1, max_depth=1, focus_m=1.0, f_number=None)
     bare = replace(scene, name="", settings=replace(scene.settings, camera=common, film=FilmSettings()))
     kept = {key: value for key, value in camera.settings.items() if key not in _NO_MATTER}
@@ -82,14 +82,14 @@ def _leaves(tree: Any, place: str = "") -> dict[str, Any]:
 
 
 def digest(value: Any) -> str:
-    """Hexadecimal digits that stand for a value made of dataclasses, mappings, sequences, arrays and plain values."""
+    """Hexadecimal digest of a value made of dataclasses, mappings, sequences, arrays and plain values."""
     hasher = hashlib.sha256()
     _feed(hasher, value)
     return hasher.hexdigest()[:_DIGITS]
 
 
 def _feed(hasher: Any, value: Any) -> None:
-    """Every part is preceded by what it is and how long, so that no two values read alike."""
+    """Every part is preceded by its type and length, so that different values never give the same bytes."""
     if isinstance(value, np.ndarray):
         hasher.update(f"array {value.dtype.str} {value.shape};".encode())
         hasher.update(np.ascontiguousarray(value).data)
@@ -114,7 +114,7 @@ def _feed(hasher: Any, value: Any) -> None:
 
 
 def _rays(camera: Camera) -> str:
-    """Digest of the rays of a fixed set of samples: no two cameras that differ share it."""
+    """Digest of the rays of a fixed set of samples, which tells cameras apart."""
     random = np.random.default_rng(0)
     film = ((random.random((2, _PROBES)) - 0.5) * np.array(camera.film_mm)[:, None]).astype(np.float32)
     low, high = camera.wavelength_nm or (400.0, 700.0)
@@ -126,7 +126,7 @@ def _rays(camera: Camera) -> str:
 
 
 def write_checkpoint(path: Path, film: Film, identity: dict[str, Any], spent: dict[str, float]) -> None:
-    """Write what a film has, while workers may go on.
+    """Write the film's present sums; workers may continue meanwhile.
 
     Args:
         identity: of the job. spent: seconds so far, by the names of `SPENT`.
@@ -154,13 +154,13 @@ def write_checkpoint(path: Path, film: Film, identity: dict[str, Any], spent: di
 
 
 def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[str, float]:
-    """Go on from a checkpoint: fill a film that is still empty, and return the seconds spent.
+    """Resume from a checkpoint: fill an empty film and return the seconds spent.
 
-    More samples than the checkpoint was made for go on from it, as long as none of its tiles has had a pass cut short
-    by the end: any multiple of 16 samples can be raised to any number.
+    More samples than the checkpoint was made for can be added as long as no tile had a shortened last pass: any
+    multiple of 16 samples can be raised to any number.
 
     Raises:
-        InputError: missing, not whole, or of another render; it names what differs.
+        InputError: missing, incomplete, or of another render; it names what differs.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -185,7 +185,7 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
         if isinstance(error, InputError):
             raise
         raise _corrupt(path, str(error) or type(error).__name__) from None
-    except (NotImplementedError, RuntimeError) as error:  # zip's own, of features that we do not write
+    except (NotImplementedError, RuntimeError) as error:  # raised by zipfile for features that are never written here
         raise _corrupt(path, str(error)) from None
 
 
@@ -210,7 +210,7 @@ def _short(value: Any) -> str:
 
 
 def _check_tiling(path: Path, about: dict[str, Any], tiling: Tiling) -> None:
-    """Tiles and passes are cut alike; only below 16 samples they depend on the number of samples."""
+    """Tiles and passes must be the same; only below 16 samples they depend on the number of samples."""
     if not isinstance(about["samples"], int) or not 1 <= about["samples"] < 1 << 31:
         raise _corrupt(path, f"{about['samples']} samples")
     spent = about["spent"]
@@ -222,7 +222,7 @@ def _check_tiling(path: Path, about: dict[str, Any], tiling: Tiling) -> None:
 
 
 def _check_samples(path: Path, samples: int, tiling: Tiling, done: NDArray[np.int64]) -> None:
-    """What is done of every tile is a part of what is asked now."""
+    """The passes of every tile must be a part of the requested ones."""
     if done.min() < 0 or done.max() > -(-samples // tiling.step):
         raise _corrupt(path, "impossible numbers of passes")
     had, counts = np.minimum(done * tiling.step, samples), tiling.samples_done(done)
@@ -236,14 +236,13 @@ def _check_samples(path: Path, samples: int, tiling: Tiling, done: NDArray[np.in
 
 
 def _header(array: NDArray[Any]) -> bytes:
-    """The header of an .npy file."""
     out = io.BytesIO()
     np.lib.format.write_array_header_1_0(out, np.lib.format.header_data_from_array_1_0(array))
     return out.getvalue()
 
 
 def _fill(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, array: NDArray[Any]) -> None:
-    """Read a member into an array of just its size and type; nothing else is taken, and no memory besides."""
+    """Read a member into an array of exactly its size and type; anything else is refused before memory is used."""
     header = _header(array)
     if info.file_size != len(header) + array.nbytes:
         raise _corrupt(path, f"{info.filename} of {info.file_size} bytes")

@@ -1,6 +1,6 @@
 """Colour spaces of a picture, and the adaptation from one white to another.
 
-The film gathers linear sRGB. Everything after that is one matrix a picture: other primaries, another white, a white
+The film gathers linear sRGB. Everything after that is one matrix: other primaries, another white, a white
 balance. Whites are adapted by von Kries scaling in the Bradford space.
 
 Sources: IEC 61966-2-1 (sRGB), Academy S-2014-004 (ACEScg: primaries AP1, the white of ACES near D60), SMPTE RP 177-1993
@@ -29,7 +29,6 @@ def xyz_of(xy: ArrayLike) -> Matrix:
 
 
 def _solve(matrix: Matrix, right: Matrix) -> Matrix:
-    """inverse(matrix) @ right."""
     return np.asarray(np.linalg.solve(matrix, right), np.float64)
 
 
@@ -45,7 +44,7 @@ class ColourSpace:
     """A linear RGB space.
 
     Attributes:
-        name: for people and for the command line. interop_id: what the attribute colorInteropID of an EXR says.
+        name: for display and the command line. interop_id: value of the attribute colorInteropID of an EXR.
         primaries: chromaticities (x, y) of red, green and blue. white: of (1, 1, 1).
     """
 

@@ -1,4 +1,4 @@
-"""What is seen infinitely far away: a colour, a gradient, a picture or the clear sky, and the sun.
+"""Light from infinity: a colour, a gradient, a picture or the clear sky, and the sun.
 
 In each direction it is a sum of up to three spectra of the palette. All but a single colour are aimed at, by a table of
 how bright they are in each direction; of a single colour, scattered rays are the best samples there are.
@@ -36,7 +36,7 @@ from neurolens.render.spectrum import Index, Palette
 
 Coefficients = Callable[[FloatArray], FloatArray]  # of the three spectra, [3, N] in directions [3, N]
 _TABLE = (128, 256)  # rows are even, so that the horizon is the edge of one
-# Share of the mean that every cell with light weighs at least: it may be brighter away from its middle.
+# Least weight of a cell with light, as a share of the mean: it may be brighter away from its middle.
 _FAINTEST = 0.02
 
 SUN_RADIUS_RAD = math.radians(0.533 / 2)
@@ -116,7 +116,7 @@ def total_spectrum(sky: Sky, direction: FloatArray) -> tuple[FloatArray64, NDArr
 
 
 class Surroundings(LightGroup):
-    """Light from infinitely far away: one light to aim at, if there are weights.
+    """Light from infinity: one light to aim at, if there are weights.
 
     Args:
         rows: of the palette, three spectra, or the one of a single colour.
@@ -165,7 +165,7 @@ class Surroundings(LightGroup):
 def make_surroundings(
     environment: Environment, sky: Sky | None, picture: FloatArray | None, palette: Palette
 ) -> Surroundings:
-    """The surroundings that a scene's tables describe; `picture` [H, W, 3] is that of the environment."""
+    """The environment of a scene's tables; `picture` [H, W, 3] is its picture."""
     if sky is not None:
         return _clear_sky(sky, palette)
     if picture is not None:
@@ -176,7 +176,6 @@ def make_surroundings(
 
 
 def _weights(palette: Palette, rows: list[int], coefficients: Coefficients, shape: tuple[int, int]) -> FloatArray:
-    """Brightness [H, W] in the middles of cells."""
     bright = np.maximum(palette.means(rows) @ coefficients(centres(*shape)), 0).reshape(shape)
     return np.where(bright > 0, np.maximum(bright, _FAINTEST * bright.mean()), 0)
 

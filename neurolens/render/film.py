@@ -1,4 +1,4 @@
-"""The film: which film point a pixel is, and the sums that gather there.
+"""The film: film points of pixels, and the accumulated sums.
 
 Sums of every pixel, by tiles and passes, lie in memory that forked workers share.
 """
@@ -38,7 +38,7 @@ RGB, LUMINANCE2, DEPTH, HITS, PASSED, DROPPED, COLUMNS = slice(0, 3), 3, 4, 5, 6
 # Of a render in the main process: the sums, and at the end picture and layers, in the writer's order too.
 BYTES_A_PIXEL = 8 * COLUMNS + 100
 _LONGEST_WAIT_S = 5.0
-_ASPECT_TOLERANCE = 0.02  # a picture whose pixels are this much out of square is a mistake, not a choice
+_ASPECT_TOLERANCE = 0.02  # larger deviations from square pixels are taken as mistakes
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class PixelGrid:
 
 
 def check_memory(width: int, height: int) -> None:
-    """Refuse a picture before memory is taken for it.
+    """Refuse a picture that is too large before memory is allocated.
 
     Raises:
         InputError: its film alone would fill the machine.
@@ -103,14 +103,14 @@ def check_memory(width: int, height: int) -> None:
     try:
         most = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):
-        return  # a system that does not say
+        return  # not known on this system
     if width * height * BYTES_A_PIXEL > most:
         expected = f"at most {most // BYTES_A_PIXEL} pixels: each takes {BYTES_A_PIXEL} bytes, of {most / 1e9:.3g} GB"
         raise InputError("picture", "width x height", (width, height), expected)
 
 
 def fork_context() -> Any:
-    """Where locks and processes come from: forked ones on Linux."""
+    """The multiprocessing context: fork on Linux."""
     return multiprocessing.get_context("fork" if FORKS else None)
 
 
@@ -118,7 +118,7 @@ def shared(shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
     """Zeros that forked workers share.
 
     Raises:
-        MemoryError: the system has not as much to give.
+        MemoryError: not enough memory.
     """
     size = int(np.prod(shape, dtype=np.float64)) * np.dtype(dtype).itemsize
     try:
@@ -134,7 +134,7 @@ class Tiling:
     A function of the picture alone. What a worker holds at a time depends on a tile, not on the picture.
 
     Attributes:
-        pixels, samples: of the picture. tile: pixels a tile. step: samples a pass; the last pass may have fewer.
+        pixels, samples: of the picture. tile: pixels per tile. step: samples per pass; the last pass may have fewer.
     """
 
     pixels: int
@@ -144,7 +144,7 @@ class Tiling:
 
     @classmethod
     def of(cls, pixels: int, samples: int) -> Tiling:
-        """Tiles of about `BATCH` paths a pass."""
+        """Tiles of about `BATCH` paths per pass."""
         step = min(samples, SAMPLES_A_PASS)
         return cls(pixels, samples, max(1, BATCH // step), step)
 
@@ -175,7 +175,7 @@ class Film:
     """Sums of the pixels and how many passes are in them.
 
     Sums and passes of a tile change together, with the lock held: whoever copies them under the lock has a whole tile,
-    and a worker that is killed while somebody else holds the lock leaves none half done.
+    and a worker that is killed without the lock leaves no tile half done.
 
     Attributes:
         sums: [pixels, COLUMNS] float64. done: [tiles] passes finished.
@@ -195,10 +195,10 @@ class Film:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep all tiles as they are inside the block.
+        """Block changes of all tiles inside the block.
 
         Raises:
-            NeurolensError: the lock does not come free, for a worker was killed while it held it.
+            NeurolensError: the lock is not released, as a worker was killed while it held it.
         """
         if not self.lock.acquire(timeout=_LONGEST_WAIT_S):
             raise NeurolensError("a render worker was killed while it wrote to the film")

@@ -1,6 +1,6 @@
 """Spectra of light: the CIE's tables and illuminants, daylight, black bodies and measured spectra.
 
-Only the shape of a spectrum is used: the emission of a light says how bright it is. Every spectrum is scaled as a
+Only the shape of a spectrum is used: the emission of a light sets its brightness. Every spectrum is scaled as a
 whole, which keeps its chromaticity, so that emission 1 has the luminance of daylight D65 of emission 1.
 
 Sources: CIE 15:2018 (illuminants A, D50, D65, E), CODATA 2018 (second radiation constant).
@@ -91,10 +91,10 @@ def check_spectrum(file: Path, field: str, rows: Sequence[Sequence[float]], most
 
 
 def read_spectrum(scene: Path, field: str, path: Path, most: float | None = None) -> Spectrum:
-    """A CSV file of rows "nm, value"; a line of words may come first, and lines that start with # are passed over.
+    """A CSV file of rows "nm, value"; a header may come first, and lines that start with # are skipped.
 
     Raises:
-        InputError: missing, too large, no numbers, or what `check_spectrum` refuses.
+        InputError: missing, too large, not numbers, or refused by `check_spectrum`.
     """
     try:
         if path.stat().st_size > _LARGEST_FILE:
@@ -147,7 +147,7 @@ def illuminant(name: str, measured: Mapping[str, Spectrum] | None = None) -> Spe
 
 
 def check_name(file: str | Path, field: str, name: str, measured: Mapping[str, object]) -> None:
-    """Refuse a name that stands for no spectrum.
+    """Refuse an unknown name of a spectrum.
 
     Raises:
         InputError: names file, field and what is known.

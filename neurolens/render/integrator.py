@@ -96,7 +96,7 @@ class Vertex:
         normal *= sign
         if self.smooth:
             shading *= sign
-            # An interpolated normal that turns away from the ray is of no use: take the true one.
+            # An interpolated normal that faces away from the ray is replaced by the true one.
             np.copyto(shading, normal, where=dot(shading, paths.direction) > -1e-3)
         self.facing, self.shading = normal, shading
         # How far to step off the surface, m: the rounding of a hit grows with the distance travelled.
@@ -295,7 +295,6 @@ def trace(
 
 
 def _add_environment(world: World, paths: Paths, found: NDArray[np.int32], aim: bool, radiance: FloatArray) -> None:
-    """Light from paths that leave the scene."""
     if world.dark:
         return
     rows = np.flatnonzero(found < 0)

@@ -38,11 +38,11 @@ class Job:
     """One render: the scene made ready, and memory shared by the workers.
 
     Attributes:
-        scene, camera, grid, seed, max_depth, settings, differentials: as asked for; settings are those of the film.
+        scene, camera, grid, seed, max_depth, settings, differentials: as requested; settings are those of the film.
         mode: how wavelengths are taken. balance: matrix [3, 3] on the film's linear sRGB that makes the light of the
             white balance neutral; where there is none, `neutral`. luminance_row: [3], of the film's sRGB after that.
         paths_a_sample: lanes of a sample; film: see `Film`.
-        seconds: [2] of all workers: in the camera, and in all.
+        seconds: [2] of all workers: in the camera, and total.
         message: text of a worker's error. stop: set to end the work early.
     """
 
@@ -135,7 +135,7 @@ class Job:
         """Distance along the optical axis from the film's plane to what camera rays hit first."""
         hit, shape = np.isfinite(distance), (len(sums), -1)
         away = -self._axes[:, 2]
-        with np.errstate(over="ignore", invalid="ignore"):  # rays that do not pass hold anything
+        with np.errstate(over="ignore", invalid="ignore"):  # rays that do not pass have arbitrary values
             depth = away @ (origin - self._position[:, None])
             depth += distance * (away @ direction)
         hit &= np.isfinite(depth)
@@ -177,7 +177,7 @@ class Job:
         return origin, direction, weight
 
     def _camera_wavelengths(self, hue: FloatArray) -> FloatArray:
-        """Wavelengths for the camera; one that does not disperse gets them clipped to what it was made for."""
+        """Wavelengths for the camera, clipped to its range if it does not disperse."""
         wavelengths = self.spectral.wavelengths_nm(hue)
         accepted = self.camera.wavelength_nm
         if accepted is not None:
@@ -186,7 +186,6 @@ class Job:
 
 
 def _turned(hue: FloatArray, by: FloatArray | np.float32) -> FloatArray:
-    """Numbers in [0, 1) turned round."""
     turned = hue + by
     turned -= turned >= 1
     return turned
@@ -203,7 +202,7 @@ MEANING = {
 
 @dataclass(frozen=True)
 class Layers:
-    """What a picture says of its own pixels, [H, W] float32 each.
+    """Additional channels of a picture, [H, W] float32 each.
 
     Attributes:
         samples, depth, blocked: see `MEANING`; what is in focus is at depth `focus_m`.
@@ -219,9 +218,8 @@ class Layers:
 
 
 def develop(job: Job) -> tuple[FloatArray, Layers]:
-    """Picture [H, W, 3] float32 linear sRGB and its layers; each tile is divided by the samples that it has.
-
-    It may be called while the workers go on.
+    """Picture [H, W, 3] float32 linear sRGB and its layers, each tile divided by its samples so far; safe while workers
+    run.
     """
     tiling, grid = job.tiling, job.grid
     rgb = np.zeros((tiling.pixels, 3), np.float32)

@@ -1,4 +1,4 @@
-"""All lights of a scene that can be aimed at, as one: rectangles, discs, spheres, points and spots.
+"""The lights of a scene that can be sampled: rectangles, discs, spheres, points and spots.
 
 A light is chosen partly by how much it lights the point that the camera looks at, partly at random. Its group then
 gives a direction towards it: a rectangle and a disc are sampled uniformly over their area, a sphere over the cone that
@@ -31,7 +31,7 @@ class LightSamples:
         direction: [3, N] unit vectors. distance: [N] m, to the light's surface, inf to the sky. light: [N] its number.
         inverse_pdf: [N] 1 / density per solid angle, choice of the light included; 0 where the light shows its back,
             and for lights without size, which no scattered ray finds.
-        scale: [N] what the light's emission is multiplied by: the same, and for lights without size the irradiance of
+        scale: [N] factor of the light's emission: the same, and for lights without size the irradiance of
             intensity 1 over the probability of the choice.
     """
 
@@ -133,7 +133,7 @@ class Lights:
 def _irradiance(
     area: NDArray[np.floating], middle: NDArray[np.floating], emission: Sequence[Vector], target_m: Vector
 ) -> NDArray[np.float64]:
-    """About that at a point, of lights [n] of some area that they show it, the three colours added up."""
+    """About the irradiance at a point from lights [n] of a visible area, the three colours added up."""
     away2 = np.sum((middle - np.array(target_m)) ** 2, axis=1)
     return area * np.array([sum(rgb) for rgb in emission]) / np.maximum(away2, 1e-6)
 
@@ -213,7 +213,7 @@ class SphereLights(LightGroup):
 
 
 class PointLights(LightGroup):
-    """Points, then spots, which only aiming at them finds; a point is a spot that shines everywhere."""
+    """Points, then spots, found only by sampling lights; a point is a spot that emits in all directions."""
 
     sizeless = True
 

@@ -91,7 +91,7 @@ def _albedos(alpha: float) -> list[tuple[NDArray[np.float64], NDArray[np.float64
     """Cosines and S, cosines and T, by quadrature over visible normals, which the lobe is smooth in."""
     cosine = ((np.arange(_NODES) + 1) / _NODES) ** 2
     around, outwards = (np.arange(_AROUND) + 0.5) / _AROUND, (np.arange(_OUTWARDS) + 0.5) / _OUTWARDS
-    # The tail of the lobe, from which light is lost, is a narrow strip at 1: nodes are dense there.
+    # The tail of the lobe, where light is lost, is a narrow strip at 1: nodes are dense there.
     u, v = (x.ravel() for x in np.meshgrid(around, 1 - (1 - outwards) ** 3))
     weight = np.repeat(3 * (1 - outwards) ** 2, _AROUND) / u.size
     cos_out = np.repeat(cosine, u.size)

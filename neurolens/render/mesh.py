@@ -1,7 +1,7 @@
 """Triangle meshes: a bounding-volume tree traversed by whole batches of rays.
 
 Nodes have 16 children and leaves 8 triangles: few levels, and at each level one dense test of every (ray, node) pair
-against 16 boxes or 8 triangles, which is what numpy does fast. Triangles carry the three planes of Havel and Herout
+against 16 boxes or 8 triangles, which suits numpy. Triangles carry the three planes of Havel and Herout
 2010, "Yet faster ray-triangle intersection".
 
 Where the Python binding of Embree is installed (`pip install neurolens[embree]`), Embree takes the place of the tree.
@@ -21,7 +21,7 @@ from neurolens.render.primitives import NEAREST, FloatArray64, IntArray, Primiti
 
 _BRANCHES, _LEAF = 16, 8
 _PAIRS_AT_ONCE = 4096  # keeps the [pairs, 8] temporaries inside the L2 cache
-_STEP = np.float32(1e-5)  # m by which a ray starts again that met the surface that it leaves
+_STEP = np.float32(1e-5)  # m by which a ray that met its own start surface is moved on
 
 
 def _split(rows: NDArray[np.intp], centres: FloatArray64) -> list[NDArray[np.intp]]:
@@ -84,7 +84,7 @@ class Mesh:
         boxes, children, leaves = _tree(corners.mean(axis=1), low, high)
         self._low, self._high = low.min(axis=0).astype(np.float32), high.max(axis=0).astype(np.float32)
         bounds = np.array(boxes)  # [nodes, 16, 6]
-        # A hair wider, so that rounding to float32 never cuts a triangle off.
+        # Slightly wider, so that rounding to float32 never cuts a triangle off.
         grow = 1e-6 * max(1.0, float(np.abs(vertices).max()))
         self._node_low = np.ascontiguousarray((bounds[..., :3] - grow).transpose(2, 0, 1), np.float32)
         self._node_high = np.ascontiguousarray((bounds[..., 3:] + grow).transpose(2, 0, 1), np.float32)
@@ -183,7 +183,7 @@ def make_mesh(first: int, vertices: FloatArray64, faces: NDArray[np.int64]) -> P
 
 
 def tracer() -> str:
-    """What `make_mesh` makes meshes hit with: their hits differ by rounding."""
+    """Name of the tracer that `make_mesh` uses: hits of tracers differ by rounding."""
     try:
         _library()
     except ImportError:
@@ -192,7 +192,7 @@ def tracer() -> str:
 
 
 def _library() -> tuple[Any, Any]:
-    """The parts of embreex; by name, as nothing is known of their types."""
+    """The modules of embreex, imported by name as they are untyped."""
     return import_module("embreex.mesh_construction"), import_module("embreex.rtcore_scene")
 
 
@@ -216,7 +216,7 @@ class EmbreeMesh:
         entry, exit_ = slabs(rays, self._low, self._high)
         np.minimum(exit_, best, out=exit_)
         np.maximum(entry, NEAREST, out=entry)
-        # The box is flat where the mesh is: a hair of slack keeps what lies in it.
+        # The box of a flat mesh is flat: a small margin keeps its triangles inside.
         ray = np.flatnonzero(entry * np.float32(1 - 1e-5) <= exit_)
         start = rays.origin.take(ray, axis=1)
         moved = np.zeros(len(ray), np.float32)

@@ -1,7 +1,7 @@
 """Reads triangle meshes: OBJ and PLY files through trimesh, or tables of the scene itself.
 
-trimesh passes over what it does not understand. Files are therefore looked through first, so that no vertex and no face
-of one is lost without a word; its loaders then do the reading, without merging or mending anything. Texture coordinates
+trimesh ignores what it does not understand. Files are therefore checked first, so that no vertex and no face is lost
+silently; its loaders then read them, without merging or repairing. Texture coordinates
 and normals of an OBJ file count where every face has them.
 """
 
@@ -123,7 +123,7 @@ def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
         raise
     except OSError as error:
         raise InputError(scene, field, str(path), f"a mesh file that can be read ({error.strerror})") from None
-    except Exception as error:  # trimesh raises whatever its parsing runs into
+    except Exception as error:  # trimesh raises exceptions of many types
         raise InputError(scene, field, str(path), f"a mesh file that trimesh can read ({error})") from None
     if len(mesh.faces) < least:
         raise InputError(scene, field, str(path), f"{least} triangles, as the file says, not {len(mesh.faces)}")
@@ -133,8 +133,8 @@ def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
 def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[TriangleSet, int]:
     """The triangles of an OBJ file, and how many its faces should give.
 
-    The loader passes over lines that it does not understand; here they are refused. So are indices beyond the lines
-    before, which it takes for texture coordinates or normals that are not there. It gets the lines in one form, their
+    The loader ignores lines that it does not understand; here they are refused. So are indices beyond the lines
+    before, which it takes for missing texture coordinates or normals. It gets the lines in one form, their
     indices counted from 1, also those that the file counts back from the line before: -1 is the last one so far.
     """
     from trimesh.exchange.obj import load_obj
@@ -168,7 +168,7 @@ def _counted_from_one(scene: Path, field: str, corners: list[str], counts: dict[
 
     Refused are corners that refer to something that does not come before them, and corners of unlike forms.
     """
-    if len({tuple(map(bool, corner.split("/"))) for corner in corners}) > 1:  # the loader would take one for another
+    if len({tuple(map(bool, corner.split("/"))) for corner in corners}) > 1:  # the loader would confuse them
         raise InputError(scene, field, " ".join(corners)[:60], "corners of the same form, as in 1/1 2/2 3/3")
     counted = []
     for corner in corners:
@@ -185,7 +185,7 @@ def _counted_from_one(scene: Path, field: str, corners: list[str], counts: dict[
 
 
 def _read_ply(scene: Path, field: str, path: Path, content: bytes) -> tuple[TriangleSet, int]:
-    """The triangles of a PLY file, and how many faces its header promises; no more than the file can hold."""
+    """The triangles of a PLY file, and the number of faces in its header, at most as many as the file can hold."""
     from trimesh.exchange.ply import load_ply
 
     head, end, _ = content[:_LARGEST_HEADER].partition(b"end_header")

@@ -1,7 +1,7 @@
 """Pictures in and out: OpenEXR, the PNG preview, textures, environments, and the masks of apertures.
 
-The OpenEXR library writes garbage for arrays that are not contiguous, changes the header it is given, and refuses
-float64 and int32; `write_exr` takes care of all three. What a scene names is bounded before it is decoded.
+The OpenEXR library writes wrong data for arrays that are not contiguous, changes the header it is given, and refuses
+float64 and int32; `write_exr` handles all three. The size of pictures named by a scene is checked before decoding.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from neurolens.render.scenetables import BRIGHTEST
 METADATA_KEY = "neurolens"
 _HALF_MAX = 65504.0
 _COLOURS = "RGB"
-LARGEST_PICTURE, LARGEST_ENVIRONMENT = 8192, 4096  # pixels a side
-_DEPTH = "Z"  # the name that other programs know
+LARGEST_PICTURE, LARGEST_ENVIRONMENT = 8192, 4096  # pixels per side
+_DEPTH = "Z"  # the name of depth in other programs
 
 
 def write_exr(
@@ -40,7 +40,7 @@ def write_exr(
     space: ColourSpace = SRGB,
     layers: Mapping[str, ArrayLike] | None = None,
 ) -> None:
-    """Write a picture as OpenEXR: channels R, G and B, then layers, ZIP compression, whole or not at all.
+    """Write a picture as OpenEXR: channels R, G and B, then layers, ZIP compression, atomically.
 
     The attributes chromaticities, adoptedNeutral and colorInteropID say which colour space it is.
 
@@ -86,7 +86,7 @@ def write_exr(
             OpenEXR.File([OpenEXR.Part(header, channels)]).write(str(temporary))
         except RuntimeError as error:  # the library's only kind; it names the temporary file
             said = str(error).replace(str(temporary), path.name)
-            raise InputError(path, "file", f"({said})", "a place that can be written") from None
+            raise InputError(path, "file", f"({said})", "a writable path") from None
 
 
 def _shaped(path: str | Path, picture: NDArray[Any]) -> NDArray[Any]:
@@ -143,7 +143,7 @@ def _read_channels(
     """All channels as float32, and the text of our metadata.
 
     Args:
-        place: file and field that name the picture, if there are others than the picture itself. most: pixels a side.
+        place: file and field that name the picture, if there are others than the picture itself. most: pixels per side.
     """
     file, field = place or (path, "file")
     name = str(path) if place else "(missing)"
@@ -153,7 +153,7 @@ def _read_channels(
         with OpenEXR.File(str(path), header_only=True) as header:
             low, high = header.header()["dataWindow"]
         if most is not None and max(high[k] - low[k] + 1 for k in range(2)) > most:
-            raise InputError(file, field, name, f"a picture of at most {most} pixels a side")
+            raise InputError(file, field, name, f"a picture of at most {most} pixels per side")
         with OpenEXR.File(str(path), separate_channels=True) as whole:
             part = whole.parts[0]
             planes = {name: np.array(channel.pixels, np.float32) for name, channel in part.channels.items()}
@@ -165,7 +165,7 @@ def _read_channels(
 
 
 def write_png(path: str | Path, rgb: ArrayLike, exposure: float = 0.0) -> None:
-    """Write an 8-bit sRGB preview of a linear picture [H, W, 3], brighter by `exposure` stops, whole or not at all.
+    """Write an 8-bit sRGB preview of a linear picture [H, W, 3], brighter by `exposure` stops, atomically.
 
     Raises:
         InputError: another shape.
@@ -178,11 +178,11 @@ def write_png(path: str | Path, rgb: ArrayLike, exposure: float = 0.0) -> None:
 
 @contextmanager
 def _opened(file: str | Path, field: str, path: Path, most: int) -> Iterator[Image.Image]:
-    """A picture of at most `most` pixels a side; mistakes name file and field."""
+    """A picture of at most `most` pixels per side; mistakes name file and field."""
     try:
         with Image.open(path) as picture:
             if max(picture.size) > most:
-                raise InputError(file, field, str(path), f"a picture of at most {most} pixels a side")
+                raise InputError(file, field, str(path), f"a picture of at most {most} pixels per side")
             yield picture
     except FileNotFoundError:
         raise InputError(file, field, str(path), "a picture that exists") from None
@@ -208,7 +208,7 @@ def read_picture(scene: Path, field: str, path: Path, most: int = LARGEST_PICTUR
 
 
 def read_environment(scene: Path, field: str, path: Path, scale: float = 1.0) -> FloatArray:
-    """Linear sRGB [H, W, 3] of an equirectangular picture, OpenEXR or whatever Pillow reads; not yet times `scale`.
+    """Linear sRGB [H, W, 3] of an equirectangular picture, OpenEXR or a format of Pillow; not yet times `scale`.
 
     Raises:
         InputError: as `read_picture`; also a picture that is not twice as wide as high, values that are negative or not
@@ -237,7 +237,7 @@ def make_aperture(
     curvature: float | None = None,
     mask: str | Path | None = None,
 ) -> Aperture | None:
-    """The stop's shape of a command line or a scene; None where nothing is said.
+    """The stop's shape of a command line or a scene; None if not given.
 
     Raises:
         InputError: blades and a mask together, a rotation or curvature of nothing, a picture that cannot be read.
@@ -245,7 +245,7 @@ def make_aperture(
     if blades is None and mask is None:
         if rotation_deg is None and curvature is None:
             return None
-        raise InputError("aperture", "blades", "(missing)", "a number of blades, or a mask, that the others shape")
+        raise InputError("aperture", "blades", "(missing)", "a number of blades, or a mask, with the other options")
     if blades is not None and mask is not None:
         raise InputError("aperture", "mask", str(mask), "blades or a mask, not both")
     if mask is not None and curvature is not None:
@@ -257,7 +257,7 @@ def make_aperture(
 def read_mask(path: str | Path) -> NDArray[np.bool_]:
     """The opening that a picture shows, [H, W] bool: light passes where it is brighter than half, and opaque.
 
-    Grey means no half transmission: a ray passes or it does not. The longer side of the picture spans the stop.
+    There is no partial transmission: a ray passes or it does not. The longer side of the picture spans the stop.
 
     Raises:
         InputError: a picture that is missing, cannot be read, is too large, or dark all over.

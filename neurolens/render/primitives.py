@@ -56,7 +56,7 @@ def dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _parts(vector: FloatArray64) -> list[tuple[int, np.float32]]:
-    """Components that are not 0, with their axes: walls mostly have one."""
+    """Components that are not 0, with their axes: most walls have one."""
     return [(k, np.float32(v)) for k, v in enumerate(vector) if v]
 
 
@@ -209,7 +209,7 @@ def slabs(rays: Rays, low: FloatArray, high: FloatArray) -> tuple[FloatArray, Fl
     return entry, exit_
 
 
-_LARGE_M = 1000.0  # the rounding of float32 puts the surface of larger spheres behind the rays that leave it
+_LARGE_M = 1000.0  # in float32 the surface of larger spheres would lie behind the rays that leave it
 
 
 class Spheres:
@@ -229,12 +229,12 @@ class Spheres:
         self._kind: type[np.floating[Any]] = np.float64 if radii.max() > _LARGE_M else np.float32
         self._centre: Any = centres.T.astype(self._kind)
         self._radius: Any = radii.astype(self._kind)
-        # A hair of 2e-6 of the squared distances covers the rounding of the products.
+        # A margin of 2e-6 of the squared distances covers the rounding of the products.
         slack, ones = 2e-6, np.ones(len(radii))
         constant = radii**2 - (1 - slack) * np.sum(centres**2, axis=1)
         self._along = np.column_stack([centres, -ones]).astype(np.float32)
         self._rest = np.column_stack([2 * centres, constant, (slack - 1) * ones]).astype(np.float32)
-        # As many rays as keep the product so small that BLAS does not start threads of its own.
+        # Few enough rays that BLAS does not start its own threads for the product.
         self._rays_at_once = int(np.clip(200_000 // (5 * len(radii)), 64, 4096))
 
     def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:

@@ -1,4 +1,4 @@
-"""Renders a scene through a camera, with what goes on beside: progress, a preview, checkpoints, an early end."""
+"""Renders a scene through a camera, with progress, previews, checkpoints and an early end."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ _MOST_SAMPLES = 1 << 20
 
 @dataclass(frozen=True)
 class Watch:
-    """How a long render is kept safe.
+    """Previews, checkpoints and early end of a long render.
 
     Attributes:
         preview: called with the picture so far, [H, W, 3] linear sRGB, at most every `preview_s` seconds.
         checkpoint: file that the render is kept in every `checkpoint_s` seconds, when it is stopped and when it fails,
             and that it goes on from where it exists. Once written it stays until the caller, who then has the picture,
             removes it.
-        restart: begin again, whatever the checkpoint holds.
+        restart: ignore an existing checkpoint.
         keep: write the checkpoint of a render that is complete, too, to add samples later.
-        stop: asked now and then; True ends the render with what it has.
-        note: told in one line what went wrong beside the render, such as a preview that could not be written.
+        stop: polled; True ends the render with the present samples.
+        note: called with a line on failures that do not end the render, such as a preview that could not be written.
     """
 
     preview: Callable[[FloatArray], None] | None = None
@@ -51,7 +51,7 @@ class Watch:
 
 
 class Keeper:
-    """Does what a `Watch` asks for, for one job.
+    """Carries out a `Watch` for one job.
 
     Attributes:
         resumed: share of the work that was done before.
@@ -78,7 +78,7 @@ class Keeper:
         return self._earlier_s + time.perf_counter() - self._began
 
     def __call__(self) -> bool:
-        """What is due; True where the render shall stop."""
+        """Do what is due; True if the render is to stop."""
         watch, fraction, now = self._watch, self._job.film.fraction, time.perf_counter()
         if self._progress is not None and fraction > self.resumed:
             pace = (now - self._began) / (fraction - self.resumed)
@@ -90,31 +90,31 @@ class Keeper:
         return watch.stop()
 
     def save(self) -> None:
-        """Write the checkpoint, where there is one to write and something to keep that it has not yet."""
+        """Write the checkpoint, if one is named and it lacks finished work."""
         fraction = self._job.film.fraction
         if self._watch.checkpoint is None or not fraction:
             return
         if self._kept == fraction and self._watch.checkpoint.exists():
-            return  # a disk may have no room for another
+            return  # the disk may lack room for another
         camera, every = (float(s) for s in self._job.seconds)
         spent = {"seconds": self.seconds, "camera_thread_seconds": camera, "thread_seconds": every}
         write_checkpoint(self._watch.checkpoint, self._job.film, self._identity, spent)
         self._written, self._kept = True, fraction
 
     def finish(self) -> None:
-        """Keep a render that stopped; one that is complete only where a checkpoint would else tell of less of it."""
+        """Keep a render that stopped; a complete one only to update an older checkpoint."""
         if self._watch.keep or self._written or self._job.film.fraction < 1:
             self._try("checkpoint", self.save)
 
     def rescue(self, error: NeurolensError) -> NeurolensError:
-        """Keep what a render that failed had; the error, with where that is."""
+        """Keep the samples of a failed render; returns the error with the place of the checkpoint."""
         self._try("checkpoint", self.save)
         if not self._written:
             return error
-        return NeurolensError(f"{error}; what was done is kept in {self._watch.checkpoint}: the same command goes on")
+        return NeurolensError(f"{error}; what was done is kept in {self._watch.checkpoint}: the same command resumes")
 
     def _try(self, what: str, act: Callable[[], None], pause_s: float = 0.0) -> float:
-        """Do what the render can do without, and say when next; the first failure of a kind is told."""
+        """Do an optional action and return the time of the next; the first failure of each kind is reported."""
         began = time.perf_counter()
         try:
             act()
@@ -138,8 +138,8 @@ class RenderResult:
             passed_fraction, thread_seconds (summed over the workers), camera_thread_seconds (of these, in the camera),
             camera_fraction (their ratio), dropped_samples (not finite; they count as black). Seconds and dropped
             samples count those before a checkpoint, too.
-        layers: what the picture says of its own pixels.
-        save: writes the checkpoint that the watch names, for one who cannot write the picture; raises OSError or
+        layers: additional channels.
+        save: writes the watch's checkpoint, for use if the picture cannot be written; raises OSError or
             NeurolensError. None without a watch that names one.
     """
 
@@ -169,15 +169,15 @@ def render(
     The result depends on the seed, not on the number of threads, nor on whether it was interrupted and went on from a
     checkpoint: bit for bit, on one machine with one set of packages. Cameras share all random numbers. Samples are
     taken in the order of the Sobol' sequence, so that more can be added to those that a checkpoint has. Memory: the
-    film's sums, picture and layers, 164 bytes a pixel at most, and for each worker what one tile takes, whatever the
+    film's sums, picture and layers, 164 bytes per pixel at most, and for each worker what one tile takes, whatever the
     size of the picture.
 
     Args:
         width, height, samples, max_depth: as in `CameraSettings`; left out, those of the scene.
         film: spectral sampling and white balance; left out, those of the scene.
-        threads: workers. A camera may have `for_worker() -> Camera`, called once in each, to open sessions of its own.
-        differentials: ask the camera for ray differentials, too. Nothing uses them: for measuring what they cost.
-        progress: called now and then with the fraction done and the estimated seconds left.
+        threads: workers. A camera may have `for_worker() -> Camera`, called once in each, to open its own sessions.
+        differentials: also compute ray differentials, which are not used: to measure their cost.
+        progress: called with the fraction done and the estimated seconds left.
         watch: previews, checkpoints and an early end.
 
     Raises:
@@ -211,7 +211,7 @@ def render(
     keeper.finish()
     rgb, layers = develop(job)
     stats = {"scene": scene.name, "threads": threads, **_stats(job, seconds)}
-    # Else a result would keep the film's sums in memory.
+    # Otherwise the result would keep the film's sums in memory.
     save = keeper.save if watch is not None and watch.checkpoint is not None else None
     return RenderResult(rgb, stats, layers, save)
 
@@ -247,7 +247,7 @@ def _stats(job: Job, seconds: float) -> dict[str, Any]:
 
 
 def _check_differentials(camera: Camera) -> None:
-    """Ask for the differentials of one ray, so that a camera without them is found before the work."""
+    """Compute the differentials of one ray, to reject a camera without them before the work."""
     ask = getattr(camera, "sample_differentials", None)
     if ask is None:
         raise InputError("render", "differentials", True, f"left out: camera {camera.name} has none")

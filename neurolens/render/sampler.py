@@ -40,7 +40,6 @@ _JOE_KUO: tuple[tuple[int, int, tuple[int, ...]], ...] = (
 
 
 def _direction_numbers(dimension: int) -> list[int]:
-    """The 32 direction numbers of a 0-based dimension."""
     if dimension == 0:
         return [1 << (31 - k) for k in range(32)]
     degree, coefficients, first = _JOE_KUO[dimension - 1]
@@ -65,7 +64,7 @@ def sobol(count: int, dimensions: int = _SOBOL_DIMENSIONS) -> UInt32Array:
 
 
 def hash32(x: UInt32Array) -> UInt32Array:
-    """A bijection of 32-bit integers that mixes all bits (two rounds of xor-shift and multiply); x is not changed."""
+    """A bijection of 32-bit integers that mixes all bits (two rounds of xor-shift and multiply); x is unchanged."""
     x = x ^ (x >> np.uint32(16))
     x *= np.uint32(0x7FEB352D)
     x ^= x >> np.uint32(15)
@@ -75,7 +74,6 @@ def hash32(x: UInt32Array) -> UInt32Array:
 
 
 def _reverse_bits(x: UInt32Array) -> UInt32Array:
-    """Bits in reverse order."""
     x = x.byteswap()
     for shift, mask in ((4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
         low = x & np.uint32(mask)
@@ -95,7 +93,7 @@ def _to_unit(bits: UInt32Array) -> FloatArray:
 
 @dataclass(frozen=True)
 class PathKeys:
-    """What identifies paths to the sampler.
+    """Keys of paths for the sampler.
 
     Attributes:
         pixel: [N] hashed pixel number and seed.
@@ -117,11 +115,11 @@ class PathKeys:
 
 
 class Sampler:
-    """Samples for a picture of `samples` samples a pixel.
+    """Samples for a picture of `samples` samples per pixel.
 
     Args:
-        samples: samples a pixel; a power of two stratifies best.
-        seed: another seed, other numbers.
+        samples: samples per pixel; a power of two stratifies best.
+        seed: of the random numbers.
     """
 
     def __init__(self, samples: int, seed: int) -> None:

@@ -1,6 +1,6 @@
 """A scene: the TOML file, then the pictures, meshes and spectra it names, with every reference checked.
 
-What the tables of shapes, materials and lights mean stands in `neurolens.render.scenetables`.
+The tables of shapes, materials and lights are defined in `neurolens.render.scenetables`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _WALLS = ("left", "right", "floor", "ceiling", "far", "near")
 
 @dataclass(frozen=True)
 class CameraSettings(Checked):
-    """Where the camera stands and what it takes; which camera it is, the caller of `render` decides.
+    """Place, film and picture of the camera; the camera itself is chosen by the caller of `render`.
 
     Attributes:
         position_m: film-plane centre. look_at_m: a point on the optical axis. up: points to the picture's top.
@@ -102,7 +102,7 @@ class Scene:
     Attributes:
         name: the file's name without ending. settings: the tables of the file.
         images: linear RGB [H, W, 3] of each image texture. triangles: one a mesh.
-        aperture: shape of the stop's opening, None where the scene says nothing.
+        aperture: shape of the stop's opening, None if not given.
         illuminants, reflectances: measured spectra by name.
         environment: linear RGB [H, W, 3] of the environment's picture, if it has one.
     """
@@ -162,7 +162,6 @@ def _aperture(path: Path, camera: CameraSettings) -> Aperture | None:
 
 
 def _illuminants(path: Path, settings: SceneSettings) -> dict[str, Spectrum]:
-    """The measured illuminants; every light's illuminant exists."""
     low, high = settings.camera.wavelengths_nm
     measured = _spectra(path, "illuminants", settings.illuminants, settings.camera)
     for name, (nm, values) in measured.items():
@@ -203,7 +202,7 @@ def _spectra(
 
 
 def _check_references(path: Path, settings: SceneSettings, triangles: Sequence[TriangleSet]) -> None:
-    """Every material, texture and reflectance that is named exists, and textures lie where they can."""
+    """Check that named materials, textures and reflectances exist, and that textures fit their shapes."""
     materials, textures = settings.materials or {}, settings.textures or {}
     for name, material in materials.items():
         if material.texture is not None:
@@ -246,7 +245,7 @@ def _check_texture(
 
 
 def _check_camera(path: Path, settings: SceneSettings, triangles: Sequence[TriangleSet]) -> None:
-    """The middle of the film is in nothing solid: a sphere, a box, or a closed mesh with its front outside."""
+    """Check that the film's centre is not inside a solid: a sphere, a box, or a closed mesh with its front outside."""
     at = np.array(settings.camera.position_m)
     spheres, boxes = settings.spheres, settings.boxes
     solids: dict[str, Any] = {f"meshes[{k}]": encloses(mesh, at) for k, mesh in enumerate(triangles)}
@@ -259,7 +258,7 @@ def _check_camera(path: Path, settings: SceneSettings, triangles: Sequence[Trian
 
 
 def files_named(tables: Any) -> Iterator[Path]:
-    """Every file that a scene's tables name, as it is written there."""
+    """Every file named in a scene's tables, as written."""
     if isinstance(tables, Path):
         yield tables
     elif is_dataclass(tables):

@@ -1,4 +1,4 @@
-"""The tables of a scene file that say what stands and shines in it: shapes, materials, textures, lights, the sky.
+"""The tables of a scene file: shapes, materials, textures, lights, the sky.
 
 Frozen dataclasses, checked one by one; the reader (`neurolens.render.scene`) adds the file to their errors. Metres, y
 up, colours linear sRGB.
@@ -37,7 +37,7 @@ def require(ok: bool, field: str, value: object, expected: str) -> None:
         raise InputError("scene", field, value, expected)
 
 
-Rule = tuple[Callable[[Any], bool], str]  # whether a value is right, and what is expected
+Rule = tuple[Callable[[Any], bool], str]  # test of a value, and text of what is expected
 _SIZE: Rule = (lambda v: SMALLEST_M <= v <= FARTHEST_M, f"a length from {SMALLEST_M:g} to {FARTHEST_M:g} m")
 _POSITIVE: Rule = (lambda v: 0 < v < math.inf, "a finite number above 0")
 _ANGLE: Rule = (lambda v: abs(v) <= _MOST_DEG, f"degrees, at most {_MOST_DEG:g} either way")
@@ -54,7 +54,7 @@ def _count(most: int) -> Rule:
     return lambda v: 1 <= v <= most, f"an integer from 1 to {most}"
 
 
-# By the name of a field; names mean the same in all tables.
+# By field name; a name has the same meaning in all tables.
 _RULES: dict[str, Rule] = {
     **dict.fromkeys(("position_m", "look_at_m", "up", "point_m", "centre_m", "min_m", "max_m", "translate_m"), _PLACE),
     **dict.fromkeys(("corner_m", "edge_u_m", "edge_v_m"), _PLACE),
@@ -83,7 +83,7 @@ _RULES: dict[str, Rule] = {
 
 
 class Checked:
-    """A table whose values keep the rules for fields of their names; None stands for a field that is left out."""
+    """A table whose values obey the rules of their field names; None is a missing field."""
 
     def __post_init__(self) -> None:
         for field, value in vars(self).items():
@@ -103,7 +103,7 @@ class Plane(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class Emitter(Checked):
-    """A shape that reflects, shines or both.
+    """A shape that reflects, emits or both.
 
     The emission's colour tints the light of `illuminant`: "A", "D50", "D65", "E", a black body such as "3200 K", or one
     of the scene's own; emission [1, 1, 1] of each has the luminance that it has of D65.
@@ -212,7 +212,7 @@ class MeshSettings(Checked):
 
 
 def _check_kind(item: Texture | Material, needed: tuple[str, ...], optional: tuple[str, ...]) -> None:
-    """Every needed field is there, and none that the kind does not know."""
+    """Check that required fields are present and no unknown ones."""
     what = f"a {item.kind} {type(item).__name__.lower()}"
     for field, value in vars(item).items():
         if field == "kind":
@@ -309,7 +309,7 @@ class Material(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class PointLight(Checked):
-    """A light without size that shines alike in all directions; `illuminant` as for an `Emitter`."""
+    """A point light, equal in all directions; `illuminant` as for an `Emitter`."""
 
     position_m: Vector
     intensity: Vector
@@ -322,7 +322,7 @@ class PointLight(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class SpotLight(PointLight):
-    """A light without size that shines into a cone about the direction to `look_at_m`.
+    """A point light that emits into a cone about the direction to `look_at_m`.
 
     Its intensity is `intensity` within the half angle `inner_deg` of the axis and 0 beyond `outer_deg`; in between it
     falls by the smoothstep t^2 (3 - 2t) of t = (cos angle - cos outer) / (cos inner - cos outer).

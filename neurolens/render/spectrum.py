@@ -19,10 +19,10 @@ from neurolens.render.illuminants import FloatArray64, Spectrum, daylight_table,
 from neurolens.render.scenetables import Vector
 
 _DFC_NM = 587.5618, 486.1327, 656.2725  # Fraunhofer lines d, F and C
-# Beyond this the three responses are so alike over the range that separating them would only amplify noise.
+# Beyond this condition number the three responses are too similar: separating them would only amplify noise.
 _LARGEST_CONDITION = 30.0
-_DEFENSIVE = 0.1  # share of the wavelengths that is spread evenly, whatever the importance says
-_STEPS = 2048  # at which the importance is read
+_DEFENSIVE = 0.1  # share of the wavelengths drawn uniformly, independent of the importance
+_STEPS = 2048  # at which the importance is sampled
 
 
 class SpectralRange:
@@ -35,7 +35,7 @@ class SpectralRange:
         low_nm, high_nm: the range; equal for light of one wavelength.
         bins: table length.
         lanes: wavelengths that a path carries, a whole number of bins apart.
-        light: spectrum (nm, radiance relative to D65) of the light to expect. None draws wavelengths evenly; else a
+        light: expected spectrum of the light (nm, radiance relative to D65). None draws wavelengths evenly; else a
             wavelength is drawn in proportion to the film's response to it (root of the sum of squares of R, G and B)
             times light, and a tenth of all evenly.
 
@@ -44,7 +44,7 @@ class SpectralRange:
         basis: [3, bins] float64, in [0, 1], adding up to 1.
         response: [3, bins] float32, linear sRGB film value of radiance 1 at a wavelength drawn from a bin, over the
             density with which it is drawn. The mean of response times basis is the unit matrix, so a colour lit by
-            white light comes back as itself whatever the range. A range too narrow to tell colours apart gives a grey
+            white light is reproduced for any range. A range too narrow to tell colours apart gives a grey
             film.
         colours: whether the range tells colours apart.
     """

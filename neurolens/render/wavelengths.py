@@ -1,4 +1,4 @@
-"""Which wavelengths paths carry: drawn by importance, one a path or four."""
+"""Which wavelengths paths carry: drawn by importance, one per path or four."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from neurolens.render.scenetables import Vector
 from neurolens.render.spectrum import SpectralRange
 
 LANES = 4  # wavelengths of a hero path, and paths that share their random numbers
-_FINE = 1024  # wavelengths at which the light of a scene is summed up
+_FINE = 1024  # wavelengths at which the light of a scene is summed
 _PROBES, _PROBED_WAVELENGTHS = 1024, 5
-_LITTLE_PX = 0.05  # a shift that the pixel, a box one pixel wide, hides
+_LITTLE_PX = 0.05  # pixels; a smaller shift is hidden by the pixel filter, a box one pixel wide
 _FARTHEST_M = 1e4
 
 
@@ -41,7 +41,7 @@ def spectral_range(scene: Scene, camera: Camera, film: FilmSettings, lanes: int 
 
 
 def expected_light(scene: Scene) -> Spectrum:
-    """Spectrum (nm, radiance relative to D65) of a scene's light: its lamps by their area, and as much environment."""
+    """Spectrum (nm, radiance relative to D65) of a scene's light: lamps by area, the environment with equal weight."""
     fine = SpectralRange(*scene.settings.camera.wavelengths_nm, _FINE)
     lamps: dict[str, FloatArray64] = {}  # sums of emission by illuminant
     for name, emission, area in _lamps(scene):
@@ -86,7 +86,7 @@ def _lamps(scene: Scene) -> Iterator[tuple[str, Vector, float]]:
 
 
 def mode_for(camera: Camera, grid: PixelGrid, limits_nm: tuple[float, float], film: FilmSettings) -> WavelengthMode:
-    """What "auto" means for a camera: "hero" where one ray serves all wavelengths, else "one".
+    """The mode that "auto" selects for a camera: "hero" where one ray serves all wavelengths, else "one".
 
     Raises:
         InputError: "hero" is asked for and the camera disperses.

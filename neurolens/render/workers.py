@@ -1,4 +1,4 @@
-"""The workers of a render: who takes which tile, how they start, and how they end.
+"""The workers of a render: distribution of tiles, start and end.
 
 Workers are forked processes: numpy's short operations leave no time for threads to share the interpreter (two threads
 were slower than one at 8k-element batches, two processes twice as fast). Where the system does not fork, threads do the
@@ -26,13 +26,13 @@ _POLL_S, _PATIENCE_S = 0.05, 5.0
 
 
 def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None:
-    """Do what is left of the work, in this process or in forked ones.
+    """Do the remaining work, in this process or in forked ones.
 
     Args:
-        watch: called now and then meanwhile; True ends the work early, between tiles.
+        watch: polled; True ends the work early, between tiles.
 
     Raises:
-        NeurolensError: a worker failed or was killed. Tiles are whole nevertheless.
+        NeurolensError: a worker failed or was killed; the film's tiles stay consistent.
     """
     context = fork_context()
     claimed = context.Value("q", int(job.film.done.min()) * job.tiling.tiles)
@@ -43,7 +43,7 @@ def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None
     team = [kind(target=_quiet, args=(job, claimed, k, workers, os.getpid()), daemon=True) for k in range(workers)]
     killed: list[int] = []
     try:
-        with _signals_held():  # which forked workers inherit: the one that hears Ctrl-C is this process
+        with _signals_held():  # inherited by forked workers: only this process handles Ctrl-C
             for worker in team:
                 worker.start()
         while alive := [worker for worker in team if worker.is_alive()]:
@@ -51,7 +51,7 @@ def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None
             if FORKS:
                 killed = [worker.exitcode for worker in team if worker.exitcode]
             if killed or (watch is not None and watch()):
-                break  # where one was killed, the others may wait for its tile for ever
+                break  # after a kill the others may wait for its tile forever
     finally:
         job.stop[0] = 1
         _dismiss(job, [worker for worker in team if worker.ident is not None])
@@ -94,7 +94,7 @@ def _work(job: Job, claimed: Any, parent: int | None = None) -> None:
         while film.done[tile] < part and not job.stop[0]:
             time.sleep(1e-4)
         if job.stop[0] or (parent is not None and os.getppid() != parent):
-            return  # asked to stop, or left alone
+            return  # stop requested, or parent gone
         if film.done[tile] > part:
             continue  # done before a checkpoint
         began = time.perf_counter()
@@ -105,7 +105,7 @@ def _work(job: Job, claimed: Any, parent: int | None = None) -> None:
 
 
 def _quiet(job: Job, claimed: Any, number: int, workers: int, parent: int) -> None:
-    """A worker of several: its error is left in the shared message alone."""
+    """One of several workers: its error goes to the shared message only."""
     try:
         if FORKS:
             _pin(number, workers)
@@ -117,7 +117,7 @@ def _quiet(job: Job, claimed: Any, number: int, workers: int, parent: int) -> No
 
 
 def _said(error: BaseException) -> str:
-    """One line of an expected error; of any other its place in the code, too."""
+    """One line for an expected error; for any other with its place in the code."""
     if isinstance(error, NeurolensError):
         return str(error)
     if isinstance(error, MemoryError):
@@ -128,7 +128,7 @@ def _said(error: BaseException) -> str:
 
 
 def _pin(number: int, workers: int) -> None:
-    """Keep a worker on one core where there is a worker for each; fewer stay free to get out of each other's way."""
+    """Pin a worker to one core if there is a worker for each core; fewer are left to the scheduler."""
     with suppress(AttributeError, OSError):
         cores = sorted(os.sched_getaffinity(0))
         if workers >= len(cores):
@@ -137,7 +137,7 @@ def _pin(number: int, workers: int) -> None:
 
 @contextmanager
 def _signals_held() -> Iterator[None]:
-    """Keep Ctrl-C and SIGTERM waiting inside the block; processes and threads started there never see them."""
+    """Block Ctrl-C and SIGTERM inside the block; processes and threads started there never receive them."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

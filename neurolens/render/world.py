@@ -2,7 +2,7 @@
 
 Every flat shape, box face, sphere and triangle is a surface with a number. What a path needs at a hit (normal, kind of
 material, colours) is looked up by that number in flat tables, because a gather costs a nanosecond a path. Row -1 is
-what a ray meets that meets nothing.
+for rays without a hit.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Assembly:
     """All shapes of a scene, from its tables: quads, discs, planes, rooms, boxes, spheres, meshes.
 
     Attributes:
-        primitives: to hit. surfaces: in order of their numbers. boxes: whose faces are told apart after a hit.
+        primitives: to hit. surfaces: in order of their numbers. boxes: whose faces are identified after a hit.
         smooth: of meshes with interpolated normals the first surface, planes [T, 3, 4] and corners' normals [T, 3, 3].
         first_sphere: number of the first sphere's surface.
     """
@@ -133,7 +133,7 @@ class Assembly:
 
 
 class World:
-    """What the integrator sees of a scene over a range of wavelengths.
+    """A scene as the integrator uses it, over a range of wavelengths.
 
     Attributes:
         kind: [S] uint8, DIFFUSE to NOTHING. normal: [3, S]. light: [S] number of the light or -1.
@@ -155,7 +155,6 @@ class World:
         self._shadow_casters = [p for p in self._primitives if not self._never_shades(p)]
 
     def _fill_tables(self, surfaces: list[Surfaces], spectral: SpectralRange) -> None:
-        """One row a surface, and the last one for nothing."""
         parts = [*surfaces, Surfaces(np.zeros((1, 3)))]
         materials, counts = [part.material for part in parts], [len(part.normals) for part in parts]
         colour, palette = self.palette.colour, self.palette
@@ -223,7 +222,7 @@ class World:
         rows += [self.palette.light(point.intensity, point.illuminant) for point in points]
         if settings.sky is not None and self._sun.count:
             rows.append(self._sun.row(settings.sky, self.palette))
-        # The sky's number is the last; what it shines depends on the direction.
+        # The sky's number is the last; its radiance depends on the direction.
         self._sky_number = len(rows) if self._sky.count else -1
         self._sun_number = len(rows) - 1 if self._sun.count else -1
         self.light_emission_row = np.array([*rows, 0], np.intp)
@@ -244,7 +243,7 @@ class World:
         return best, found
 
     def visible(self, origin: FloatArray, direction: FloatArray, distance: FloatArray) -> NDArray[np.bool_]:
-        """Whether nothing stands on the way [N] from origins [3, N] to lights at `distance` [N]."""
+        """Visibility [N] of lights at `distance` [N] from origins [3, N]."""
         rays = Rays.of(origin, direction)
         best, found = distance * np.float32(1 - 1e-4), np.full(len(distance), -1, np.int32)
         for shape in self._shadow_casters:
@@ -252,7 +251,7 @@ class World:
         return found < 0
 
     def surfaces(self, found: IntArray, point: FloatArray) -> Index:
-        """Surface numbers [N], the faces of boxes told apart."""
+        """Surface numbers [N] with the faces of boxes identified."""
         surface = found.astype(np.intp)
         for box in self._boxes:
             rows = np.flatnonzero(found == box.first)

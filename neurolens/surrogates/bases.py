@@ -1,16 +1,21 @@
-"""Candidate terms and their columns: monomials of the invariants (times p or u), or of the raw coordinates."""
+"""Candidate terms of polynomials, their columns, and least squares.
+
+Terms are monomials of the invariants (times p or u), or of the raw coordinates.
+"""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurolens.surrogates.cores import monomials
+from neurolens.base.errors import InputError
+from neurolens.graph.interpret import monomials as monomials
 from neurolens.surrogates.lightfield import LightField
 
 Exponents = NDArray[np.int64]
@@ -92,13 +97,20 @@ def solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None) -> Te
     return (found / norms[:, None]).T
 
 
-__all__ = [
-    "Exponents",
-    "invariant_exponents",
-    "monomials",
-    "raw_exponents",
-    "raw_variables",
-    "solve",
-    "vector_columns",
-    "vector_gram",
-]
+@contextmanager
+def pinned_threads(threads: int = 1) -> Iterator[None]:
+    """Give torch this many threads inside the block, and what it had before after it.
+
+    A fit on one thread gives the same bits anywhere, and does not crawl on a shared machine.
+
+    Raises:
+        InputError: fewer than one.
+    """
+    if threads < 1:
+        raise InputError("torch", "threads", threads, "at least 1")
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -174,7 +174,7 @@ def _clear_rays(model: LensModel, count: int, least: float = 0.01) -> tuple[Film
     with torch.no_grad():
         out = model.predict(rays)
         rough = model.predict(_single(rays))
-        _, scalars = model.core.to(torch.float64)(model.encoding(rays))
+        _, scalars = model.core(model.encoding(rays))
     stop = (out.stop_x**2 + out.stop_y**2) / model.domain.stop_radius_mm**2 - 1
     margin = torch.cat([scalars[1:], stop[None]]).abs().min(0).values
     radius = torch.stack(

@@ -1,43 +1,228 @@
-"""The cores of surrogates: a polynomial in the invariants, a polynomial in the raw coordinates, a small network.
+"""The cores of surrogates: polynomials in the invariants or the raw coordinates, small networks, and sums and zones.
 
-Each maps a light field to vectors [3, 2, N] (position, direction, stop; scaled) and scalars [1 + G, N]
-(transmittance, gates), and is plain data: what the ONNX graph needs is in its fields.
+A core maps a light field to vectors (position, direction, stop crossing) and scalars (transmittance, gates). It is
+plain data with one method that writes it into a graph (`neurolens.graph`); every evaluator and writer reads that. A new
+kind of core is one class here; `stored.CORES` names it in files.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from neurolens.surrogates.lightfield import LightField
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Exponents, Form, Graph, Value
 
 if TYPE_CHECKING:
-    from neurolens.surrogates.residual import Residual
+    from torch import Tensor
 
+    from neurolens.surrogates.lightfield import LightField
+
+Array = NDArray[np.float64]
 Basis = Literal["invariants", "raw"]
+# Order of the vectors of every core.
+POSITION, DIRECTION, STOP = 0, 1, 2
+# Invariants as pairs of the rows p_x, p_y, u_x, u_y: rho, sigma, tau; of two mirrors those of x, then those of y.
+ROUND: tuple[Form, ...] = (((0, 0), (1, 1)), ((0, 2), (1, 3)), ((2, 2), (3, 3)))
+MIRROR: tuple[Form, ...] = tuple(((a, b),) for i in (0, 1) for a, b in ((i, i), (i, 2 + i), (2 + i, 2 + i)))
 
 
-def monomials(variables: Tensor, exponents: NDArray[np.int64]) -> Tensor:
-    """[M, N] products of powers of `variables` [V, N], for exponents [M, V]."""
-    powers = [torch.ones_like(variables)]
-    for _ in range(int(exponents.max(initial=0))):
-        powers.append(powers[-1] * variables)
-    out = torch.ones((len(exponents), variables.shape[1]), dtype=variables.dtype, device=variables.device)
-    for row, exponent in enumerate(exponents):
-        for v, e in enumerate(exponent):
-            if e:
-                out[row] *= powers[e][v]
-    return out
+@dataclass(frozen=True)
+class Field:
+    """The light field in a graph.
+
+    Attributes:
+        planes: rows p_x, p_y, u_x, u_y, and v where w = v^2 + w_bias.
+        w_bias: see planes. w: the wavelength's variable itself, where there is no v. Neither: w is 0.
+    """
+
+    planes: Value
+    w_bias: float = 0.0
+    w: Value | None = None
+
+    @property
+    def p(self) -> Value:
+        return self.planes[0:2]
+
+    @property
+    def u(self) -> Value:
+        return self.planes[2:4]
+
+    @property
+    def dispersive(self) -> bool:
+        return self.w is not None or self.planes.rows == 5
+
+    def products(self, forms: Sequence[Form], w: bool = True) -> Value:
+        """Sums of products of the rows p, u; below them w, where it varies and is wanted."""
+        g = self.planes.graph
+        if self.w is not None and w:
+            return g.concat(g.quadratic(self.planes, forms), self.w)
+        if self.planes.rows == 5 and w:
+            return g.quadratic(self.planes, [*forms, ((4, 4),)], [*np.zeros(len(forms)), self.w_bias])
+        return g.quadratic(self.planes, forms)
+
+    def raw(self) -> Value:
+        """p, u and, where it varies, w."""
+        g = self.planes.graph
+        if not self.dispersive:
+            return self.planes
+        w = self.w if self.w is not None else g.quadratic(self.planes, [((4, 4),)], [self.w_bias])
+        return g.concat(self.planes[0:4], w)
+
+
+@dataclass(frozen=True)
+class Units:
+    """Factors on a core's outputs, folded into its coefficients: on the three vectors, and on the gates."""
+
+    vectors: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    gates: float = 1.0
+
+    def scalars(self, count: int) -> Array:
+        """Factors [count] on transmittance and gates."""
+        return np.array([1.0, *[self.gates] * (count - 1)])
+
+
+@dataclass(frozen=True)
+class CoreValues:
+    """What a core gives: three vectors (2 rows each), transmittance, gates (a row each; None without any).
+
+    `unit`: where a core gives it, the unit direction (3 rows) itself, which then stands for `vectors[DIRECTION]`.
+    """
+
+    vectors: tuple[Value, Value, Value]
+    transmittance: Value
+    gates: Value | None
+    unit: Value | None = None
+
+    def chosen(self, truth: Value, other: CoreValues) -> CoreValues:
+        """These values where `truth`, those of `other` elsewhere."""
+        g = truth.graph
+        a, b = self.vectors, other.vectors
+        vectors = tuple(g.select(truth, x, y) for x, y in zip(a, b, strict=True))
+        gates = None if self.gates is None or other.gates is None else g.select(truth, self.gates, other.gates)
+        return CoreValues(vectors, g.select(truth, self.transmittance, other.transmittance), gates)  # type: ignore[arg-type]
+
+
+class Core:
+    """Base of all cores; their numbers are float64 numpy arrays. `basis` is a word for cards."""
+
+    basis: ClassVar[str] = "invariants"
+
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        """Append the core to a graph."""
+        raise NotImplementedError
+
+    def fixed(self, w: float) -> Self:
+        """The same core for one value of w, which then is 0."""
+        raise TypeError(f"no fixed wavelength for a core of type {type(self).__name__}")
+
+    def keep(self, scalars: Sequence[int]) -> Self:
+        """The same core with these of its scalars only."""
+        raise TypeError(f"no part of a core of type {type(self).__name__}")
+
+    @property
+    def coefficients(self) -> int:
+        """All coefficients that are not 0; of networks, all weights."""
+        raise NotImplementedError
+
+    @property
+    def coefficients_per_vector(self) -> int:
+        """Coefficients that one of position and direction costs, the larger of the two (A and B terms both count)."""
+        return self.coefficients
+
+    def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
+        """Vectors [3, 2, N] and scalars [1 + G, N] of a light field of tensors, in its precision."""
+        import torch
+
+        from neurolens.surrogates.lightfield import angle_vector
+
+        out = evaluate(self._graph, {"p": field.p, "u": field.u, "w": field.w[None]})
+        direction = angle_vector(*out["unit"]) if "unit" in out else out["direction"]
+        vectors = [v.expand(2, len(field)) for v in (out["position"], direction, out["stop"])]
+        return torch.stack(vectors), out["scalars"].expand(-1, len(field))
+
+    @cached_property
+    def _graph(self) -> Graph:
+        g = Graph()
+        field = Field(g.concat(g.input("p", 2), g.input("u", 2)), w=g.input("w"))
+        values = self.build(g, field, Units())
+        g.outputs = dict(zip(("position", "direction", "stop"), values.vectors, strict=True))
+        if values.unit is not None:
+            g.outputs["unit"] = values.unit
+        gates = [] if values.gates is None else [values.gates]
+        g.outputs["scalars"] = g.concat(values.transmittance, *gates)
+        return g
+
+
+def symmetric(rows: Value, field: Field, scalars: int) -> CoreValues:
+    """A p + B u of three vectors, from rows A of each, B of each (of x, then y, with mirrors), then the scalars."""
+    g, wide = rows.graph, (rows.rows - scalars) // 6
+    *ab, transmittance, gates = g.split(rows, [wide] * 6 + [1, scalars - 1])
+    p, u = field.p, field.u
+    vectors = tuple(a * p + b * u for a, b in zip(ab[:3], ab[3:], strict=True))
+    return CoreValues(vectors, transmittance, gates if scalars > 1 else None)  # type: ignore[arg-type]
+
+
+class _Polynomial(Core):
+    """What the three polynomials share: exponents whose last column is that of w, and tables over the terms."""
+
+    exponents: Exponents
+    scalars: Array
+    _vectors: ClassVar[str]  # name of the field that holds the vectors' coefficients
+
+    def fixed(self, w: float) -> Self:
+        rest = self.exponents.copy()
+        rest[:, -1] = 0
+        unique, place = np.unique(rest, axis=0, return_inverse=True)
+        merge = np.zeros((len(rest), len(unique)))
+        merge[np.arange(len(rest)), place.reshape(-1)] = w ** self.exponents[:, -1].astype(float)
+        tables = {self._vectors: getattr(self, self._vectors) @ merge, "scalars": self.scalars @ merge}
+        return replace(self, exponents=unique, **tables)  # type: ignore[type-var]
+
+    def keep(self, scalars: Sequence[int]) -> Self:
+        return replace(self, scalars=self.scalars[list(scalars)])  # type: ignore[type-var]
+
+    @cached_property
+    def coefficients(self) -> int:
+        return int((getattr(self, self._vectors) != 0).sum() + (self.scalars != 0).sum())
+
+    def _tables(self, units: Units) -> tuple[Array, Array]:
+        """Vectors' coefficients and scalars in units."""
+        vectors = getattr(self, self._vectors)
+        factors = np.array(units.vectors).reshape(3, *[1] * (vectors.ndim - 1))
+        return vectors * factors, self.scalars * units.scalars(len(self.scalars))[:, None]
+
+    def _terms(self, g: Graph, field: Field, weight: Array, forms: Sequence[Form] | None) -> Value:
+        """weight [R, M] times the terms; those in w are left out where it is 0."""
+        x = field.raw() if forms is None else field.products(forms)
+        used = np.ones(len(self.exponents), bool) if field.dispersive else self.exponents[:, -1] == 0
+        return g.polynomial(self.exponents[used][:, : x.rows], weight[:, used], x)
+
+
+class _Symmetric(_Polynomial):
+    """A p + B u, with A, B and the scalars polynomials in invariants: `ab` [3, 2, .., M] and `scalars` [S, M]."""
+
+    ab: Array
+    _vectors = "ab"
+    _forms: ClassVar[tuple[Form, ...]]
+
+    def rows(self, g: Graph, field: Field, units: Units) -> Value:
+        """Rows A of the three vectors, B of them, scalars."""
+        ab, scalars = self._tables(units)
+        a, b = (ab[:, k].reshape(-1, len(self.exponents)) for k in (0, 1))
+        return self._terms(g, field, np.concatenate([a, b, scalars]), self._forms)
+
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        return symmetric(self.rows(g, field, units), field, len(self.scalars))
 
 
 @dataclass(frozen=True, eq=False)
-class InvariantPolynomial:
+class InvariantPolynomial(_Symmetric):
     """out = A p + B u, with A, B and the scalars polynomials in rho, sigma, tau, w.
 
     Attributes:
@@ -46,65 +231,53 @@ class InvariantPolynomial:
         scalars: [S, M].
     """
 
-    exponents: NDArray[np.int64]
-    ab: Tensor
-    scalars: Tensor
+    exponents: Exponents
+    ab: Array
+    scalars: Array
+    _forms = ROUND
 
-    basis: Basis = "invariants"
-
-    def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
-        m = monomials(field.invariants(), self.exponents)
-        a, b = self.ab[:, 0] @ m, self.ab[:, 1] @ m  # [3, N]
-        return a[:, None] * field.p + b[:, None] * field.u, self.scalars @ m
-
-    def to(self, dtype: torch.dtype) -> InvariantPolynomial:
-        return replace(self, ab=self.ab.to(dtype), scalars=self.scalars.to(dtype))
+    def plus(self, ab: Array, scalars: Array) -> InvariantPolynomial:
+        """With constants [3, 2] and [S] added."""
+        constant = (self.exponents == 0).all(1)
+        if constant.any():
+            return replace(
+                self, ab=self.ab + ab[..., None] * constant, scalars=self.scalars + scalars[:, None] * constant
+            )
+        return InvariantPolynomial(
+            np.concatenate([self.exponents, np.zeros((1, 4), np.int64)]),
+            np.concatenate([self.ab, ab[..., None]], 2),
+            np.concatenate([self.scalars, scalars[:, None]], 1),
+        )
 
     @cached_property
     def coefficients_per_vector(self) -> int:
         return int((self.ab[:2] != 0).any(0).sum())
 
-    @cached_property
-    def coefficients(self) -> int:
-        return int((self.ab != 0).sum() + (self.scalars != 0).sum())
-
 
 @dataclass(frozen=True, eq=False)
-class MirrorPolynomial:
+class MirrorPolynomial(_Symmetric):
     """Of a lens with two planes of symmetry: out_x = A_x p_x + B_x u_x, and y likewise.
 
     Attributes:
-        exponents: [M, 7] int64 of `LightField.mirror_invariants`; rows are unique.
+        exponents: [M, 7] int64 of p_x^2, p_x u_x, u_x^2, the same of y, w; rows are unique.
         ab: [3, 2, 2, M]: for each vector, A and B, of x and of y.
         scalars: [S, M].
     """
 
-    exponents: NDArray[np.int64]
-    ab: Tensor
-    scalars: Tensor
-
-    basis: str = "mirror"
-
-    def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
-        m = monomials(field.mirror_invariants(), self.exponents)
-        a, b = (self.ab[:, i] @ m for i in (0, 1))  # [3, 2, N]
-        return a * field.p + b * field.u, self.scalars @ m
-
-    def to(self, dtype: torch.dtype) -> MirrorPolynomial:
-        return replace(self, ab=self.ab.to(dtype), scalars=self.scalars.to(dtype))
+    exponents: Exponents
+    ab: Array
+    scalars: Array
+    basis = "mirror"
+    _forms = MIRROR
 
     @cached_property
     def coefficients_per_vector(self) -> int:
         """Of one vector's two components together, the larger of position and direction."""
         return int((self.ab[:2] != 0).sum((1, 2, 3)).max())
 
-    @cached_property
-    def coefficients(self) -> int:
-        return int((self.ab != 0).sum() + (self.scalars != 0).sum())
-
 
 @dataclass(frozen=True, eq=False)
-class RawPolynomial:
+class RawPolynomial(_Polynomial):
     """Every component of every vector, and every scalar, is a polynomial in p_x, p_y, u_x, u_y, w: the published form.
 
     Attributes:
@@ -113,32 +286,27 @@ class RawPolynomial:
         scalars: [S, M].
     """
 
-    exponents: NDArray[np.int64]
-    components: Tensor
-    scalars: Tensor
+    exponents: Exponents
+    components: Array
+    scalars: Array
+    basis = "raw"
+    _vectors = "components"
 
-    basis: Basis = "raw"
-
-    def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
-        m = monomials(torch.cat([field.p, field.u, field.w[None]]), self.exponents)
-        return self.components @ m, self.scalars @ m
-
-    def to(self, dtype: torch.dtype) -> RawPolynomial:
-        return replace(self, components=self.components.to(dtype), scalars=self.scalars.to(dtype))
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        components, scalars = self._tables(units)
+        rows = self._terms(g, field, np.concatenate([components.reshape(6, -1), scalars]), None)
+        *vectors, transmittance, gates = g.split(rows, [2, 2, 2, 1, len(scalars) - 1])
+        return CoreValues(tuple(vectors), transmittance, gates if len(scalars) > 1 else None)  # type: ignore[arg-type]
 
     @cached_property
     def coefficients_per_vector(self) -> int:
         """Coefficients of both components of a vector, the larger of position and direction."""
         return int((self.components[:2] != 0).sum((1, 2)).max())
 
-    @cached_property
-    def coefficients(self) -> int:
-        return int((self.components != 0).sum() + (self.scalars != 0).sum())
-
 
 @dataclass(frozen=True, eq=False)
-class Network:
-    """A multilayer perceptron from the four invariants to the coefficients A and B of each vector and to the scalars.
+class Network(Core):
+    """A multilayer perceptron from the invariants to the coefficients A and B of each vector and to the scalars.
 
     Attributes:
         hidden: weight [units, inputs] and bias [units] of each tanh layer; the first takes scaled invariants.
@@ -148,21 +316,10 @@ class Network:
         shift, scale: [4] each: the network sees (invariants - shift) * scale; [7] of a lens with cylinders.
     """
 
-    hidden: tuple[tuple[Tensor, Tensor], ...]
-    output: tuple[Tensor, Tensor]
-    shift: Tensor
-    scale: Tensor
-
-    basis: Basis = "invariants"
-
-    def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
-        invariants = field.mirror_invariants() if self.mirror else field.invariants()
-        h = (invariants - self.shift[:, None]) * self.scale[:, None]
-        for weight, bias in self.hidden:
-            h = torch.tanh(weight @ h + bias[:, None])
-        out = self.output[0] @ h + self.output[1][:, None]
-        ab = out[: self.ab_rows].reshape(3, -1, 2, out.shape[1])  # [3, 1 or 2, 2, N]
-        return ab[:, :, 0] * field.p + ab[:, :, 1] * field.u, out[self.ab_rows :]
+    hidden: tuple[tuple[Array, Array], ...]
+    output: tuple[Array, Array]
+    shift: Array
+    scale: Array
 
     @property
     def mirror(self) -> bool:
@@ -174,27 +331,85 @@ class Network:
         """Outputs before the scalars."""
         return 12 if self.mirror else 6
 
-    def to(self, dtype: torch.dtype) -> Network:
-        return replace(
-            self,
-            hidden=tuple((w.to(dtype), b.to(dtype)) for w, b in self.hidden),
-            output=(self.output[0].to(dtype), self.output[1].to(dtype)),
-            shift=self.shift.to(dtype),
-            scale=self.scale.to(dtype),
-        )
+    def rows(self, g: Graph, field: Field, units: Units, added: Value | None = None) -> Value:
+        """Rows A of the three vectors, B of them, scalars; plus `added`, whose rows have the same order."""
+        h = field.products(MIRROR if self.mirror else ROUND)
+        for k, (weight, bias) in enumerate(self.hidden):
+            if k == 0:  # shift and scale are folded into it; without dispersion the last invariant is 0
+                weight = weight * self.scale
+                bias = bias - (weight * self.shift).sum(1)
+                weight = weight[:, : h.rows]
+            h = g.affine(weight, h, bias).tanh()
+        weight, bias = self.output
+        n, axes = self.ab_rows, self.ab_rows // 6
+        order = [*range(0, n, 2), *range(1, n, 2), *range(n, len(weight))]  # A of the three vectors, then B
+        vectors = np.repeat(units.vectors, axes)
+        factors = np.concatenate([vectors, vectors, units.scalars(len(weight) - n)])
+        weight, bias = factors[:, None] * weight[order], factors * bias[order]
+        return g.affine(weight, h, bias, added=added)
 
-    @cached_property
-    def coefficients_per_vector(self) -> int:
-        return self.coefficients
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        return symmetric(self.rows(g, field, units), field, len(self.output[1]) - self.ab_rows)
+
+    def fixed(self, w: float) -> Self:
+        # It is shown w = 0: the shift makes that the wanted one.
+        shift = self.shift.copy()
+        shift[-1] -= w
+        return replace(self, shift=shift)
+
+    def keep(self, scalars: Sequence[int]) -> Self:
+        rows = [*range(self.ab_rows), *(self.ab_rows + k for k in scalars)]
+        return replace(self, output=(self.output[0][rows], self.output[1][rows]))
 
     @cached_property
     def coefficients(self) -> int:
-        return sum(w.numel() + b.numel() for w, b in (*self.hidden, self.output))
+        return sum(w.size + b.size for w, b in (*self.hidden, self.output))
+
+
+class _Parts(Core):
+    """A core of several."""
+
+    parts: tuple[Any, ...]
+
+    def fixed(self, w: float) -> Self:
+        return replace(self, parts=tuple(part.fixed(w) for part in self.parts))  # type: ignore[type-var]
+
+    def keep(self, scalars: Sequence[int]) -> Self:
+        return replace(self, parts=tuple(part.keep(scalars) for part in self.parts))  # type: ignore[type-var]
+
+    @property
+    def coefficients_per_vector(self) -> int:
+        """Of all parts together."""
+        return sum(part.coefficients_per_vector for part in self.parts)
+
+    @property
+    def coefficients(self) -> int:
+        return sum(part.coefficients for part in self.parts)
 
 
 @dataclass(frozen=True, eq=False)
-class Partitioned:
+class Residual(_Parts):
+    """The sum of a polynomial and a network on what the polynomial leaves, both on the same invariants.
+
+    The polynomial takes the bulk, which is smooth and of low degree, the network the fine structure of every output.
+    """
+
+    parts: tuple[InvariantPolynomial, Network]
+
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        polynomial, network = self.parts
+        # The network's last bias joins the polynomial's constant, so that its last product adds the two.
+        weight, bias = network.output
+        whole = polynomial.plus(bias[:6].reshape(3, 2), bias[6:])
+        network = replace(network, output=(weight, np.zeros_like(bias)))
+        return symmetric(network.rows(g, field, units, whole.rows(g, field, units)), field, len(bias) - 6)
+
+
+@dataclass(frozen=True, eq=False)
+class Partitioned(_Parts):
     """Cores of zones of the light field, split by rho (the squared film radius): the published light-field partition.
+
+    Every zone's core is evaluated for every ray, and one is chosen.
 
     Attributes:
         edges: rising values of rho between zones.
@@ -204,23 +419,9 @@ class Partitioned:
     edges: tuple[float, ...]
     parts: tuple[InvariantPolynomial | RawPolynomial | Network | Residual, ...]
 
-    def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
-        vectors, scalars = self.parts[0](field)
-        rho = field.invariants()[0]
-        for edge, part in zip(self.edges, self.parts[1:], strict=True):
-            beyond = rho > edge
-            outer = part(field)
-            vectors, scalars = torch.where(beyond, outer[0], vectors), torch.where(beyond, outer[1], scalars)
-        return vectors, scalars
-
-    def to(self, dtype: torch.dtype) -> Partitioned:
-        return replace(self, parts=tuple(part.to(dtype) for part in self.parts))
-
-    @property
-    def coefficients_per_vector(self) -> int:
-        """Of all zones together."""
-        return sum(part.coefficients_per_vector for part in self.parts)
-
-    @property
-    def coefficients(self) -> int:
-        return sum(part.coefficients for part in self.parts)
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        values = [part.build(g, field, units) for part in self.parts]
+        rho, chosen = field.products(ROUND[:1], w=False), values[0]
+        for edge, outer in zip(self.edges, values[1:], strict=True):
+            chosen = chosen.chosen(rho <= edge, outer)
+        return chosen

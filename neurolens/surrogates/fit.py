@@ -6,143 +6,41 @@ import itertools
 import math
 import time
 import warnings
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import get_args
+
+import torch
+from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.surrogates.cores import Basis, RawPolynomial
+from neurolens.surrogates.bases import pinned_threads
+from neurolens.surrogates.cores import Core, InvariantPolynomial, Network, Partitioned, RawPolynomial, Residual
+from neurolens.surrogates.domain import draw_everywhere
 from neurolens.surrogates.fits.checkpoint import of_zone, spent_s
 from neurolens.surrogates.fits.mirror import fit_mirror
-from neurolens.surrogates.fits.mlp import fit_network
-from neurolens.surrogates.fits.paraxial import fit_paraxial
-from neurolens.surrogates.fits.partition import ZoneCore, fit_partitioned
+from neurolens.surrogates.fits.network import fit_network
 from neurolens.surrogates.fits.planes import fit_planes
-from neurolens.surrogates.fits.polynomial import Method as PolynomialMethod
-from neurolens.surrogates.fits.polynomial import PolynomialSettings, fit_polynomial
-from neurolens.surrogates.fits.target import TERMS_LADDER, first_order_um, reach
+from neurolens.surrogates.fits.polynomial import fit_paraxial, fit_polynomial
 from neurolens.surrogates.gates import choose_gates, explained
-from neurolens.surrogates.lightfield import Encoding, fit_encoding
-from neurolens.surrogates.lit import draw_everywhere
-from neurolens.surrogates.model import Core, Gate, LensModel
-from neurolens.surrogates.pairs import RayPairs, trace_pairs
-from neurolens.surrogates.residual import Residual
-from neurolens.surrogates.targets import scales_of
-from neurolens.surrogates.threads import pinned_threads
+from neurolens.surrogates.lightfield import fit_encoding
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.pairs import PairSet, RayPairs, trace_pairs
+from neurolens.surrogates.published import fit_published
+from neurolens.surrogates.settings import NETWORKS, PLANES_SEARCHED, POLYNOMIALS, ModelSettings, PublishedName
+from neurolens.surrogates.targets import Prepared, film_equivalent, scales_of, squared_error, targets_of
 
-PublishedName = Literal["taylor", "hanika", "schrade", "zheng-adaptive", "neurolens2017", "rtf"]
-Method = Literal["thin", "thick", "dense", "omp", "ols", "adaptive", "mlp", "ols+mlp", PublishedName]
-POLYNOMIALS = ("dense", "omp", "ols", "adaptive")
-NETWORKS = ("mlp", "ols+mlp")
-PLANES_SEARCHED = ("ols", "adaptive", "ols+mlp")
 # Rays drawn over the domain to find what blocks anything: a share of 1e-4 is 20 of them.
 _GATE_RAYS = 200_000
-# About 5000 candidate columns, whose Gram matrix takes 200 MB.
-_MOST_DEGREE = {"invariants": 16, "raw": 11}
-
-
-@dataclass(frozen=True)
-class ModelSettings:
-    """One surrogate of an experiment.
-
-    Attributes:
-        name: of the file and of the table's row; made from the other settings where empty.
-        method: "thin", "thick" (first order); "dense", "omp", "ols", "adaptive" (polynomials); "mlp"; "ols+mlp" (a
-            polynomial and a network on what it leaves); the published methods of `neurolens.surrogates.published`.
-        basis, terms, degree, replacement, elimination, growth, position_weight, transmittance_terms: see
-            `PolynomialSettings`.
-        planes: whether `PLANES_SEARCHED` methods in the invariants search the planes of the light field.
-        partitions: zones of the film with a fit of their own (polynomials and networks).
-        units, layers: of the network. steps, seconds: its training ends by either, or by convergence; results repeat
-            bit for bit where the time does not end it.
-        seed: of the network's first weights.
-        target_um: film-equivalent RMS asked for. Polynomials take the fewest terms of `TERMS_LADDER` that reach it; a
-            fit that does not reach it warns and gives its best.
-
-    Raises:
-        InputError: numbers that ask for more than a fit can hold, or for less than one.
-    """
-
-    method: Method = "ols"
-    name: str = ""
-    basis: Basis = "invariants"
-    terms: int = 40
-    degree: int = 7
-    replacement: bool = True
-    elimination: bool = True
-    growth: int = 2
-    position_weight: float = 2.0
-    transmittance_terms: int = 16
-    planes: bool = True
-    partitions: int = 1
-    units: int = 16
-    layers: int = 2
-    steps: int = 300
-    seconds: float = 60.0
-    seed: int = 0
-    target_um: float | None = None
-
-    def __post_init__(self) -> None:
-        most_degree = _MOST_DEGREE[self.basis] if self.basis in _MOST_DEGREE else min(_MOST_DEGREE.values())
-        limits = {
-            "terms": (1, 2000),
-            "degree": (0, most_degree),
-            "growth": (0, 16),
-            "transmittance_terms": (0, 200),
-            "partitions": (1, 64),
-            "units": (1, 512),
-            "layers": (1, 8),
-            "steps": (1, 100_000),
-        }
-        for name, (least, most) in limits.items():
-            if not least <= getattr(self, name) <= most:
-                raise InputError("settings", name, getattr(self, name), f"an integer from {least} to {most}")
-        if not 0 < self.seconds:
-            raise InputError("settings", "seconds", self.seconds, "a number above 0")
-        if not 0 < self.position_weight < math.inf:
-            raise InputError("settings", "position_weight", self.position_weight, "a number above 0")
-        if self.target_um is not None and not 0 < self.target_um < math.inf:
-            raise InputError("settings", "target_um", self.target_um, "micrometres above 0, or none")
-
-    @property
-    def label(self) -> str:
-        """The name, or one made from the settings: "ols-40", "raw-omp-80", "dense-d4", "mlp-16x2"."""
-        if self.name:
-            return self.name
-        zones = f"-{self.partitions}zones" if self.partitions > 1 else ""
-        if self.target_um is not None:
-            zones += f"-to-{self.target_um:g}um"
-        if self.method in NETWORKS:
-            before = f"ols-{self.terms}-" if self.method == "ols+mlp" else ""
-            return f"{before}mlp-{self.units}x{self.layers}{zones}"
-        if self.method in ("thin", "thick"):
-            return self.method
-        size = f"-d{self.degree}" if self.method == "dense" else f"-{self.terms}"
-        return f"{'raw-' if self.basis == 'raw' else ''}{self.method}{'' if self.climbs else size}{zones}"
-
-    @property
-    def climbs(self) -> bool:
-        """Whether the fit chooses the number of terms by the error asked for."""
-        return self.target_um is not None and self.method in ("omp", "ols", "adaptive")
-
-    @property
-    def family(self) -> str:
-        return "paraxial" if self.method in ("thin", "thick") else self.method
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """Ray pairs with what all fits share: encoding and gates. `lost_share`: lost rays of the domain that no gate tells.
-
-    Lost rays miss a surface or are totally reflected.
-    """
-
-    pairs: RayPairs
-    encoding: Encoding
-    gates: tuple[Gate, ...]
-    lost_share: float
+# Terms of polynomials tried for an error asked for, fewest first.
+TERMS_LADDER = (12, 16, 20, 28, 40, 64, 100)
+ZoneCore = InvariantPolynomial | RawPolynomial | Network | Residual
+# A zone's fit sees this share of rho beyond its edges, so that neighbours meet.
+OVERLAP = 0.03
+_FEWEST_RAYS = 200
+_FITTED = ("train", "rim", "edge", "far")  # the splits that fits see
 
 
 def prepare(pairs: RayPairs) -> Prepared:
@@ -205,17 +103,14 @@ def fit_model(
 def _fit_once(
     prepared: Prepared, settings: ModelSettings, progress: Callable[[float], None] | None, checkpoint: Path | None
 ) -> LensModel:
-    encoding, gates = prepared.encoding, prepared.gates
+    pairs, encoding, gates = prepared.pairs, prepared.encoding, prepared.gates
     with pinned_threads():
         if settings.method in get_args(PublishedName):
-            from neurolens.surrogates.published import fitting  # published methods need this module's types
-
-            core, encoding, gates = fitting.fit_published(prepared, settings, progress)
+            core, encoding, gates = fit_published(prepared, settings, progress)
         else:
             if settings.planes and settings.basis == "invariants" and settings.method in PLANES_SEARCHED:
-                encoding = fit_planes(prepared.pairs, encoding, settings.terms, settings.position_weight)
+                encoding = fit_planes(pairs, encoding, settings.terms, settings.position_weight)
             core = _fit_core(replace(prepared, encoding=encoding), settings, progress, checkpoint)
-    pairs = prepared.pairs
     return LensModel(
         lens=pairs.lens,
         domain=pairs.domain,
@@ -232,30 +127,27 @@ def _fit_once(
 def _fit_core(
     prepared: Prepared, settings: ModelSettings, progress: Callable[[float], None] | None, checkpoint: Path | None
 ) -> Core:
-    pairs, encoding, gates = prepared.pairs, prepared.encoding, prepared.gates
-    if settings.method in ("thin", "thick") and not encoding.mirror:
-        return fit_paraxial(pairs, encoding, gates, settings.method)
+    mirror = prepared.encoding.mirror
+    if settings.method in ("thin", "thick") and not mirror:
+        return fit_paraxial(prepared, settings.method)
     if settings.method not in (*POLYNOMIALS, *NETWORKS):
         known = ("thin", "thick", *POLYNOMIALS, *NETWORKS, *get_args(PublishedName))
         raise InputError("fit", "method", settings.method, f"one of {', '.join(known)}")
-
-    if encoding.mirror and settings.method != "mlp":
-        return fit_mirror(pairs, encoding, gates, settings.method, settings.terms, settings.degree)
+    if mirror and settings.method != "mlp":
+        return fit_mirror(prepared, settings.method, settings.terms, settings.degree)
     zones = itertools.count()
 
-    def fit(zone: RayPairs) -> ZoneCore:
+    def fit(data: Prepared) -> ZoneCore:
         base = None
         if settings.method != "mlp":
-            base = fit_polynomial(zone, encoding, gates, _polynomial_settings(settings))
+            base = fit_polynomial(data, replace(settings, method="ols") if settings.method == "ols+mlp" else settings)
         if settings.method not in NETWORKS:
             assert base is not None
             return base
         if isinstance(base, RawPolynomial):
             raise InputError("fit", "basis", settings.basis, "invariants, with a network beside the polynomial")
         network = fit_network(
-            zone,
-            encoding,
-            gates,
+            data,
             units=settings.units,
             layers=settings.layers,
             seed=settings.seed,
@@ -267,10 +159,87 @@ def _fit_core(
         )
         return network if base is None else Residual((base, network))
 
-    return fit_partitioned(pairs, encoding, settings.partitions, fit)
+    return fit_partitioned(prepared, settings.partitions, fit)
 
 
-def _polynomial_settings(settings: ModelSettings) -> PolynomialSettings:
-    method = "ols" if settings.method == "ols+mlp" else cast(PolynomialMethod, settings.method)
-    shared = {f.name: getattr(settings, f.name) for f in fields(PolynomialSettings)}
-    return PolynomialSettings(**shared | {"method": method})
+def reach(models: Iterable[LensModel], target_um: float, error_um: Callable[[LensModel], float]) -> LensModel:
+    """The first model whose film-equivalent RMS is at most `target_um`, else the best; what it reached in its settings.
+
+    Args:
+        models: at least one; fitted as they are asked for, so that none after the first that serves is.
+        error_um: film-equivalent RMS of a model.
+
+    Warns:
+        NeurolensWarning: none reaches it.
+    """
+    found: list[tuple[float, LensModel]] = []
+    for model in models:
+        error = error_um(model)
+        found.append((error if math.isfinite(error) else math.inf, model))
+        if error <= target_um:
+            break
+    least, best = min(found, key=lambda pair: pair[0])
+    if not least <= target_um:
+        warnings.warn(
+            f"{best.lens.path}: {best.method}: asked for {target_um:g} um, reached {least:.3g} um; this is the best of "
+            "the fits tried",
+            NeurolensWarning,
+            stacklevel=3,
+        )
+    return replace(best, settings={**best.settings, "reached_um": least if math.isfinite(least) else None})
+
+
+def first_order_um(pairs: RayPairs) -> Callable[[LensModel], float]:
+    """Film-equivalent RMS of models to first order, in the nearest focused plane, over the rays held out."""
+
+    def error(model: LensModel) -> float:
+        targets = targets_of(pairs.lens, model.encoding, pairs.held_out)
+        off = model.core(targets.field)[0] - targets.vectors
+        return math.sqrt(float((film_equivalent(pairs.lens, pairs.domain, off)[0] ** 2).sum(0).mean()))
+
+    return error
+
+
+def fit_partitioned(prepared: Prepared, zones: int, fit: Callable[[Prepared], ZoneCore]) -> Partitioned | ZoneCore:
+    """Split the zone with the largest summed squared error in two halves of its rays, until there are `zones`.
+
+    After Zheng and Zheng 2017 (adaptive sparse polynomials) and NeuroLens 2017 (networks), which both split the space
+    of rays. Zones are rings of the film, so that the rotational symmetry of the invariants survives.
+
+    Args:
+        fit: fits one core to the rays of a zone.
+
+    Raises:
+        InputError: fewer than one zone, or several with fewer than 200 training rays each.
+    """
+    pairs, encoding = prepared.pairs, prepared.encoding
+    if zones < 1 or (zones > 1 and len(pairs.train) < zones * _FEWEST_RAYS):
+        most = max(1, len(pairs.train) // _FEWEST_RAYS)
+        raise InputError("fit", "partitions", zones, f"1 to {most} zones for {len(pairs.train)} training rays")
+    rhos = {name: encoding(getattr(pairs, name).inputs).invariants()[0] for name in _FITTED}
+    rho = rhos["train"]
+    bounds = [(-torch.inf, torch.inf)]
+    cores = [fit(prepared)]
+    while len(cores) < zones:
+        inside = [(rho > low) & (rho <= high) for low, high in bounds]
+        each = zip(cores, inside, strict=True)
+        errors = [squared_error(pairs, encoding, core, pairs.train.select(at)) for core, at in each]
+        worst = errors.index(max(errors))
+        low, high = bounds[worst]
+        middle = float(rho[inside[worst]].median())
+        halves = [(low, middle), (middle, high)]
+        bounds[worst : worst + 1] = halves
+        cores[worst : worst + 1] = [fit(_zone(prepared, rhos, *half)) for half in halves]
+    if zones == 1:
+        return cores[0]
+    return Partitioned(tuple(high for _, high in bounds[:-1]), tuple(cores))
+
+
+def _zone(prepared: Prepared, rhos: dict[str, Tensor], low: float, high: float) -> Prepared:
+    def within(name: str) -> PairSet:
+        rho, rays = rhos[name], getattr(prepared.pairs, name)
+        chosen: PairSet = rays.select((rho > low - OVERLAP) & (rho <= high + OVERLAP))
+        return chosen
+
+    zone = replace(prepared.pairs, train=within("train"), rim=within("rim"), edge=within("edge"), far=within("far"))
+    return replace(prepared, pairs=zone)

@@ -31,6 +31,10 @@ class LightField(NamedTuple):
     u: Tensor
     w: Tensor
 
+    def __len__(self) -> int:
+        """Rays."""
+        return self.w.shape[0]
+
     def invariants(self) -> Tensor:
         """[4, N]: rho, sigma, tau, w."""
         p, u = self.p, self.u
@@ -129,26 +133,3 @@ def angle_vector(dx: Tensor, dy: Tensor, dz: Tensor) -> Tensor:
     # theta / sine tends to 1 on the axis; the guard also keeps the exact axis finite.
     ratio = torch.where(sine > 1e-12, theta / torch.where(sine > 1e-12, sine, 1.0), 1.0)
     return torch.stack([ratio * dx, ratio * dy])
-
-
-# Taylor coefficients of sin(x)/x and cos(x) in x^2; 12 terms hold 1e-14 to 130 degrees.
-_SINC = [1.0]
-_COS = [1.0]
-for _k in range(1, 12):
-    _SINC.append(-_SINC[-1] / ((2 * _k) * (2 * _k + 1)))
-    _COS.append(-_COS[-1] / ((2 * _k - 1) * (2 * _k)))
-
-
-def direction_of(v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Unit direction (dx, dy, dz) of angle vectors [2, N], by series in |v|^2 (no root, no special case at 0)."""
-    square = v[0] * v[0] + v[1] * v[1]
-    sinc, cos = torch.full_like(square, _SINC[-1]), torch.full_like(square, _COS[-1])
-    for a, b in zip(_SINC[-2::-1], _COS[-2::-1], strict=True):
-        sinc, cos = sinc * square + a, cos * square + b
-    return v[0] * sinc, v[1] * sinc, -cos
-
-
-def direction_of_slope(slope: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Unit direction of slopes (dx, dy) / -dz [2, N], as first-order models give them."""
-    inverse = torch.rsqrt(1 + slope[0] * slope[0] + slope[1] * slope[1])
-    return slope[0] * inverse, slope[1] * inverse, -inverse

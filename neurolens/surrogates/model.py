@@ -1,55 +1,38 @@
 """A complete surrogate: raw millimetres and nanometres in; scene ray, transmittance, stop crossing and status out.
 
 Polynomials and networks differ only in their core, which maps the light field to a few vectors and scalars. Everything
-round it (scaling, symmetry, decoding, stop, rims, domain guard) is here, once, and is what the ONNX graph repeats.
+round it is written once, in `assemble`; here it is evaluated on torch tensors.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, Protocol
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.graph.derive import derivative, with_derivatives
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph
+from neurolens.graph.program import RAY, WAVELENGTH
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
+from neurolens.surrogates.assemble import EXACT, model_graph
+from neurolens.surrogates.cores import Core
 from neurolens.surrogates.domain import Domain, FilmRays
-from neurolens.surrogates.front import sag_mm
-from neurolens.surrogates.lightfield import Encoding, LightField, direction_of, direction_of_slope
+from neurolens.surrogates.lightfield import Encoding
 
-# Order of the vector outputs of every core.
-POSITION, DIRECTION, STOP = 0, 1, 2
-
+OUTPUTS = ("scene_ray", "transmittance", "stop_xy_mm", "status")
+_DIFFERENTIATED = ("scene_ray", "stop_xy_mm")
 # Positive and finite, in float32 too.
 ANY_WAVELENGTH_NM = (1e-30, 3e38)
-
-
-class Core(Protocol):
-    """What differs between surrogates.
-
-    Attributes:
-        coefficients_per_vector: coefficients that one of position and direction costs (A and B terms both count;
-            weights of a network: all of them).
-        coefficients: all of them.
-    """
-
-    @property
-    def coefficients_per_vector(self) -> int: ...
-
-    @property
-    def coefficients(self) -> int: ...
-
-    def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
-        """Vectors [3, 2, N] (position, direction, stop; see `Scales`) and scalars [1 + G, N] (transmittance, gates)."""
-        ...
-
-    def to(self, dtype: torch.dtype) -> Core:
-        """The same core computing in another precision."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -83,6 +66,31 @@ class Prediction(NamedTuple):
     stop_x: Tensor
     stop_y: Tensor
     status: Tensor
+
+
+class Derivatives(NamedTuple):
+    """A model's prediction and its derivatives; lens frame. Rows of a ray: x, y, z (mm), dx, dy, dz.
+
+    Attributes:
+        prediction: as `LensModel.predict` gives it.
+        d_film, d_pupil: [6, 2, N] per mm of the film point's and of the pupil point's x and y, the other point held.
+        d_wavelength: [6, N] per nm.
+        stop_d_film, stop_d_pupil: [2, 2, N] of the stop crossing, mm per mm. stop_d_wavelength: [2, N] mm per nm.
+    """
+
+    prediction: Prediction
+    d_film: Tensor
+    d_pupil: Tensor
+    d_wavelength: Tensor
+    stop_d_film: Tensor
+    stop_d_pupil: Tensor
+    stop_d_wavelength: Tensor
+
+
+def prediction_of(out: Mapping[str, Tensor], count: int) -> Prediction:
+    """The outputs of a model's graph for `count` rays."""
+    scene, power, stop, status = (out[n].expand(-1, count) for n in OUTPUTS)
+    return Prediction(Rays(*scene), power[0], stop[0], stop[1], status[0])
 
 
 @dataclass(frozen=True)
@@ -120,43 +128,46 @@ class LensModel:
         Raises:
             InputError: a stop wider than the model was fitted for.
         """
+        return prediction_of(evaluate(self.graph, self._inputs(rays, stop_radius_mm)), len(rays))
+
+    def differentiate(self, rays: FilmRays, stop_radius_mm: float | None = None) -> Derivatives:
+        """Evaluate the model with its derivatives; arguments and errors as `predict`.
+
+        The wavelength's derivative is at fixed film and pupil point. Where the status is not 0 the figures mean
+        nothing.
+        """
+        out = evaluate(self._derivative_graph, self._inputs(rays, stop_radius_mm))
+        scene, stop = (
+            torch.stack([out[derivative(name, row)].expand(-1, len(rays)) for row in (*RAY, WAVELENGTH)], 1)
+            for name in _DIFFERENTIATED
+        )
+        parts = [block for d in (scene, stop) for block in (d[:, :2], d[:, 2:4], d[:, 4])]
+        return Derivatives(prediction_of(out, len(rays)), *parts)
+
+    def _inputs(self, rays: FilmRays, stop_radius_mm: float | None) -> dict[str, Tensor]:
+        columns = torch.stack([rays.film_x, rays.film_y, rays.pupil_x, rays.pupil_y, rays.wavelength_nm])
+        radius = columns.new_full((1, 1), self.checked_radius_mm(stop_radius_mm))
+        return {"rays": columns, "film_z_mm": rays.film_z[None], "stop_radius_mm": radius}
+
+    def checked_radius_mm(self, stop_radius_mm: float | None) -> float:
+        """The stop radius asked for, or the domain's.
+
+        Raises:
+            InputError: a stop wider than the model was fitted for.
+        """
         if stop_radius_mm is not None and not 0 <= stop_radius_mm <= DOMAIN_SLACK * self.domain.stop_radius_mm:
             expected = f"0 to {self.domain.stop_radius_mm:.6g} mm, the widest stop of the fit"
             raise InputError(self.method, "stop_radius_mm", stop_radius_mm, expected)
-        core = self.core.to(rays.film_x.dtype)
-        vectors, scalars = core(self.encoding(rays))
-        x, y = vectors[POSITION] * self.scales.position_mm
-        stop_x, stop_y = vectors[STOP] * self.scales.stop_mm
-        decode = direction_of if self.direction == "angle" else direction_of_slope
-        dx, dy, dz = decode(vectors[DIRECTION])
-        radius = self.domain.stop_radius_mm if stop_radius_mm is None else stop_radius_mm
-        status = self._status(rays, scalars[1:], stop_x * stop_x + stop_y * stop_y, radius)
-        return Prediction(Rays(x, y, self._sag(x, y), dx, dy, dz), scalars[0], stop_x, stop_y, status)
+        return self.domain.stop_radius_mm if stop_radius_mm is None else stop_radius_mm
 
-    def _sag(self, x: Tensor, y: Tensor) -> Tensor:
-        # First-order models give the position in the plane of the front vertex.
-        return sag_mm(self.lens.surfaces[0], x, y) if self.direction == "angle" else 0.0 * (x + y)
+    @cached_property
+    def graph(self) -> Graph:
+        """For evaluation in float64: inputs and outputs as `assemble` says."""
+        return model_graph(self, math.pi, EXACT)
 
-    def _status(self, rays: FilmRays, gates: Tensor, stop_square: Tensor, stop_radius: float) -> Tensor:
-        """First failure in the order of travel, then the domain; guards are written so that NaN fails them."""
-        status = torch.zeros_like(rays.film_x, dtype=torch.int32)
-        stop = self.lens.stop_index
-        # Camera rays meet the last surface first, so the first failure is the one written last here.
-        tests = [(g.surface, ~(gates[i] <= 0), g.status) for i, g in enumerate(self.gates)]
-        tests.append((stop, ~(stop_square <= stop_radius**2), st.blocked(stop, st.RIM)))
-        for _, fails, code in sorted(tests, key=lambda t: (t[0], -(t[2] % 4))):
-            status = torch.where(fails, code, status)
-        return torch.where(self.inside_domain(rays), status, st.OUTSIDE_DOMAIN).to(torch.int32)
-
-    def inside_domain(self, rays: FilmRays) -> Tensor:
-        """[N] bool; false for NaN. Bounds have a relative slack of 1e-5, the rounding of float32 inputs."""
-        d, slack = self.domain, DOMAIN_SLACK
-        ok = rays.film_x**2 + rays.film_y**2 <= (d.film_radius_mm * slack) ** 2
-        ok &= rays.pupil_x**2 + rays.pupil_y**2 <= (d.pupil_radius_mm * slack) ** 2
-        near, far = d.film_z_mm
-        ok &= (rays.film_z >= near / slack) & (rays.film_z <= far * slack)
-        low, high = self.wavelength_limits_nm
-        return ok & (rays.wavelength_nm >= low) & (rays.wavelength_nm <= high)
+    @cached_property
+    def _derivative_graph(self) -> Graph:
+        return with_derivatives(self.graph, _DIFFERENTIATED, [("rays", k) for k in range(5)])
 
     @property
     def wavelength_limits_nm(self) -> tuple[float, float]:

@@ -18,8 +18,7 @@ from neurolens.base.files import atomic_path
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import Rays, trace
-from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
-from neurolens.surrogates.lit import SPARSE, draw, lit_share
+from neurolens.surrogates.domain import SPARSE, Domain, FilmRays, draw, lit_share, sample_domain
 
 SCHEMA = 3
 SPLITS = ("train", "held_out", "rim", "edge", "far")

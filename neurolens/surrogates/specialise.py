@@ -8,20 +8,16 @@ in white light take the whole model. A film position and a stop narrow the domai
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.base.errors import InputError
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.optics.glass import inverse_square_um
-from neurolens.surrogates.cores import InvariantPolynomial, MirrorPolynomial, Network, Partitioned, RawPolynomial
-from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.model import STOP, Core, LensModel
-from neurolens.surrogates.residual import Residual
+from neurolens.surrogates.cores import STOP
+from neurolens.surrogates.domain import Domain, sample_domain
+from neurolens.surrogates.model import LensModel
 
 # A gate goes where at most this share of the domain's rays is blocked by it and by nothing else.
 IDLE_SHARE = 1e-5
@@ -36,6 +32,18 @@ class Fix:
     wavelengths_nm: tuple[float, ...] = ()
     film_z_mm: float | None = None
     stop_radius_mm: float | None = None
+
+    def check(self, domain: Domain) -> None:
+        """Refuse a film position or a stop outside a domain.
+
+        Raises:
+            InputError: as it says.
+        """
+        z, stop, (near, far), widest = self.film_z_mm, self.stop_radius_mm, domain.film_z_mm, domain.stop_radius_mm
+        if z is not None and not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
+            raise InputError("fix", "film_z", z, f"{near:.6g} to {far:.6g} mm, the film positions of the fit")
+        if stop is not None and not 0 < stop <= widest * DOMAIN_SLACK:
+            raise InputError("fix", "stop", stop, f"above 0, up to {widest:.6g} mm, the widest stop of the fit")
 
 
 def fixed_models(model: LensModel, fix: Fix) -> tuple[LensModel, ...]:
@@ -54,19 +62,15 @@ def fixed_models(model: LensModel, fix: Fix) -> tuple[LensModel, ...]:
 
 def _narrowed(model: LensModel, fix: Fix) -> LensModel:
     """The same model over one film position, with one stop as its widest."""
+    fix.check(model.domain)
     domain, lens, settings = model.domain, model.lens, dict(model.settings)
-    (near, far), widest = domain.film_z_mm, domain.stop_radius_mm
-    z, stop = fix.film_z_mm, fix.stop_radius_mm
-    if z is not None:
-        if not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
-            raise InputError("fix", "film_z", z, f"{near:.6g} to {far:.6g} mm, the film positions of the fit")
-        domain = replace(domain, film_z_mm=(z, z))
-        settings["film_z_mm"] = z
-    if stop is not None:
-        if not 0 < stop <= widest * DOMAIN_SLACK:
-            raise InputError("fix", "stop", stop, f"above 0, up to {widest:.6g} mm, the widest stop of the fit")
-        domain, lens = replace(domain, stop_radius_mm=stop), lens.with_stop_radius(stop)
-        settings["stop_radius_mm"] = stop
+    if fix.film_z_mm is not None:
+        domain = replace(domain, film_z_mm=(fix.film_z_mm, fix.film_z_mm))
+        settings["film_z_mm"] = fix.film_z_mm
+    if fix.stop_radius_mm is not None:
+        domain = replace(domain, stop_radius_mm=fix.stop_radius_mm)
+        lens = lens.with_stop_radius(fix.stop_radius_mm)
+        settings["stop_radius_mm"] = fix.stop_radius_mm
     return replace(model, domain=domain, lens=lens, settings=settings)
 
 
@@ -90,8 +94,7 @@ def without_idle_gates(models: tuple[LensModel, ...]) -> tuple[LensModel, ...]:
     if len(left) == len(models[0].gates):
         return models
     return tuple(
-        replace(m, gates=tuple(m.gates[k] for k in left), core=_keep(m.core, [0, *(1 + k for k in left)]))
-        for m in models
+        replace(m, gates=tuple(m.gates[k] for k in left), core=m.core.keep([0, *(1 + k for k in left)])) for m in models
     )
 
 
@@ -101,18 +104,6 @@ def _blocked(model: LensModel) -> Tensor:
         vectors, scalars = model.core(model.encoding(sample_domain(model.domain, _IDLE_RAYS, seed=17)))
     stop = ((vectors[STOP] * model.scales.stop_mm) ** 2).sum(0) > model.domain.stop_radius_mm**2
     return torch.cat([stop[None], scalars[1:] > 0])
-
-
-def _keep(core: Core, scalars: list[int]) -> Any:
-    """A core with these of its scalars only."""
-    if isinstance(core, (InvariantPolynomial, MirrorPolynomial, RawPolynomial)):
-        return replace(core, scalars=core.scalars[scalars])
-    if isinstance(core, Network):
-        rows = [*range(core.ab_rows), *(core.ab_rows + k for k in scalars)]
-        return replace(core, output=(core.output[0][rows], core.output[1][rows]))
-    if isinstance(core, (Partitioned, Residual)):
-        return replace(core, parts=tuple(_keep(part, scalars) for part in core.parts))
-    raise TypeError(f"no part of a core of type {type(core).__name__}")
 
 
 def at_wavelength(model: LensModel, wavelength_nm: float) -> LensModel:
@@ -131,34 +122,6 @@ def at_wavelength(model: LensModel, wavelength_nm: float) -> LensModel:
         model,
         domain=replace(model.domain, wavelength_nm=(wavelength_nm, wavelength_nm)),
         encoding=replace(model.encoding, w_half=0.0),
-        core=_fixed(model.core, w),
+        core=model.core.fixed(w),
         settings={**model.settings, "wavelength_nm": wavelength_nm},
     )
-
-
-def _fixed(core: Core, w: float) -> Any:
-    if isinstance(core, (InvariantPolynomial, MirrorPolynomial)):
-        exponents, merge = _merge(core.exponents, w)
-        return replace(core, exponents=exponents, ab=core.ab @ merge, scalars=core.scalars @ merge)
-    if isinstance(core, RawPolynomial):
-        exponents, merge = _merge(core.exponents, w)
-        return replace(core, exponents=exponents, components=core.components @ merge, scalars=core.scalars @ merge)
-    if isinstance(core, Network):
-        # With w_half = 0 the network is shown w = 0; its shift makes that the wanted one.
-        shift = core.shift.clone()
-        shift[-1] -= w
-        return replace(core, shift=shift)
-    if isinstance(core, (Partitioned, Residual)):
-        # Zones are split by rho, which no wavelength changes.
-        return replace(core, parts=tuple(_fixed(part, w) for part in core.parts))
-    raise TypeError(f"no fixed wavelength for a core of type {type(core).__name__}")
-
-
-def _merge(exponents: NDArray[np.int64], w: float) -> tuple[NDArray[np.int64], Tensor]:
-    """Exponents without w, each once, and the matrix [M, M'] that sums the old coefficients into the new."""
-    rest = exponents.copy()
-    rest[:, -1] = 0
-    unique, place = np.unique(rest, axis=0, return_inverse=True)
-    merge = np.zeros((len(exponents), len(unique)))
-    merge[np.arange(len(exponents)), place.reshape(-1)] = w ** exponents[:, -1].astype(float)
-    return unique, torch.from_numpy(merge)

@@ -23,11 +23,18 @@ from torch import Tensor
 from neurolens.base.errors import InputError, ModelError
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.optics.prescription import Coating, Lens, Surface
-from neurolens.surrogates.cores import InvariantPolynomial, MirrorPolynomial, Network, Partitioned, RawPolynomial
+from neurolens.surrogates.cores import (
+    Core,
+    InvariantPolynomial,
+    MirrorPolynomial,
+    Network,
+    Partitioned,
+    RawPolynomial,
+    Residual,
+)
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import Core, Gate, LensModel, Scales
-from neurolens.surrogates.residual import Residual
+from neurolens.surrogates.model import Gate, LensModel, Scales
 
 SCHEMA = 1
 # Cores by the name that files carry. Their fields are tensors, integer arrays, numbers, tuples and other cores.
@@ -161,9 +168,8 @@ def _inflated(text: str) -> bytes:
 
 
 def _pack(value: Any) -> Any:
-    if isinstance(value, Tensor):
-        array = value.detach().cpu().numpy().astype("<f4")
-        return {"f4": base64.b64encode(array.tobytes()).decode(), "shape": list(array.shape)}
+    if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+        return {"f4": base64.b64encode(value.astype("<f4").tobytes()).decode(), "shape": list(value.shape)}
     if isinstance(value, np.ndarray):
         if value.size and not (0 <= value.min() and value.sum(-1).max() <= _MAX_DEGREE):
             raise InputError("export", "exponents", "(a negative or larger one)", f"terms of degree 0 to {_MAX_DEGREE}")
@@ -196,7 +202,7 @@ def _core(packed: Any, depth: int = 0) -> Any:
         return array.astype(np.int64)
     if not np.isfinite(array).all():
         raise ValueError("coefficients that are NaN or infinite")
-    return torch.from_numpy(array.astype(np.float64))
+    return array.astype(np.float64)
 
 
 def _numbers(kind: Any, packed: dict[str, Any]) -> Any:

@@ -1,19 +1,22 @@
-"""What a core is fitted to: the exact vectors and scalars of ray pairs, scaled, with weights that say what counts."""
+"""What a core is fitted to: ray pairs, their exact vectors and scalars, scaled, with weights that say what counts."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Core
 from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.gates import boundary_rays, boundary_weights
 from neurolens.surrogates.lightfield import Encoding, LightField, angle_vector
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Scales
-from neurolens.surrogates.pairs import PairSet
+from neurolens.surrogates.model import Gate, Scales
+from neurolens.surrogates.pairs import PairSet, RayPairs
 
 
 def scales_of(lens: Lens) -> Scales:
@@ -46,6 +49,39 @@ def targets_of(lens: Lens, encoding: Encoding, pairs: PairSet) -> Targets:
     return Targets(encoding(pairs.inputs), vectors, pairs.transmittance)
 
 
+@dataclass(frozen=True)
+class Prepared:
+    """Ray pairs with what all fits share.
+
+    Attributes:
+        encoding, gates: of the model.
+        lost_share: rays of the domain that miss a surface or are totally reflected in a way that no gate tells.
+    """
+
+    pairs: RayPairs
+    encoding: Encoding
+    gates: tuple[Gate, ...]
+    lost_share: float = 0.0
+
+    @property
+    def train(self) -> Targets:
+        return targets_of(self.pairs.lens, self.encoding, self.pairs.train)
+
+    @cached_property
+    def boundary(self) -> PairSet:
+        """The rays on which gates and the stop crossing are fitted."""
+        return boundary_rays(self.pairs, self.gates)
+
+    @property
+    def boundary_field(self) -> LightField:
+        return self.encoding(self.boundary.inputs)
+
+    @cached_property
+    def boundary_weights(self) -> tuple[Tensor, Tensor]:
+        """Of the gates [G, N] and of the stop crossing [N]."""
+        return boundary_weights(self.pairs.lens, self.gates, self.boundary)
+
+
 def film_equivalent_weights(lens: Lens, domain: Domain) -> tuple[float, float]:
     """Micrometres on the film per unit of scaled position and per radian, first order.
 
@@ -66,6 +102,13 @@ def film_equivalent(lens: Lens, domain: Domain, vectors: Tensor) -> Tensor:
     position, direction = film_equivalent_weights(lens, domain)
     at_infinity = direction * vectors[DIRECTION]
     return torch.stack([at_infinity + position * vectors[POSITION], at_infinity])
+
+
+def squared_error(pairs: RayPairs, encoding: Encoding, core: Core, rays: PairSet) -> float:
+    """Summed squared film-equivalent error (um^2) of a core over rays of a lens and domain."""
+    targets = targets_of(pairs.lens, encoding, rays)
+    found, wanted = (film_equivalent(pairs.lens, pairs.domain, v) for v in (core(targets.field)[0], targets.vectors))
+    return float(((found - wanted) ** 2).sum())
 
 
 def weighed_apart(lens: Lens, domain: Domain, vectors: Tensor, position_weight: float) -> Tensor:

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from shipped import LENSES
 
-from neurolens.analysis import layout, plot_style, plots
+from neurolens.analysis import layout, plot_style
 from neurolens.cli import main
 from neurolens.commands.analyse import WHATS
 
@@ -48,8 +48,9 @@ def test_text_and_picture_of_each(
     what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[Any] = []
-    for module in (plots, layout):
-        monkeypatch.setattr(module, "new_figure", lambda *s: made.append(plot_style.new_figure(*s)) or made[-1])
+    new_figure = plot_style.new_figure
+    for module in (plot_style, layout):
+        monkeypatch.setattr(module, "new_figure", lambda *s: made.append(new_figure(*s)) or made[-1])
     assert main(["analyse", str(TESSAR), what, "-o", str(tmp_path / "pictures")]) == 0
     text = capsys.readouterr().out
     assert "1 pictures drawn" in text and len(text.splitlines()) > 4

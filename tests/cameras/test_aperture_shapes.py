@@ -12,8 +12,8 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.thin import ThinLens
 from neurolens.optics.apertures import Aperture
 
 FILM = (36.0, 24.0)
@@ -89,7 +89,6 @@ def test_a_shot_shapes_every_camera_but_a_point() -> None:
         make_camera("pinhole", shot)
 
 
-@pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 def test_a_shot_zooms_and_focuses_inside() -> None:
     zoom = lens_models.LENSES / "nikon_zoom_70_200.toml"
     near = make_camera(zoom, Shot(FILM, 3.0, zoom=100.0, focus="internal"))

@@ -13,9 +13,9 @@ import pytest
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.optics.paraxial import film_z_mm, first_order
 
 FILM = (36.0, 24.0)

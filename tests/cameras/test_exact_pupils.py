@@ -11,7 +11,7 @@ from camera_helpers import at, camera, film_rays, jittered
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.exact_pupils import OUTLINE, PUPILS, pupil_named
+from neurolens.cameras.exact import OUTLINE, PUPILS, pupil_named
 from neurolens.cameras.lens_film import LensFilm
 from neurolens.cameras.vignetting import VIGNETTINGS
 from neurolens.commands import arguments

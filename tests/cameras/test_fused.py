@@ -11,7 +11,6 @@ from typing import Any
 
 import lens_models
 import numpy as np
-import onnx
 import pytest
 
 from neurolens.base import status as st
@@ -19,20 +18,17 @@ from neurolens.base.errors import InputError
 from neurolens.cameras import fused as fused_module
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import CameraRays
-from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.exact import ExactCamera, FusedExactCamera
 from neurolens.cameras.fused import FusedCamera
-from neurolens.cameras.fusedexact import FusedExactCamera
-from neurolens.cameras.graphprogram import program_of
 from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.graph import compiler, loworder
+from neurolens.graph.ir import Graph
+from neurolens.modelfile.graph import graph_of
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
-from neurolens.programs import compiler, loworder
-from neurolens.programs.contract import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
-from neurolens.programs.expressions import Program
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
-from neurolens.surrogates.onnx.export import export_onnx
-from neurolens.surrogates.precision import store_weights
+from neurolens.surrogates.export import export_onnx
 
 ROOT = Path(__file__).parents[2]
 FILM = (36.0, 24.0)
@@ -216,16 +212,17 @@ def test_rays_that_are_lost_on_their_way_stay_finite() -> None:
 def test_directions_of_another_length_pass_nothing(length: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a poor network makes of a few rays, here of those of half the film."""
 
-    def spoilt(*args: Any) -> Program:
-        program = program_of(*args)
-        zero = program.select(program.input(RAY[0]), 0.0, 0.0, 1.0)
-        strange = zero / zero if math.isnan(length) else program.literal(1.0) / zero
-        factor = strange if not math.isfinite(length) else program.select(zero, 0.0, length, 1.0)
-        program.outputs |= {name: program.outputs[name] * factor for name in SCENE_RAY[3:]}
-        return program
+    def spoilt(*args: Any) -> Graph:
+        g = graph_of(*args)
+        zero = g.select(g.input("rays", 5)[0] <= 0.0, 0.0, 1.0)
+        strange = zero / zero if math.isnan(length) else 1.0 / zero
+        factor = strange if not math.isfinite(length) else g.select(zero <= 0.0, length, 1.0)
+        scene_ray = g.outputs["scene_ray"]
+        g.outputs["scene_ray"] = g.concat(scene_ray[0:3], scene_ray[3:6] * factor)
+        return g
 
     _, whole = pair()
-    monkeypatch.setattr(fused_module, "program_of", spoilt)
+    monkeypatch.setattr(fused_module, "graph_of", spoilt)
     half = FusedCamera(load_model(model_file()), film_mm=FILM, focus_m=2.0)
     given = numbers(4000, seed=2)
     wanted, found = whole.sample(*given), half.sample(*given)
@@ -246,64 +243,6 @@ def test_lenses_that_a_c_tracer_does_not_know() -> None:
             make_camera(spec, Shot(FILM, 2.0))
 
 
-def evaluated_as_onnxruntime(file: Path, state: tuple[float, ...] = (), differ: float = 2e-4) -> None:
-    """A graph's program, evaluated in numpy, against onnxruntime."""
-    model = load_model(file)
-    model = model.at(*state) if state else model
-    domain, rng = model.card["domain"], np.random.default_rng(2)
-    film, pupil = ((rng.random((2, 5000)) - 0.5) * 1.6 * domain[k] for k in ("film_radius_mm", "pupil_radius_mm"))
-    wavelength, z, stop = rng.uniform(390, 720, 5000), domain["film_z_mm"][0], 0.8 * domain["stop_radius_mm"]
-    wanted = model.rays(film, pupil, wavelength, z, stop)
-    inputs = dict(zip((*RAY, WAVELENGTH), (*film, *pupil, wavelength), strict=True)) | {FILM_Z: z, STOP_RADIUS: stop}
-    found = program_of(file, model.data, state).evaluate(inputs)
-    same = found["status"] == wanted.status
-    ok = same & (wanted.status == st.PASSED)
-    assert same.mean() >= 1 - differ and ok.mean() > 0.05 and len(np.unique(wanted.status)) > 2
-    for name, row in zip(SCENE_RAY, wanted.scene_ray, strict=True):
-        assert np.abs(found[name] - row)[ok].max() < (1e-4 if name.endswith("mm") else 2e-6)
-    assert np.abs(found["transmittance"] - wanted.transmittance)[ok].max() < 1e-5
-
-
-@pytest.mark.parametrize("kind", lens_models.KINDS)
-def test_programs_of_every_kind_of_graph(kind: str) -> None:
-    evaluated_as_onnxruntime(lens_models.exported(kind))
-
-
-@pytest.mark.parametrize("precision", ["int8", "float16"])
-def test_programs_of_rounded_weights(precision: str, tmp_path: Path) -> None:
-    file = store_weights(lens_models.exported("network"), tmp_path / "rounded.onnx", precision)  # type: ignore[arg-type]
-    evaluated_as_onnxruntime(file)
-
-
-def test_programs_of_many_states() -> None:
-    file = ROOT / "models" / "nikon_zoom_80_200-range.states-64.onnx"
-    for share in (0.0, 0.37, 1.0):
-        state = tuple(a.range[0] + share * (a.range[1] - a.range[0]) for a in load_model(file).axes)
-        evaluated_as_onnxruntime(file, state, differ=1e-3)
-
-
-def test_an_operator_without_a_fused_form(tmp_path: Path) -> None:
-    proto = onnx.load(lens_models.exported("network"))
-    next(n for n in proto.graph.node if n.op_type == "Tanh").op_type = "Sin"
-    with pytest.raises(InputError, match="Sin"):
-        program_of(tmp_path / "model.onnx", proto.SerializeToString())
-
-
-def test_graphs_that_ask_for_too_much(tmp_path: Path) -> None:
-    """A few numbers that meet as rows and columns, and a shape that only fits as many rays as the check has."""
-    helper, tensor = onnx.helper, onnx.numpy_helper.from_array
-    row, column = (tensor(np.ones(s, np.float32), n) for s, n in (((1, 5000), "row"), ((5000, 1), "column")))
-    shape = tensor(np.array([1, 16400]), "shape")
-    for node, constants in (
-        (helper.make_node("Mul", ["row", "column"], ["x"]), [row, column]),
-        (helper.make_node("MatMul", ["column", "row"], ["x"]), [row, column]),
-        (helper.make_node("Reshape", ["film_z_mm", "shape"], ["x"]), [shape]),
-    ):
-        graph = helper.make_graph([node], "g", [], [], constants)
-        with pytest.raises(InputError, match="graph"):
-            program_of(tmp_path / "model.onnx", helper.make_model(graph).SerializeToString())
-
-
 def test_workers_share_one_library() -> None:
     _, fused = pair()
     scene = load_scene(ROOT / "experiments" / "scenes" / "grid.toml")
@@ -316,7 +255,7 @@ def test_no_torch_no_onnx(tmp_path: Path) -> None:
     code = (
         "import sys\n"
         "sys.modules.update(dict.fromkeys(['torch', 'onnx', 'sklearn', 'matplotlib']))\n"
-        "from neurolens.programs import compiler\n"
+        "from neurolens.graph import compiler\n"
         f"compiler.FLAGS = {compiler.FLAGS!r}\n"
         "from neurolens.cameras.build import Shot, make_camera\n"
         f"camera = make_camera('fused:{model_file()}', Shot((36.0, 24.0), 2.0))\n"

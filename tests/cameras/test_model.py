@@ -17,8 +17,8 @@ from onnx import ModelProto, TensorProto, helper, numpy_helper
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
-from neurolens.cameras import onnxfile
 from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
+from neurolens.modelfile import onnxfile
 
 ROOT = Path(__file__).parents[2]
 

@@ -19,7 +19,6 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.radiometry import film_light
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 ROOT = Path(__file__).parents[2]
 FILM = (36.0, 24.0)
 # Lens, focal length, f-number, least share of rays that pass.

@@ -62,12 +62,7 @@ def rate_and_lost(outline: PupilOutline, passes: Passes, reach: float = 7.0, wid
         passed = passes(film, points, wavelength)
         sent, hit = sent + (area > 0).sum(), hit + passed.sum()
         wide = PupilOutline(
-            0.0,
-            outline.film_radius_mm,
-            outline.wavelength_nm,
-            outline.centre,
-            wider * outline.x,
-            wider * outline.y,
+            0.0, outline.film_radius_mm, outline.wavelength_nm, outline.centre, wider * outline.x, wider * outline.y
         )
         points, area = wide.sample(film, square, waves)
         passed = passes(film, points, wavelength)

@@ -15,11 +15,10 @@ from camera_helpers import FILM, FISHEYES, GAUSS, camera, film_rays, jittered, t
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.thin import ThinLens
-from neurolens.surrogates.inversion.fit import fit_inverse
-from neurolens.surrogates.onnx.export import export_onnx
-from neurolens.surrogates.onnx.inverse import export_inverse
+from neurolens.surrogates.export import export_inverse, export_onnx
+from neurolens.surrogates.inverse_fit import fit_inverse
 
 IDEAL = ("pinhole", "thin", "thick", *FISHEYES)
 

@@ -11,9 +11,8 @@ from camera_helpers import FILM, FISHEYES, KINDS, RADII, camera, film_value, jit
 
 from neurolens.base import status as st
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.fisheye import PROJECTIONS
-from neurolens.cameras.thick import ThickLens
-from neurolens.cameras.thin import ThinLens
+from neurolens.cameras.ideal import ThickLens, ThinLens
+from neurolens.cameras.pinhole import PROJECTIONS
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.radiometry import disc_irradiance
 

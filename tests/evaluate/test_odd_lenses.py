@@ -20,8 +20,8 @@ from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.domain import domain_of
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 AIR: dict[str, float] = {}
@@ -68,7 +68,6 @@ def written(folder: Path, name: str, f_number: float, surfaces: Surfaces) -> Pat
 
 
 @pytest.mark.parametrize("name", ODD)
-@pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 def test_promises_of_the_default_domain_hold(name: str, tmp_path: Path) -> None:
     experiment = default_experiment(written(tmp_path, name, *ODD[name]))
     lens = experiment.lens.read()
@@ -83,7 +82,6 @@ def test_promises_of_the_default_domain_hold(name: str, tmp_path: Path) -> None:
     assert figures["direction_rms_deg"] < 0.01 and figures["false_pass"] < 0.01 and figures["false_block"] < 0.01
 
 
-@pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 def test_defaults_of_the_whole_library() -> None:
     """Every lens: visible light, or the d line; an object in focus that lies before the front surface."""
     for file in sorted(LENSES.glob("*.toml")):

@@ -55,12 +55,9 @@ def biconvex(**changes: Any) -> dict[str, Any]:
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Every figure made, so that a test can read its axes."""
     made: list[Any] = []
-    for name in (
-        "neurolens.evaluate.plots",
-        "neurolens.evaluate.figures",
-        "neurolens.analysis.layout",
-    ):
-        monkeypatch.setattr(f"{name}.new_figure", lambda *size: made.append(style.new_figure(*size)) or made[-1])
+    new_figure = style.new_figure
+    for module in (style, drawn, layout):
+        monkeypatch.setattr(module, "new_figure", lambda *size: made.append(new_figure(*size)) or made[-1])
     return made
 
 

@@ -30,7 +30,6 @@ from neurolens.surrogates.domain import Domain, FilmRays, domain_of
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, trace_pairs
 
 LENSES = Path(__file__).parents[2] / "lenses"
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 
 
 def lens_and_domain(

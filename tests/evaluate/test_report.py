@@ -1,16 +1,99 @@
-"""The report: well-formed, complete, offline, and safe against hostile names; missing figures stay missing."""
+"""Records of a run, read back as written, and the report: complete, offline, and safe against hostile names."""
 
 from __future__ import annotations
 
+import itertools
+import json
+import math
+import random
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+import numpy as np
 import pytest
 
 from neurolens.base.errors import InputError
-from neurolens.evaluate.report import DASH, local_url, write_report
+from neurolens.evaluate import records
+from neurolens.evaluate.records import break_even_rays, pareto_front
+from neurolens.evaluate.report import local_url, write_report
+
+
+def test_break_even_is_where_the_total_times_meet() -> None:
+    fit_s, load_s, ns_exact, ns_model = 8.0, 0.5, 48.0, 14.0
+    rays = break_even_rays(fit_s, load_s, ns_exact, ns_model)
+    assert rays is not None
+    assert rays * ns_exact * 1e-9 == pytest.approx(fit_s + load_s + rays * ns_model * 1e-9, rel=1e-12)
+    assert break_even_rays(1.0, 0.0, 11.0, 10.0) == pytest.approx(1e9)
+
+
+@pytest.mark.parametrize(
+    "times", [(8, 0.5, 20, 20), (8, 0.5, 20, 30), (None, 0, 9, 1), (8, 0, None, 1), (8, 0, 9, None)]
+)
+def test_break_even_is_none_where_it_never_pays_or_is_not_known(times: tuple[float | None, ...]) -> None:
+    assert break_even_rays(*times) is None
+
+
+@pytest.mark.parametrize("times", [(-1, 0, 20, 10), (1, 0, math.nan, 10), (math.inf, 0, 20, 10)])
+def test_break_even_refuses_times_that_cannot_be(times: tuple[float, ...]) -> None:
+    with pytest.raises(InputError, match="break_even_rays"):
+        break_even_rays(*times)
+
+
+def test_pareto_front_by_hand() -> None:
+    points = [(10, 5.0), (12, 1.0), (11, 6.0), (20, 1.0), (30, 0.2), (12, 2.0), (math.nan, 0.0)]
+    assert pareto_front(points) == [0, 1, 4]
+    assert pareto_front([]) == []
+    assert pareto_front([(1, 1), (1, 1), (2, 1)]) == [0, 1]
+
+
+def test_pareto_front_agrees_with_its_definition() -> None:
+    draw = random.Random(3)
+    points = [(draw.randint(0, 12), draw.randint(0, 12)) for _ in range(120)]
+
+    def bettered(p: tuple[int, int]) -> bool:
+        return any(q[0] <= p[0] and q[1] <= p[1] and q != p for q in points)
+
+    front = pareto_front(points)
+    assert sorted(front) == [i for i, p in enumerate(points) if not bettered(p)]
+    assert all(points[i][0] <= points[j][0] for i, j in itertools.pairwise(front))
+
+
+def test_results_come_back_as_written(tmp_path: Path) -> None:
+    path = tmp_path / "results.json"
+    results = {
+        "lens": {"name": "Tessar", "efl_mm": np.float32(50.0)},
+        "models": [{"name": "a", "rms_um": math.nan, "ns_per_ray": {"min": np.float64(12.5), "threads": np.int64(1)}}],
+        "domain": {"wavelength_nm": np.array([400.0, 700.0]), "focus_m": (2.0, math.inf)},
+        "seed": 3,
+    }
+    records.write_results(path, results)
+    text = path.read_text()
+    assert "NaN" not in text and "Infinity" not in text  # which JSON does not know
+    back = json.loads(text)
+    assert back["lens"]["efl_mm"] == 50.0 and back["domain"]["wavelength_nm"] == [400.0, 700.0]
+    assert back["models"] == [{"name": "a", "rms_um": None, "ns_per_ray": {"min": 12.5, "threads": 1}}]
+    assert back["domain"]["focus_m"] == [2.0, "infinity"] and back["schema_version"] == records.SCHEMA_VERSION
+    assert [p.name for p in tmp_path.iterdir()] == ["results.json"]
+
+
+@pytest.mark.parametrize(
+    ("results", "words"),
+    [
+        ({"modles": []}, "modles"),
+        ({"models": {}}, "models.*a list"),
+        ({"lens": []}, "lens.*a table"),
+        ({"models": [{"rms_um": 1.0}]}, "models 0, name"),
+        ({"exact": ["eager"]}, "exact 0, name"),
+        ([], "top level"),
+    ],
+)
+def test_results_of_another_shape_are_refused(results: object, words: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=words):
+        records.write_results(tmp_path / "results.json", results)  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
 
 HOSTILE = "<script>alert('x')</script>\"&'"
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -142,35 +225,6 @@ def test_a_picture_outside_the_run_folder_is_not_shown(file: str, run_dir: Path)
     assert page.sources == ["./room.png"] and set(page.links) == {"./room.png"}
     assert "Picture missing" in page.text
     (run_dir.parent / "secret.png").unlink()
-
-
-def test_what_was_not_measured_is_a_dash(run_dir: Path) -> None:
-    results = {
-        "models": [{"name": "a", "rms_um": 1.5, "fit_s": None, "max_um": float("nan")}, {"name": "b", "max_um": 9.0}]
-    }
-    page = read(write_report(run_dir, results))
-    assert page.cells == ["1.5", DASH, DASH, "9"]  # columns: RMS, max; no record holds the others
-
-
-def test_an_empty_run_still_makes_a_page(run_dir: Path) -> None:
-    page = read(write_report(run_dir, {}))
-    assert "neurolens run" in page.text and not page.sources and not page.cells
-    assert not list(run_dir.glob(".*"))
-
-
-def test_the_headline_leaves_out_fast_models_that_are_far_off(run_dir: Path) -> None:
-    """A thin lens is fast and wrong: the best speed-up shown is that of a model within 2 um."""
-    models = [
-        {"name": "thin", "rms_um": 300.0, "speedup_over_compiled": 25.0, "ns_per_ray": {"min": 2.0}},
-        {"name": "ols", "rms_um": 1.8, "speedup_over_compiled": 3.7, "ns_per_ray": {"min": 13.0}},
-    ]
-    images = [
-        {"camera": c, "scene": s, "flip_ratio": r}
-        for c, s, r in (("exact", "a", 1), ("ols", "a", 0.99), ("ols", "b", 1.04), ("t", "a", 3))
-    ]
-    page = read(write_report(run_dir, {"models": models, "images": images}))
-    headline = page.text[page.text.index("Headline") : page.text.index("Models, on rays")]
-    assert "3.7" in headline and "25" not in headline and "1.04" in headline and "0.99" not in headline
 
 
 def test_bad_input_is_one_clear_error(tmp_path: Path) -> None:

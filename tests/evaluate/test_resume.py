@@ -33,7 +33,7 @@ fit_and_measure(prepared(), SETTINGS, Path(sys.argv[1]), 2000, lambda share: Non
 
 def _weights(core: object) -> torch.Tensor:
     assert isinstance(core, Network)
-    return torch.cat([t.reshape(-1) for pair in (*core.hidden, core.output) for t in pair])
+    return torch.cat([torch.from_numpy(t).reshape(-1) for pair in (*core.hidden, core.output) for t in pair])
 
 
 @pytest.mark.slow

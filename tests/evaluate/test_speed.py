@@ -10,17 +10,10 @@ import pytest
 import torch
 
 from neurolens.base.errors import InputError
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.evaluate.candidates import camera_candidate, exact_candidates
-from neurolens.evaluate.speed import (
-    Call,
-    Candidate,
-    Race,
-    Unavailable,
-    pinned_threads,
-    race,
-)
+from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, pinned_threads, race
 from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of
 

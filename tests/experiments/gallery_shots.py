@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import numpy as np
 from experiments.gallery.cameras import CAMERAS, Shot, Surrogate, View, shot_of, surrogate_of
 from experiments.gallery.measures import MEASURES
 from experiments.gallery.settings import Panel
-from neurolens.base.errors import NeurolensWarning
 from neurolens.render.scene import scene_from_tables
 
 ROOT = Path(__file__).parents[2]
@@ -32,9 +30,7 @@ def shot(lens: str, *, focus_m: float, wavelengths_nm: tuple[float, float] = (55
         "wavelengths_nm": list(wavelengths_nm),
     }
     panel.setdefault("film_mm", (36.0, 24.0))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NeurolensWarning)
-        return shot_of(Panel("test", file, Path("scene"), **panel), scene_from_tables({"camera": camera}))
+    return shot_of(Panel("test", file, Path("scene"), **panel), scene_from_tables({"camera": camera}))
 
 
 def view(taken: Shot, column: str, surrogate: Surrogate | None = None) -> View:

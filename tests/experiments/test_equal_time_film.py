@@ -16,7 +16,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.thin import ThinLens
+from neurolens.cameras.ideal import ThinLens
 from neurolens.optics.lensfile import read_lens
 
 FILM = (36.0, 18.0)

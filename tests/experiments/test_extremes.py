@@ -18,7 +18,6 @@ from neurolens.base import status as st
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 LENSES = Path(__file__).parents[2] / "lenses"
 COUNT = 300
 ALL = [

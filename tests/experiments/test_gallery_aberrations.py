@@ -17,7 +17,7 @@ from experiments.gallery.settings import read_effect
 from neurolens.analysis.field_curves import RECTILINEAR, curvature, distortion
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.seidel import seidel
-from neurolens.cameras.thin import ThinLens
+from neurolens.cameras.ideal import ThinLens
 from neurolens.optics.glass import LINE_D_NM, index_of
 from neurolens.optics.paraxial import first_order
 from neurolens.render.renderer import render

@@ -16,8 +16,8 @@ from experiments.gallery.bokeh import LightDisc, light_disc
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.thin import ThinLens
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.trace import Rays, trace

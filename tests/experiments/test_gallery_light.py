@@ -16,9 +16,9 @@ from experiments.gallery.run import check
 from experiments.gallery.settings import read_effect
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import load_model
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.cameras.vignetting import Vignetted
 from neurolens.optics.lensfile import read_lens
 from neurolens.render.scene import load_scene

@@ -18,7 +18,7 @@ from experiments.gallery.run import check, fingerprint_of
 from experiments.gallery.settings import find_effects, read_effect
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
-from neurolens.cameras.thin import ThinLens
+from neurolens.cameras.ideal import ThinLens
 from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings

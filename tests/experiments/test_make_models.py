@@ -15,6 +15,7 @@ from experiments.make_models import Entry, Library, chosen, fingerprint, read_li
 from experiments.promises import read_index
 from neurolens.base.config import from_dict
 from neurolens.base.errors import InputError
+from neurolens.base.files import sha256_of
 from neurolens.base.progress import Progress
 from neurolens.evaluate.measure import Measured
 from neurolens.surrogates.fit import ModelSettings
@@ -49,7 +50,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         for settings in entry.models:
             (out / entry.file(settings)).write_bytes(b"a model")
             rows.append(row(entry.file(settings), entry.state, fingerprint(entry, library.pairs)))
-            rows[-1]["sha256"] = make_models._sha256(out / entry.file(settings))
+            rows[-1]["sha256"] = sha256_of(out / entry.file(settings))
         return rows
 
     monkeypatch.setattr(make_models, "make_entry", make_entry)

@@ -8,7 +8,6 @@ from pathlib import Path
 import lens_models
 import numpy as np
 import pytest
-import torch
 from vignetting_oracle import vignetting_errors
 
 from experiments import outside
@@ -20,9 +19,7 @@ from neurolens.evaluate.experiment import LensChoice
 from neurolens.evaluate.vignetting import relative_illumination
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.specialise import at_wavelength
 
 LENSES = Path(__file__).parents[2] / "lenses"
 
@@ -91,25 +88,11 @@ def test_the_command_writes_rows_and_keeps_others(
     assert main([*command[:2], "no such lens", *command[3:]]) != 0
 
 
-@pytest.mark.parametrize("kind", ["invariants", "network", "fisheye"])  # the last without dispersion
-def test_nothing_passes_outside_the_domain(kind: str, tmp_path: Path) -> None:
-    """2e5 random inputs: any bits, NaN, infinities, denormals, huge and negative numbers, rays just outside."""
-    model = load_model(export_onnx(lens_models.model(kind), tmp_path / "m.onnx"))
+def test_broken_promises_are_counted() -> None:
+    """Any bits, NaN, rays just outside: a model keeps its promises; one that passes everything is caught at each."""
+    model = load_model(lens_models.exported("invariants"))
     found = outside.send(model, 200_000, seed=7)
-    assert found.broken == dict.fromkeys(found.broken, 0)
-    assert found.inside > 10_000 and found.passed > 3000
-
-
-def test_a_model_for_one_wavelength_takes_no_other(tmp_path: Path) -> None:
-    path = export_onnx(at_wavelength(lens_models.model("invariants"), 550.0), tmp_path / "m.onnx")
-    found = outside.send(load_model(path), 40_000, seed=7)
-    assert found.broken == dict.fromkeys(found.broken, 0)
-    assert found.inside > 2000 and found.passed > 500
-
-
-def test_broken_promises_are_counted(tmp_path: Path) -> None:
-    """A model that passes everything, with rays that are none, is caught at each."""
-    model = load_model(export_onnx(lens_models.model("invariants"), tmp_path / "m.onnx"))
+    assert found.broken == dict.fromkeys(found.broken, 0) and found.inside > 10_000 and found.passed > 3000
     honest = model.rays
 
     def liar(*arguments: object) -> object:
@@ -118,12 +101,5 @@ def test_broken_promises_are_counted(tmp_path: Path) -> None:
 
     model.rays = liar  # type: ignore[method-assign, assignment]
     found = outside.send(model, 40_000, seed=7)
-    assert found.broken[outside.PASSES_OUTSIDE] > 10_000
-    assert found.broken[outside.NOT_FINITE] > 1000
-    assert torch.tensor(found.passed) == 40_000
-
-
-def test_the_outside_command_says_how_many(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = export_onnx(lens_models.model("invariants"), tmp_path / "m.onnx")
-    assert main(["outside", str(path), "--rays", "5000", "--quiet"]) == 0
-    assert "5000 rays" in capsys.readouterr().out
+    assert found.broken[outside.PASSES_OUTSIDE] > 10_000 and found.broken[outside.NOT_FINITE] > 1000
+    assert found.passed == 40_000

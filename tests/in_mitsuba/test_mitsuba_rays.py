@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from neurolens.base.errors import InputError, NeurolensError
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.mitsuba import load_scene
 from neurolens.mitsuba.scenes import our_scene
 from neurolens.mitsuba.sensor import BATCH, ChannelWavelengths, FilmRays, wavelength_samples

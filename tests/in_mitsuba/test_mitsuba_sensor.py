@@ -17,8 +17,8 @@ from PIL import Image
 
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import Camera, FloatArray
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.cli import main
 from neurolens.mitsuba import camera, load_scene, register, render, require_mitsuba
 from neurolens.mitsuba.scenes import our_scene, with_our_spectra

@@ -135,15 +135,6 @@ def test_apertures_compare_by_what_they_are() -> None:
     assert len({Aperture(5), Aperture(5), Aperture(mask=STAR), Aperture(mask=STAR)}) == 2
 
 
-def test_a_mask_keeps_its_own_copy() -> None:
-    mask = STAR.astype(bool)
-    shape = Aperture(mask=mask)
-    mask[:] = False
-    assert shape.mask is not None and shape.mask.any()
-    with pytest.raises(ValueError, match="read-only"):
-        shape.mask[0, 0] = True
-
-
 @pytest.mark.parametrize(
     ("fields", "expected"),
     [

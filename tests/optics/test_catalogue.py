@@ -148,18 +148,6 @@ def test_absorption_is_linear_between_samples_and_constant_outside() -> None:
     assert torch.autograd.gradcheck(glass.absorption_per_mm, (inside,), eps=1e-4, atol=1e-12, rtol=1e-6)
 
 
-def test_the_command_shows_names_and_codes(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["glass", "F2", "PMMA", "517642", "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)["glasses"]
-    names = [row["glass"] for row in rows]
-    assert names[:5] == ["Schott:F2", "Hikari:F2", "CDGM:F2", "generic:PMMA", "Schott:N-BK7"]
-    assert rows[4]["internal_transmittance_10mm"]["550"] == pytest.approx(0.998, abs=7e-4)
-    assert main(["glass", "N-BK7"]) == 0
-    assert "1.516800" in capsys.readouterr().out
-    assert main(["glass", "N-BK77"]) == 2
-    assert "N-BK7 (Schott)" in capsys.readouterr().err
-
-
 def test_six_digit_codes() -> None:
     assert [str(g) for g in catalogue.by_code("517642")][0] == "Schott:N-BK7"
     assert {"N-BK7", "BSC7", "H-K9L"} <= {g.name for g in catalogue.by_code("517.642", 8)}

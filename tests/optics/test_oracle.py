@@ -20,7 +20,6 @@ from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays, Traced, trace
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 ROOT = Path(__file__).parents[2]
 SHARED = ROOT.parent / "shared" / "data"
 OWN = json.loads((ROOT / "tests" / "data" / "oracle_rays.json").read_text())["lenses"]

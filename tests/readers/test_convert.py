@@ -30,17 +30,6 @@ def in_folder_of_table(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(table.parent)
 
 
-def test_prints_what_was_read(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "lens.toml"
-    assert main(["convert", str(table), "-o", str(out), "--source", "a book", "--f-number", "5"]) == 0
-    text = capsys.readouterr().out
-    for expected in ("Singlet", "a book", "50.8475 mm", "stated f/5", "3, stop on 0", str(out)):
-        assert expected in text
-    lens = read_lens(out)
-    assert (lens.name, lens.source, lens.f_number) == ("Singlet", "a book", 5.0)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["lens.toml", "singlet.dat"]
-
-
 def test_json_has_units_in_its_keys(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["convert", str(table), "-o", str(tmp_path / "lens.toml"), "--units", "in", "--json"]) == 0
     captured = capsys.readouterr()
@@ -119,9 +108,3 @@ def test_a_lens_file_of_our_own_is_read_too(tmp_path: Path, capsys: pytest.Captu
     assert "--name and --source only" in failure(capsys, "convert", PATHS[2], "-o", out, "--force", "--units", "in")
     assert main(["convert", str(PATHS[2]), "-o", str(out), "--force", "--name", "mine"]) == 0
     assert read_lens(out).name == "mine"
-
-
-def test_doubts_about_the_lens_are_printed(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    table.write_text(TABLE.replace("-50.0 0 ", "-50.0 80 "))
-    assert main(["convert", str(table), "-o", str(tmp_path / "lens.toml")]) == 0
-    assert "warning: the table's last thickness puts the film at z = 89.00 mm" in capsys.readouterr().out

@@ -20,8 +20,8 @@ from render_helpers import FILM, SIZE, WHITE, diffuse, lit_scene, scene
 
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import CameraRays
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.render.checkpoint import digest
 from neurolens.render.film import FilmSettings
 from neurolens.render.renderer import RenderResult, Watch, render

@@ -54,11 +54,7 @@ def test_adaptation_of_the_academy_s_transforms() -> None:
 
 def test_srgb_to_acescg_as_published_and_white_stays_white() -> None:
     matrix = conversion(SRGB, ACESCG)
-    published = [
-        [0.613097, 0.339523, 0.047379],
-        [0.070194, 0.916354, 0.013452],
-        [0.020616, 0.109570, 0.869815],
-    ]
+    published = [[0.613097, 0.339523, 0.047379], [0.070194, 0.916354, 0.013452], [0.020616, 0.109570, 0.869815]]
     assert matrix == pytest.approx(np.array(published), abs=1.5e-6)
     assert matrix @ np.ones(3) == pytest.approx(np.ones(3), abs=1e-12)
     assert conversion(SRGB, SRGB) == pytest.approx(np.eye(3), abs=1e-12)

@@ -11,8 +11,8 @@ import pytest
 from render_helpers import FILM, SIZE, WHITE, diffuse, lit_scene, scene
 
 from neurolens.cameras.contract import CameraRays
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.render.film import BYTES_A_PIXEL, COLUMNS, FilmSettings, PixelGrid
 from neurolens.render.job import Job, develop
 from neurolens.render.renderer import Watch, render

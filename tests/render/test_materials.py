@@ -7,13 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from neurolens.render.materials import (
-    CoatTable,
-    GlossyLobes,
-    cosine_direction,
-    fresnel_dielectric,
-    glass_direction,
-)
+from neurolens.render.materials import CoatTable, GlossyLobes, cosine_direction, fresnel_dielectric, glass_direction
 
 RANDOM = np.random.default_rng(7)
 COUNT = 200_000

@@ -14,8 +14,8 @@ from render_helpers import FILM, SIZE, WHITE, diffuse, lit_scene, scene
 
 from neurolens.base.errors import InputError, ModelError, NeurolensError
 from neurolens.cameras.contract import CameraRays
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.render.film import Film, Tiling
 from neurolens.render.renderer import Watch, render
 

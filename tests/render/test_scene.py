@@ -12,8 +12,8 @@ from PIL import Image
 from render_helpers import CAMERA, WHITE, diffuse, radiance, scene, world
 
 from neurolens.base.errors import InputError
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.optics.apertures import Aperture
 from neurolens.render import pictures
 from neurolens.render.meshfile import encloses

@@ -1,19 +1,26 @@
-"""Colours go to spectra and come back; wavelengths drawn by importance have exact densities and less noise."""
+"""Wavelengths drawn by importance, and four of them a path: exact densities, the same mean, less noise."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from render_helpers import WHITE, assert_same_mean, diffuse, scene
+from PIL import Image
+from render_helpers import FILM, WHITE, assert_same_mean, diffuse, scene
 
+from neurolens.base.errors import InputError
+from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.render.film import FilmSettings
+from neurolens.render.film import FilmSettings, PixelGrid
 from neurolens.render.illuminants import table
 from neurolens.render.renderer import render
+from neurolens.render.scene import Scene
 from neurolens.render.spectrum import SpectralRange
-from neurolens.render.wavelengths import expected_light, spectral_range
+from neurolens.render.wavelengths import dispersion_px, expected_light, mode_for, spectral_range
 
 FLAT = (table("wavelength_nm"), np.ones(81))
 SPIKE = (np.array([400.0, 499.0, 500.0, 501.0, 700.0]), np.array([0.01, 0.01, 5.0, 0.01, 0.01]))
@@ -116,3 +123,158 @@ def test_cauchy_index_has_the_asked_abbe_number() -> None:
     assert lines[0] == pytest.approx(1.62, abs=1e-6)
     assert (lines[0] - 1) / (lines[1] - lines[2]) == pytest.approx(36.4, rel=1e-4)
     assert np.all(SpectralRange(400, 700).refractive_index(1.5, None) == np.float32(1.5))
+
+
+SMALL: dict[str, Any] = {"width": 12, "height": 8, "threads": 1}
+MATERIALS: dict[str, Any] = {
+    "red": diffuse(0.8, 0.1, 0.05),
+    "tiles": {"kind": "diffuse", "texture": "tiles"},
+    "poster": {"kind": "diffuse", "texture": "poster"},
+    "copper": {"kind": "glossy", "specular": [0.9, 0.5, 0.2], "roughness": 0.3, "reflectance": [0.02, 0.1, 0.4]},
+    "mirror": {"kind": "mirror", "reflectance": [0.9, 0.7, 0.5]},
+    "flint": {"kind": "glass", "n_d": 1.9, "V_d": 12.0},
+    "plain": {"kind": "glass", "n_d": 1.5},
+}
+WALL = {"point_m": [0, 0, -3], "normal": [0, 0, 1], "material": "tiles"}
+LAMP = {"corner_m": [-1, 1.5, -2], "edge_u_m": [2, 0, 0], "edge_v_m": [0, 0, 1], "emission": [5, 4, 2]}
+
+
+def room(tmp_path: Path, material: str) -> Scene:
+    pixels = np.random.default_rng(5).integers(0, 255, (8, 8, 3)).astype(np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "p.png")
+    textures = {
+        "tiles": {"kind": "checker", "colours": [[0.9, 0.2, 0.1], [0.1, 0.3, 0.9]], "cell_m": 0.2},
+        "poster": {"kind": "image", "file": str(tmp_path / "p.png")},
+    }
+    return scene(
+        {"look_at_m": [0, 0, 0]},
+        environment={"colour": [0.2, 0.4, 0.8]},
+        textures=textures,
+        materials=MATERIALS,
+        planes=[WALL],
+        quads=[LAMP, {"corner_m": [-1, -1, -2], "edge_u_m": [2, 0, 0], "edge_v_m": [0, 0, 1], "material": "poster"}],
+        spheres=[{"centre_m": [0, 0, -1.5], "radius_m": 0.9, "material": material}],
+    )
+
+
+def renders(made: Scene, camera: Any, mode: str, seeds: int, **options: Any) -> np.ndarray:
+    film = FilmSettings(wavelengths=mode)  # type: ignore[arg-type]
+    options = SMALL | {"samples": 16, "max_depth": 5} | options
+    return np.stack([render(made, camera, seed=seed, film=film, **options).rgb for seed in range(seeds)])
+
+
+def colour_noise(pictures: np.ndarray) -> float:
+    """Variance over seeds of R - G and B - G."""
+    return float((pictures[..., [0, 2]] - pictures[..., 1:2]).var(axis=0).mean())
+
+
+@pytest.mark.parametrize("material", ["red", "copper", "mirror", "plain", "flint"])
+def test_hero_paths_have_the_same_mean_and_less_colour_noise(material: str, tmp_path: Path) -> None:
+    made, camera = room(tmp_path, material), Pinhole(40.0, FILM)
+    one, hero = (renders(made, camera, mode, 48) for mode in ("one", "hero"))
+    assert_same_mean(one, hero, 0.02)
+    # Where dispersion parts them at every path, nothing is left to gain.
+    assert colour_noise(hero) < (1.1 if material == "flint" else 0.4) * colour_noise(one)
+
+
+def test_roulette_and_many_reflections_in_dispersive_glass_lose_nothing() -> None:
+    # Everything is 1 in white light: glass that scatters wavelengths apart must give all of it back.
+    spheres = [{"centre_m": [0, 0, -1.5], "radius_m": 0.9, "material": "flint"}]
+    made = scene(environment=WHITE, materials={"flint": MATERIALS["flint"]}, spheres=spheres)
+    for mode in ("one", "hero", "lanes"):
+        pictures = renders(made, Pinhole(400.0, FILM), mode, 24, samples=64, max_depth=200)
+        assert pictures.mean(axis=(0, 1, 2)) == pytest.approx(np.ones(3), abs=8e-3)
+
+
+def test_companions_are_as_probable_as_the_hero() -> None:
+    spectral = SpectralRange(400, 700, lanes=4)
+    table = np.arange(256.0)
+    turned = spectral.rotated(table)
+    assert turned.shape == (4, 256) and np.all(np.sort(turned, axis=1) == table)
+    assert turned[:, 3].tolist() == [3, 67, 131, 195] and turned[:, 200].tolist() == [200, 8, 72, 136]
+    assert SpectralRange(400, 700).rotated(table) is table
+
+
+class Prism(Pinhole):
+    """Magnifies long wavelengths, by `shift` over 400 to 700 nm, and lets less of them pass."""
+
+    dispersive, wavelength_nm, shift = True, (400.0, 700.0), 0.05
+
+    def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
+        off = (wavelength_nm - np.float32(550)) * np.float32(1 / 300)
+        rays = super().sample(film_mm * (1 + np.float32(self.shift) * off), pupil, wavelength_nm)
+        return replace(rays, weight=rays.weight * (1 - off))
+
+
+def prism(shift: float) -> Prism:
+    camera = Prism(40.0, FILM)
+    camera.shift = shift
+    return camera
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e-3, 0.05])
+def test_dispersion_is_measured_in_pixels(shift: float) -> None:
+    # RMS distance from the film's centre is sqrt((w^2 + h^2) / 12); half the shift on either side of the middle.
+    expected = 0.5 * shift * np.sqrt((36**2 + 24**2) / 12) / (36 / 72)
+    assert dispersion_px(prism(shift), PixelGrid(72, 48, FILM), (400, 700)) == pytest.approx(
+        expected, rel=0.03, abs=2e-4
+    )
+
+
+def test_a_camera_that_disperses_gets_one_wavelength_a_path() -> None:
+    made = scene(environment=WHITE)
+    options: dict[str, Any] = {"width": 72, "height": 48, "samples": 1, "threads": 1}
+
+    def mode(camera: Any, wavelengths: str = "auto") -> str:
+        film = FilmSettings(wavelengths=wavelengths)  # type: ignore[arg-type]
+        return str(render(made, camera, film=film, **options).stats["wavelengths"])
+
+    assert mode(Pinhole(40.0, FILM)) == "hero" and mode(Pinhole(40.0, FILM), "one") == "one"
+    assert mode(prism(0.05)) == "one" and mode(prism(0.05), "lanes") == "lanes"
+    assert mode(prism(1e-4)) == "hero"
+    with pytest.raises(InputError, match=r"film\.wavelengths: got 'hero', expected one or lanes.*pixels"):
+        mode(prism(0.05), "hero")
+
+
+@pytest.mark.parametrize(("shift", "mode"), [(0.05, "lanes"), (1e-4, "hero")])
+def test_modes_of_a_dispersive_camera_have_the_same_mean(shift: float, mode: str, tmp_path: Path) -> None:
+    # The prism's tint is in the weights of each lane, its fringes in the rays.
+    made = room(tmp_path, "mirror")
+    one, other = (renders(made, prism(shift), m, 48) for m in ("one", mode))
+    assert_same_mean(one, other, 0.02)
+    grey = renders(scene(environment=WHITE), prism(shift), mode, 4, samples=256).mean(axis=(0, 1, 2))
+    assert grey[2] > 1.2 * grey[0]
+    assert colour_noise(other) < (0.4 if mode == "hero" else 0.85) * colour_noise(one)
+
+
+def test_one_wavelength_of_light_makes_the_same_grey_with_four_lanes() -> None:
+    made = scene({"wavelengths_nm": [550, 550]}, environment={"colour": [0.5, 0.5, 0.5]})
+    for mode in ("one", "hero", "lanes"):
+        pictures = renders(made, Pinhole(4000.0, FILM), mode, 1)
+        assert pictures == pytest.approx(np.full_like(pictures, 0.5), abs=1e-4)
+
+
+@pytest.mark.parametrize("mode", ["hero", "lanes"])
+def test_workers_do_not_change_the_picture(mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.render.film.BATCH", 256)
+    film = FilmSettings(wavelengths=mode)  # type: ignore[arg-type]
+    made = room(tmp_path, "flint")
+    one, two = (
+        render(made, Pinhole(40.0, FILM), width=12, height=8, samples=22, film=film, threads=n).rgb for n in (1, 2)
+    )
+    assert np.array_equal(one, two)
+
+
+def test_a_lens_that_disperses_less_than_a_pixel_shows() -> None:
+    # Small enough a picture, and one ray serves all wavelengths; each lane still has the lens's transmittance for it.
+    lens = Path(__file__).parents[2] / "lenses" / "laikin_double_gauss_50.toml"
+    camera = make_camera(lens, Shot(FILM, 3.0, 2.8))
+    assert camera.dispersive
+    limits = (400.0, 700.0)
+    assert mode_for(camera, PixelGrid(24, 16, FILM), limits, FilmSettings()) == "hero"
+    assert mode_for(camera, PixelGrid(720, 480, FILM), limits, FilmSettings()) == "one"
+    ball = {"centre_m": [0, 0, -2], "radius_m": 0.4, "emission": [1, 2, 4], "illuminant": "A"}
+    made = scene(environment=WHITE, spheres=[ball])
+    one, hero = (renders(made, camera, mode, 16, width=24, height=16) for mode in ("one", "hero"))
+    assert_same_mean(one, hero, 0.01)
+    assert colour_noise(hero) < 0.3 * colour_noise(one)

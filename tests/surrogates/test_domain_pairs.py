@@ -18,17 +18,10 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import film_z_mm, first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import PupilBounds
-from neurolens.surrogates.domain import (
-    Domain,
-    domain_from_camera,
-    domain_of,
-    focused_plane_z_mm,
-    sample_domain,
-)
+from neurolens.surrogates.domain import Domain, domain_from_camera, domain_of, focused_plane_z_mm, sample_domain
 from neurolens.surrogates.pairs import PairSet, PairSettings, RayPairs, load_pairs, make_pairs, save_pairs, trace_pairs
 from neurolens.surrogates.targets import film_equivalent_weights
 
-pytestmark = pytest.mark.filterwarnings("ignore::neurolens.base.errors.NeurolensWarning")
 ROOT = Path(__file__).parents[2] / "lenses"
 BOUNDS = PupilBounds(10.0, 20.0, (-5.0, -4.0), (5.0, 6.0), (5.0, 5.0), 7.0)
 DOMAIN = Domain(20.0, (50.0, 55.0), (math.inf, 0.5), 10.0, 7.35, (400.0, 700.0), 6.0, BOUNDS)

@@ -17,19 +17,16 @@ from onnx import ModelProto
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import FloatArray
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.onnxderivatives import OnnxDerivatives
-from neurolens.cameras.onnxinverse import load_inverse
+from neurolens.cameras.onnxmaps import OnnxDerivatives, load_inverse
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.thin import ThinLens
 from neurolens.modelfile import CARD_KEY
 from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.export import export_inverse, export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
-from neurolens.surrogates.inversion.derivatives import differentiate
-from neurolens.surrogates.inversion.fit import fit_inverse
-from neurolens.surrogates.inversion.maps import InverseModel
-from neurolens.surrogates.onnx.export import export_onnx
-from neurolens.surrogates.onnx.inverse import export_inverse
+from neurolens.surrogates.inverse import InverseModel
+from neurolens.surrogates.inverse_fit import fit_inverse
 
 KINDS = ("invariants", "raw", "network", "thick", "fisheye")
 
@@ -58,7 +55,7 @@ def test_derivatives_of_the_file_are_those_of_the_model(kind: str, tmp_path: Pat
     film, pupil = (torch.stack(p).float().numpy() for p in ((rays.film_x, rays.film_y), (rays.pupil_x, rays.pupil_y)))
     w, plane, stop = rays.wavelength_nm.float().numpy(), float(rays.film_z[0]), m.domain.stop_radius_mm
     found = OnnxDerivatives(loaded)(film, pupil, w, plane, stop)
-    wanted = differentiate(m, rays)
+    wanted = m.differentiate(rays)
     ok = (wanted.prediction.status == st.PASSED).numpy()
     for a, b in ((found.d_film, wanted.d_film.numpy()), (found.d_pupil, wanted.d_pupil.numpy())):
         for rows in (slice(0, 3), slice(3, 6)):

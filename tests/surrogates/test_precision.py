@@ -8,15 +8,14 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-import torch
 from lens_models import prepared
 from onnx import TensorProto, helper, numpy_helper
 
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import load_model
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.precision import store_weights
 
 KINDS = ("float16", "int8")
@@ -135,7 +134,7 @@ def test_what_it_refuses(files: dict[str, Path], model: LensModel, tmp_path: Pat
 def test_rows_of_zeros_stay_zeros(model: LensModel, tmp_path: Path) -> None:
     core = model.core
     (first, bias), *rest = core.hidden  # type: ignore[attr-defined]
-    still = replace(core, hidden=((torch.cat([torch.zeros_like(first[:1]), first[1:]]), bias), *rest))  # type: ignore[type-var]
+    still = replace(core, hidden=((np.concatenate([np.zeros_like(first[:1]), first[1:]]), bias), *rest))  # type: ignore[type-var]
     whole = export_onnx(replace(model, core=still), tmp_path / "a.onnx")
     for kind in KINDS:
         assert np.isfinite(_rays(store_weights(whole, tmp_path / "b.onnx", kind))[0]).all()

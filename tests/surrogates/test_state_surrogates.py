@@ -18,23 +18,22 @@ import torch
 from vignetting_oracle import vignetting_errors
 
 from experiments import outside
-from neurolens.axes import Axis, product, weights
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import OnnxLens, load_model
 from neurolens.evaluate.check import check_states, random_states, space_of_card
 from neurolens.evaluate.rays import ray_errors
+from neurolens.modelfile.axes import Axis, product, weights
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.export import export_states
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.states import export_states
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.states.fit import StateSettings, fit_states
-from neurolens.surrogates.states.model import StateModel, mix
-from neurolens.surrogates.states.space import StateSpace, focus_axis, zoom_axis
+from neurolens.surrogates.states import StateModel, StateSpace, focus_axis, mix, zoom_axis
+from neurolens.surrogates.states_fit import StateSettings, fit_states
 
 ZOOM = Axis("zoom", "mm", (70.0, 135.0, 200.0), 3, reciprocal=True, stated=(("70mm", 70.0),))
 FOCUS = Axis("focus", "1/m", (0.0, 1.0), 4)

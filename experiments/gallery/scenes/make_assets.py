@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 HERE = Path(__file__).parent
-FINE = 4  # samples a pixel, each way
+FINE = 4  # samples per pixel, each way
 
 
 def wheel(side: int = 900, rims: int = 9, spokes: int = 40) -> np.ndarray:

@@ -1,12 +1,13 @@
 """What every polynomial fits after position and direction: stop crossing, transmittance and gates.
 
-They use the terms that are there anyway, and more where those do not tell the boundaries well.
+They use the terms that are there anyway, and more where those do not tell the boundaries or the transmittance well:
+absorption and coatings change with the wavelength faster than any ray's path does, and near grazing rays faster with
+the ray.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+import itertools
 
 import numpy as np
 import torch
@@ -21,13 +22,11 @@ from neurolens.surrogates.bases import (
     vector_columns,
     vector_gram,
 )
-from neurolens.surrogates.fits.gates import GateFit
 from neurolens.surrogates.fits.selection import Sweep
-from neurolens.surrogates.gates import boundary_rays, boundary_weights, gate_reach, gate_values
-from neurolens.surrogates.lightfield import Encoding, LightField
-from neurolens.surrogates.model import Gate
-from neurolens.surrogates.pairs import PairSet, RayPairs
-from neurolens.surrogates.targets import Targets, targets_of
+from neurolens.surrogates.gates import GateFit, gate_reach, gate_values
+from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.pairs import PairSet
+from neurolens.surrogates.targets import Prepared
 
 # Terms are added for boundaries until each is met to this RMS: of a gate (twice the relative radius of a rim), and of
 # the stop crossing in stop radii.
@@ -35,36 +34,13 @@ GATE_ERROR, STOP_ERROR = 2e-3, 5e-4
 MOST_BOUNDARY_TERMS = 64
 _DEGREE = 9  # of the terms among which those for boundaries are found
 _RAYS = 12_000  # on which they are found
+TRANSMITTANCE_ERROR = 2.5e-4  # RMS at which no term is added
+_TRANSMITTANCE_RAYS = 6000
+_TRANSMITTANCE_DEGREE, _MOST_W = 7, 8  # of the candidates
+_LEAST_GAIN = 0.03  # a term must take away this share of the squared error left
 
 
-@dataclass(frozen=True)
-class FitData:
-    """What every polynomial fit of one set of ray pairs shares."""
-
-    pairs: RayPairs
-    encoding: Encoding
-    gates: tuple[Gate, ...]
-
-    @property
-    def train(self) -> Targets:
-        return targets_of(self.pairs.lens, self.encoding, self.pairs.train)
-
-    @cached_property
-    def boundary(self) -> PairSet:
-        """The rays on which gates and the stop crossing are fitted."""
-        return boundary_rays(self.pairs, self.gates)
-
-    @property
-    def boundary_field(self) -> LightField:
-        return self.encoding(self.boundary.inputs)
-
-    @cached_property
-    def boundary_weights(self) -> tuple[Tensor, Tensor]:
-        """Of the gates [G, N] and of the stop crossing [N]."""
-        return boundary_weights(self.pairs.lens, self.gates, self.boundary)
-
-
-def fit_stop(data: FitData, exponents: Exponents) -> Tensor:
+def fit_stop(data: Prepared, exponents: Exponents) -> Tensor:
     """[2 M]: A and B of the stop crossing (in stop radii) on the monomials given, from rays on both sides of rims."""
     crossing, weight = stop_crossing(data)
     field = data.boundary_field
@@ -72,14 +48,14 @@ def fit_stop(data: FitData, exponents: Exponents) -> Tensor:
     return solve(columns, crossing.reshape(1, -1), weight.repeat(2))[0]
 
 
-def stop_crossing(data: FitData) -> tuple[Tensor, Tensor]:
+def stop_crossing(data: Prepared) -> tuple[Tensor, Tensor]:
     """[2, N] crossings of the boundary rays in stop radii, and their weights [N]."""
     pairs, lens = data.boundary, data.pairs.lens
     crossing = torch.stack([pairs.cross_x[lens.stop_index], pairs.cross_y[lens.stop_index]]) / lens.stop_radius_mm
     return crossing, data.boundary_weights[1]
 
 
-def fit_scalars(data: FitData, exponents: Exponents) -> Tensor:
+def fit_scalars(data: Prepared, exponents: Exponents) -> Tensor:
     """[1 + G, M]: transmittance and gates on the monomials of the invariants given."""
 
     def features(rays: PairSet) -> Tensor:
@@ -90,7 +66,7 @@ def fit_scalars(data: FitData, exponents: Exponents) -> Tensor:
 
 
 def solve_scalars(
-    data: FitData, features: Tensor, transmittance: Tensor, boundary_features: Tensor, far_features: Tensor
+    data: Prepared, features: Tensor, transmittance: Tensor, boundary_features: Tensor, far_features: Tensor
 ) -> Tensor:
     """Transmittance on the passing rays, each gate on the rays that get as far, most on those that it decides.
 
@@ -108,7 +84,7 @@ def solve_scalars(
     return torch.cat([solve(features, transmittance[None]), fit.coefficients()])
 
 
-def boundary_terms(data: FitData, exponents: Exponents, most: int = MOST_BOUNDARY_TERMS) -> Exponents:
+def boundary_terms(data: Prepared, exponents: Exponents, most: int = MOST_BOUNDARY_TERMS) -> Exponents:
     """[K, 4] further exponents, where those given [M, 4] meet the stop crossing or a gate badly; often none.
 
     Forward selection by the gain of all those boundaries together, in squares of the error that each may have.
@@ -159,7 +135,7 @@ class _BoundaryFit:
 
 
 def _boundary_fits(
-    data: FitData, field: LightField, features: Tensor, start: int | None = None, only: list[int] | None = None
+    data: Prepared, field: LightField, features: Tensor, start: int | None = None, only: list[int] | None = None
 ) -> list[_BoundaryFit]:
     """The fits of the stop crossing and of every gate, or `only` some of them, with the first `start` terms in."""
     crossing, weight = stop_crossing(data)
@@ -181,3 +157,43 @@ def _boundary_fits(
             fit.add(term)
         fits.append(fit)
     return fits
+
+
+def transmittance_terms(data: Prepared, exponents: Exponents, most: int) -> Exponents:
+    """[K, 4] further exponents, at most `most`, by forward selection beside those given [M, 4]; often none."""
+    rays = data.pairs.train.select(slice(0, _TRANSMITTANCE_RAYS))
+    none = exponents[:0]
+    if most == 0 or len(rays) < 2 * (len(exponents) + most):
+        return none
+    invariants, wanted = data.encoding(rays.inputs).invariants(), rays.transmittance[None]
+    features = monomials(invariants, exponents)
+    left = wanted - solve(features, wanted) @ features
+    allowed = TRANSMITTANCE_ERROR**2 * len(rays)
+    if not float((left**2).sum()) > allowed:
+        return none
+    known = {tuple(e) for e in exponents.tolist()}
+    offered = [tuple(e) for e in _candidates(dispersive=data.encoding.w_half != 0).tolist()]
+    new = np.array([e for e in offered if e not in known], dtype=np.int64).reshape(-1, 4)
+    features = monomials(invariants, np.concatenate([exponents, new]))
+    sweep = Sweep((features @ features.T).numpy(), (features @ wanted.T).numpy(), (wanted**2).sum(1).numpy())
+    for k in range(len(exponents)):
+        if sweep.scores("ols")[k] >= 0:
+            sweep.add(k)
+    chosen: list[int] = []
+    while len(chosen) < most and sweep.residual > allowed:
+        scores = sweep.scores("ols")
+        best = int(scores.argmax())
+        if not scores[best] > _LEAST_GAIN * sweep.residual:
+            break
+        sweep.add(best)
+        chosen.append(best - len(exponents))
+    return new[[k for k in chosen if k >= 0]]
+
+
+def _candidates(*, dispersive: bool) -> Exponents:
+    plain = invariant_exponents(_TRANSMITTANCE_DEGREE, dispersive=dispersive)
+    if not dispersive:
+        return plain
+    low = [p for p in itertools.product(range(2), repeat=3) if sum(p) <= 1]
+    colours = np.array([(*p, w) for w in range(1, _MOST_W + 1) for p in low], dtype=np.int64)
+    return np.unique(np.concatenate([plain, colours]), axis=0)

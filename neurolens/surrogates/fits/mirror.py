@@ -15,14 +15,12 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.surrogates.bases import Exponents, solve
-from neurolens.surrogates.cores import MirrorPolynomial, monomials
-from neurolens.surrogates.fits.boundaries import FitData, solve_scalars, stop_crossing
+from neurolens.surrogates.bases import Exponents, monomials, solve
+from neurolens.surrogates.cores import STOP, MirrorPolynomial
+from neurolens.surrogates.fits.boundaries import solve_scalars, stop_crossing
 from neurolens.surrogates.fits.selection import Sweep, forward, replace_terms
-from neurolens.surrogates.lightfield import Encoding, LightField
-from neurolens.surrogates.model import STOP, Gate
-from neurolens.surrogates.pairs import RayPairs
-from neurolens.surrogates.targets import film_equivalent
+from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.targets import Prepared, film_equivalent
 
 METHODS = ("omp", "ols")  # and networks (`mlp`)
 # Gram matrices are made of so many rays at a time; more candidates than this would take too long to choose from.
@@ -60,9 +58,7 @@ def mirror_exponents(degree: int, axis: int, *, dispersive: bool = True) -> Expo
     return np.array(sorted(rows, key=lambda r: (sum(r), r)), dtype=np.int64)
 
 
-def fit_mirror(
-    pairs: RayPairs, encoding: Encoding, gates: tuple[Gate, ...], method: str, terms: int, degree: int
-) -> MirrorPolynomial:
+def fit_mirror(data: Prepared, method: str, terms: int, degree: int) -> MirrorPolynomial:
     """Choose and fit terms; position and direction share them, x and y have their own.
 
     Args:
@@ -78,15 +74,15 @@ def fit_mirror(
         raise InputError("fit", "method", method, f"{', '.join(METHODS)} or mlp, the fits of lenses with cylinders")
     if terms < 4:
         raise InputError("fit", "terms", terms, "at least 4 coefficients per vector output")
+    pairs, train = data.pairs, data.train
     if len(pairs.train) <= terms:
         raise InputError("fit", "train", len(pairs.train), f"more training rays than the {terms} terms")
-    data = FitData(pairs, encoding, gates)
-    train = data.train
+    dispersive = data.encoding.w_half != 0
     outputs = film_equivalent(pairs.lens, pairs.domain, train.vectors)
     place: dict[tuple[int, ...], int] = {}
     supports = []
     for axis in (0, 1):
-        candidates = _candidates(degree, axis, dispersive=encoding.w_half != 0)
+        candidates = _candidates(degree, axis, dispersive=dispersive)
         sweep = Sweep(*_normal_equations(candidates, train.field, outputs[:, axis]))
         forward(sweep, terms // 2, "ols" if method == "ols" else "omp")
         if method == "ols":
@@ -94,7 +90,7 @@ def fit_mirror(
         count = len(candidates.exponents)
         chosen = [(tuple(int(e) for e in candidates.exponents[k % count]), k >= count) for k in sorted(sweep.chosen)]
         supports.append([(place.setdefault(e, len(place)), of_u) for e, of_u in chosen])
-    for e in _scalar_terms(dispersive=encoding.w_half != 0):
+    for e in _scalar_terms(dispersive=dispersive):
         place.setdefault(e, len(place))
     exponents = np.array(list(place), dtype=np.int64)
     features = monomials(train.field.mirror_invariants(), exponents)
@@ -106,9 +102,10 @@ def fit_mirror(
             ab[:2, int(of_u), axis, i] = column
     ab[STOP] = _fit_stop(data, exponents)
     boundary, far = (
-        monomials(encoding(rays.inputs).mirror_invariants(), exponents) for rays in (data.boundary, pairs.far)
+        monomials(data.encoding(rays.inputs).mirror_invariants(), exponents) for rays in (data.boundary, pairs.far)
     )
-    return MirrorPolynomial(exponents, ab, solve_scalars(data, features, train.transmittance, boundary, far))
+    scalars = solve_scalars(data, features, train.transmittance, boundary, far)
+    return MirrorPolynomial(exponents, ab.numpy(), scalars.numpy())
 
 
 def _scalar_terms(*, dispersive: bool) -> list[tuple[int, ...]]:
@@ -142,7 +139,7 @@ def _normal_equations(terms: _Terms, field: LightField, outputs: Tensor) -> tupl
     return gram.numpy(), moments.numpy(), (outputs**2).sum(1).numpy()
 
 
-def _fit_stop(data: FitData, exponents: Exponents) -> Tensor:
+def _fit_stop(data: Prepared, exponents: Exponents) -> Tensor:
     """[2, 2, M]: A and B, of x and y, of the stop crossing in stop radii, from rays on both sides of rims."""
     crossing, weight = stop_crossing(data)
     field = data.boundary_field

@@ -1,13 +1,16 @@
-"""Polynomial surrogates: dense, matching pursuit, orthogonal least squares with replacement, adaptive growth.
+"""Polynomial surrogates: dense, matching pursuit, orthogonal least squares with replacement, growth; and first order.
 
 One support serves position and direction, chosen by the film-equivalent error in the nearest focused plane and at
 infinity. The stop crossing, the transmittance and the gates are then fitted on the monomials that are computed anyway.
+The thin and the thick lens that renderers use today have the same form: their rays follow the ideal (collinear) map of
+the prescription's focal length and principal planes; stop and rims are fitted as quadratic forms, which is what
+first-order rim crossings are.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -15,6 +18,8 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
 from neurolens.surrogates.bases import (
     Exponents,
     invariant_exponents,
@@ -25,84 +30,45 @@ from neurolens.surrogates.bases import (
     vector_columns,
     vector_gram,
 )
-from neurolens.surrogates.cores import Basis, InvariantPolynomial, RawPolynomial
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Basis, InvariantPolynomial, RawPolynomial
 from neurolens.surrogates.fits.boundaries import (
-    FitData,
     boundary_terms,
     fit_scalars,
     fit_stop,
     solve_scalars,
     stop_crossing,
+    transmittance_terms,
 )
-from neurolens.surrogates.fits.growth import grow
-from neurolens.surrogates.fits.selection import Sweep, backward, forward, matching_pursuit, replace_terms
-from neurolens.surrogates.fits.transmittance_terms import transmittance_terms
+from neurolens.surrogates.fits.selection import Sweep, backward, forward, grow, matching_pursuit, replace_terms
 from neurolens.surrogates.gates import gate_values
 from neurolens.surrogates.lightfield import Encoding, LightField
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate
-from neurolens.surrogates.pairs import RayPairs
-from neurolens.surrogates.targets import weighed_apart
+from neurolens.surrogates.settings import POLYNOMIALS, ModelSettings
+from neurolens.surrogates.targets import Prepared, scales_of, weighed_apart
 
-Method = Literal["dense", "omp", "ols", "adaptive"]
+ParaxialMethod = Literal["thin", "thick"]
 
-SELECTION_RAYS = 10_000
+_CHOICE_RAYS = 10_000
 SURPLUS = 1.5
 
 
-@dataclass(frozen=True)
-class PolynomialSettings:
-    """How a polynomial is fitted.
-
-    Attributes:
-        method: "dense" (all terms up to `degree`), "omp" (matching pursuit), "ols" (orthogonal least squares with
-            replacement), "adaptive" (terms of any degree grown from chosen terms).
-        basis: "invariants" (rotational symmetry held exactly) or "raw" (p_x, p_y, u_x, u_y, w).
-        terms: coefficients per vector output; ignored by "dense".
-        degree: largest total degree of the candidates that a fit starts from; ignored by "adaptive".
-        replacement: whether "ols" exchanges terms afterwards.
-        elimination: whether "ols" first chooses half as many terms again, and drops those that cost least.
-        growth: rounds in which "ols" in the invariants adds to the candidates what the chosen terms give, multiplied by
-            each variable: terms of higher degree where they help.
-        position_weight: how much more than to first order the position counts in the choice of terms.
-        transmittance_terms: how many more terms the transmittance may have where it needs them.
-    """
-
-    method: Method = "ols"
-    basis: Basis = "invariants"
-    terms: int = 40
-    degree: int = 7
-    replacement: bool = True
-    elimination: bool = True
-    growth: int = 2
-    position_weight: float = 2.0
-    transmittance_terms: int = 16
-
-
-def fit_polynomial(
-    pairs: RayPairs, encoding: Encoding, gates: tuple[Gate, ...], settings: PolynomialSettings
-) -> InvariantPolynomial | RawPolynomial:
-    """Fit by one of the methods of `PolynomialSettings`.
+def fit_polynomial(data: Prepared, settings: ModelSettings) -> InvariantPolynomial | RawPolynomial:
+    """Fit by one of `POLYNOMIALS`.
 
     Raises:
-        InputError: an unknown method or basis, fewer than two terms, a negative degree, or too few training rays.
+        InputError: an unknown method or basis, fewer than two terms, or too few training rays.
     """
-    for name, value, known in (
-        ("method", settings.method, get_args(Method)),
-        ("basis", settings.basis, get_args(Basis)),
-    ):
+    for name, value, known in (("method", settings.method, POLYNOMIALS), ("basis", settings.basis, get_args(Basis))):
         if value not in known:
             raise InputError("fit", name, value, f"one of {', '.join(known)}")
     if settings.terms < 2:
         raise InputError("fit", "terms", settings.terms, "at least 2 coefficients per vector output")
-    if settings.degree < 0:
-        raise InputError("fit", "degree", settings.degree, "a total degree of 0 or more")
-    if len(pairs.train) <= settings.terms:
-        raise InputError("fit", "train", len(pairs.train), f"more training rays than the {settings.terms} terms")
-    data = FitData(pairs, encoding, gates)
+    count = len(data.pairs.train)
+    if count <= settings.terms:
+        raise InputError("fit", "train", count, f"more training rays than the {settings.terms} terms")
     return _fit_invariant(data, settings) if settings.basis == "invariants" else _fit_raw(data, settings)
 
 
-def _fit_invariant(data: FitData, settings: PolynomialSettings) -> InvariantPolynomial:
+def _fit_invariant(data: Prepared, settings: ModelSettings) -> InvariantPolynomial:
     train = data.train
     invariants = train.field.invariants()
     outputs = weighed_apart(data.pairs.lens, data.pairs.domain, train.vectors, settings.position_weight)
@@ -111,7 +77,7 @@ def _fit_invariant(data: FitData, settings: PolynomialSettings) -> InvariantPoly
         exponents, chosen = grow(invariants, train.field, outputs, settings.terms, dispersive=dispersive)
     else:
         # Many rays more than candidates make a choice no better; the coefficients are fitted on all of them.
-        field, wanted = LightField(*(c[..., :SELECTION_RAYS] for c in train.field)), outputs[..., :SELECTION_RAYS]
+        field, wanted = LightField(*(c[..., :_CHOICE_RAYS] for c in train.field)), outputs[..., :_CHOICE_RAYS]
         exponents = invariant_exponents(settings.degree, dispersive=dispersive)
         for _ in range(settings.growth if settings.method == "ols" else 0):
             if 2 * len(exponents) <= settings.terms:
@@ -133,7 +99,7 @@ def _fit_invariant(data: FitData, settings: PolynomialSettings) -> InvariantPoly
     ab = torch.zeros((3, 2 * len(exponents)), dtype=torch.float64)
     ab[:2, [c if c < len(kept) else c - len(kept) + len(exponents) for c in columns]] = coefficients
     ab[STOP] = fit_stop(data, exponents)
-    return InvariantPolynomial(exponents, ab.reshape(3, 2, -1), fit_scalars(data, exponents))
+    return InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), fit_scalars(data, exponents).numpy())
 
 
 def _sweep(exponents: Exponents, field: LightField, outputs: Tensor) -> Sweep:
@@ -149,7 +115,7 @@ def _grown(exponents: Exponents, chosen: list[int], *, dispersive: bool) -> Expo
     return np.concatenate([exponents, np.array(new, dtype=np.int64).reshape(-1, 4)])
 
 
-def _choose(sweep: Sweep, settings: PolynomialSettings) -> list[int]:
+def _choose(sweep: Sweep, settings: ModelSettings) -> list[int]:
     if settings.method == "dense":
         return list(range(sweep.count))
     surplus = SURPLUS if settings.method == "ols" and settings.elimination else 1.0
@@ -164,7 +130,7 @@ def _squares(outputs: Tensor) -> np.ndarray:
     return (outputs.flatten(1) ** 2).sum(1).numpy()
 
 
-def _fit_raw(data: FitData, settings: PolynomialSettings) -> RawPolynomial:
+def _fit_raw(data: Prepared, settings: ModelSettings) -> RawPolynomial:
     """Every component with a support of its own, as published, half of `terms` each; one more for the scalars."""
     train = data.train
     # Supports are chosen on the rays near the rims, where every output has a value; coefficients on all boundary rays.
@@ -199,10 +165,10 @@ def _fit_raw(data: FitData, settings: PolynomialSettings) -> RawPolynomial:
     at = columns["scalars"]
     scalars = torch.zeros((1 + len(data.gates), len(place)), dtype=torch.float64)
     scalars[:, at] = solve_scalars(data, features[at], train.transmittance, boundary[at], far[at])
-    return RawPolynomial(exponents, components, scalars)
+    return RawPolynomial(exponents, components.numpy(), scalars.numpy())
 
 
-def _raw_support(variables: Tensor, outputs: Tensor, settings: PolynomialSettings, dispersive: bool) -> Exponents:
+def _raw_support(variables: Tensor, outputs: Tensor, settings: ModelSettings, dispersive: bool) -> Exponents:
     """Exponents [K, 5] chosen for outputs [R, N] in common."""
     # Outputs count by how much they vary: transmittance varies little about a large mean, which one term explains.
     outputs = outputs / (outputs - outputs.mean(1, keepdim=True)).norm(dim=1, keepdim=True).clamp_min(1e-300)
@@ -215,3 +181,31 @@ def _raw_support(variables: Tensor, outputs: Tensor, settings: PolynomialSetting
     if settings.method == "omp" and len(outputs) == 1:
         return exponents[matching_pursuit(gram, moments[:, 0], settings.terms)]
     return exponents[_choose(Sweep(gram, moments, _squares(outputs)), settings)]
+
+
+def ideal_map(lens: Lens, encoding: Encoding, method: ParaxialMethod) -> Tensor:
+    """[2, 2]: position (scaled) and slope (dx / -dz) of the scene-side ray per unit of scaled p and u.
+
+    The position is that in the plane of the front vertex. "thin" puts both principal planes at the rear one.
+    """
+    data = first_order(lens)
+    rear = data.rear_principal_z_mm
+    front = data.front_principal_z_mm if method == "thick" else rear
+    rows = []
+    for p, u in ((1.0, 0.0), (0.0, 1.0)):
+        on_film = p * encoding.film_scale_mm
+        on_pupil = u * encoding.pupil_scale_mm + encoding.chief * on_film
+        rise = (on_pupil - on_film) / (encoding.pupil_plane_z_mm - encoding.film_plane_z_mm)  # dx / dz, film side
+        height = on_film + rise * (rear - encoding.film_plane_z_mm)
+        rise = rise + height / data.efl_mm  # light loses h / f on its way to the film; camera rays regain it
+        rows.append([(height - rise * front) / scales_of(lens).position_mm, -rise])
+    return torch.tensor(rows, dtype=torch.float64).T
+
+
+def fit_paraxial(data: Prepared, method: ParaxialMethod) -> InvariantPolynomial:
+    """A model whose rays are first order; its direction vector is a slope (see `LensModel.direction`)."""
+    exponents = np.array([[0, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], dtype=np.int64)
+    ab = torch.zeros((3, 2, len(exponents)), dtype=torch.float64)
+    ab[[POSITION, DIRECTION], :, 0] = ideal_map(data.pairs.lens, data.encoding, method)
+    ab[STOP, :, 0] = fit_stop(data, exponents[:1])
+    return InvariantPolynomial(exponents, ab.numpy(), fit_scalars(data, exponents).numpy())

@@ -1,18 +1,28 @@
-"""Which terms of a basis to keep: orthogonal matching pursuit, orthogonal least squares, replacement.
+"""Which terms of a basis to keep: orthogonal matching pursuit, orthogonal least squares, replacement, growth.
 
 All work on the Gram matrix of the candidate columns, so that their cost does not grow with the number of rays. The
 sweep operator (Goodnight 1979, "A Tutorial on the SWEEP Operator") moves a column into or out of the fit in one
 rank-one update; afterwards the diagonal holds what every candidate has left after orthogonalisation, and the
 right-hand side its correlation with the residual.
+
+Growth (Zheng and Zheng 2017, "Adaptive sparse polynomial regression for camera lens simulation") knows no limit of
+degree: it starts from the lowest terms, and every term chosen brings its products with each variable into the
+candidates.
 """
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
+
+from neurolens.surrogates.bases import Exponents, monomials, vector_columns
+from neurolens.surrogates.lightfield import LightField
 
 Floats = NDArray[np.float64]
 Rule = Literal["omp", "ols"]
@@ -25,6 +35,8 @@ DEPENDENT = 1e-11
 SPANNED = 1e-12
 # A share of this size is rounding of the Gram matrix, about fifty units in the last place.
 _NOTHING = 1e-14
+# Rays that decide the choice of terms; the coefficients are fitted on all of them afterwards.
+SELECTION_RAYS = 6000
 
 
 class Sweep:
@@ -109,6 +121,42 @@ class Sweep:
         t[k, k] = -1.0 / pivot
 
 
+class JointSweep:
+    """Several sweeps with the same candidates, of which all choose the same: the sum of their residuals decides."""
+
+    def __init__(self, sweeps: Sequence[Sweep]) -> None:
+        self.sweeps = sweeps
+
+    @property
+    def chosen(self) -> list[int]:
+        return self.sweeps[0].chosen
+
+    @property
+    def residual(self) -> float:
+        return sum(s.residual for s in self.sweeps)
+
+    def add(self, k: int) -> None:
+        for s in self.sweeps:
+            s.add(k)
+
+    def drop(self, k: int) -> None:
+        for s in self.sweeps:
+            s.drop(k)
+
+    def refresh(self) -> None:
+        for s in self.sweeps:
+            s.refresh()
+
+    def restart(self, chosen: list[int]) -> None:
+        for s in self.sweeps:
+            s.restart(chosen)
+
+    def scores(self, rule: Rule) -> Floats:
+        """[M] gain of all together; -1 where any sweep's other terms span the candidate."""
+        scores = np.stack([s.scores(rule) for s in self.sweeps])
+        return np.where((scores >= 0).all(0), scores.sum(0), -1.0)
+
+
 def matching_pursuit(gram: Floats, moments: Floats, terms: int) -> list[int]:
     """Support of plain orthogonal matching pursuit (scikit-learn's) for one output with products `moments` [M]."""
     from sklearn.linear_model import orthogonal_mp_gram
@@ -123,13 +171,10 @@ def matching_pursuit(gram: Floats, moments: Floats, terms: int) -> list[int]:
     return [int(k) for k in np.flatnonzero(found)]
 
 
-def forward(sweep: Sweep, terms: int, rule: Rule = "ols", among: list[int] | None = None) -> None:
-    """Add the best-scored candidate until `terms` are chosen or none helps. `among` restricts the candidates."""
-    allowed = np.full(sweep.count, among is None)
-    if among is not None:
-        allowed[among] = True
+def forward(sweep: Sweep | JointSweep, terms: int, rule: Rule = "ols") -> None:
+    """Add the best-scored candidate until `terms` are chosen or none helps."""
     while len(sweep.chosen) < terms:
-        scores = np.where(allowed, sweep.scores(rule), -1.0)
+        scores = sweep.scores(rule)
         best = int(scores.argmax())
         if scores[best] <= 0:
             return
@@ -146,14 +191,11 @@ def backward(sweep: Sweep, terms: int) -> None:
     sweep.refresh()
 
 
-def replace_terms(sweep: Sweep, passes: int = 10, among: list[int] | None = None) -> int:
+def replace_terms(sweep: Sweep | JointSweep, passes: int = 10) -> int:
     """Take each chosen term out and put the best candidate in (Schrade et al. 2016), until a pass changes nothing.
 
     Returns the number of terms exchanged. The residual never grows.
     """
-    allowed = np.full(sweep.count, among is None)
-    if among is not None:
-        allowed[among] = True
     exchanged = 0
     for _ in range(passes):
         before, known, residual = exchanged, list(sweep.chosen), sweep.residual
@@ -162,7 +204,7 @@ def replace_terms(sweep: Sweep, passes: int = 10, among: list[int] | None = None
             sweep.drop(k)
             # Its true gain, because the score of a term that the later ones nearly span counts as none.
             gain = max(sweep.residual - with_k, 0.0)
-            scores = np.where(allowed, sweep.scores("ols"), -1.0)
+            scores = sweep.scores("ols")
             best = int(scores.argmax())
             # The old term wins ties, so that rounding cannot cycle.
             if scores[best] <= gain * (1 + 1e-9):
@@ -177,3 +219,87 @@ def replace_terms(sweep: Sweep, passes: int = 10, among: list[int] | None = None
         if exchanged == before:
             break
     return exchanged
+
+
+class _Candidates:
+    """Terms (a monomial, times p or u for vectors), their columns and the Gram matrix, all of which only grow."""
+
+    def __init__(self, variables: Tensor, field: LightField | None, outputs: Tensor) -> None:
+        step = max(1, variables.shape[1] // SELECTION_RAYS)
+        self.variables = variables[:, ::step]
+        self.field = None if field is None else LightField(*(c[..., ::step] for c in field))
+        self.target = outputs[..., ::step].flatten(1)
+        self.terms: list[tuple[tuple[int, ...], int]] = []
+        self.columns = torch.empty((0, self.target.shape[1]), dtype=variables.dtype)
+        self.gram = np.empty((0, 0))
+
+    def extend(self, terms: list[tuple[tuple[int, ...], int]]) -> None:
+        known = set(self.terms)
+        new = [t for t in dict.fromkeys(terms) if t not in known]
+        if not new:
+            return
+        features = monomials(self.variables, np.array([t[0] for t in new], dtype=np.int64))
+        if self.field is None:
+            columns = features
+        else:
+            both = vector_columns(features, self.field)
+            columns = both[[i + side * len(new) for i, (_, side) in enumerate(new)]]
+        self.terms += new
+        old = len(self.columns)
+        self.columns = torch.cat([self.columns, columns])
+        products = (self.columns @ columns.T).numpy()
+        gram = np.zeros((len(self.terms), len(self.terms)))
+        gram[:old, :old] = self.gram
+        gram[:, old:], gram[old:, :] = products, products.T
+        self.gram = gram
+
+    def sweep(self, chosen: list[int]) -> Sweep:
+        moments = (self.columns @ self.target.T).numpy()
+        sweep = Sweep(self.gram, moments, (self.target**2).sum(1).numpy())
+        for k in chosen:
+            sweep.add(k)
+        return sweep
+
+
+def grow(
+    variables: Tensor, field: LightField | None, outputs: Tensor, terms: int, *, dispersive: bool
+) -> tuple[Exponents, list[int]]:
+    """Choose `terms` terms by growth.
+
+    Args:
+        variables: [V, N]: the invariants with `field`, or the raw coordinates without.
+        field: where given, every monomial offers two columns, times p and times u, and outputs are vectors.
+        outputs: [R, 2, N] with a field, [R, 1, N] without.
+        dispersive: False leaves the last variable (the wavelength) out.
+
+    Returns:
+        Exponents [M, V] of all monomials offered, and the chosen columns as in `vector_columns` (k, or M + k for u).
+    """
+    count = variables.shape[0] if dispersive else variables.shape[0] - 1
+    unit = np.eye(variables.shape[0], dtype=np.int64)
+    sides = (0,) if field is None else (0, 1)
+    steps = list(unit[:count])
+    if field is None:
+        # A component of a vector is odd in the four coordinates: a single factor leads to terms that never help.
+        steps = [unit[a] + unit[b] for a in range(4) for b in range(a, 4)] + list(unit[4:count])
+    seed = (0,) * variables.shape[0]
+    candidates = _Candidates(variables, field, outputs)
+    lowest = [seed, *(tuple(int(e) for e in unit[v]) for v in range(count))]
+    candidates.extend([(e, side) for e in lowest for side in sides])
+    chosen: list[int] = []
+    stride = max(1, terms // 16)
+    while len(chosen) < terms:
+        sweep = candidates.sweep(chosen)
+        forward(sweep, min(terms, len(sweep.chosen) + stride))
+        if len(sweep.chosen) == len(chosen):
+            break
+        replace_terms(sweep, passes=2)
+        chosen = sweep.chosen
+        for k in chosen:
+            exponent, _ = candidates.terms[k]
+            children = [tuple(int(e) for e in np.array(exponent) + step) for step in steps]
+            candidates.extend([(child, side) for child in children for side in sides])
+    offered = list(dict.fromkeys(e for e, _ in candidates.terms))
+    place = {e: i for i, e in enumerate(offered)}
+    columns = [place[candidates.terms[k][0]] + candidates.terms[k][1] * len(offered) for k in chosen]
+    return np.array(offered, dtype=np.int64), columns

@@ -7,9 +7,21 @@ their own.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
-from neurolens.surrogates.fit import ModelSettings
+from neurolens.base.errors import InputError
+from neurolens.surrogates.cores import Core
+from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import Gate
+from neurolens.surrogates.published.adaptive import fit_adaptive
+from neurolens.surrogates.published.data import RawData, outer_pupil
+from neurolens.surrogates.published.neural import fit_averaged
+from neurolens.surrogates.published.polynomials import fit_dense, fit_sparse
+from neurolens.surrogates.published.rtf import fit_rtf
+from neurolens.surrogates.published.taylor import fit_taylor
+from neurolens.surrogates.settings import ModelSettings
+from neurolens.surrogates.targets import Prepared
 
 
 class PublishedMethod(NamedTuple):
@@ -66,4 +78,38 @@ PUBLISHED: dict[str, PublishedMethod] = {
     ),
 }
 
-__all__ = ["PUBLISHED", "PublishedMethod"]
+
+class PublishedFit(NamedTuple):
+    """A core with the coordinates that it is written in and the tests of who passes that its scalars stand for."""
+
+    core: Core
+    encoding: Encoding
+    gates: tuple[Gate, ...]
+
+
+def fit_published(
+    prepared: Prepared, settings: ModelSettings, progress: Callable[[float], None] | None = None
+) -> PublishedFit:
+    """Fit one published method.
+
+    Raises:
+        InputError: an unknown method, or a lens or settings that it cannot take.
+    """
+    s, method = settings, settings.method
+    if method not in PUBLISHED:
+        raise InputError("fit", "method", method, f"one of {', '.join(PUBLISHED)}")
+    data = RawData.of(prepared, centred=method in ("taylor", "hanika"))
+    core: Core
+    if method == "neurolens2017":
+        core, gates = fit_averaged(data, s, progress)
+    elif method == "rtf":
+        core, gates = fit_rtf(data, s.degree)
+    elif method == "taylor":
+        core, gates = outer_pupil(data, fit_taylor(prepared.pairs.lens, data.encoding, s.degree), 0.0)
+    elif method == "hanika":
+        core, gates = outer_pupil(data, fit_dense(data, s.degree))
+    elif method == "schrade":
+        core, gates = outer_pupil(data, fit_sparse(data, s.terms, s.degree))
+    else:
+        core, gates = outer_pupil(data, fit_adaptive(data, s.terms, s.partitions, progress))
+    return PublishedFit(core, data.encoding, gates)

@@ -1,9 +1,9 @@
 """Adaptive sparse polynomials with a partition of the light field (Zheng and Zheng 2017, The Visual Computer).
 
-Every scalar output has terms of its own, grown from the lowest: each chosen term brings its products with the variables
-into the candidates, so that no degree limits them (`fits.growth`). Where the error stays high the light field is
-divided: the cell with the largest summed error is cut in two halves of its rays, along whichever of its coordinates
-leaves least, and each half is fitted anew, until the number of cells asked for is reached.
+Every scalar output has terms of its own, grown from the lowest (`fits.selection.grow`): each chosen term brings its
+products with the variables into the candidates, so that no degree limits them. Where the error stays high the light
+field is divided: the cell with the largest summed error is cut in two halves of its rays, along whichever of its
+coordinates leaves least, and each half is fitted anew, until the number of cells asked for is reached.
 
 Left open by the paper and chosen here: the coordinates that may be cut are the squared film radius, the squared slope
 and the product of both (rho, tau, sigma of the light field), since cuts in x or y alone would break the lens's
@@ -20,18 +20,48 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.surrogates.cores import RawPolynomial
-from neurolens.surrogates.fits.growth import grow
+from neurolens.graph.ir import Graph
+from neurolens.surrogates.bases import Exponents
+from neurolens.surrogates.cores import ROUND, Core, CoreValues, Field, RawPolynomial, Units
+from neurolens.surrogates.fits.selection import grow
 from neurolens.surrogates.pairs import PairSet
-from neurolens.surrogates.published.cores import Cells
-from neurolens.surrogates.published.data import Exponents, Outputs, RawData, outer_pupil, solve_outputs
+from neurolens.surrogates.published.data import Outputs, RawData, outer_pupil, solve_outputs
 from neurolens.surrogates.published.polynomials import fit_dense
-from neurolens.surrogates.targets import film_equivalent, targets_of
+from neurolens.surrogates.targets import squared_error
 
 # A cell's fit sees this share of its rays' range beyond a cut, so that neighbours meet.
 MARGIN = 0.03
 _FEWEST_RAYS = 400
 _COORDINATES = (0, 2, 1)  # rho, tau, sigma: of equal errors the first is cut
+
+
+@dataclass(frozen=True, eq=False)
+class Cells(Core):
+    """A partition of the light field into two halves, each with a polynomial of its own or divided again.
+
+    Attributes:
+        variable: 0, 1 or 2: which invariant decides (rho, sigma, tau of the light field).
+        threshold: rays above it are those of `high`.
+        low, high: the halves.
+    """
+
+    variable: int
+    threshold: float
+    low: RawPolynomial | Cells
+    high: RawPolynomial | Cells
+
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        low, high = (half.build(g, field, units) for half in (self.low, self.high))
+        return low.chosen(field.products(ROUND[self.variable : self.variable + 1], w=False) <= self.threshold, high)
+
+    @property
+    def coefficients_per_vector(self) -> int:
+        """Of all cells together."""
+        return self.low.coefficients_per_vector + self.high.coefficients_per_vector
+
+    @property
+    def coefficients(self) -> int:
+        return self.low.coefficients + self.high.coefficients
 
 
 @dataclass
@@ -99,13 +129,7 @@ def _support(output: Outputs, terms: int, dispersive: bool) -> Exponents:
 
 
 def _squared_error(data: RawData, polynomial: RawPolynomial, rays: PairSet) -> float:
-    """Summed squared film-equivalent error."""
-    core, _ = outer_pupil(data, polynomial)
-    lens, domain = data.pairs.lens, data.pairs.domain
-    targets = targets_of(lens, data.encoding, rays)
-    vectors, _ = core(targets.field)
-    difference = film_equivalent(lens, domain, vectors) - film_equivalent(lens, domain, targets.vectors)
-    return float((difference**2).sum())
+    return squared_error(data.pairs, data.encoding, outer_pupil(data, polynomial)[0], rays)
 
 
 def _where_to_cut(data: RawData, cell: _Node, invariants: Tensor) -> tuple[int, float]:

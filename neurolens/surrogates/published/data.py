@@ -2,30 +2,120 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.surrogates.bases import raw_exponents
-from neurolens.surrogates.cores import RawPolynomial, monomials
-from neurolens.surrogates.fit import Prepared
+from neurolens.graph.ir import Graph, Value
+from neurolens.surrogates.bases import Exponents, monomials, raw_exponents, raw_variables
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Core, CoreValues, Field, RawPolynomial, Units
 from neurolens.surrogates.gates import gate_reach
-from neurolens.surrogates.lightfield import Encoding, LightField
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP, Gate
+from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import PairSet, RayPairs
-from neurolens.surrogates.published.cores import Cells, OuterPupil, to_tangents
-from neurolens.surrogates.targets import scales_of
+from neurolens.surrogates.targets import Prepared, scales_of
 
-Exponents = NDArray[np.int64]
 # Outputs of the published polynomials, with the parity in x and in y that mirror symmetry gives each.
 OUTPUTS = ("position x", "position y", "tangent x", "tangent y", "stop x", "stop y", "transmittance")
 PARITY = ((1, 0), (0, 1), (1, 0), (0, 1), (1, 0), (0, 1), (0, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class OuterPupil(Core):
+    """A polynomial that gives the ray on the outer pupil: the position on a sphere, the direction in its tangent frame.
+
+    Hanika and Dachsbacher 2014: the direction's components along the sphere's two tangents, which stay small where the
+    front surface of a wide angle turns towards the ray. Two tests besides the stop's, as in the public lens code
+    (crop by the inward and by the outward facing pupil): each is left out where its surface is the stop.
+
+    Attributes:
+        polynomial: vectors are position, tangent components and stop crossing; the one scalar is the transmittance.
+        curvature: of the outer pupil in units of 1 / position unit, positive towards the film; 0: tangents are x and y.
+        outer: position unit over the outer pupil's radius; None: no test. The second of the tests.
+        inner: the crossing with the rear vertex's plane in rear radii is inner[0] p + inner[1] u; None: no test.
+    """
+
+    polynomial: Core
+    curvature: float
+    outer: float | None
+    inner: tuple[float, float] | None
+    basis = "raw"
+
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        unit, _, stop = units.vectors
+        values = self.polynomial.build(g, field, Units((unit, 1.0, stop), units.gates))
+        position, gates = values.vectors[POSITION], []
+        if self.inner is not None:
+            gates.append(g.square(field.p * self.inner[0] + field.u * self.inner[1]))
+        if self.outer is not None:
+            gates.append(g.square(position * (self.outer / unit)))
+        tests = g.concat(*((r2 - 1.0) * units.gates for r2 in gates)) if gates else None
+        direction = from_tangents(position, values.vectors[DIRECTION], self.curvature / unit)
+        return replace(values, unit=direction, gates=tests)
+
+    @property
+    def coefficients_per_vector(self) -> int:
+        return self.polynomial.coefficients_per_vector
+
+    @property
+    def coefficients(self) -> int:
+        return self.polynomial.coefficients
+
+
+def to_tangents(position: Tensor, direction: Sequence[Tensor], curvature: float) -> Tensor:
+    """[2, N] components of unit directions along the tangents of the outer pupil's sphere at points [2, N].
+
+    ex = (s, 0, cx) / l has no y component, ey = (-cx cy, l^2, s cy) / l, with c the curvature, s^2 = 1 - |c (x, y)|^2
+    and l^2 = s^2 + cx^2; the normal towards the scene is (cx, cy, -s). On the axis ex and ey are x and y. Beyond the
+    sphere's equator: there.
+    """
+    cx, cy = curvature * position[0], curvature * position[1]
+    s = torch.sqrt((1 - cx * cx - cy * cy).clamp_min(0.0))
+    inverse = torch.rsqrt((s * s + cx * cx).clamp_min(1e-30))
+    ex = (s * inverse, torch.zeros_like(s), cx * inverse)
+    ey = (-cx * cy * inverse, (cx * cx + s * s) * inverse, s * cy * inverse)
+    return torch.stack([sum(a * d for a, d in zip(e, direction, strict=True)) for e in (ex, ey)])  # type: ignore[misc]
+
+
+def from_tangents(position: Value, tangents: Value, curvature: float) -> Value:
+    """Unit directions (3 rows) of `to_tangents`; components beyond the unit circle give a ray along the surface."""
+    g = position.graph
+    square = g.square(tangents)
+    along = (1.0 - square).maximum(0.0).sqrt()
+    tangents = tangents * (1.0 / square.maximum(1.0).sqrt())
+    if curvature == 0:
+        return g.concat(tangents, -along)
+    normal = position * curvature
+    s2 = (1.0 - g.square(normal)).maximum(0.0)
+    s, (a, b), (cx, cy) = s2.sqrt(), g.split(tangents, [1, 1]), g.split(normal, [1, 1])
+    length2 = s2 + cx * cx
+    inverse = 1.0 / length2.maximum(1e-30).sqrt()
+    a, b = a * inverse, b * inverse
+    x = a * s - b * cx * cy + along * cx
+    y = b * length2 + along * cy
+    return g.concat(x, y, a * cx + b * cy * s - along * s)
+
+
+def outer_pupil(data: RawData, polynomial: Core, curvature: float | None = None) -> tuple[OuterPupil, tuple[Gate, ...]]:
+    """The core about a polynomial, with its tests of the inner and the outer pupil, as rays meet them."""
+    lens, e = data.pairs.lens, data.encoding
+    last = len(lens.surfaces) - 1
+    rear = float(lens.vertices_mm[last])
+    # The share of the way from the film's plane to that of the pupil points.
+    along = (rear - e.film_plane_z_mm) / (e.pupil_plane_z_mm - e.film_plane_z_mm)
+    radius = lens.surfaces[last].semi_diameter_mm
+    by_p = e.film_scale_mm * (1 + along * (e.chief - 1))
+    inner = (by_p / radius, along * e.pupil_scale_mm / radius) if lens.stop_index != last else None
+    outer = 1.0 if lens.stop_index != 0 else None
+    core = OuterPupil(polynomial, data.curvature if curvature is None else curvature, outer, inner)
+    gates = ([] if inner is None else [Gate(last, st.RIM)]) + ([] if outer is None else [Gate(0, st.RIM)])
+    return core, tuple(gates)
 
 
 def slope_encoding(encoding: Encoding, passing: PairSet) -> Encoding:
@@ -117,7 +207,7 @@ def solve_outputs(outputs: tuple[Outputs, ...], supports: list[Exponents]) -> Ra
         row[at] = stable_solve(monomials(output.variables, support), output.values, output.weights)[0]
     components = torch.zeros((3, 2, len(place)), dtype=torch.float64)
     components[POSITION], components[DIRECTION], components[STOP] = rows[0:2], rows[2:4], rows[4:6]
-    return RawPolynomial(exponents, components, rows[6:])
+    return RawPolynomial(exponents, components.numpy(), rows[6:].numpy())
 
 
 def stable_solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None, cut: float = 1e-7) -> Tensor:
@@ -132,26 +222,3 @@ def stable_solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None
     q, r = torch.linalg.qr((columns / norms[:, None]).T)
     found = torch.linalg.lstsq(r, q.T @ outputs.T, rcond=cut, driver="gelsd").solution
     return (found / norms[:, None]).T
-
-
-def outer_pupil(
-    data: RawData, polynomial: RawPolynomial | Cells, curvature: float | None = None
-) -> tuple[OuterPupil, tuple[Gate, ...]]:
-    """The core about a polynomial, with its tests of the inner and the outer pupil, as rays meet them."""
-    lens, e = data.pairs.lens, data.encoding
-    last = len(lens.surfaces) - 1
-    rear = float(lens.vertices_mm[last])
-    # The share of the way from the film's plane to that of the pupil points.
-    along = (rear - e.film_plane_z_mm) / (e.pupil_plane_z_mm - e.film_plane_z_mm)
-    radius = lens.surfaces[last].semi_diameter_mm
-    by_p = e.film_scale_mm * (1 + along * (e.chief - 1))
-    inner = (by_p / radius, along * e.pupil_scale_mm / radius) if lens.stop_index != last else None
-    outer = 1.0 if lens.stop_index != 0 else None
-    core = OuterPupil(polynomial, data.curvature if curvature is None else curvature, outer, inner)
-    gates = ([] if inner is None else [Gate(last, st.RIM)]) + ([] if outer is None else [Gate(0, st.RIM)])
-    return core, tuple(gates)
-
-
-def raw_variables(field: LightField) -> Tensor:
-    """[5, N]: x, y, slopes, w."""
-    return torch.cat([field.p, field.u, field.w[None]])

@@ -18,18 +18,22 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.graph.ir import Graph, Value
+from neurolens.surrogates.cores import ROUND, Core, CoreValues, Field, Units
 from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.lightfield import LightField, angle_vector
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import PairSet, trace_pairs
-from neurolens.surrogates.published.data import RawData, raw_variables
+from neurolens.surrogates.published.data import RawData
+from neurolens.surrogates.settings import ModelSettings
 from neurolens.surrogates.targets import scales_of
 
 NETWORKS = 3  # whose mean is taken
@@ -39,11 +43,12 @@ _FEWEST_RAYS = 200
 _MARGIN = 0.02  # of rho beyond a ring's edges
 _BLOCKED_RAYS = 65536
 
-Layers = tuple[tuple[Tensor, Tensor], ...]
+Array = NDArray[np.float64]
+Layers = tuple[tuple[Array, Array], ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Averaged:
+class Averaged(Core):
     """The core: for each ring of the film the mean of some networks.
 
     Attributes:
@@ -53,61 +58,35 @@ class Averaged:
 
     edges: tuple[float, ...]
     networks: tuple[tuple[Layers, ...], ...]
+    basis = "raw"
 
-    basis: str = "raw"
-
-    def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
-        inputs, rho = raw_variables(field), field.invariants()[0]
-        out = ring_mean(self.networks[0], inputs)
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        inputs, rho = field.raw(), field.products(ROUND[:1], w=False)
+        out = _ring(inputs, self.networks[0])
         for edge, ring in zip(self.edges, self.networks[1:], strict=True):
-            out = torch.where(rho > edge, ring_mean(ring, inputs), out)
-        direction = out[3:6] * torch.rsqrt((out[3:6] ** 2).sum(0))
-        vector = angle_vector(direction[0], direction[1], direction[2])
-        scalars = torch.stack([out[2], 0.5 - out[6]])
-        return torch.stack([out[:2], vector, torch.zeros_like(vector)]), scalars
-
-    def to(self, dtype: torch.dtype) -> Averaged:
-        cast = tuple(tuple(tuple((w.to(dtype), b.to(dtype)) for w, b in net) for net in ring) for ring in self.networks)
-        return replace(self, networks=cast)
-
-    @property
-    def coefficients_per_vector(self) -> int:
-        return self.coefficients
+            out = g.select(rho <= edge, out, _ring(inputs, ring))
+        position, transmittance, direction, flag = g.split(out, [2, 1, 3, 1])
+        unit = direction * (1.0 / g.square(direction).sqrt())
+        position, gate = position * units.vectors[0], (0.5 - flag) * units.gates
+        return CoreValues((position, position, position * 0.0), transmittance, gate, unit)
 
     @property
     def coefficients(self) -> int:
-        return sum(w.numel() + b.numel() for ring in self.networks for net in ring for w, b in net)
+        return sum(w.size + b.size for ring in self.networks for net in ring for w, b in net)
 
 
-def ring_mean(networks: tuple[Layers, ...], inputs: Tensor) -> Tensor:
-    """[7, N] mean over networks of inputs [5, N]."""
-    total = run(networks[0], inputs)
-    for layers in networks[1:]:
-        total = total + run(layers, inputs)
-    return total / len(networks)
-
-
-def run(layers: Layers, inputs: Tensor) -> Tensor:
-    """[7, N] of one network."""
-    h = inputs
-    for weight, bias in layers[:-1]:
-        h = torch.relu(torch.addmm(bias[:, None], weight, h))
-    return torch.addmm(layers[-1][1][:, None], layers[-1][0], h)
-
-
-@dataclass(frozen=True)
-class NetworkSettings:
-    """Shape and training: units a layer, hidden layers, Adam steps of each network, seconds of all, seed, rings.
-
-    Seconds are the processor's, so that a busy machine trains no worse.
-    """
-
-    units: int
-    layers: int
-    steps: int
-    seconds: float
-    seed: int
-    rings: int
+def _ring(inputs: Value, networks: tuple[Layers, ...]) -> Value:
+    """Mean of networks, 7 rows; without dispersion their last input is 0."""
+    g, total = inputs.graph, None
+    for layers in networks:
+        h = inputs
+        for weight, bias in layers[:-1]:
+            h = g.affine(weight[:, : h.rows], h, bias).maximum(0.0)
+        weight, bias = layers[-1]
+        h = g.affine(weight / len(networks), h, bias / len(networks))
+        total = h if total is None else total + h
+    assert total is not None
+    return total
 
 
 @dataclass(frozen=True)
@@ -120,24 +99,26 @@ class _Rays:
 
 
 def fit_averaged(
-    data: RawData, settings: NetworkSettings, progress: Callable[[float], None] | None = None
+    data: RawData, settings: ModelSettings, progress: Callable[[float], None] | None = None
 ) -> tuple[Averaged, tuple[Gate, ...]]:
     """Train every network; the same seed gives the same weights where `steps` ends the training.
+
+    `partitions` are the rings; `seconds` are the processor's, of all networks, so that a busy machine trains no worse.
 
     Raises:
         InputError: more rings than the rays allow.
     """
     count = len(data.pairs.train)
-    if count < settings.rings * _FEWEST_RAYS:
+    if count < settings.partitions * _FEWEST_RAYS:
         most = max(1, count // _FEWEST_RAYS)
-        raise InputError("fit", "partitions", settings.rings, f"1 to {most} rings for {count} training rays")
+        raise InputError("fit", "partitions", settings.partitions, f"1 to {most} rings for {count} training rays")
     rays = _training_rays(data)
     rho = rays.inputs[0] ** 2 + rays.inputs[1] ** 2
-    shares = torch.arange(1, settings.rings) / settings.rings
+    shares = torch.arange(1, settings.partitions) / settings.partitions
     edges = tuple(float(e) for e in torch.quantile(rho[rays.passes > 0], shares))
     ends = (-math.inf, *edges, math.inf)
     rings: list[tuple[Layers, ...]] = []
-    total = settings.rings * NETWORKS
+    total = settings.partitions * NETWORKS
     for low, high in zip(ends, ends[1:], strict=False):
         within = (rho > low - _MARGIN) & (rho <= high + _MARGIN)
         ring = _Rays(rays.inputs[:, within], rays.values[:, within], rays.passes[within])
@@ -150,7 +131,7 @@ def fit_averaged(
         rings.append(tuple(networks))
     lens = data.pairs.lens
     gate = Gate(0 if lens.stop_index else len(lens.surfaces) - 1, st.RIM)
-    return Averaged(edges, tuple(rings)).to(torch.float64), (gate,)
+    return Averaged(edges, tuple(rings)), (gate,)
 
 
 def _training_rays(data: RawData) -> _Rays:
@@ -178,7 +159,7 @@ def _training_rays(data: RawData) -> _Rays:
     return _Rays(inputs.float(), outputs.float(), outputs[6].float())
 
 
-def _train(rays: _Rays, settings: NetworkSettings, seed: int, seconds: float) -> Layers:
+def _train(rays: _Rays, settings: ModelSettings, seed: int, seconds: float) -> Layers:
     generator = torch.Generator().manual_seed(seed)
     widths = [5, *[settings.units] * settings.layers, 7]
     weights: list[Tensor] = []
@@ -217,4 +198,5 @@ def _train(rays: _Rays, settings: NetworkSettings, seed: int, seconds: float) ->
         adam.step()
     fitted = [w.detach() for w in weights]
     fitted[-2], fitted[-1] = fitted[-2] * spread[:, None], fitted[-1] * spread + mean
-    return tuple((fitted[k], fitted[k + 1]) for k in range(0, len(fitted), 2))
+    arrays = [w.double().numpy() for w in fitted]
+    return tuple((arrays[k], arrays[k + 1]) for k in range(0, len(arrays), 2))

@@ -15,31 +15,34 @@ out, is one polynomial more of the same terms.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError  # type: ignore[import-untyped]
 from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.surrogates.cores import monomials
+from neurolens.graph.ir import Graph, Value
+from neurolens.surrogates.bases import Exponents, monomials
+from neurolens.surrogates.cores import Core, CoreValues, Field, Units
 from neurolens.surrogates.domain import Domain, FilmRays
-from neurolens.surrogates.lightfield import LightField, angle_vector
+from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import trace_pairs
 from neurolens.surrogates.published.data import RawData, stable_solve
-from neurolens.surrogates.published.ellipse import least_ellipse
 from neurolens.surrogates.targets import scales_of
 
+Array = NDArray[np.float64]
 # Positions of the input plane at which the ellipse is fitted, and rays of each.
 POSITIONS = 33
 _RAYS = 6000
 
 
 @dataclass(frozen=True, eq=False)
-class Meridian:
+class Meridian(Core):
     """The core: polynomials in the meridian of the ray, and the elliptic pass function.
 
     Attributes:
@@ -53,42 +56,47 @@ class Meridian:
         ellipse: [K, 3]: radius across, radius along, centre along the meridian (mm).
     """
 
-    exponents: NDArray[np.int64]
-    outputs: Tensor
+    exponents: Exponents
+    outputs: Array
     slope: float
     pupil: float
     film: float
-    knots: Tensor
-    ellipse: Tensor
+    knots: Array
+    ellipse: Array
+    basis = "raw"
 
-    basis: str = "raw"
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        p, u, unit = field.p, field.u, units.vectors[0]
+        rho = g.square(p)
+        radius, on_axis = rho.sqrt(), rho <= 0.0
+        safe = g.select(on_axis, 1.0, radius)
+        y = (p[0] / safe, g.select(on_axis, 1.0, p[1] / safe))  # on the axis: the y axis itself
+        slope = u * self.slope
+        along = 1.0 / (g.square(slope) + 1.0).sqrt()
+        x = g.concat(radius, g.concat(*_turned(slope, y)) * along)
+        exponents, weight = self.exponents, self.outputs * np.array([unit, unit, 1, 1, 1, 1])[:, None]
+        if field.dispersive:
+            x = g.concat(x, field.raw()[4])
+        else:
+            used = exponents[:, 3] == 0
+            exponents, weight = exponents[used][:, :3], weight[:, used]
+        position, direction, transmittance = g.split(g.polynomial(exponents, weight, x), [2, 3, 1])
+        direction = direction * (1.0 / g.square(direction).sqrt())
+        position = _turned_back(position, y)
+        crossing = _turned(p * self.film + u * self.pupil, y)
+        vectors = (position, position, position * 0.0)
+        gate = (self._ellipse(radius, crossing) - 1.0) * units.gates
+        return CoreValues(vectors, transmittance, gate, g.concat(_turned_back(direction[0:2], y), -direction[2]))
 
-    def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
-        variables, y = meridian_variables(field, self.slope)
-        across, along, *direction, transmittance = self.outputs @ monomials(variables, self.exponents)
-        inverse = torch.rsqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
-        dx, dy, dz = (d * inverse for d in direction)
-        position = turn_back(torch.stack([across, along]), y)
-        turned = turn_back(torch.stack([dx, dy]), y)
-        vector = angle_vector(turned[0], turned[1], -dz)
-        scalars = torch.stack([transmittance, self._pass(field, y)])
-        return torch.stack([position, vector, torch.zeros_like(position)]), scalars
-
-    def _pass(self, field: LightField, y: Tensor) -> Tensor:
-        """Positive outside the ellipse."""
-        radius = torch.hypot(field.p[0], field.p[1])
-        crossing = turn(self.film * field.p + self.pupil * field.u, y)
-        base, bends = self.hinges()
-        across, along, centre = base[:, None] + bends @ torch.relu(radius - self.knots[:-1, None])
-        return (crossing[0] / across) ** 2 + ((crossing[1] - centre) / along) ** 2 - 1
-
-    def hinges(self) -> tuple[Tensor, Tensor]:
-        """The piecewise linear ellipse as base [3] + bends [3, K - 1] @ relu(y - knots)."""
-        slopes = (self.ellipse[1:] - self.ellipse[:-1]) / (self.knots[1:] - self.knots[:-1])[:, None]
-        return self.ellipse[0], torch.cat([slopes[:1], slopes[1:] - slopes[:-1]]).T
-
-    def to(self, dtype: torch.dtype) -> Meridian:
-        return replace(self, outputs=self.outputs.to(dtype), knots=self.knots.to(dtype), ellipse=self.ellipse.to(dtype))
+    def _ellipse(self, radius: Value, crossing: tuple[Value, Value]) -> Value:
+        """Squared place of a crossing in the ellipse at a radius: above 1 outside. Piecewise linear by hinges."""
+        g = radius.graph
+        slopes = np.diff(self.ellipse, axis=0) / np.diff(self.knots)[:, None]
+        bends = np.concatenate([slopes[:1], np.diff(slopes, axis=0)]).T
+        hinges = g.affine(np.ones((len(self.knots) - 1, 1)), radius, -self.knots[:-1]).maximum(0.0)
+        across, along, centre = g.split(g.affine(bends, hinges, self.ellipse[0]), [1, 1, 1])
+        a, b = crossing[0] / across, (crossing[1] - centre) / along
+        return a * a + b * b
 
     @property
     def coefficients_per_vector(self) -> int:
@@ -97,7 +105,19 @@ class Meridian:
 
     @property
     def coefficients(self) -> int:
-        return int((self.outputs != 0).sum()) + self.ellipse.numel()
+        return int((self.outputs != 0).sum()) + self.ellipse.size
+
+
+def _turned(v: Value, y: tuple[Value, Value]) -> tuple[Value, Value]:
+    """As `turn`."""
+    a, b = v.graph.split(v, [1, 1])
+    return a * y[1] - b * y[0], a * y[0] + b * y[1]
+
+
+def _turned_back(v: Value, y: tuple[Value, Value]) -> Value:
+    """The inverse of `_turned`."""
+    a, b = v.graph.split(v, [1, 1])
+    return v.graph.concat(a * y[1] + b * y[0], b * y[1] - a * y[0])
 
 
 def _meridian(p: Tensor) -> Tensor:
@@ -113,11 +133,6 @@ def turn(v: Tensor, y: Tensor) -> Tensor:
     return torch.stack([v[0] * y[1] - v[1] * y[0], v[0] * y[0] + v[1] * y[1]])
 
 
-def turn_back(v: Tensor, y: Tensor) -> Tensor:
-    """The inverse of `turn`."""
-    return torch.stack([v[0] * y[1] + v[1] * y[0], v[1] * y[1] - v[0] * y[0]])
-
-
 def meridian_variables(field: LightField, slope: float) -> tuple[Tensor, Tensor]:
     """[4, N] y, dx, dy, w of turned rays, and the meridians [2, N]."""
     y = _meridian(field.p)
@@ -126,7 +141,7 @@ def meridian_variables(field: LightField, slope: float) -> tuple[Tensor, Tensor]
     return torch.stack([torch.hypot(field.p[0], field.p[1]), *unit, field.w]), y
 
 
-def meridian_exponents(degree: int, *, dispersive: bool) -> NDArray[np.int64]:
+def meridian_exponents(degree: int, *, dispersive: bool) -> Exponents:
     """[M, 4] all exponents of y, dx, dy to a total degree, each with w^0, w^1 and w^2."""
     rows = [e for e in itertools.product(range(degree + 1), repeat=3) if sum(e) <= degree]
     return np.array([(*e, w) for w in range(3 if dispersive else 1) for e in rows], dtype=np.int64)
@@ -149,17 +164,17 @@ def fit_rtf(data: RawData, degree: int) -> tuple[Meridian, tuple[Gate, ...]]:
     # A coarser cut for the transmittance, which varies little: in float32 its rounding would show first.
     outputs = torch.cat([stable_solve(columns, values), stable_solve(columns, train.transmittance[None], cut=1e-5)])
     knots, ellipse = fit_ellipses(data)
-    core = Meridian(exponents, outputs, slope, e.pupil_scale_mm, e.film_scale_mm, knots, ellipse)
+    core = Meridian(exponents, outputs.numpy(), slope, e.pupil_scale_mm, e.film_scale_mm, knots, ellipse)
     return core, (Gate(0 if lens.stop_index else len(lens.surfaces) - 1, st.RIM),)
 
 
-def fit_ellipses(data: RawData, positions: int = POSITIONS, count: int = _RAYS) -> tuple[Tensor, Tensor]:
+def fit_ellipses(data: RawData, positions: int = POSITIONS, count: int = _RAYS) -> tuple[Array, Array]:
     """Knots [K] (in units of p) and ellipses [K, 3] (radius across and along, centre along; mm on the pupil plane).
 
     Positions where no three rays pass take the ellipse of their neighbour towards the axis.
     """
     domain, e = data.pairs.domain, data.encoding
-    knots = torch.linspace(0, 1, positions, dtype=torch.float64)
+    knots = np.linspace(0, 1, positions)
     rows: list[tuple[float, float, float]] = []
     for knot in knots:
         crossings = _passing(data, domain, float(knot) * e.film_scale_mm, count)
@@ -169,10 +184,10 @@ def fit_ellipses(data: RawData, positions: int = POSITIONS, count: int = _RAYS) 
             rows.append(rows[-1])
     while len(rows) < positions:
         rows.insert(0, rows[0] if rows else (1e-9, 1e-9, 0.0))
-    return knots, torch.tensor(rows, dtype=torch.float64)
+    return knots, np.array(rows)
 
 
-def _passing(data: RawData, domain: Domain, y_mm: float, count: int) -> NDArray[np.float64]:
+def _passing(data: RawData, domain: Domain, y_mm: float, count: int) -> Array:
     """[K, 2] where passing rays from height y in the input plane cross the pupil plane, across and along."""
     points = torch.quasirandom.SobolEngine(3, scramble=True, seed=17).draw(count, dtype=torch.float64).T
     radius, angle = domain.pupil_radius_mm * torch.sqrt(points[0]), 2 * torch.pi * points[1]
@@ -183,3 +198,43 @@ def _passing(data: RawData, domain: Domain, y_mm: float, count: int) -> NDArray[
     rays = FilmRays(zero, zero + y_mm, plane, crossing[0], crossing[1], low + (high - low) * points[2])
     passed = trace_pairs(data.pairs.lens, rays, domain.pupil_z_mm).status == st.PASSED
     return np.asarray(crossing[:, passed].T.numpy(), dtype=np.float64)
+
+
+def least_ellipse(points: Array, tolerance: float = 1e-4) -> tuple[float, float, float]:
+    """Radius along x, radius along y and centre on the y axis of the least ellipse about points and mirror images.
+
+    The mirror is the y axis, x -> -x: the ellipse then has its centre on it and its axes along x and y. Khachiyan 1996,
+    with the steps of Todd and Yildirim 2007; the area is right to about `tolerance`, and all points lie inside.
+
+    Args:
+        points: [K, 2], at least one.
+    """
+    both = np.concatenate([points, points * [-1, 1]])
+    size = max(float(np.ptp(both, axis=0).max()), 1e-12)
+    try:
+        both = both[ConvexHull(both).vertices]
+    except (QhullError, ValueError):
+        half = np.ptp(both, axis=0) / 2  # points on a line
+        return max(float(half[0]), 1e-9 * size), max(float(half[1]), 1e-9 * size), float(both[:, 1].mean())
+    centre_y, scale = both[:, 1].mean(), size / 2
+    lifted = np.concatenate([both[:, :1], both[:, 1:] - centre_y, np.full((len(both), 1), scale)], axis=1).T / scale
+    weights = np.full(len(both), 1 / len(both))
+    for _ in range(2000):
+        inverse = np.linalg.inv((lifted * weights) @ lifted.T)
+        distance = np.einsum("ik,ij,jk->k", lifted, inverse, lifted)
+        far = int(distance.argmax())
+        near = int(np.where(weights > 1e-12, distance, np.inf).argmin())
+        excess, lack = distance[far] / 3 - 1, 1 - distance[near] / 3
+        if max(excess, lack) <= tolerance:
+            break
+        k = far if excess >= lack else near
+        step = (distance[k] - 3) / (3 * (distance[k] - 1))
+        step = max(step, -weights[k] / (1 - weights[k])) if weights[k] < 1 else step
+        weights *= 1 - step
+        weights[k] += step
+    centre = both.T @ weights
+    spread = ((both - centre).T * weights) @ (both - centre)
+    radii = np.sqrt(2 * np.diag(spread))
+    # The last ten thousandth: grow until every point is inside.
+    outside = np.sqrt((((both - [0.0, centre[1]]) / radii) ** 2).sum(1).max())
+    return float(radii[0] * outside), float(radii[1] * outside), float(centre[1])

@@ -16,24 +16,95 @@ transmittance is that of the axial ray; conics and even aspheres are expanded li
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
-from neurolens.surrogates.cores import RawPolynomial
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, RawPolynomial
 from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import DIRECTION, POSITION, STOP
-from neurolens.surrogates.published.series import Series, Truncated, truncated
 from neurolens.surrogates.targets import scales_of
 
+# Coefficients [M] of `Truncated.exponents`: a power series in several variables, cut beyond a total degree.
+Series = NDArray[np.float64]
 # Wavelengths at which the lens is expanded, in w; coefficients are interpolated by the parabola through them.
 NODES = (-1.0, 0.0, 1.0)
+
+
+class Truncated:
+    """Arithmetic of series in `variables` variables to a total `degree`.
+
+    Attributes:
+        exponents: [M, variables] int64, the constant first.
+    """
+
+    def __init__(self, variables: int, degree: int) -> None:
+        rows = [e for e in itertools.product(range(degree + 1), repeat=variables) if sum(e) <= degree]
+        self.exponents: NDArray[np.int64] = np.array(sorted(rows, key=lambda e: (sum(e), e)), dtype=np.int64)
+        self.degree = degree
+        total = self.exponents.sum(1)
+        left, right = np.nonzero(total[:, None] + total[None, :] <= degree)
+        place = {tuple(map(int, e)): k for k, e in enumerate(self.exponents)}
+        made = self.exponents[left] + self.exponents[right]
+        self._left, self._right = left, right
+        self._product = np.array([place[tuple(map(int, e))] for e in made])
+
+    def variable(self, k: int, scale: float = 1.0) -> Series:
+        """`scale` times variable k."""
+        wanted = np.zeros(self.exponents.shape[1], dtype=np.int64)
+        wanted[k] = 1
+        return scale * (self.exponents == wanted).all(1).astype(np.float64)
+
+    def constant(self, value: float) -> Series:
+        return value * (self.exponents == 0).all(1).astype(np.float64)
+
+    def times(self, a: Series, b: Series) -> Series:
+        """The product, cut."""
+        found = np.bincount(self._product, a[self._left] * b[self._right], len(self.exponents))
+        return np.asarray(found, dtype=np.float64)
+
+    def of(self, taylor: Sequence[float], a: Series) -> Series:
+        """f(a) from the Taylor coefficients of f about a's constant, `degree` + 1 of them."""
+        small = a.copy()
+        small[0] = 0.0
+        out = self.constant(taylor[-1])
+        for coefficient in reversed(taylor[:-1]):
+            out = self.times(out, small)
+            out[0] += coefficient
+        return out
+
+    def power(self, a: Series, exponent: float) -> Series:
+        """a to any power; the constant of `a` must be positive unless the exponent is a natural number.
+
+        Raises:
+            ValueError: no such series.
+        """
+        if exponent == int(exponent) and exponent >= 0:
+            out = self.constant(1.0)
+            for _ in range(int(exponent)):
+                out = self.times(out, a)
+            return out
+        if not a[0] > 0:
+            raise ValueError(f"no power series of a^{exponent} about {a[0]}")
+        taylor = [a[0] ** exponent]
+        for k in range(self.degree):
+            taylor.append(taylor[-1] * (exponent - k) / ((k + 1) * a[0]))
+        return self.of(taylor, a)
+
+
+@lru_cache(maxsize=8)
+def truncated(variables: int, degree: int) -> Truncated:
+    """The arithmetic of a degree; made once."""
+    return Truncated(variables, degree)
 
 
 class RaySeries(NamedTuple):
@@ -156,7 +227,7 @@ def fit_taylor(lens: Lens, encoding: Encoding, degree: int) -> RawPolynomial:
     rows, exponents = rows[:, used], exponents[used.numpy()]
     components = torch.zeros((3, 2, len(exponents)), dtype=torch.float64)
     components[POSITION], components[DIRECTION], components[STOP] = rows[0:2], rows[2:4], rows[4:6]
-    return RawPolynomial(exponents, components, rows[6:])
+    return RawPolynomial(exponents, components.numpy(), rows[6:].numpy())
 
 
 def _axial_transmittance(lens: Lens, encoding: Encoding, wavelength_nm: float) -> float:

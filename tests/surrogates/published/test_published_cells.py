@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import lens_models
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.model import load_model
-from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import ray_errors
 from neurolens.surrogates.cores import RawPolynomial
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.onnx.export import export_onnx
 from neurolens.surrogates.pairs import trace_pairs
-from neurolens.surrogates.published.adaptive import fit_adaptive
-from neurolens.surrogates.published.cores import Cells
+from neurolens.surrogates.published.adaptive import Cells, fit_adaptive
 from neurolens.surrogates.published.data import RawData
-from neurolens.surrogates.published.neural import Averaged, ring_mean, run
+from neurolens.surrogates.published.neural import Averaged, Layers
 
 NETWORKS = ModelSettings("neurolens2017", basis="raw", units=16, layers=2, steps=60, seconds=600.0, partitions=2)
 
@@ -78,7 +74,7 @@ def test_growth_reaches_degrees_that_no_list_of_candidates_was_cut_at() -> None:
     polynomial = fit_adaptive(RawData.of(prepared), 24, 1)
     assert isinstance(polynomial, RawPolynomial)
     used = polynomial.components[:2].reshape(4, -1) != 0
-    assert int(polynomial.exponents[used.any(0).numpy()].sum(1).max()) >= 5
+    assert int(polynomial.exponents[used.any(0)].sum(1).max()) >= 5
 
 
 @pytest.mark.parametrize("method", ("zheng-adaptive", "neurolens2017"))
@@ -88,21 +84,35 @@ def test_more_cells_than_rays_allow_are_refused(method: str) -> None:
         fit_model(lens_models.prepared(), settings)
 
 
+def by_hand(layers: Layers, h: np.ndarray) -> np.ndarray:
+    """[7, N] of one network."""
+    for k, (weight, bias) in enumerate(layers):
+        h = weight @ h + bias[:, None]
+        h = h if k == len(layers) - 1 else np.maximum(h, 0)
+    return h
+
+
 def test_networks_are_averaged_and_chosen_by_film_radius() -> None:
     model = fit_model(lens_models.prepared(), NETWORKS)
     core = model.core
     assert isinstance(core, Averaged)
     assert [len(ring) for ring in core.networks] == [3, 3]
     assert len(core.edges) == 1
-    inputs = torch.cat([rays_of().p, rays_of().u, rays_of().w[None]])
-    mean = torch.stack([run(net, inputs) for net in core.networks[0]]).mean(0)
-    assert torch.allclose(ring_mean(core.networks[0], inputs), mean, atol=1e-12)
+    field, edge = rays_of(), core.edges[0]
+    inputs = torch.cat([field.p, field.u, field.w[None]]).numpy()
+    ring = (field.invariants()[0].numpy() > edge).astype(int)
+    assert set(ring) == {0, 1}
+    means = np.stack([np.mean([by_hand(net, inputs) for net in nets], axis=0) for nets in core.networks])
+    wanted = np.take_along_axis(means, ring[None, None], axis=0)[0]
+    vectors, scalars = core(field)
+    np.testing.assert_allclose(vectors[0], wanted[:2], atol=1e-12)
+    np.testing.assert_allclose(scalars, [wanted[2], 0.5 - wanted[6]], atol=1e-12)
     # The seed makes the weights, and another seed others.
     again, other = (fit_model(lens_models.prepared(), replace(NETWORKS, seed=s)).core for s in (0, 1))
     assert isinstance(again, Averaged)
     assert isinstance(other, Averaged)
-    assert torch.equal(again.networks[1][2][0][0], core.networks[1][2][0][0])
-    assert not torch.equal(other.networks[1][2][0][0], core.networks[1][2][0][0])
+    assert np.array_equal(again.networks[1][2][0][0], core.networks[1][2][0][0])
+    assert not np.array_equal(other.networks[1][2][0][0], core.networks[1][2][0][0])
 
 
 def test_networks_learn_rays_and_who_passes() -> None:
@@ -121,21 +131,3 @@ def test_the_clock_ends_a_training() -> None:
     model = fit_model(lens_models.prepared(), replace(NETWORKS, steps=100_000, seconds=0.5))
     assert model.fit_s < 60
     assert rms_um(model) > 0
-
-
-@pytest.mark.parametrize("method", ("zheng-adaptive", "neurolens2017"))
-@pytest.mark.parametrize("name", ("laikin_double_gauss_50", "muller_fisheye_100"))
-def test_graphs_give_what_the_models_give(method: str, name: str, tmp_path: Path) -> None:
-    settings = ModelSettings("zheng-adaptive", basis="raw", terms=6, partitions=2)
-    model = fit_model(lens_models.prepared(name), NETWORKS if method == "neurolens2017" else settings)
-    predict = onnx_predictor(load_model(export_onnx(model, tmp_path / "model.onnx", {})))
-    drawn = sample_domain(model.domain, 4000, 5)
-    rays = replace(drawn, film_z=torch.full_like(drawn.film_z, model.domain.film_z_mm[1]))
-    exact, graph = model.predict(rays), predict(rays)
-    passed = (exact.status == st.PASSED) & (graph.status == st.PASSED)
-    assert int((exact.status != graph.status).sum()) <= 4
-    assert int(passed.sum()) > 1000
-    for a, b in zip(exact.rays, graph.rays, strict=True):
-        close = (a - b)[passed].abs() < 5e-5 * max(1.0, float(a[passed].abs().max()))
-        # A ray within rounding of a cut may take the other cell.
-        assert int((~close).sum()) <= 2

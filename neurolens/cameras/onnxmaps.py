@@ -1,0 +1,266 @@
+"""Derivatives and inverse maps of exported models that were written with them: numpy and onnxruntime alone.
+
+Inverse maps lead from stop points, and from scene rays, back to camera rays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, ModelError
+from neurolens.cameras.contract import FloatArray
+from neurolens.cameras.onnxlens import DERIVATIVES, INPUTS, OUTPUTS, LensRays, OnnxLens
+from neurolens.cameras.onnxsession import open_session, run_batches
+from neurolens.modelfile.cardcheck import check_card, is_number
+from neurolens.modelfile.onnxfile import read_checked
+from neurolens.optics.sag import meet_front
+
+# Rays a call: these graphs have more rows than those of models alone.
+_DERIVATIVES_BATCH, _INVERSE_BATCH = 8192, 4096
+_CALL = {"film_z_mm": ("tensor(float)", 1), "stop_radius_mm": ("tensor(float)", 1)}
+_OUTPUTS = {"rays": ("tensor(float)", 5, None), **OUTPUTS, "density": ("tensor(float)", None)}
+_GIVEN = {"stop": "stop_rays", "scene": "front_rays"}
+
+
+class LensDerivatives(NamedTuple):
+    """A model's rays, and their derivatives [6, 2, N]: x, y, z (mm) and direction by x and y of a point, per mm.
+
+    `d_film`: the pupil point held; `d_pupil`: the film point held.
+    """
+
+    rays: LensRays
+    d_film: FloatArray
+    d_pupil: FloatArray
+
+
+class OnnxDerivatives:
+    """The derivatives of a loaded model; its session is one of its own, so that others do not pay for it.
+
+    Raises:
+        InputError: a model that was exported without derivatives, or one of many states.
+    """
+
+    def __init__(self, model: OnnxLens) -> None:
+        self.model = model
+        try:
+            if model.axes:
+                raise ModelError(f"{model.path}: a model of many states")
+            self._session = open_session(model.path, model.data, model.threads, INPUTS, {**OUTPUTS, **DERIVATIVES})
+        except ModelError as error:
+            raise InputError(model.path, "derivatives", f"({error})", "a model exported with derivatives") from error
+
+    def __call__(
+        self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray, film_z_mm: float, stop_radius_mm: float
+    ) -> LensDerivatives:
+        """Rays and derivatives for film and pupil points [2, N] mm and wavelengths [N] nm, as `OnnxLens.rays`."""
+        rays = np.concatenate([film, pupil, wavelength_nm[None]]).astype(np.float32)
+        call = {"film_z_mm": film_z_mm, "stop_radius_mm": stop_radius_mm}
+        names = (*OUTPUTS, *DERIVATIVES)
+        out = run_batches(self.model.path, self._session, names, ("rays", rays), call, _DERIVATIVES_BATCH)
+        return LensDerivatives(LensRays(*out[:4]), *(np.moveaxis(d, 0, 1) for d in out[4:]))
+
+
+class InverseRays(NamedTuple):
+    """Camera rays found, [N]; they mean something where status is 0.
+
+    rays [5, N] float32 (film x, y, pupil x, y in mm, wavelength in nm); scene_ray [6, N], transmittance [N], stop_xy_mm
+    [2, N] and status [N] as the model gives them for those rays, with NO_SOLUTION where they are not what was asked
+    for; density [N]: of `through_stop` |d stop / d pupil|, of `from_scene` mm^2 of film times mm^2 of the pupil plane
+    per mm^2 of (x, y) on the front surface and steradian.
+    """
+
+    rays: FloatArray
+    scene_ray: FloatArray
+    transmittance: FloatArray
+    stop_xy_mm: FloatArray
+    status: NDArray[np.int32]
+    density: FloatArray
+
+
+class OnnxInverse:
+    """The inverse maps of one model. Make it with `load_inverse`.
+
+    Attributes:
+        card: of the model; its entry "inverse" says how the map was fitted and how often it converges, by map.
+    """
+
+    def __init__(self, maps: Mapping[str, tuple[Any, dict[str, Any]]], path: Path) -> None:
+        self.path, self._maps = path, maps
+        self.card = next(iter(maps.values()))[1]
+
+    def through_stop(
+        self,
+        film_xy_mm: ArrayLike,
+        stop_xy_mm: ArrayLike,
+        wavelength_nm: ArrayLike,
+        film_z_mm: float | None = None,
+        stop_radius_mm: float | None = None,
+    ) -> InverseRays:
+        """Rays from film points [2, N] through stop points [2, N].
+
+        Raises:
+            InputError: arrays of other shapes, or no file of this map.
+        """
+        film, stop, wavelength = _arrays(film_xy_mm, 2, stop_xy_mm, 2, wavelength_nm)
+        return self._run("stop", np.concatenate([film, stop, wavelength]), film_z_mm, stop_radius_mm)
+
+    def from_scene(
+        self,
+        origin_mm: ArrayLike,
+        direction: ArrayLike,
+        wavelength_nm: ArrayLike,
+        film_z_mm: float | None = None,
+        stop_radius_mm: float | None = None,
+    ) -> InverseRays:
+        """Camera rays of light along scene rays.
+
+        Args:
+            origin_mm: [3, N], a point of each ray before or on the front surface, lens frame.
+            direction: [3, N] unit vectors of the camera rays, away from the lens: from a point X of the front surface
+                to a scene point S, (S - X) / |S - X|.
+
+        Raises:
+            InputError: arrays of other shapes, or no file of this map.
+        """
+        origin, d, wavelength = _arrays(origin_mm, 3, direction, 3, wavelength_nm)
+        front = self.front
+        x, y = meet_front(front, *origin, *d)
+        with np.errstate(all="ignore"):
+            sine = np.hypot(d[0], d[1])
+            if front is None:  # first order: slopes
+                v, solid = d[:2] / -d[2], np.abs(d[2]) ** 3
+            else:
+                angle = np.arctan2(sine, -d[2])
+                safe = np.where(sine > 1e-12, sine, 1.0)
+                v = d[:2] * np.where(sine > 1e-12, angle / safe, 1.0)
+                solid = np.where(angle > 1e-12, sine / np.where(angle > 1e-12, angle, 1.0), 1.0)
+        out = self._run("scene", np.stack([x, y, v[0], v[1], wavelength[0]]), film_z_mm, stop_radius_mm)
+        with np.errstate(all="ignore"):  # area of direction vectors to solid angle
+            return out._replace(density=(out.density / solid).astype(np.float32))
+
+    @property
+    def front(self) -> Any:
+        """Shape of the surface on which scene rays are taken (`optics.sag.Shape`); None for the plane z = 0.
+
+        Raises:
+            InputError: no file of the map of scene rays.
+        """
+        shape = self._map("scene")[1]["inverse"]["front"]
+        return None if shape is None else SimpleNamespace(**shape)
+
+    def _map(self, name: str) -> tuple[Any, dict[str, Any]]:
+        if name not in self._maps:
+            raise InputError(self.path, "map", name, f"one of those found: {', '.join(self._maps)}")
+        return self._maps[name]
+
+    def _run(
+        self, name: str, given: NDArray[Any], film_z_mm: float | None, stop_radius_mm: float | None
+    ) -> InverseRays:
+        session, card = self._map(name)
+        domain = card["domain"]
+        call = {
+            "film_z_mm": domain["film_z_mm"][0] if film_z_mm is None else film_z_mm,
+            "stop_radius_mm": domain["stop_radius_mm"] if stop_radius_mm is None else stop_radius_mm,
+        }
+        with np.errstate(over="ignore"):
+            rays = (_GIVEN[name], given.astype(np.float32))
+        return InverseRays(*run_batches(self.path, session, InverseRays._fields, rays, call, _INVERSE_BATCH))
+
+
+def load_inverse(path: str | Path, lens: str | None = None, threads: int = 1) -> OnnxInverse:
+    """Load the inverse maps that lie beside a model: NAME.stop.onnx and NAME.scene.onnx for NAME.onnx.
+
+    Args:
+        path: of the model. lens, threads: as of `load_model`.
+
+    Raises:
+        ModelError: neither file is there, or one is damaged, of another lens, or does not lead the card's reference
+            rays back.
+    """
+    base = Path(path).with_suffix("")
+    maps = {}
+    for name in _GIVEN:
+        file = base.with_name(f"{base.name}.{name}.onnx")
+        if file.is_file():
+            maps[name] = _load(file, name, lens, threads)
+    if not maps:
+        raise ModelError(f"{base}.stop.onnx, {base}.scene.onnx: no such files, expected exported inverse maps")
+    inverse = OnnxInverse(maps, Path(path))
+    for name, (_, card) in maps.items():
+        _check(inverse, name, card)
+    return inverse
+
+
+def _load(file: Path, name: str, lens: str | None, threads: int) -> tuple[Any, dict[str, Any]]:
+    data, card = read_checked(file)
+    check_card(file, card)
+    facts = card.get("inverse")
+    if not isinstance(facts, dict) or facts.get("map") != name or not _is_front(facts.get("front", "")):
+        raise ModelError(f"{file}: card: inverse: got {str(facts)[:80]}, expected the facts of the {name} map")
+    if lens is not None and card["lens"].get("sha256") != lens:
+        raise ModelError(f"{file}: card: lens.sha256: the map stands for another lens, {card['lens'].get('name')}")
+    inputs = {_GIVEN[name]: ("tensor(float)", 5, None), **_CALL}
+    return open_session(file, data, threads, inputs, _OUTPUTS), card
+
+
+def _is_front(value: Any) -> bool:
+    """Whether this is a front surface as `meet_front` takes it: none, or a table of its shape."""
+    if value is None:
+        return True
+    if not isinstance(value, dict) or set(value) != {"curvature", "conic", "asphere", "cylinder"}:
+        return False
+    terms = value["asphere"]
+    return (
+        is_number(value["curvature"])
+        and is_number(value["conic"])
+        and value["cylinder"] in (None, "x", "y")
+        and isinstance(terms, list)
+        and all(isinstance(t, list) and len(t) == 2 and all(map(is_number, t)) for t in terms)
+    )
+
+
+def _check(inverse: OnnxInverse, name: str, card: dict[str, Any]) -> None:
+    """Nine of ten of the card's passing reference rays come back; folded maps lead a few to another ray."""
+    try:
+        reference = card["reference"]
+        passed = np.asarray(reference["status"]) == st.PASSED
+        rays = np.asarray(reference["rays"], np.float64)[:, passed]
+        call = (rays[4], float(reference["film_z_mm"][0]), float(reference["stop_radius_mm"]))
+        if name == "stop":
+            found = inverse.through_stop(rays[:2], np.asarray(reference["stop_xy_mm"])[:, passed], *call)
+        else:
+            scene = np.asarray(reference["scene_ray"], np.float64)[:, passed]
+            found = inverse.from_scene(scene[:3], scene[3:], *call)
+    except (InputError, KeyError, TypeError, ValueError, IndexError) as error:
+        raise ModelError(f"{inverse.path}: {name}: card: reference: {type(error).__name__}: {error}") from error
+    off = np.abs(found.rays[:4] - rays[:4]).max(0)
+    back = (off < 1e-3 * float(card["domain"]["pupil_radius_mm"])) & (found.status == st.PASSED)
+    if not (back.size and back.mean() >= 0.9):
+        raise ModelError(f"{inverse.path}: {name} map: {int(back.sum())} of {back.size} reference rays come back")
+
+
+def _arrays(a: ArrayLike, rows_a: int, b: ArrayLike, rows_b: int, wavelength: ArrayLike) -> list[NDArray[np.float64]]:
+    """Three arrays [rows, N] of float64.
+
+    Raises:
+        InputError: other shapes.
+    """
+    try:
+        first, second, w = (np.asarray(v, np.float64) for v in (a, b, wavelength))
+    except (ValueError, TypeError) as error:
+        raise InputError("OnnxInverse", "points", "(no arrays)", "arrays of numbers") from error
+    if first.ndim != 2 or len(first) != rows_a:
+        raise InputError("OnnxInverse", "points", f"({first.shape})", f"an array ({rows_a}, N)")
+    count = first.shape[1]
+    if second.shape != (rows_b, count):
+        raise InputError("OnnxInverse", "points, directions", f"({second.shape})", f"an array ({rows_b}, {count})")
+    if w.shape not in ((), (count,)):
+        raise InputError("OnnxInverse", "wavelength_nm", f"({w.shape})", f"a number or an array ({count},)")
+    return [first, second, np.broadcast_to(w, (1, count))]

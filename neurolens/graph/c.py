@@ -1,0 +1,229 @@
+"""Programs as C99: one self-contained header with a function for one ray and one over arrays, which vectorises."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurolens.graph.program import Argument, Program, Step, is_per_call
+
+_HEAD = """\
+/*
+{comment}
+ *
+ * {name}(...) takes one ray; {name}_rays(...) takes arrays, one value a ray, that must not overlap. It has no
+ * branches: gcc -O3 -march=native (clang alike) makes vectors of it. Results mean something where status is 0. The
+ * guard of the domain needs NaN: never compile this with -ffast-math or -ffinite-math-only.
+ */
+#ifndef {guard}
+#define {guard}
+
+#include <stddef.h>
+
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
+#error "{name}: rays outside the domain are told by NaN; compile without -ffast-math and -ffinite-math-only"
+#endif
+#ifdef __cplusplus
+#define {macro}_RESTRICT __restrict
+#else
+#define {macro}_RESTRICT restrict
+#endif
+#if defined(__GNUC__)
+#define {macro}_INLINE static inline __attribute__((always_inline, unused))
+#define {macro}_UNUSED __attribute__((unused))
+#else
+#define {macro}_INLINE static inline
+#define {macro}_UNUSED
+#endif
+/* a b + c, rounded once where the machine can. */
+#if defined(__GNUC__) && (defined(__FMA__) || defined(__FP_FAST_FMAF) || defined(__ARM_FEATURE_FMA))
+#define {macro}_FMA(a, b, c) __builtin_fmaf((a), (b), (c))
+#else
+#define {macro}_FMA(a, b, c) ((a) * (b) + (c))
+#endif
+"""
+# sqrtf of the library sets errno, which keeps compilers from making vectors of it unless they are told not to care.
+_SQRT = """
+/* Square root: the machine's with -fno-math-errno, else by Newton's steps from the halved exponent, within an ulp. */
+{macro}_INLINE float {name}_sqrt(float x)
+{{
+#ifdef __NO_MATH_ERRNO__
+    return __builtin_sqrtf(x);
+#else
+    union {{ float f; unsigned u; }} y;
+    y.f = x;
+    y.u = 0x5f375a86u - (y.u >> 1);
+    float r = y.f;
+    r = r * (1.5f - 0.5f * x * r * r);
+    r = r * (1.5f - 0.5f * x * r * r);
+    r = r * (1.5f - 0.5f * x * r * r);
+    const float s = x * r;
+    return s + 0.5f * r * (x - s * s);
+#endif
+}}
+"""
+# As whole numbers, which order as the sizes of floats do: compilers make branches of two comparisons of floats.
+_CLAMP = """
+{macro}_INLINE float {name}_clamp(float x, float limit)
+{{
+    union {{ float f; unsigned u; }} a, b;
+    a.f = x;
+    b.f = limit;
+    const unsigned sign = a.u & 0x80000000u, size = a.u & 0x7fffffffu;
+    a.u = (size < b.u ? size : b.u) | sign;
+    return a.f;
+}}
+"""
+
+
+@dataclass(frozen=True)
+class Signature:
+    """Names of a written function.
+
+    Attributes:
+        name: of the function. inputs: in order. outputs: floats in order, then status.
+        bands: wavelengths of the coefficient tables; a function of several takes `band`, a number from 0.
+    """
+
+    name: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    bands: int = 1
+
+    @staticmethod
+    def of(program: Program, name: str) -> Signature:
+        """The inputs that a program names, in its order, and its outputs."""
+        steps = (program.steps[k] for k in program.live())
+        inputs = [s.name for s in steps if s.kind == "input"]
+        outputs = [o for o in program.outputs if o != "status"]
+        # What holds for a whole call goes last.
+        ordered = [i for i in inputs if not is_per_call(i)] + [i for i in inputs if is_per_call(i)]
+        return Signature(name, tuple(ordered), tuple(outputs), program.tables)
+
+    @property
+    def per_ray(self) -> tuple[str, ...]:
+        return tuple(i for i in self.inputs if not is_per_call(i))
+
+    @property
+    def per_call(self) -> tuple[str, ...]:
+        return tuple(i for i in self.inputs if is_per_call(i))
+
+
+def write_c(program: Program, name: str, comment: Sequence[str]) -> str:
+    """The text of a header.
+
+    Args:
+        name: of the function, an identifier.
+        comment: lines on the model, for its head.
+    """
+    signature = Signature.of(program, name)
+    macro = name.upper()
+    lines = "\n".join(f" * {line}".rstrip() for line in comment).replace("*/", "* /")
+    text = _HEAD.format(comment=lines, name=name, guard=f"{macro}_H", macro=macro)
+    live = program.live()
+    if any(program.steps[k].kind == "sqrt" for k in live):
+        text += _SQRT.format(name=name, macro=macro)
+    if any(program.steps[k].kind == "clamp" for k in live):
+        text += _CLAMP.format(name=name, macro=macro)
+    writer = Writer(program, f"{name}_sqrt", f"{macro}_FMA", clamp=f"{name}_clamp")
+    body = [f"    const float t{k} = {writer.step(program.steps[k])};" for k in live if not _input(program, k)]
+    results = [f"    ray.{o} = {writer.value(program.outputs[o].argument)};" for o in signature.outputs]
+    results.append(f"    ray.status = (int){writer.value(program.outputs['status'].argument)};")
+    if writer.table:
+        rows = ",\n".join("    {" + ", ".join(literal(v) for v in row) + "}" for row in np.array(writer.table).T)
+        text += f"\nstatic const float {name}_table[{program.tables}][{len(writer.table)}] = {{\n{rows}}};\n"
+        body.insert(0, f"    const float *const c = {name}_table[band];")
+    return text + _functions(signature, macro, body, results)
+
+
+def _input(program: Program, k: int) -> bool:
+    return program.steps[k].kind == "input"
+
+
+def _functions(s: Signature, macro: str, body: list[str], results: list[str]) -> str:
+    fields = "\n".join(f"    float {o};" for o in s.outputs)
+    band = ["int band"] if s.bands > 1 else []
+    guard = [f"    const int known = band >= 0 && band < {s.bands};", "    if (!known) band = 0;"] if band else []
+    if band:
+        results = [*results, "    if (!known) ray.status = 1;"]
+    one = ",\n    ".join([*(f"float {i}" for i in s.inputs), *band])
+    many = ",\n    ".join(
+        [
+            "size_t count",
+            *(f"const float *{macro}_RESTRICT {i}" for i in s.per_ray),
+            *(f"float {i}" for i in s.per_call),
+            *band,
+            *(f"float *{macro}_RESTRICT {o}" for o in s.outputs),
+            f"int *{macro}_RESTRICT status",
+        ]
+    )
+    given = ", ".join([*(f"{i}[i]" for i in s.per_ray), *s.per_call, *(["band"] if band else [])])
+    stores = "\n".join(f"        {o}[i] = ray.{o};" for o in (*s.outputs, "status"))
+    unused = "".join(f"    (void){i};\n" for i in s.inputs)
+    return (
+        f"\ntypedef struct {{\n{fields}\n    int status;\n}} {s.name}_ray;\n"
+        f"\n{macro}_INLINE {s.name}_ray {s.name}(\n    {one})\n{{\n{unused}    {s.name}_ray ray;\n"
+        + "\n".join([*guard, *body, *results])
+        + "\n    return ray;\n}\n"
+        f"\n{macro}_UNUSED static inline void {s.name}_rays(\n    {many})\n{{\n"
+        "    for (size_t i = 0; i < count; i++) {\n"
+        f"        const {s.name}_ray ray = {s.name}({given});\n{stores}\n    }}\n}}\n\n#endif\n"
+    )
+
+
+class Writer:
+    """Steps as expressions of C, and of GLSL, which has the same ones.
+
+    Args:
+        sqrt, fma, clamp: functions of those; without one its operations are written.
+        place: of the table's coefficient {}.
+
+    Attributes:
+        table: coefficients that differ between tables, each a row of one value a table, in the order of their use.
+    """
+
+    def __init__(self, program: Program, sqrt: str, fma: str = "", place: str = "c[{}]", clamp: str = "") -> None:
+        self.program, self.sqrt, self.fma, self.place, self.clamp = program, sqrt, fma, place, clamp
+        self.table: list[tuple[float, ...]] = []
+
+    def value(self, argument: Argument) -> str:
+        """A step's name, a number, or a place in the table of coefficients."""
+        if isinstance(argument, int):
+            step = self.program.steps[argument]
+            return step.name if step.kind == "input" else f"t{argument}"
+        if all(v == argument[0] for v in argument):
+            return literal(argument[0])
+        if argument not in self.table:
+            self.table.append(argument)
+        return self.place.format(self.table.index(argument))
+
+    def step(self, step: Step) -> str:
+        given = [self.value(a) for a in step.arguments]
+        if step.kind in _INFIX:
+            return f"{given[0]} {_INFIX[step.kind]} {given[1]}"
+        if step.kind == "select":
+            return "{} <= {} ? {} : {}".format(*given)
+        if step.kind in ("max", "min"):
+            a, b = given
+            return f"{a} {'>' if step.kind == 'max' else '<'} {b} ? {a} : {b}"
+        if step.kind == "clamp":
+            x, limit = given
+            return f"{self.clamp}({x}, {limit})" if self.clamp else f"max(min({x}, {limit}), -{limit})"
+        if step.kind == "neg":
+            return f"-({given[0]})"
+        if step.kind == "sqrt":
+            return f"{self.sqrt}({given[0]})"
+        return f"{self.fma}({', '.join(given)})" if self.fma else "{} * {} + {}".format(*given)
+
+
+_INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
+
+
+def literal(value: float) -> str:
+    """A float32 number in nine digits, which give it back exactly; negative ones in brackets."""
+    text = f"{np.float32(value):.9g}"
+    if "." not in text and "e" not in text:
+        text += ".0"
+    return f"({text}f)" if text.startswith("-") else f"{text}f"

@@ -1,0 +1,344 @@
+"""Derivatives of graphs: forward-mode differentiation, one rule an operator.
+
+What values and derivatives have in common is done once (Griewank and Walther, "Evaluating Derivatives", 2008, chapter
+3): a polynomial's partial derivatives are further rows of the same polynomial, for they need (nearly) its monomials.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.graph.ir import Exponents, Graph, Node, Value
+from neurolens.graph.passes import pruned
+from neurolens.graph.program import row_names
+
+Array = NDArray[np.float64]
+# A derivative along one direction; None where it is 0.
+Moved = Value | None
+
+
+def derivative(output: str, by: str) -> str:
+    """Name of the output that holds the derivatives of one output by one row of an input (`program.row_names`)."""
+    return f"{output}_by_{by}"
+
+
+def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tuple[str, int]]) -> Graph:
+    """The graph with outputs `derivative(output, row)`, of as many rows as the output, besides its own.
+
+    At a choice (select, max, min, clip) the derivative is that of what was chosen.
+
+    Args:
+        outputs: those to differentiate. inputs: names and rows of those to differentiate by.
+    """
+    g = Graph()
+    values: dict[int, Value] = {}  # by the old graph's numbers
+    known: list[dict[int, Value]] = [{} for _ in inputs]  # derivatives by the new graph's numbers, by direction
+    chains: dict[int, tuple[int, Value]] = {}  # a function of one value: that one, and the derivative by it
+    names: dict[tuple[str, int], str] = {}
+    for number, node in enumerate(graph.nodes):
+        x = [values[k] for k in node.inputs]
+        moves: list[list[Moved]] = [[direction.get(v.number) for v in x] for direction in known]
+        rule = _RULES.get(node.kind, _none)
+        if node.kind == "polynomial" and any(d[0] is not None for d in moves):
+            values[number], rule = _with_gradient(g, node, x[0])
+        else:
+            values[number] = g.like(node, x)
+        y = values[number]
+        if node.kind == "input":
+            names |= {(node.name, row): name for row, name in enumerate(row_names(node.name, node.rows))}
+        base = _base(node, x, moves, chains)
+        if base is not None:
+            factor = rule(node, y, x, _factors(x, moves, chains))
+            if factor is None:
+                continue
+            chains[y.number] = base, factor
+        for (name, row), direction, d in zip(inputs, known, moves, strict=True):
+            if node.kind == "input" and node.name == name:
+                direction[y.number] = g.constant(np.eye(node.rows)[row])
+            elif any(v is not None for v in d):
+                moved = rule(node, y, x, d) if base is None else _times(direction[base], chains[y.number][1])
+                if moved is not None and not _is_zero(moved):
+                    direction[y.number] = moved
+    g.outputs = {name: values[v.number] for name, v in graph.outputs.items()}
+    for place, direction in zip(inputs, known, strict=True):
+        for output in outputs:
+            value = g.outputs[output]
+            g.outputs[derivative(output, names[place])] = direction.get(value.number) or value * 0.0
+    return _joined(pruned(g))
+
+
+def _joined(graph: Graph) -> Graph:
+    """Products of several matrices with one value, as those of all directions with the planes, as one product."""
+    groups: dict[tuple[Any, ...], list[Node]] = {}
+    for node in graph.nodes:
+        if node.kind == "affine" and not node.static[1]:
+            groups.setdefault((node.inputs, node.static), []).append(node)
+    found, values = Graph(), list[Value]()
+    for node in graph.nodes:
+        inputs = [values[k] for k in node.inputs]
+        group = groups.get((node.inputs, node.static), []) if node.kind == "affine" else []
+        if len(group) > 1:
+            rows = sum(n.rows for n in group)
+            arrays = [np.concatenate(a) for a in zip(*(n.arrays for n in group), strict=True)]
+            start = sum(n.rows for n in group[: next(k for k, n in enumerate(group) if n is node)])
+            whole = found.add("affine", inputs, rows, arrays=arrays, static=node.static)
+            values.append(whole[start : start + node.rows])
+        elif node.kind == "take":
+            values.append(found.take(inputs[0], node.static))
+        else:
+            values.append(found.like(node, inputs))
+    found.outputs = {name: values[v.number] for name, v in graph.outputs.items()}
+    return found
+
+
+def _factors(x: Sequence[Value], moves: Sequence[Sequence[Moved]], chains: dict[int, tuple[int, Value]]) -> list[Moved]:
+    """Derivatives of an operation's values by the one that they all depend on."""
+    one = x[0].graph.constant(1.0)
+    return [
+        None if all(d[i] is None for d in moves) else chains[v.number][1] if v.number in chains else one
+        for i, v in enumerate(x)
+    ]
+
+
+def _base(
+    node: Node, x: Sequence[Value], moves: Sequence[Sequence[Moved]], chains: dict[int, tuple[int, Value]]
+) -> int | None:
+    """The one value, of as many rows, that an operation row by row depends on; None: there are several, or none.
+
+    Its derivative by that value serves all directions.
+    """
+    moved = {v.number: v for i, v in enumerate(x) if any(d[i] is not None for d in moves)}
+    bases = {chains[n][0] if n in chains else n for n in moved}
+    same_rows = all(v.rows == node.rows for v in moved.values())
+    return bases.pop() if node.kind in _BY_ROWS and len(bases) == 1 and same_rows else None
+
+
+def _sum(terms: Sequence[Moved]) -> Moved:
+    there = [t for t in terms if t is not None]
+    total = there[0] if there else None
+    for term in there[1:]:
+        total = _merged(total, term) or total + term  # type: ignore[arg-type, operator]
+    return total
+
+
+_FEW = 2  # columns
+
+
+def _merged(a: Value, b: Value) -> Value | None:
+    """A sum of which one or both are products of narrow matrices, of the call or of numbers, as one product."""
+    g, narrow = a.graph, [v for v in (a, b) if _is_narrow(v)]
+    if not narrow or a.rows != b.rows or a.node.per_call or b.node.per_call:
+        return None
+    parts = [g.inputs_of(v.number) for v in narrow]
+    moving, added = narrow[0].node.static
+    if len(narrow) == 2:
+        other = narrow[1].node
+        if other.static[0] != moving or (moving and parts[0][1] != parts[1][1]):
+            return None
+        rest = _sum([p[-1] for v, p in zip(narrow, parts, strict=True) if v.node.static[1]])
+    else:
+        rest = _sum([parts[0][-1] if added else None, b if narrow[0] == a else a])
+    weights = [np.hstack([v.node.arrays[k] for v in narrow]) for k in ((0, 2) if moving else (0,))]
+    move = (parts[0][1], weights[1]) if moving else None
+    return g.affine(weights[0], g.concat(*(p[0] for p in parts)), moving=move, added=rest)
+
+
+def _is_narrow(v: Value) -> bool:
+    node = v.node
+    return node.kind == "affine" and node.rows > 1 and node.arrays[0].shape[1] <= _FEW and not node.arrays[1].any()
+
+
+def _times(a: Moved, b: Value) -> Moved:
+    if a is None or _is_one(b):
+        return a
+    if _is_one(a) and b.rows >= a.rows:
+        return b
+    column = _column(a) if b.rows == 1 and not b.node.per_call else None
+    if column is None:
+        return a * b
+    base, moving = column
+    return a.graph.affine(base, b, moving=moving)
+
+
+def _column(value: Value) -> tuple[Array, tuple[Value, Array] | None] | None:
+    """Two or more rows that are numbers, or numbers of which some times a value of the call are added, as columns."""
+    g, node, rows = value.graph, value.node, list(range(value.rows))
+    if node.kind == "take":
+        node, rows = g.nodes[node.inputs[0]], list(node.static)
+    if len(rows) == 1:
+        return None
+    if node.kind == "constant":
+        return node.arrays[0][rows, None], None
+    source = g.nodes[node.inputs[0]] if node.inputs else node
+    if node.kind != "affine" or node.static != (True, False) or source.kind != "constant" or node.arrays[1].any():
+        return None
+    base, change = (node.arrays[k][rows] @ source.arrays[0][:, None] for k in (0, 2))
+    return base, (Value(g, node.inputs[1]), change)
+
+
+def _is_one(value: Value) -> bool:
+    return value.node.kind == "constant" and bool((value.node.arrays[0] == 1).all())
+
+
+def _is_zero(value: Value) -> bool:
+    """Whether all rows are 0 whatever the rays: constants, and rows of matrices that hold nothing."""
+    g, node, rows = value.graph, value.node, list(range(value.rows))
+    if node.kind == "take":
+        node, rows = g.nodes[node.inputs[0]], list(node.static)
+    if node.kind == "constant":
+        return not node.arrays[0][rows].any()
+    return node.kind == "affine" and not node.static[1] and not any(a[rows].any() for a in node.arrays)
+
+
+def _none(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    """Truths and statuses are piecewise constant."""
+    return None
+
+
+def _take(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    return None if d[0] is None else y.graph.take(d[0], node.static)
+
+
+def _concat(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    g = y.graph
+    return g.concat(*(g.constant(np.zeros(v.rows)) if m is None else m for v, m in zip(x, d, strict=True)))
+
+
+def _affine(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    g, weight = y.graph, node.arrays[0]
+    moving, added = node.static
+    terms: list[Moved] = [d[-1]] if added else []
+    if moving and d[1] is not None:
+        terms.append(g.affine(node.arrays[2], x[0]) * d[1])
+    if d[0] is not None:
+        change = node.arrays[2] if moving else None
+        if d[0].node.kind == "constant":  # a column of the matrix
+            column = weight @ d[0].node.arrays[0]
+            if change is None:
+                terms.append(g.constant(column))
+            else:
+                moved = (x[1], (change @ d[0].node.arrays[0])[:, None])
+                terms.append(g.affine(column[:, None], g.constant(1.0), moving=moved))
+        else:
+            terms.append(g.affine(weight, d[0], moving=None if change is None else (x[1], change)))
+    return _sum(terms)
+
+
+def _quadratic(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    """Linear in x where the derivative of x is the same for all rays."""
+    g, dx = y.graph, d[0]
+    assert dx is not None
+    column = _column(dx)
+    if column is not None:
+        base, moving = column
+        change = moving and (moving[0], _linear(node, moving[1][:, 0]))
+        return g.affine(_linear(node, base[:, 0]), x[0], moving=change)
+    # All products x_i dx_j in one operation, then summed. The twos of squares serve all directions.
+    pairs = sorted({pair for form in node.static for i, j in form for pair in ((i, j), (j, i))})
+    left, right = (g.take(v, [pair[k] for pair in pairs]) for k, v in enumerate((x[0], dx)))
+    products = left * [1.0 + (i == j) for i, j in pairs] * right
+    return g.affine([[float(p in form or p[::-1] in form) for p in pairs] for form in node.static], products)
+
+
+def _linear(node: Node, dx: Array) -> Array:
+    """[R, K]: the derivative of a quadratic along dx [K] as a matrix on x."""
+    matrix = np.zeros((node.rows, len(dx)))
+    for r, form in enumerate(node.static):
+        for i, j in form:
+            matrix[r, i] += dx[j]
+            matrix[r, j] += dx[i]
+    return matrix
+
+
+def partial_derivatives(exponents: Exponents, weight: Array) -> tuple[Exponents, Array]:
+    """A polynomial with its partial derivatives.
+
+    Args:
+        exponents: [M, V]. weight: [R, M].
+
+    Returns exponents [M', V] that hold the monomials of all of them, and weights [1 + V, R, M']: the polynomial's,
+    then those of each derivative.
+    """
+    place = {tuple(map(int, e)): i for i, e in enumerate(exponents)}
+    used = [int(i) for i in np.flatnonzero(weight.any(0))]
+    terms: list[tuple[int, int, int, int]] = []
+    for v in range(exponents.shape[1]):
+        for i in used:
+            e = exponents[i]
+            if e[v]:
+                lower = tuple(int(k) - (j == v) for j, k in enumerate(e))
+                terms.append((1 + v, i, place.setdefault(lower, len(place)), int(e[v])))
+    out = np.zeros((1 + exponents.shape[1], len(weight), len(place)))
+    out[0, :, : len(exponents)] = weight
+    for row, source, target, factor in terms:
+        out[row, :, target] += factor * weight[:, source]
+    return np.array(list(place), dtype=np.int64).reshape(len(place), exponents.shape[1]), out
+
+
+def _with_gradient(g: Graph, node: Node, x: Value) -> tuple[Value, Callable[..., Moved]]:
+    exponents, weight = partial_derivatives(*node.arrays)
+    value, *gradient = g.split(
+        g.polynomial(exponents, weight.reshape(-1, len(exponents)), x), [node.rows] * len(weight)
+    )
+
+    def rule(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+        dx = d[0]
+        assert dx is not None
+        return _sum([part * dx[v] for v, part in enumerate(gradient) if not _is_zero(dx[v])])
+
+    return value, rule
+
+
+def _series(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    coefficients = node.arrays[0][1:] * np.arange(1, len(node.arrays[0]))
+    return _times(d[0], y.graph.series(x[0], coefficients if len(coefficients) > 1 else [*coefficients, 0.0]))
+
+
+def _product(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    if x[0] == x[1]:
+        return _times(d[0], x[0] * 2.0)
+    return _sum([_times(d[0], x[1]), _times(d[1], x[0])])
+
+
+def _quotient(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    """One reciprocal serves all directions."""
+    below = None if d[1] is None else -(y * d[1])
+    return _times(_sum([d[0], below]), 1.0 / x[1])
+
+
+def _choice(truth: Value, then: Moved, otherwise: Moved) -> Moved:
+    g = truth.graph
+    return None if then is None and otherwise is None else g.select(truth, then or 0.0, otherwise or 0.0)
+
+
+def _minus(d: Moved) -> Moved:
+    return None if d is None else -d
+
+
+Rule = Callable[[Node, Value, Sequence[Value], Sequence[Moved]], Moved]
+_RULES: dict[str, Rule] = {
+    "take": _take,
+    "concat": _concat,
+    "affine": _affine,
+    "quadratic": _quadratic,
+    "series": _series,
+    "add": lambda node, y, x, d: _sum(d),
+    "sub": lambda node, y, x, d: _sum([d[0], _minus(d[1])]),
+    "mul": _product,
+    "div": _quotient,
+    "neg": lambda node, y, x, d: _minus(d[0]),
+    "sqrt": lambda node, y, x, d: _times(d[0], 0.5 / y),
+    "tanh": lambda node, y, x, d: _times(d[0], 1.0 - y * y),
+    "abs": lambda node, y, x, d: _choice(x[0] <= 0.0, _minus(d[0]), d[0]),
+    "max": lambda node, y, x, d: _choice(x[0] <= x[1], d[1], d[0]),
+    "min": lambda node, y, x, d: _choice(x[0] <= x[1], d[0], d[1]),
+    "clip": lambda node, y, x, d: _choice(x[0].between(*node.arrays[0]), d[0], None),
+    "select": lambda node, y, x, d: _choice(x[0], d[1], d[2]),
+}
+_BY_ROWS = frozenset(
+    ("add", "sub", "mul", "div", "neg", "sqrt", "tanh", "abs", "max", "min", "clip", "select", "series")
+)

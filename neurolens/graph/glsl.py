@@ -1,0 +1,46 @@
+"""Programs as GLSL: one function with the contract of the C header."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from neurolens.graph.c import Signature, Writer, literal
+from neurolens.graph.program import Program
+
+_HEAD = """\
+/*
+{comment}
+ *
+ * For GLSL 3.30, GLSL ES 3.00 (with highp floats) and later. Results mean something where status is 0. A language that
+ * may ignore NaN cannot promise the status of one: rays handed in must be numbers.
+ */
+"""
+
+
+def write_glsl(program: Program, name: str, comment: Sequence[str]) -> str:
+    """The text of a function; arguments as of `c.write_c`."""
+    signature = Signature.of(program, name)
+    lines = "\n".join(f" * {line}".rstrip() for line in comment).replace("*/", "* /")
+    writer = Writer(program, "sqrt", "", f"{name}_table[band_first + {{}}]")
+    live = program.live()
+    body = [f"    float t{k} = {writer.step(program.steps[k])};" for k in live if program.steps[k].kind != "input"]
+    results = [f"    {o} = {writer.value(program.outputs[o].argument)};" for o in signature.outputs]
+    results.append(f"    status = int({writer.value(program.outputs['status'].argument)});")
+    text = _HEAD.format(comment=lines)
+    if writer.table:
+        numbers = [literal(v) for v in np.array(writer.table).T.reshape(-1)]
+        rows = ",\n    ".join(", ".join(numbers[i : i + 8]) for i in range(0, len(numbers), 8))
+        size = len(numbers)
+        text += f"\nconst float {name}_table[{size}] = float[{size}](\n    {rows}\n);\n"
+    band = []
+    if signature.bands > 1:
+        band = ["in int band"]
+        first = f"    int band_first = {len(writer.table)} * clamp(band, 0, {signature.bands - 1});"
+        body = [first, *body]
+        results.append(f"    if (band < 0 || band >= {signature.bands}) status = 1;")
+    arguments = [*(f"in float {i}" for i in signature.inputs), *band]
+    arguments += [*(f"out float {o}" for o in signature.outputs), "out int status"]
+    parameters = ",\n    ".join(arguments)
+    return text + f"\nvoid {name}(\n    {parameters})\n{{\n" + "\n".join([*body, *results]) + "\n}\n"

@@ -1,0 +1,163 @@
+"""Graphs evaluated step by step on numpy arrays or torch tensors, in the precision of what they are given."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.graph.ir import Exponents, Graph, Node
+from neurolens.graph.passes import live_rows
+
+# torch tensors or numpy arrays, [R, N]; values of the call are [R, 1].
+Rows = Any
+
+
+def evaluate(graph: Graph, inputs: Mapping[str, Rows]) -> dict[str, Rows]:
+    """The outputs of a graph, [R, N] each ([R, 1] where the same for all rays).
+
+    Args:
+        inputs: by name, [R, N] or, of the call, [R, 1]: all numpy arrays or all torch tensors of one floating dtype.
+            Torch follows its gradients.
+
+    Raises:
+        KeyError: an input that is missing.
+    """
+    first = next(iter(inputs.values()), None)
+    space = _Space(first)
+    live = live_rows(graph, graph.outputs)
+    known: dict[int, Rows] = {}
+    with np.errstate(all="ignore"):
+        for number, node in enumerate(graph.nodes):
+            if number in live:
+                given = [known[k] for k in node.inputs]
+                known[number] = inputs[node.name] if node.kind == "input" else _value(space, node, given)
+    return {name: known[v.number] for name, v in graph.outputs.items()}
+
+
+def _value(space: _Space, node: Node, given: list[Rows]) -> Rows:
+    simple = _EACH.get(node.kind)
+    if simple is not None:
+        return simple(space, *given)
+    return _WHOLE[node.kind](space, node, given)
+
+
+class _Space:
+    """What numpy and torch write differently."""
+
+    def __init__(self, like: Rows | None) -> None:
+        self.torch = None if like is None or isinstance(like, np.ndarray) else import_module("torch")
+        self.like = np.zeros((1, 1)) if like is None else like
+        library: Any = self.torch or np
+        self.sqrt, self.tanh, self.where, self.ones_like = library.sqrt, library.tanh, library.where, library.ones_like
+        self.maximum, self.minimum, self.clip = library.maximum, library.minimum, library.clip
+        self.concat = library.cat if self.torch else np.concatenate
+
+    def numbers(self, array: NDArray[Any]) -> Rows:
+        """Coefficients in the precision (and place) of the rays."""
+        if self.torch:
+            return self.torch.as_tensor(array, dtype=self.like.dtype, device=self.like.device)
+        return array.astype(self.like.dtype)
+
+    def cast(self, x: Rows, whole: bool = False) -> Rows:
+        """A truth or a status as numbers."""
+        if self.torch:
+            return x.to(self.torch.int32 if whole else self.like.dtype)
+        return x.astype(np.int32 if whole else self.like.dtype)
+
+    def broadcast(self, rows: list[Rows]) -> list[Rows]:
+        """Rows of the call repeated for all rays, where others are of rays."""
+        width = max(r.shape[1] for r in rows) if all(r.shape[1] for r in rows) else 0
+        if self.torch:
+            return [r.expand(r.shape[0], width) if r.shape[1] != width else r for r in rows]
+        return [np.broadcast_to(r, (r.shape[0], width)) if r.shape[1] != width else r for r in rows]
+
+
+def monomials(x: Rows, exponents: Exponents) -> Rows:
+    """[M, N] products of powers of the rows of x [V, N], an array or a tensor, for exponents [M, V]."""
+    space = _Space(x)
+    powers = [space.ones_like(x)]
+    for _ in range(int(exponents.max(initial=0))):
+        powers.append(powers[-1] * x)
+    rows = []
+    for exponent in exponents:
+        factors = [powers[e][v : v + 1] for v, e in enumerate(exponent) if e]
+        rows.append(functools.reduce(operator.mul, factors) if factors else powers[0][:1])
+    return space.concat(rows)
+
+
+def _affine(space: _Space, node: Node, given: list[Rows]) -> Rows:
+    moving, added = node.static
+    total = space.numbers(node.arrays[0]) @ given[0]
+    if moving:
+        total = total + given[1] * (space.numbers(node.arrays[2]) @ given[0])
+    total = total + space.numbers(node.arrays[1][:, None])
+    return total + given[-1] if added else total
+
+
+def _quadratic(space: _Space, node: Node, given: list[Rows]) -> Rows:
+    x, rows = given[0], []
+    for form, bias in zip(node.static, node.arrays[0], strict=True):
+        total = functools.reduce(operator.add, (x[i : i + 1] * x[j : j + 1] for i, j in form))
+        rows.append(total + float(bias) if bias else total)
+    return space.concat(rows)
+
+
+def _polynomial(space: _Space, node: Node, given: list[Rows]) -> Rows:
+    return space.numbers(node.arrays[1]) @ monomials(given[0], node.arrays[0])
+
+
+def _series(space: _Space, node: Node, given: list[Rows]) -> Rows:
+    coefficients = [float(c) for c in node.arrays[0]]
+    total = space.ones_like(given[0]) * coefficients[-1]
+    for c in coefficients[-2::-1]:
+        total = total * given[0] + c
+    return total
+
+
+def _between(space: _Space, node: Node, given: list[Rows]) -> Rows:
+    low, high = (space.numbers(c[:, None]) for c in node.arrays[0].T)
+    return space.cast((given[0] >= low) & (given[0] <= high))
+
+
+def _first_failure(space: _Space, node: Node, given: list[Rows]) -> Rows:
+    status = space.numbers(np.zeros((1, 1)))
+    for k in range(len(node.static) - 1, -1, -1):
+        fails = ~(given[2 * k] <= given[2 * k + 1])
+        status = space.where(fails, space.numbers(np.array([[float(node.static[k])]])), status)
+    return status
+
+
+_EACH: dict[str, Callable[..., Rows]] = {
+    "add": lambda s, a, b: a + b,
+    "sub": lambda s, a, b: a - b,
+    "mul": lambda s, a, b: a * b,
+    "div": lambda s, a, b: a / b,
+    "neg": lambda s, a: -a,
+    "sqrt": lambda s, a: s.sqrt(a),
+    "tanh": lambda s, a: s.tanh(a),
+    "abs": lambda s, a: abs(a),
+    "max": lambda s, a, b: s.maximum(a, b),
+    "min": lambda s, a, b: s.minimum(a, b),
+    "le": lambda s, a, b: s.cast(a <= b),
+    "and": lambda s, a, b: a * b,
+    "select": lambda s, truth, a, b: s.where(truth > 0, a, b),
+    "whole": lambda s, a: s.cast(a, whole=True),
+}
+_WHOLE: dict[str, Callable[[_Space, Node, list[Rows]], Rows]] = {
+    "constant": lambda s, node, given: s.numbers(node.arrays[0][:, None]),
+    "take": lambda s, node, given: given[0][list(node.static)],
+    "concat": lambda s, node, given: s.concat(s.broadcast(given)),
+    "clip": lambda s, node, given: s.clip(given[0], *(float(v) for v in node.arrays[0])),
+    "affine": _affine,
+    "quadratic": _quadratic,
+    "polynomial": _polynomial,
+    "series": _series,
+    "between": _between,
+    "first_failure": _first_failure,
+}

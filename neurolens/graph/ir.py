@@ -1,0 +1,298 @@
+"""A model as one graph: operators on rows of rays, written once and read by every evaluator and writer.
+
+A value has R rows and one column a ray, or one for the whole call (a film position, a stop radius). `affine`,
+`polynomial`, `quadratic` and `series` stay whole and are lowered late: to matrix products and few passes over the rays
+for ONNX (`graph.onnx`), to fused multiply-adds for C and GLSL (`graph.scalars`). A new reader is one rule an operator:
+
+    input, constant             named rows of the caller; numbers
+    take, concat                rows of a value; rows of several values below each other
+    affine                      W x + b; W may be W0 + s W1 with s of the call, and rows may be added
+    quadratic                   sums of products of two rows of x, plus constants
+    polynomial                  W m with m the monomials of the rows of x
+    series                      a polynomial in one row, lowest coefficient first
+    add sub mul div max min     row by row; one row meets any number of rows
+    neg sqrt tanh abs clip      (clip between two numbers)
+    le between and select       truths: 1 where x <= y, and where low <= x <= high (0 for NaN); choice by a truth
+    first_failure               the code of the first test that fails, 0 where none does
+    whole                       a number as an integer
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Exponents = NDArray[np.int64]
+# Rows of a quadratic: the pairs of rows of x whose products are summed.
+Form = tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class Node:
+    """One operation.
+
+    Attributes:
+        kind: an operator of the module's table. inputs: numbers of earlier nodes.
+        rows: of its value. per_call: whether it is the same for all rays of a call.
+        name: of an input.
+        arrays: its numbers, float64 (exponents int64). static: what is neither a value nor a coefficient.
+    """
+
+    kind: str
+    inputs: tuple[int, ...]
+    rows: int
+    per_call: bool
+    name: str = ""
+    arrays: tuple[NDArray[Any], ...] = ()
+    static: tuple[Any, ...] = ()
+
+
+@dataclass(frozen=True)
+class Value:
+    """R rows of a graph; arithmetic appends operations to it."""
+
+    graph: Graph
+    number: int
+
+    @property
+    def node(self) -> Node:
+        return self.graph.nodes[self.number]
+
+    @property
+    def rows(self) -> int:
+        return self.node.rows
+
+    def __getitem__(self, rows: int | slice | list[int]) -> Value:
+        every = range(self.rows)
+        wanted = [every[rows]] if isinstance(rows, int) else list(every[rows]) if isinstance(rows, slice) else rows
+        return self.graph.take(self, wanted)
+
+    def __add__(self, other: Operand) -> Value:
+        return self.graph.each("add", self, other)
+
+    def __sub__(self, other: Operand) -> Value:
+        return self.graph.each("sub", self, other)
+
+    def __mul__(self, other: Operand) -> Value:
+        return self.graph.each("mul", self, other)
+
+    def __truediv__(self, other: Operand) -> Value:
+        return self.graph.each("div", self, other)
+
+    def __radd__(self, other: ArrayLike) -> Value:
+        return self.graph.constant(other) + self
+
+    def __rsub__(self, other: ArrayLike) -> Value:
+        return self.graph.constant(other) - self
+
+    def __rmul__(self, other: ArrayLike) -> Value:
+        return self * other
+
+    def __rtruediv__(self, other: ArrayLike) -> Value:
+        return self.graph.constant(other) / self
+
+    def __neg__(self) -> Value:
+        return self.graph.each("neg", self)
+
+    def sqrt(self) -> Value:
+        return self.graph.each("sqrt", self)
+
+    def tanh(self) -> Value:
+        return self.graph.each("tanh", self)
+
+    def abs(self) -> Value:
+        return self.graph.each("abs", self)
+
+    def maximum(self, other: Operand) -> Value:
+        return self.graph.each("max", self, other)
+
+    def minimum(self, other: Operand) -> Value:
+        return self.graph.each("min", self, other)
+
+    def clip(self, low: float, high: float) -> Value:
+        return self.graph.add("clip", (self,), self.rows, arrays=(np.array([low, high]),))
+
+    def whole(self) -> Value:
+        return self.graph.each("whole", self)
+
+    def __le__(self, other: Operand) -> Value:
+        return self.graph.each("le", self, other)
+
+    def __and__(self, other: Value) -> Value:
+        return self.graph.each("and", self, other)
+
+    def between(self, low: ArrayLike, high: ArrayLike) -> Value:
+        """1 where low <= value <= high, 0 elsewhere and for NaN; one number a row, or one for all."""
+        limits = np.broadcast_to(np.stack([low, high]).T, (self.rows, 2)).astype(np.float64)
+        return self.graph.add("between", (self,), self.rows, arrays=(limits,))
+
+
+Operand = Value | ArrayLike
+# Done at once on numbers.
+_FOLDED: dict[str, Any] = {"add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative}
+
+
+@dataclass(eq=False)
+class Graph:
+    """Nodes in order, and named results. Equal nodes are one."""
+
+    nodes: list[Node] = field(default_factory=list)
+    outputs: dict[str, Value] = field(default_factory=dict)
+    _known: dict[tuple[Any, ...], int] = field(default_factory=dict, repr=False)
+
+    def add(
+        self,
+        kind: str,
+        inputs: Sequence[Value],
+        rows: int,
+        *,
+        name: str = "",
+        arrays: Sequence[NDArray[Any]] = (),
+        static: tuple[Any, ...] = (),
+        per_call: bool | None = None,
+    ) -> Value:
+        """Append a node of any kind; `per_call` None: where all of its inputs are."""
+        numbers = tuple(v.number for v in inputs)
+        if per_call is None:
+            per_call = all(self.nodes[k].per_call for k in numbers)
+        key = (kind, numbers, rows, name, static, *((a.shape, a.tobytes()) for a in arrays))
+        if key not in self._known:
+            self._known[key] = len(self.nodes)
+            self.nodes.append(Node(kind, numbers, rows, per_call, name, tuple(arrays), static))
+        return Value(self, self._known[key])
+
+    def input(self, name: str, rows: int = 1, *, per_call: bool = False) -> Value:
+        return self.add("input", (), rows, name=name, per_call=per_call)
+
+    def constant(self, value: ArrayLike) -> Value:
+        """Numbers, one a row."""
+        array = np.atleast_1d(np.asarray(value, np.float64))
+        return self.add("constant", (), len(array), arrays=(array,), per_call=True)
+
+    def value(self, operand: Operand) -> Value:
+        return operand if isinstance(operand, Value) else self.constant(operand)
+
+    def each(self, kind: str, *operands: Operand) -> Value:
+        """An operation row by row; a single row stands for as many as the others have."""
+        values = [self.value(v) for v in operands]
+        rows = max(v.rows for v in values)
+        if any(v.rows not in (1, rows) for v in values):
+            raise ValueError(f"{kind} of {[v.rows for v in values]} rows")
+        if kind in _FOLDED and all(v.node.kind == "constant" for v in values):
+            return self.constant(_FOLDED[kind](*(v.node.arrays[0] for v in values)))
+        return self.add(kind, values, rows)
+
+    def take(self, x: Value, rows: Sequence[int]) -> Value:
+        if list(rows) == list(range(x.rows)):
+            return x
+        if x.node.kind == "concat":  # from the part that holds them all
+            start = 0
+            for k in x.node.inputs:
+                part = Value(self, k)
+                if all(start <= r < start + part.rows for r in rows):
+                    return self.take(part, [r - start for r in rows])
+                start += part.rows
+        if x.node.kind == "constant":
+            return self.constant(x.node.arrays[0][list(rows)])
+        if x.node.kind == "take":
+            return self.take(Value(self, x.node.inputs[0]), [x.node.static[r] for r in rows])
+        return self.add("take", (x,), len(rows), static=tuple(int(r) for r in rows))
+
+    def split(self, x: Value, sizes: Iterable[int]) -> list[Value]:
+        """Consecutive rows of `x`, so many in each part."""
+        ends = np.cumsum([0, *sizes])
+        return [x[int(a) : int(b)] for a, b in zip(ends, ends[1:], strict=False)]
+
+    def concat(self, *parts: Value) -> Value:
+        if len(parts) == 1:
+            return parts[0]
+        if all(p.node.kind == "constant" for p in parts):
+            return self.constant(np.concatenate([p.node.arrays[0] for p in parts]))
+        flat = [q for p in parts for q in (self.inputs_of(p.number) if p.node.kind == "concat" else [p])]
+        return self.add("concat", flat, sum(p.rows for p in flat))
+
+    def affine(
+        self,
+        weight: ArrayLike,
+        x: Value,
+        bias: ArrayLike | None = None,
+        *,
+        moving: tuple[Value, ArrayLike] | None = None,
+        added: Value | None = None,
+    ) -> Value:
+        """weight [R, K] x + bias [R].
+
+        Args:
+            moving: (s, W1) with s one row of the call: the weight is then weight + s W1.
+            added: R rows that are added.
+        """
+        w = np.asarray(weight, np.float64)
+        b = np.zeros(len(w)) if bias is None else np.asarray(bias, np.float64)
+        arrays, inputs = [w, b], [x]
+        if moving is not None:
+            arrays.append(np.asarray(moving[1], np.float64))
+            inputs.append(moving[0])
+        if added is not None:
+            inputs.append(added)
+        static = (moving is not None, added is not None)
+        return self.add("affine", inputs, len(w), arrays=arrays, static=static)
+
+    def quadratic(self, x: Value, forms: Sequence[Form], bias: ArrayLike | None = None) -> Value:
+        """Row r is the sum of x_i x_j over the pairs (i, j) of form r, plus bias [R]."""
+        b = np.zeros(len(forms)) if bias is None else np.asarray(bias, np.float64)
+        return self.add("quadratic", (x,), len(forms), arrays=(b,), static=tuple(tuple(f) for f in forms))
+
+    def square(self, x: Value) -> Value:
+        """The squared length of x, one row."""
+        return self.quadratic(x, [tuple((i, i) for i in range(x.rows))])
+
+    def dot(self, a: Value, b: Value) -> Value:
+        """The scalar product of a and b, one row."""
+        if a == b:
+            return self.square(a)
+        return self.quadratic(self.concat(a, b), [tuple((k, a.rows + k) for k in range(a.rows))])
+
+    def polynomial(self, exponents: Exponents, weight: ArrayLike, x: Value) -> Value:
+        """weight [R, M] times the monomials of x [V rows], for exponents [M, V], rows of which are unique."""
+        w = np.asarray(weight, np.float64)
+        return self.add("polynomial", (x,), len(w), arrays=(np.asarray(exponents, np.int64), w))
+
+    def series(self, x: Value, coefficients: ArrayLike) -> Value:
+        return self.add("series", (x,), x.rows, arrays=(np.asarray(coefficients, np.float64),))
+
+    def select(self, truth: Value, then: Operand, otherwise: Operand) -> Value:
+        return self.each("select", truth, then, otherwise)
+
+    def first_failure(self, tests: Sequence[tuple[Value, Value]], codes: Sequence[int]) -> Value:
+        """The status of a ray: code k of the first test, in order, that is not value <= limit; NaN fails; 0 if none.
+
+        Codes fall in the order in which rays meet the tests, but for several at one surface (`base.status`). ONNX
+        clips value - limit between 0 and the code: tests are to be scaled so that a failure exceeds every code.
+        """
+        flat = [v for pair in tests for v in pair]
+        return self.add("first_failure", flat, 1, static=tuple(int(c) for c in codes))
+
+    def like(self, node: Node, inputs: Sequence[Value]) -> Value:
+        """Append the operation of a node of any graph."""
+        per_call = node.per_call if node.kind in ("input", "constant") else None
+        return self.add(
+            node.kind, inputs, node.rows, name=node.name, arrays=node.arrays, static=node.static, per_call=per_call
+        )
+
+    def inline(self, other: Graph, given: Mapping[str, Value]) -> dict[str, Value]:
+        """Append all of another graph, these values as its inputs (others stay inputs); returns its outputs."""
+        values: list[Value] = []
+        for node in other.nodes:
+            if node.kind == "input" and node.name in given:
+                values.append(given[node.name])
+                continue
+            values.append(self.like(node, [values[k] for k in node.inputs]))
+        return {name: values[v.number] for name, v in other.outputs.items()}
+
+    def inputs_of(self, number: int) -> list[Value]:
+        return [Value(self, k) for k in self.nodes[number].inputs]

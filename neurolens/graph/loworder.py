@@ -1,0 +1,132 @@
+"""Derivatives of a lens's graph as sparse polynomials of low order, for ray differentials.
+
+A ray differential says how wide a pixel's footprint is, to choose the texels that it averages: a few percent do.
+Carried through a surrogate, derivatives double its work; as polynomials of some ten terms each they are a few products.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base import status as st
+from neurolens.graph.derive import derivative, with_derivatives
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph, Value
+from neurolens.graph.passes import live_rows
+from neurolens.graph.program import FILM_X_Y
+
+Array = NDArray[np.float64]
+_DEGREE, _DEGREE_WAVE = 4, 2  # of film and pupil point; of what may be multiplied by the wavelength's variable
+_STOP, _MOST_TERMS = 0.005, 16  # error at which an output has enough, as a share of its group's; terms of an output
+WORST = 0.03  # RMS error, as a share of a derivative, above which there is no such graph
+_FEWEST = 500  # rays that pass, to fit to
+_ONE_WAVELENGTH = 1e-3  # relative spread of 1 / wavelength^2 below which it is one
+_GROUPS = (slice(0, 3), slice(3, 6))  # rows of point and direction: each has one scale
+_NAMES = [derivative("scene_ray", by) for by in FILM_X_Y]
+Monomial = tuple[int, ...]  # numbers of the variables in it, ascending
+
+
+@dataclass(frozen=True)
+class LowOrder:
+    """A graph with the derivatives of `scene_ray` by the film point (`derive.derivative`).
+
+    Attributes:
+        error: RMS over the fitted rays of the error of a derivative (the point's or the direction's 3 x 2 matrix,
+            Frobenius norm) over its size, the larger of the two. terms: of all outputs.
+    """
+
+    graph: Graph
+    error: float
+    terms: int
+
+
+def with_film_derivatives(graph: Graph) -> Graph:
+    """The graph of a lens with the derivatives of `scene_ray` by the film point: its own, not fitted ones."""
+    return with_derivatives(graph, ["scene_ray"], [("rays", row) for row in range(len(FILM_X_Y))])
+
+
+def with_low_order_derivatives(graph: Graph, samples: Mapping[str, NDArray[np.float32]]) -> LowOrder | None:
+    """Fit the derivatives of a lens's graph by orthogonal matching pursuit, each until it is good enough.
+
+    Args:
+        samples: inputs of rays that cover those it will be asked for, [rows, N] or, of the call, [rows, 1].
+
+    Returns None where low orders do not do: a lens too strong, or too few rays that pass.
+    """
+    exact = evaluate(with_film_derivatives(graph), samples)
+    passed = np.broadcast_to(exact["status"][0] == st.PASSED, samples["rays"].shape[1:])
+    if passed.sum() < _FEWEST:
+        return None
+    found = Graph()
+    found.outputs = found.inline(graph, {})
+    columns, variables = _variables(found, samples["rays"].astype(np.float64)[:, passed])
+    monomials = _monomials(len(columns))
+    one = np.ones(int(passed.sum()))
+    products = np.stack([np.prod([one, *(columns[k] for k in m)], axis=0) for m in monomials])
+    wanted = _matrices(exact, passed)
+    weights = np.zeros((6, 2, len(monomials)))
+    for group in _GROUPS:
+        enough = _STOP * float(np.sqrt(np.mean(np.square(wanted[group]))))
+        for row in range(group.start, group.stop):
+            for by in range(2):
+                chosen, values = _pursue(products, wanted[row, by], enough)
+                weights[row, by, chosen] = values
+    used = weights.any((0, 1))
+    exponents = np.array([np.bincount(m, minlength=len(columns)) for m in monomials], np.int64)[used]
+    rows = found.polynomial(exponents, weights[..., used].transpose(1, 0, 2).reshape(12, -1), variables)
+    found.outputs |= dict(zip(_NAMES, found.split(rows, (6, 6)), strict=True))
+    fitted = _matrices(evaluate(found, samples), passed)  # in float32, as it will be used
+    error = max(_error(fitted[group], wanted[group]) for group in _GROUPS)
+    return LowOrder(found, error, int(np.count_nonzero(weights))) if error <= WORST else None
+
+
+def _matrices(results: Mapping[str, NDArray[np.float32]], passed: NDArray[np.bool_]) -> Array:
+    """Derivatives [6, 2, M] of the rays that pass."""
+    rows = [np.broadcast_to(results[name], (6, len(passed)))[:, passed] for name in _NAMES]
+    return np.stack(rows, axis=1).astype(np.float64)
+
+
+def _error(found: Array, wanted: Array) -> float:
+    """RMS over rays of the relative error in the Frobenius norm."""
+    size = np.maximum(np.linalg.norm(wanted, axis=(0, 1)), 1e-30)
+    return float(np.sqrt(np.mean((np.linalg.norm(found - wanted, axis=(0, 1)) / size) ** 2)))
+
+
+def _variables(g: Graph, rays: Array) -> tuple[Array, Value]:
+    """Film and pupil point, and 1 / wavelength^2 from its mean where the lens knows the wavelength: numbers, rows."""
+    inputs = g.input("rays", 5)
+    if 4 in live_rows(g, g.outputs).get(inputs.number, ()):
+        wave = (1000 / rays[4]) ** 2
+        if np.ptp(wave) > _ONE_WAVELENGTH * wave.mean():  # else a constant, which there is already
+            inverse = 1000.0 / inputs[4]
+            varying = inverse * inverse + -float(wave.mean())
+            return np.stack([*rays[:4], wave - wave.mean()]), g.concat(inputs[0:4], varying)
+    return rays[:4], inputs[0:4]
+
+
+def _monomials(count: int) -> list[Monomial]:
+    points = [m for n in range(_DEGREE + 1) for m in combinations_with_replacement(range(4), n)]
+    return points + [(*m, 4) for m in points if len(m) <= _DEGREE_WAVE and count > 4]
+
+
+def _pursue(columns: Array, wanted: Array, good: float) -> tuple[list[int], Array]:
+    """Rows of `columns` [M, N] and their weights, whose sum comes within `good` (RMS) of `wanted` [N].
+
+    A plain pursuit of a few dozen columns: those of `surrogates.fits` need torch, and a render with a model does not.
+    """
+    size = np.maximum(np.linalg.norm(columns, axis=1), 1e-30)
+    chosen: list[int] = []
+    weights, left = np.zeros(0), wanted
+    while len(chosen) < _MOST_TERMS and np.sqrt(np.mean(left**2)) > good:
+        gain = np.abs(columns @ left) / size
+        gain[chosen] = 0
+        chosen.append(int(gain.argmax()))
+        part = columns[chosen] / size[chosen, None]
+        weights = np.linalg.lstsq(part.T, wanted, rcond=None)[0] / size[chosen]
+        left = wanted - weights @ columns[chosen]
+    return chosen, weights

@@ -1,0 +1,89 @@
+"""How monomials are made, each the product of two: for rows of rays in few blocks, for one ray in few products."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+Exponent = tuple[int, ...]
+Pair = tuple[Exponent, Exponent]
+Made = tuple[Exponent, tuple[Exponent, Exponent] | None]  # a monomial and the two that it is the product of
+
+
+def plan_monomials(wanted: Sequence[Exponent], variables: int) -> list[Made]:
+    """An order in which every monomial is a variable (None) or the product of two before it.
+
+    Factors that exist anyway are taken first; where none do, the one that adds least. Depth first: what a monomial is
+    made of was made just before.
+    """
+    units = [tuple(int(i == v) for i in range(variables)) for v in range(variables)]
+    factors: dict[Exponent, tuple[Exponent, Exponent]] = {}
+    known = {*units, *wanted}
+
+    def resolve(e: Exponent) -> None:
+        if sum(e) == 1 or e in factors:
+            return
+        options = []
+        for right in product(*(range(k + 1) for k in e)):
+            left = tuple(a - b for a, b in zip(e, right, strict=True))
+            if 0 < sum(right) <= sum(left):
+                options.append((sum(f not in known for f in {left, right}), sum(right), left, right))
+        _, _, left, right = min(options)
+        known.update((left, right))
+        factors[e] = (left, right)
+        resolve(left)
+        resolve(right)
+
+    for e in sorted(wanted, key=lambda e: (sum(e), e), reverse=True):
+        resolve(e)
+    return _depth_first([*units, *sorted(factors, key=lambda e: (sum(e), e))], factors, set(wanted))
+
+
+def _depth_first(
+    nodes: list[Exponent], factors: dict[Exponent, tuple[Exponent, Exponent]], wanted: set[Exponent]
+) -> list[Made]:
+    """Nodes after their factors; each is followed by those that it was the last factor of."""
+    waiting: dict[Exponent, set[Exponent]] = {e: set(pair) for e, pair in factors.items()}
+    order: list[Made] = []
+    stack = [e for e in reversed(nodes) if e not in factors]
+    while stack:
+        e = stack.pop()
+        order.append((e, factors.get(e)))
+        for child in sorted((c for c, missing in waiting.items() if e in missing), reverse=True):
+            waiting[child].discard(e)
+            if not waiting[child]:
+                del waiting[child]
+                stack.append(child)
+    return [(e, pair) for e, pair in order if pair is not None or e in wanted]
+
+
+def level_of(e: Exponent) -> int:
+    """0 for a variable, 1 for degree 2, 2 for 3 to 4, 3 for 5 to 8 ..."""
+    return (sum(e) - 1).bit_length()
+
+
+def plan_products(exponents: list[Exponent], variables: int) -> dict[int, dict[Exponent, Pair]]:
+    """How to build every monomial as a product of two of lower levels: {level: {monomial: (left, right)}}.
+
+    Factors that are wanted anyway come first, then small right factors; what is still missing is added. Greedy.
+    """
+    wanted = {e for e in exponents if sum(e) > 1}
+    parents: dict[Exponent, Pair] = {}
+    # From the highest degree down, so that an added factor is still ahead in the loop.
+    queue = sorted(wanted, key=lambda e: (sum(e), e))
+    while queue:
+        e = queue.pop()
+        options = []
+        for right in product(*(range(k + 1) for k in e)):
+            left = tuple(x - y for x, y in zip(e, right, strict=True))
+            if 0 < sum(right) <= sum(left) and level_of(left) < level_of(e):
+                missing = sum(sum(part) > 1 and part not in wanted for part in {left, right})
+                options.append((missing, level_of(right), sum(right), left, right))
+        *_, left, right = min(options)
+        parents[e] = (left, right)
+        for part in (left, right):
+            if sum(part) > 1 and part not in wanted:
+                wanted.add(part)
+                queue = sorted([*queue, part], key=lambda e: (sum(e), e))
+    levels = sorted({level_of(e) for e in parents})
+    return {n: {e: pair for e, pair in parents.items() if level_of(e) == n} for n in levels}

@@ -1,0 +1,492 @@
+"""Graphs as ONNX: rays on the last axis, linear steps as matrix products, few passes over the rays.
+
+Opset 17, float32. Constants are held once; several graphs of one structure become one whose constants follow a state.
+What is of the call has one column, or where it is one number the shape [1].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from onnx import ModelProto, NodeProto, TensorProto, checker, helper, numpy_helper
+
+from neurolens.base.errors import InputError
+from neurolens.graph.ir import Graph, Node
+from neurolens.graph.monomials import Exponent, Pair, plan_products
+from neurolens.graph.passes import pruned, same_structure
+
+Array = NDArray[np.float64]
+# Opset 17 and IR 8 are read by every onnxruntime since 1.12.
+OPSET, IR_VERSION = 17, 8
+FLOAT, INT32 = TensorProto.FLOAT, TensorProto.INT32
+
+
+@dataclass(frozen=True)
+class Mixing:
+    """What a state does to the constants of the graphs of its nodes.
+
+    Attributes:
+        graph: of the call: input `state`, and output `features`; inputs and outputs of other names stand before the
+            inputs of those names.
+        transform: [K, nodes]: features @ transform are the weights of the nodes.
+    """
+
+    graph: Graph
+    transform: Array
+
+
+def write_onnx(
+    graphs: Graph | Sequence[Graph],
+    metadata: Mapping[str, str],
+    mixing: Mixing | None = None,
+    shapes: Mapping[str, Sequence[int]] | None = None,
+) -> ModelProto:
+    """The checked model of a graph, or of the graphs of a state's nodes.
+
+    Args:
+        metadata: its entries.
+        mixing: with several graphs.
+        shapes: first axes of outputs whose rows are to be cut further. Outputs of one row have the shape [N].
+
+    Raises:
+        InputError: numbers that float32 cannot hold; graphs that differ in more than numbers.
+    """
+    kept = [pruned(g) for g in ([graphs] if isinstance(graphs, Graph) else graphs)]
+    if not same_structure(kept):
+        raise InputError("export", "nodes", "(graphs that differ)", "models of one structure at every node")
+    writer = _Writer(kept, mixing)
+    body = writer.body(shapes or {})
+    inputs = {n.name: n for g in ([mixing.graph] if mixing else []) + [kept[0]] for n in g.nodes if n.kind == "input"}
+    ordered = sorted(inputs.values(), key=lambda n: (n.per_call, n.name == "state"))
+    graph = helper.make_graph(
+        body,
+        "neurolens",
+        [helper.make_tensor_value_info(n.name, FLOAT, [n.rows] if n.per_call else [n.rows, "N"]) for n in ordered],
+        [helper.make_tensor_value_info(*info) for info in writer.results],
+        writer.tensors,
+    )
+    model = helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="neurolens"
+    )
+    helper.set_model_props(model, dict(metadata))
+    checker.check_model(model, full_check=True)
+    return model
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """weight @ value + bias, not yet written: what takes it folds it into its own product. [T, R, K] and [T, R]."""
+
+    value: str
+    weight: Array
+    bias: Array
+
+
+@dataclass(frozen=True)
+class _Longer:
+    """A value of more rows: before its own row `at`, sums of pairs of its rows stand."""
+
+    name: str
+    at: int
+    sums: int
+
+    def place(self, row: int) -> int:
+        return row if row < self.at else row + self.sums
+
+
+class _Writer:
+    """Values are named by strings; arrays have the graphs on their first axis, T."""
+
+    def __init__(self, graphs: Sequence[Graph], mixing: Mixing | None = None, prefix: str = "") -> None:
+        self.graphs, self.mixing, self.prefix = graphs, mixing, prefix
+        self.nodes: list[NodeProto] = []
+        self.tensors: list[TensorProto] = []
+        self.results: list[tuple[str, int, list[int | str]]] = []
+        self.known: dict[int, str | _Linear | _Longer] = {}
+        self.inputs: dict[str, str] = {}
+        self._constants: dict[tuple[bytes, str, tuple[int, ...]], str] = {}
+        self._moved: dict[tuple[bytes, tuple[int, ...]], tuple[str, Array, tuple[int, ...]]] = {}
+        self._cuts: dict[int, dict[tuple[int, ...], str]] = {}
+        self._squares: dict[int, tuple[str, dict[tuple[int, int], int]]] = {}  # rows of squares, of x_i and x_i + x_j
+
+    def body(self, shapes: Mapping[str, Sequence[int]]) -> list[NodeProto]:
+        """All nodes, and with them the constants and results."""
+        if self.mixing is not None:
+            names = {n.name for n in self.mixing.graph.nodes if n.kind == "input"}
+            self.inputs = {name: f"{name}_in_state" for name in names & set(self.mixing.graph.outputs)}
+        graph = self.graphs[0]
+        for number, node in enumerate(graph.nodes):
+            self.known[number] = self._made(number, node)
+        for name, value in graph.outputs.items():
+            self._result(name, self.name(value.number), value.node, shapes.get(name))
+        return [*self._state(), *self.nodes]
+
+    def _made(self, number: int, node: Node) -> str | _Linear | _Longer:
+        arrays = [np.stack([g.nodes[number].arrays[i] for g in self.graphs]) for i in range(len(node.arrays))]
+        rule = _RULES.get(node.kind)
+        if rule is not None:
+            return rule(self, number, node, arrays)
+        return self.op(_SIMPLE[node.kind], *(self.name(k) for k in node.inputs))
+
+    def _result(self, name: str, value: str, node: Node, shape: Sequence[int] | None) -> None:
+        kind = INT32 if node.kind == "whole" else FLOAT
+        axes: list[int | str] = [*(shape or ([node.rows] if node.rows > 1 else [])), "N"]
+        if len(axes) == 2:
+            self.op("Identity", value, out=name)
+        else:
+            self.op("Reshape", value, self.const([*axes[:-1], -1], np.int64), out=name)
+        self.results.append((name, kind, axes))
+
+    def name(self, number: int) -> str:
+        """The tensor of a node's value."""
+        value = self.known[number]
+        if isinstance(value, _Linear):
+            self.known[number] = value = self.affine(value.weight, value.value, value.bias)
+        return (
+            _take_rows(self, number, range(self.graphs[0].nodes[number].rows)) if isinstance(value, _Longer) else value
+        )
+
+    def op(self, kind: str, *inputs: str, out: str | None = None, **attributes: Any) -> str:
+        """Append a node with one output and return its name."""
+        name = out or f"{self.prefix}{kind}_{len(self.nodes)}"
+        number = f"{self.prefix}n{len(self.nodes)}"
+        self.nodes.append(helper.make_node(kind, list(inputs), [name], name=number, **attributes))
+        return name
+
+    def const(self, value: ArrayLike, dtype: type = np.float32) -> str:
+        """A constant of all graphs; equal ones are stored once."""
+        with np.errstate(over="ignore"):
+            array: NDArray[Any] = np.ascontiguousarray(np.asarray(value, dtype=dtype))
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise InputError("export", "weights", "(NaN or infinity)", "finite numbers, in float32 too")
+        key = (array.tobytes(), array.dtype.str, array.shape)
+        if key not in self._constants:
+            self._constants[key] = f"c{len(self._constants)}"
+            self.tensors.append(numpy_helper.from_array(array, self._constants[key]))
+        return self._constants[key]
+
+    def numbers(self, stack: Array) -> str:
+        """Numbers [T, ...], one for each graph: a constant where they agree, else what follows the state."""
+        if len(stack) == 1 or (stack == stack[0]).all():
+            return self.const(stack[0])
+        assert self.mixing is not None
+        rows = self.mixing.transform @ stack.reshape(len(stack), -1)
+        key = (rows.tobytes(), stack.shape[1:])
+        name = f"state_c{len(self._moved)}"
+        return self._moved.setdefault(key, (name, rows, stack.shape[1:]))[0]
+
+    def affine(self, weight: Array, value: str, bias: Array) -> str:
+        """weight [T, R, K] @ value [K, N] + bias [T, R]."""
+        if not np.any(bias):
+            return self.op("MatMul", self.numbers(weight), value)
+        return self.op("Gemm", self.numbers(weight), value, self.numbers(bias[:, :, None]))
+
+    def split(self, value: str, sizes: Sequence[int]) -> list[str]:
+        """Cut along the first axis."""
+        if len(sizes) == 1:
+            return [value]
+        number = len(self.nodes)
+        names = [f"{self.prefix}Split_{number}_{i}" for i in range(len(sizes))]
+        inputs = [value, self.const(list(sizes), np.int64)]
+        self.nodes.append(helper.make_node("Split", inputs, names, name=f"{self.prefix}n{number}", axis=0))
+        return names
+
+    def concat(self, names: Sequence[str]) -> str:
+        return names[0] if len(names) == 1 else self.op("Concat", *names, axis=0)
+
+    def _state(self) -> list[NodeProto]:
+        """Nodes that make what follows the state: all of it in one product, cut and shaped."""
+        if self.mixing is None:
+            return []
+        if not self._moved and "features" in self.mixing.graph.outputs:
+            outputs = {k: v for k, v in self.mixing.graph.outputs.items() if k != "features"}
+            graph = pruned(self.mixing.graph, outputs)
+        else:
+            graph = pruned(self.mixing.graph)
+        before = _Writer([graph], prefix="state_")
+        before.tensors, before._constants = self.tensors, self._constants
+        for number, node in enumerate(graph.nodes):
+            before.known[number] = before._made(number, node)
+        for name, value in graph.outputs.items():
+            if name in self.inputs:
+                before.op("Identity", before.name(value.number), out=self.inputs[name])
+        if self._moved:
+            rows = np.concatenate([rows for _, rows, _ in self._moved.values()], axis=1)
+            features = before.op(
+                "Reshape", before.name(graph.outputs["features"].number), before.const([1, -1], np.int64)
+            )
+            row = before.op("MatMul", features, before.const(rows))
+            flat = before.op("Reshape", row, before.const([-1], np.int64))
+            parts = before.split(flat, [math.prod(shape) for _, _, shape in self._moved.values()])
+            for part, (name, _, shape) in zip(parts, self._moved.values(), strict=True):
+                before.op("Reshape", part, before.const(list(shape), np.int64), out=name)
+        return before.nodes
+
+
+def _input(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
+    name = w.inputs.get(node.name, node.name)
+    if node.per_call and node.rows > 1:  # in columns, as all that is of the call
+        return w.op("Reshape", name, w.const([-1, 1], np.int64))
+    return name
+
+
+def _constant(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
+    return w.numbers(arrays[0] if node.rows == 1 else arrays[0][:, :, None])
+
+
+def _take(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
+    return _take_rows(w, node.inputs[0], node.static)
+
+
+def _take_rows(w: _Writer, source: int, rows: Sequence[int]) -> str:
+    """Rows, by one cut for all that take consecutive rows of the same value, where these do not overlap."""
+    value, nodes = w.known[source], w.graphs[0].nodes
+    longer = value if isinstance(value, _Longer) else _Longer(w.name(source), nodes[source].rows, 0)
+    name, total, place = longer.name, nodes[source].rows + longer.sums, longer.place
+    if source not in w._cuts:
+        end = 0
+        cuts: list[tuple[int, ...]] = []
+        takes = {n.static for n in nodes if n.kind == "take" and n.inputs[0] == source}
+        for run in sorted(tuple(place(r) for r in take) for take in takes):
+            if run[0] >= end and run == tuple(range(run[0], run[-1] + 1)):
+                cuts += [tuple(range(end, run[0])), run]
+                end = run[-1] + 1
+        cuts = [c for c in (*cuts, tuple(range(end, total))) if c]
+        w._cuts[source] = dict(zip(cuts, w.split(name, [len(c) for c in cuts]), strict=True))
+    wanted = [place(r) for r in rows]
+    found = w._cuts[source].get(tuple(wanted))
+    return found or w.op("Gather", name, w.const(wanted, np.int64), axis=0)
+
+
+def _concat(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
+    nodes = w.graphs[0].nodes
+    of_rays = [k for k in node.inputs if not nodes[k].per_call]
+    names = []
+    for k in node.inputs:
+        name = w.name(k)
+        if of_rays and nodes[k].per_call:  # repeated for every ray
+            zeros = w.const(np.zeros((nodes[k].rows, nodes[of_rays[0]].rows)))
+            name = w.op("Add", w.op("MatMul", zeros, w.name(of_rays[0])), name)
+        elif nodes[k].per_call and nodes[k].rows == 1:  # [1], to stand in a column
+            name = w.op("Reshape", name, w.const([1, 1], np.int64))
+        names.append(name)
+    return w.concat(names)
+
+
+def _affine(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str | _Longer:
+    weight, bias = arrays[:2]
+    moving, added = node.static
+    source = w.known[node.inputs[0]]
+    if moving:
+        # Sums of rows that a quadratic wants are further rows of the same product.
+        sums = _mixed_pairs(w.graphs[0], number)
+        at = 1 + max((max(pair) for pair in sums), default=0)
+        base, change = (
+            np.concatenate([m[:, :at], *(m[:, [i]] + m[:, [j]] for i, j in sums), m[:, at:]], 1)
+            for m in (weight, arrays[2])
+        )
+        column = w.graphs[0].nodes[node.inputs[0]].kind == "constant"
+        if column:  # times the weight before the state or the call is known
+            columns = np.stack([g.nodes[node.inputs[0]].arrays[0] for g in w.graphs])[:, :, None]
+            base, change = base @ columns, change @ columns
+        matrix = w.op("Add", w.op("Mul", w.name(node.inputs[1]), w.numbers(change)), w.numbers(base))
+        if column:
+            return matrix
+        if added:
+            return w.op("Gemm", matrix, w.name(node.inputs[0]), w.name(node.inputs[-1]))
+        whole = w.op("MatMul", matrix, w.name(node.inputs[0]))
+        if not sums:
+            return whole
+        longer = _Longer(whole, at, len(sums))
+        w._squares[number] = (w.op("Mul", whole, whole), _places(longer, node.rows, sums))
+        return longer
+    if isinstance(source, _Linear):
+        bias = bias + np.einsum("trk,tk->tr", weight, source.bias)
+        weight, value = weight @ source.weight, source.value
+    else:
+        value = w.name(node.inputs[0])
+    if added:
+        if bias.any():
+            raise ValueError("affine: numbers and rows to add: give the numbers to the rows")
+        return w.op("Gemm", w.numbers(weight), value, w.name(node.inputs[-1]))
+    return w.affine(weight, value, bias)
+
+
+def _mixed_pairs(graph: Graph, number: int) -> list[tuple[int, int]]:
+    """Pairs of different rows of a value whose products its quadratics ask for."""
+    quadratics = (n for n in graph.nodes if n.kind == "quadratic" and n.inputs[0] == number)
+    return sorted({p for n in quadratics for form in n.static for p in form if p[0] != p[1]})
+
+
+def _quadratic(w: _Writer, number: int, node: Node, arrays: list[Array]) -> _Linear:
+    """x y = ((x + y)^2 - x^2 - y^2) / 2: squares only, so that one pass makes them all."""
+    source = node.inputs[0]
+    rows = w.graphs[0].nodes[source].rows
+    if source not in w._squares:
+        sums, name = _mixed_pairs(w.graphs[0], source), w.name(source)
+        if sums:
+            left, right = (_take_rows(w, source, [p[k] for p in sums]) for k in (0, 1))
+            name = w.concat([name, w.op("Add", left, right)])
+        w._squares[source] = (w.op("Mul", name, name), _places(_Longer(name, rows, len(sums)), rows, sums))
+    squares, place = w._squares[source]
+    matrix = np.zeros((node.rows, len(place)))
+    for r, form in enumerate(node.static):
+        for i, j in form:
+            if i == j:
+                matrix[r, place[i, i]] += 1
+            else:
+                matrix[r, place[i, j]] += 0.5
+                matrix[r, [place[i, i], place[j, j]]] -= 0.5
+    return _Linear(squares, np.repeat(matrix[None], len(w.graphs), 0), arrays[0])
+
+
+def _places(longer: _Longer, rows: int, sums: Sequence[tuple[int, int]]) -> dict[tuple[int, int], int]:
+    """Where the squares of rows (i, i) and of sums of two rows (i, j) stand."""
+    return {(i, i): longer.place(i) for i in range(rows)} | {pair: longer.at + k for k, pair in enumerate(sums)}
+
+
+def _polynomial(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
+    """Monomials of degree 2, 3 to 4, 5 to 8 ... are each the product of two lower ones, gathered from their blocks."""
+    exponents, weight = node.arrays[0], arrays[1]
+    used = (weight != 0).any((0, 1))
+    table = {tuple(e): weight[:, :, k] for e, k in zip(exponents[used].tolist(), np.flatnonzero(used), strict=True)}
+    variables = exponents.shape[1]
+    units = [tuple(int(i == v) for i in range(variables)) for v in range(variables)]
+    blocks = [(w.name(node.inputs[0]), units)]
+    for level, pairs in plan_products(list(table), variables).items():
+        made = [_products(w, blocks, group) for group in _by_block(blocks, pairs)]
+        if level == 1:
+            # Degrees 1 and 2 are the factors of all that follows: together they need one gather, not two.
+            names, lists = zip(*blocks, *made, strict=True)
+            blocks = [(w.concat(names), [e for known in lists for e in known])]
+        else:
+            blocks += made
+    out, nothing = "", np.zeros(weight.shape[:2])
+    for name, known in _joined(w, blocks):
+        part = np.stack([table.get(e, nothing) for e in known], axis=2)
+        if not out:
+            out = w.affine(part, name, table.get((0,) * variables, nothing))
+        else:
+            out = w.op("Gemm", w.numbers(part), name, out)
+    return out
+
+
+def _series(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
+    """Horner's scheme; a leading 1 costs nothing."""
+    t, coefficients = w.name(node.inputs[0]), arrays[0]
+    value = t if (coefficients[:, -1] == 1).all() else w.op("Mul", t, w.numbers(coefficients[:, -1]))
+    for k in range(coefficients.shape[1] - 2, -1, -1):
+        if coefficients[:, k].any():
+            value = w.op("Add", value, w.numbers(coefficients[:, k]))
+        if k:
+            value = w.op("Mul", value, t)
+    return value
+
+
+def _divided(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
+    above, below = node.inputs
+    if _is_constant(w, above, 1.0):
+        return w.op("Reciprocal", w.name(below))
+    return w.op("Div", w.name(above), w.name(below))
+
+
+def _larger(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
+    if _is_constant(w, node.inputs[1], 0.0):
+        return w.op("Relu", w.name(node.inputs[0]))
+    return w.op("Max", *(w.name(k) for k in node.inputs))
+
+
+def _is_constant(w: _Writer, number: int, value: float) -> bool:
+    return all(g.nodes[number].kind == "constant" and (g.nodes[number].arrays[0] == value).all() for g in w.graphs)
+
+
+def _clip(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
+    return w.op("Clip", w.name(node.inputs[0]), w.numbers(arrays[0][:, 0]), w.numbers(arrays[0][:, 1]))
+
+
+def _between(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
+    """False for NaN, whatever Clip makes of it."""
+    x, limits = w.name(node.inputs[0]), arrays[0]  # [T, R, 2]
+    if node.rows == 1:
+        low, high = (w.numbers(limits[:, 0, k]) for k in (0, 1))
+        return w.op("Equal", x, w.op("Clip", x, low, high))
+    low, high = (w.numbers(limits[:, :, k : k + 1]) for k in (0, 1))
+    return w.op("And", w.op("GreaterOrEqual", x, low), w.op("LessOrEqual", x, high))
+
+
+def _first_failure(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
+    """Camera rays meet the last surface first, so the first failure is the largest code (at one, the smallest)."""
+    failed: dict[int, str] = {}  # by surface
+    tests = zip(node.inputs[::2], node.inputs[1::2], node.static, strict=True)
+    for value, limit, status in sorted(tests, key=lambda t: t[2]):
+        zero = _is_constant(w, limit, 0.0)
+        test = w.name(value) if zero else w.op("Sub", w.name(value), w.name(limit))
+        code = w.op("Clip", test, w.const(0.0), w.const(float(status)))
+        surface = status // 4
+        if surface in failed:
+            earlier = failed[surface]
+            code = w.op("Where", w.op("Greater", earlier, w.const(0.0)), earlier, code)
+        failed[surface] = code
+    return w.op("Max", *failed.values())
+
+
+_SIMPLE = {
+    "add": "Add", "sub": "Sub", "mul": "Mul", "min": "Min", "neg": "Neg", "sqrt": "Sqrt", "tanh": "Tanh", "abs": "Abs",
+    "le": "LessOrEqual", "and": "And", "select": "Where",
+}  # fmt: skip
+_RULES: dict[str, Callable[[_Writer, int, Node, list[Array]], str | _Linear | _Longer]] = {
+    "input": _input,
+    "constant": _constant,
+    "take": _take,
+    "concat": _concat,
+    "affine": _affine,
+    "quadratic": _quadratic,
+    "polynomial": _polynomial,
+    "series": _series,
+    "div": _divided,
+    "max": _larger,
+    "clip": _clip,
+    "between": _between,
+    "first_failure": _first_failure,
+    "whole": lambda w, number, node, arrays: w.op("Cast", w.name(node.inputs[0]), to=INT32),
+}
+
+
+Block = tuple[str, list[Exponent]]
+
+
+def _by_block(blocks: list[Block], pairs: dict[Exponent, Pair]) -> list[dict[Exponent, Pair]]:
+    """Products grouped by the blocks in which their two factors lie."""
+    home = {e: i for i, (_, known) in enumerate(blocks) for e in known}
+    groups: dict[tuple[int, int], dict[Exponent, Pair]] = {}
+    for e, (a, b) in sorted(pairs.items()):
+        groups.setdefault((home[a], home[b]), {})[e] = (a, b)
+    return list(groups.values())
+
+
+def _joined(w: _Writer, blocks: list[Block]) -> list[Block]:
+    """Blocks as the matrix products take them: joined where copying them costs less than another product."""
+    copy_row, product = 0.07, 1.2  # ns a ray, measured in onnxruntime (12 outputs)
+    best, cut = math.inf, 0
+    for first in range(len(blocks)):  # blocks before `first` stay alone, the others become one
+        rows = sum(len(known) for _, known in blocks[first:])
+        cost = product * first + (copy_row * rows if first < len(blocks) - 1 else 0.0)
+        if cost < best:
+            best, cut = cost, first
+    names, lists = zip(*blocks[cut:], strict=True)
+    return [*blocks[:cut], (w.concat(names), [e for known in lists for e in known])]
+
+
+def _products(w: _Writer, blocks: list[Block], pairs: dict[Exponent, Pair]) -> Block:
+    """One block of products whose left factors lie in one block, and whose right factors lie in one block."""
+    factors = []
+    for side in (0, 1):
+        wanted = [pair[side] for pair in pairs.values()]
+        name, known = next(block for block in blocks if wanted[0] in block[1])
+        factors.append(w.op("Gather", name, w.const([known.index(e) for e in wanted], np.int64), axis=0))
+    return w.op("Mul", *factors), list(pairs)

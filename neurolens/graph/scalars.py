@@ -1,0 +1,208 @@
+"""Graphs as programs of float steps, one ray at a time: what C, GLSL and their like are written from.
+
+Several graphs of one structure (one for each of several fixed wavelengths) become one program with as many coefficient
+tables. Polynomials take few products; sums of products are fused multiply-adds, numbers are folded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from neurolens.base.errors import InputError
+from neurolens.graph.ir import Exponents, Graph, Node
+from neurolens.graph.monomials import plan_monomials
+from neurolens.graph.passes import pruned, same_structure
+from neurolens.graph.program import Expr, Program, row_names
+
+Array = NDArray[np.float64]
+# Pairs (a, b) of a truth: it holds where a <= b in all of them.
+Tests = list[tuple[Expr, Expr]]
+_ROWS = 8  # of a matrix product at a time, of 16 registers; fewer would wait for one another
+
+
+def lower(graphs: Graph | Sequence[Graph], fixed: Mapping[str, ArrayLike] | None = None) -> Program:
+    """The program of a graph, or of several of one structure, a coefficient table each.
+
+    Args:
+        fixed: inputs of the call that are numbers: they are folded in.
+
+    Inputs and outputs are named row by row, see `program.row_names`. Inputs that nothing needs are none.
+
+    Raises:
+        InputError: graphs that differ in more than numbers; numbers that float32 cannot hold.
+    """
+    kept = [pruned(g) for g in ([graphs] if isinstance(graphs, Graph) else graphs)]
+    if not same_structure(kept):
+        raise InputError("export", "models", "(graphs that differ)", "models of one structure")
+    return _Lowering(kept, fixed or {}).program
+
+
+class _Lowering:
+    def __init__(self, graphs: Sequence[Graph], fixed: Mapping[str, ArrayLike]) -> None:
+        self.graphs, self.fixed = graphs, fixed
+        self.program = Program(tables=len(graphs))
+        self.rows: list[list[Any]] = []  # Expr, or Tests for truths, of every row of every node
+        for number, node in enumerate(graphs[0].nodes):
+            given = [self.rows[k] for k in node.inputs]
+            rule = _RULES.get(node.kind)
+            if rule is not None:
+                arrays = [np.stack([g.nodes[number].arrays[i] for g in graphs], -1) for i in range(len(node.arrays))]
+                self.rows.append(rule(self, node, given, arrays))
+            else:
+                self.rows.append([self._each(node.kind, *(_row(v, r) for v in given)) for r in range(node.rows)])
+        for name, value in graphs[0].outputs.items():
+            rows = [self._number(v) for v in self.rows[value.number]]
+            self.program.outputs.update(zip(row_names(name, len(rows)), rows, strict=True))
+
+    def _number(self, value: Expr | Tests) -> Expr:
+        """A truth as 1 or 0."""
+        if isinstance(value, Expr):
+            return value
+        return self._choice(value, self.program.literal(1.0), self.program.literal(0.0))
+
+    def _choice(self, tests: Tests, then: Expr, otherwise: Expr) -> Expr:
+        for low, high in tests:
+            then = self.program.select(low, high, then, otherwise)
+        return then
+
+    def _each(self, kind: str, *given: Any) -> Any:
+        p = self.program
+        if kind == "and":
+            return [*self._tests(given[0]), *self._tests(given[1])]
+        if kind == "le":
+            return [(self._number(given[0]), self._number(given[1]))]
+        if kind == "select":
+            return self._choice(self._tests(given[0]), self._number(given[1]), self._number(given[2]))
+        numbers = [self._number(v) for v in given]
+        if kind == "add":
+            return p.sum(*numbers)
+        if kind == "tanh":
+            return p.tanh(numbers[0])
+        if kind == "abs":
+            return p.op("max", numbers[0], -numbers[0])
+        return numbers[0] if kind == "whole" else p.op(kind, *numbers)
+
+    def _tests(self, truth: Expr | Tests) -> Tests:
+        return [(self.program.literal(0.5), truth)] if isinstance(truth, Expr) else truth
+
+
+def _row(rows: Sequence[Any], r: int) -> Any:
+    """A single row stands for any."""
+    return rows[r if len(rows) > 1 else 0]
+
+
+def _input(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
+    if node.name in at.fixed:
+        return [at.program.literal(v) for v in np.atleast_1d(np.asarray(at.fixed[node.name], np.float64))]
+    # An input without a use is no argument: steps are appended when something takes them.
+    return [at.program.input(name) for name in row_names(node.name, node.rows)]
+
+
+def _affine(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
+    """By groups of rows whose sums fit the registers; each of the columns is spent on every row of a group at once."""
+    p, x = at.program, given[0]
+    moving, added = node.static
+    found = [p.literal(bias) for bias in arrays[1]]
+    if added:
+        found = [total + row for total, row in zip(found, given[-1], strict=True)]
+    if moving:
+        for r, (base, change) in enumerate(zip(arrays[0], arrays[2], strict=True)):
+            # The largest product comes last: it is rounded once, with the sum.
+            for c in np.argsort(np.abs(base + change).max(-1), kind="stable"):
+                found[r] = p.fma(x[c], _moved(p, given[1][0], base[c], change[c]), found[r])
+        return found
+    for rows in np.array_split(np.arange(node.rows), max(1, round(node.rows / _ROWS))):
+        for c in range(len(x)):
+            for r in rows:
+                weight = p.literal(arrays[0][r, c])
+                # A product times 1 and the sum are one operation.
+                found[r] = p.sum(x[c], found[r]) if weight.is_literal(1) else p.fma(x[c], weight, found[r])
+    return found
+
+
+def _moved(p: Program, s: Expr, base: Array, change: Array) -> Expr:
+    """base + s change; from s = 1 where it can cancel: the film at infinity focus, where 1 - s is exact."""
+    if not base.any():
+        return s * p.literal(change)
+    return p.fma(p.literal(1.0) - s, p.literal(-change), p.literal(base + change)) if change.any() else p.literal(base)
+
+
+def _quadratic(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
+    found = []
+    for form, bias in zip(node.static, arrays[0], strict=True):
+        total = at.program.literal(bias)
+        for i, j in reversed(form):
+            total = at.program.fma(given[0][i], given[0][j], total)
+        found.append(total)
+    return found
+
+
+def _polynomial(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
+    """Each monomial is made once, by one multiplication, and spent at once on every row: few stay in registers."""
+    p, variables = at.program, given[0]
+    table = _collected(variables, node.arrays[0], arrays[1])
+    rows = [p.literal(c) for c in table.pop((0,) * len(variables), np.zeros((node.rows, p.tables)))]
+    made = {tuple(int(i == v) for i in range(len(variables))): value for v, value in enumerate(variables)}
+    for e, factors in plan_monomials(list(table), len(variables)):
+        if factors is not None:
+            made[e] = made[factors[0]] * made[factors[1]]
+        if e in table:
+            rows = [
+                p.fma(made[e], p.literal(c), row) if c.any() else row for c, row in zip(table[e], rows, strict=True)
+            ]
+    return rows
+
+
+def _collected(variables: Sequence[Expr], exponents: Exponents, weight: Array) -> dict[tuple[int, ...], Array]:
+    """Coefficients [R, T] of the monomials that have any; variables that are numbers are multiplied in."""
+    numbers = {v: np.array(e.literal) for v, e in enumerate(variables) if e.literal is not None}
+    table: dict[tuple[int, ...], Array] = {}
+    for e, column in zip(exponents.tolist(), np.moveaxis(weight, 1, 0), strict=True):
+        for v, number in numbers.items():
+            if e[v]:
+                column, e[v] = column * number ** e[v], 0
+        if column.any():
+            key = tuple(e)
+            table[key] = table[key] + column if key in table else column
+    return table
+
+
+def _series(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
+    return [at.program.horner(x, list(arrays[0])) for x in given[0]]
+
+
+def _between(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Tests]:
+    p = at.program
+    limits = [(p.literal(low), p.literal(high)) for low, high in arrays[0]]
+    return [[(low, x), (x, high)] for x, (low, high) in zip(given[0], limits, strict=True)]
+
+
+def _clip(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
+    low, high = (at.program.literal(v) for v in arrays[0])
+    return [at.program.op("min", at.program.op("max", x, low), high) for x in given[0]]
+
+
+def _first_failure(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
+    status = at.program.literal(0.0)
+    for k in range(len(node.static) - 1, -1, -1):
+        status = at.program.select(given[2 * k][0], given[2 * k + 1][0], status, float(node.static[k]))
+    return [status]
+
+
+_RULES: dict[str, Callable[[_Lowering, Node, list[Any], list[Array]], list[Any]]] = {
+    "input": _input,
+    "constant": lambda at, node, given, arrays: [at.program.literal(v) for v in arrays[0]],
+    "take": lambda at, node, given, arrays: [given[0][r] for r in node.static],
+    "concat": lambda at, node, given, arrays: [row for part in given for row in part],
+    "clip": _clip,
+    "affine": _affine,
+    "quadratic": _quadratic,
+    "polynomial": _polynomial,
+    "series": _series,
+    "between": _between,
+    "first_failure": _first_failure,
+}

@@ -1,0 +1,159 @@
+"""The card of an exported model, checked on loading: everything that is read later is there and makes sense."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError, ModelError
+from neurolens.modelfile.states import check_states
+
+
+def is_number(value: Any) -> bool:
+    """Whether this is a number of JSON that a float holds."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    try:
+        return math.isfinite(float(value))
+    except OverflowError:  # an integer beyond every float
+        return False
+
+
+def _positive(value: Any) -> bool:
+    return is_number(value) and value > 0
+
+
+def _rising(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(_positive, value)) and value[0] <= value[1]
+
+
+def _distances(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(v == "inf" or _positive(v) for v in value)
+
+
+def _numbers(value: Any) -> bool:
+    return isinstance(value, list) and len(value) >= 2 and all(map(is_number, value))
+
+
+def _text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _seed(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= 2**53
+
+
+def _errors(value: Any, depth: int = 3) -> bool:
+    """Figures by name, those of parts of the rays in tables of their own; lists are for readers."""
+    return isinstance(value, dict) and all(
+        v is None
+        or isinstance(v, (bool, str, list))
+        or (is_number(v) and v >= 0)
+        or (depth > 0 and _errors(v, depth - 1))
+        for v in value.values()
+    )
+
+
+def _table(value: Any) -> bool:
+    return isinstance(value, dict)
+
+
+Rule = tuple[Callable[[Any], bool], str]
+NUMBER: Rule = (is_number, "a finite number")
+POSITIVE: Rule = (_positive, "a finite number above 0")
+TEXT: Rule = (_text, "a text")
+NUMBERS: Rule = (_numbers, "a list of two or more finite numbers")
+
+# Place in the card to what must be there. A table comes before what is in it.
+_RULES: dict[str, Rule] = {
+    "lens": (_table, "a table"),
+    "lens.id": TEXT,
+    "lens.name": TEXT,
+    "lens.sha256": TEXT,
+    "lens.dispersive": (lambda v: isinstance(v, bool), "true or false"),
+    "lens.efl_mm": (lambda v: is_number(v) and v != 0, "a finite number other than 0"),
+    "lens.f_number": POSITIVE,
+    "lens.stop_radius_mm": POSITIVE,
+    "lens.front_principal_z_mm": NUMBER,
+    "lens.rear_principal_z_mm": NUMBER,
+    "domain": (_table, "a table"),
+    "domain.film_radius_mm": POSITIVE,
+    "domain.film_z_mm": (_rising, "two numbers above 0, rising"),
+    "domain.focus_m": (_distances, 'two distances above 0, or "inf"'),
+    "domain.pupil_z_mm": NUMBER,
+    "domain.pupil_radius_mm": POSITIVE,
+    "domain.wavelength_nm": (_rising, "two numbers above 0, rising"),
+    "domain.stop_radius_mm": POSITIVE,
+    "domain.bounds": (_table, "a table"),
+    "domain.bounds.pupil_z_mm": NUMBER,
+    "domain.bounds.film_radius_mm": POSITIVE,
+    "domain.bounds.disc_mm": POSITIVE,
+    "domain.bounds.low_mm": NUMBERS,
+    "domain.bounds.high_mm": NUMBERS,
+    "domain.bounds.half_mm": NUMBERS,
+    "fit": (_table, "a table"),
+    "fit.method": TEXT,
+    "fit.settings": (_table, "a table"),
+    "errors": (_errors, "a table of figures from 0 up, of tables of such, of texts and lists"),
+}
+_OPTIONAL: dict[str, Rule] = {
+    "lens.stop_surface": (lambda v: isinstance(v, int) and not isinstance(v, bool) and 0 <= v < 10_000, "an integer"),
+    "domain.nearest_m": (lambda v: v is None or _positive(v), "a number above 0, or null"),
+    "errors.poor": (lambda v: isinstance(v, list) and all(map(_text, v)), "a list of texts"),
+    "fit.settings.rays_seed": (lambda v: v is None or _seed(v), "an integer up to 2^53, or null"),
+}
+_MISSING = "(missing)"
+
+
+def check_card(file: Any, card: Mapping[str, Any]) -> None:
+    """Check a card.
+
+    Args:
+        file: what an error names.
+
+    Raises:
+        ModelError: the first place that is missing or holds something else, and what belongs there.
+    """
+    _check_places(file, card, {**_RULES, **_OPTIONAL})
+    if card.get("states") is None:
+        return
+    node_rules = {k: rule for k, rule in _RULES.items() if k.split(".")[0] in ("lens", "domain")}
+    node_rules["lens.infinity_film_z_mm"] = node_rules["lens.film_z_mm"] = NUMBER
+    try:
+        check_states(card, lambda node: _check_places(f"{file}: card: states.nodes", node, node_rules))
+    except (InputError, KeyError, TypeError, ValueError, ArithmeticError) as error:
+        raise ModelError(f"{file}: card: states: {type(error).__name__}: {error}") from error
+
+
+def pupil_rows(bounds: Mapping[str, Any]) -> NDArray[np.float32]:
+    """[3, R] low, high, half of the boxes in a card's bounds.
+
+    Raises:
+        InputError: no three lists of equal length, or numbers that float32 cannot hold.
+    """
+    rows = np.array([bounds["low_mm"], bounds["high_mm"], bounds["half_mm"]], dtype=np.float32)
+    if rows.ndim != 2 or rows.shape[1] < 2 or not np.isfinite(rows).all():
+        raise InputError("pupil bounds", "low_mm, high_mm, half_mm", rows.shape, "three lists of finite numbers")
+    return rows
+
+
+def _check_places(file: Any, card: Mapping[str, Any], rules: Mapping[str, Rule]) -> None:
+    for place, (holds, expected) in rules.items():
+        value: Any = card
+        for key in place.split("."):
+            value = value.get(key, _MISSING)
+            if value is _MISSING:
+                break
+        if value is _MISSING and place in _OPTIONAL:
+            continue
+        if value is _MISSING or not holds(value):
+            shown = _MISSING if value is _MISSING else repr(value)[:80]
+            raise ModelError(f"{file}: card: {place}: got {shown}, expected {expected}")
+    try:
+        pupil_rows(card["domain"]["bounds"])
+    except (InputError, ValueError, OverflowError) as error:
+        raise ModelError(f"{file}: card: domain.bounds: {error}") from error

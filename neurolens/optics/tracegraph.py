@@ -1,0 +1,248 @@
+"""The exact lens as a graph, from which C is written: the best that tracing can do.
+
+Surrogates are compared with it. Surfaces of every shape, stop, rims, missed surfaces, total
+reflection, dispersion; transmittance of bare surfaces (Fresnel, unpolarised, averaged at each surface) and of coated
+ones as if they were bare: coatings cost no time here. Ray tracing after Feder, J. Opt. Soc. Am. 41 (1951);
+conics, cylinders and aspheres as in `shapes`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from neurolens.base import status as st
+from neurolens.graph.ir import Graph, Value
+from neurolens.optics.glass import index_of
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.shapes import LAST_STEP, STEEPEST, is_plain, start_of
+
+# The index is a polynomial in 1 / lambda^2 that holds it to float32's last bit.
+_INDEX = 3e-8
+_TINY = 1e-30  # least value under a root
+Test = tuple[Value, Value]  # passed where the first is at most the second
+
+
+def exact_graph(lens: Lens, pupil_z_mm: float, wavelength_nm: tuple[float, float], *, whole: bool = True) -> Graph:
+    """Film and pupil points in, scene ray and status out: inputs and outputs are those of a model's graph.
+
+    Args:
+        pupil_z_mm: plane of the pupil points. wavelength_nm: range in which the indices hold to float32's last bit.
+        whole: with stop, rims and transmittance; else the ray alone, and whether it gets through.
+
+    Coatings and absorption are not followed: callers that need them must refuse such lenses.
+    """
+    return _Tracing(lens, pupil_z_mm, wavelength_nm, whole).graph
+
+
+class _Tracing:
+    def __init__(self, lens: Lens, pupil_z_mm: float, wavelength_nm: tuple[float, float], whole: bool) -> None:
+        self.lens, self.wavelength_nm, self.whole = lens, wavelength_nm, whole
+        self.graph = g = Graph()
+        rays, film_z = g.input("rays", 5), g.input("film_z_mm", per_call=True)
+        self.inverse_square = g.square(1000.0 / rays[4]) if lens.dispersive else g.constant(0.0)
+        self.stop_square = g.square(g.input("stop_radius_mm", per_call=True)) if whole else g.constant(0.0)
+        self.indices: dict[object, Value] = {}
+        self.tests: list[tuple[Test, int]] = []  # in the order in which rays meet them, with their codes
+        self.at_stop, self.power = rays[0:2], g.constant(1.0)
+        way = g.concat(rays[2:4] - rays[0:2], pupil_z_mm - film_z)
+        self.d = way * (1.0 / g.square(way).sqrt())
+        self.x = g.concat(rays[0:2], film_z)
+        self._through()
+
+    def _through(self) -> None:
+        g, lens, vertex = self.graph, self.lens, 0.0
+        for k in range(len(lens.surfaces) - 1, -1, -1):
+            here = float(lens.vertices_mm[k])
+            self.x = g.concat(self.x[0:2], self.x[2] + (vertex - here))
+            vertex = here
+            self._surface(k, lens.surfaces[k])
+        g.outputs["scene_ray"] = g.concat(self.x, self.d)
+        if self.whole:
+            g.outputs |= {"transmittance": self.power, "stop_xy_mm": self.at_stop}
+        tests, codes = zip(*self.tests, strict=True) if self.tests else ((), ())
+        g.outputs["status"] = g.first_failure(tests, codes).whole()
+
+    def _surface(self, k: int, s: Surface) -> None:
+        g, d = self.graph, self.d
+        nearest = d * -g.dot(self.x, d) + self.x  # of the ray's points, to the vertex
+        met = _meet_plain(nearest, d, float(s.curvature)) if is_plain(s) else _meet_shape(nearest, d, s)
+        self.x = met.point
+        self.tests += [(test, st.blocked(k, st.MISSED)) for test in met.tests]
+        if s.stop:
+            self.at_stop = self.x[0:2]
+        if self.whole:
+            limit = self.stop_square if s.stop else g.constant(s.semi_diameter_mm**2)
+            self.tests.append(((g.square(self.x[0:2]), limit), st.blocked(k, st.RIM)))
+        before, after = self._index(k + 1), self._index(k)
+        if before == after:
+            return
+        ratio, q = before / after, met.cosine
+        cos2 = ratio * ratio * (q * q + -1.0) + 1.0
+        self.tests.append((_above(cos2), st.blocked(k, st.TOTAL_REFLECTION)))
+        cos = cos2.sqrt()
+        bent = cos - ratio * q
+        if met.normal is not None:
+            self.d = met.normal * -bent + d * ratio
+        else:  # of a sphere, the unit normal towards the film is (-c x, -c y, 1 - c z)
+            turn = bent * float(s.curvature)
+            self.d = g.concat(self.x[0:2] * turn + d[0:2] * ratio, d[2] * ratio + (self.x[2] * turn + -bent))
+        if self.whole:
+            self._fresnel(q, cos, before, after)
+
+    def _fresnel(self, cos_i: Value, cos_t: Value, before: Value, after: Value) -> None:
+        """(Ts + Tp) / 2 with one division: 2 a b (1 / s^2 + 1 / p^2), s = n1 c1 + n2 c2, p = n2 c1 + n1 c2."""
+        s = before * cos_i + after * cos_t
+        p = after * cos_i + before * cos_t
+        product, both = (before * cos_i) * (after * cos_t), s * p
+        self.power = self.power * (product * 2.0 * (s * s + p * p) / (both * both))
+
+    def _index(self, k: int) -> Value:
+        """Of the medium before surface k, as light comes from the scene."""
+        if k == 0:
+            return self.graph.constant(1.0)
+        s = self.lens.surfaces[k - 1]
+        key = (s.glass, float(s.n_d), s.V_d)
+        if key not in self.indices:
+            self.indices[key] = self._polynomial(s)
+        return self.indices[key]
+
+    def _polynomial(self, s: Surface) -> Value:
+        g = self.graph
+        if s.glass is None and s.V_d is None:
+            return g.constant(float(s.n_d))
+        long, short = ((1000 / w) ** 2 for w in reversed(self.wavelength_nm))
+        if long == short:
+            return g.constant(float(index_of(s, 1000 / long**0.5)))
+        inverse = np.linspace(long, short, 200)
+        n = np.array([float(index_of(s, 1000 / v**0.5)) for v in inverse])
+        for degree in range(1, 8):
+            fit = np.polynomial.Polynomial.fit(inverse, n, degree)
+            if np.abs(fit(inverse) - n).max() < _INDEX:
+                break
+        return g.series(self.inverse_square, fit.convert().coef)
+
+
+class _Meeting(NamedTuple):
+    """Point, cosine of incidence and tests that tell whether there is one; unit normal towards +z, None of a sphere."""
+
+    point: Value
+    cosine: Value
+    tests: list[Test]
+    normal: Value | None = None
+
+
+def _above(square: Value) -> Test:
+    """Passed where `square` is positive; NaN does not pass."""
+    return square.graph.constant(_TINY), square
+
+
+def _meet_plain(m: Value, d: Value, c: float) -> _Meeting:
+    """Meet a sphere or a plane from the ray's point m nearest to the vertex (Feder's e, M1 and L)."""
+    if not c:
+        return _Meeting(d * -(m[2] / d[2]) + m, -d[2], [])
+    f = m.graph.square(m) * c + m[2] * -2.0
+    q2 = f * -c + d[2] * d[2]
+    q = q2.sqrt()
+    way = f / (d[2] - q)  # towards -z
+    return _Meeting(d * way + m, q, [_above(q2)])
+
+
+def _meet_shape(m: Value, d: Value, surface: Surface) -> _Meeting:
+    """Meet a surface that is no sphere and no plane.
+
+    Args:
+        m: the ray's point nearest to the vertex, vertex frame, mm. d: unit direction, towards -z.
+    """
+    w = (float(surface.cylinder != "y"), float(surface.cylinder != "x"))
+    if surface.asphere:
+        return _meet_asphere(m, d, surface, w)
+    c = float(surface.curvature)
+    kind = (c * w[0], c * w[1], c * (1 + float(surface.conic)))
+    q2, denominator, way = _meet_quadric(m, d, kind)
+    point = d * way + m
+    normal = point * [-v for v in kind] + [0.0, 0.0, 1.0]
+    scale = 1.0 / m.graph.square(normal).sqrt()
+    tests = [_above(q2), _above(denominator * denominator), _above(normal[2])]
+    return _Meeting(point, q2.sqrt() * scale, tests, normal * scale)
+
+
+def _meet_quadric(m: Value, d: Value, kind: tuple[float, float, float]) -> tuple[Value, Value, Value]:
+    """Meet cx x^2 + cy y^2 + cz z^2 = 2 z: discriminant, what the way is divided by, and the way from m."""
+    a, b, f = (_weighted(*pair, kind) for pair in ((d, d), (m, d), (m, m)))
+    b, f = b - d[2], m[2] * -2.0 + f
+    q2 = b * b + -(a * f)
+    q, towards = q2.maximum(0.0).sqrt(), b <= 0.0
+    # The two forms of the same root: each divides by what is not small.
+    denominator = m.graph.select(towards, a, -b - q)
+    numerator = m.graph.select(towards, q - b, f)
+    return q2, denominator, numerator / denominator
+
+
+def _weighted(a: Value, b: Value, weights: tuple[float, ...]) -> Value:
+    """Sum of the products of the rows of a and b, each times its weight."""
+    g, used = a.graph, [k for k, weight in enumerate(weights) if weight]
+    if not used:
+        return g.constant(0.0)
+    both = g.concat(a[used] * [weights[k] for k in used], b[used])
+    return g.quadratic(both, [tuple((k, len(used) + k) for k in reversed(range(len(used))))])
+
+
+def _meet_asphere(m: Value, d: Value, surface: Surface, w: tuple[float, float]) -> _Meeting:
+    """From the conic that fits best, by the steps of `shapes`, of which the last decides whether they converged."""
+    g = m.graph
+    (c, cz), steps = start_of(surface)
+    _, _, way = _meet_quadric(m, d, (c * w[0], c * w[1], cz))
+    for _ in range(steps - 1):
+        at = d * way + m
+        sag, slope, turn = _sag(surface, w, at)
+        along = _weighted(at, d, w)
+        rate = slope * along + -d[2]
+        bend = along * along * turn + slope * _weighted(d, d, w)
+        lack = (sag - at[2]) * 2.0
+        root = (rate * rate + -(bend * lack)).maximum(_TINY).sqrt()
+        way = way + lack / -(root + rate)
+    at = d * way + m
+    sag, slope, _ = _sag(surface, w, at)
+    step = (at[2] - sag) / (slope * _weighted(at, d, w) + -d[2])
+    point = d * step + at
+    _, slope, _ = _sag(surface, w, point)
+    normal = point[0:2] * [-w[0], -w[1]] * slope
+    scale = 1.0 / g.quadratic(normal, [((0, 0), (1, 1))], [1.0]).sqrt()
+    cosine = -((normal[0] * d[0] + (normal[1] * d[1] + d[2])) * scale)
+    tests = [
+        (step.abs(), g.constant(LAST_STEP * surface.semi_diameter_mm)),
+        _above(cosine),
+        (g.constant(STEEPEST), _cos2(surface, _weighted(point, point, w))),
+    ]
+    return _Meeting(point, cosine, tests, g.concat(normal * scale, scale))
+
+
+def _sag(surface: Surface, w: tuple[float, float], at: Value) -> tuple[Value, Value, Value]:
+    """Depth, d sag / d h over h, and the change of this by h over h of the conic alone."""
+    h2 = _weighted(at, at, w)
+    sag, slope = (_polynomial(surface, h2, order) for order in (0, 1))
+    c = float(surface.curvature)
+    if not c:
+        return sag * h2, slope, at.graph.constant(0.0)
+    cos = _cos2(surface, h2).maximum(STEEPEST).sqrt()
+    both = c / (cos * cos + cos)  # one division for c / (1 + cos) and c / cos
+    inverse = both * cos + both
+    turn = inverse * inverse * inverse * (1 + float(surface.conic))
+    return (both * cos + sag) * h2, inverse + slope, turn
+
+
+def _cos2(surface: Surface, h2: Value) -> Value:
+    c = float(surface.curvature)
+    return h2 * (-(1 + float(surface.conic)) * c * c) + 1.0
+
+
+def _polynomial(surface: Surface, h2: Value, order: int) -> Value:
+    """sum A_p h^(p - 2) (order 0) or sum p A_p h^(p - 2) (order 1), in h^2 or, where odd powers occur, in h."""
+    powers = {n: float(a) for n, a in surface.asphere}
+    even = all(n % 2 == 0 for n in powers)
+    h, down = (h2, 2) if even else (h2.maximum(_TINY).sqrt(), 1)
+    count = (max(powers) - 2) // down + 1
+    terms = [powers.get(2 + down * k, 0.0) * (2 + down * k) ** order for k in range(count)]
+    return h.graph.series(h, terms)

@@ -1,1 +1,0 @@
-"""Arithmetic on rays as programs of float steps: their derivatives, C from them, and compiling that."""

@@ -1,0 +1,221 @@
+"""Models as ONNX files with their cards: of one state, or of a zoom's (and internal focus's) whole range."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path
+from neurolens.graph.derive import derivative, with_derivatives
+from neurolens.graph.ir import Graph, Value
+from neurolens.graph.onnx import Mixing, write_onnx
+from neurolens.graph.program import RAY
+from neurolens.modelfile import CARD_KEY, MODEL_KEY
+from neurolens.modelfile.axes import Axis
+from neurolens.optics.focusing import at_infinity
+from neurolens.optics.paraxial import first_order
+from neurolens.surrogates.assemble import ONNX, model_graph
+from neurolens.surrogates.card import card_of, card_to_json, lens_facts, reference_rays
+from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, scene_graph, stop_graph
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.stored import model_to_text, storable
+
+if TYPE_CHECKING:
+    from neurolens.surrogates.states import StateModel
+
+STATE = "state"
+# A film position that lies in no domain: where the state is out of range, this takes the place of the one asked for.
+_NOWHERE = -1.0
+
+
+def export_onnx(
+    model: LensModel, path: str | Path, errors: dict[str, Any] | None = None, *, derivatives: bool = False
+) -> Path:
+    """Write a model with its card.
+
+    Inputs: rays [5, N] float32 (film_x_mm, film_y_mm, pupil_x_mm, pupil_y_mm, wavelength_nm), film_z_mm [1],
+    stop_radius_mm [1]. Outputs, as `LensModel.predict`: scene_ray [6, N] (x, y, z mm, unit direction; lens frame),
+    transmittance [N], stop_xy_mm [2, N], status [N] int32.
+
+    Args:
+        errors: held-out errors for the card, JSON-able.
+        derivatives: further outputs, scene_ray_d_film and scene_ray_d_pupil [2, 6, N]: of the scene ray per mm of the
+            film point's (of the pupil point's) x, then y.
+
+    Returns the path.
+
+    Raises:
+        InputError: weights or errors that are not finite; two gates for one reason on one surface, or one on the stop.
+    """
+    check_gates(model)
+    graph, shapes = model_graph(model, largest_angle(model), ONNX), {}
+    if derivatives:
+        graph = with_derivatives(graph, ["scene_ray"], [("rays", k) for k in range(4)])
+        for name, by in (("scene_ray_d_film", RAY[:2]), ("scene_ray_d_pupil", RAY[2:])):
+            graph.outputs[name] = graph.concat(*(graph.outputs.pop(derivative("scene_ray", row)) for row in by))
+            shapes[name] = (2, 6)
+    return _write(path, write_onnx(graph, model_metadata(model, errors or {}), shapes=shapes))
+
+
+def _write(path: str | Path, proto: Any) -> Path:
+    target = Path(path)
+    with atomic_path(target) as temporary:
+        temporary.write_bytes(proto.SerializeToString())
+    return target
+
+
+def model_metadata(model: LensModel, errors: dict[str, Any]) -> dict[str, str]:
+    """The card, and the coefficients where their core has a form for files."""
+    card = {CARD_KEY: card_to_json(card_of(model, errors))}
+    return {**card, MODEL_KEY: model_to_text(model)} if storable(model.core) else card
+
+
+def check_gates(model: LensModel) -> None:
+    """Refuse gates whose codes could not be told apart.
+
+    Raises:
+        InputError: two gates for one reason on one surface, or one on the stop.
+    """
+    codes = [gate.status for gate in model.gates]
+    if len({*codes, st.blocked(model.lens.stop_index, st.RIM)}) <= len(codes):
+        raise InputError("export", "gates", codes, "one gate a surface and reason, and none on the rim of the stop")
+
+
+def largest_angle(model: LensModel, count: int = 32768) -> float:
+    """Largest angle (rad) from the axis of the model's passing rays, a little enlarged. Sets the length of series."""
+    rays = sample_domain(model.domain, count, seed=5)
+    with torch.no_grad():
+        out = model.predict(rays)
+    passed = out.status == st.PASSED
+    angle = torch.atan2(torch.hypot(out.rays.dx, out.rays.dy), -out.rays.dz)
+    return 1.03 * float(angle[passed].max()) if bool(passed.any()) else math.pi / 2
+
+
+def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, Any] | None = None) -> tuple[Path, Path]:
+    """Write both inverse maps beside a model's file: NAME.stop.onnx and NAME.scene.onnx for NAME.onnx.
+
+    Both give rays [5, N] (film x, y, pupil x, y, wavelength), scene_ray, transmittance, stop_xy_mm and status as the
+    model does for those rays (NO_SOLUTION where they are not what was asked for), and density [N]. Inputs: see
+    `stop_graph` and `scene_graph`; per-call ones have the shape [1].
+
+    Args:
+        path: of the model's file. errors: for the card, as of `export_onnx`.
+
+    Raises:
+        InputError: as `export_onnx`.
+    """
+    model = inverse.model
+    check_gates(model)
+    base, card, front = Path(path).with_suffix(""), card_of(model, errors or {}), model.lens.surfaces[0]
+    shape = {
+        "curvature": float(front.curvature),
+        "conic": float(front.conic),
+        "asphere": [[int(p), float(a)] for p, a in front.asphere],
+        "cylinder": front.cylinder,
+    }
+    written = []
+    for name, build in (("stop", stop_graph), ("scene", scene_graph)):
+        known = {
+            "map": name,
+            "steps": STEPS,
+            "tolerance": TOLERANCE,
+            "direction": model.direction,
+            "front": shape if model.direction == "angle" else None,
+            "fit": inverse.report,
+        }
+        graph = build(inverse, ONNX, largest_angle(model))
+        proto = write_onnx(graph, {CARD_KEY: card_to_json({**card, "inverse": known})})
+        written.append(_write(base.with_name(f"{base.name}.{name}.onnx"), proto))
+    return written[0], written[1]
+
+
+def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | None = None) -> Path:
+    """Write a model of many states with its card.
+
+    As `export_onnx`, with one more input: state [A], a number for every axis, in its unit. A state out of range puts
+    every ray outside the domain. Constants that are equal at all nodes stay constants; the others follow the features
+    of the state (`axes.Axis.features`), which costs a few operations a call and nothing a ray.
+
+    Args:
+        errors: held-out errors for the card, JSON-able.
+
+    Raises:
+        InputError: what `export_onnx` refuses, and nodes whose graphs differ in more than numbers.
+    """
+    check_gates(model.nodes[0])
+    angle = max(largest_angle(node, 8192) for node in model.nodes)
+    graphs = [model_graph(node, angle, ONNX) for node in model.nodes]
+    metadata = {CARD_KEY: card_to_json(state_card(model, errors or {}))}
+    return _write(path, write_onnx(graphs, metadata, mixing_of(model.axes)))
+
+
+def mixing_of(axes: Sequence[Axis]) -> Mixing:
+    """How constants follow the state: the products of the axes' features, those of the last axis fastest."""
+    g = Graph()
+    state, film_z = g.input(STATE, len(axes), per_call=True), g.input("film_z_mm", per_call=True)
+    low, high = zip(*(a.limits for a in axes), strict=True)
+    within = state.between(low, high)
+    inside = within[0]
+    found = _axis_features(axes[0], state[0])
+    transform: NDArray[np.float64] = axes[0].to_features
+    for k, axis in enumerate(axes[1:], 1):
+        inside = inside & within[k]
+        own = _axis_features(axis, state[k])
+        count = own.rows
+        # Kronecker's product: every feature so far times every one of this axis.
+        found = g.take(found, np.repeat(np.arange(found.rows), count).tolist()) * g.take(
+            own, np.tile(np.arange(count), found.rows).tolist()
+        )
+        transform = np.asarray(np.kron(transform, axis.to_features), np.float64)
+    g.outputs = {"features": found, "film_z_mm": g.select(inside, film_z, _NOWHERE)}
+    return Mixing(g, transform)
+
+
+def _axis_features(axis: Axis, value: Value) -> Value:
+    """[K rows] as `Axis.features`, T_j by their recurrence."""
+    g, (factor, offset) = value.graph, axis.pieces
+    coordinate = 1.0 / value if axis.reciprocal else value
+    t = (coordinate * factor + offset).clip(-1.0, 1.0)
+    chebyshev = [g.constant(np.ones_like(factor)), t]
+    for _ in range(2, axis.degree + 1):
+        chebyshev.append((t + t) * chebyshev[-1] - chebyshev[-2])
+    return g.concat(g.constant(1.0), *(c + -((-1.0) ** j) for j, c in enumerate(chebyshev) if j))
+
+
+def state_card(model: StateModel, errors: dict[str, Any]) -> dict[str, Any]:
+    """The card of the model at its first state, with axes, nodes' lenses and domains, and more rays."""
+    first = model.at(*model.first_state)
+    card = card_of(first, errors)
+    card["units"] = {**card["units"], STATE: [f"{a.name} {a.unit}" for a in model.axes]}
+    card["states"] = {
+        "axes": [a.to_dict() for a in model.axes],
+        "default": list(model.first_state),
+        "zoom": model.space.zoom,
+        "f_number": model.space.f_number,
+        "nodes": [{"lens": _node_facts(node), "domain": node.domain.to_dict()} for node in model.nodes],
+        "reference": [{"state": list(s), **reference_rays(model.at(*s), 8, 1)} for s in _between_nodes(model)],
+    }
+    return card
+
+
+def _node_facts(node: LensModel) -> dict[str, Any]:
+    """The card's table of a node's lens; the f-number is that at infinity focus, as photographers count."""
+    facts = lens_facts(node.lens, node.domain.film_z_mm[0])
+    return {**facts, "f_number": float(first_order(at_infinity(node.lens)).f_number)}
+
+
+def _between_nodes(model: StateModel) -> list[tuple[float, ...]]:
+    """States at which a client may check itself: the far end, and two where no node is."""
+    shares = ((0.31, 0.62), (0.77, 0.38))
+    ends = [a.range for a in model.axes]
+    inner = [tuple(lo + (hi - lo) * s for (lo, hi), s in zip(ends, share, strict=False)) for share in shares]
+    return [tuple(hi for _, hi in ends), *(tuple(float(np.float32(v)) for v in s) for s in inner)]

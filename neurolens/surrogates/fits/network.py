@@ -1,0 +1,293 @@
+"""Small networks with the symmetry of the lens (after NeuroLens, Zheng and Zheng 2017b), and the course of a training.
+
+Several starts run on few rays, then the best, on as many rays as it takes not to overfit: a smooth lens is learnt from
+2000 rays as well as from 16,000, at an eighth of the cost of a step. Where the error on rays that the fit has not seen
+runs ahead of that on its own, it goes on with twice as many.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
+from neurolens.surrogates.bases import pinned_threads
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, Network
+from neurolens.surrogates.fits.checkpoint import Checkpoint, fingerprint
+from neurolens.surrogates.fits.projection import Problem, Projection, Stand, activations, minimise, project
+from neurolens.surrogates.gates import boundary_weights, gate_values
+from neurolens.surrogates.pairs import PairSet
+from neurolens.surrogates.targets import Prepared, film_equivalent_weights, targets_of
+
+# What the other outputs weigh against film-equivalent micrometres: so many um for 1 mm at the stop; and, for each mm of
+# the film radius, for a transmittance of 1 and for a gate of 1 (a rim radius twice over). They only decide which
+# features the hidden layers learn: the last layer is solved for each output by itself.
+_STOP_UM_PER_MM, _TRANSMITTANCE_UM, _GATE_UM = 30.0, 20.0, 10.0
+# Training ends at an RMS of this share of the film radius: float32 itself, which evaluates the model, has eps 1.2e-7.
+_ENOUGH = 1e-7
+FEWEST_RAYS = 2000
+# Each start gets this share of the steps before the best goes on.
+_TRIAL_STEPS = 0.1
+# Steps between looks at the error on rays not fitted (and between checkpoints).
+_BURST = 10
+# More rays, when the RMS on rays not fitted is larger than that on the fitted ones by this factor.
+_GAP = 1.15
+# Converged, when so many bursts in a row lower the loss by less than this share each.
+_LITTLE, _IDLE = 0.01, 3
+
+
+def fit_network(
+    data: Prepared,
+    *,
+    units: int = 16,
+    layers: int = 2,
+    seed: int = 0,
+    seconds: float = 60.0,
+    steps: int = 300,
+    starts: int = 3,
+    rays: int = 16000,
+    base: InvariantPolynomial | None = None,
+    checkpoint: Path | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Network:
+    """Fit a network of `layers` tanh layers of `units` units, in float64 on one thread.
+
+    Position and direction weigh by their film-equivalent error, the stop crossing, the transmittance and the gates
+    modestly. Several random starts are tried, and the best goes on.
+
+    Args:
+        data: half the rays come from `pairs.train`, half from those near the boundaries and beyond (`boundary`).
+        steps: most steps of the optimiser (Levenberg-Marquardt); convergence or the time limit may end it earlier.
+        seconds: limit of the training. The same seed gives the same weights bit for bit where it does not bite.
+        starts: random starts.
+        rays: most rays used.
+        base: a polynomial whose residual is fitted instead.
+        checkpoint: file that takes the state every few seconds. Where it holds that of the very same fit, training
+            goes on from there, to the very same weights; a file that is damaged or of another fit is replaced.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        InputError: units, layers, steps, starts or seconds that are not positive, or no rays.
+        OSError: the checkpoint cannot be written.
+    """
+    numbers = {"units": units, "layers": layers, "steps": steps, "starts": starts, "seconds": seconds, "rays": rays}
+    for name, value in numbers.items():
+        if not value > 0:
+            raise InputError("mlp", name, value, "a positive number")
+    if not len(data.pairs.train):
+        raise InputError("mlp", "pairs.train", "(no rays)", "at least one passing ray")
+    with pinned_threads():
+        problem, shift, scale = _problem(data, rays, base)
+        key = fingerprint(problem.tensors, {**numbers, "seed": seed})
+        enough = (_ENOUGH * 1000 * data.pairs.domain.film_radius_mm) ** 2
+        kept = Checkpoint(checkpoint, key)
+        training = Training(problem, (units, layers), seed, steps, starts, seconds, enough, kept, progress)
+        best = training.run()
+    if progress:
+        progress(1.0)
+    *hidden, output = ((w[:, :-1].numpy().copy(), w[:, -1].numpy().copy()) for w in (*best.hidden, best.output))
+    return Network(tuple(hidden), output, shift.numpy(), scale.numpy())
+
+
+def _problem(data: Prepared, rays: int, base: InvariantPolynomial | None) -> tuple[Problem, Tensor, Tensor]:
+    """The weighted fit, and shift and scale [4] of the invariants."""
+    pairs, boundary = data.pairs, data.boundary
+    train = pairs.train.select(slice(0, max(rays - len(boundary), rays - rays // 2)))
+    boundary = boundary.select(slice(0, rays - len(train)))
+    parts = [_part(data, s, base) for s in (train, boundary) if len(s)]
+    inputs, *rest = (torch.cat(c, -1) for c in zip(*parts, strict=True))
+    low, high = inputs.amin(1), inputs.amax(1)
+    shift = (low + high) / 2
+    scale = torch.where(high > low, 2 / torch.where(high > low, high - low, 1.0), 1.0)
+    return Problem(((inputs - shift[:, None]) * scale[:, None]).T.contiguous(), *rest), shift, scale
+
+
+def _part(data: Prepared, pairs: PairSet, base: InvariantPolynomial | None) -> tuple[Tensor, ...]:
+    """Invariants [4, N] and the fields of `Problem` after the inputs, rays last."""
+    lens, domain, gates = data.pairs.lens, data.pairs.domain, data.gates
+    targets, gate = targets_of(lens, data.encoding, pairs), gate_values(lens, gates, pairs)
+    passes = (pairs.status == st.PASSED).to(torch.float64)
+    position_um, direction_um = film_equivalent_weights(lens, domain)
+    weights = torch.empty((3, len(pairs)), dtype=torch.float64)
+    weights[POSITION], weights[DIRECTION] = position_um * passes, direction_um * passes
+    gate_weights, stop_weights = boundary_weights(lens, gates, pairs)
+    weights[STOP] = _STOP_UM_PER_MM * lens.stop_radius_mm * stop_weights
+    vectors, scalars = targets.vectors, torch.cat([targets.transmittance[None], gate])
+    size = domain.film_radius_mm
+    scalar_weights = torch.cat([_TRANSMITTANCE_UM * size * passes[None], _GATE_UM * size * gate_weights])
+    field = targets.field
+    if base is not None:
+        known, known_scalars = base(field)
+        vectors, scalars = vectors - known, scalars - known_scalars
+    if data.encoding.mirror:  # x and y of each vector by themselves
+        p, u = (torch.cat([v] * 3)[:, None] for v in (field.p, field.u))
+        vectors, weights = vectors.reshape(6, 1, -1), weights.repeat_interleave(2, 0)
+        return field.mirror_invariants(), p, u, vectors, weights, scalars, scalar_weights
+    return field.invariants(), field.p[None], field.u[None], vectors, weights, scalars, scalar_weights
+
+
+@dataclass
+class _Place:
+    """Where a training is, but for the weights: plain numbers.
+
+    Attributes:
+        start: the start that runs, or their number once the best goes on.
+        taken: steps of the present start, or of the best.
+        level: how often the rays were doubled.
+        champion: the best start so far, by its loss `least`.
+        previous: loss after the last burst.
+        idle: bursts in a row that gained little.
+        ended: whether the training is over.
+    """
+
+    start: int = 0
+    taken: int = 0
+    level: int = 0
+    champion: int = -1
+    least: float = math.inf
+    previous: float = math.inf
+    damping: float = 0.0
+    growth: float = 0.0
+    idle: int = 0
+    ended: bool = False
+
+
+@dataclass
+class Training:
+    """One training, which can be left at any burst and taken up again.
+
+    Attributes:
+        problem: all rays.
+        shape: units and layers.
+        seed: of the first start's weights.
+        steps, seconds: the training ends by either.
+        starts: random starts.
+        enough: a loss so low that the rounding of float32 evaluation is larger.
+        checkpoint: what earlier runs left.
+        progress: called with the share done.
+    """
+
+    problem: Problem
+    shape: tuple[int, int]
+    seed: int
+    steps: int
+    starts: int
+    seconds: float
+    enough: float
+    checkpoint: Checkpoint
+    progress: Callable[[float], None] | None = None
+    _place: _Place = field(default_factory=_Place)
+    _champion: list[Tensor] = field(default_factory=list)
+    _highest: float = 0.0
+
+    def run(self) -> Projection:
+        """Train, from the start or from where the checkpoint was written; the last layer fits all rays."""
+        halvings = max(0, (len(self.problem) // FEWEST_RAYS).bit_length() - 1)
+        self._levels = [2**k for k in range(halvings, -1, -1)]
+        self._stand = Stand(random_layers(self.problem.inputs, *self.shape, self.seed))
+        self._resume()
+        self._take_rays()
+        if self.starts == 1:
+            self._place.start = 1
+        while not self._place.ended:
+            if self._place.start < self.starts:
+                self._try_start()
+            else:
+                self._go_on()
+            self._save()
+        self._save(now=True)
+        return project(self.problem, self._stand.hidden)
+
+    def _take_rays(self) -> None:
+        self._rays = self.problem.every(self._levels[self._place.level])
+        odd = self.problem.every(4, first=1) if self._levels[0] > 1 else None
+        self._unseen = odd if self._place.level + 1 < len(self._levels) else None
+
+    def _burst(self, steps: int, until: float) -> Projection:
+        """At most `_BURST` steps, none after this share of the time."""
+        place = self._place
+        deadline = time.monotonic() + until * self.seconds - self.checkpoint.elapsed_s
+        count = min(_BURST, steps - place.taken)
+        best, self._stand = minimise(
+            self._rays, self._stand, count, deadline, lambda share: self._report(place.taken + share * count)
+        )
+        place.taken += count
+        return best
+
+    def _try_start(self) -> None:
+        """A burst of one of the starts; the end of its trial compares it with the best so far."""
+        place, short = self._place, max(1, round(_TRIAL_STEPS * self.steps))
+        until = 0.4 * (place.start + 1) / self.starts
+        best = self._burst(short, until)
+        if place.taken < short and self.checkpoint.elapsed_s < until * self.seconds and not self._stand.stuck:
+            return
+        if best.loss < place.least or not self._champion:
+            place.least, place.champion, self._champion = best.loss, place.start, self._stand.hidden
+        place.start, place.taken = place.start + 1, 0
+        if place.start < self.starts:
+            self._stand = Stand(random_layers(self.problem.inputs, *self.shape, self.seed + 7919 * place.start))
+        else:
+            self._stand = Stand(self._champion)
+
+    def _go_on(self) -> None:
+        """A burst of the best start; then more rays, or the end."""
+        place = self._place
+        best = self._burst(self.steps, 1.0)
+        little = best.loss > (1 - _LITTLE) * place.previous
+        place.idle = place.idle + 1 if little else 0
+        place.previous = best.loss
+        done = place.idle >= _IDLE or best.loss <= self.enough
+        if self._unseen is not None and (done or place.taken % (2 * _BURST) == 0):
+            outputs = activations(best.hidden, self._unseen.inputs)[-1] @ best.output.T
+            if self._unseen.loss(outputs) > _GAP**2 * best.loss:
+                place.level, place.previous, place.idle, done = place.level + 1, math.inf, 0, False
+                self._stand = Stand(best.hidden, min(self._stand.damping, Stand.damping))
+                self._take_rays()
+        over = place.taken >= self.steps or self.checkpoint.elapsed_s >= self.seconds or self._stand.stuck
+        place.ended = over or done
+
+    def _report(self, taken: float) -> None:
+        """Tell the share done; it never goes back."""
+        if self.progress:
+            short = max(1, round(_TRIAL_STEPS * self.steps)) if self.starts > 1 else 0
+            done = min(self._place.start, self.starts) * short + taken
+            share = max(done / (self.starts * short + self.steps), self.checkpoint.elapsed_s / self.seconds)
+            self._highest = min(1.0, max(self._highest, share))
+            self.progress(self._highest)
+
+    def _save(self, *, now: bool = False) -> None:
+        self._place.damping, self._place.growth = self._stand.damping, self._stand.growth
+        self.checkpoint.save(asdict(self._place), [*self._stand.hidden, *self._champion], now=now)
+
+    def _resume(self) -> None:
+        known = self.checkpoint.load()
+        if known is None:
+            return
+        state, arrays = known
+        self._place = _Place(**state)
+        layers = self.shape[1]
+        self._stand = Stand(arrays[:layers], self._place.damping, self._place.growth)
+        self._champion = arrays[layers:]
+
+
+def random_layers(inputs: Tensor, units: int, layers: int, seed: int) -> list[Tensor]:
+    """Uniform weights (Glorot and Bengio 2010) and biases that spread the bends of tanh over the data."""
+    generator = torch.Generator().manual_seed(seed)
+    changes = (inputs != inputs[0]).any(0)
+    hidden, width = [], inputs.shape[1]
+    for k in range(layers):
+        weight = (2 * torch.rand((units, width), generator=generator, dtype=torch.float64) - 1) * math.sqrt(
+            6 / (width + units)
+        )
+        bias = torch.rand((units, 1), generator=generator, dtype=torch.float64) - 0.5
+        # A constant input (the wavelength of a lens without dispersion) gets no weight.
+        hidden.append(torch.cat([weight * changes if k == 0 else weight, bias], 1))
+        width = units
+    return hidden

@@ -1,0 +1,186 @@
+"""Fitting the inverse of a surrogate: first guesses of both maps, and how often three Newton steps from them arrive."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
+from neurolens.graph.interpret import monomials
+from neurolens.optics.surfaces import Rays
+from neurolens.surrogates.bases import Exponents, pinned_threads, solve
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP
+from neurolens.surrogates.domain import FilmRays
+from neurolens.surrogates.fits.selection import Sweep, forward
+from neurolens.surrogates.inverse import STEPS, TOLERANCE, FilmSide, Guess, InverseModel, StopRays, scaled_film_z
+from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.pairs import RayPairs, join_pairs
+from neurolens.surrogates.targets import targets_of
+
+# Rays beyond the rims teach the guess how the map goes on; those that pass count more.
+_BEYOND_WEIGHT = 0.3
+# Rays teach where the model is within this of the lens, of the largest value of each output, ...
+_AWAY = 0.02
+# ... and the guess of the stop where the stop is seen at least at this share of its usual area.
+_FOLD = 0.1
+# Terms and degree of the guesses: first, and where too few rays converge.
+_SIZES = ((40, 6), (80, 7))
+_WANTED, _CHECKED = 0.9999, 20_000
+_OTHER = 0.02
+# Rays of the choice of terms: the Gram matrix of all candidates takes a second.
+_MOST_RAYS = 12_000
+
+
+def fit_inverse(model: LensModel, pairs: RayPairs) -> InverseModel:
+    """Fit the first guesses of both inverse maps on rays that pass and on rays a little beyond the rims.
+
+    Guesses get more terms where three Newton steps from them do not reach 99.99% of the model's passing rays.
+
+    Args:
+        pairs: of the model's lens and domain.
+
+    Raises:
+        InputError: pairs of another lens.
+    """
+    if pairs.lens.sha256 != model.lens.sha256:
+        raise InputError("fit_inverse", "pairs", pairs.lens.name, f"ray pairs of {model.lens.name}")
+    start = time.perf_counter()
+    with pinned_threads(), torch.no_grad():
+        rays, weight = _teaching(model, pairs)
+        rounds = [_fit(model, rays, weight, *_SIZES[0])]
+        report = convergence(rounds[0], pairs.train.inputs.select(slice(0, _CHECKED)))
+        if min(report["stop"]["converged"], report["scene"]["converged"]) < _WANTED:
+            rounds.append(_fit(model, rays, weight, *_SIZES[1]))
+            other = convergence(rounds[1], pairs.train.inputs.select(slice(0, _CHECKED)))
+            best = {n: int(other[n]["converged"] > report[n]["converged"]) for n in ("stop", "scene")}
+            rounds[0] = InverseModel(model, rounds[best["stop"]].stop, rounds[best["scene"]].scene)
+            report = {n: (report, other)[best[n]][n] for n in ("stop", "scene")}
+    found = rounds[0]
+    report["stop"]["coefficients"], report["scene"]["coefficients"] = found.stop.coefficients, found.scene.coefficients
+    report |= {"rays": len(rays), "seconds": time.perf_counter() - start}
+    return replace(found, report=report)
+
+
+def convergence(inverse: InverseModel, rays: FilmRays, steps: int = STEPS) -> dict[str, Any]:
+    """How often the inverse maps find the model's own passing rays, in the dtype of `rays`.
+
+    Returns for "stop" and "scene": converged (share with a residual below TOLERANCE) and other (share that came to
+    another ray of the same stop point, or scene ray: the map is folded there, and that ray is not found).
+    """
+    forward = inverse.model.predict(rays)
+    passed = forward.status == st.PASSED
+    rays, x, y = rays.select(passed), forward.stop_x[passed], forward.stop_y[passed]
+    scene = Rays(*(c[passed] for c in forward.rays))
+    stop = inverse.through_stop(rays.film_x, rays.film_y, rays.film_z, x, y, rays.wavelength_nm, steps=steps)
+    back = inverse.from_scene(scene, rays.film_z, rays.wavelength_nm, steps=steps)
+    return {"stop": _found(inverse.model, rays, stop), "scene": _found(inverse.model, rays, back)}
+
+
+def _found(model: LensModel, rays: FilmRays, out: StopRays | FilmSide) -> dict[str, Any]:
+    solved = out.residual < TOLERANCE
+    away = torch.hypot(out.rays.pupil_x - rays.pupil_x, out.rays.pupil_y - rays.pupil_y)
+    other = solved & (away > _OTHER * model.domain.pupil_radius_mm)
+    count = max(len(rays), 1)
+    return {"converged": float(solved.double().sum()) / count, "other": float(other.double().sum()) / count}
+
+
+def _fit(model: LensModel, rays: FilmRays, weight: Tensor, terms: int, degree: int) -> InverseModel:
+    light, e = model.encoding(rays), model.encoding
+    vectors, _ = model.core(light)
+    film, pupil = torch.stack([rays.film_x, rays.film_y]), torch.stack([rays.pupil_x, rays.pupil_y])
+    chief, scale = (torch.tensor(v, dtype=torch.float64)[:, None] for v in (e.chiefs, e.pupil_scales_mm))
+    # Where the stop is seen through a caustic two rays cross it in one point: the guess follows the sheet of the axis.
+    d = model.differentiate(rays).stop_d_pupil
+    turned = d[0, 0] * d[1, 1] - d[0, 1] * d[1, 0]
+    weight_stop = weight * (turned > _FOLD * turned.median())
+    known: dict[str, Any] = {"mirror": e.mirror, "terms": terms, "degree": degree}
+    none = torch.zeros_like(weight)
+    z = scaled_film_z(model, rays.film_z)
+    stop_field = LightField(film / e.film_scale_mm, vectors[STOP], light.w)
+    u = (pupil - chief * film) / scale
+    stop = fit_guess(stop_field, none if z is None else z, u[None], weight_stop, **known)
+    scene_field = LightField(vectors[POSITION], vectors[DIRECTION], light.w)
+    return InverseModel(model, stop, fit_guess(scene_field, none, torch.stack([light.u, light.p]), weight, **known))
+
+
+def _teaching(model: LensModel, pairs: RayPairs) -> tuple[FilmRays, Tensor]:
+    """Rays of the fits and their weights [N]: those that pass, and those a little beyond the rims that the model knows.
+
+    What is inverted is the model, not the lens: rays where it has run away from the lens would teach nonsense.
+    """
+    size = min(len(pairs.train), len(pairs.rim))
+    sets = join_pairs([pairs.train.select(slice(0, 2 * size)), pairs.rim.select(slice(0, size))])
+    exact = targets_of(model.lens, model.encoding, sets).vectors
+    away = (model.core(model.encoding(sets.inputs))[0] - exact).norm(dim=1)  # [3, N]
+    known = (away < _AWAY * exact.norm(dim=1).amax(1, keepdim=True)).all(0)
+    weight = torch.ones(len(sets), dtype=torch.float64)
+    weight[-size:] = _BEYOND_WEIGHT
+    order = torch.randperm(len(sets), generator=torch.Generator().manual_seed(0))
+    order = order[known[order]]
+    return sets.inputs.select(order), weight[order]
+
+
+def _variables(field: LightField, z: Tensor, mirror: bool) -> Tensor:
+    return torch.cat([field.mirror_invariants() if mirror else field.invariants(), z[None]])
+
+
+def fit_guess(
+    field: LightField, z: Tensor, outputs: Tensor, weight: Tensor, *, mirror: bool, terms: int, degree: int
+) -> Guess:
+    """Choose terms by orthogonal least squares and fit them.
+
+    Args:
+        field, z: inputs as of `Guess`, [.., N]. outputs: [K, 2, N], of unit order. weight: [N].
+        terms: columns (of A and B together) that the K vectors share. degree: largest total degree of the invariants.
+    """
+    exponents = _candidates(degree, mirror, bool(field.w.any()), bool(z.any()))
+    part = slice(0, _MOST_RAYS)
+    columns = _columns(field, z, exponents, mirror, part) * weight[part]  # [2 M, 2, n]
+    count = len(exponents)
+    wanted = outputs[..., part] * weight[part]
+    supports = []
+    for axes in ([0], [1]) if mirror else ([0, 1],):
+        d, o = columns[:, axes].flatten(1), wanted[:, axes].flatten(1)
+        sweep = Sweep((d @ d.T).numpy(), (d @ o.T).numpy(), (o * o).sum(1).numpy())
+        forward(sweep, min(terms, 2 * count))
+        supports.append(sorted(sweep.chosen))
+    kept = sorted({k % count for support in supports for k in support})
+    place = {k: i for i, k in enumerate(kept)}
+    all_columns = _columns(field, z, exponents[kept], mirror, slice(None)) * weight
+    ab = torch.zeros((len(outputs), 2, len(supports), len(kept)), dtype=torch.float64)
+    for i, support in enumerate(supports):
+        axes = [i] if mirror else [0, 1]
+        rows = [place[k % count] + (k >= count) * len(kept) for k in support]
+        found = solve(all_columns[rows][:, axes].flatten(1), (outputs * weight)[:, axes].flatten(1))
+        for column, k in enumerate(support):
+            ab[:, int(k >= count), i, place[k % count]] = found[:, column]
+    return Guess(exponents[kept], ab.numpy())
+
+
+def _candidates(degree: int, mirror: bool, dispersive: bool, moves: bool) -> Exponents:
+    """Exponents up to a total degree; w and z multiply lower degrees only."""
+    variables = 6 if mirror else 3
+    most = min(degree, 3) if mirror else degree
+    rows = [
+        (*powers, w, z)
+        for w in range(3 if dispersive else 1)
+        for z in range(3 if moves else 1)
+        for powers in itertools.product(range(most + 1), repeat=variables)
+        if sum(powers) + 2 * w + z + w * z <= most or (sum(powers) == 0 and w + z <= 2)
+    ]
+    return np.array(sorted(rows, key=lambda r: (sum(r), r)), dtype=np.int64)
+
+
+def _columns(field: LightField, z: Tensor, exponents: Exponents, mirror: bool, part: slice) -> Tensor:
+    """[2 M, 2, n] candidate columns m a and m b."""
+    f = LightField(field.p[:, part], field.u[:, part], field.w[part])
+    m = monomials(_variables(f, z[part], mirror), exponents)[:, None]
+    return torch.cat([m * f.p, m * f.u])

@@ -1,1 +1,0 @@
-"""Derivatives, and both inverse maps."""

@@ -1,1 +1,0 @@
-"""Surrogates as ONNX graphs."""

@@ -1,0 +1,148 @@
+"""Settings of a surrogate, and ablations: the changes that leave one part of a fit out, by table row."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from neurolens.base.errors import InputError
+from neurolens.surrogates.cores import Basis
+
+PublishedName = Literal["taylor", "hanika", "schrade", "zheng-adaptive", "neurolens2017", "rtf"]
+Method = Literal["thin", "thick", "dense", "omp", "ols", "adaptive", "mlp", "ols+mlp", PublishedName]
+POLYNOMIALS = ("dense", "omp", "ols", "adaptive")
+NETWORKS = ("mlp", "ols+mlp")
+PLANES_SEARCHED = ("ols", "adaptive", "ols+mlp")
+# About 5000 candidate columns, whose Gram matrix takes 200 MB.
+_MOST_DEGREE = {"invariants": 16, "raw": 11}
+
+
+@dataclass(frozen=True)
+class ModelSettings:
+    """One surrogate of an experiment.
+
+    Attributes:
+        name: of the file and of the table's row; made from the other settings where empty.
+        method: "thin", "thick" (first order); polynomials: "dense" (all terms up to `degree`), "omp" (matching
+            pursuit), "ols" (orthogonal least squares with replacement), "adaptive" (terms of any degree grown from
+            chosen terms); "mlp"; "ols+mlp" (a polynomial and a network on what it leaves); the published methods of
+            `neurolens.surrogates.published`.
+        basis: of polynomials: "invariants" (rotational symmetry held exactly) or "raw" (p_x, p_y, u_x, u_y, w).
+        terms: coefficients per vector output; ignored by "dense".
+        degree: largest total degree of the candidates that a fit starts from; ignored by "adaptive".
+        replacement: whether "ols" exchanges terms afterwards.
+        elimination: whether "ols" first chooses half as many terms again, and drops those that cost least.
+        growth: rounds in which "ols" in the invariants adds to the candidates what the chosen terms give, multiplied by
+            each variable: terms of higher degree where they help.
+        position_weight: how much more than to first order the position counts in the choice of terms.
+        transmittance_terms: how many more terms the transmittance may have where it needs them.
+        planes: whether `PLANES_SEARCHED` methods in the invariants search the planes of the light field.
+        partitions: zones of the film with a fit of their own (polynomials and networks).
+        units, layers: of the network. steps, seconds: its training ends by either, or by convergence; results repeat
+            bit for bit where the time does not end it.
+        seed: of the network's first weights.
+        target_um: film-equivalent RMS asked for. Polynomials take the fewest terms of `TERMS_LADDER` that reach it; a
+            fit that does not reach it warns and gives its best.
+
+    Raises:
+        InputError: numbers that ask for more than a fit can hold, or for less than one.
+    """
+
+    method: Method = "ols"
+    name: str = ""
+    basis: Basis = "invariants"
+    terms: int = 40
+    degree: int = 7
+    replacement: bool = True
+    elimination: bool = True
+    growth: int = 2
+    position_weight: float = 2.0
+    transmittance_terms: int = 16
+    planes: bool = True
+    partitions: int = 1
+    units: int = 16
+    layers: int = 2
+    steps: int = 300
+    seconds: float = 60.0
+    seed: int = 0
+    target_um: float | None = None
+
+    def __post_init__(self) -> None:
+        most_degree = _MOST_DEGREE[self.basis] if self.basis in _MOST_DEGREE else min(_MOST_DEGREE.values())
+        limits = {
+            "terms": (1, 2000),
+            "degree": (0, most_degree),
+            "growth": (0, 16),
+            "transmittance_terms": (0, 200),
+            "partitions": (1, 64),
+            "units": (1, 512),
+            "layers": (1, 8),
+            "steps": (1, 100_000),
+        }
+        for name, (least, most) in limits.items():
+            if not least <= getattr(self, name) <= most:
+                raise InputError("settings", name, getattr(self, name), f"an integer from {least} to {most}")
+        if not 0 < self.seconds:
+            raise InputError("settings", "seconds", self.seconds, "a number above 0")
+        if not 0 < self.position_weight < math.inf:
+            raise InputError("settings", "position_weight", self.position_weight, "a number above 0")
+        if self.target_um is not None and not 0 < self.target_um < math.inf:
+            raise InputError("settings", "target_um", self.target_um, "micrometres above 0, or none")
+
+    @property
+    def label(self) -> str:
+        """The name, or one made from the settings: "ols-40", "raw-omp-80", "dense-d4", "mlp-16x2"."""
+        if self.name:
+            return self.name
+        zones = f"-{self.partitions}zones" if self.partitions > 1 else ""
+        if self.target_um is not None:
+            zones += f"-to-{self.target_um:g}um"
+        if self.method in NETWORKS:
+            before = f"ols-{self.terms}-" if self.method == "ols+mlp" else ""
+            return f"{before}mlp-{self.units}x{self.layers}{zones}"
+        if self.method in ("thin", "thick"):
+            return self.method
+        size = f"-d{self.degree}" if self.method == "dense" else f"-{self.terms}"
+        return f"{'raw-' if self.basis == 'raw' else ''}{self.method}{'' if self.climbs else size}{zones}"
+
+    @property
+    def climbs(self) -> bool:
+        """Whether the fit chooses the number of terms by the error asked for."""
+        return self.target_um is not None and self.method in ("omp", "ols", "adaptive")
+
+    @property
+    def family(self) -> str:
+        return "paraxial" if self.method in ("thin", "thick") else self.method
+
+
+# Of method "ols" in the invariants.
+POLYNOMIAL_ABLATIONS: Mapping[str, Mapping[str, Any]] = {
+    "planes not searched": {"planes": False},
+    "candidates do not grow": {"growth": 0},
+    "no elimination": {"elimination": False},
+    "no replacement": {"replacement": False},
+    "position at its first-order weight": {"position_weight": 1.0},
+    "no terms for transmittance": {"transmittance_terms": 0},
+    "forward selection alone": {"planes": False, "growth": 0, "elimination": False, "replacement": False},
+    "matching pursuit": {"method": "omp"},
+    "raw monomials": {"basis": "raw", "degree": 5},
+}
+# Of networks.
+NETWORK_ABLATIONS: Mapping[str, Mapping[str, Any]] = {
+    "20 steps of training": {"steps": 20},
+    "one layer": {"layers": 1},
+}
+
+
+def ablated(settings: ModelSettings, name: str) -> ModelSettings:
+    """The settings with one part left out, named for the table; the benchmark gives the ratio of the two errors.
+
+    Raises:
+        InputError: an ablation of neither table, or of the other kind of model.
+    """
+    known = NETWORK_ABLATIONS if settings.method == "mlp" else POLYNOMIAL_ABLATIONS
+    if name not in known:
+        raise InputError("ablation", "name", name, f"one of {', '.join(known)}")
+    return replace(settings, **known[name], name=f"{settings.label}, {name}")

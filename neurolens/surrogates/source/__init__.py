@@ -1,1 +1,0 @@
-"""Surrogates as programs, and as C and GLSL."""

@@ -1,0 +1,262 @@
+"""Surrogates of a lens in many states (zoom, internal focus): models of one structure at nodes, mixed between.
+
+A `StateSpace` says which states: the axes of a lens file, and its lens and domain at every state. Every number of the
+model at a state is interpolated from the nodes (see `modelfile.axes`), so that the model at a state is a plain
+`LensModel`, and everything that knows those knows this one. A core is linear in its numbers: its error at a state is at
+most a small multiple (the Lebesgue constant) of the nodes' errors, plus that of interpolating the exact lens itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from neurolens.base.errors import InputError
+from neurolens.modelfile.axes import Array, Axis, product, weights
+from neurolens.modelfile.states import mix_domain
+from neurolens.optics.focusing import infinity_states, nearest_focus_m
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import image_radius_mm
+from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import LensModel
+
+State = tuple[float, ...]
+
+# Degree of the polynomials between stated positions: of a zoom, by the largest ratio of two neighbours, so that
+# interpolation adds no more error than the nodes have (measured on five zooms).
+FOCUS_DEGREE, _BASE_DEGREE, _DEGREES_PER_LOG = 4, 2, 4.6
+_LEAST_STEPS = 6  # between nodes, over the whole range
+# With both axes the nodes multiply: one degree less of each.
+_FEWER = 1
+_SAME = 1e-3  # focal lengths that differ by less than this share are one
+# Zoom positions at which the common near limit of internal focus is sought.
+_LIMITS = 9
+
+
+@dataclass(frozen=True)
+class StateSpace:
+    """The states of a lens that one model is of.
+
+    Attributes:
+        lens: the lens as its file gives it, or scaled.
+        axes: zoom, internal focus, or both in this order.
+        zoom: state of the file where zoom is no axis.
+        f_number: None is the widest stop of each state.
+        film_radius_mm: None takes the lit film of each state.
+        focus_m: object distances (far, near) that moving the film reaches, the same in every state or following from
+            the lens. Without effect where internal focus is an axis.
+        wavelength_nm: shortest and longest.
+    """
+
+    lens: Lens
+    axes: tuple[Axis, ...]
+    zoom: str | float | None = None
+    f_number: float | None = None
+    film_radius_mm: float | None = None
+    focus_m: tuple[float, float] | Callable[[Lens], tuple[float, float]] = (math.inf, math.inf)
+    wavelength_nm: tuple[float, float] = (400.0, 700.0)
+
+    @cached_property
+    def _planes_mm(self) -> list[float]:
+        """The tightest pupil plane at every knot of the axes."""
+        return [self._domain(state, None).pupil_z_mm for state in product(self._knots)]
+
+    @property
+    def _knots(self) -> tuple[Axis, ...]:
+        return tuple(replace(a, degree=1) for a in self.axes)
+
+    def _values(self, state: Sequence[float]) -> dict[str, float]:
+        return dict(zip((a.name for a in self.axes), state, strict=True))
+
+    def lens_at(self, state: Sequence[float]) -> Lens:
+        """The exact lens at a state; with internal focus, focused there, else at infinity focus."""
+        values = self._values(state)
+        zoom = values.get("zoom", self.zoom)
+        if "focus" not in values:
+            return self.lens.at(zoom=zoom, f_number=self.f_number)
+        focus_m = 1 / values["focus"] if values["focus"] > 0 else math.inf
+        return self.lens.at(
+            zoom=zoom, f_number=self.f_number, focus="internal", focus_m=None if math.isinf(focus_m) else focus_m
+        )
+
+    def domain_at(self, state: Sequence[float]) -> Domain:
+        """The domain of a state: the full lit film, and the film positions that focusing by the film needs.
+
+        Its pupil plane is straight between the knots: the tightest one of every state by itself would jump.
+        """
+        return self._domain(state, float(weights(self._knots, state) @ np.array(self._planes_mm)))
+
+    def _domain(self, state: Sequence[float], pupil_z_mm: float | None) -> Domain:
+        values, lens, radius, film_z = self._values(state), self.lens_at(state), self.film_radius_mm, None
+        if "focus" not in values:
+            focus = self.focus_m if isinstance(self.focus_m, tuple) else self.focus_m(lens)
+        else:
+            # The picture's size is that of the lens at infinity focus: it breathes, the film does not.
+            if radius is None:
+                radius = image_radius_mm(self.lens_at([0.0 if k == "focus" else v for k, v in values.items()]))[0]
+            assert lens.film_z_mm is not None
+            film_z = (lens.film_z_mm, lens.film_z_mm)
+            distance = 1 / values["focus"] if values["focus"] > 0 else math.inf
+            focus = (distance, distance)
+        return domain_of(
+            lens,
+            film_radius_mm=radius,
+            focus_m=focus,
+            wavelength_nm=self.wavelength_nm,
+            film_z_mm=film_z,
+            pupil_z_mm=pupil_z_mm,
+        )
+
+
+def zoom_axis(lens: Lens, degree: int | None = None) -> Axis:
+    """The whole range of a zoom: focal length in mm, smooth between the states of the file.
+
+    `degree` None follows from the range.
+
+    Raises:
+        InputError: a file with fewer than two zoom states.
+    """
+    found: list[tuple[float, str]] = []
+    for state in infinity_states(lens):
+        found.append((float(first_order(lens.at(zoom=state.name)).efl_mm), state.name))
+    found.sort()
+    knots: list[float] = []
+    for efl, _ in found:
+        if not knots or efl > knots[-1] * (1 + _SAME):
+            knots.append(efl)
+    if len(knots) < 2:
+        raise InputError(lens.path, "zoom", "range", "a lens file with two zoom states or more")
+    if degree is None:
+        largest = max(b / a for a, b in zip(knots, knots[1:], strict=False))
+        degree = _BASE_DEGREE + math.ceil(_DEGREES_PER_LOG * math.log(largest))
+        degree = max(degree, math.ceil(_LEAST_STEPS / (len(knots) - 1)))
+    # Ray slopes go as 1 / f: in that coordinate they are straight.
+    return Axis("zoom", "mm", tuple(knots), degree, reciprocal=True, stated=tuple((n, e) for e, n in found))
+
+
+def focus_axis(lens: Lens, zoom: Sequence[str | float | None] = (None,), degree: int = FOCUS_DEGREE) -> Axis:
+    """Internal focus from infinity to the near limit that all the zoom positions given reach: vergence in 1/m.
+
+    Raises:
+        InputError: a file without focus states.
+    """
+    nearest = max(nearest_focus_m(lens.at(zoom=z)) for z in zoom)
+    return Axis("focus", "1/m", (0.0, (1 - 1e-9) / nearest), degree)
+
+
+def axes_of(lens: Lens, *, zoom: bool, internal: bool, state: str | float | None = None) -> tuple[Axis, ...]:
+    """The axes asked for: the zoom's whole range, internal focus, or both.
+
+    Args:
+        state: the zoom position where `zoom` is False.
+
+    Raises:
+        InputError: neither, or what the file has no states for.
+    """
+    if not (zoom or internal):
+        raise InputError(lens.path, "states", "(none)", "the zoom's range, internal focus, or both")
+    if not zoom:
+        return (focus_axis(lens, (state,)),)
+    first = zoom_axis(lens)
+    if not internal:
+        return (first,)
+    low, high = first.range
+    places = [1 / (1 / high + (1 / low - 1 / high) * k / (_LIMITS - 1)) for k in range(_LIMITS)]
+    inner = [v for v in places if low < v < high]
+    focus = focus_axis(lens, [*(n for n, _ in first.stated), *inner])
+    return replace(first, degree=max(1, first.degree - _FEWER)), replace(focus, degree=focus.degree - _FEWER)
+
+
+@dataclass(frozen=True)
+class StateModel:
+    """Models at the nodes of one or more state axes.
+
+    Attributes:
+        space: the states, and the exact lens at each.
+        nodes: one model a node, in the order of `modelfile.axes.product`; of one structure: they differ in numbers.
+        fit_s: seconds that the whole fit took.
+    """
+
+    space: StateSpace
+    nodes: tuple[LensModel, ...]
+    fit_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        count = len(product(self.axes))
+        if len(self.nodes) != count:
+            raise InputError("state model", "nodes", f"({len(self.nodes)})", f"{count}, as many as the axes have")
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """The state variables."""
+        return self.space.axes
+
+    @property
+    def first_state(self) -> State:
+        """The first end of every axis: what a model shows where no state is asked for."""
+        return tuple(a.range[0] for a in self.axes)
+
+    def at(self, *state: float) -> LensModel:
+        """The model of one state.
+
+        Raises:
+            InputError: another number of values than axes, or one out of range.
+        """
+        w = weights(self.axes, state)
+        first = self.nodes[0]
+        return replace(
+            first,
+            lens=self.space.lens_at(state),
+            domain=Domain.from_dict(mix_domain([n.domain.to_dict() for n in self.nodes], w)),
+            encoding=mix_encodings([n.encoding for n in self.nodes], w),
+            core=mix([n.core for n in self.nodes], w),
+            settings={**first.settings, "state": dict(zip((a.name for a in self.axes), state, strict=True))},
+            fit_s=self.fit_s,
+        )
+
+
+def mix_encodings(encodings: Sequence[Encoding], weights: Array) -> Encoding:
+    """The encoding of a state: planes as they are, scales by their reciprocals, as the graph's matrices hold them."""
+
+    def of(value: Callable[[Encoding], float]) -> float:
+        return float(weights @ np.array([value(e) for e in encodings]))
+
+    pupil_scale = 1 / of(lambda e: 1 / e.pupil_scale_mm)
+    return replace(
+        encodings[0],
+        film_plane_z_mm=of(lambda e: e.film_plane_z_mm),
+        pupil_plane_z_mm=of(lambda e: e.pupil_plane_z_mm),
+        chief=pupil_scale * of(lambda e: e.chief / e.pupil_scale_mm),
+        film_scale_mm=1 / of(lambda e: 1 / e.film_scale_mm),
+        pupil_scale_mm=pupil_scale,
+    )
+
+
+def mix(values: Sequence[Any], weights: Array) -> Any:
+    """Weighted sum of float arrays wherever they stand in equal structures of dataclasses and tuples.
+
+    Raises:
+        InputError: structures that differ in anything but those numbers.
+    """
+    first = values[0]
+    if isinstance(first, np.ndarray) and first.dtype.kind == "f":
+        if any(v.shape != first.shape for v in values):
+            raise InputError("state model", "nodes", [v.shape for v in values], "arrays of one shape")
+        return np.einsum("k,k...->...", weights, np.stack(values))
+    if is_dataclass(first) and not isinstance(first, type):
+        names = [f.name for f in fields(first)]
+        return replace(first, **{n: mix([getattr(v, n) for v in values], weights) for n in names})
+    if isinstance(first, tuple):
+        if any(len(v) != len(first) for v in values):
+            raise InputError("state model", "nodes", [len(v) for v in values], "tuples of one length")
+        return tuple(mix([v[i] for v in values], weights) for i in range(len(first)))
+    if not all(np.array_equal(v, first) for v in values):
+        raise InputError("state model", "nodes", f"({type(first).__name__})", "the same at every node")
+    return first

@@ -1,1 +1,0 @@
-"""Models of many states: zoom and internal focus as one more input."""

@@ -1,0 +1,306 @@
+"""Pinhole, thin lens, thick lens and fisheye projections against closed forms."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import lens_models
+import numpy as np
+import pytest
+from camera_helpers import FILM, GAUSS, ROOT, at, camera, differences, film_rays, film_value, jittered
+
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
+from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.ideal import ThickLens, ThinLens
+from neurolens.cameras.pinhole import PROJECTIONS, Fisheye, Pinhole
+from neurolens.cameras.sampling import concentric_disk
+from neurolens.optics.apertures import Aperture
+from neurolens.optics.film_plane import film_z_mm
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.radiometry import disc_irradiance
+
+
+def square_grid(side: int) -> np.ndarray:
+    """Centres of a side x side grid on the unit square, [2, side^2] float32."""
+    u = (np.arange(side) + 0.5) / side
+    return np.stack(np.meshgrid(u, u)).reshape(2, -1).astype(np.float32)
+
+
+def test_disk_map_is_uniform() -> None:
+    disk = concentric_disk(square_grid(200))
+    radius2 = np.sum(disk**2, axis=0)
+    assert radius2.max() <= 1.0
+    assert abs(radius2.mean() - 0.5) < 1e-3
+    for radius in (0.2, 0.5, 0.8):
+        assert abs(np.mean(radius2 < radius**2) - radius**2) < 5e-3
+    assert np.all(concentric_disk(np.full((2, 1), 0.5, np.float32)) == 0)
+
+
+@pytest.mark.parametrize("film", [(0.0, 0.0), (10.0, -5.0), (-18.0, 12.0)])
+@pytest.mark.parametrize("focus_m", [0.3, 2.0, 30.0])
+def test_thin_lens_rays_of_a_film_point_meet_at_the_focus_distance(film: tuple[float, float], focus_m: float) -> None:
+    camera = ThinLens(50.0, 1.8, focus_m)
+    pupil = square_grid(16)
+    rays = camera.sample(at(film, pupil.shape[1]), pupil, np.full(pupil.shape[1], 550, np.float32))
+    along = (-focus_m - rays.origin_m[2]) / rays.direction[2]
+    met = rays.origin_m + along * rays.direction
+    magnification = (1e3 * focus_m - camera.image_distance_mm) / camera.image_distance_mm
+    expected = np.array([-film[0] * magnification, -film[1] * magnification]) * 1e-3
+    assert np.abs(met[:2] - expected[:, None]).max() < 4e-7 * max(1.0, magnification)
+    assert np.allclose(np.sum(rays.direction**2, axis=0), 1, atol=1e-6)
+    assert np.all(rays.status == 0)
+    assert rays.origin_m.dtype == rays.direction.dtype == rays.weight.dtype == np.float32
+
+
+def test_thin_lens_at_infinity_gives_parallel_rays_towards_the_upside_down_scene() -> None:
+    camera = ThinLens(50.0, 2.0, math.inf)
+    pupil = square_grid(8)
+    rays = camera.sample(at((10.0, 5.0), 64), pupil, np.full(64, 550, np.float32))
+    assert np.ptp(rays.direction, axis=1).max() == 0
+    assert rays.direction[0, 0] < 0 and rays.direction[1, 0] < 0 and rays.direction[2, 0] < 0
+    assert np.allclose(rays.direction[:2, 0] / rays.direction[2, 0], [10 / 50, 5 / 50], atol=1e-6)
+
+
+def test_conjugate_distances_obey_the_lens_equation() -> None:
+    for focus_m in (0.2, 0.5, 3.0, 1e6):
+        image = film_z_mm(50.0, 0.0, 0.0, focus_m)
+        assert 1 / image + 1 / (1e3 * focus_m - image) == pytest.approx(1 / 50.0, rel=1e-12)
+
+
+def test_weight_is_one_on_the_axis_and_the_fourth_power_of_the_cosine_off_it() -> None:
+    pupil = square_grid(64)
+    wavelength = np.full(pupil.shape[1], 550, np.float32)
+    for lens in (ThinLens(50.0, 1.4, 1.0), ThinLens(50.0, 22.0, math.inf), Pinhole(50.0)):
+        axis = lens.sample(at((0.0, 0.0), pupil.shape[1]), pupil, wavelength)
+        assert axis.weight.mean() == pytest.approx(1, abs=2e-4)
+    for narrow in (ThinLens(50.0, 64.0, math.inf), Pinhole(50.0)):
+        corner = narrow.sample(at((18.0, 12.0), pupil.shape[1]), pupil, wavelength)
+        assert corner.weight.mean() == pytest.approx(math.cos(math.atan(math.hypot(18, 12) / 50)) ** 4, rel=1e-3)
+
+
+RETROFOCUS = ROOT / "lenses" / "angenieux_retrofocus_35.toml"
+TELEPHOTO = ROOT / "lenses" / "sigler_telephoto_100.toml"
+
+
+def made(path: Path, focus_m: float = 2.0, **change: object) -> ThickLens:
+    camera = make_camera(f"thick:{path}", Shot(FILM, focus_m, **change))  # type: ignore[arg-type]
+    assert isinstance(camera, ThickLens)
+    return camera
+
+
+def test_with_planes_and_pupil_together_it_is_the_thin_lens() -> None:
+    thin = ThinLens(50.0, 1.8, 0.7, FILM)
+    thick = ThickLens(50.0, 1.8, 0.7, FILM)
+    rays = film_rays(thin, 2000)
+    a, b = thin.sample(*rays), thick.sample(*rays)
+    np.testing.assert_allclose(a.direction, b.direction, atol=1e-6)
+    np.testing.assert_allclose(a.origin_m, b.origin_m, atol=1e-7)
+    np.testing.assert_allclose(a.weight, b.weight, rtol=1e-5)
+
+
+@pytest.mark.parametrize("path", [GAUSS, RETROFOCUS, TELEPHOTO])
+def test_rays_of_a_film_point_meet_at_the_focus_distance_and_fill_the_entrance_pupil(path: Path) -> None:
+    focus_m, height = 2.0, 9.0
+    camera = made(path, focus_m)
+    square, wavelength = jittered(24)
+    rays = camera.sample(at((height, 0.0), 576), square, wavelength)
+    t = (-focus_m - rays.origin_m[2]) / rays.direction[2]
+    met = rays.origin_m[:2] + t * rays.direction[:2]
+    lens = read_lens(path).at(focus_m=focus_m)
+    data = first_order(lens)
+    assert lens.film_z_mm is not None
+    image = lens.film_z_mm - data.rear_principal_z_mm
+    separation = data.rear_principal_z_mm - data.front_principal_z_mm
+    magnification = (1e3 * focus_m - separation - image) / image
+    assert met[0] == pytest.approx(-1e-3 * height * magnification, rel=2e-4) and np.abs(met[1]).max() < 2e-5
+    # On the plane of the entrance pupil the same rays fill its disc.
+    t = (1e-3 * (data.entrance_pupil_z_mm - lens.film_z_mm) - rays.origin_m[2]) / rays.direction[2]
+    place = 1e3 * (rays.origin_m[:2] + t * rays.direction[:2])
+    radius = np.hypot(*place)
+    assert radius.max() == pytest.approx(data.entrance_pupil_diameter_mm / 2, rel=0.01)
+    assert np.mean(radius**2) == pytest.approx((data.entrance_pupil_diameter_mm / 2) ** 2 / 2, rel=0.02)
+
+
+@pytest.mark.parametrize("path", [GAUSS, RETROFOCUS, TELEPHOTO])
+def test_light_falls_off_as_that_of_the_exit_pupil(path: Path) -> None:
+    """The irradiance of a uniform disc, at any height (Foote 1915), is that of the paraxial exit pupil."""
+    camera = made(path, math.inf)
+    data = first_order(read_lens(path).at(focus_m=math.inf))
+    distance = data.rear_focal_z_mm - data.exit_pupil_z_mm
+    heights = np.array([0.0, 10.0, 20.0])
+    light = disc_irradiance(data.exit_pupil_diameter_mm / 2, distance, heights)
+    found = [film_value(camera, (h, 0.0)) for h in heights]
+    assert found == pytest.approx(light / light[0], abs=2e-4)
+
+
+def test_a_telecentric_lens_has_no_falloff() -> None:
+    """An entrance pupil in the front focal plane: every film point sees the same cone."""
+    camera = ThickLens(50.0, 2.8, math.inf, FILM, principal_z_mm=(0.0, 20.0), entrance_pupil_z_mm=-50.0)
+    assert [film_value(camera, p) for p in ((0.0, 0.0), (15.0, 10.0))] == pytest.approx([1, 1], abs=2e-4)
+
+
+def test_differentials_of_a_thick_lens_are_finite_differences() -> None:
+    camera = made(RETROFOCUS)
+    film, square, wavelength = film_rays(camera, 500)
+    moves = camera.sample_differentials(film, square, wavelength).differentials
+    assert moves is not None
+    found = np.concatenate([moves.origin_m, moves.direction])
+    np.testing.assert_allclose(found, differences(camera, film, square, wavelength, 0.25), atol=3e-6)
+
+
+def test_thick_lens_and_exact_lens_see_the_same_to_first_order() -> None:
+    """Near the axis their rays meet at the same place, and the light is the same."""
+    thick, exact = (camera(kind) for kind in ("thick", "exact"))
+    square, wavelength = jittered(16)[0], np.full(256, 587.6, np.float32)
+    lines = []
+    for lens in (thick, exact):
+        rays = lens.sample(at((1.0, 0.5), 256), square, wavelength)
+        passed = rays.status == st.PASSED
+        t = (-2.0 - rays.origin_m[2]) / rays.direction[2]
+        lines.append((rays.origin_m + t * rays.direction)[:2, passed].mean(1))
+    assert lines[0] == pytest.approx(lines[1], rel=5e-3)
+    assert film_value(thick, (1.0, 0.5)) == pytest.approx(film_value(exact, (1.0, 0.5)), abs=2e-3)
+
+
+def test_shapes_of_the_stop_keep_the_exposure() -> None:
+    camera = made(GAUSS, aperture=Aperture(blades=5))
+    assert film_value(camera, (0.0, 0.0)) == pytest.approx(1, abs=5e-3)
+    square, wavelength = jittered(128)
+    passed = camera.sample(at((3.0, 0.0), 128 * 128), square, wavelength).status == st.PASSED
+    assert passed.mean() == pytest.approx(2.5 * math.sin(math.radians(72)) / math.pi, abs=0.01)
+
+
+def test_settings_are_those_of_the_lens_in_its_state() -> None:
+    camera = made(GAUSS, f_number=4.0, efl_mm=35.0)
+    assert camera.settings["efl_mm"] == pytest.approx(35) and camera.settings["f_number"] == pytest.approx(4)
+    assert camera.settings["lens"]["sha256"] == lens_models.lens().at(focal_length_mm=35.0).sha256
+
+
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: ThinLens(50.0, 1.8, 0.19), "focus_m"),
+        (lambda: ThinLens(-50.0, 1.8, 2.0), "focal_mm"),
+        (lambda: ThinLens(50.0, 0.0, 2.0), "f_number"),
+        (lambda: ThinLens(50.0, 2.0, math.nan), "focus_m"),
+        (lambda: Pinhole(math.inf), "focal_mm"),
+        (lambda: Pinhole(50.0, (36.0, 0.0)), "film_mm height"),
+        (lambda: made(ROOT / "lenses" / "cooke_anamorphic_42.toml"), "cylinders"),
+        (lambda: make_camera("thick:absent.toml", Shot(FILM, 2.0)), "absent.toml"),
+        (lambda: make_camera("thick:model.onnx", Shot(FILM, 2.0)), "camera"),
+        (lambda: make_camera(f"thick:{GAUSS}", Shot(FILM, 2.0, pupil="boxes")), "pupil"),
+        (lambda: ThickLens(50.0, 2.0, 0.1), "focus_m"),
+        (lambda: ThickLens(50.0, 2.0, 2.0, entrance_pupil_z_mm=math.nan), "entrance_pupil_z_mm"),
+        (lambda: ThickLens(50.0, 2.0, 2.0, principal_z_mm=(0.0, math.inf)), "principal_z_mm"),
+        (lambda: ThickLens(50.0, 2.0, 2.0, film_at_mm=-1.0), "film_at_mm"),
+        # With x' = 50 the exit pupil of an entrance pupil at x = -50 lies in the film.
+        (lambda: ThickLens(50.0, 2.0, 0.2, entrance_pupil_z_mm=-100.0), "exit pupil"),
+    ],
+)
+def test_bad_arguments_are_named(make: object, field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        make()  # type: ignore[operator]
+
+
+FOCAL = 10.0
+# Film radius in focal lengths, angle in degrees.
+PLACES = {
+    "equidistant": [(math.pi / 4, 45), (math.pi / 2, 90), (2.5, math.degrees(2.5))],
+    "equisolid": [(2 * math.sin(math.pi / 8), 45), (math.sqrt(2), 90), (math.sqrt(3), 120)],
+    "stereographic": [(2 * math.tan(math.pi / 8), 45), (2, 90), (2 * math.sqrt(3), 120)],
+    "orthographic": [(math.sqrt(0.5), 45), (0.5, 30), (math.sqrt(0.75), 60)],
+}
+
+
+def sample(camera: Fisheye, film: np.ndarray):  # noqa: ANN201
+    return camera.sample(film.astype(np.float32), np.zeros((2, film.shape[1]), np.float32), np.zeros(film.shape[1]))
+
+
+@pytest.mark.parametrize("name", PROJECTIONS)
+def test_known_angles_at_known_places(name: str) -> None:
+    radius, degrees = np.array(PLACES[name]).T
+    film = FOCAL * radius * np.array([[0.6], [-0.8]])
+    rays = sample(Fisheye(name, FOCAL), film)
+    angle = np.degrees(np.arctan2(np.hypot(*rays.direction[:2]), -rays.direction[2]))
+    assert angle == pytest.approx(degrees, rel=1e-5)
+    # The camera looks along -z, and the picture stands on its head.
+    assert (rays.direction[0] < 0).all() and (rays.direction[1] > 0).all()
+    assert (rays.status == st.PASSED).all()
+
+
+@pytest.mark.parametrize("name", PROJECTIONS)
+def test_weight_is_that_of_etendue(name: str) -> None:
+    """E / E(axis) = c f^2 dOmega / dA, the solid angle of a patch of film by differences of its rays' directions."""
+    camera = Fisheye(name, FOCAL, (200.0, 200.0))
+    rng = np.random.default_rng(0)
+    edge = FOCAL * min(0.97 * camera.projection.end, 8.0)
+    radius, azimuth = edge * rng.random(400), 2 * math.pi * rng.random(400)
+    film = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth)]).astype(np.float32)
+    rays = sample(camera, film)
+    slopes = differences(camera, film, film, film[0], 0.02)[3:]
+    solid = FOCAL**2 * np.linalg.norm(np.cross(slopes[:, 0].T, slopes[:, 1].T), axis=1)
+    foreshortening = -rays.direction[2] if name == "orthographic" else 1
+    assert rays.weight == pytest.approx(foreshortening * solid, abs=2e-3)
+    assert sample(camera, np.zeros((2, 1))).weight[0] == 1
+
+
+def test_laws_of_the_falloff() -> None:
+    theta = np.radians([20.0, 60.0, 89.0, 130.0])
+    laws = {"equidistant": np.sin(theta) / theta, "equisolid": 1 + 0 * theta, "stereographic": np.cos(theta / 2) ** 4}
+    for name, law in laws.items():
+        radius = FOCAL * PROJECTIONS[name].radius(theta)
+        assert sample(Fisheye(name, FOCAL), np.stack([radius, 0 * radius])).weight == pytest.approx(law, abs=1e-5)
+
+
+def test_film_beyond_the_projection_is_dark() -> None:
+    for name, end in (("equidistant", math.pi), ("equisolid", 2.0), ("orthographic", 1.0)):
+        rays = sample(Fisheye(name, FOCAL), FOCAL * end * np.array([[0.999, 1.001, 50.0], [0.0, 0.0, 50.0]]))
+        assert rays.status.tolist() == [st.PASSED, st.OUTSIDE_DOMAIN, st.OUTSIDE_DOMAIN]
+        assert (rays.weight[1:] == 0).all() and np.linalg.norm(rays.direction, axis=0) == pytest.approx(1, abs=1e-6)
+    # A stereographic film has no end: it sees all but what lies straight behind.
+    assert sample(Fisheye("stereographic", FOCAL), np.full((2, 1), 1e4)).status[0] == st.PASSED
+    half = Fisheye("equidistant", FOCAL, field_deg=90.0)
+    assert sample(half, FOCAL * np.array([[0.78, 0.79], [0.0, 0.0]])).status.tolist() == [0, st.OUTSIDE_DOMAIN]
+
+
+@pytest.mark.parametrize("name", PROJECTIONS)
+def test_differentials_of_a_fisheye_are_finite_differences(name: str) -> None:
+    camera = Fisheye(name, FOCAL)
+    rng = np.random.default_rng(0)
+    film = (rng.random((2, 300)) * 12 - 6).astype(np.float32)
+    film[:, 0] = 0
+    moves = camera.sample_differentials(film, film, film[0]).differentials
+    assert moves is not None
+    found = np.concatenate([moves.origin_m, moves.direction])
+    np.testing.assert_allclose(found, differences(camera, film, film, film[0], 0.02), atol=2e-5)
+
+
+def test_field_sets_the_circle_within_the_film() -> None:
+    camera = make_camera("fisheye-equisolid", Shot((36.0, 24.0), 1.0, field_deg=200.0))
+    assert isinstance(camera, Fisheye)
+    rays = sample(camera, np.array([[0.0, 0.0], [11.999, 12.001]]))
+    assert rays.status.tolist() == [st.PASSED, st.OUTSIDE_DOMAIN]
+    assert math.degrees(math.acos(-rays.direction[2, 0])) == pytest.approx(100, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("spec", "change", "field"),
+    [
+        ("fisheye-equal", {}, "camera"),
+        ("fisheye-equidistant", {"zoom": 50.0}, "zoom"),
+        ("fisheye-equidistant", {"focus": "best"}, "focus"),
+        ("fisheye-equidistant", {"field_deg": 361.0}, "field_deg"),
+        ("fisheye-orthographic", {"field_deg": 181.0}, "field_deg"),
+        ("fisheye-equisolid", {"field_deg": 90.0, "efl_mm": 8.0}, "efl_mm"),
+        ("fisheye-equisolid", {"efl_mm": math.inf}, "focal_mm"),
+        ("fisheye-equisolid", {"pupil": "boxes"}, "pupil"),
+    ],
+)
+def test_bad_settings_are_named(spec: str, change: dict[str, object], field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        make_camera(spec, Shot((36.0, 24.0), 1.0, **change))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="projection"):
+        Fisheye("fish", 10.0)

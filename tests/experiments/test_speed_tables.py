@@ -1,0 +1,207 @@
+"""What the benches on the clock prepare and compute of known times; no clock is judged."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import lens_models
+import numpy as np
+import pytest
+import torch
+
+from experiments import lab
+from experiments.__main__ import main
+from experiments.fused_speed import ray_candidate
+from experiments.mitsuba_speed import STAGES, Row, Settings, film_mm, profile, record
+from experiments.trace_speed import (
+    ASPHERIC_SURFACES,
+    LENSES,
+    MAIN,
+    chosen_lenses,
+    film_rays,
+    launched,
+    memory_of,
+    with_aspheres,
+)
+from neurolens.base import status as st
+from neurolens.cameras.contract import CameraRays, FloatArray
+from neurolens.cameras.model import load_model
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.evaluate.candidates import CompiledSource, find_compiler, fused_candidate
+from neurolens.evaluate.describe import refractions
+from neurolens.evaluate.speed import Unavailable, race
+from neurolens.graph.program import SCENE_RAY
+from neurolens.graph.scalars import lower
+from neurolens.optics.pupils import camera_rays
+from neurolens.optics.trace import trace
+from neurolens.optics.tracegraph import exact_graph
+from neurolens.render.scene import scene_from_tables
+from neurolens.surrogates.assemble import RAY_ONLY
+from neurolens.surrogates.domain import sample_domain
+
+SETTINGS = Settings(size=100, samples=4, threads=2, repeats=3)
+
+
+def row(seconds: list[float], pictures: list[FloatArray]) -> Row:
+    return Row(
+        "name", "RGB", "pinhole", lambda seed: pictures[0], np.ones((1, 1, 1), np.float32), 9.0, seconds, pictures
+    )
+
+
+def test_figures_of_known_times_and_pictures() -> None:
+    base = row([0.4, 0.2, 0.3], [np.full((2, 2, 3), v, np.float32) for v in (1, 2, 3)])
+    found = record(row([0.5, 0.6, 0.7], base.pictures), SETTINGS, base)
+    assert found["mpaths_per_s"] == pytest.approx(40_000 / 0.5 * 1e-6)
+    assert found["mpaths_per_s_median"] == pytest.approx(40_000 / 0.6 * 1e-6)
+    assert found["time_over_ours"] == pytest.approx(0.6 / 0.3)
+    assert found["mean_rgb"] == pytest.approx([2, 2, 2])
+    assert found["noise"] == pytest.approx(1 / np.mean([1, 4, 9]))  # variance 1 over the mean square
+
+
+def test_the_first_picture_is_kept_apart_and_white_is_taken_out() -> None:
+    made = Row("name", "RGB", "pinhole", lambda seed: np.full((2, 2, 3), seed, np.float32), np.float32(0.5))  # type: ignore[arg-type]
+    for seed in range(3):
+        made.run(seed)
+    assert len(made.seconds) == 2 and made.first_s > 0
+    assert [p.mean() for p in made.pictures] == [2, 4]
+
+
+def test_the_film_sees_what_a_field_of_90_degrees_does() -> None:
+    assert film_mm({"sensor": {"fov": 90}}) == pytest.approx((100, 100))  # 50 mm behind the hole
+
+
+class Slow(Pinhole):
+    """A camera that takes longer than all the rest."""
+
+    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        np.linalg.svd(np.ones((600, 600)))
+        return super().sample(film_mm, pupil, wavelength_nm)
+
+
+def test_a_slow_camera_is_what_takes_the_time() -> None:
+    camera = {"position_m": [0, 1, 0], "look_at_m": [0, 1, -1], "focus_m": 2, "film_width_mm": 32, "film_height_mm": 18}
+    tables = {"camera": camera, "materials": {"grey": {"kind": "diffuse", "reflectance": [0.5, 0.5, 0.5]}}}
+    tables |= {"planes": [{"point_m": [0, 0, 0], "normal": [0, 1, 0], "material": "grey"}]}
+    tables |= {"environment": {"colour": [1, 1, 1]}}
+    scene = scene_from_tables(tables)
+    fast, slow = (profile(scene, kind(20, (32, 18)), 32, 18, 4) for kind in (Pinhole, Slow))
+    for shares in (fast, slow):
+        assert set(shares) == set(STAGES) and min(shares.values()) >= 0
+        assert sum(shares.values()) == pytest.approx(1)
+    assert fast["camera"] < 0.3 and fast["intersection"] > 0 and fast["random numbers"] > 0
+    assert slow["camera"] > 0.6
+
+
+FOLDER = Path(__file__).parents[2] / "lenses"
+
+
+def test_lenses_have_the_refractions_that_the_table_says() -> None:
+    lenses, missing = chosen_lenses(FOLDER)
+    assert missing == []
+    assert set(lenses) == set(LENSES)
+    for count, lens in lenses.items():
+        # The anamorphic zoom's table leaves its last plane to the reader.
+        assert refractions(lens) in (count, count - 1)
+    assert refractions(lenses[MAIN]) == MAIN
+    assert sum(s.cylinder is not None for s in lenses[57].surfaces) > 2
+
+
+def test_two_aspheres_change_the_rays_and_little_else() -> None:
+    plain = chosen_lenses(FOLDER)[0][MAIN]
+    aspheric = with_aspheres(plain)
+    changed = [k for k, s in enumerate(aspheric.surfaces) if s.asphere]
+    assert changed == list(ASPHERIC_SURFACES)
+    assert [p for p, _ in aspheric.surfaces[changed[0]].asphere] == [4, 6, 8, 10]
+    rays = launched(plain, film_rays(plain, 4096), torch.float64)
+    a, b = trace(plain, *rays), trace(aspheric, *rays)
+    both = (a.status == 0) & (b.status == 0)
+    assert both.sum() > 0.7 * (a.status == 0).sum() > 100
+    assert 1e-2 < (a.rays.x - b.rays.x)[both].abs().max() < 3.0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rays_have_wavelengths_of_their_own(dtype: torch.dtype) -> None:
+    lens = chosen_lenses(FOLDER)[0][MAIN]
+    rays, wavelength = launched(lens, film_rays(lens, 1000), dtype)
+    assert {c.dtype for c in (*rays, wavelength)} == {dtype}
+    assert all(c.is_contiguous() for c in rays)
+    assert 400 <= wavelength.min() < 410 and 690 < wavelength.max() <= 700
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_memory_is_measured_in_a_child() -> None:
+    found = lab.in_child(memory_of, str(FOLDER / "laikin_double_gauss_50.toml"), 100_000)
+    assert found["rays"] == 100_000
+    assert found["results_mb"] == pytest.approx(2.8)
+
+
+@pytest.mark.slow
+def test_a_child_that_fails_says_why() -> None:
+    with pytest.raises(lab.Unmeasured, match="none.toml"):
+        lab.in_child(memory_of, str(FOLDER / "none.toml"), 10)
+
+
+def test_a_lens_that_is_not_there_is_one_clear_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["trace", "--quick", "--only", "zeiss", "--out", str(tmp_path)]) == 2
+    shown = capsys.readouterr().err.strip()
+    assert "--only" in shown and "laikin" in shown and "\n" not in shown
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_exact_graph_is_the_exact_trace() -> None:
+    lens, domain = lens_models.lens(), lens_models.domain()
+    s = sample_domain(domain, 20_000, 3)
+    s = replace(s, film_z=torch.full_like(s.film_z, domain.film_z_mm[0]))
+    rays = camera_rays(s.film_x, s.film_y, s.film_z, s.pupil_x, s.pupil_y, domain.pupil_z_mm)
+    exact = trace(lens, rays, s.wavelength_nm, transmittance=True)
+    columns = {"film_x_mm": s.film_x, "film_y_mm": s.film_y, "pupil_x_mm": s.pupil_x, "pupil_y_mm": s.pupil_y}
+    inputs = {k: v.numpy() for k, v in columns.items()} | {"wavelength_nm": s.wavelength_nm.numpy()}
+    inputs |= {"film_z_mm": domain.film_z_mm[0], "stop_radius_mm": lens.stop_radius_mm}
+    found = lower(exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm)).evaluate(inputs)
+    status = exact.status.numpy()
+    assert np.mean(found["status"] != status) < 1e-4 and len(np.unique(status)) > 3
+    passed = (status == st.PASSED) & (found["status"] == st.PASSED)
+    for name, column in zip(SCENE_RAY, exact.rays, strict=True):
+        assert np.abs(found[name] - column.numpy())[passed].max() < 1e-4
+    assert exact.transmittance is not None
+    assert np.abs(found["transmittance"] - exact.transmittance.numpy())[passed].max() < 1e-5
+    alone = lower(exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=False)).evaluate(inputs)
+    assert np.array_equal(alone["dx"][passed], found["dx"][passed]) and "transmittance" not in alone
+
+
+def test_candidates_time_models_and_files() -> None:
+    try:
+        find_compiler()
+    except Unavailable as reason:
+        pytest.skip(f"the C form is not timed here: {reason}")
+    model = lens_models.model("invariants")
+    candidate = fused_candidate("fused", model, model.domain, parts=RAY_ONLY)
+    assert candidate is not None
+    timing = race([candidate], model.domain, rounds=1).timing("fused")
+    assert timing is not None and 0 < timing["min"] < 1e4
+    assert fused_candidate("x", lens_models.exported("invariants"), model.domain) is not None
+
+
+def test_the_part_of_a_graph_that_gives_rays_gives_the_same() -> None:
+    file, domain = lens_models.exported("invariants"), lens_models.domain()
+    rays = sample_domain(domain, 500, 3)
+    rays = replace(rays, film_z=torch.full_like(rays.film_z, domain.film_z_mm[0]))
+    (found,) = ray_candidate("ray", file).prepare(rays)()  # type: ignore[misc]
+    columns = [c.numpy().astype(np.float32) for c in rays.columns()]
+    whole = load_model(file).rays(np.stack(columns[0:2]), np.stack(columns[3:5]), columns[5], float(columns[2][0]))
+    assert (whole.status == st.PASSED).sum() > 100 and np.abs(found - whole.scene_ray).max() < 1e-5
+
+
+def test_without_a_compiler_or_coefficients_there_is_no_candidate(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    model = lens_models.model("invariants")
+    assert fused_candidate("x", tmp_path / "no.onnx", model.domain) is None
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("CC", "")
+    assert fused_candidate("x", model, model.domain) is None
+    with pytest.raises(Unavailable, match="no C compiler"):
+        CompiledSource(lower(exact_graph(lens_models.lens(), 0.0, (400.0, 700.0))))

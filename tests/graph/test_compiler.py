@@ -1,0 +1,88 @@
+"""Compiled libraries: kept for the next time, never taken from a folder that others can write to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from neurolens.base.errors import InputError
+from neurolens.graph import compiler
+
+SOURCE = "int answer(void) { return 42; }\n"
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    try:
+        compiler.find_compiler()
+    except InputError as reason:
+        pytest.skip(f"nothing is compiled here: {reason}")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+
+def test_compiled_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert compiler.load_compiled(SOURCE).answer() == 42
+    (library,) = (tmp_path / "neurolens").glob("*.so")
+    assert (tmp_path / "neurolens").stat().st_mode & 0o077 == 0 and library.stat().st_mode & 0o077 == 0
+    monkeypatch.setattr(compiler, "compile_c", None)  # not called again
+    assert compiler.load_compiled(SOURCE).answer() == 42
+
+
+def test_other_sources_flags_and_compilers_make_other_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiler.load_compiled(SOURCE)
+    assert compiler.load_compiled(SOURCE.replace("42", "43")).answer() == 43
+    first = compiler._key(SOURCE)
+    monkeypatch.setattr(compiler, "FLAGS", ("-std=c99", "-O1"))
+    assert compiler._key(SOURCE) != first
+
+
+def test_a_folder_open_to_others_is_not_used(tmp_path: Path) -> None:
+    folder = tmp_path / "neurolens"
+    folder.mkdir()
+    folder.chmod(0o777)
+    assert compiler.load_compiled(SOURCE).answer() == 42
+    assert not list(folder.iterdir())
+
+
+def test_libraries_that_are_damaged_or_of_others_are_made_anew(tmp_path: Path) -> None:
+    compiler.load_compiled(SOURCE)
+    (library,) = (tmp_path / "neurolens").glob("*.so")
+    kept, good = tmp_path / "kept.so", library.read_bytes()
+    library.unlink()  # in use: a new file, not new bytes
+    library.write_bytes(good[:100])
+    assert compiler.load_compiled(SOURCE).answer() == 42
+    kept.write_bytes(good)
+    library.unlink()
+    library.symlink_to(kept)
+    assert compiler.load_compiled(SOURCE).answer() == 42 and not library.is_symlink()
+
+
+@pytest.mark.parametrize("text", ["not a program", "#!/bin/sh\nexit 0\n", "#!/bin/sh\nprintf '\\377' >&2\nexit 1\n"])
+def test_what_is_no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, text: str) -> None:
+    odd = tmp_path / "odd"
+    odd.write_text(text)
+    odd.chmod(0o700)
+    monkeypatch.setenv("CC", str(odd))
+    with pytest.raises(InputError, match="a C compiler"):
+        compiler.load_compiled(SOURCE)
+    assert not list((tmp_path / "neurolens").iterdir())
+
+
+def test_no_compiler_and_one_that_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="error"):
+        compiler.load_compiled("this is no C\n")
+    assert not list((tmp_path / "neurolens").iterdir())
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("CC", "")
+    with pytest.raises(InputError, match="a C compiler"):
+        compiler.load_compiled(SOURCE)
+
+
+def test_a_compiler_may_have_arguments_and_must_be_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", f"{compiler.find_compiler()} -DANSWER=43")
+    assert compiler.load_compiled(SOURCE.replace("42", "ANSWER")).answer() == 43
+    for missing in ("no-such-compiler", "'unclosed"):
+        monkeypatch.setenv("CC", missing)
+        with pytest.raises(InputError, match="CC"):
+            compiler.load_compiled(SOURCE)

@@ -1,0 +1,167 @@
+"""Operators of graphs: derivatives against central differences, one rule an operator; torch and C against numpy."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neurolens.base.errors import InputError
+from neurolens.graph import derive
+from neurolens.graph.c import write_c
+from neurolens.graph.compiler import compile_c
+from neurolens.graph.derive import derivative, with_derivatives
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph, Value
+from neurolens.graph.passes import pruned
+from neurolens.graph.program import row_names
+from neurolens.graph.scalars import lower
+
+Array = np.ndarray
+RNG = np.random.default_rng(0)
+W, CHANGE = RNG.normal(size=(2, 4, 3))
+EXPONENTS = np.array([[0, 0, 0], [1, 0, 0], [2, 1, 0], [0, 3, 1], [0, 0, 2]])
+COEFFICIENTS = RNG.normal(size=(2, len(EXPONENTS)))
+FORMS = [((0, 0), (1, 1)), ((0, 2), (1, 1), (2, 1)), ((1, 2),)]
+
+# Of x (3 rows, from 0.3 to 1.4, no two of a ray close), y (3 rows, likewise), and s of the call.
+CASES: dict[str, Callable[[Graph, Value, Value, Value], Value]] = {
+    "take": lambda g, x, y, s: x[[2, 0, 0]] * y,
+    "concat": lambda g, x, y, s: g.concat(x[1], s, x * y),
+    "affine": lambda g, x, y, s: g.affine(W, x * x, W[:, 0]),
+    "affine of an input": lambda g, x, y, s: g.affine(W, x, W[:, 0]),
+    "affine with a part that follows the call": lambda g, x, y, s: g.affine(W, x * y, moving=(s, CHANGE)),
+    "affine of an input that follows the call": lambda g, x, y, s: g.affine(W, x, moving=(s * s, CHANGE)),
+    "affine and added rows": lambda g, x, y, s: g.affine(W, y, added=g.affine(CHANGE, x * x)),
+    "quadratic": lambda g, x, y, s: g.quadratic(x * y, FORMS, [1.0, 2.0, 3.0]),
+    "quadratic of an input": lambda g, x, y, s: g.quadratic(x, FORMS),
+    "quadratic of what follows the call": lambda g, x, y, s: g.quadratic(g.affine(W, x, moving=(s, CHANGE)), FORMS),
+    "polynomial": lambda g, x, y, s: g.polynomial(EXPONENTS, COEFFICIENTS, x * y),
+    "series": lambda g, x, y, s: g.series(x * y, [1.0, -2.0, 0.5, 0.25]),
+    "series of one": lambda g, x, y, s: g.series(x, [1.0, -2.0]),
+    "add": lambda g, x, y, s: x + y * x,
+    "sub": lambda g, x, y, s: s - x * y,
+    "mul": lambda g, x, y, s: x * y * s,
+    "square": lambda g, x, y, s: x * x,
+    "div": lambda g, x, y, s: x / (y + s),
+    "neg": lambda g, x, y, s: -(x * y),
+    "sqrt": lambda g, x, y, s: (x * y).sqrt(),
+    "tanh": lambda g, x, y, s: (x - y).tanh(),
+    "abs": lambda g, x, y, s: (x - y).abs(),
+    "max": lambda g, x, y, s: (x * x).maximum(y * y),
+    "min": lambda g, x, y, s: (x * x).minimum(y * y),
+    "clip": lambda g, x, y, s: (x * y).clip(0.4, 0.9),
+    "select": lambda g, x, y, s: g.select(x <= y, x * x, y * s),
+    "select by several": lambda g, x, y, s: g.select((x <= y) & x.between(0.5, 1.2), x * y, 3.0),
+    "constant": lambda g, x, y, s: g.constant([1.0, 2.0]) + s * 0.0,
+}
+
+
+def graph_of(name: str) -> Graph:
+    g = Graph()
+    g.outputs["out"] = CASES[name](g, g.input("x", 3), g.input("y", 3), g.input("s", per_call=True))
+    return g
+
+
+def inputs(count: int = 400) -> dict[str, Array]:
+    """Numbers apart from those at which choices change."""
+    x, y = np.random.default_rng(1).uniform(0.3, 1.4, (2, 3, 8 * count))
+    edges = [np.abs(x - y), np.abs(x * x - y * y), *(np.abs(x * y - e) for e in (0.4, 0.9))]
+    edges += [np.abs(x - e) for e in (0.5, 1.2)]
+    far = (np.min(edges, axis=0) > 2e-3).all(0)
+    return {"x": x[:, far][:, :count], "y": y[:, far][:, :count], "s": np.array([[0.7]])}
+
+
+def test_every_rule_is_tested() -> None:
+    assert {kind for kind in derive._RULES if kind not in CASES} == set()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_derivatives_are_those_of_central_differences(name: str) -> None:
+    graph, given, step = graph_of(name), inputs(), 1e-5
+    directions = [("x", 0), ("x", 2), ("y", 1), ("s", 0)]
+    found = evaluate(with_derivatives(graph, ["out"], directions), given)
+    value = evaluate(graph, given)["out"]
+    np.testing.assert_allclose(found["out"] + 0 * value, value, rtol=1e-14, atol=0)
+    for by, row in directions:
+        move = np.zeros((given[by].shape[0], 1))
+        move[row] = step
+        ahead, behind = (evaluate(graph, given | {by: given[by] + k * move})["out"] for k in (1, -1))
+        slope = found[derivative("out", row_names(by, len(move))[row])]
+        np.testing.assert_allclose(slope + 0 * value, (ahead - behind) / (2 * step) + 0 * value, rtol=0, atol=2e-8)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_torch_and_single_steps_give_what_numpy_gives(name: str) -> None:
+    """In float64 torch to the last bits, and its gradients; the program in float32."""
+    graph, given = graph_of(name), inputs()
+    wanted = evaluate(graph, given)["out"]
+    tensors = {k: torch.from_numpy(v).requires_grad_() for k, v in given.items()}
+    found = evaluate(graph, tensors)["out"]
+    np.testing.assert_allclose(found.detach().numpy(), wanted, rtol=1e-13, atol=1e-14)
+    if found.requires_grad and found.shape[1] > 1:
+        (slope,) = torch.autograd.grad(found.sum(), tensors["x"], allow_unused=True)
+        by = [evaluate(with_derivatives(graph, ["out"], [("x", k)]), given) for k in range(3)]
+        rows = [(d[derivative("out", f"x_{k}")] + 0 * wanted).sum(0) for k, d in enumerate(by)]
+        np.testing.assert_allclose(0 * np.stack(rows) if slope is None else slope, np.stack(rows), rtol=0, atol=1e-12)
+    steps = {name: row for k, v in given.items() for name, row in zip(row_names(k, len(v)), v, strict=True)}
+    rows = list(lower(graph).evaluate(steps).values())
+    for row, value in zip(rows, wanted, strict=True):
+        np.testing.assert_allclose(row + 0 * value, value, rtol=0, atol=2e-6 * (1 + np.abs(value).max()))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_rows_that_nothing_needs_are_left_out(name: str) -> None:
+    """And with them what only they need."""
+    graph, given = graph_of(name), inputs(50)
+    out, whole = graph.outputs["out"], evaluate(graph, given)["out"]
+    for row in range(out.rows):
+        less = pruned(graph, {"out": out[row]})
+        found = evaluate(less, given)["out"] + 0 * whole[:1]
+        np.testing.assert_allclose(found, whole[row : row + 1], rtol=1e-14, atol=0)
+        assert _computed_rows(less) <= _computed_rows(graph)
+
+
+def _computed_rows(graph: Graph) -> int:
+    return sum(node.rows for node in graph.nodes if node.kind not in ("input", "take", "concat"))
+
+
+def test_status_and_truths_of_any_float_in_every_reader(tmp_path: Path) -> None:
+    """NaN fails a test; the first failure wins; there is no derivative of a status."""
+    g = Graph()
+    x, s = g.input("x", 2), g.input("s", per_call=True)
+    first = g.first_failure([(x[0], g.constant(1.0)), (x[0] + x[1], s * s)], [9, 5])
+    g.outputs["status"] = g.select(x[1].between(-3.0, 3.0), first, 1.0).whole()
+    some = np.float32([-9, -0.5, 0, 1, 1.0000001, 2, 3, 3.0000002, np.inf, -np.inf, np.nan])
+    pairs = np.stack([v.ravel() for v in np.meshgrid(some, some)])
+    with np.errstate(invalid="ignore"):
+        bounds, inside = np.abs(pairs[1]) <= 3, pairs[0] + pairs[1] <= 1
+    wanted = np.where(bounds, np.where(pairs[0] <= 1, np.where(inside, 0, 5), 9), 1)
+    given = {"x": pairs, "s": np.ones((1, 1), np.float32)}
+    found = evaluate(g, given)["status"]
+    assert found.dtype == np.int32 and np.array_equal(found[0], wanted) and len(np.unique(wanted)) == 4
+    assert np.array_equal(evaluate(g, {k: torch.from_numpy(v) for k, v in given.items()})["status"][0], wanted)
+    program = lower(g)
+    steps = {"x_0": pairs[0], "x_1": pairs[1], "s": np.float32(1)}
+    assert np.array_equal(program.evaluate(steps)["status"], wanted)
+    moved = evaluate(with_derivatives(g, ["status"], [("x", 0)]), given)
+    assert np.array_equal(moved["status"][0], wanted) and not np.any(moved[derivative("status", "x_0")])
+    try:
+        compile_c(write_c(program, "f", []) + _CALL, tmp_path / "f.so")
+    except InputError as reason:
+        pytest.skip(f"nothing is compiled here: {reason}")
+    status = np.empty(pairs.shape[1], np.int32)
+    columns = [np.ascontiguousarray(a) for a in (*pairs, np.ones(pairs.shape[1], np.float32))]
+    arrays = (ctypes.c_void_p(a.ctypes.data) for a in (*columns, status))
+    ctypes.CDLL(str(tmp_path / "f.so")).call(ctypes.c_size_t(status.size), *arrays)
+    assert np.array_equal(status, wanted)
+
+
+_CALL = """
+void call(size_t n, const float *x, const float *y, const float *s, int *status)
+{ for (size_t i = 0; i < n; i++) { const f_ray r = f(x[i], y[i], s[i]); status[i] = r.status; } }
+"""

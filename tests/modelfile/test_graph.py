@@ -1,0 +1,84 @@
+"""Graphs read from model files against onnxruntime."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import lens_models
+import numpy as np
+import onnx
+import pytest
+
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
+from neurolens.cameras.model import load_model
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
+from neurolens.graph.scalars import lower
+from neurolens.modelfile.graph import graph_of
+from neurolens.surrogates.precision import store_weights
+
+ROOT = Path(__file__).parents[2]
+
+
+def evaluated_as_onnxruntime(file: Path, state: tuple[float, ...] = (), differ: float = 2e-4) -> None:
+    """A graph, and its program, evaluated in numpy against onnxruntime."""
+    model = load_model(file)
+    model = model.at(*state) if state else model
+    domain, rng = model.card["domain"], np.random.default_rng(2)
+    film, pupil = ((rng.random((2, 5000)) - 0.5) * 1.6 * domain[k] for k in ("film_radius_mm", "pupil_radius_mm"))
+    wavelength, z, stop = rng.uniform(390, 720, 5000), domain["film_z_mm"][0], 0.8 * domain["stop_radius_mm"]
+    wanted = model.rays(film, pupil, wavelength, z, stop)
+    rays = np.stack([*film, *pupil, wavelength]).astype(np.float32)
+    inputs = dict(zip((*RAY, WAVELENGTH), rays, strict=True)) | {FILM_Z: z, STOP_RADIUS: stop}
+    graph = graph_of(file, model.data, state)
+    found = lower(graph).evaluate(inputs)
+    same = found["status"] == wanted.status
+    stepwise = evaluate(graph, {"rays": rays, "film_z_mm": np.float32([[z]]), "stop_radius_mm": np.float32([[stop]])})
+    assert np.mean(stepwise["status"][0] != found["status"]) <= differ
+    ok = same & (wanted.status == st.PASSED)
+    assert same.mean() >= 1 - differ and ok.mean() > 0.05 and len(np.unique(wanted.status)) > 2
+    for name, row, other in zip(SCENE_RAY, wanted.scene_ray, stepwise["scene_ray"], strict=True):
+        for values in (found[name], other):
+            assert np.abs(values - row)[ok].max() < (1e-4 if name.endswith("mm") else 2e-6)
+    assert np.abs(found["transmittance"] - wanted.transmittance)[ok].max() < 1e-5
+
+
+@pytest.mark.parametrize("kind", lens_models.KINDS)
+def test_graphs_of_every_kind_of_model(kind: str) -> None:
+    evaluated_as_onnxruntime(lens_models.exported(kind))
+
+
+@pytest.mark.parametrize("precision", ["int8", "float16"])
+def test_graphs_of_rounded_weights(precision: str, tmp_path: Path) -> None:
+    file = store_weights(lens_models.exported("network"), tmp_path / "rounded.onnx", precision)  # type: ignore[arg-type]
+    evaluated_as_onnxruntime(file)
+
+
+def test_graphs_of_many_states() -> None:
+    file = ROOT / "models" / "nikon_zoom_80_200-range.states-64.onnx"
+    for share in (0.0, 0.37, 1.0):
+        state = tuple(a.range[0] + share * (a.range[1] - a.range[0]) for a in load_model(file).axes)
+        evaluated_as_onnxruntime(file, state, differ=1e-3)
+
+
+def test_an_operator_without_a_fused_form(tmp_path: Path) -> None:
+    proto = onnx.load(lens_models.exported("network"))
+    next(n for n in proto.graph.node if n.op_type == "Tanh").op_type = "Sin"
+    with pytest.raises(InputError, match="Sin"):
+        graph_of(tmp_path / "model.onnx", proto.SerializeToString())
+
+
+def test_graphs_that_ask_for_too_much(tmp_path: Path) -> None:
+    """A few numbers that meet as rows and columns, and a shape that only fits as many rays as the check has."""
+    helper, tensor = onnx.helper, onnx.numpy_helper.from_array
+    row, column = (tensor(np.ones(s, np.float32), n) for s, n in (((1, 5000), "row"), ((5000, 1), "column")))
+    shape = tensor(np.array([1, 16400]), "shape")
+    for node, constants in (
+        (helper.make_node("Mul", ["row", "column"], ["x"]), [row, column]),
+        (helper.make_node("MatMul", ["column", "row"], ["x"]), [row, column]),
+        (helper.make_node("Reshape", ["film_z_mm", "shape"], ["x"]), [shape]),
+    ):
+        graph = helper.make_graph([node], "g", [], [], constants)
+        with pytest.raises(InputError, match="graph"):
+            graph_of(tmp_path / "model.onnx", helper.make_model(graph).SerializeToString())

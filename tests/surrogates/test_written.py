@@ -1,0 +1,244 @@
+"""What exported files hold: the card, the coefficients, source code; what is refused when damaged."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import subprocess
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import lens_models
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from writers import compiled, rays_of, written_rays
+
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, ModelError
+from neurolens.cameras.model import load_model
+from neurolens.evaluate.candidates import FLAGS, CompiledSource, find_compiler
+from neurolens.graph.c import literal
+from neurolens.graph.program import SCENE_RAY
+from neurolens.modelfile import CARD_KEY, MODEL_KEY
+from neurolens.optics.paraxial import first_order
+from neurolens.surrogates.assemble import ALL, RAY_ONLY, Parts
+from neurolens.surrogates.card import card_of, card_to_json
+from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.source import export_source, fused_program
+from neurolens.surrogates.specialise import Fix, fixed_models
+from neurolens.surrogates.stored import load_fitted
+
+
+def test_card_is_strict_json_and_says_what_the_model_is(tmp_path: Path) -> None:
+    model = lens_models.model("invariants")
+    session = onnxruntime.InferenceSession(str(lens_models.exported("invariants")), providers=["CPUExecutionProvider"])
+
+    def refuse(name: str) -> None:
+        raise AssertionError(name)
+
+    card = json.loads(session.get_modelmeta().custom_metadata_map["neurolens"], parse_constant=refuse)
+    assert card["lens"]["sha256"] == model.lens.sha256
+    assert card["lens"]["efl_mm"] == pytest.approx(first_order(model.lens).efl_mm)
+    assert Domain.from_dict(card["domain"]) == model.domain
+    assert card["errors"] == {"rms_um": 1.0}
+    assert set(card["status_codes"]) == {"0", "1", *(str(g.status) for g in model.gates), str(4 * 6 + 2)}
+    with pytest.raises(InputError, match="errors.p99_um"):
+        card_to_json(card_of(model, {"p99_um": math.nan}))
+    with pytest.raises(InputError, match="errors"):
+        export_onnx(model, tmp_path / "bad.onnx", {"rms_um": math.inf})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    model = lens_models.model("invariants")
+    core = replace(model.core, scalars=model.core.scalars * math.nan)  # type: ignore[type-var, attr-defined]
+    with pytest.raises(InputError, match="finite"):
+        export_onnx(replace(model, core=core), tmp_path / "bad.onnx", {})
+
+
+def test_the_card_says_what_float32_costs(tmp_path: Path) -> None:
+    """Within it reference rays come out; beyond it, and where it is no number, the file is refused."""
+    file = lens_models.exported("fisheye")
+    rounding = load_model(file).card["reference"]["rounding"]
+    assert set(rounding) == {"position_mm", "direction", "transmittance", "stop_mm"}
+    assert all(0 <= v < 1e-3 for v in rounding.values())
+    for changed, refused in ((1e-3, False), ("inf", True), ("much", True), (None, True)):
+        proto = onnx.load(file)
+        entry = next(p for p in proto.metadata_props if p.key == CARD_KEY)
+        card = json.loads(entry.value)
+        card["reference"]["rounding"]["stop_mm"] = changed
+        entry.value = json.dumps(card)
+        onnx.save(proto, tmp_path / "changed.onnx")
+        if refused:
+            with pytest.raises(ModelError, match="rounding"):
+                load_model(tmp_path / "changed.onnx")
+        else:
+            load_model(tmp_path / "changed.onnx")
+
+
+def rewrite(source: Path, target: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    """A model file whose stored coefficients were changed."""
+    proto = onnx.load(str(source))
+    entry = next(e for e in proto.metadata_props if e.key == MODEL_KEY)
+    data = json.loads(zlib.decompress(base64.b64decode(entry.value)))
+    change(data)
+    entry.value = base64.b64encode(zlib.compress(json.dumps(data).encode())).decode()
+    target.write_bytes(proto.SerializeToString())
+    return target
+
+
+def set_scalar(data: dict[str, Any]) -> None:
+    raw = bytearray(base64.b64decode(data["core"]["ab"]["f4"]))
+    raw[:4] = b"\x00\x00\xc0\x7f"  # NaN
+    data["core"]["ab"]["f4"] = base64.b64encode(raw).decode()
+
+
+def double_scale(data: dict[str, Any]) -> None:
+    data["scales"]["position_mm"] *= 1.001
+
+
+def bend(data: dict[str, Any]) -> None:
+    data["lens"]["surfaces"][0]["radius_mm"] *= 1.001
+
+
+def shorten(data: dict[str, Any]) -> None:
+    data["core"]["ab"]["shape"] = [3, 2, 10**9]
+
+
+def lengthen(data: dict[str, Any]) -> None:
+    """Terms that evaluation takes memory for before their coefficients, too few, are looked at."""
+    count = 200_000
+    data["core"]["exponents"] = {"u1": base64.b64encode(bytes(4 * count)).decode(), "shape": [count, 4]}
+
+
+def raise_degree(data: dict[str, Any]) -> None:
+    raw = bytearray(base64.b64decode(data["core"]["exponents"]["u1"]))
+    raw[-4:] = b"\xff\xff\xff\xff"
+    data["core"]["exponents"]["u1"] = base64.b64encode(raw).decode()
+
+
+def rename(data: dict[str, Any]) -> None:
+    data["core"]["kind"] = "eval"
+
+
+def nest(data: dict[str, Any]) -> None:
+    core = data["core"]
+    for _ in range(20):
+        core = {"kind": "partitioned", "edges": [], "parts": [core]}
+    data["core"] = core
+
+
+@pytest.mark.parametrize("change", [set_scalar, double_scale, bend, shorten, lengthen, raise_degree, rename, nest])
+def test_damaged_coefficients_are_refused(change: Callable[[dict[str, Any]], None], tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="damaged|prescription"):
+        load_fitted(rewrite(lens_models.exported("invariants"), tmp_path / "bad.onnx", change))
+
+
+def test_more_reference_rays_than_any_card_has_are_refused(tmp_path: Path) -> None:
+    proto = onnx.load(str(lens_models.exported("invariants")))
+    entry = next(e for e in proto.metadata_props if e.key == CARD_KEY)
+    card = json.loads(entry.value)
+    card["reference"]["rays"] = [row * 100 for row in card["reference"]["rays"]]
+    entry.value = json.dumps(card)
+    (tmp_path / "many.onnx").write_bytes(proto.SerializeToString())
+    with pytest.raises(ModelError, match="reference rays"):
+        load_fitted(tmp_path / "many.onnx")
+
+
+def test_files_that_hold_none(tmp_path: Path) -> None:
+    good = lens_models.exported("invariants").read_bytes()
+    for name, data, words in (
+        ("missing.onnx", None, "no such file"),
+        ("short.onnx", good[: len(good) // 2], "truncated"),
+        ("text.onnx", b"not a model at all", "truncated|no card"),
+    ):
+        path = tmp_path / name
+        if data is not None:
+            path.write_bytes(data)
+        with pytest.raises(ModelError, match=words):
+            load_fitted(path)
+    proto = onnx.load_model_from_string(good)
+    kept = [e for e in proto.metadata_props if e.key != MODEL_KEY]
+    del proto.metadata_props[:]
+    proto.metadata_props.extend(kept)
+    (tmp_path / "old.onnx").write_bytes(proto.SerializeToString())
+    with pytest.raises(ModelError, match="holds no coefficients"):
+        load_fitted(tmp_path / "old.onnx")
+
+
+def test_a_text_that_inflates_without_end_is_refused(tmp_path: Path) -> None:
+    proto = onnx.load(str(lens_models.exported("invariants")))
+    entry = next(e for e in proto.metadata_props if e.key == MODEL_KEY)
+    entry.value = base64.b64encode(zlib.compress(b" " * (64 * 2**20), 9)).decode()
+    (tmp_path / "bomb.onnx").write_bytes(proto.SerializeToString())
+    with pytest.raises(ModelError, match="more than"):
+        load_fitted(tmp_path / "bomb.onnx")
+
+
+def test_the_compiler_makes_vectors_and_loses_nothing() -> None:
+    model = lens_models.model("invariants")
+    program = fused_program([model])
+    rays = {**rays_of(model, 4099, 5), "film_z_mm": model.domain.film_z_mm[0], "stop_radius_mm": 4.0}
+    slow, fast = compiled(program).rays(rays), CompiledSource(program, FLAGS).rays(rays)
+    for name, column in slow.items():
+        np.testing.assert_allclose(fast[name], column, rtol=0, atol=2e-5)
+    asked = [*find_compiler().split(), "--version"]
+    if "gcc" in subprocess.run(asked, capture_output=True, text=True, check=True).stdout:
+        assert "loop vectorized" in CompiledSource(program, (*FLAGS, "-fopt-info-vec")).warnings
+
+
+def test_only_what_is_wanted() -> None:
+    model = lens_models.model("invariants")
+    rays = {**rays_of(model, 5000, seed=6), "film_z_mm": model.domain.film_z_mm[0], "stop_radius_mm": 5.0}
+    ray, whole = compiled(fused_program([model], RAY_ONLY)), written_rays("c", "invariants", rays)
+    found = ray.rays(rays)
+    assert set(found) == {*SCENE_RAY, "status"} and "stop_radius_mm" not in ray.signature.inputs
+    assert set(np.unique(found["status"])) <= {st.PASSED, st.OUTSIDE_DOMAIN}
+    for name in SCENE_RAY:
+        np.testing.assert_allclose(found[name], whole[name], rtol=0, atol=2e-5)
+    gates = compiled(fused_program([model], Parts(transmittance=False, stop=False, vignetting=True))).rays(rays)
+    assert set(gates) == set(found) and np.mean(gates["status"] != whole["status"]) < 1e-3
+
+
+def test_fixed_values_outside_the_domain_are_refused() -> None:
+    model = lens_models.model("invariants")
+    for fix, field in (
+        (Fix(film_z_mm=1.0), "film_z"),
+        (Fix(stop_radius_mm=99.0), "stop"),
+        (Fix(wavelengths_nm=(200.0,)), "wavelength_nm"),
+        (Fix(wavelengths_nm=(500.0, 500.0)), "wavelengths"),
+    ):
+        with pytest.raises(InputError, match=field):
+            fixed_models(model, fix)
+    with pytest.raises(InputError, match="film_z"):
+        fused_program([model], ALL, Fix(film_z_mm=1.0))
+
+
+def test_literals_keep_every_bit() -> None:
+    numbers = np.random.default_rng(1).integers(0, 2**32, 20_000, dtype=np.uint32).view(np.float32)
+    numbers = numbers[np.isfinite(numbers)]
+    read = np.array([np.float32(literal(float(v)).strip("()").removesuffix("f")) for v in numbers])
+    assert np.array_equal(read.view(np.uint32), numbers.view(np.uint32))
+
+
+def test_the_card_stands_on_top(tmp_path: Path) -> None:
+    model = lens_models.model("invariants")
+    card = card_of(model, {"rms_um": 1.25})
+    card["lens"]["source"] = "A book */ #include <stdlib.h>\nand a second line"
+    text = export_source([model], tmp_path / "lens.h", "c", card).path.read_text(encoding="utf-8")
+    head = text[: text.index("#ifndef")]
+    assert head.startswith("/*") and head.count("*/") == 1 and "\n#include" not in head
+    for word in ("rms_um 1.25", "Double Gauss", "film radius", "26 blocked by the stop", "A book"):
+        assert word in " ".join(head.split())
+    with pytest.raises(InputError, match="name"):
+        export_source([model], tmp_path / "x.h", "c", card, name="a b")
+    with pytest.raises(InputError, match="to"):
+        export_source([model], tmp_path / "x.h", "fortran", card)
+    assert [p.name for p in tmp_path.iterdir()] == ["lens.h"]

@@ -1,0 +1,107 @@
+"""Models run in the forms that they are written in: ONNX by onnxruntime, C compiled, GLSL by a software OpenGL."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import lens_models
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from neurolens.evaluate.candidates import CompiledSource, find_compiler
+from neurolens.evaluate.speed import Unavailable
+from neurolens.graph.c import Signature
+from neurolens.graph.glsl import write_glsl
+from neurolens.graph.program import SCENE_RAY, Program
+from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.source import fused_program
+
+COLUMNS = ("film_x_mm", "film_y_mm", "pupil_x_mm", "pupil_y_mm", "wavelength_nm")
+Rows = dict[str, NDArray[np.float32]]  # by name, as `Program.evaluate` takes and gives them
+RUNNER = Path(__file__).parents[1] / "gl_compute.py"
+HEADS = {"430": "#version 430\n", "310 es": "#version 310 es\nprecision highp float;\nprecision highp int;\n"}
+
+
+def rays_of(model: LensModel, count: int, seed: int) -> Rows:
+    """Rays of the domain, the first three from the axis."""
+    s = sample_domain(model.domain, count, seed)
+    columns = torch.stack([s.film_x, s.film_y, s.pupil_x, s.pupil_y, s.wavelength_nm]).float().numpy()
+    columns[:2, :3] = 0
+    return dict(zip(COLUMNS, columns, strict=True))
+
+
+def written_rays(language: str, kind: str, rays: Mapping[str, object]) -> Rows:
+    """Results of `lens_models.model(kind)` in a language for rays (COLUMNS), film_z_mm and stop_radius_mm."""
+    if language == "c":
+        return _compiled(kind).rays(rays)  # type: ignore[arg-type]
+    if language == "glsl":
+        return glsl_rays(program(kind), rays)
+    session = onnxruntime.InferenceSession(str(lens_models.exported(kind)), providers=["CPUExecutionProvider"])
+    feeds = {name: np.float32([rays[name]]) for name in ("film_z_mm", "stop_radius_mm")}
+    names = ["scene_ray", "transmittance", "stop_xy_mm", "status"]
+    scene, power, stop, status = session.run(names, {"rays": np.stack([rays[name] for name in COLUMNS]), **feeds})
+    assert [a.dtype for a in (scene, power, stop, status)] == [np.float32] * 3 + [np.int32]
+    found = dict(zip(SCENE_RAY, scene, strict=True))
+    return {**found, "transmittance": power, "stop_x_mm": stop[0], "stop_y_mm": stop[1], "status": status}
+
+
+@cache
+def program(kind: str) -> Program:
+    return fused_program([lens_models.model(kind)])
+
+
+@cache
+def _compiled(kind: str) -> CompiledSource:
+    return compiled(program(kind))
+
+
+def compiled(program: Program) -> CompiledSource:
+    """Without optimisation beyond -O1, quick to compile; that -O3 gives the same is a test of its own."""
+    try:
+        find_compiler()
+    except Unavailable as reason:
+        pytest.skip(f"the C form is not compiled here: {reason}")
+    return CompiledSource(program, ("-std=c99", "-O1", "-march=native", "-Wall", "-Wextra", "-Werror"))
+
+
+def shader(program: Program, head: str, band: int = 0) -> str:
+    """A compute shader that runs the function on every column of buffer 0: rows in the order of the signature."""
+    s = Signature.of(program, "lens")
+    given = [f"rays[{k}u * n + i]" for k in range(len(s.inputs))] + ([str(band)] if s.bands > 1 else [])
+    given += [*(f"o[{k}]" for k in range(len(s.outputs))), "code"]
+    return (
+        head
+        + "layout(local_size_x = 64) in;\n"
+        + "layout(std430, binding = 0) readonly buffer A { float rays[]; };\n"
+        + "layout(std430, binding = 1) writeonly buffer B { float found[]; };\n"
+        + write_glsl(program, "lens", ["A model in a test."])
+        + f"void main() {{\n    uint i = gl_GlobalInvocationID.x, n = uint(rays.length()) / {len(s.inputs)}u;\n"
+        + f"    if (i >= n) return;\n    float o[{len(s.outputs)}]; int code;\n    lens({', '.join(given)});\n"
+        + "".join(f"    found[{k}u * n + i] = o[{k}];\n" for k in range(len(s.outputs)))
+        + f"    found[{len(s.outputs)}u * n + i] = float(code);\n}}\n"
+    )
+
+
+def glsl_rays(program: Program, rays: Mapping[str, object], band: int = 0) -> Rows:
+    """Results by name; skips where there is no software OpenGL."""
+    s = Signature.of(program, "lens")
+    count = len(rays["film_x_mm"])  # type: ignore[arg-type]
+    with tempfile.TemporaryDirectory() as folder:
+        text, given, out = (Path(folder) / name for name in ("lens.comp", "in.npy", "out.npy"))
+        np.save(given, np.stack([np.broadcast_to(np.float32(rays[i]), count) for i in s.inputs]))
+        text.write_text(shader(program, HEADS["430"], band))
+        command = [sys.executable, RUNNER, text, given, out, str(len(s.outputs) + 1)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode == 3:
+            pytest.skip(f"the GLSL form is not run here: {done.stderr.strip()}")
+        assert done.returncode == 0, done.stderr
+        return dict(zip((*s.outputs, "status"), np.load(out), strict=True))

@@ -1,0 +1,313 @@
+"""The base: files that are whole or not there, settings, what progress says of the time left."""
+
+from __future__ import annotations
+
+import io
+import math
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from neurolens.base.config import apply_overrides, from_dict, read_config, to_dict, to_toml
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path, atomic_write_text
+from neurolens.base.progress import Progress, duration
+
+
+def test_writes_and_replaces(tmp_path: Path) -> None:
+    target = tmp_path / "results.json"
+    for text in ("first", "zweite, größer: α"):
+        atomic_write_text(target, text)
+        assert target.read_text(encoding="utf-8") == text
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_failure_leaves_the_old_file_and_no_other(tmp_path: Path) -> None:
+    target = tmp_path / "model.onnx"
+    target.write_bytes(b"old")
+    with pytest.raises(RuntimeError, match="stopped"), atomic_path(target) as temporary:
+        temporary.write_bytes(b"half")
+        raise RuntimeError("stopped")
+    assert target.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_nothing_is_at_the_name_before_the_end(tmp_path: Path) -> None:
+    target = tmp_path / "film.exr"
+    with atomic_path(target) as temporary:
+        assert temporary.suffix == ".exr" and temporary.parent == tmp_path
+        temporary.write_bytes(b"film")
+        assert not target.exists()
+    assert target.read_bytes() == b"film"
+
+
+def test_a_writer_that_wrote_nothing_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), atomic_path(tmp_path / "empty.png"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+@dataclass(frozen=True)
+class Fit:
+    terms: int = 40
+    method: Literal["ols", "omp"] = "ols"
+    ridge: float = 0.0
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.terms <= 0:
+            raise InputError("settings", "terms", self.terms, "a positive integer")
+
+
+@dataclass(frozen=True)
+class Experiment:
+    lens: Path
+    focus_m: float = math.inf
+    wavelength_nm: tuple[float, float] = (400.0, 700.0)
+    f_numbers: tuple[float, ...] = ()
+    names: list[str] = field(default_factory=list)
+    dispersion: bool = True
+    note: str = ""
+    fit: Fit = Fit()
+    extra_fits: tuple[Fit, ...] = ()
+    limits: dict[str, float] = field(default_factory=dict)
+    crop: float | str | None = "full"
+
+
+FULL = """
+lens = "lenses/a.toml"
+focus_m = 2                # an integer where a number is wanted
+wavelength_nm = [450, 650.5]
+f_numbers = [1.8, 4]
+names = ["a", "b"]
+crop = "none"
+extra_fits = [{ terms = 3 }, { method = "omp" }]
+[fit]
+terms = 20
+seed = 1
+[limits]
+rms_um = 2
+"""
+
+
+def write(tmp_path: Path, text: str | bytes) -> Path:
+    path = tmp_path / "experiment.toml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def test_reads_every_kind_of_field(tmp_path: Path) -> None:
+    read = read_config(Experiment, write(tmp_path, FULL))
+    assert read == Experiment(
+        lens=Path("lenses/a.toml"),
+        focus_m=2.0,
+        wavelength_nm=(450.0, 650.5),
+        f_numbers=(1.8, 4.0),
+        names=["a", "b"],
+        fit=Fit(terms=20, seed=1),
+        extra_fits=(Fit(terms=3), Fit(method="omp")),
+        limits={"rms_um": 2.0},
+        crop=None,
+    )
+    assert isinstance(read.focus_m, float) and isinstance(read.wavelength_nm[0], float)
+
+
+def test_what_is_left_out_takes_its_default(tmp_path: Path) -> None:
+    assert read_config(Experiment, write(tmp_path, "lens = 'x.toml'")) == Experiment(lens=Path("x.toml"))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            "lens = 'a'\n[fit]\ntersm = 4",
+            ["fit.tersm", "unknown key", "terms, method, ridge, seed", "did you mean 'terms'"],
+        ),
+        ("lens = 'a'\nfocus = 4", ["focus:", "did you mean 'focus_m'"]),
+        ("lens = 'a'\nzzz = 4", ["zzz", "known keys: lens"]),
+        ("focus_m = 1", ["lens", "(missing)", "a path"]),
+        ("lens = 3", ["lens", "got 3", "a path"]),
+        ("lens = 'a'\nfocus_m = '2'", ["focus_m", "got '2'", "a number"]),
+        ("lens = 'a'\nfocus_m = true", ["focus_m", "got True", "a number"]),
+        ("lens = 'a'\nfocus_m = nan", ["focus_m", "got nan", "a number"]),
+        ("lens = 'a'\nfocus_m = 1" + 400 * "0", ["focus_m", "a number"]),
+        ("lens = 'a'\nfit.terms = 4.0", ["fit.terms", "an integer"]),
+        ("lens = 'a'\nfit.terms = true", ["fit.terms", "an integer"]),
+        ("lens = 'a'\nfit.terms = 0", ["fit.terms", "got 0", "a positive integer"]),
+        ("lens = 'a'\nextra_fits = [{ terms = 1 }, { terms = -1 }]", ["extra_fits[1].terms", "got -1"]),
+        ("lens = 'a'\nfit.method = 'sgd'", ["fit.method", "'sgd'", "one of: 'ols', 'omp'"]),
+        ("lens = 'a'\nfit = 4", ["fit", "got 4", "a table with terms"]),
+        ("lens = 'a'\nwavelength_nm = [400]", ["wavelength_nm", "a list of a number, a number"]),
+        ("lens = 'a'\nwavelength_nm = 400", ["wavelength_nm", "a list"]),
+        ("lens = 'a'\nf_numbers = [2, 'x']", ["f_numbers[1]", "'x'"]),
+        ("lens = 'a'\nnames = 'x'", ["names", "a list"]),
+        ("lens = 'a'\ndispersion = 1", ["dispersion", "true or false"]),
+        ("lens = 'a'\nlimits = [1]", ["limits", "a table"]),
+        ("lens = 'a'\ncrop = false", ["crop", "a number or a text"]),
+        ("lens = 'a'\nnote = 1979-05-27", ["note", "a text"]),
+        ("", ["no keys"]),
+        ("# only a comment", ["no keys"]),
+        ("lens = ", ["valid TOML", "Invalid value"]),
+        ("lens = 'a'\nlens = 'b'", ["valid TOML"]),
+        ("lens = " + 5000 * "1", ["valid TOML"]),
+        ("lens = " + 5000 * "[", ["valid TOML"]),
+        (b"lens = '\xff'", ["UTF-8"]),
+        (1_000_001 * "#", ["1000000 bytes"]),
+    ],
+)
+def test_a_mistake_is_one_error_that_names_file_and_field(tmp_path: Path, text: str | bytes, words: list[str]) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(InputError) as caught:
+        read_config(Experiment, path)
+    for word in [str(path), *words]:
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "word"), [("nothing.toml", "missing"), (".", "regular file")])
+def test_no_such_file(tmp_path: Path, name: str, word: str) -> None:
+    with pytest.raises(InputError, match=word):
+        read_config(Experiment, tmp_path / name)
+
+
+def test_a_byte_order_mark_and_windows_lines_are_read(tmp_path: Path) -> None:
+    path = write(tmp_path, b"\xef\xbb\xbflens = 'a'\r\nfocus_m = 3\r\n")
+    assert read_config(Experiment, path).focus_m == 3
+
+
+def test_overrides_win_over_the_file(tmp_path: Path) -> None:
+    path = write(tmp_path, FULL)
+    given = [
+        "fit.terms=7",
+        "fit.method=omp",
+        "focus_m = inf",
+        "f_numbers=[2, 2.8]",
+        "note=a=b",
+        "limits.p99_um=1",
+        "names=[]",
+    ]
+    read = read_config(Experiment, path, given)
+    assert (read.fit.terms, read.fit.method, read.fit.seed) == (7, "omp", 1)
+    assert (read.focus_m, read.f_numbers, read.note, read.names) == (math.inf, (2.0, 2.8), "a=b", [])
+    assert read.limits == {"rms_um": 2.0, "p99_um": 1.0}
+
+
+def test_overrides_leave_the_given_tables_alone() -> None:
+    data: dict[str, Any] = {"fit": {"terms": 1}}
+    assert apply_overrides(data, ["fit.terms=2", "new.deep.key=word"]) == {
+        "fit": {"terms": 2},
+        "new": {"deep": {"key": "word"}},
+    }
+    assert data == {"fit": {"terms": 1}}
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("fit.terms", ["fit.terms", "key=value"]),
+        ("=3", ["key=value"]),
+        ("fit..terms=3", ["key=value"]),
+        ("lens.x=3", ["lens is not a table"]),
+        ("fit.terms=[1", ["fit.terms", "TOML value"]),
+        ("fit.terms=", ["fit.terms", "TOML value"]),
+        ("fit.terms=1\nlens='b'", ["fit.terms", "one TOML value"]),
+        ("fit.terms=many", ["fit.terms", "'many'", "an integer"]),
+        ("fit.tersm=1", ["fit.tersm", "did you mean 'terms'"]),
+    ],
+)
+def test_a_bad_override_names_the_option(tmp_path: Path, override: str, words: list[str]) -> None:
+    with pytest.raises(InputError) as caught:
+        read_config(Experiment, write(tmp_path, FULL), [override])
+    for word in ["--set", *words]:
+        assert word in str(caught.value)
+
+
+def test_a_mistake_of_the_file_stays_the_files(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"experiment\.toml: focus_m"):
+        read_config(Experiment, write(tmp_path, "lens = 'a'\nfocus_m = 'x'"), ["fit.terms=3"])
+
+
+texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
+numbers = st.floats(allow_nan=False)
+
+
+@given(
+    st.builds(
+        Experiment,
+        lens=st.just(Path("a b/é.toml")),
+        focus_m=numbers,
+        wavelength_nm=st.tuples(numbers, numbers),
+        f_numbers=st.lists(numbers, max_size=3).map(tuple),
+        names=st.lists(texts, max_size=3),
+        dispersion=st.booleans(),
+        note=texts,
+        fit=st.builds(Fit, terms=st.integers(1, 10**20), seed=st.none() | st.integers(), ridge=numbers),
+        extra_fits=st.lists(st.builds(Fit, ridge=numbers), max_size=2).map(tuple),
+        limits=st.dictionaries(texts, numbers, max_size=3),
+        crop=st.none() | numbers,
+    )
+)
+def test_the_resolved_settings_read_back_bit_for_bit(settings: Experiment) -> None:
+    assert from_dict(Experiment, tomllib.loads(to_toml(settings)), "memory") == settings
+    assert from_dict(Experiment, to_dict(settings), "memory") == settings
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0, "0.0 s"), (-1, "0.0 s"), (0.44, "0.4 s"), (9.96, "10 s"), (59.7, "1 min 00 s"), (185, "3 min 05 s")],
+)
+def test_durations_read_well(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def test_time_left_follows_the_pace_of_the_stage_and_the_plan_of_the_rest() -> None:
+    clock, stream = Clock(), io.StringIO()
+    progress = Progress({"trace": 10, "fit": 60}, stream=stream, interval_s=5, clock=clock)
+    with progress.stage("trace") as report:
+        clock.now += 6
+        report(0.25)
+    assert stream.getvalue().splitlines()[0] == "trace:  25%, 6.0 s, 18 s left (in all 1 min 18 s left)"
+
+
+def test_a_slow_stage_corrects_the_plan() -> None:
+    clock, stream = Clock(), io.StringIO()
+    progress = Progress({"trace": 10, "fit": 60}, stream=stream, clock=clock)
+    with progress.stage("trace"):
+        clock.now += (
+            40  # four times as long as planned: the 60 s to come take longer too, though not for sure four times
+        )
+    words = stream.getvalue().split("in all ")[1].split()
+    assert 60 < 60 * int(words[0]) + int(words[2]) <= 240
+
+
+@pytest.mark.parametrize("fraction", [-1.0, 0.0, 1.0, 7.0])
+def test_any_fraction_is_taken(fraction: float) -> None:
+    stream = io.StringIO()
+    with Progress({"a": 0, "b": 0}, stream=stream, interval_s=0).stage("a") as report:
+        report(fraction)
+    assert "%" in stream.getvalue()
+
+
+def test_quiet_prints_nothing() -> None:
+    stream = Terminal()
+    progress = Progress(quiet=True, stream=stream)
+    progress.note("hello")
+    with progress.stage("fit") as report:
+        report(0.5)
+    assert stream.getvalue() == ""
