@@ -77,8 +77,9 @@ def agree(kind: str, model: LensModel, found: Rows, rays: Rows, film_z: float, s
     assert np.quantile(point_mm, 0.99) < 1e-4 * loose
     # A ray along the surface has the direction of a square root at its end, where float32 keeps half its digits.
     steep = np.abs(wanted[5][passed]) > 0.05
-    assert np.mean(direction[steep] > 5e-5) <= (1e-3 if cut else 0)
-    assert np.mean(point_mm[steep] > 5e-5 * max(1.0, np.abs(wanted[:3, passed]).max())) <= (1e-3 if cut else 0)
+    most = 5e-5 if cut or not published else 3e-5 if kind.startswith("taylor") else 2e-5
+    assert np.mean(direction[steep] > most) <= (1e-3 if cut else 0)
+    assert np.mean(point_mm[steep] > most * max(1.0, np.abs(wanted[:3, passed]).max())) <= (1e-3 if cut else 0)
     assert np.abs(np.linalg.norm(scene[3:, passed], axis=0) - 1).max() < 1e-6
     power = np.abs(found["transmittance"] - expected.transmittance.numpy())[passed]
     assert np.mean(power > 1e-5) <= (1e-3 if cut else 0)
