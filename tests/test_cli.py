@@ -336,7 +336,7 @@ def test_a_reader_that_leaves_is_no_error(scene: Path, tmp_path: Path) -> None:
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A polynomial of the singlet, exported with the errors that it has."""
     from neurolens.cameras.model import load_model
-    from neurolens.evaluate.measure import measure_errors
+    from neurolens.evaluate.measure import fresh_rays, measure_on
     from neurolens.optics.lensfile import read_lens
     from neurolens.surrogates.domain import domain_of
     from neurolens.surrogates.export import export_onnx
@@ -349,8 +349,8 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fitted = fit_model(prepare(pairs), ModelSettings(method="ols", terms=12))
     path = tmp_path_factory.mktemp("models") / "singlet.onnx"
     export_onnx(fitted, path)
-    errors = measure_errors(load_model(path), lens, domain, pairs.held_out, 20_000, seed=77)
-    return export_onnx(fitted, path, errors=errors)
+    rays = fresh_rays(lens, domain, pairs.held_out, count=20_000, seed=77)
+    return export_onnx(fitted, path, errors=measure_on(rays, load_model(path)))
 
 
 def with_errors(model: Path, path: Path, **errors: float) -> Path:

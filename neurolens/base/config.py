@@ -95,7 +95,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
     hints = get_type_hints(cls)
     values: dict[str, Any] = {}
     for name, field in fields.items():
-        place = f"{prefix}.{name}" if prefix else name
+        place = _join(prefix, name)
         if name in data:
             values[name] = _convert(data[name], hints[name], file, place)
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
@@ -103,9 +103,11 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
     try:
         return cls(**values)
     except InputError as error:
-        raise InputError(
-            file, f"{prefix}.{error.field}" if prefix else error.field, error.value, error.expected
-        ) from None
+        raise InputError(file, _join(prefix, error.field), error.value, error.expected) from None
+
+
+def _join(prefix: str, name: str) -> str:
+    return f"{prefix}.{name}" if prefix else name
 
 
 def _convert(value: Any, kind: Any, file: str | Path, place: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,6 @@ from neurolens.commands.arguments import add_json, whole
 from neurolens.commands.output import number, print_json, table
 
 if TYPE_CHECKING:
-    from neurolens.cameras.model import OnnxLens
     from neurolens.evaluate.check import Promise
 
 _DESCRIPTION = """\
@@ -71,17 +71,12 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, compare, time; 1 where a promise does not hold."""
     from neurolens.cameras.model import load_model
-    from neurolens.evaluate.check import check_model, lens_of_card
+    from neurolens.evaluate.candidates import time_model
+    from neurolens.evaluate.check import check_model, check_states, lens_of_card, space_of_card
 
     model = load_model(args.model)  # on one thread: the race distributes batches
-    space = None
-    if model.axes:
-        from neurolens.evaluate.check import check_states, space_of_card
-
-        space = space_of_card(model.card, model.axes, args.lens, args.model)
-        lens = space.lens
-    else:
-        lens = lens_of_card(model.card, args.lens, args.model)
+    space = space_of_card(model.card, model.axes, args.lens, args.model) if model.axes else None
+    lens = space.lens if space else lens_of_card(model.card, args.lens, args.model)
     progress = Progress({"measure": 10, "time": 2}, quiet=args.quiet)
     with progress.stage("measure"):
         if space is not None:
@@ -89,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             figures, promises = check_model(model, lens, rays=args.rays, seed=args.seed)
     with progress.stage("time"):
-        timing = _time(model, args.model.stem, args.threads)
+        timing = time_model(model, args.model.stem, rounds=10, threads=args.threads)
     holds = all(p.holds for p in promises)
     data = {
         "model": str(args.model),
@@ -97,10 +92,7 @@ def run(args: argparse.Namespace) -> int:
         "method": model.card["fit"]["method"],
         **figures,
         "ns_per_ray": timing,
-        "promises": [
-            {"key": p.key, "promised": p.promised, "measured": p.measured, "allowed": p.allowed, "holds": p.holds}
-            for p in promises
-        ],
+        "promises": [{**asdict(p), "holds": p.holds} for p in promises],
         "holds": holds,
         "poor": model.card["errors"].get("poor") or [],
     }
@@ -109,17 +101,6 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(_text(data, promises))
     return 0 if holds else 1
-
-
-def _time(model: OnnxLens, name: str, threads: int) -> Any:
-    """Nanoseconds per ray, in the model's best batch size."""
-    from neurolens.evaluate.candidates import model_candidate
-    from neurolens.evaluate.speed import race
-    from neurolens.surrogates.domain import Domain
-
-    domain = Domain.from_dict(model.card["domain"])
-    candidate = model_candidate(name, model, domain.stop_radius_mm)
-    return race([candidate], domain, threads=threads, rounds=10).timing(name)
 
 
 def _text(data: dict[str, Any], promises: list[Promise]) -> str:

@@ -169,7 +169,7 @@ def _fix(given: dict[str, list[float]], model: LensModel) -> Fix:
 def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] | None, derivatives: bool) -> None:
     """The graph with its card: the errors of the card given, or measured anew for what was fixed."""
     from neurolens.cameras.model import load_model
-    from neurolens.evaluate.measure import measure_errors
+    from neurolens.evaluate.measure import fresh_rays, measure_on
     from neurolens.surrogates.export import export_onnx
 
     if len(models) > 1:
@@ -182,7 +182,8 @@ def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] |
     seed, held_out = _seed(model), _pairs(model, train=1).held_out
     with atomic_path(out) as measured:  # a file without its errors never has the final name
         export_onnx(model, measured, {})
-        errors = measure_errors(load_model(measured), model.lens, model.domain, held_out, _VIGNETTING, seed + 1)
+        rays = fresh_rays(model.lens, model.domain, held_out, count=_VIGNETTING, seed=seed + 1)
+        errors = measure_on(rays, load_model(measured))
         export_onnx(model, measured, errors, derivatives=derivatives)
 
 

@@ -17,12 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import ThinLens
+from neurolens.cameras.model import OnnxLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.rays import frame_width_mm
-from neurolens.evaluate.speed import Call, Candidate, Unavailable
-from neurolens.graph import compiler
+from neurolens.evaluate.records import ExactRecord, Timing
+from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, race
 from neurolens.graph.c import Signature, write_c
-from neurolens.graph.compiler import FLAGS, compile_c
+from neurolens.graph.compiler import FLAGS, compile_c, find_compiler
 from neurolens.graph.program import Program
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -35,6 +36,7 @@ from neurolens.surrogates.source import FREE, fused_program
 from neurolens.surrogates.specialise import Fix
 from neurolens.surrogates.stored import load_fitted
 
+EXACT = ("exact eager", "exact compiled")  # names of `exact_candidates` of a whole camera
 EAGER_BATCHES = (8192, 16384, 32768)
 COMPILED_BATCHES = (16384,)  # each further size costs half a minute of compilation
 
@@ -81,14 +83,17 @@ def exact_candidates(
         given = arguments(rays)
         try:
             fast(*given)
-        except (
-            Exception
-        ) as error:  # torch raises many types: no compiler, a compiler that fails, an unsupported platform
+        except Exception as error:  # of many types: no compiler, a compiler that fails, an unsupported platform
             raise Unavailable(f"torch cannot compile here: {_first_line(error)}") from error
         return lambda: fast(*given)
 
     found = [Candidate(f"{label} eager", eager, EAGER_BATCHES)]
     return [*found, Candidate(f"{label} compiled", faster, COMPILED_BATCHES)] if compiled else found
+
+
+def exact_records(timed: Race) -> list[ExactRecord]:
+    """Those of the exact tracers that a race timed, or that could not run."""
+    return [timed.record(name) for name in EXACT if name in timed.ns or name in timed.unavailable]
 
 
 def _first_line(error: BaseException) -> str:
@@ -121,8 +126,8 @@ def ideal_cameras(lens: Lens, domain: Domain) -> list[Candidate]:
     return [camera_candidate(thin, domain, "thin lens"), camera_candidate(pinhole, domain, "pinhole")]
 
 
-def model_candidate(name: str, model: Any, stop_radius_mm: float) -> Candidate:
-    """An exported model (`cameras.model.OnnxLens`, loaded with one thread: the race shares out batches)."""
+def model_candidate(name: str, model: OnnxLens, stop_radius_mm: float) -> Candidate:
+    """An exported model, loaded with one thread: the race shares out batches."""
 
     def prepare(rays: FilmRays) -> Call:
         columns = [np.ascontiguousarray(c.numpy(), dtype=np.float32) for c in rays.columns()]
@@ -132,19 +137,15 @@ def model_candidate(name: str, model: Any, stop_radius_mm: float) -> Candidate:
     return Candidate(name, prepare)
 
 
+def time_model(model: OnnxLens, name: str, *, rounds: int, threads: int = 1) -> Timing | None:
+    """Nanoseconds per ray of an exported model over its domain."""
+    domain = Domain.from_dict(model.card["domain"])
+    return race([model_candidate(name, model, domain.stop_radius_mm)], domain, threads=threads, rounds=rounds).timing(
+        name
+    )
+
+
 _NAME = "lens"
-
-
-def find_compiler() -> str:
-    """A C compiler: $CC, else cc, gcc or clang.
-
-    Raises:
-        Unavailable: none is found.
-    """
-    try:
-        return compiler.find_compiler()
-    except InputError as error:
-        raise Unavailable("no C compiler (looked for $CC, cc, gcc, clang)") from error
 
 
 class CompiledSource:
@@ -160,7 +161,6 @@ class CompiledSource:
         folder = Path(self._folder.name)
         library = folder / "lens.so"
         text = write_c(program, _NAME, ["A timed model."]) + self._wrapper()
-        find_compiler()
         try:
             self.warnings = compile_c(text, library, flags)
         except InputError as error:
@@ -253,9 +253,12 @@ def fused_candidate(
     """
     try:
         find_compiler()
+    except InputError:
+        return None
+    try:
         found = load_fitted(model) if isinstance(model, Path) else model
         models = [found] if isinstance(found, LensModel) else found
         program = fused_program(models, parts, fix)
-    except (Unavailable, ModelError, TypeError):
+    except (ModelError, TypeError):
         return None
     return program_candidate(name, program, domain, fix.stop_radius_mm)

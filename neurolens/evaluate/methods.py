@@ -19,11 +19,11 @@ from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text, fingerprint_of, sha256_of
 from neurolens.base.progress import Progress, Report
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.candidates import exact_candidates, fused_candidate, model_candidate
+from neurolens.evaluate.candidates import EXACT, exact_candidates, exact_records, fused_candidate, model_candidate
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
 from neurolens.evaluate.measure import FreshRays, measure, onnx_predictor, seconds_to_load, shared_rays
 from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
-from neurolens.evaluate.records import break_even_rays, plain
+from neurolens.evaluate.records import plain
 from neurolens.evaluate.speed import Race, race
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
@@ -221,7 +221,7 @@ def run_bench(
 
 def _record(bench: Bench, row: Row, again: bool, report: Report) -> dict[str, Any]:
     """An existing record of the same settings, or a new one, with its failure if it fails."""
-    file = bench.record_file(row)
+    file, mark = bench.record_file(row), ""
     head = {"lens": bench.name, "method": row.name, "group": row.group, "source": row.source}
     try:
         mark = bench.fingerprint(row)
@@ -232,18 +232,11 @@ def _record(bench: Bench, row: Row, again: bool, report: Report) -> dict[str, An
         made = {"failed": None, **_fit_and_measure(bench, row, report)}
     except Exception as error:  # a row with the reason; other methods and lenses continue
         # Expected errors are permanent; unexpected ones are retried by the next run.
-        mark = _mark(bench, row) if isinstance(error, NeurolensError) else ""
+        mark = mark if isinstance(error, NeurolensError) else ""
         made = {"failed": _reason(error), "not_exported": None}
     record = plain({"fingerprint": mark, **head, "settings": asdict(row.settings), **made})
     _write(file, record)
     return record
-
-
-def _mark(bench: Bench, row: Row) -> str:
-    try:
-        return bench.fingerprint(row)
-    except NeurolensError:  # no such lens
-        return ""
 
 
 def _reason(error: Exception) -> str:
@@ -329,9 +322,6 @@ def _write(file: Path, record: dict[str, Any]) -> None:
     atomic_write_text(file, json.dumps(record, indent=1, allow_nan=False) + "\n")
 
 
-EXACT = ("exact eager", "exact compiled")
-
-
 def race_models(
     lens: Lens, domain: Domain, files: Mapping[str, Path], rounds: int, threads: int, compiled: bool, report: Report
 ) -> Race:
@@ -351,17 +341,14 @@ def times_of(record: Mapping[str, Any], timed: Race) -> dict[str, Any]:
     Returns: ns_per_ray, speedup (by the minima), break_even_rays (after which fitting and loading pay off; "never"
         where the exact tracer is as fast), the same with "fused_" before, and exact: the tracers' times.
     """
-    name, found = record["method"], dict[str, Any]()
     best = EXACT[1] if EXACT[1] in timed.ns else EXACT[0]
-    exact = timed.timing(best)
-    for prefix, candidate in (("", name), ("fused_", f"{name} fused")):
-        timing, ratio = timed.timing(candidate), timed.speedup(candidate, best)
-        pays: float | str | None = None
-        if exact and timing:
-            pays = break_even_rays(record["fit_s"], record["load_s"], exact["min"], timing["min"]) or "never"
+    found = dict[str, Any]()
+    for prefix, name in (("", record["method"]), ("fused_", f"{record['method']} fused")):
+        gain = timed.gain(name, best, record["fit_s"], record["load_s"])
+        never = "never" if gain.speedup is not None else None
         found |= {
-            f"{prefix}ns_per_ray": timing,
-            f"{prefix}speedup": ratio["min"] if ratio else None,
-            f"{prefix}break_even_rays": pays,
+            f"{prefix}ns_per_ray": gain.ns_per_ray,
+            f"{prefix}speedup": gain.speedup,
+            f"{prefix}break_even_rays": gain.break_even_rays or never,
         }
-    return {**found, "exact": [timed.record(n) for n in EXACT if n in timed.ns or n in timed.unavailable]}
+    return {**found, "exact": exact_records(timed)}

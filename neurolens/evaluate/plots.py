@@ -2,36 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from neurolens.analysis.plot_style import FAINT, INK, drawing, plain_log_ticks
 from neurolens.base.errors import InputError
-from neurolens.evaluate.records import FAMILIES, VARIABLES, number, pareto_front
+from neurolens.evaluate.pages import Record, number
+from neurolens.evaluate.records import pareto_front
 
-# Okabe and Ito's colours, distinguishable by colour-blind readers; black is kept for the exact tracer.
-FAMILY_COLOURS = {
-    "paraxial": "#7f7f7f",
-    "dense": "#56b4e9",
-    "omp": "#e69f00",
-    "ols": "#0072b2",
-    "adaptive": "#009e73",
-    "mlp": "#d55e00",
-}
-FAMILY_NAMES = {
-    "paraxial": "paraxial",
-    "dense": "dense",
-    "omp": "OMP",
-    "ols": "orthogonal LS",
-    "adaptive": "adaptive",
-    "mlp": "MLP",
+# Names and colours (Okabe and Ito's), distinguishable by colour-blind readers; black is kept for the exact tracer.
+FAMILIES = {
+    "paraxial": ("paraxial", "#7f7f7f"),
+    "dense": ("dense", "#56b4e9"),
+    "omp": ("OMP", "#e69f00"),
+    "ols": ("orthogonal LS", "#0072b2"),
+    "adaptive": ("adaptive", "#009e73"),
+    "mlp": ("MLP", "#d55e00"),
 }
 OTHER_COLOUR = "#cc79a7"
+_VARIABLES = ("raw", "invariants")
 
 
 def family_colour(family: str | None) -> str:
-    return FAMILY_COLOURS.get(str(family), OTHER_COLOUR)
+    return FAMILIES.get(str(family), ("", OTHER_COLOUR))[1]
 
 
 def place_labels(axes: Any, points: Sequence[tuple[float, float]], labels: Sequence[str], **text: Any) -> None:
@@ -77,8 +71,6 @@ def _cost(box: tuple[float, float, float, float], points: Sequence[Any], taken: 
         cost += 100.0
     return cost
 
-
-Record = Mapping[str, Any]
 
 ERROR_LABELS = {
     "rms_um": "film-equivalent error, RMS (µm)",
@@ -185,12 +177,12 @@ def _with_numbers(records: Sequence[Record], error: str, *keys: str) -> list[Rec
 
 
 def _series(records: Sequence[Record]) -> list[tuple[str, str, list[int]]]:
-    """(family, variables, indices) in the order of FAMILIES and VARIABLES; unknown families come last."""
+    """(family, variables, indices) in the order of FAMILIES and _VARIABLES; unknown families come last."""
     found = {(str(r.get("family")), str(r.get("variables"))) for r in records}
 
-    def rank(key: tuple[str, str]) -> tuple[int, int, tuple[str, str]]:
-        family = FAMILIES.index(key[0]) if key[0] in FAMILIES else len(FAMILIES)
-        return family, VARIABLES.index(key[1]) if key[1] in VARIABLES else len(VARIABLES), key
+    def rank(key: tuple[str, str]) -> tuple[Any, ...]:
+        places = ((*known, name).index(name) for name, known in zip(key, (FAMILIES, _VARIABLES), strict=True))
+        return *places, key
 
     def members(key: tuple[str, str]) -> list[int]:
         return [i for i, r in enumerate(records) if (str(r.get("family")), str(r.get("variables"))) == key]
@@ -205,7 +197,7 @@ def _plot_models(axes: Any, records: Sequence[Record], points: Sequence[tuple[fl
         line = sorted(points[i] for i in members)
         axes.plot(*zip(*line, strict=True), color=colour, lw=1, alpha=0.35, zorder=2)
         fill = colour if variables != "raw" else "white"
-        name = FAMILY_NAMES.get(family, family) + (f", {variables}" if variables in VARIABLES else "")
+        name = FAMILIES.get(family, (family,))[0] + (f", {variables}" if variables in _VARIABLES else "")
         look = {"ms": 7, "mfc": fill, "mec": colour, "mew": 1.5, "ls": "none", "zorder": 3, "label": name}
         axes.plot(*zip(*line, strict=True), _MARKERS.get(variables, "D"), **look)
         for i in members:

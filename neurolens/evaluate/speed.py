@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from neurolens.base.errors import InputError, NeurolensError
-from neurolens.evaluate.records import ExactRecord, Timing
+from neurolens.evaluate.records import ExactRecord, Timing, break_even_rays
 from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
 
@@ -54,6 +54,18 @@ class Candidate:
     prepare: Callable[[FilmRays], Call]
     batches: tuple[int, ...] = BATCHES
     domain: Domain | None = None
+
+
+@dataclass(frozen=True)
+class Gain:
+    """A model on the clock: its times, how many times faster it is (by the minima), after how many rays it pays off.
+
+    None where one of the two was not timed; break_even_rays also where the model is no faster.
+    """
+
+    ns_per_ray: Timing | None
+    speedup: float | None
+    break_even_rays: float | None
 
 
 @dataclass(frozen=True)
@@ -95,6 +107,12 @@ class Race:
             return None
         ratios = [b / a for a, b in zip(self.ns[name], self.ns[over], strict=True)]
         return {"min": min(self.ns[over]) / min(self.ns[name]), "median": statistics.median(ratios)}
+
+    def gain(self, name: str, exact: str, fit_s: float | None, load_s: float | None) -> Gain:
+        """What a model that took `fit_s` to fit and `load_s` to load gains over an exact tracer."""
+        timing, ratio, slow = self.timing(name), self.speedup(name, exact), self.timing(exact)
+        pays = break_even_rays(fit_s, load_s, slow["min"], timing["min"]) if slow and timing else None
+        return Gain(timing, ratio["min"] if ratio else None, pays)
 
     def record(self, name: str) -> ExactRecord:
         """Row for the list of exact tracers in `results.json`."""

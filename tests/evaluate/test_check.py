@@ -22,7 +22,6 @@ from neurolens.evaluate.measure import (
     ZONED,
     fresh_rays,
     measure,
-    measure_errors,
     measure_on,
     what_is_poor,
     with_more,
@@ -37,7 +36,9 @@ RAYS = 6000
 def errors() -> dict[str, Any]:
     """What the exported polynomial's card would promise."""
     pairs = make_pairs(lens(), domain(), PairSettings(train=1, held_out=RAYS, rim=1, seed=3))
-    return measure_errors(load_model(exported("invariants")), lens(), domain(), pairs.held_out, 4 * RAYS, seed=55)
+    return measure_on(
+        fresh_rays(lens(), domain(), pairs.held_out, count=4 * RAYS, seed=55), load_model(exported("invariants"))
+    )
 
 
 def broken(errors: dict[str, Any], seed: int | None = None) -> set[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from neurolens.analysis.layout import lens_layout
 from neurolens.base.errors import InputError
 from neurolens.evaluate import figures as drawn
 from neurolens.evaluate import plots
+from neurolens.evaluate.image import ImageErrors
+from neurolens.evaluate.vignetting import Illumination
 
 MODELS = [
     {"name": "thin lens", "family": "paraxial", "rms_um": 300.0, "ns_per_ray": {"min": 2.0, "median": 2.1}},
@@ -147,8 +150,8 @@ def test_side_by_side(count: int, tmp_path: Path, figures: list[Any]) -> None:
     draw = np.random.default_rng(0)
     images = {f"camera {i}": draw.uniform(0, 1, (18, 32, 3)) for i in range(count)}
     maps = {name: draw.uniform(0, 0.3, (18, 32)) for name in list(images)[1:]}
-    figures_of = {"flip": 0.1, "noise_floor_flip": 0.09, "rel_mse": 0.02}
-    captions = {name: drawn.image_caption(figures_of) for name in images}
+    errors = ImageErrors(0.1, 0.02, 0.09, 0.019, 1.1, 4)
+    captions = {name: drawn.image_caption(errors) for name in images}
     path = drawn.side_by_side(images, maps, tmp_path / "side.png", captions, title="Room")
     assert pixels(path).std() > 5
     assert all(name in texts(figures[0]) for name in images)
@@ -172,13 +175,12 @@ def test_bad_images_and_error_keys_are_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_illumination_shows_every_model_and_refuses_other_lengths(tmp_path: Path) -> None:
-    radius = [0.0, 10.0, 20.0]
-    light = {"film_radius_mm": radius, "exact": [1.0, 0.8, 0.5], "models": {"ols": [1.0, 0.81, 0.52]}}
-    path = drawn.illumination_plot(light, tmp_path / "light.png")
+def test_illumination_shows_every_model_and_refuses_nan(tmp_path: Path) -> None:
+    light = Illumination([0.0, 10.0, 20.0], [1.0, 0.8, 0.5], [1.0, 0.81, 0.52], 0.02)
+    path = drawn.illumination_plot({"ols": light}, tmp_path / "light.png")
     with Image.open(path) as picture:
         assert picture.size[0] > 800 and np.unique(np.asarray(picture.convert("L"))).size > 50
-    for bad in ({"models": {"ols": [1.0]}}, {"exact": [1.0, math.nan, 0.5]}):
+    for bad in ({}, {"ols": replace(light, exact=[1.0, math.nan, 0.5])}):
         with pytest.raises(InputError, match="illumination"):
-            drawn.illumination_plot({**light, **bad}, tmp_path / "no.png")
+            drawn.illumination_plot(bad, tmp_path / "no.png")
     assert not (tmp_path / "no.png").exists()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -63,8 +63,8 @@ def test_the_exact_lens_has_no_error(gauss: tuple[Lens, Domain, PairSet]) -> Non
     lens, domain, rays = gauss
     errors = ray_errors(lens, domain, rays, lambda _: says(rays.scene, rays.transmittance))
     settings = ("pixel_um", "rays", "share_beyond_60_deg")
-    assert all(value == 0 for key, value in errors.items() if key not in settings)
-    assert errors["rays"] == len(rays)
+    assert all(value == 0 for key, value in asdict(errors).items() if key not in settings)
+    assert errors.rays == len(rays)
 
 
 def test_a_direction_error_at_infinity_is_f_times_the_angle() -> None:
@@ -75,8 +75,8 @@ def test_a_direction_error_at_infinity_is_f_times_the_angle() -> None:
     errors = ray_errors(lens, domain, rays, lambda _: says(turned(rays.scene, epsilon), rays.transmittance))
     expected = 1000 * first_order(lens).efl_mm * epsilon
     for key in ("rms_um", "rms_infinity_um", "p99_um", "max_um"):
-        assert errors[key] == pytest.approx(expected, rel=5e-3)  # the d line's f, over 400-700 nm
-    assert errors["direction_max_deg"] == pytest.approx(math.degrees(epsilon), rel=1e-6)
+        assert getattr(errors, key) == pytest.approx(expected, rel=5e-3)  # the d line's f, over 400-700 nm
+    assert errors.direction_max_deg == pytest.approx(math.degrees(epsilon), rel=1e-6)
 
 
 def test_a_shift_at_a_finite_plane_is_magnification_times_the_shift() -> None:
@@ -90,9 +90,9 @@ def test_a_shift_at_a_finite_plane_is_magnification_times_the_shift() -> None:
     data = first_order(lens)
     extension = domain.film_z_mm[0] - data.rear_focal_z_mm
     magnification = extension / data.efl_mm  # Newton
-    assert errors["rms_um"] == pytest.approx(1000 * magnification * shift, rel=5e-3)
-    assert errors["rms_infinity_um"] == 0
-    assert errors["position_rms_um"] == pytest.approx(1000 * shift, rel=1e-3)  # directions are not quite along the axis
+    assert errors.rms_um == pytest.approx(1000 * magnification * shift, rel=5e-3)
+    assert errors.rms_infinity_um == 0
+    assert errors.position_rms_um == pytest.approx(1000 * shift, rel=1e-3)  # directions are not quite along the axis
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_a_ray_from_one_micrometre_beside_is_an_error_of_one_micrometre(
     errors = ray_errors(lens, domain, rays, lambda _: says(moved.scene, moved.transmittance))
     assert len(rays) > 10
     for key in ("rms_um", "max_um", "rms_infinity_um", "max_infinity_um"):
-        assert errors[key] == pytest.approx(1.0, rel=1e-3)
+        assert getattr(errors, key) == pytest.approx(1.0, rel=1e-3)
 
 
 def test_the_jacobian_on_the_axis_is_paraxial() -> None:
@@ -157,14 +157,14 @@ def test_the_point_on_the_ray_does_not_matter(gauss: tuple[Lens, Domain, PairSet
     s = rays.scene
     further = s._replace(x=s.x + 30 * s.dx, y=s.y + 30 * s.dy, z=s.z + 30 * s.dz)
     errors = ray_errors(lens, domain, rays, lambda _: says(further, rays.transmittance))
-    assert errors["position_rms_um"] < 1e-9 and errors["max_um"] < 1e-8
+    assert errors.position_rms_um < 1e-9 and errors.max_um < 1e-8
 
 
 def test_transmittance_errors(gauss: tuple[Lens, Domain, PairSet]) -> None:
     lens, domain, rays = gauss
     errors = ray_errors(lens, domain, rays, lambda _: says(rays.scene, rays.transmittance - 0.01))
-    assert errors["transmittance_rms"] == pytest.approx(0.01)
-    assert errors["transmittance_max"] == pytest.approx(0.01)
+    assert errors.transmittance_rms == pytest.approx(0.01)
+    assert errors.transmittance_max == pytest.approx(0.01)
 
 
 def test_pixels_and_the_common_scale(gauss: tuple[Lens, Domain, PairSet]) -> None:
@@ -175,15 +175,14 @@ def test_pixels_and_the_common_scale(gauss: tuple[Lens, Domain, PairSet]) -> Non
         return says(turned(rays.scene, 1e-5), rays.transmittance)
 
     errors = ray_errors(lens, domain, rays, slightly_off)
-    assert errors["pixel_um"] == pytest.approx(9, rel=3e-3)
-    assert errors["rms_px"] == pytest.approx(errors["rms_um"] / errors["pixel_um"])
-    assert ray_errors(lens, domain, rays, slightly_off, pitch_um=2.0)["rms_px"] == pytest.approx(errors["rms_um"] / 2)
+    assert errors.pixel_um == pytest.approx(9, rel=3e-3)
+    assert errors.rms_px == pytest.approx(errors.rms_um / errors.pixel_um)
     half = lens.scaled(0.5)
     small = domain_of(half, focus_m=(1.0, 1.0))
     few = held_out(half, small)
     scaled = ray_errors(half, small, few, lambda _: says(turned(few.scene, 1e-5), few.transmittance))
-    assert scaled["rms_um_at_21_6"] == pytest.approx(2 * scaled["rms_um"])
-    assert scaled["rms_um_at_21_6"] == pytest.approx(errors["rms_um_at_21_6"], rel=0.01)
+    assert scaled.rms_um_at_21_6 == pytest.approx(2 * scaled.rms_um)
+    assert scaled.rms_um_at_21_6 == pytest.approx(errors.rms_um_at_21_6, rel=0.01)
 
 
 def test_beyond_60_degrees_only_angles_count() -> None:
@@ -193,14 +192,12 @@ def test_beyond_60_degrees_only_angles_count() -> None:
     bent = turned(rays.scene, 1e-3)
     mixed = Rays(*(torch.where(wide, b, s) for b, s in zip(bent, rays.scene, strict=True)))
     errors = ray_errors(lens, domain, rays, lambda _: says(mixed, rays.transmittance))
-    assert errors["max_um"] == 0
-    assert errors["direction_max_deg"] == pytest.approx(
-        math.degrees(1e-3), rel=1e-4
-    )  # of a ray nearly across the y axis
-    assert 0.1 < errors["share_beyond_60_deg"] == pytest.approx(float(wide.double().mean()))
+    assert errors.max_um == 0
+    assert errors.direction_max_deg == pytest.approx(math.degrees(1e-3), rel=1e-4)  # of a ray nearly across the y axis
+    assert 0.1 < errors.share_beyond_60_deg == pytest.approx(float(wide.double().mean()))
     far = rays.select(wide)
     only_far = ray_errors(lens, domain, far, lambda _: says(far.scene, far.transmittance))
-    assert math.isnan(only_far["rms_um"]) and only_far["direction_rms_deg"] == 0
+    assert math.isnan(only_far.rms_um) and only_far.direction_rms_deg == 0
 
 
 def test_nonsense_is_not_averaged_away(gauss: tuple[Lens, Domain, PairSet]) -> None:
@@ -209,10 +206,10 @@ def test_nonsense_is_not_averaged_away(gauss: tuple[Lens, Domain, PairSet]) -> N
     s = rays.scene
     backwards = s._replace(dz=torch.where(first, -s.dz, s.dz))
     errors = ray_errors(lens, domain, rays, lambda _: says(backwards, rays.transmittance))
-    assert math.isinf(errors["max_um"]) and errors["direction_max_deg"] > 90
+    assert math.isinf(errors.max_um) and errors.direction_max_deg > 90
     broken = s._replace(dx=torch.where(first, math.nan, s.dx))
     errors = ray_errors(lens, domain, rays, lambda _: says(broken, rays.transmittance))
-    assert math.isnan(errors["rms_um"]) and math.isnan(errors["direction_rms_deg"])
+    assert math.isnan(errors.rms_um) and math.isnan(errors.direction_rms_deg)
 
 
 def test_blocked_or_no_rays_are_refused(gauss: tuple[Lens, Domain, PairSet]) -> None:
@@ -258,8 +255,8 @@ def test_where_the_image_folds_an_error_counts_for_ten_times_first_order_at_most
     for seed in (1, 2):
         rays = make_pairs(lens, domain, PairSettings(train=1, held_out=3000, rim=1, seed=seed)).held_out
         errors = ray_errors(lens, domain, rays, lambda _, r=rays: says(turned(r.scene, 1e-6), r.transmittance))
-        rms.append(errors["rms_infinity_um"])
-        assert errors["max_infinity_um"] < 1000 * 10 * f * 1e-6 / math.cos(math.radians(60)) ** 2
+        rms.append(errors.rms_infinity_um)
+        assert errors.max_infinity_um < 1000 * 10 * f * 1e-6 / math.cos(math.radians(60)) ** 2
     radial, _ = local_jacobian(lens, domain, rays.inputs, focused_vergence(lens, rays.inputs.film_z))
     assert float(radial.min()) < 0.01 / f
     assert rms[0] == pytest.approx(rms[1], rel=0.1)

@@ -117,7 +117,7 @@ def test_a_model_file_that_was_changed_is_fitted_again(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text('title = "a"\n[lens]\nfile = "a"\n[[model]]\nterms = 6\nplanes = false\n')
     settings = read_experiment(tmp_path / "a.toml", [lens, *small, "lens.f_number=8", "domain.film_radius_mm=21"])
     lens_ = settings.lens.read()
-    prepared = prepare(make_pairs(lens_, settings.domain_of(lens_), settings.pairs))
+    prepared = prepare(make_pairs(lens_, settings.domain.of(lens_), settings.pairs))
     first = fit_and_measure(prepared, settings.model[0], tmp_path, 2000, lambda _: None)
     whole = first.file.read_bytes()
     assert fit_and_measure(prepared, settings.model[0], tmp_path, 2000, lambda _: None).record == first.record

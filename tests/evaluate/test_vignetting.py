@@ -91,11 +91,11 @@ def test_zones_tell_where_on_the_film() -> None:
 
 def test_illumination_of_a_small_hole_is_cos4() -> None:
     result = relative_illumination(*hole(0.2), opening(1.0, 0.9), points=4096, rows=9)
-    expected = [math.cos(math.atan2(r, FILM_Z)) ** 4 for r in result["film_radius_mm"]]
-    assert result["exact"] == pytest.approx(expected, rel=1e-4)
-    assert result["model"] == pytest.approx([0.9 * e for e in expected], rel=1e-4)
-    assert result["max_difference"] == pytest.approx(0.1, rel=1e-4)
-    assert result["film_radius_mm"][-1] == FILM_RADIUS
+    expected = [math.cos(math.atan2(r, FILM_Z)) ** 4 for r in result.film_radius_mm]
+    assert result.exact == pytest.approx(expected, rel=1e-4)
+    assert result.model == pytest.approx([0.9 * e for e in expected], rel=1e-4)
+    assert result.max_difference == pytest.approx(0.1, rel=1e-4)
+    assert result.film_radius_mm[-1] == FILM_RADIUS
 
 
 def test_the_deciding_rim_agrees_with_the_tracer() -> None:
@@ -121,7 +121,5 @@ def test_a_real_lens_against_itself_stopped_down() -> None:
     for result in stopped_down(lens, domain, exactly, count=32768):
         assert result["false_pass"] == result["false_block"] == 0
     light = relative_illumination(lens, domain, exactly, points=2048, rows=5)
-    assert light["max_difference"] == 0
-    assert (
-        light["exact"][0] == 1 and light["exact"][-1] < 0.5
-    )  # a fast double Gauss darkens by over a stop in the corner
+    assert light.max_difference == 0
+    assert light.exact[0] == 1 and light.exact[-1] < 0.5  # a fast double Gauss darkens by over a stop in the corner
