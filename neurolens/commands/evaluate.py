@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_json, whole
-from neurolens.commands.output import number, print_json, table
+from neurolens.commands.output import answer, number, table
 
 if TYPE_CHECKING:
     from neurolens.evaluate.check import Promise
@@ -63,8 +63,7 @@ def add_parser(subparsers: Any) -> None:
         "--seed", metavar="N", type=whole(0), help="of the rays (default: one that differs from the fit's)"
     )
     parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=1, help="for the timing (default: 1)")
-    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
-    add_json(parser)
+    add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="nothing is written")
 
 
@@ -96,10 +95,7 @@ def run(args: argparse.Namespace) -> int:
         "holds": holds,
         "poor": model.card["errors"].get("poor") or [],
     }
-    if args.json:
-        print_json(data)
-    else:
-        print(_text(data, promises))
+    answer(args, data, lambda: _text(data, promises))
     return 0 if holds else 1
 
 
@@ -117,14 +113,12 @@ def _text(data: dict[str, Any], promises: list[Promise]) -> str:
     if broken:
         verdict = f"Does not hold: {', '.join(broken)}."
     lens = data["lens"]
-    return "\n\n".join(
-        [
-            f"{data['model']}: {data['method']} of {lens['name']} ({lens['file']})\n"
-            f"{data['rays']} fresh rays, seed {data['seed']}",
-            table(header, rows),
-            f"{timing['min']:.1f} ns per ray (median {timing['median']:.1f}), {timing['threads']} thread(s), "
-            f"batches of {timing['batch']}",
-            *([f"Poor, as the card says: {', '.join(data['poor'])}."] if data["poor"] else []),
-            verdict,
-        ]
-    )
+    parts = [
+        f"{data['model']}: {data['method']} of {lens['name']} ({lens['file']})\n"
+        f"{data['rays']} fresh rays, seed {data['seed']}",
+        table(header, rows),
+        f"{timing['min']:.1f} ns per ray (median {timing['median']:.1f}), {timing['threads']} thread(s), "
+        f"batches of {timing['batch']}",
+    ]
+    parts += [f"Poor, as the card says: {', '.join(data['poor'])}."] if data["poor"] else []
+    return "\n\n".join([*parts, verdict])

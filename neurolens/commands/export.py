@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, check_writable
 from neurolens.commands.arguments import add_json
-from neurolens.commands.output import print_json
+from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
     from neurolens.surrogates.model import LensModel
@@ -99,13 +99,10 @@ def run(args: argparse.Namespace) -> int:
         bands = [m.domain.wavelength_nm[0] for m in models] if s.bands > 1 else []
         about = {"function": s.name, "inputs": s.inputs, "outputs": [*s.outputs, "status"], "bands_nm": bands}
         about["operations_per_ray"] = written.operations
-    if args.json:
-        print_json({"file": str(args.out), "to": args.to, "bytes": args.out.stat().st_size, **about})
-    else:
-        print(args.out)
-        for found in about.get("inverse", {}).values():
-            print(f"{found['file']}: finds {found['converged']:.3%} of the model's rays in three steps")
-    return 0
+    data = {"file": str(args.out), "to": args.to, "bytes": args.out.stat().st_size, **about}
+    maps = about.get("inverse", {}).values()
+    said = [f"{m['file']}: finds {m['converged']:.3%} of the model's rays in three steps" for m in maps]
+    return answer(args, data, lambda: "\n".join([str(args.out), *said]))
 
 
 def model_file(path: Path) -> Path:

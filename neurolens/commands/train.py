@@ -11,7 +11,7 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_json
-from neurolens.commands.output import number, print_json, table
+from neurolens.commands.output import answer, number, table
 
 _DESCRIPTION = """\
 Run an experiment: trace ray pairs of the lens, fit the surrogates, export them as ONNX,
@@ -46,11 +46,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("experiment", metavar="EXPERIMENT.toml", nargs="?", type=Path, help="experiment file")
     parser.add_argument("--lens", metavar="FILE", type=Path, help="lens file, instead of an experiment")
     parser.add_argument(
-        "--out",
-        metavar="DIR",
-        type=Path,
+        "--out", metavar="DIR", type=Path,
         help="run folder, made if needed (default: runs/NAME of the experiment or lens file)",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--set", metavar="KEY=VALUE", dest="overrides", action="append", default=[],
         help="change a setting, for example --set pairs.train=10000; values are TOML, may be repeated",
@@ -63,8 +61,7 @@ def add_parser(subparsers: Any) -> None:
         "--internal-focus", action="store_true",
         help="of --lens: one model of internal focus, infinity to the near limit (input \"state\", in 1/m)",
     )  # fmt: skip
-    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
-    add_json(parser)
+    add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="fitted models are kept in the run folder; the same command resumes")
 
 
@@ -84,11 +81,8 @@ def run(args: argparse.Namespace) -> int:
         experiment = read_experiment(args.experiment, args.overrides)
     progress = Progress(quiet=args.quiet)
     results = run_experiment(experiment, folder, progress=progress, command=_command(args))
-    if args.json:
-        print_json({"folder": str(folder), "report": str(folder / "report.html"), **results})
-    else:
-        print(_text(results, folder))
-    return 0
+    data = {"folder": str(folder), "report": str(folder / "report.html"), **results}
+    return answer(args, data, lambda: _text(results, folder))
 
 
 def _run_folder(args: argparse.Namespace) -> Path:
