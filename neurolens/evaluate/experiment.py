@@ -35,11 +35,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 def check_names(field: str, names: Sequence[str]) -> None:
-    """Refuse names that are not valid in file names.
-
-    Raises:
-        InputError: a name with other than letters, digits, dots, underscores and dashes, or that starts with a mark.
-    """
+    """Refuse names that are not valid in file names, as an InputError."""
     for name in names:
         if not _NAME.fullmatch(name):
             expected = "a name of letters, digits, '.', '_' and '-', a letter or digit first"
@@ -120,7 +116,7 @@ class DomainChoice:
 
 
 def near_limit_m(lens: Lens) -> float:
-    """Default distance from the film to the nearest object in focus; see above."""
+    """Default distance from the film to the nearest object in focus."""
     data = first_order(lens)
     f, film_z = abs(data.efl_mm), data.rear_focal_z_mm
     separation = data.rear_principal_z_mm - data.front_principal_z_mm
@@ -242,19 +238,6 @@ def read_experiment(path: str | Path, overrides: Sequence[str] = ()) -> Experime
     return _with_files(read_config(Experiment, path, overrides), lambda file: folder / file)
 
 
-def relative_to(experiment: Experiment, folder: Path) -> Experiment:
-    """The same experiment with its files named relative to `folder`, as `read_experiment` takes a file's there."""
-
-    def moved(path: Path) -> Path:
-        place = path.parent.resolve() / path.name
-        try:
-            return Path(os.path.relpath(place, folder.resolve()))
-        except ValueError:  # another drive
-            return place
-
-    return _with_files(experiment, moved)
-
-
 def _with_files(experiment: Experiment, moved: Callable[[Path], Path]) -> Experiment:
     gain = experiment.scene_domain
     return replace(
@@ -270,7 +253,15 @@ def keep_inputs(experiment: Experiment, folder: Path) -> dict[str, Any]:
 
     Returns the resolved settings, files named relative to the folder.
     """
-    resolved = relative_to(experiment, folder)
+
+    def moved(path: Path) -> Path:
+        place = path.parent.resolve() / path.name
+        try:
+            return Path(os.path.relpath(place, folder.resolve()))
+        except ValueError:  # another drive
+            return place
+
+    resolved = _with_files(experiment, moved)
     atomic_write_text(folder / "config.toml", to_toml(resolved))
     source, kept = experiment.lens.file, folder / "lenses" / experiment.lens.file.name
     kept.parent.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,6 @@
 """Errors of models by zone, on rays not used in any fit, traced once through the exact lens.
 
-Zones are thirds of the film radius (`vignetting.ZONES`), at full aperture and stopped down. A smaller stop changes no
-ray, only which of them pass: the crossing with the stop, kept from the one exact trace, tells.
+A smaller stop changes no ray, only which of them pass: the crossing with the stop, kept from the one trace, tells.
 """
 
 from __future__ import annotations
@@ -105,8 +104,7 @@ def _stop_square(lens: Lens, pairs: PairSet) -> Tensor:
 
 def _without_crossings(pairs: PairSet) -> PairSet:
     """The same rays without the data per surface, which is most of their memory."""
-    names = ("cross_x", "cross_y", "meets", "refracts")
-    return replace(pairs, **{name: getattr(pairs, name)[:0] for name in names})
+    return replace(pairs, **{name: getattr(pairs, name)[:0] for name in ("cross_x", "cross_y", "meets", "refracts")})
 
 
 @dataclass(frozen=True)
@@ -175,16 +173,14 @@ def _within(domain: Domain, rays: FilmRays, zone: str) -> Tensor:
 def _zone(fresh: FreshRays, each: EachRay, state: str, zone: str, exact: Tensor, said: Tensor) -> dict[str, Any]:
     part = zone_of(fresh, each, state, zone)
     within = _within(fresh.domain, fresh.drawn, zone)
-    found: dict[str, Any] = {
+    passing, shares = int(exact[within].sum()), false_shares(exact[within], said[within])
+    return {
         "rms_um": _rms(part.focus_um),
         "direction_rms_deg": _rms(part.direction_deg),
         "rays": len(part.inside),
-        **false_shares(exact[within], said[within]),
-        "passing": int(exact[within].sum()),
+        **(shares if passing >= LEAST_RAYS else dict.fromkeys(shares)),
+        "passing": passing,
     }
-    if found["passing"] < LEAST_RAYS:
-        found |= {"false_pass": None, "false_block": None}
-    return found
 
 
 def _rms(values: Tensor) -> float | None:
@@ -240,9 +236,7 @@ def onnx_predictor(model: OnnxLens) -> Predict:
 
 
 def shared_rays(prepared: Prepared, vignetting_rays: int) -> FreshRays:
-    """The test rays of all models of one lens and domain: many, as a card's errors must be reproducible on other rays,
-    and a few bad rays, one in ten thousand, may dominate them.
-    """
+    """The test rays of all models of one lens and domain; many, as a few bad ones, one in 10,000, may dominate."""
     pairs = prepared.pairs
     seed = pairs.settings.seed + FRESH
     rays = fresh_rays(pairs.lens, pairs.domain, pairs.held_out, count=vignetting_rays, seed=seed)

@@ -1,7 +1,4 @@
-"""Every method on the same rays of a lens: the rows of `neurolens bench surrogates`, their records, errors and times.
-
-Existing records of the same settings and version are kept.
-"""
+"""Every method on the same rays of a lens: the rows of `bench surrogates`, their records, errors and times."""
 
 from __future__ import annotations
 
@@ -30,7 +27,6 @@ from neurolens.optics.pupils import image_radius_mm
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model, prepare
-from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.precision import Precision, store_weights
 from neurolens.surrogates.published import PUBLISHED
@@ -147,8 +143,7 @@ class Bench:
 
     @property
     def name(self) -> str:
-        parts = [self.choice.file.stem, self.choice.configuration or ""]
-        return "-".join(p for p in parts if p)
+        return "-".join(part for part in (self.choice.file.stem, self.choice.configuration) if part)
 
     @cached_property
     def lens(self) -> Lens:
@@ -165,11 +160,6 @@ class Bench:
     @cached_property
     def rays(self) -> FreshRays:
         return shared_rays(self.prepared, self.settings.vignetting_rays)
-
-    @cached_property
-    def per_reference(self) -> float:
-        """Micrometres at an image radius of 21.6 mm for one of this lens."""
-        return REFERENCE_RADIUS_MM / image_radius_mm(self.lens)[0]
 
     def record_file(self, row: Row) -> Path:
         return self.folder / "records" / self.name / f"{row.name}.json"
@@ -248,17 +238,22 @@ def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
     """Errors of the exported graph in onnxruntime; of the float64 model where a method has no graph."""
     prepared, file = bench.prepared, bench.model_file(row)
     model = fit_model(prepared, row.settings, report)
-    refused = _export(model, file)
-    if row.weights and refused is None:
-        store_weights(file, file, row.weights, {})
-    predict: Any = model.predict
-    load_s = None
-    if refused is None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    load_s, refused, predict = None, None, model.predict
+    try:
+        export_onnx(model, file, {})
+    except (NeurolensError, NotImplementedError, TypeError) as error:
+        refused = _reason(error)
+    else:
+        if row.weights:
+            store_weights(file, file, row.weights, {})
         load_s, predict = seconds_to_load(file), onnx_predictor(load_model(file))
     found = measure(bench.rays, predict)
     figures = {key: found.figures[key] for key in _FIGURES}
+    # Micrometres at the common scale of lenses of different size.
+    scale = REFERENCE_RADIUS_MM / image_radius_mm(bench.lens)[0]
     scaled = {
-        f"{key}_at_21_6": None if figures[key] is None else bench.per_reference * figures[key]  # type: ignore[operator]
+        f"{key}_at_21_6": None if (value := figures[key]) is None else scale * value
         for key in ("p99_um", "max_um", "position_rms_um")
     }
     network = row.settings.method in NETWORKS
@@ -277,15 +272,6 @@ def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
         "film_radius_mm": bench.domain.film_radius_mm,
         "passing_share": float(bench.rays.passes.double().mean()),
     }
-
-
-def _export(model: LensModel, file: Path) -> str | None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        export_onnx(model, file, {})
-    except (NeurolensError, NotImplementedError, TypeError) as error:
-        return _reason(error)
-    return None
 
 
 def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]], report: Report) -> None:
