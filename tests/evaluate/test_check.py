@@ -17,15 +17,7 @@ from vignetting_oracle import vignetting_errors
 
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.check import check_model, share_promise
-from neurolens.evaluate.measure import (
-    STOPS,
-    ZONED,
-    fresh_rays,
-    measure,
-    measure_on,
-    what_is_poor,
-    with_more,
-)
+from neurolens.evaluate.measure import STOPS, ZONED, fresh_rays, measure, measure_on, what_is_poor, with_more
 from neurolens.evaluate.vignetting import ZONES
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
