@@ -38,14 +38,11 @@ def test_relative_mse_of_a_constant_offset(level: float, offset: float, eps: flo
     assert image.rel_mse(reference + offset, reference, ImageSettings(eps=eps)) == pytest.approx(expected, rel=1e-12)
 
 
-def test_relative_mse_of_one_channel_counts_a_third() -> None:
+def test_relative_mse_of_one_channel_counts_a_third_and_trimming_drops_the_firefly() -> None:
     reference = np.full((4, 4, 3), 2.0)
     test = reference.copy()
     test[..., 1] += 0.5
     assert image.rel_mse(test, reference) == pytest.approx(0.25 / (4 + 0.01) / 3, rel=1e-12)
-
-
-def test_trimming_drops_the_firefly_and_nothing_else() -> None:
     reference = np.ones((10, 10, 3))
     test = reference + 0.1
     test[3, 4] = 1e6
@@ -83,15 +80,9 @@ def test_flip_sees_what_the_display_shows(picture: np.ndarray) -> None:
 
 
 def test_fine_noise_is_less_visible_from_farther_away(picture: np.ndarray) -> None:
-    test = noisy(picture, 0.1, 3)
+    test, kept = noisy(picture, 0.1, 3), picture.copy()
     near, far = (image.flip(test, picture, ImageSettings(pixels_per_degree=ppd)) for ppd in (30.0, 120.0))
-    assert far < near
-
-
-def test_flip_leaves_its_inputs_alone(picture: np.ndarray) -> None:
-    test, kept = noisy(picture, 0.1, 4), picture.copy()
-    image.flip(test, picture)
-    assert np.array_equal(picture, kept)
+    assert far < near and np.array_equal(picture, kept)
 
 
 def test_noise_floor_of_known_noise() -> None:
@@ -122,14 +113,13 @@ def test_comparing_tells_a_true_camera_from_a_wrong_one(picture: np.ndarray) -> 
     assert wrong.flip_ratio > 1.3 and wrong.rel_mse > 2 * wrong.noise_floor_rel_mse
 
 
-def test_comparing_fewer_renders_uses_the_floor_of_the_same_pairs(picture: np.ndarray) -> None:
+def test_comparing_fewer_renders_uses_the_floor_of_the_same_pairs_and_a_floor_of_zero_gives_no_ratio(
+    picture: np.ndarray,
+) -> None:
     exact = [noisy(picture, 0.02 * (1 + seed), seed) for seed in range(4)]
     figures = image.compare(exact[:1], exact)
     assert figures.pairs == 1 and figures.flip_ratio == 1.0
     assert figures.noise_floor_flip == image.compare(exact, exact).noise_floor_flip
-
-
-def test_a_floor_of_zero_gives_no_ratio(picture: np.ndarray) -> None:
     figures = image.compare([picture * 1.1] * 4, [picture] * 4)
     assert figures.noise_floor_flip == 0.0 and figures.flip_ratio is None and figures.flip > 0
 
