@@ -84,9 +84,8 @@ def test_a_shift_at_a_finite_plane_is_magnification_times_the_shift() -> None:
     lens = lens.with_stop_radius(1.0)
     domain = domain_of(lens, focus_m=(1.0, 1.0), film_radius_mm=0.01)
     rays, shift = held_out(lens, domain), 1e-3
-    errors = ray_errors(
-        lens, domain, rays, lambda _: says(rays.scene._replace(x=rays.scene.x + shift), rays.transmittance)
-    )
+    moved = rays.scene._replace(x=rays.scene.x + shift)
+    errors = ray_errors(lens, domain, rays, lambda _: says(moved, rays.transmittance))
     data = first_order(lens)
     extension = domain.film_z_mm[0] - data.rear_focal_z_mm
     magnification = extension / data.efl_mm  # Newton
@@ -112,15 +111,12 @@ def test_a_ray_from_one_micrometre_beside_is_an_error_of_one_micrometre(
     rays = trace_pairs(lens, FilmRays(radius * cos, radius * sin, *place), domain.pupil_z_mm)
     rays = rays.select((rays.status == 0) & (rays.scene.dz < -0.6))
     inputs = rays.inputs
-    cos, sin = (
-        inputs.film_x / torch.hypot(inputs.film_x, inputs.film_y),
-        inputs.film_y / torch.hypot(inputs.film_x, inputs.film_y),
+    cos, sin = (c / torch.hypot(inputs.film_x, inputs.film_y) for c in (inputs.film_x, inputs.film_y))
+    film_x, film_y = (
+        inputs.film_x + cos * radial - sin * tangential,
+        inputs.film_y + sin * radial + cos * tangential,
     )
-    beside = replace(
-        inputs,
-        film_x=inputs.film_x + cos * radial - sin * tangential,
-        film_y=inputs.film_y + sin * radial + cos * tangential,
-    )
+    beside = replace(inputs, film_x=film_x, film_y=film_y)
     moved = trace_pairs(lens, beside, domain.pupil_z_mm)
     errors = ray_errors(lens, domain, rays, lambda _: says(moved.scene, moved.transmittance))
     assert len(rays) > 10
@@ -135,12 +131,9 @@ def test_the_jacobian_on_the_axis_is_paraxial() -> None:
         rays = FilmRays(zero, zero, zero + domain.film_z_mm[0], zero, zero, zero + 587.5618)
         vergence = focused_vergence(lens, rays.film_z)
         data = first_order(lens)
-        if math.isinf(focus_m):
-            expected = 1 / data.efl_mm
-        else:
-            expected = (
-                data.efl_mm / (domain.film_z_mm[0] - data.rear_focal_z_mm) * float(vergence)
-            )  # object size / distance
+        expected = 1 / data.efl_mm
+        if not math.isinf(focus_m):  # object size / distance
+            expected = data.efl_mm / (domain.film_z_mm[0] - data.rear_focal_z_mm) * float(vergence)
         for value in local_jacobian(lens, domain, rays, vergence):
             assert float(value) == pytest.approx(expected, rel=1e-5)
 
@@ -152,19 +145,13 @@ def test_angles_have_no_floor_and_no_ceiling() -> None:
         assert float(angles_deg(ahead, turned(ahead, math.radians(angle)))) == pytest.approx(angle, rel=1e-9, abs=1e-14)
 
 
-def test_the_point_on_the_ray_does_not_matter(gauss: tuple[Lens, Domain, PairSet]) -> None:
+def test_the_point_on_the_ray_does_not_matter_the_transmittance_does(gauss: tuple[Lens, Domain, PairSet]) -> None:
     lens, domain, rays = gauss
     s = rays.scene
     further = s._replace(x=s.x + 30 * s.dx, y=s.y + 30 * s.dy, z=s.z + 30 * s.dz)
-    errors = ray_errors(lens, domain, rays, lambda _: says(further, rays.transmittance))
+    errors = ray_errors(lens, domain, rays, lambda _: says(further, rays.transmittance - 0.01))
     assert errors.position_rms_um < 1e-9 and errors.max_um < 1e-8
-
-
-def test_transmittance_errors(gauss: tuple[Lens, Domain, PairSet]) -> None:
-    lens, domain, rays = gauss
-    errors = ray_errors(lens, domain, rays, lambda _: says(rays.scene, rays.transmittance - 0.01))
-    assert errors.transmittance_rms == pytest.approx(0.01)
-    assert errors.transmittance_max == pytest.approx(0.01)
+    assert (errors.transmittance_rms, errors.transmittance_max) == pytest.approx((0.01, 0.01))
 
 
 def test_pixels_and_the_common_scale(gauss: tuple[Lens, Domain, PairSet]) -> None:
