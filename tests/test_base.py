@@ -69,7 +69,7 @@ class Experiment:
     focus_m: float = math.inf
     wavelength_nm: tuple[float, float] = (400.0, 700.0)
     f_numbers: tuple[float, ...] = ()
-    names: list[str] = field(default_factory=list)
+    names: tuple[str, ...] = ()
     dispersion: bool = True
     note: str = ""
     fit: Fit = Fit()
@@ -103,7 +103,7 @@ def write(tmp_path: Path, text: str | bytes) -> Path:
 def test_reads_every_kind_of_field(tmp_path: Path) -> None:
     read = read_config(Experiment, write(tmp_path, FULL))
     assert read == Experiment(
-        lens=Path("lenses/a.toml"), focus_m=2.0, wavelength_nm=(450.0, 650.5), f_numbers=(1.8, 4.0), names=["a", "b"],
+        lens=Path("lenses/a.toml"), focus_m=2.0, wavelength_nm=(450.0, 650.5), f_numbers=(1.8, 4.0), names=("a", "b"),
         fit=Fit(terms=20, seed=1), extra_fits=(Fit(terms=3), Fit(method="omp")), limits={"rms_um": 2.0}, crop=None,
     )  # fmt: skip
     assert isinstance(read.focus_m, float) and isinstance(read.wavelength_nm[0], float)
@@ -167,7 +167,7 @@ def test_overrides_win_over_the_file(tmp_path: Path) -> None:
     given = ("fit.terms=7", "fit.method=omp", "focus_m = inf", "f_numbers=[2, 2.8]", "note=a=b", "limits.p99_um=1")
     read = read_config(Experiment, path, [*given, "names=[]"])
     assert (read.fit.terms, read.fit.method, read.fit.seed) == (7, "omp", 1)
-    assert (read.focus_m, read.f_numbers, read.note, read.names) == (math.inf, (2.0, 2.8), "a=b", [])
+    assert (read.focus_m, read.f_numbers, read.note, read.names) == (math.inf, (2.0, 2.8), "a=b", ())
     assert read.limits == {"rms_um": 2.0, "p99_um": 1.0}
 
 
@@ -212,7 +212,7 @@ numbers = st.floats(allow_nan=False)
         focus_m=numbers,
         wavelength_nm=st.tuples(numbers, numbers),
         f_numbers=st.lists(numbers, max_size=3).map(tuple),
-        names=st.lists(texts, max_size=3),
+        names=st.lists(texts, max_size=3).map(tuple),
         dispersion=st.booleans(),
         note=texts,
         fit=st.builds(Fit, terms=st.integers(1, 10**20), seed=st.none() | st.integers(), ridge=numbers),

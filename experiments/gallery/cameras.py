@@ -70,7 +70,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Surrogate:
-    """An exported model, the domain it was fitted to, and its record (`rms_um`, ...; see `records.ModelRecord`)."""
+    """An exported model, the domain it was fitted to, and its record (`rms_um`, ...; see `records.Results`)."""
 
     file: Path
     domain: Domain

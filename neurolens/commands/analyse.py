@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.commands.arguments import add_json, add_lens_state, between, focus_of, state_of
+from neurolens.commands.arguments import add_json, add_lens_state, between, check_run_folder, focus_of, state_of
 from neurolens.commands.output import answer, number, table
 
 if TYPE_CHECKING:
@@ -91,8 +91,7 @@ def run(args: argparse.Namespace) -> int:
     if args.full and not args.json:
         raise InputError("neurolens analyse", "--full", "(given)", "this option only with --json")
     if args.output is not None:
-        if args.output.exists() and not args.output.is_dir():
-            raise InputError(args.output, "--output", str(args.output), "a folder")
+        check_run_folder(args.output, args.output, "--output")
         args.output.mkdir(parents=True, exist_ok=True)
 
     from neurolens.analysis.layout import state_text

@@ -223,6 +223,12 @@ def check_folder(path: Path, option: str) -> None:
         raise InputError(path, option, str(path.parent), "a folder that exists")
 
 
+def check_run_folder(path: Path, command: str | Path, option: str) -> None:
+    """Refuse a file where a folder is to be made or filled; raises InputError."""
+    if path.exists() and not path.is_dir():
+        raise InputError(command, option, str(path), "a folder, not a file")
+
+
 def check_suffix(path: Path, option: str, suffixes: tuple[str, ...]) -> None:
     """Refuse a file to write of another kind, before the work; raises InputError."""
     if path.suffix.lower() not in suffixes:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
-from neurolens.commands.arguments import Parser, whole
+from neurolens.commands.arguments import Parser, check_run_folder, whole
 
 if TYPE_CHECKING:
     from neurolens.evaluate.methods import BenchSettings
@@ -78,8 +78,7 @@ def run_surrogates(args: argparse.Namespace) -> int:
 
     rows, settings, out = chosen_rows(args.methods), _settings(args), args.out
     files = _lens_files(args.lenses)
-    if out.exists() and not out.is_dir():
-        raise InputError("neurolens bench surrogates", "--out", str(out), "a folder, not a file")
+    check_run_folder(out, "neurolens bench surrogates", "--out")
     benches = [Bench(LensChoice(file), settings, out) for file in files]
     out.mkdir(parents=True, exist_ok=True)
     config = {

@@ -232,10 +232,8 @@ def picture_size(settings: CameraSettings, width: int | None, height: int | None
     shape = settings.film_width_mm / settings.film_height_mm
     if width is None and height is None:
         return settings.width, settings.height
-    if height is None:
-        assert width is not None
-        return width, max(1, round(width / shape))
-    return (max(1, round(height * shape)) if width is None else width), height
+    found_width = max(1, round((height or 0) * shape)) if width is None else width
+    return found_width, max(1, round(found_width / shape)) if height is None else height
 
 
 def film_size(text: str) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_json
+from neurolens.commands.arguments import add_json, check_run_folder
 from neurolens.commands.output import answer, number, table
 
 _DESCRIPTION = """\
@@ -95,8 +95,7 @@ def _run_folder(args: argparse.Namespace) -> Path:
         found = "(neither)" if args.lens is None else "(both)"
         raise InputError("neurolens train", "EXPERIMENT.toml or --lens", found, "one of them")
     folder: Path = args.out if args.out is not None else Path("runs") / (args.experiment or args.lens).stem
-    if folder.exists() and not folder.is_dir():
-        raise InputError("neurolens train", "--out", str(folder), "a folder, not a file")
+    check_run_folder(folder, "neurolens train", "--out")
     return folder
 
 
@@ -135,20 +134,8 @@ def _text(results: Mapping[str, Any], folder: Path) -> str:
 
 
 def _row(model: Mapping[str, Any]) -> tuple[str, ...]:
-    timing = model.get("ns_per_ray") or {}
-
-    def percent(key: str) -> str:
-        value = model.get(key)
-        return "-" if value is None else f"{100 * value:.2f}%"
-
-    return (
-        str(model.get("name")),
-        number(model.get("rms_um"), 3),
-        number(model.get("p99_um"), 3),
-        number(model.get("direction_rms_deg"), 3),
-        percent("false_pass"),
-        percent("false_block"),
-        number(timing.get("min"), 3),
-        number(model.get("speedup_over_compiled"), 3),
-        number(model.get("fit_s"), 3),
-    )
+    errors = (number(model.get(key), 3) for key in ("rms_um", "p99_um", "direction_rms_deg"))
+    shares = (model.get(key) for key in ("false_pass", "false_block"))
+    times = ((model.get("ns_per_ray") or {}).get("min"), model.get("speedup_over_compiled"), model.get("fit_s"))
+    percent = ("-" if share is None else f"{100 * share:.2f}%" for share in shares)
+    return (str(model.get("name")), *errors, *percent, *(number(value, 3) for value in times))

@@ -63,11 +63,13 @@ def side_by_side(
         figure, places, bar_place = _page(len(pictures), height / width, bool(maps), title)
         shown = None
         for (name, picture), (top, below) in zip(pictures.items(), places, strict=True):
-            axes = _picture_axes(figure, top)
+            axes = figure.add_axes(top)
+            axes.set_axis_off()
             axes.imshow(to_srgb(picture, exposure), interpolation="nearest")
             axes.set_title(name, fontsize=10.5, fontweight="bold", pad=4)
             if name in maps:
-                axes = _picture_axes(figure, below)
+                axes = figure.add_axes(below)
+                axes.set_axis_off()
                 shown = axes.imshow(maps[name], cmap="magma", vmin=0, vmax=scale, interpolation="nearest")
             _caption(axes, (captions or {}).get(name, ""))
         if shown is not None:
@@ -125,12 +127,6 @@ def _page(count: int, aspect: float, maps: bool, title: str) -> tuple[Any, list[
         left, top = gap + (index % columns) * (wide + gap), head + (index // columns) * band + name
         places.append((box(left, top, wide, tall), box(left, top + tall + gap / 2, wide, tall)))
     return figure, places, box(page[0] - bar + 0.08, head + name, 0.14, page[1] - head - name - words)
-
-
-def _picture_axes(figure: Any, box: _Box) -> Any:
-    axes = figure.add_axes(box)
-    axes.set_axis_off()
-    return axes
 
 
 def _rounded_up(maps: Mapping[str, Any]) -> float:
@@ -208,11 +204,8 @@ def breathing_plot(ways: Mapping[str, Sequence[Breath]], path: str | Path, title
             near = sorted((b for b in breaths if b.focus_m < 1e9), key=lambda b: b.focus_m)
             if len(near) < 2:
                 raise InputError("breathing plot", name, f"({len(near)} distances)", "two finite distances or more")
-            look = {
-                "color": FIELD_COLOURS[number % len(FIELD_COLOURS)],
-                "ls": _DASHES[number % len(_DASHES)],
-                "lw": 1.8,
-            }
+            colour, dashes = FIELD_COLOURS[number % len(FIELD_COLOURS)], _DASHES[number % len(_DASHES)]
+            look = {"color": colour, "ls": dashes, "lw": 1.8}
             distance = [b.focus_m for b in near]
             change = f"{name} (picture grows by {100 * field_change(breaths):.1f}%)"
             panels[0].plot(distance, [b.field_deg for b in near], label=change, **look)

@@ -98,7 +98,7 @@ def pareto_plot(
     markers are coefficients per vector output.
 
     Args:
-        records: `records.ModelRecord`s; those with no time or no error are left out, and their number is stated.
+        records: `records.Results.models`; those with no time or no error are left out, and their number is stated.
         path: PNG, PDF or SVG to write.
         exact: `records.ExactRecord`s; the reason is shown for one that is not available.
         error: the key on the y axis, of ERROR_LABELS.
@@ -135,7 +135,7 @@ def error_against_coefficients_plot(
     """Error (log) against coefficients per vector output, a line for each family; models without such a count across.
 
     Args:
-        records: `records.ModelRecord`s; an MLP and the paraxial map count no coefficients: a dotted line each.
+        records: `records.Results.models`; an MLP and the paraxial map count no coefficients: a dotted line each.
         path: PNG, PDF or SVG to write.
         error: the key on the y axis, of ERROR_LABELS.
     Raises:
@@ -243,9 +243,8 @@ def _plot_exact(axes: Any, exact: Sequence[Record]) -> None:
     axes.text(0.008, 0.82 * _BAND, words, transform=axes.transAxes, va="center", fontsize=8.2, color="#555b63")
     low, high = axes.get_ylim()
     for minor in (False, True):  # no ticks beside the band
-        axes.set_yticks(
-            [t for t in axes.get_yticks(minor=minor) if low * (high / low) ** _BAND < t < high], minor=minor
-        )
+        above = [t for t in axes.get_yticks(minor=minor) if low * (high / low) ** _BAND < t < high]
+        axes.set_yticks(above, minor=minor)
     timed = sorted((t, str(r["name"])) for r in exact if (t := _exact_time(r)))
     if timed:
         axes.axvspan(timed[0][0], axes.get_xlim()[1], color="#000000", alpha=0.035, lw=0, zorder=0)

@@ -1,8 +1,6 @@
-"""The records of a run, as in `results.json`, with units in the keys.
+"""The records of a run, as in `results.json`, with units in the keys; shares are fractions of 1.
 
-Every key is optional but `name`: what was not measured is absent or null, never a made-up number. Shares
-(`false_pass`, `camera_share`, ...) are fractions of 1. Errors are defined in surrogates.md, "Error, defined once".
-As JSON has no infinity, focus at infinity is the text "infinity"; NaN is null.
+What was not measured is absent or null, never a made-up number. For infinity and NaN see `plain`.
 """
 
 from __future__ import annotations
@@ -30,40 +28,6 @@ class Timing(TypedDict, total=False):
     repeats: int
 
 
-class ModelRecord(TypedDict, total=False):
-    """One surrogate on held-out rays. `family` is of `plots.FAMILIES`, `variables` raw or invariants."""
-
-    name: str
-    family: str
-    variables: str
-    file: str  # the exported model, relative to the run folder
-    rms_um: float | None  # film-equivalent error, focused plane, rays to 60 degrees from the axis
-    p99_um: float | None
-    max_um: float | None
-    rms_infinity_um: float | None  # the same for the plane at infinity
-    rms_px: float | None  # at pixel_um of the domain
-    direction_rms_deg: float | None
-    position_rms_um: float | None  # distance from the predicted point to the exact ray
-    transmittance_rms: float | None
-    transmittance_max: float | None
-    false_pass: float | None  # passed by the model, blocked by the lens / passed by the model
-    false_block: float | None  # blocked by the model, passed by the lens / passed by the lens
-    false_pass_near_rim: float | None  # within 2% of a rim; false_block_near_rim likewise
-    false_block_near_rim: float | None
-    stopped_down: dict[str, dict[str, float | None]]  # "2_stops", "4_stops" closed, same fit: false_pass, false_block
-    zones: dict[str, dict[str, dict[str, Any]]]  # "full", "2_stops" by zone of the film; see `measure.Findings`
-    poor: list[str]  # errors that are visible in a picture
-    coefficients_per_vector: int | None  # A and B terms both count; a raw basis: all scalars of the vector
-    parameters: int | None  # of the whole model: coefficients or weights, rims included
-    bytes: int | None
-    fit_s: float | None
-    load_s: float | None
-    ns_per_ray: Timing | None
-    speedup_over_compiled: float | None  # compiled exact / model, both minima of the same run
-    break_even_rays: float | None
-    note: str
-
-
 class ExactRecord(TypedDict, total=False):
     """One exact tracer on the clock; `available` is false, with a `reason`, where it cannot run."""
 
@@ -79,7 +43,11 @@ class Results:
 
     Attributes:
         lens, domain: flat tables of figures with units in their keys.
-        models: `ModelRecord`s.
+        models: name, family (of `plots.FAMILIES`), variables (raw or invariants), file relative to the run folder,
+            `measure.CARD_KEYS`, stopped_down and zones as of `measure.Findings`, poor (errors that are visible in a
+            picture), coefficients_per_vector (A and B terms both count; of a raw basis all scalars of the vector),
+            parameters (of the whole model, rims included), bytes, fit_s, load_s, ns_per_ray (`Timing`),
+            speedup_over_compiled (minima of the same run), break_even_rays, note.
         settings: the resolved configuration.
         exact: exact tracers on the clock.
         cameras: renders of a scene through a camera: name, scene, render_s, camera_s (inside the camera) and its share,
@@ -88,7 +56,7 @@ class Results:
             lens, `image.ImageErrors`.
         image_settings: of `image.ImageSettings`.
         domain_gain: what a domain taken from the scene gains: scene, text, and rows, for the whole lens and for the
-            scene: ModelRecords with domain (its name) and `scenes.domain_facts`.
+            scene: such models with domain (its name) and `scenes.domain_facts`.
         figures: file, relative to the run folder, title, caption; wide where it goes across the page.
         started: ISO 8601.
     """
