@@ -143,7 +143,7 @@ def _compare_scene(
 def scene_gain(experiment: Experiment, folder: Path, progress: Progress) -> dict[str, Any] | None:
     """One model for the whole lens, the same for one shot, and for the shot half of it: error, size and time.
 
-    Returns a `records.DomainGain`, None where the experiment names no scene.
+    Returns `records.Results.domain_gain`, None where the experiment names no scene.
     """
     choice = experiment.scene_domain
     if choice is None:
