@@ -92,13 +92,10 @@ def run_surrogates(args: argparse.Namespace) -> int:
     atomic_write_text(out / "config.json", json.dumps(plain(config), indent=1) + "\n")
     facts = f"{_conditions(args, settings)} {NOTES}"
     found: dict[str, Any] = {}
-
-    def done(bench: Bench, records: list[dict[str, Any]]) -> None:
+    for bench, records in run_bench(benches, rows, Progress(quiet=args.quiet), again=args.again):
         found[bench.name] = records
         write_lens(bench.name, records, facts, out)
         atomic_write_text(out / "summary.md", summary_page(found, facts))
-
-    run_bench(benches, rows, again=args.again, progress=Progress(quiet=args.quiet), done=done)
     print(f"{summary_page(found, facts)}\nLook at\n  {out / 'summary.md'}\n  {out / (benches[0].name + '.md')}, ...")
     return 0
 

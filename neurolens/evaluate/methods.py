@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -178,23 +178,13 @@ class Bench:
 
 
 def run_bench(
-    benches: Sequence[Bench],
-    rows: Sequence[Row],
-    *,
-    again: bool = False,
-    progress: Progress,
-    done: Callable[[Bench, list[dict[str, Any]]], None] = lambda bench, records: None,
-) -> dict[str, list[dict[str, Any]]]:
-    """Records of every lens, by its name; `done` is called after each lens.
-
-    Args:
-        again: recompute existing records, too.
-    """
+    benches: Sequence[Bench], rows: Sequence[Row], progress: Progress, *, again: bool = False
+) -> Iterator[tuple[Bench, list[dict[str, Any]]]]:
+    """Lens by lens, the records of its rows; existing ones are recomputed only `again`."""
+    slow = (*NETWORKS, "neurolens2017")
     for bench in benches:
-        slow = (*NETWORKS, "neurolens2017")
         progress.plan({f"{bench.name}: {r.name}": 30.0 if r.settings.method in slow else 4.0 for r in rows})
         progress.plan({f"{bench.name}: race": 60.0 if bench.settings.compile_exact else 15.0})
-    found = {}
     for bench in benches:
         records = []
         with warnings.catch_warnings():
@@ -204,9 +194,7 @@ def run_bench(
                     records.append(_record(bench, row, again, report))
             with progress.stage(f"{bench.name}: race") as report:
                 _add_times(bench, rows, records, report)
-        found[bench.name] = records
-        done(bench, records)
-    return found
+        yield bench, records
 
 
 def _record(bench: Bench, row: Row, again: bool, report: Report) -> dict[str, Any]:
@@ -215,7 +203,7 @@ def _record(bench: Bench, row: Row, again: bool, report: Report) -> dict[str, An
     head = {"lens": bench.name, "method": row.name, "group": row.group, "source": row.source}
     try:
         mark = bench.fingerprint(row)
-        known = None if again else read_record(file, mark)
+        known = None if again else _known_record(file, mark)
         if known is not None and (known["failed"] or known["not_exported"] or bench.model_file(row).is_file()):
             return known
         file.unlink(missing_ok=True)  # an interruption must not leave a record of removed files
@@ -286,21 +274,21 @@ def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]],
     mark = fingerprint_of([hashes, s.rounds, s.threads, s.compile_exact])
     if all(record.get("race") == mark for record in records if record["method"] in files):
         return
-    timed = race_models(bench.lens, bench.domain, files, s.rounds, s.threads, s.compile_exact, report)
+    timed = _race(bench, files, report)
     for i, (row, record) in enumerate(zip(rows, records, strict=True)):
         if row.name in files:
-            records[i] = plain({**record, **times_of(record, timed), "race": mark})
+            records[i] = plain({**record, **_times_of(record, timed), "race": mark})
             _write(bench.record_file(row), records[i])
 
 
-def read_record(file: Path, fingerprint: str | None = None) -> dict[str, Any] | None:
+def _known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
     """A record; None if missing, unreadable or of other settings."""
     try:
         record = json.loads(file.read_text(encoding="utf-8"))
         good = isinstance(record, dict) and {"lens", "method", "failed", "not_exported"} <= record.keys()
     except (OSError, ValueError):
         return None
-    return record if good and fingerprint in (None, record.get("fingerprint")) else None
+    return record if good and record.get("fingerprint") == fingerprint else None
 
 
 def _write(file: Path, record: dict[str, Any]) -> None:
@@ -308,20 +296,19 @@ def _write(file: Path, record: dict[str, Any]) -> None:
     atomic_write_text(file, json.dumps(record, indent=1, allow_nan=False) + "\n")
 
 
-def race_models(
-    lens: Lens, domain: Domain, files: Mapping[str, Path], rounds: int, threads: int, compiled: bool, report: Report
-) -> Race:
+def _race(bench: Bench, files: Mapping[str, Path], report: Report) -> Race:
     """Race exported models, by name, and the exact tracer; "NAME fused" where a C compiler makes one."""
-    candidates = exact_candidates(lens.with_stop_radius(domain.stop_radius_mm), domain, compiled=compiled)
+    s, domain = bench.settings, bench.domain
+    candidates = exact_candidates(bench.lens.with_stop_radius(domain.stop_radius_mm), domain, compiled=s.compile_exact)
     for name, file in files.items():
         candidates.append(model_candidate(name, load_model(file), domain.stop_radius_mm))
-        fused = fused_candidate(f"{name} fused", file, domain) if threads == 1 else None
+        fused = fused_candidate(f"{name} fused", file, domain) if s.threads == 1 else None
         if fused is not None:
             candidates.append(fused)
-    return race(candidates, domain, rounds=rounds, threads=threads, report=report)
+    return race(candidates, domain, rounds=s.rounds, threads=s.threads, report=report)
 
 
-def times_of(record: Mapping[str, Any], timed: Race) -> dict[str, Any]:
+def _times_of(record: Mapping[str, Any], timed: Race) -> dict[str, Any]:
     """Times of one model for its record, held against the fastest exact tracer of the same race.
 
     Returns: ns_per_ray, speedup (by the minima), break_even_rays (after which fitting and loading pay off; "never"

@@ -42,7 +42,7 @@ def bench_of(folder: Path, file: Path = LENSES / f"{TRIPLET}.toml", settings: Be
 
 
 def run(bench: Bench, *rows: Row, **options: Any) -> list[dict[str, Any]]:
-    return run_bench([bench], rows, progress=Progress(quiet=True), **options)[bench.name]
+    return next(run_bench([bench], rows, Progress(quiet=True), **options))[1]
 
 
 @pytest.fixture(scope="module")
