@@ -215,11 +215,10 @@ class Experiment:
         if chosen.zoom is not None and chosen.configuration is not None:
             raise InputError("settings", "lens.configuration", chosen.configuration, 'left out beside zoom = "range"')
         lens = read_lens(chosen.file).with_aperture(None)
+        internal = chosen.focusing == "internal"
         return StateSpace(
             lens,
-            axes_of(
-                lens, zoom=chosen.zoom is not None, internal=chosen.focusing == "internal", state=chosen.configuration
-            ),
+            axes_of(lens, zoom=chosen.zoom is not None, internal=internal, state=chosen.configuration),
             zoom=chosen.configuration,
             f_number=chosen.f_number,
             film_radius_mm=domain.film_radius_mm,

@@ -131,9 +131,7 @@ def _page(count: int, aspect: float, maps: bool, title: str) -> tuple[Any, list[
 
 def _rounded_up(maps: Mapping[str, Any]) -> float:
     """99.5th percentile of all maps (not the maximum: fireflies), rounded up to 1, 2 or 5 times a power of ten."""
-    if not maps:
-        return 1.0
-    value = float(np.percentile(np.concatenate([m.ravel() for m in maps.values()]), 99.5))
+    value = float(np.percentile(np.concatenate([m.ravel() for m in maps.values()]), 99.5)) if maps else 0.0
     if value <= 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))

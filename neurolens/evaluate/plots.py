@@ -117,9 +117,7 @@ def pareto_plot(
         axes.grid(True, which="major")
         plain_log_ticks(axes.xaxis, axes.yaxis)
         _plot_exact(axes, exact)
-        axes.set_title(title, loc="left", fontweight="bold")
-        _note_left_out(axes, len(records) - len(shown), "without a time or an error")
-        figure.legend(loc="outside right upper")
+        _finish(axes, title, len(records) - len(shown), "without a time or an error")
         counts = [number(r, "coefficients_per_vector") for r in shown]
         labels = [f"{n:.0f}" if n else str(r.get("name", "")) for n, r in zip(counts, shown, strict=True)]
         place_labels(axes, points, labels, fontsize=7.6, color="#333333")
@@ -154,9 +152,7 @@ def error_against_coefficients_plot(
         _plot_lines_across(axes, lines, error)
         axes.grid(True, which="major")
         plain_log_ticks(axes.yaxis)
-        axes.set_title(title, loc="left", fontweight="bold")
-        _note_left_out(axes, len(records) - len(shown), "without an error")
-        figure.legend(loc="outside right upper")
+        _finish(axes, title, len(records) - len(shown), "without an error")
     return Path(path)
 
 
@@ -283,7 +279,9 @@ def _time_label(records: Sequence[Record]) -> str:
     return f"time per ray (ns, least of the repeats; whisker to the median{stated})"
 
 
-def _note_left_out(axes: Any, count: int, why: str) -> None:
-    if count:
-        text = f"{count} model{'s' if count > 1 else ''} {why} not shown"
+def _finish(axes: Any, title: str, left_out: int, why: str) -> None:
+    axes.set_title(title, loc="left", fontweight="bold")
+    axes.figure.legend(loc="outside right upper")
+    if left_out:
+        text = f"{left_out} model{'s' if left_out > 1 else ''} {why} not shown"
         axes.text(1, 1.012, text, transform=axes.transAxes, ha="right", fontsize=8, color=FAINT)

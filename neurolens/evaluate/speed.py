@@ -127,7 +127,6 @@ def race(
     *,
     threads: int = 1,
     rounds: int = 20,
-    seed: int = 3,
     fresh: bool = True,
     report: Callable[[float], None] = lambda share: None,
 ) -> Race:
@@ -155,7 +154,7 @@ def race(
             torch._dynamo.reset()  # torch limits the number of recompilations of a function
         for i, c in enumerate(candidates):
             try:
-                passes[c.name] = _best_batch(c, _pool(c.domain or domain, seed), team)
+                passes[c.name] = _best_batch(c, _pool(c.domain or domain), team)
             except Unavailable as reason:
                 unavailable[c.name] = str(reason)
             report(_PREPARING * (i + 1) / len(candidates))
@@ -170,11 +169,11 @@ def race(
     return Race(ns, {n: p.batch for n, p in passes.items()}, threads, rounds, unavailable, before, _load())
 
 
-def _pool(domain: Domain | FilmRays, seed: int) -> FilmRays:
+def _pool(domain: Domain | FilmRays) -> FilmRays:
     """The rays of one pass: `POOL` of them, from the domain's film plane nearest to the lens."""
     if isinstance(domain, FilmRays):
         return domain
-    rays = sample_domain(domain, POOL, seed)
+    rays = sample_domain(domain, POOL, seed=3)
     return replace(rays, film_z=torch.full_like(rays.film_z, domain.film_z_mm[0]))
 
 
