@@ -26,7 +26,6 @@ from neurolens.cameras.onnxsession import open_session
 from neurolens.commands.arguments import whole
 from neurolens.evaluate.candidates import (
     exact_candidates,
-    find_compiler,
     fused_candidate,
     model_candidate,
     program_candidate,
@@ -35,7 +34,7 @@ from neurolens.evaluate.describe import refractions
 from neurolens.evaluate.experiment import LensChoice
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.speed import Call, Candidate, Race, race
-from neurolens.graph.compiler import FLAGS
+from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
 from neurolens.optics.prescription import Lens
@@ -110,7 +109,7 @@ def small_enough(prepared: Prepared, choices: Sequence[ModelSettings]) -> tuple[
     pairs = prepared.pairs
     for settings in choices:
         model = fit_model(prepared, settings)
-        rms = float(ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict)["rms_um"])
+        rms = float(ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict).rms_um)
         if rms <= WITHIN_UM:
             break
     return model, rms

@@ -14,6 +14,7 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +101,7 @@ def measure(file: Path, domain: str, rays: int) -> dict[str, Any]:
                 "monomials": len(getattr(model.core, "exponents", ())),
                 "seconds": seconds,
                 "openings": opening_errors(model.lens, model, rays),
-                "illumination": light,
+                "illumination": asdict(light),
             }
         except NeurolensError as error:
             row["failed"] = str(error)
