@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from neurolens import __version__
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path
+from neurolens.base.files import atomic_path, fingerprint_of
 from neurolens.cameras.contract import Camera
 from neurolens.render.film import Film, FilmSettings, Tiling
 from neurolens.render.job import Job
@@ -34,7 +34,7 @@ from neurolens.render.mesh import tracer
 _NO_MATTER = ("model", "notes")
 _NOTHING = "(nothing)"  # a place that one of two identities lacks
 _PROBES, _DIGITS = 1024, 16
-_FORMAT = 2
+_FORMAT = 3
 _ABOUT, _SUMS, _DONE = "about.json", "sums.npy", "done.npy"
 SPENT = ("seconds", "camera_thread_seconds", "thread_seconds")
 _LARGEST_ABOUT = 8 << 20
@@ -57,15 +57,8 @@ def identity(job: Job) -> dict[str, Any]:
         "neurolens": __version__,
         "scene": digest(bare),
         "camera": {"name": camera.name, **kept, "rays": _rays(camera)},
-        "width": job.grid.width,
-        "height": job.grid.height,
         "film_mm": list(job.grid.film_mm),
-        "seed": job.seed,
-        "max_depth": job.max_depth,
-        "wavelengths": job.settings.wavelengths,
-        "wavelength_sampling": job.settings.wavelength_sampling,
-        "white_balance": job.settings.white_balance,
-        "differentials": job.differentials,
+        **job.asked(),
     }
     if scene.triangles:
         told["meshes traced by"] = tracer()
@@ -83,34 +76,21 @@ def _leaves(tree: Any, place: str = "") -> dict[str, Any]:
 
 def digest(value: Any) -> str:
     """Hexadecimal digest of a value made of dataclasses, mappings, sequences, arrays and plain values."""
-    hasher = hashlib.sha256()
-    _feed(hasher, value)
-    return hasher.hexdigest()[:_DIGITS]
+    return fingerprint_of([_plain(value)])[:_DIGITS]
 
 
-def _feed(hasher: Any, value: Any) -> None:
-    """Every part is preceded by its type and length, so that different values never give the same bytes."""
+def _plain(value: Any) -> Any:
+    """The value for JSON, every part with its type, so that different values never give the same text."""
     if isinstance(value, np.ndarray):
-        hasher.update(f"array {value.dtype.str} {value.shape};".encode())
-        hasher.update(np.ascontiguousarray(value).data)
-    elif isinstance(value, Mapping):
-        hasher.update(f"mapping {len(value)};".encode())
-        for key in sorted(value, key=str):
-            _feed(hasher, str(key))
-            _feed(hasher, value[key])
-    elif isinstance(value, (tuple, list)):
-        hasher.update(f"sequence {len(value)};".encode())
-        for item in value:
-            _feed(hasher, item)
-    elif is_dataclass(value):
-        _feed(hasher, type(value).__name__)
-        _feed(hasher, {field.name: getattr(value, field.name) for field in fields(value)})
-    elif hasattr(value, "__dict__"):
-        _feed(hasher, type(value).__name__)
-        _feed(hasher, vars(value))
-    else:
-        text = repr(value)
-        hasher.update(f"{type(value).__name__} {len(text)} {text};".encode())
+        content = hashlib.sha256(np.ascontiguousarray(value).data).hexdigest()
+        return [value.dtype.str, value.shape, content]
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    if is_dataclass(value):
+        return [type(value).__name__, {field.name: _plain(getattr(value, field.name)) for field in fields(value)}]
+    return f"{type(value).__name__} {value!r}"
 
 
 def _rays(camera: Camera) -> str:

@@ -7,11 +7,11 @@ import sys
 import numpy as np
 import pytest
 
+from experiments.mitsuba_scenes import our_scene
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.mitsuba import load_scene
-from neurolens.mitsuba.scenes import our_scene
 from neurolens.mitsuba.sensor import BATCH, ChannelWavelengths, FilmRays, wavelength_samples
 from neurolens.render.film import PixelGrid
 from neurolens.render.spectrum import SpectralRange

@@ -87,25 +87,6 @@ def test_cameras_share_their_noise() -> None:
     assert np.abs(pinhole - almost).mean() < 0.02 * np.abs(pinhole - other).mean()
 
 
-def test_differentials_are_asked_for_and_change_nothing() -> None:
-    made, options = lit_scene(), SIZE | {"samples": 4, "threads": 1}
-    asked = 0
-
-    class Counting(ThinLens):
-        def sample_differentials(self, *at: Any) -> CameraRays:
-            nonlocal asked
-            asked += at[0].shape[1]
-            return super().sample_differentials(*at)
-
-    camera = Counting(50.0, 2.0, 3.0, FILM)
-    plain, with_them = render(made, camera, **options), render(made, camera, differentials=True, **options)
-    assert asked >= 36 * 24 * 4 and np.array_equal(plain.rgb, with_them.rgb)
-    assert 0 < with_them.stats["camera_thread_seconds"] < with_them.stats["thread_seconds"]
-    with pytest.raises(InputError, match="differentials"):
-        camera.sample_differentials = None  # type: ignore[assignment, method-assign]
-        render(made, camera, differentials=True, **options)
-
-
 class HalfBlocked(Pinhole):
     """Blocks the left half of the film, with rays that must not be used."""
 
