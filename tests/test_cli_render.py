@@ -46,6 +46,11 @@ def alive(pid: int) -> bool:
         return False
 
 
+def full(path: Path, *_: object, **__: object) -> None:
+    """A writer on a full disk."""
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+
 def wait(condition: Any) -> None:
     deadline = time.monotonic() + 60
     while not condition():
@@ -133,9 +138,6 @@ def test_a_picture_that_cannot_be_written_keeps_the_render_and_the_older_picture
     write_exr(out, np.full((2, 2, 3), 7.0))
     common = ("render", scene, "--camera", "thin", "--quiet", "-o", out)
 
-    def full(path: Path, *_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-
     # There is no checkpoint yet, then there is one that no other can take the place of: it has everything.
     for writers in (["pictures.write_exr"], ["pictures.write_exr", "renderer.write_checkpoint"]):
         with monkeypatch.context() as patch:
@@ -156,9 +158,6 @@ def test_a_disk_without_room_for_picture_and_checkpoint_is_told_as_it_is(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "a.exr"
-
-    def full(path: Path, *_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
     common = ("render", scene, "--camera", "thin", "--quiet", "-o", out, "--threads", 1)
     run_json(capsys, *common, "--keep-checkpoint")
