@@ -20,7 +20,7 @@ from neurolens.render.spectrum import Index
 from neurolens.render.wavelengths import LANES, mode_for, spectral_range
 from neurolens.render.world import World
 
-WeightedRays = tuple[FloatArray, FloatArray, FloatArray]  # origin, direction [3, N] and weight [N] or [lanes, N]
+WeightedRays = tuple[FloatArray, FloatArray, FloatArray]  # origin, direction [3, N] and weight ([lanes,] N)
 # Of a sample's luminance; sums of colours up to a million times as bright stay within float32.
 _BRIGHTEST_SAMPLE = 1e30
 
@@ -66,8 +66,7 @@ class Job:
         self.neutral, self.balance = white is None, np.eye(3)
         if white is not None:
             self.balance = balance(self.spectral.film_rgb(self.world.palette.illuminant(white)))
-        response = self.spectral.rotated(self.spectral.response)
-        self._response = response.reshape(-1, 3, self.spectral.bins)  # [lanes, 3, bins]
+        self._response = self.spectral.rotated(self.spectral.response)  # [lanes, 3, bins]
         self.luminance_row = SRGB.to_xyz[1] @ self.balance
         self._luminance = np.einsum("c,lcb->lb", self.luminance_row, self._response).astype(np.float32)
         self.sampler = Sampler(samples, seed)
@@ -122,15 +121,14 @@ class Job:
         Paths whose light is not finite, or beyond any sum, are counted and add nothing: one would spoil its pixel and
         with it the whole file.
         """
-        value = value.reshape(-1, len(bins))
         luminance = np.einsum("ln,ln->n", self._luminance.take(bins, axis=-1), value)
         dropped = ~(np.abs(luminance) <= _BRIGHTEST_SAMPLE)
         if dropped.any():
             value, luminance = np.where(dropped, np.float32(0), value), np.where(dropped, np.float32(0), luminance)
         sums[:, columns.DROPPED] = np.count_nonzero(dropped.reshape(shape), axis=1)
         luminance = luminance.reshape(shape)
-        colour = self._response.take(bins, axis=-1).reshape(-1, 3, *shape)
-        sums[:, columns.RGB] = np.einsum("lcps,lps->pc", colour, value.reshape(-1, *shape))
+        colour = self._response.take(bins, axis=-1).reshape(len(value), 3, *shape)
+        sums[:, columns.RGB] = np.einsum("lcps,lps->pc", colour, value.reshape(len(value), *shape))
         if self.paths_a_sample > 1:
             luminance = np.add.reduceat(luminance, np.arange(0, shape[1], self.paths_a_sample), axis=1)
         sums[:, columns.LUMINANCE2] = np.einsum("ps,ps->p", luminance, luminance, dtype=np.float64)
@@ -149,20 +147,17 @@ class Job:
         sums[:, columns.HITS] = np.count_nonzero(hit.reshape(shape), axis=1)
 
     def _hero_rays(self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, hue: FloatArray) -> WeightedRays:
-        """Rays of the hero wavelengths, with the weights of all lanes where there are several."""
-        rays = self._camera_rays(camera, film_mm, pupil, self._camera_wavelengths(hue))
+        """Rays of the hero wavelengths, with the weights of all lanes."""
+        origin, direction, hero = self._camera_rays(camera, film_mm, pupil, self._camera_wavelengths(hue))
         lanes = self.spectral.lanes
-        if lanes == 1:
-            return rays
-        weight = np.empty((lanes, len(hue)), np.float32)
-        weight[:] = rays[2]
+        weight = np.repeat(hero[None], lanes, axis=0)
         if camera.dispersive or not getattr(camera, "achromatic", False):
             for lane in range(1, lanes):
                 wavelength_nm = self._camera_wavelengths(_turned(hue, np.float32(lane / lanes)))
                 weight[lane] = self._camera_rays(camera, film_mm, pupil, wavelength_nm)[2]
-            weight *= rays[2] > 0  # the hero's ray must exist
+            weight *= hero > 0  # the hero's ray must exist
         weight /= lanes
-        return rays[0], rays[1], weight
+        return origin, direction, weight
 
     def _camera_rays(
         self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray

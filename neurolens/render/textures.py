@@ -103,7 +103,7 @@ class TextureTable:
         bins: Index,
         look_up: Callable[[Index, Index], FloatArray],
     ) -> None:
-        """Write the reflectance at points [3, N] into `value` [..., N] where surfaces [N] have a texture."""
+        """Write the reflectance at points [3, N] into `value` [lanes, N] where surfaces [N] have a texture."""
         if not self._used:
             return
         number = self._number.take(surface)
@@ -114,7 +114,7 @@ class TextureTable:
             at, frame = point.take(rows, axis=1), self._frames.take(surface[rows], axis=2)
             u, v = frame[:, 0] * at[0] + frame[:, 1] * at[1] + frame[:, 2] * at[2] + frame[:, 3]
             if texture.kind == "image":
-                value[..., rows] = self._picture(self._images[name], u, v, bins[rows])
+                value[:, rows] = self._picture(self._images[name], u, v, bins[rows])
                 continue
             if texture.kind == "checker":
                 # 2e-4 of a cell of slack: a shape that begins on a cell's edge shows no speckle of rounding there.
@@ -123,12 +123,12 @@ class TextureTable:
                 reach = np.float32(0.5 * (texture.line_m or 0) / (texture.cell_m or 1))
                 on_line = (np.abs(u - np.rint(u)) <= reach) | (np.abs(v - np.rint(v)) <= reach)
                 which = 1 - on_line.astype(np.intp)
-            value[..., rows] = look_up(self._rows[k].take(which), bins[rows])
+            value[:, rows] = look_up(self._rows[k].take(which), bins[rows])
 
     def _picture(self, image: FloatArray, u: FloatArray, v: FloatArray, bins: Index) -> FloatArray:
-        """Reflectance [..., N] of the texel at (u, v), in pictures from the lower left corner; the film smooths it."""
+        """Reflectance [lanes, N] of the texel at (u, v), in pictures from the lower left corner."""
         height, width = image.shape[:2]
         column = ((u - np.floor(u)) * width).astype(np.intp)
         row = ((1 - (v - np.floor(v))) * height).astype(np.intp)
         rgb = image[np.minimum(row, height - 1), np.minimum(column, width - 1)]
-        return np.einsum("nc,...cn->...n", rgb, self._basis.take(bins, axis=-1))
+        return np.einsum("nc,lcn->ln", rgb, self._basis.take(bins, axis=-1))

@@ -88,8 +88,9 @@ def radiance(
     pixel, sample = np.divmod(np.arange(count), samples)
     rays = [np.repeat(np.float32(v)[:, None], count, axis=1) for v in (origin, direction)]
     bins = np.arange(count) * 256 // count if pixels == 1 else np.full(count, 128)
-    weight = np.ones(count if lanes == 1 else (lanes, count), np.float32)
-    return trace(made, sampler, sampler.keys(pixel, sample), *rays, weight, bins, max_depth, aim=aim)
+    weight = np.ones((lanes, count), np.float32)
+    found = trace(made, sampler, sampler.keys(pixel, sample), *rays, weight, bins, max_depth, aim=aim)
+    return found if lanes > 1 else found[0]
 
 
 def assert_aimed(made: World, towards: list[float], noise: float, resolved: float = 0.03, max_depth: int = 3) -> None:

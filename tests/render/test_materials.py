@@ -23,8 +23,8 @@ def full(value: float, count: int = COUNT) -> np.ndarray:
 
 def glossy(normal: np.ndarray, out: np.ndarray, base: float, coat: float, alpha: float) -> GlossyLobes:
     count = normal.shape[1]
-    numbers = [full(value, count) for value in (base, coat, alpha)]
-    return GlossyLobes(normal, out, *numbers, CoatTable([alpha]), np.zeros(count, np.intp))
+    base_coat = [full(value, count)[None] for value in (base, coat)]
+    return GlossyLobes(normal, out, *base_coat, full(alpha, count), CoatTable([alpha]), np.zeros(count, np.intp))
 
 
 def test_cosine_directions_have_the_moments_of_the_cosine_law() -> None:
