@@ -28,6 +28,7 @@ WAVELENGTH_MODES: tuple[str, ...] = get_args(WavelengthMode)
 WAVELENGTH_SAMPLINGS: tuple[str, ...] = get_args(WavelengthSampling)
 
 FORKS = sys.platform.startswith("linux")
+CONTEXT: Any = multiprocessing.get_context("fork" if FORKS else None)
 BATCH = 32768  # paths; fewer, and calling numpy costs more than computing; many more, and their state leaves the cache
 SAMPLES_A_PASS = 16
 CHUNK_BYTES = 16 << 20  # of the sums that are copied at a time
@@ -109,11 +110,6 @@ def check_memory(width: int, height: int) -> None:
         raise InputError("picture", "width x height", (width, height), expected)
 
 
-def fork_context() -> Any:
-    """The multiprocessing context: fork on Linux."""
-    return multiprocessing.get_context("fork" if FORKS else None)
-
-
 def shared(shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
     """Zeros that forked workers share.
 
@@ -185,7 +181,7 @@ class Film:
         self.tiling = tiling
         self.sums = shared((tiling.pixels, COLUMNS), np.float64)
         self.done = shared((tiling.tiles,), np.int64)
-        self.lock = fork_context().Lock()
+        self.lock = CONTEXT.Lock()
 
     def add(self, tile: int, sums: NDArray[np.float64]) -> None:
         """Add one pass to a tile."""
