@@ -58,7 +58,7 @@ def sobol(count: int, dimensions: int = _SOBOL_DIMENSIONS) -> UInt32Array:
     index = np.arange(count, dtype=np.uint32)
     points = np.zeros((dimensions, count), np.uint32)
     for dimension in range(dimensions):
-        for k, number in enumerate(_direction_numbers(dimension)):
+        for k, number in enumerate(_direction_numbers(dimension)[: count.bit_length()]):
             points[dimension] ^= (index >> np.uint32(k) & np.uint32(1)) * np.uint32(number)
     return points
 

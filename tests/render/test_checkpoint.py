@@ -79,21 +79,17 @@ def test_a_render_that_is_asked_to_stop_gives_the_picture_so_far(tmp_path: Path)
 
 @pytest.mark.usefixtures("small_tiles")
 def test_an_interrupt_that_nobody_asked_about_keeps_the_checkpoint_too(tmp_path: Path) -> None:
-    part, begun = tmp_path / "a.exr.part", False
-
-    def progress(fraction: float, _: float) -> None:
-        nonlocal begun
-        begun = fraction > 0
+    done = [0.0]
 
     def stop() -> bool:
-        if begun:
+        if done[-1] > 0:
             raise KeyboardInterrupt
         return False
 
-    watch = Watch(checkpoint=part, stop=stop)
+    watch = Watch(checkpoint=tmp_path / "a.exr.part", stop=stop)
     with pytest.raises(KeyboardInterrupt):
-        render(lit_scene(), THIN, samples=100_000, watch=watch, progress=progress, **SIZE)
-    with np.load(part, allow_pickle=False) as kept:
+        render(lit_scene(), THIN, samples=100_000, watch=watch, progress=lambda f, _: done.append(f), **SIZE)
+    with np.load(tmp_path / "a.exr.part", allow_pickle=False) as kept:
         assert kept["done"].any()
 
 
