@@ -87,29 +87,6 @@ def test_the_light_of_a_scene() -> None:
     assert np.all(np.isfinite(one[1]))
 
 
-def coloured_room() -> object:
-    wall = {"point_m": [0, 0, -2], "normal": [0, 0, 1], "material": "m"}
-    ball = {"centre_m": [0.2, 0.1, -1.5], "radius_m": 0.3, "material": "g"}
-    lamp = {"centre_m": [0.6, 0.6, -1], "radius_m": 0.1, "emission": [9, 9, 9], "illuminant": "3000 K"}
-    glossy = {"kind": "glossy", "specular": [0.1, 0.05, 0.02], "roughness": 0.4, "reflectance": [0.1, 0.2, 0.6]}
-    return scene(
-        environment={"colour": [0.3, 0.3, 0.3]},
-        materials={"m": diffuse(0.7, 0.3, 0.1), "g": glossy},
-        planes=[wall],
-        spheres=[ball, lamp],
-    )
-
-
-def test_importance_changes_the_noise_and_not_the_mean() -> None:
-    made, options = coloured_room(), {"width": 24, "height": 16, "samples": 16, "threads": 1, "max_depth": 3}
-    even, drawn = (
-        np.stack([render(made, CAMERA, seed=k, film=film, **options).rgb for k in range(14)])
-        for film in (FilmSettings(wavelength_sampling=s, wavelengths="one") for s in ("uniform", "importance"))
-    )
-    assert_same_mean(even, drawn, 0.01)
-    assert drawn.var(axis=0).mean() < 0.8 * even.var(axis=0).mean()
-
-
 @pytest.mark.parametrize("limits", [(587.5618, 587.5618), (540, 560)])
 def test_light_of_one_wavelength_makes_a_grey_picture(limits: tuple[float, float]) -> None:
     spectral = SpectralRange(*limits)
@@ -157,8 +134,10 @@ def room(tmp_path: Path, material: str) -> Scene:
     )
 
 
-def renders(made: Scene, camera: Any, mode: str, seeds: int, **options: Any) -> np.ndarray:
-    film = FilmSettings(wavelengths=mode)  # type: ignore[arg-type]
+def renders(
+    made: Scene, camera: Any, mode: Any, seeds: int, wavelength_sampling: Any = "importance", **options: Any
+) -> np.ndarray:
+    film = FilmSettings(wavelengths=mode, wavelength_sampling=wavelength_sampling)
     options = SMALL | {"samples": 16, "max_depth": 5} | options
     return np.stack([render(made, camera, seed=seed, film=film, **options).rgb for seed in range(seeds)])
 
@@ -166,6 +145,13 @@ def renders(made: Scene, camera: Any, mode: str, seeds: int, **options: Any) -> 
 def colour_noise(pictures: np.ndarray) -> float:
     """Variance over seeds of R - G and B - G."""
     return float((pictures[..., [0, 2]] - pictures[..., 1:2]).var(axis=0).mean())
+
+
+def test_importance_changes_the_noise_and_not_the_mean(tmp_path: Path) -> None:
+    made = room(tmp_path, "copper")
+    even, drawn = (renders(made, CAMERA, "one", 14, wavelength_sampling=s) for s in ("uniform", "importance"))
+    assert_same_mean(even, drawn, 0.01)
+    assert drawn.var(axis=0).mean() < 0.8 * even.var(axis=0).mean()
 
 
 @pytest.mark.parametrize("material", ["red", "copper", "mirror", "plain", "flint"])
