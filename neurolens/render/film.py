@@ -96,11 +96,7 @@ class PixelGrid:
 
 
 def check_memory(width: int, height: int) -> None:
-    """Refuse a picture that is too large before memory is allocated.
-
-    Raises:
-        InputError: its film alone would fill the machine.
-    """
+    """Refuse (InputError) a picture whose film alone would fill the machine, before memory is allocated."""
     try:
         most = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):
@@ -111,11 +107,7 @@ def check_memory(width: int, height: int) -> None:
 
 
 def shared(shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
-    """Zeros that forked workers share.
-
-    Raises:
-        MemoryError: not enough memory.
-    """
+    """Zeros that forked workers share; MemoryError where there is not enough of it."""
     size = int(np.prod(shape, dtype=np.float64)) * np.dtype(dtype).itemsize
     try:
         return np.frombuffer(mmap.mmap(-1, size), dtype).reshape(shape)
@@ -191,11 +183,7 @@ class Film:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Block changes of all tiles inside the block.
-
-        Raises:
-            NeurolensError: the lock is not released, as a worker was killed while it held it.
-        """
+        """Block changes of all tiles inside the block; NeurolensError where a worker was killed that held the lock."""
         if not self.lock.acquire(timeout=_LONGEST_WAIT_S):
             raise NeurolensError("a render worker was killed while it wrote to the film")
         try:

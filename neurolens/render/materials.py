@@ -61,11 +61,7 @@ def visible_normal(out: FloatArray, alpha: FloatArray, square: FloatArray) -> Fl
 
 
 class CoatTable:
-    """S and T by cosine for some GGX widths.
-
-    Args:
-        alphas: the widths, one row each.
-    """
+    """S and T by cosine for some GGX widths, one row each."""
 
     def __init__(self, alphas: Sequence[float]) -> None:
         cosine = (np.arange(_ENTRIES) + 0.5) / _ENTRIES

@@ -104,10 +104,9 @@ def _check(scene: Path, field: str, mesh: TriangleSet) -> None:
 
 
 def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
-    """The triangles of an OBJ or PLY file (ASCII or binary) in its own units; polygons are cut into triangles.
+    """The triangles of an OBJ or PLY file (ASCII or binary) in its own units, polygons cut into triangles.
 
-    Raises:
-        InputError: see `read_mesh`.
+    Errors as of `read_mesh`.
     """
     kind = path.suffix.lower()
     try:

@@ -52,11 +52,7 @@ class Watch:
 
 
 class Keeper:
-    """Carries out a `Watch` for one job.
-
-    Attributes:
-        resumed: share of the work that was done before.
-    """
+    """Carries out a `Watch` for one job; `resumed` is the share of the work that was done before."""
 
     def __init__(self, job: Job, watch: Watch, progress: Progress | None) -> None:
         self._job, self._watch, self._progress = job, watch, progress

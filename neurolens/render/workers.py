@@ -26,10 +26,7 @@ _POLL_S, _PATIENCE_S = 0.05, 5.0
 
 
 def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None:
-    """Do the remaining work, in this process or in forked ones.
-
-    Args:
-        watch: polled; True ends the work early, between tiles.
+    """Do the remaining work, in this process or in forked ones; `watch` is polled and ends it early, between tiles.
 
     Raises:
         NeurolensError: a worker failed or was killed; the film's tiles stay consistent.

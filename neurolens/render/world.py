@@ -29,16 +29,12 @@ _KINDS = {"diffuse": DIFFUSE, "glossy": GLOSSY, "mirror": MIRROR, "glass": GLASS
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Surfaces in a row that differ only in where they are.
-
-    Attributes:
-        normals: [count, 3]. frames: [count, 2, 5] of textures. emitter: what shines, None if it does not.
-    """
+    """Surfaces in a row that differ only in where they are: normals [count, 3], `frames` [count, 2, 5] of textures."""
 
     normals: NDArray[np.float64]
     material: Material | None = None
     frames: NDArray[np.float64] | None = None
-    emitter: Emitter | None = None
+    emitter: Emitter | None = None  # what shines
 
 
 def _unit(vector: Vector) -> NDArray[np.float64]:
