@@ -1,7 +1,4 @@
-"""Scenes of Mitsuba as scenes of our renderer, for comparing the two on Mitsuba's own Cornell box.
-
-Rectangles, cubes, diffuse colours and area lights can be converted.
-"""
+"""Mitsuba's own Cornell box as a scene of our renderer, on which the two are compared."""
 
 from __future__ import annotations
 
@@ -11,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError
 from neurolens.mitsuba.library import matrix
 from neurolens.render.illuminants import table
 from neurolens.render.scene import Scene, scene_from_tables
@@ -29,33 +25,24 @@ _CUBE = [
 def our_scene(
     description: Mapping[str, Any], film_mm: tuple[float, float], *, back_m: float = 0.0, triangles: bool = False
 ) -> Scene:
-    """A dictionary of Mitsuba, such as mi.cornell_box(), as a scene of ours: the same geometry, colours and depth.
+    """The dictionary mi.cornell_box() as a scene of ours: the same geometry, colours and depth.
 
     Args:
-        description: for mi.load_dict, with a sensor; a scene unit is a metre.
+        description: rectangles, cubes, diffuse colours and area lights; a scene unit is a metre.
         back_m: how far behind the place of Mitsuba's sensor the film stands. Its own pinhole and thin lens stand at
             that place themselves, one image distance in front of the film.
         triangles: a mesh for each material instead of rectangles; lights stay rectangles.
-
-    Raises:
-        InputError: unsupported shapes, materials or lights.
     """
     named = {k: v for k, v in description.items() if k not in _SKIPPED}
     materials = {k: v for k, v in named.items() if v["type"] == "diffuse"}
-    quads: list[dict[str, Any]] = []
-    for name, item in named.items():
-        if item["type"] in ("rectangle", "cube"):
-            quads += _quads(name, item, materials)
-        elif name not in materials:
-            raise InputError("mitsuba scene", f"{name}.type", item["type"], "rectangle, cube or diffuse")
+    quads = [quad for name, item in named.items() if name not in materials for quad in _quads(item)]
     flat = [q for q in quads if not triangles or "emission" in q]
+    meshed = [q for q in quads if q not in flat]
     tables = {
         "camera": _camera(description, film_mm, back_m),
-        "materials": {k: {"kind": "diffuse", "reflectance": _rgb(k, v["reflectance"])} for k, v in materials.items()},
+        "materials": {k: {"kind": "diffuse", "reflectance": _rgb(v["reflectance"])} for k, v in materials.items()},
         "quads": flat,
-        "meshes": [
-            _mesh(k, [q for q in quads if q not in flat and q["material"] == k]) for k in materials if triangles
-        ],
+        "meshes": [_mesh(k, [q for q in meshed if q["material"] == k]) for k in materials if triangles],
     }
     return scene_from_tables(tables, "mitsuba scene")
 
@@ -79,23 +66,19 @@ def _camera(description: Mapping[str, Any], film_mm: tuple[float, float], back_m
     }
 
 
-def _quads(name: str, item: Mapping[str, Any], materials: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _quads(item: Mapping[str, Any]) -> list[dict[str, Any]]:
     """A rectangle, or the faces of a cube, as tables of our quads."""
     place = matrix(item["to_world"])
-    material = item["bsdf"].get("id")
-    if material not in materials:
-        raise InputError("mitsuba scene", f"{name}.bsdf", material or "(inline)", f"one of: {', '.join(materials)}")
-    emitter = item.get("emitter")
-    if emitter is not None and emitter["type"] != "area":
-        raise InputError("mitsuba scene", f"{name}.emitter", emitter["type"], "area")
+    shared = {"material": item["bsdf"]["id"]}
+    if "emitter" in item:
+        shared["emission"] = _rgb(item["emitter"]["radiance"])
     quads = []
     for centre, u, v in _CUBE if item["type"] == "cube" else _RECTANGLE:
         corner = place[:3, :3] @ (centre - (u + v) / 2) + place[:3, 3]
         quad = {"corner_m": corner, "edge_u_m": place[:3, :3] @ u}
         # Rotations that Mitsuba stores as float32 leave errors of 1e-8, which would misalign walls with the axes.
         quad = {k: x.round(6).tolist() for k, x in {**quad, "edge_v_m": place[:3, :3] @ v}.items()}
-        light = {} if emitter is None else {"emission": _rgb(name, emitter["radiance"])}
-        quads.append({**quad, "material": material, **light})
+        quads.append(quad | shared)
     return quads
 
 
@@ -109,11 +92,8 @@ def _mesh(material: str, quads: list[dict[str, Any]]) -> dict[str, Any]:
     return {"material": material, "vertices_m": vertices, "faces": faces}
 
 
-def _rgb(name: str, colour: Mapping[str, Any]) -> list[float]:
-    if colour.get("type") != "rgb":
-        raise InputError("mitsuba scene", f"{name}: colour", colour.get("type", "(missing)"), "rgb")
-    value = np.broadcast_to(np.asarray(colour["value"], np.float64), 3)
-    return [float(x) for x in value]
+def _rgb(colour: Mapping[str, Any]) -> list[float]:
+    return [float(x) for x in np.broadcast_to(np.asarray(colour["value"], np.float64), 3)]
 
 
 def with_our_spectra(description: Mapping[str, Any]) -> dict[str, Any]:
@@ -127,7 +107,7 @@ def with_our_spectra(description: Mapping[str, Any]) -> dict[str, Any]:
         if not isinstance(item, Mapping):
             return item
         if item.get("type") == "rgb":
-            return _spectrum(np.asarray(_rgb("", item)), light)
+            return _spectrum(np.asarray(_rgb(item)), light)
         return {k: replaced(v, light or k in ("radiance", "emitter")) for k, v in item.items()}
 
     return {k: replaced(v, False) for k, v in description.items()}
