@@ -26,16 +26,6 @@ def test_points_and_spheres_obey_the_inverse_square_law(radius: float, height: f
     assert values.mean() == pytest.approx(expected, rel=5e-3) if radius else np.allclose(values, expected, rtol=3e-4)
 
 
-def test_point_light_is_a_small_sphere_of_the_same_intensity() -> None:
-    point = {"position_m": [1, 2, 0], "intensity": [math.pi * 0.01**2 * 7] * 3}
-    sphere = {"centre_m": [1, 2, 0], "radius_m": 0.01, "emission": [7, 7, 7]}
-    a, b = (
-        radiance(on_floor(**lights), [0, 1, 1], [0, 0, 0], max_depth=1).mean()
-        for lights in ({"points": [point]}, {"spheres": [sphere]})
-    )
-    assert a == pytest.approx(b, rel=2e-3)
-
-
 @pytest.mark.parametrize("kind", ["points", "spheres"])
 def test_the_shadow_of_a_ball_is_sharp_and_points_are_not_seen(kind: str) -> None:
     lamp = {"position_m": [0, 4, 0], "intensity": [9, 9, 9]}
