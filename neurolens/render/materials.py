@@ -211,20 +211,20 @@ def glass_direction(
     outside: NDArray[np.bool_],
     index: FloatArray,
     choice: FloatArray,
-    chance: FloatArray | None = None,
+    chance: FloatArray,
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Reflected or refracted travel directions [3, N], each chosen with its Fresnel probability, and which refract [N].
+    """Reflected or refracted travel directions [3, N], and which refract [N].
 
     Args:
-        direction: of travel. outside: whether the ray comes from outside. index: of the glass. choice: in [0, 1).
-        chance: probability of reflection to use instead of Fresnel's.
+        direction: of travel. outside: whether the ray comes from outside. index: of the glass.
+        choice: in [0, 1). chance: probability of reflection, 1 where it is total.
 
     The throughput stays: the factor n^2 of radiance inside glass cancels on the way out, and no light stands in glass.
     """
     relative = np.where(outside, index, 1 / index)
     cos_in = np.clip(-dot(direction, normal), 0, 1)
-    reflectance, cos_out = fresnel_dielectric(cos_in, relative)
-    refracts = choice >= (reflectance if chance is None else chance)
+    _, cos_out = fresnel_dielectric(cos_in, relative)
+    refracts = choice >= chance
     along = np.where(refracts, 1 / relative, np.float32(1))
     across = np.where(refracts, cos_in / relative - cos_out, 2 * cos_in)
     result = direction * along + normal * across

@@ -177,7 +177,7 @@ class World:
         named = [m.texture if m else None for m in materials]
         framed = [(n, t, part.frames) for n, t, part in zip(counts, named, parts, strict=True)]
         tables, images = self.scene.settings.textures or {}, self.scene.images
-        self.textures = textures.TextureTable(tables, images, framed, colour, spectral)
+        self.textures = textures.TextureTable(tables, images, framed, palette, spectral)
 
     def _emission(self, emitter: Emitter | None) -> int:
         return 0 if emitter is None else self.palette.light(emitter.emission, emitter.illuminant)
@@ -280,7 +280,7 @@ class World:
     def reflectance(self, surface: Index, point: FloatArray, bins: Index) -> FloatArray:
         """Reflectance [lanes, N] at wavelength bins [N], textures included."""
         value = self.palette.look_up(self.reflectance_row.take(surface), bins)
-        self.textures.apply(value, surface, point, bins, self.palette.look_up)
+        self.textures.apply(value, surface, point, bins)
         return value
 
     def aimed_emission(self, aimed: LightSamples, rows: Index, bins: Index) -> FloatArray:
