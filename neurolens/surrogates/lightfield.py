@@ -76,6 +76,11 @@ class Encoding:
         return self.chief_y is not None
 
     @property
+    def dispersive(self) -> bool:
+        """Whether rays depend on the wavelength."""
+        return self.w_half != 0
+
+    @property
     def chiefs(self) -> tuple[float, float]:
         """k of x and of y."""
         return self.chief, self.chief if self.chief_y is None else self.chief_y

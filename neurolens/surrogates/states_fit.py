@@ -11,22 +11,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-import torch
 
 from neurolens.base.errors import InputError
 from neurolens.modelfile import axes as ax
 from neurolens.surrogates.bases import (
     Exponents,
     invariant_exponents,
+    kept,
     monomials,
     pinned_threads,
     solve,
     vector_columns,
-    vector_gram,
 )
-from neurolens.surrogates.cores import STOP, InvariantPolynomial
+from neurolens.surrogates.cores import STOP
 from neurolens.surrogates.fit import prepare
-from neurolens.surrogates.fits.boundaries import fit_scalars, fit_stop
+from neurolens.surrogates.fits.boundaries import invariant_core
 from neurolens.surrogates.fits.selection import JointSweep, Sweep, forward, replace_terms
 from neurolens.surrogates.lightfield import Encoding, fit_encoding
 from neurolens.surrogates.model import Gate, LensModel, Scales
@@ -130,35 +129,27 @@ def choose_jointly(data: Sequence[Prepared], settings: StateSettings) -> tuple[E
 
     Returns the exponents [M, 4] kept and the columns of `bases.vector_columns` chosen among them (m p, then m u).
     """
-    dispersive = data[0].encoding.w_half != 0
+    dispersive = data[0].encoding.dispersive
     exponents = invariant_exponents(settings.degree, dispersive=dispersive)
     sweeps = []
     for d in data:
         train = d.train
         outputs = film_equivalent(d.pairs.lens, d.pairs.domain, train.vectors)
-        gram, moments = vector_gram(monomials(train.field.invariants(), exponents), train.field, outputs)
-        sweeps.append(Sweep(gram, moments, (outputs.flatten(1) ** 2).sum(1).numpy()))
+        sweeps.append(Sweep.of_vectors(monomials(train.field.invariants(), exponents), train.field, outputs))
     joint = JointSweep(sweeps)
     forward(joint, settings.terms)
     replace_terms(joint, _PASSES)
-    chosen = joint.chosen
-    count = len(exponents)
-    kept = sorted({k % count for k in chosen})
-    place = {k: i for i, k in enumerate(kept)}
-    return exponents[kept], sorted(place[k % count] + (k >= count) * len(kept) for k in chosen)
+    return kept(exponents, sorted(joint.chosen))
 
 
 def _fit_node(
     data: Prepared, exponents: Exponents, columns: list[int], stop_mm: float, settings: StateSettings
 ) -> LensModel:
     """The model of one node; its stop crossing is in units of `stop_mm`, the same at every node."""
-    pairs, train, count = data.pairs, data.train, len(exponents)
-    ab = torch.zeros((3, 2 * count), dtype=torch.float64)
+    pairs, train, scales = data.pairs, data.train, scales_of(data.pairs.lens)
     vectors = vector_columns(monomials(train.field.invariants(), exponents), train.field)[columns]
-    ab[:STOP, columns] = solve(vectors, train.vectors[:STOP].flatten(1))
-    scales = scales_of(pairs.lens)
-    ab[STOP] = fit_stop(data, exponents) * (scales.stop_mm / stop_mm)
-    core = InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), fit_scalars(data, exponents).numpy())
+    core = invariant_core(data, exponents, columns, solve(vectors, train.vectors[:STOP].flatten(1)))
+    core.ab[STOP] *= scales.stop_mm / stop_mm
     return LensModel(
         lens=pairs.lens,
         domain=pairs.domain,

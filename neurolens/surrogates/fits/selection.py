@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurolens.surrogates.bases import Exponents, monomials, vector_columns
+from neurolens.surrogates.bases import Exponents, monomials, vector_columns, vector_gram
 from neurolens.surrogates.lightfield import LightField
 
 Floats = NDArray[np.float64]
@@ -54,6 +54,17 @@ class Sweep:
         self._start = table
         self.chosen: list[int] = []
         self._table = table.copy()
+
+    @staticmethod
+    def of_columns(columns: Tensor, outputs: Tensor) -> Sweep:
+        """Of columns [M, N] and outputs [R, N]."""
+        return Sweep((columns @ columns.T).numpy(), (columns @ outputs.T).numpy(), (outputs**2).sum(1).numpy())
+
+    @staticmethod
+    def of_vectors(features: Tensor, field: LightField, outputs: Tensor) -> Sweep:
+        """Of `vector_columns` of features [M, N], and vector outputs [R, 2, N]."""
+        gram, moments = vector_gram(features, field, outputs)
+        return Sweep(gram, moments, (outputs.flatten(1) ** 2).sum(1).numpy())
 
     @property
     def residual(self) -> float:
