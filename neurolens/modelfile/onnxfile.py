@@ -31,8 +31,24 @@ def read_checked(path: str | Path) -> tuple[bytes, dict[str, Any]]:
     """Bytes and card of a model file.
 
     Raises:
-        ModelError: a file that is missing, too large, truncated, no ONNX model, without a card of this schema, or that
-            holds something a lens model never does.
+        ModelError: as `read_metadata` and `card_in`, and of a file that holds something a lens model never does.
+    """
+    data, model, metadata = read_metadata(path)
+    try:
+        opsets = [text(fields_of(entry), 1) for entry in model.get(8, [])]
+        _check_graph(fields_of(one(model, 7)), opsets, bool(model.get(25)))
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+    except (ValueError, TypeError) as error:
+        raise ModelError(f"{path}: truncated or damaged ({error})") from error
+    return data, card_in(path, metadata)
+
+
+def read_metadata(path: str | Path) -> tuple[bytes, Fields, dict[str, str]]:
+    """Bytes, fields and metadata of a model file, of which nothing else is checked.
+
+    Raises:
+        ModelError: a file that is missing, too large, truncated, or no ONNX model.
     """
     file = Path(path)
     if not file.is_file():
@@ -43,18 +59,31 @@ def read_checked(path: str | Path) -> tuple[bytes, dict[str, Any]]:
     data = file.read_bytes()
     try:
         model = fields_of(memoryview(data))
-        graph = one(model, 7)
+        one(model, 7)  # the graph
         metadata = {text(entry, 1): text(entry, 2) for entry in map(fields_of, model.get(14, []))}
-        opsets = [text(fields_of(entry), 1) for entry in model.get(8, [])]
     except (ValueError, TypeError) as error:
         raise ModelError(f"{file}: truncated, or not an ONNX model ({error})") from error
+    return data, model, metadata
+
+
+def card_in(file: Any, metadata: dict[str, str]) -> dict[str, Any]:
+    """The card in a file's metadata.
+
+    Raises:
+        ModelError: none, one that is not strict JSON, or of another kind or schema.
+    """
+    if CARD_KEY not in metadata:
+        raise ModelError(f"{file}: no card: its metadata has no {CARD_KEY!r}, so this is no model made by neurolens")
     try:
-        _check_graph(fields_of(graph), opsets, bool(model.get(25)))
-    except ModelError as error:
-        raise ModelError(f"{file}: {error}") from error
-    except (ValueError, TypeError) as error:
-        raise ModelError(f"{file}: truncated or damaged ({error})") from error
-    return data, _card(file, metadata)
+        card = json.loads(metadata[CARD_KEY], parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise ModelError(f"{file}: the card is not strict JSON ({error})") from error
+    kind = card.get("kind") if isinstance(card, dict) else None
+    if kind != CARD_KIND:
+        raise ModelError(f"{file}: card: kind: got {kind!r}, expected {CARD_KIND!r}")
+    if card.get("schema") != CARD_SCHEMA:
+        raise ModelError(f"{file}: card: schema: got {card.get('schema')!r}, expected {CARD_SCHEMA}")
+    return card
 
 
 def without_outputs(data: bytes, names: frozenset[str]) -> bytes:
@@ -78,21 +107,6 @@ def constants_and_nodes(data: bytes) -> tuple[dict[str, NDArray[Any]], list[Node
         values = np.frombuffer(raw, _TYPES[kind]) if len(raw) or kind != 1 else _floats(tensor.get(4, []))
         constants[text(tensor, 8)] = values.reshape(integers(tensor.get(1, [])))
     return constants, [_node(fields_of(node)) for node in graph.get(1, [])]
-
-
-def _card(file: Path, metadata: dict[str, str]) -> dict[str, Any]:
-    if CARD_KEY not in metadata:
-        raise ModelError(f"{file}: no card: its metadata has no {CARD_KEY!r}, so this is no model made by neurolens")
-    try:
-        card = json.loads(metadata[CARD_KEY], parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
-        raise ModelError(f"{file}: the card is not strict JSON ({error})") from error
-    kind = card.get("kind") if isinstance(card, dict) else None
-    if kind != CARD_KIND:
-        raise ModelError(f"{file}: card: kind: got {kind!r}, expected {CARD_KIND!r}")
-    if card.get("schema") != CARD_SCHEMA:
-        raise ModelError(f"{file}: card: schema: got {card.get('schema')!r}, expected {CARD_SCHEMA}")
-    return card
 
 
 def _refuse_constant(name: str) -> Any:

@@ -194,23 +194,17 @@ def domain_from_camera(
     stopped = lens.at(f_number=f_number, focus_m=focus_m) if f_number is not None else lens.at(focus_m=focus_m)
     corner = math.hypot(*film_mm) / 2
     radius = min(corner, image_radius_mm(lens)[0])
-    domain = domain_of(
-        stopped,
-        film_radius_mm=radius,
-        focus_m=(focus_m, focus_m),
-        wavelength_nm=wavelength_nm,
-        nearest_m=nearest_m,
+    focus = (focus_m, focus_m)
+    return stopped, domain_of(
+        stopped, film_radius_mm=radius, focus_m=focus, wavelength_nm=wavelength_nm, nearest_m=nearest_m
     )
-    return stopped, domain
 
 
 def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:
     """z (mm, lens frame; -inf at infinity focus) of the object plane in focus for each film plane z, first order."""
     data = first_order(lens)
     f = data.efl_mm
-    extension = (
-        film_z - data.rear_principal_z_mm - f
-    )  # Newton: object distance beyond the front focus is f^2 / extension
+    extension = film_z - data.rear_principal_z_mm - f  # Newton: f^2 / extension is how far beyond the front focus
     far = extension <= 1e-9 * f
     distance = f + f * f / torch.where(far, torch.ones_like(extension), extension)
     return data.front_principal_z_mm - torch.where(far, torch.full_like(distance, math.inf), distance)
@@ -310,11 +304,8 @@ def _boxes(domain: Domain) -> tuple[Tensor, ...]:
     low, high, half = (torch.tensor(v, dtype=torch.float64) for v in (b.low_mm, b.high_mm, b.half_mm))
     dark = low >= high
     low, high, half = low.where(~dark, math.inf), high.where(~dark, -math.inf), half.where(~dark, 0.0)
-    low, high, half = (
-        torch.minimum(low[:-1], low[1:]),
-        torch.maximum(high[:-1], high[1:]),
-        torch.maximum(half[:-1], half[1:]),
-    )
+    low, high = torch.minimum(low[:-1], low[1:]), torch.maximum(high[:-1], high[1:])
+    half = torch.maximum(half[:-1], half[1:])
     lit = low < high
     low, high = low.where(lit, 0.0), high.where(lit, 0.0)
     spare = _BOX_MARGIN * torch.maximum((high - low) / 2, half)

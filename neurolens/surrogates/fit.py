@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
@@ -27,7 +27,7 @@ from neurolens.surrogates.fits.polynomial import fit_paraxial, fit_polynomial
 from neurolens.surrogates.gates import choose_gates, explained
 from neurolens.surrogates.lightfield import fit_encoding
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import PairSet, RayPairs, trace_pairs
+from neurolens.surrogates.pairs import RayPairs, trace_pairs
 from neurolens.surrogates.published import fit_published
 from neurolens.surrogates.settings import NETWORKS, PLANES_SEARCHED, POLYNOMIALS, ModelSettings, PublishedName
 from neurolens.surrogates.targets import Prepared, film_equivalent, scales_of, squared_error, targets_of
@@ -146,17 +146,8 @@ def _fit_core(
             return base
         if isinstance(base, RawPolynomial):
             raise InputError("fit", "basis", settings.basis, "invariants, with a network beside the polynomial")
-        network = fit_network(
-            data,
-            units=settings.units,
-            layers=settings.layers,
-            seed=settings.seed,
-            seconds=settings.seconds,
-            steps=settings.steps,
-            base=base,
-            checkpoint=of_zone(checkpoint, next(zones)),
-            progress=progress,
-        )
+        file = of_zone(checkpoint, next(zones))
+        network = fit_network(data, settings, base=base, checkpoint=file, progress=progress)
         return network if base is None else Residual((base, network))
 
     return fit_partitioned(prepared, settings.partitions, fit)
@@ -236,10 +227,8 @@ def fit_partitioned(prepared: Prepared, zones: int, fit: Callable[[Prepared], Zo
 
 
 def _zone(prepared: Prepared, rhos: dict[str, Tensor], low: float, high: float) -> Prepared:
-    def within(name: str) -> PairSet:
-        rho, rays = rhos[name], getattr(prepared.pairs, name)
-        chosen: PairSet = rays.select((rho > low - OVERLAP) & (rho <= high + OVERLAP))
-        return chosen
-
-    zone = replace(prepared.pairs, train=within("train"), rim=within("rim"), edge=within("edge"), far=within("far"))
-    return replace(prepared, pairs=zone)
+    zone: dict[str, Any] = {
+        name: getattr(prepared.pairs, name).select((rho > low - OVERLAP) & (rho <= high + OVERLAP))
+        for name, rho in rhos.items()
+    }
+    return replace(prepared, pairs=replace(prepared.pairs, **zone))

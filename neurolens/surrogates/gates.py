@@ -35,11 +35,6 @@ _ROUNDS = 8
 _RIDGE, _DEPENDENT = 1e-13, 1e-12  # relative
 
 
-def has_edges(gates: tuple[Gate, ...]) -> bool:
-    """Whether any gate is a discriminant."""
-    return any(gate.reason != st.RIM for gate in gates)
-
-
 def gate_reach(gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
     """[G, N] bool: rays of which the gate's value is known, because they get as far as its surface (and to its rim)."""
     known = reached(pairs)
@@ -92,7 +87,7 @@ def boundary_rays(pairs: RayPairs, gates: tuple[Gate, ...]) -> PairSet:
 
     Fits without such a gate see no lost ray.
     """
-    if not has_edges(gates) or not len(pairs.edge):
+    if all(gate.reason == st.RIM for gate in gates) or not len(pairs.edge):
         return pairs.rim
     both = join_pairs([pairs.rim, pairs.edge])
     return both.select(torch.randperm(len(both), generator=torch.Generator().manual_seed(_MIXING_SEED)))

@@ -18,7 +18,7 @@ from neurolens.surrogates.bases import Exponents, kept, ordered, pinned_threads,
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.fits.selection import Sweep, forward
-from neurolens.surrogates.inverse import STEPS, TOLERANCE, FilmSide, Guess, InverseModel, StopRays, scaled_film_z
+from neurolens.surrogates.inverse import STEPS, TOLERANCE, Guess, InverseModel, InverseRays, scaled_film_z
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import RayPairs, join_pairs
@@ -83,7 +83,7 @@ def convergence(inverse: InverseModel, rays: FilmRays, steps: int = STEPS) -> di
     return {"stop": _found(inverse.model, rays, stop), "scene": _found(inverse.model, rays, back)}
 
 
-def _found(model: LensModel, rays: FilmRays, out: StopRays | FilmSide) -> dict[str, Any]:
+def _found(model: LensModel, rays: FilmRays, out: InverseRays) -> dict[str, Any]:
     solved = out.residual < TOLERANCE
     away = torch.hypot(out.rays.pupil_x - rays.pupil_x, out.rays.pupil_y - rays.pupil_y)
     other = solved & (away > _OTHER * model.domain.pupil_radius_mm)

@@ -22,7 +22,7 @@ from torch import Tensor
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph
 from neurolens.surrogates.bases import Exponents
-from neurolens.surrogates.cores import ROUND, Core, CoreValues, Field, RawPolynomial, Units
+from neurolens.surrogates.cores import ROUND, Composite, CoreValues, Field, RawPolynomial, Units
 from neurolens.surrogates.fits.selection import grow
 from neurolens.surrogates.pairs import PairSet
 from neurolens.surrogates.published.data import Outputs, RawData, outer_pupil, solve_outputs
@@ -36,32 +36,22 @@ _COORDINATES = (0, 2, 1)  # rho, tau, sigma: of equal errors the first is cut
 
 
 @dataclass(frozen=True, eq=False)
-class Cells(Core):
+class Cells(Composite):
     """A partition of the light field into two halves, each with a polynomial of its own or divided again.
 
     Attributes:
         variable: 0, 1 or 2: which invariant decides (rho, sigma, tau of the light field).
-        threshold: rays above it are those of `high`.
-        low, high: the halves.
+        threshold: rays above it are those of the second half.
+        parts: the halves.
     """
 
     variable: int
     threshold: float
-    low: RawPolynomial | Cells
-    high: RawPolynomial | Cells
+    parts: tuple[RawPolynomial | Cells, RawPolynomial | Cells]
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
-        low, high = (half.build(g, field, units) for half in (self.low, self.high))
+        low, high = (half.build(g, field, units) for half in self.parts)
         return low.chosen(field.products(ROUND[self.variable : self.variable + 1], w=False) <= self.threshold, high)
-
-    @property
-    def coefficients_per_vector(self) -> int:
-        """Of all cells together."""
-        return self.low.coefficients_per_vector + self.high.coefficients_per_vector
-
-    @property
-    def coefficients(self) -> int:
-        return self.low.coefficients + self.high.coefficients
 
 
 @dataclass
@@ -81,7 +71,7 @@ class _Node:
         if self.cut is None:
             return self.polynomial
         variable, threshold, low, high = self.cut
-        return Cells(variable, threshold, low.core(), high.core())
+        return Cells(variable, threshold, (low.core(), high.core()))
 
 
 def fit_adaptive(
