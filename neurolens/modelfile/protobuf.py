@@ -34,11 +34,7 @@ def fields_of(data: memoryview, fixed: frozenset[int] = frozenset()) -> Fields:
 
 
 def one(fields: Fields, number: int) -> Any:
-    """The only value of a field.
-
-    Raises:
-        ValueError: none, or several.
-    """
+    """The only value of a field. Raises ValueError: none, or several."""
     values = fields.get(number, [])
     if len(values) != 1:
         raise ValueError(f"field {number} stands {len(values)} times, expected once")
@@ -46,20 +42,12 @@ def one(fields: Fields, number: int) -> Any:
 
 
 def text(fields: Fields, number: int) -> str:
-    """The text of a field, empty where there is none.
-
-    Raises:
-        ValueError: something else than text.
-    """
+    """The text of a field, empty where there is none. Raises ValueError: something else than text."""
     return as_text(fields[number][-1]) if number in fields else ""
 
 
 def as_text(value: Any) -> str:
-    """The text that a value is.
-
-    Raises:
-        ValueError: a number, or bytes that are no text.
-    """
+    """The text that a value is. Raises ValueError: a number, or bytes that are no text."""
     if isinstance(value, int):
         raise ValueError("a number where a text should be")
     return bytes(value).decode("utf-8")

@@ -14,7 +14,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurolens.base.errors import InputError
 from neurolens.graph.interpret import monomials as monomials
 from neurolens.surrogates.lightfield import LightField
 
@@ -114,18 +113,10 @@ def solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None) -> Te
 
 
 @contextmanager
-def pinned_threads(threads: int = 1) -> Iterator[None]:
-    """Give torch this many threads inside the block, and what it had before after it.
-
-    A fit on one thread gives the same bits anywhere, and does not crawl on a shared machine.
-
-    Raises:
-        InputError: fewer than one.
-    """
-    if threads < 1:
-        raise InputError("torch", "threads", threads, "at least 1")
+def pinned_threads() -> Iterator[None]:
+    """Give torch one thread inside the block: the same bits anywhere, and no crawling on a shared machine."""
     before = torch.get_num_threads()
-    torch.set_num_threads(threads)
+    torch.set_num_threads(1)
     try:
         yield
     finally:

@@ -216,30 +216,21 @@ def sample_domain(domain: Domain, count: int, seed: int, skip: int = 0) -> FilmR
     Scrambled Sobol points (Owen scrambling, torch): the same seed gives the same rays; `skip` continues the sequence,
     so that splits never share a ray.
     """
-    s = sobol_points(count, seed, skip)
+    s, film_z, wavelength = _drawn(domain, count, seed, skip)
     film_x, film_y = _disc(s[0], s[1], domain.film_radius_mm)
     pupil_x, pupil_y = _disc(s[2], s[3], domain.pupil_radius_mm)
-    return FilmRays(film_x, film_y, film_planes(domain, s[5]), pupil_x, pupil_y, wavelengths_of(domain, s[4]))
+    return FilmRays(film_x, film_y, film_z, pupil_x, pupil_y, wavelength)
 
 
-def sobol_points(count: int, seed: int, skip: int) -> Tensor:
-    """[6, N] scrambled Sobol points; `skip` continues a sequence."""
+def _drawn(domain: Domain, count: int, seed: int, skip: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Scrambled Sobol points: four numbers of every ray [4, N], its film plane and its wavelength."""
     engine = SobolEngine(6, scramble=True, seed=seed)
     if skip:
         engine.fast_forward(skip)
-    return engine.draw(count, dtype=torch.float64).T
-
-
-def film_planes(domain: Domain, s: Tensor) -> Tensor:
-    """One of `FILM_PLANES` film planes for each number from 0 to 1."""
-    near, far = domain.film_z_mm
-    return near + (far - near) * torch.floor(s * FILM_PLANES).clamp_max(FILM_PLANES - 1) / (FILM_PLANES - 1)
-
-
-def wavelengths_of(domain: Domain, s: Tensor) -> Tensor:
-    """The domain's wavelengths, from the shortest for 0 to the longest for 1."""
-    low, high = domain.wavelength_nm
-    return low + (high - low) * s
+    s = engine.draw(count, dtype=torch.float64).T
+    (near, far), (low, high) = domain.film_z_mm, domain.wavelength_nm
+    step = torch.floor(s[5] * FILM_PLANES).clamp_max(FILM_PLANES - 1)
+    return s[:4], near + (far - near) * step / (FILM_PLANES - 1), low + (high - low) * s[4]
 
 
 def _disc(a: Tensor, b: Tensor, radius: float) -> tuple[Tensor, Tensor]:
@@ -277,16 +268,14 @@ def sample_lit(domain: Domain, count: int, seed: int, skip: int = 0) -> tuple[Fi
     """
     edges, low, high, half, area = _boxes(domain)
     weight = (edges[1:] ** 2 - edges[:-1] ** 2) * area
-    s = sobol_points(count, seed, skip)
+    s, film_z, wavelength = _drawn(domain, count, seed, skip)
     total = torch.cumsum(weight, 0)
     ring = torch.searchsorted(total, s[0] * total[-1], right=True).clamp_max(len(weight) - 1)
     part = (s[0] * total[-1] - (total - weight)[ring]) / weight[ring]
     r = torch.sqrt(edges[ring] ** 2 + part.clamp(0, 1) * (edges[1:] ** 2 - edges[:-1] ** 2)[ring])
     u, v = low[ring] + (high - low)[ring] * s[2], half[ring] * (2 * s[3] - 1)
     cos, sin = torch.cos(2 * math.pi * s[1]), torch.sin(2 * math.pi * s[1])
-    rays = FilmRays(
-        r * cos, r * sin, film_planes(domain, s[5]), u * cos - v * sin, u * sin + v * cos, wavelengths_of(domain, s[4])
-    )
+    rays = FilmRays(r * cos, r * sin, film_z, u * cos - v * sin, u * sin + v * cos, wavelength)
     kept = rays.pupil_x**2 + rays.pupil_y**2 <= domain.pupil_radius_mm**2
     return rays.select(kept), count / lit_share(domain)
 

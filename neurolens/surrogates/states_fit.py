@@ -28,7 +28,7 @@ from neurolens.surrogates.fit import prepare
 from neurolens.surrogates.fits.boundaries import invariant_core
 from neurolens.surrogates.fits.selection import JointSweep, Sweep, forward, replace_terms
 from neurolens.surrogates.lightfield import Encoding, fit_encoding
-from neurolens.surrogates.model import Gate, LensModel, Scales
+from neurolens.surrogates.model import LensModel, Scales
 from neurolens.surrogates.pairs import PairSettings, RayPairs, make_pairs
 from neurolens.surrogates.states import State, StateModel, StateSpace
 from neurolens.surrogates.targets import Prepared, film_equivalent, scales_of
@@ -77,7 +77,9 @@ def fit_states(
             known[k] = prepare(_pairs(space, states[k], settings))
             if progress:
                 progress(0.3 * (done + 1) / len(choosers))
-        gates = _all_gates([p.gates for p in known.values()])
+        # Every gate that any node needs, in the order in which camera rays meet them.
+        needed = {g for p in known.values() for g in p.gates}
+        gates = tuple(sorted(needed, key=lambda g: (-g.surface, g.reason)))
         scales = common_encoding([d.encoding for d in known.values()])
         known = {k: replace(d, encoding=_scaled_like(scales, d.encoding)) for k, d in known.items()}
         stop_mm = max(d.pairs.lens.stop_radius_mm for d in known.values())
@@ -117,11 +119,6 @@ def common_encoding(found: Sequence[Encoding]) -> Encoding:
 def _scaled_like(scales: Encoding, own: Encoding) -> Encoding:
     """The planes of a node with the scales of all."""
     return replace(scales, film_plane_z_mm=own.film_plane_z_mm, pupil_plane_z_mm=own.pupil_plane_z_mm)
-
-
-def _all_gates(found: Sequence[tuple[Gate, ...]]) -> tuple[Gate, ...]:
-    """Every gate that any node needs, in the order in which camera rays meet them."""
-    return tuple(sorted({g for gates in found for g in gates}, key=lambda g: (-g.surface, g.reason)))
 
 
 def choose_jointly(data: Sequence[Prepared], settings: StateSettings) -> tuple[Exponents, list[int]]:

@@ -62,11 +62,7 @@ def storable(core: Core) -> bool:
 
 
 def model_to_text(model: LensModel) -> str:
-    """The metadata entry of a model: deflated JSON in base64.
-
-    Raises:
-        InputError: a core that is not `storable`.
-    """
+    """The metadata entry of a model: deflated JSON in base64. Raises InputError: a core that is not `storable`."""
     if not storable(model.core):
         raise InputError("export", "core", type(model.core).__name__, f"one of {', '.join(CORES)}")
     data = {

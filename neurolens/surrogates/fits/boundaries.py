@@ -15,13 +15,7 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.surrogates.bases import (
-    Exponents,
-    invariant_exponents,
-    monomials,
-    solve,
-    vector_columns,
-)
+from neurolens.surrogates.bases import Exponents, invariant_exponents, monomials, solve, vector_columns
 from neurolens.surrogates.cores import STOP, InvariantPolynomial
 from neurolens.surrogates.fits.selection import Sweep
 from neurolens.surrogates.gates import GateFit, gate_reach, gate_values
@@ -90,7 +84,7 @@ def solve_scalars(data: Prepared, features: Callable[[LightField], Tensor]) -> T
     return torch.cat([solve(train, pairs.train.transmittance[None]), fit.coefficients()])
 
 
-def boundary_terms(data: Prepared, exponents: Exponents, most: int = MOST_BOUNDARY_TERMS) -> Exponents:
+def boundary_terms(data: Prepared, exponents: Exponents) -> Exponents:
     """[K, 4] further exponents, where those given [M, 4] meet the stop crossing or a gate badly; often none.
 
     Forward selection by the gain of all those boundaries together, in squares of the error that each may have.
@@ -108,7 +102,7 @@ def boundary_terms(data: Prepared, exponents: Exponents, most: int = MOST_BOUNDA
     features = monomials(field.invariants(), candidates)
     fits = _boundary_fits(data, field, features, len(exponents), bad)
     chosen: list[int] = []
-    while fits and len(chosen) < min(most, len(added)):
+    while fits and len(chosen) < min(MOST_BOUNDARY_TERMS, len(added)):
         scores = np.sum([f.scores() for f in fits], axis=0)
         best = int(np.argmax(scores))
         if not scores[best] > 0:

@@ -29,7 +29,7 @@ from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
 from neurolens.surrogates.bases import Exponents, monomials
 from neurolens.surrogates.cores import Core, CoreValues, Field, Units
-from neurolens.surrogates.domain import Domain, FilmRays
+from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import trace_pairs
@@ -163,28 +163,29 @@ def fit_rtf(data: RawData, degree: int) -> tuple[Meridian, tuple[Gate, ...]]:
     return core, (Gate(0 if lens.stop_index else len(lens.surfaces) - 1, st.RIM),)
 
 
-def fit_ellipses(data: RawData, positions: int = POSITIONS, count: int = _RAYS) -> tuple[Array, Array]:
+def fit_ellipses(data: RawData) -> tuple[Array, Array]:
     """Knots [K] (in units of p) and ellipses [K, 3] (radius across and along, centre along; mm on the pupil plane).
 
     Positions where no three rays pass take the ellipse of their neighbour towards the axis.
     """
-    domain, e = data.pairs.domain, data.encoding
-    knots = np.linspace(0, 1, positions)
+    e = data.encoding
+    knots = np.linspace(0, 1, POSITIONS)
     rows: list[tuple[float, float, float]] = []
     for knot in knots:
-        crossings = _passing(data, domain, float(knot) * e.film_scale_mm, count)
+        crossings = _passing(data, float(knot) * e.film_scale_mm)
         if len(crossings) >= 3:
             rows.append(least_ellipse(crossings))
         elif rows:
             rows.append(rows[-1])
-    while len(rows) < positions:
+    while len(rows) < POSITIONS:
         rows.insert(0, rows[0] if rows else (1e-9, 1e-9, 0.0))
     return knots, np.array(rows)
 
 
-def _passing(data: RawData, domain: Domain, y_mm: float, count: int) -> Array:
+def _passing(data: RawData, y_mm: float) -> Array:
     """[K, 2] where passing rays from height y in the input plane cross the pupil plane, across and along."""
-    points = torch.quasirandom.SobolEngine(3, scramble=True, seed=17).draw(count, dtype=torch.float64).T
+    domain = data.pairs.domain
+    points = torch.quasirandom.SobolEngine(3, scramble=True, seed=17).draw(_RAYS, dtype=torch.float64).T
     radius, angle = domain.pupil_radius_mm * torch.sqrt(points[0]), 2 * torch.pi * points[1]
     low, high = domain.wavelength_nm
     zero = torch.zeros_like(radius)

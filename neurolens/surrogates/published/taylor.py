@@ -103,10 +103,7 @@ class Truncated:
         return self.of(taylor, a)
 
 
-@lru_cache(maxsize=8)
-def truncated(variables: int, degree: int) -> Truncated:
-    """The arithmetic of a degree; made once."""
-    return Truncated(variables, degree)
+truncated = lru_cache(maxsize=8)(Truncated)  # made once
 
 
 class RaySeries(NamedTuple):
