@@ -17,11 +17,7 @@ _VARINT, _DOUBLE, _BYTES, _FLOAT = 0, 1, 2, 5  # wire types
 def fields_of(data: memoryview, fixed: frozenset[int] = frozenset()) -> Fields:
     """The fields of one message, by number; values are ints or bytes, in the order of the file.
 
-    Args:
-        fixed: fields that may be of fixed width (floats).
-
-    Raises:
-        ValueError: bytes that are no message, or another field of fixed width.
+    Raises ValueError: bytes that are no message, or a field of fixed width (a float) that is not among `fixed`.
     """
     found: Fields = {}
     if isinstance(data, int):
@@ -68,11 +64,7 @@ def integers(values: list[Any]) -> list[int]:
 
 
 def walk(data: memoryview) -> Iterator[tuple[int, int, Any]]:
-    """Number, wire type and value of every field of a message, in the order of the file.
-
-    Raises:
-        ValueError: bytes that are no message.
-    """
+    """Number, wire type and value of every field, in the order of the file; ValueError where it is no message."""
     at, end = 0, len(data)
     while at < end:
         key, at = _varint(data, at)

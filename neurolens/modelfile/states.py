@@ -106,10 +106,7 @@ def _zoom(path: Any, axis: Axis, zoom: str | float) -> float:
 
 
 def check_states(card: Mapping[str, Any], check_node: Any) -> None:
-    """Check the table of states of a card.
-
-    Args:
-        check_node: called with the table of every node; raises what is wrong with its lens and domain.
+    """Check the table of states of a card; `check_node` raises what is wrong with a node's lens and domain.
 
     Raises:
         InputError, KeyError, TypeError, ValueError: what does not belong there.

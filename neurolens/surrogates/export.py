@@ -20,6 +20,7 @@ from neurolens.graph.onnx import Mixing, write_onnx
 from neurolens.graph.program import RAY
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.modelfile.axes import Axis
+from neurolens.modelfile.states import STATE
 from neurolens.optics.focusing import at_infinity
 from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.assemble import ONNX, model_graph
@@ -32,7 +33,6 @@ from neurolens.surrogates.stored import model_to_text, storable
 if TYPE_CHECKING:
     from neurolens.surrogates.states import StateModel
 
-STATE = "state"
 # A film position that lies in no domain: where the state is out of range, this takes the place of the one asked for.
 _NOWHERE = -1.0
 

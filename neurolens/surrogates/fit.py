@@ -154,14 +154,9 @@ def _fit_core(
 
 
 def reach(models: Iterable[LensModel], target_um: float, error_um: Callable[[LensModel], float]) -> LensModel:
-    """The first model whose film-equivalent RMS is at most `target_um`, else the best; what it reached in its settings.
+    """The first model whose film-equivalent RMS is at most `target_um`, else the best, with a warning.
 
-    Args:
-        models: at least one; fitted as they are asked for, so that none after the first that serves is.
-        error_um: film-equivalent RMS of a model.
-
-    Warns:
-        NeurolensWarning: none reaches it.
+    What it reached stands in its settings. Models are fitted as they are asked for: none after the first that serves.
     """
     found: list[tuple[float, LensModel]] = []
     for model in models:
@@ -196,9 +191,6 @@ def fit_partitioned(prepared: Prepared, zones: int, fit: Callable[[Prepared], Zo
 
     After Zheng and Zheng 2017 (adaptive sparse polynomials) and NeuroLens 2017 (networks), which both split the space
     of rays. Zones are rings of the film, so that the rotational symmetry of the invariants survives.
-
-    Args:
-        fit: fits one core to the rays of a zone.
 
     Raises:
         InputError: fewer than one zone, or several with fewer than 200 training rays each.

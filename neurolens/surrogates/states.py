@@ -126,10 +126,7 @@ def zoom_axis(lens: Lens, degree: int | None = None) -> Axis:
     Raises:
         InputError: a file with fewer than two zoom states.
     """
-    found: list[tuple[float, str]] = []
-    for state in infinity_states(lens):
-        found.append((float(first_order(lens.at(zoom=state.name)).efl_mm), state.name))
-    found.sort()
+    found = sorted((float(first_order(lens.at(zoom=s.name)).efl_mm), s.name) for s in infinity_states(lens))
     knots: list[float] = []
     for efl, _ in found:
         if not knots or efl > knots[-1] * (1 + _SAME):

@@ -103,10 +103,9 @@ def _pairs(space: StateSpace, state: State, settings: StateSettings) -> RayPairs
 
 
 def common_encoding(found: Sequence[Encoding]) -> Encoding:
-    """Scales and chief ray for all nodes: the largest scales, the mean chief ray.
+    """Scales and chief ray for all nodes: the largest, and the mean.
 
-    Scales of each node's own would follow its domain, which need not be smooth in the state (a near limit that follows
-    one rule and then another); in such coordinates nor would be the lens.
+    A node's own scales follow its domain, which need not be smooth in the state; nor would be the lens in them.
     """
     return replace(
         found[0],

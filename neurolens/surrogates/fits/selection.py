@@ -4,10 +4,6 @@ All work on the Gram matrix of the candidate columns, so that their cost does no
 sweep operator (Goodnight 1979, "A Tutorial on the SWEEP Operator") moves a column into or out of the fit in one
 rank-one update; afterwards the diagonal holds what every candidate has left after orthogonalisation, and the
 right-hand side its correlation with the residual.
-
-Growth (Zheng and Zheng 2017, "Adaptive sparse polynomial regression for camera lens simulation") knows no limit of
-degree: it starts from the lowest terms, and every term chosen brings its products with each variable into the
-candidates.
 """
 
 from __future__ import annotations
@@ -275,7 +271,9 @@ class _Candidates:
 def grow(
     variables: Tensor, field: LightField | None, outputs: Tensor, terms: int, *, dispersive: bool
 ) -> tuple[Exponents, list[int]]:
-    """Choose `terms` terms by growth.
+    """Choose `terms` terms by growth, which knows no limit of degree: each brings its products into the candidates.
+
+    Zheng and Zheng 2017, "Adaptive sparse polynomial regression for camera lens simulation".
 
     Args:
         variables: [V, N]: the invariants with `field`, or the raw coordinates without.

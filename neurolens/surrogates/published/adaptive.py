@@ -95,14 +95,7 @@ def fit_adaptive(
             progress(done / cells)
         worst = max(root.leaves(), key=lambda leaf: leaf.error)
         variable, threshold = _where_to_cut(data, worst, invariants)
-        halves = []
-        for above in (False, True):
-            inside = worst.inside & ((invariants[variable] > threshold) == above)
-            zone = _zone(worst.data, variable, threshold, above)
-            polynomial = fit_grown(zone, terms)
-            error = _squared_error(data, polynomial, data.pairs.train.select(inside))
-            halves.append(_Node(zone, inside, polynomial, error))
-        worst.cut = (variable, threshold, halves[0], halves[1])
+        worst.cut = (variable, threshold, *_halves(data, worst, invariants, variable, threshold, terms))
     return root.core()
 
 
@@ -122,16 +115,28 @@ def _squared_error(data: RawData, polynomial: RawPolynomial, rays: PairSet) -> f
     return squared_error(data.pairs, data.encoding, outer_pupil(data, polynomial)[0], rays)
 
 
+def _halves(
+    data: RawData, cell: _Node, invariants: Tensor, variable: int, threshold: float, terms: int | None = None
+) -> tuple[_Node, _Node]:
+    """Both sides of a cut, with grown terms, or with dense cubics."""
+
+    def half(above: bool) -> _Node:
+        inside = cell.inside & ((invariants[variable] > threshold) == above)
+        zone = _zone(cell.data, variable, threshold, above)
+        polynomial = fit_dense(zone, 3) if terms is None else fit_grown(zone, terms)
+        return _Node(zone, inside, polynomial, _squared_error(data, polynomial, data.pairs.train.select(inside)))
+
+    return half(False), half(True)
+
+
 def _where_to_cut(data: RawData, cell: _Node, invariants: Tensor) -> tuple[int, float]:
     """The coordinate whose halves dense cubics fit best, and the median there."""
     best, found = float("inf"), (0, 0.0)
     for variable in _COORDINATES:
         threshold = float(invariants[variable][cell.inside].median())
         error = 0.0
-        for above in (False, True):
-            inside = cell.inside & ((invariants[variable] > threshold) == above)
-            zone = _zone(cell.data, variable, threshold, above)
-            error += _squared_error(data, fit_dense(zone, 3), data.pairs.train.select(inside))
+        for half in _halves(data, cell, invariants, variable, threshold):
+            error += half.error
         if error < best:
             best, found = error, (variable, threshold)
     return found
