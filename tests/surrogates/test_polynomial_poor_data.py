@@ -16,7 +16,6 @@ from neurolens.surrogates.cores import InvariantPolynomial
 from neurolens.surrogates.domain import domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.fits.polynomial import fit_polynomial
-from neurolens.surrogates.fits.selection import Sweep, backward, forward
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, trace_pairs
@@ -85,29 +84,6 @@ def test_fewer_rays_than_terms_are_refused(rays: int) -> None:
     pairs = replace(prepared().pairs, train=prepared().pairs.train.select(slice(0, rays)))
     with pytest.raises(InputError, match="train.*more training rays than the 30 terms"):
         fit_polynomial(replace(prepared(), pairs=pairs), ModelSettings(terms=30))
-
-
-# ---- elimination ----
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_elimination_drops_the_term_that_costs_least(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    columns = rng.normal(size=(14, 80)) + 0.8 * rng.normal(size=80)
-    outputs = rng.normal(size=(2, 80))
-
-    def left(chosen: list[int]) -> float:
-        basis = columns[chosen].T
-        return float(((outputs.T - basis @ np.linalg.lstsq(basis, outputs.T, rcond=None)[0]) ** 2).sum())
-
-    sweep = Sweep(columns @ columns.T, columns @ outputs.T, (outputs**2).sum(1))
-    forward(sweep, 9)
-    nine = list(sweep.chosen)
-    assert sweep.costs() == pytest.approx([left([c for c in nine if c != k]) - left(nine) for k in nine], rel=1e-6)
-    backward(sweep, 8)
-    assert left(sweep.chosen) == pytest.approx(min(left([c for c in nine if c != k]) for k in nine))
-    backward(sweep, 20)
-    assert len(sweep.chosen) == 8
 
 
 # ---- ablations ----

@@ -103,11 +103,6 @@ def test_too_few_rays_are_refused(rays: tuple[int, int, int], named: str) -> Non
         fitted(lens(), domain_of(lens()), rays=PairSettings(*rays))
 
 
-def test_a_plane_too_near_to_focus_is_refused() -> None:
-    with pytest.raises(InputError, match="focus_m"):
-        domain_of(lens(), focus_m=(math.inf, 0.05))
-
-
 @pytest.mark.parametrize("name", ["isshiki_fisheye_10", "edmund_asphere_30"])
 def test_the_pupil_plane_keeps_the_disc_small_and_loses_no_light(name: str) -> None:
     """A pupil that walks with the film point: once 0.8% and 32% of the disc passed."""

@@ -20,7 +20,7 @@ from experiments import outside
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import OnnxCamera
-from neurolens.cameras.onnxlens import OnnxLens, load_model
+from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.evaluate.check import check_states, random_states, space_of_card
 from neurolens.evaluate.rays import ray_errors
 from neurolens.modelfile.axes import Axis, product, weights
@@ -68,9 +68,9 @@ def rays_of(part: LensModel, count: int = 20_000, seed: int = 3) -> tuple[FilmRa
     return FilmRays(*columns), z
 
 
-def run(lens: OnnxLens, rays: FilmRays, z: float, **more: object) -> object:
+def run(lens: OnnxLens, rays: FilmRays, z: float, **more: Any) -> LensRays:
     fx, fy, _, px, py, wavelength = (c.float().numpy() for c in rays.columns())
-    return lens.rays(np.stack([fx, fy]), np.stack([px, py]), wavelength, z, **more)  # type: ignore[arg-type]
+    return lens.rays(np.stack([fx, fy]), np.stack([px, py]), wavelength, z, **more)
 
 
 @pytest.mark.parametrize("axis", [ZOOM, FOCUS, replace(ZOOM, reciprocal=False, degree=1)])
@@ -135,7 +135,7 @@ def test_axes_of_lens_files() -> None:
 
 def test_structures_that_differ_are_no_state_model() -> None:
     core = lens_models.model("invariants").core
-    other = replace(core, exponents=core.exponents + 1)  # type: ignore[attr-defined]
+    other = replace(core, exponents=core.exponents + 1)
     with pytest.raises(InputError, match="the same at every node"):
         mix([core, other], np.array([0.5, 0.5]))
     with pytest.raises(InputError, match="5, as many"):
@@ -173,13 +173,13 @@ def test_graph_agrees_with_the_model(state: float | None) -> None:
     part = m.at(value)
     rays, z = rays_of(part)
     said, expected = run(lens if state is None else lens.at(value), rays, z), part.predict(rays)
-    assert (said.status != expected.status.numpy()).mean() < 1e-3  # type: ignore[attr-defined]
-    passed = (said.status == st.PASSED) & (expected.status.numpy() == st.PASSED)  # type: ignore[attr-defined]
+    assert (said.status != expected.status.numpy()).mean() < 1e-3
+    passed = (said.status == st.PASSED) & (expected.status.numpy() == st.PASSED)
     assert 0.2 < passed.mean() < 0.95
-    off = np.abs(said.scene_ray - torch.stack(list(expected.rays)).numpy())[:, passed]  # type: ignore[attr-defined]
+    off = np.abs(said.scene_ray - torch.stack(list(expected.rays)).numpy())[:, passed]
     assert off[:3].max() < 1e-4 and off[3:].max() < 5e-7
     again = run(lens, rays, z, state=value)
-    assert np.array_equal(again.scene_ray, said.scene_ray)  # type: ignore[attr-defined]
+    assert np.array_equal(again.scene_ray, said.scene_ray)
     assert lens.at(value).pupil_z_mm == pytest.approx(part.domain.pupil_z_mm, abs=1e-9)
     assert lens.at(value).film_z_mm == pytest.approx(part.domain.film_z_mm, abs=1e-9)
     assert lens.at(value).card["lens"]["efl_mm"] == pytest.approx(value, rel=1e-12)
@@ -189,7 +189,7 @@ def test_graph_agrees_with_the_model(state: float | None) -> None:
 def test_states_out_of_range_are_outside_the_domain(bad: float) -> None:
     rays, z = rays_of(model().at(100.0), 2000)
     said = run(loaded(), rays, z, state=bad)
-    assert (said.status == st.OUTSIDE_DOMAIN).all()  # type: ignore[attr-defined]
+    assert (said.status == st.OUTSIDE_DOMAIN).all()
     with pytest.raises(InputError):
         loaded().at(bad)
 
@@ -248,13 +248,13 @@ def test_graph_of_two_axes_agrees_with_the_model(tmp_path: Path) -> None:
     for state in ((100.25, 0.0), (100.25, 0.375), (zoom.range[1], 0.5)):
         rays, z = rays_of(both.at(*state), 4000)
         said, expected = run(lens.at(*state), rays, z), both.at(*state).predict(rays)
-        assert (said.status != expected.status.numpy()).mean() < 2e-3  # type: ignore[attr-defined]
-        passed = (said.status == st.PASSED) & (expected.status.numpy() == st.PASSED)  # type: ignore[attr-defined]
-        off = np.abs(said.scene_ray - torch.stack(list(expected.rays)).numpy())[:, passed]  # type: ignore[attr-defined]
+        assert (said.status != expected.status.numpy()).mean() < 2e-3
+        passed = (said.status == st.PASSED) & (expected.status.numpy() == st.PASSED)
+        off = np.abs(said.scene_ray - torch.stack(list(expected.rays)).numpy())[:, passed]
         assert off[:3].max() < 1e-4 and off[3:].max() < 5e-7
     for bad in ((100.0, 0.6), (300.0, 0.2), (math.nan, 0.2), (100.0, math.nan), (100.0, -0.1)):
         said = run(lens, rays, z, state=bad)
-        assert (said.status == st.OUTSIDE_DOMAIN).all()  # type: ignore[attr-defined]
+        assert (said.status == st.OUTSIDE_DOMAIN).all()
 
 
 def test_cameras_zoom() -> None:
