@@ -103,9 +103,7 @@ def constants_and_nodes(data: bytes) -> tuple[dict[str, NDArray[Any]], list[Node
     graph = fields_of(one(fields_of(memoryview(data)), 7))
     constants = {}
     for tensor in (fields_of(t, _FLOATS["tensor"]) for t in graph.get(5, [])):
-        kind, raw = int(one(tensor, 2)), tensor.get(9, [b""])[-1]
-        values = np.frombuffer(raw, _TYPES[kind]) if len(raw) or kind != 1 else _floats(tensor.get(4, []))
-        constants[text(tensor, 8)] = values.reshape(integers(tensor.get(1, [])))
+        constants[text(tensor, 8)] = _values(tensor).reshape(integers(tensor.get(1, [])))
     return constants, [_node(fields_of(node)) for node in graph.get(1, [])]
 
 
@@ -125,7 +123,7 @@ def _check_graph(graph: Fields, opsets: list[str], functions: bool) -> None:
     known = [_shape_of_input(fields_of(value)) for value in graph.get(11, [])]
     known += [(text(t, 8), tuple(integers(t.get(1, [])))) for t in tensors]
     try:
-        check_shapes(nodes, known, {text(t, 8): _integers_of(t) for t in tensors if t.get(2) == [7]})
+        check_shapes(nodes, known, {text(t, 8): _values(t).tolist() for t in tensors if t.get(2) == [7]})
     except ValueError as error:
         raise ModelError(str(error)) from error
 
@@ -153,10 +151,12 @@ def _shape_of_input(value: Fields) -> tuple[str, Shape]:
     return text(value, 1), tuple(int(one(d, 1)) if 1 in d else RAYS for d in dimensions)
 
 
-def _integers_of(tensor: Fields) -> list[int]:
-    """The numbers of an int64 tensor held as raw bytes; none for others."""
-    raw = tensor.get(9, [b""])[-1]
-    return [int(v) for v in np.frombuffer(raw, "<i8")] if len(raw) % 8 == 0 else []
+def _values(tensor: Fields) -> NDArray[Any]:
+    """The numbers of a tensor: its raw bytes, or of float32 without any its float_data, packed or one by one."""
+    kind, raw = int(one(tensor, 2)), tensor.get(9, [b""])[-1]
+    if kind == 1 and not len(raw):
+        raw = b"".join(tensor.get(4, []))  # refuses what is no bytes
+    return np.frombuffer(raw, _TYPES[kind])
 
 
 def _check_tensor(tensor: Fields) -> None:
@@ -166,16 +166,9 @@ def _check_tensor(tensor: Fields) -> None:
     kind = int(tensor.get(2, [0])[-1])
     if kind not in _TYPES:
         raise ModelError(f"tensor {name}: data type {kind}, expected float32, float16 or integers")
-    raw = tensor.get(9, [b""])[-1]
     if kind in (3, 10) and tensor.get(5):  # the other way to hold them, which no writer of models takes
         raise ModelError(f"tensor {name}: data type {kind} as int32 numbers, expected its raw bytes")
     if kind in (1, 10):
-        packed = len(raw) or kind == 10
-        values = np.frombuffer(raw, _TYPES[kind]) if packed else _floats(tensor.get(4, []))
+        values = _values(tensor)
         if not np.isfinite(values).all():
             raise ModelError(f"tensor {name}: {int((~np.isfinite(values)).sum())} weights are NaN or infinite")
-
-
-def _floats(chunks: list[Any]) -> np.ndarray:
-    """float_data, packed or one by one."""
-    return np.frombuffer(b"".join(bytes(c) for c in chunks), "<f4")
