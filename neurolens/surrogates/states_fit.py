@@ -40,7 +40,7 @@ _PASSES = 2  # of replacement
 
 @dataclass(frozen=True)
 class StateSettings:
-    """How a model of many states is fitted: see `polynomial.PolynomialSettings`; rays are those of each node."""
+    """How a model of many states is fitted: see `ModelSettings`; rays are those of each node."""
 
     terms: int = 64
     degree: int = 7
