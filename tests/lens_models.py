@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import math
 import tempfile
 import warnings
+import zlib
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
+import onnx
 import torch
 from torch import Tensor
 
 from neurolens.base.errors import NeurolensWarning
 from neurolens.cameras.exact import ExactCamera
+from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.surrogates.cores import Network
@@ -105,7 +112,8 @@ def model(kind: str) -> LensModel:
     """A model of each kind.
 
     `KINDS` (each kind of core, first order, a lens that sees beyond 75 degrees), `GATED`, `PUBLISHED` (after which
-    " fisheye" takes that lens), or "zones" of the film, "residual" network, "laser" (one wavelength), "cylinders".
+    " fisheye" takes that lens), or "zones" of the film, "residual" network, "laser" (one wavelength), "cylinders",
+    "cylinders network".
     """
     if kind == "fisheye":
         return fit_model(prepared(FISHEYE), _FITS["invariants"])
@@ -113,8 +121,11 @@ def model(kind: str) -> LensModel:
         return _network(prepared(), 12)
     if kind == "laser":
         return at_wavelength(model("invariants"), 550.0)
-    if kind == "cylinders":
-        return fit_model(anamorphic(), ModelSettings(terms=48, degree=4, planes=False))
+    if kind.startswith("cylinders"):
+        network = ModelSettings("mlp", units=12, layers=2, steps=25)
+        return fit_model(
+            anamorphic(), network if "network" in kind else ModelSettings(terms=48, degree=4, planes=False)
+        )
     if kind in GATED:
         return fit_model(gated(kind), ModelSettings("ols", terms=40, planes=False))
     method, _, other = kind.partition(" ")
@@ -125,6 +136,19 @@ def model(kind: str) -> LensModel:
 def exported(kind: str) -> Path:
     """The ONNX file of `model(kind)`."""
     return export_onnx(model(kind), Path(_folder().name) / f"{kind}.onnx", {"rms_um": 1.0})
+
+
+def edited(source: Path, target: Path, change: Callable[[dict[str, Any]], object], key: str = CARD_KEY) -> Path:
+    """A model file whose card, or whose stored coefficients (`MODEL_KEY`), were changed in place."""
+    proto = onnx.load(str(source))
+    entry = next(e for e in proto.metadata_props if e.key == key)
+    packed = key == MODEL_KEY
+    data = json.loads(zlib.decompress(base64.b64decode(entry.value)) if packed else entry.value)
+    change(data)
+    text = json.dumps(data)
+    entry.value = base64.b64encode(zlib.compress(text.encode())).decode() if packed else text
+    target.write_bytes(proto.SerializeToString())
+    return target
 
 
 @cache

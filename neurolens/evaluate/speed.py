@@ -149,7 +149,7 @@ def race(
     unavailable: dict[str, str] = {}
     passes: dict[str, _Pass] = {}
     before = _load()
-    with _workers(threads) as team, pinned_threads(1), torch.no_grad():
+    with _workers(threads) as team, pinned_threads(), torch.no_grad():
         if fresh:
             torch._dynamo.reset()  # torch limits the number of recompilations of a function
         for i, c in enumerate(candidates):

@@ -106,11 +106,7 @@ class Axis:
         return np.asarray(np.linalg.inv(np.stack([self.features(v) for v in self.nodes])), dtype=np.float64)
 
     def weights(self, value: float) -> Array:
-        """[K] weights of the nodes at a value: 1 at a node itself.
-
-        Raises:
-            InputError: a value out of range.
-        """
+        """[K] weights of the nodes at a value: 1 at a node itself. Raises InputError: a value out of range."""
         low, high = self.limits
         if not low <= value <= high:
             expected = f"{self.range[0]:.6g} to {self.range[1]:.6g} {self.unit}"
@@ -134,11 +130,7 @@ class Axis:
 
     @staticmethod
     def from_dict(data: dict[str, Any]) -> Axis:
-        """The inverse of `to_dict`.
-
-        Raises:
-            InputError, KeyError, TypeError, ValueError: what is no such table.
-        """
+        """The inverse of `to_dict`. Raises InputError, KeyError, TypeError, ValueError: what is no such table."""
         stated = tuple((str(k), float(v)) for k, v in dict(data["stated"]).items())
         knots = tuple(float(v) for v in data["knots"])
         return Axis(str(data["name"]), str(data["unit"]), knots, int(data["degree"]), bool(data["reciprocal"]), stated)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -27,24 +28,12 @@ def _positive(value: Any) -> bool:
     return is_number(value) and value > 0
 
 
-def _rising(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(map(_positive, value)) and value[0] <= value[1]
+def _integer(value: Any, least: int, most: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
 
 
-def _distances(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(v == "inf" or _positive(v) for v in value)
-
-
-def _numbers(value: Any) -> bool:
-    return isinstance(value, list) and len(value) >= 2 and all(map(is_number, value))
-
-
-def _text(value: Any) -> bool:
-    return isinstance(value, str)
-
-
-def _seed(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= 2**53
+def _pair(value: Any, holds: Callable[[Any], bool]) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(holds, value))
 
 
 def _errors(value: Any, depth: int = 3) -> bool:
@@ -58,19 +47,20 @@ def _errors(value: Any, depth: int = 3) -> bool:
     )
 
 
-def _table(value: Any) -> bool:
-    return isinstance(value, dict)
-
-
 Rule = tuple[Callable[[Any], bool], str]
 NUMBER: Rule = (is_number, "a finite number")
 POSITIVE: Rule = (_positive, "a finite number above 0")
-TEXT: Rule = (_text, "a text")
-NUMBERS: Rule = (_numbers, "a list of two or more finite numbers")
+TEXT: Rule = (lambda v: isinstance(v, str), "a text")
+TABLE: Rule = (lambda v: isinstance(v, dict), "a table")
+NUMBERS: Rule = (
+    lambda v: isinstance(v, list) and len(v) >= 2 and all(map(is_number, v)),
+    "a list of two or more finite numbers",
+)
+RISING: Rule = (lambda v: _pair(v, _positive) and v[0] <= v[1], "two numbers above 0, rising")
 
 # Place in the card to what must be there. A table comes before what is in it.
 _RULES: dict[str, Rule] = {
-    "lens": (_table, "a table"),
+    "lens": TABLE,
     "lens.id": TEXT,
     "lens.name": TEXT,
     "lens.sha256": TEXT,
@@ -80,33 +70,32 @@ _RULES: dict[str, Rule] = {
     "lens.stop_radius_mm": POSITIVE,
     "lens.front_principal_z_mm": NUMBER,
     "lens.rear_principal_z_mm": NUMBER,
-    "domain": (_table, "a table"),
+    "domain": TABLE,
     "domain.film_radius_mm": POSITIVE,
-    "domain.film_z_mm": (_rising, "two numbers above 0, rising"),
-    "domain.focus_m": (_distances, 'two distances above 0, or "inf"'),
+    "domain.film_z_mm": RISING,
+    "domain.focus_m": (lambda v: _pair(v, lambda d: d == "inf" or _positive(d)), 'two distances above 0, or "inf"'),
     "domain.pupil_z_mm": NUMBER,
     "domain.pupil_radius_mm": POSITIVE,
-    "domain.wavelength_nm": (_rising, "two numbers above 0, rising"),
+    "domain.wavelength_nm": RISING,
     "domain.stop_radius_mm": POSITIVE,
-    "domain.bounds": (_table, "a table"),
+    "domain.bounds": TABLE,
     "domain.bounds.pupil_z_mm": NUMBER,
     "domain.bounds.film_radius_mm": POSITIVE,
     "domain.bounds.disc_mm": POSITIVE,
     "domain.bounds.low_mm": NUMBERS,
     "domain.bounds.high_mm": NUMBERS,
     "domain.bounds.half_mm": NUMBERS,
-    "fit": (_table, "a table"),
+    "fit": TABLE,
     "fit.method": TEXT,
-    "fit.settings": (_table, "a table"),
+    "fit.settings": TABLE,
     "errors": (_errors, "a table of figures from 0 up, of tables of such, of texts and lists"),
 }
 _OPTIONAL: dict[str, Rule] = {
-    "lens.stop_surface": (lambda v: isinstance(v, int) and not isinstance(v, bool) and 0 <= v < 10_000, "an integer"),
+    "lens.stop_surface": (lambda v: _integer(v, 0, 9999), "an integer"),
     "domain.nearest_m": (lambda v: v is None or _positive(v), "a number above 0, or null"),
-    "errors.poor": (lambda v: isinstance(v, list) and all(map(_text, v)), "a list of texts"),
-    "fit.settings.rays_seed": (lambda v: v is None or _seed(v), "an integer up to 2^53, or null"),
+    "errors.poor": (lambda v: isinstance(v, list) and all(isinstance(t, str) for t in v), "a list of texts"),
+    "fit.settings.rays_seed": (lambda v: v is None or _integer(v, -(2**53), 2**53), "an integer up to 2^53, or null"),
 }
-_MISSING = "(missing)"
 
 
 def check_card(file: Any, card: Mapping[str, Any]) -> None:
@@ -143,15 +132,13 @@ def pupil_rows(bounds: Mapping[str, Any]) -> NDArray[np.float32]:
 
 def _check_places(file: Any, card: Mapping[str, Any], rules: Mapping[str, Rule]) -> None:
     for place, (holds, expected) in rules.items():
-        value: Any = card
-        for key in place.split("."):
-            value = value.get(key, _MISSING)
-            if value is _MISSING:
-                break
-        if value is _MISSING and place in _OPTIONAL:
+        *tables, last = place.split(".")
+        # All tables but the last are there, for they have rules of their own.
+        table = reduce(lambda found, key: found[key], tables, card)
+        if place in _OPTIONAL and last not in table:
             continue
-        if value is _MISSING or not holds(value):
-            shown = _MISSING if value is _MISSING else repr(value)[:80]
+        if last not in table or not holds(table[last]):
+            shown = repr(table[last])[:80] if last in table else "(missing)"
             raise ModelError(f"{file}: card: {place}: got {shown}, expected {expected}")
     try:
         pupil_rows(card["domain"]["bounds"])

@@ -31,8 +31,24 @@ def read_checked(path: str | Path) -> tuple[bytes, dict[str, Any]]:
     """Bytes and card of a model file.
 
     Raises:
-        ModelError: a file that is missing, too large, truncated, no ONNX model, without a card of this schema, or that
-            holds something a lens model never does.
+        ModelError: as `read_metadata` and `card_in`, and of a file that holds something a lens model never does.
+    """
+    data, model, metadata = read_metadata(path)
+    try:
+        opsets = [text(fields_of(entry), 1) for entry in model.get(8, [])]
+        _check_graph(fields_of(one(model, 7)), opsets, bool(model.get(25)))
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+    except (ValueError, TypeError) as error:
+        raise ModelError(f"{path}: truncated or damaged ({error})") from error
+    return data, card_in(path, metadata)
+
+
+def read_metadata(path: str | Path) -> tuple[bytes, Fields, dict[str, str]]:
+    """Bytes, fields and metadata of a model file, of which nothing else is checked.
+
+    Raises:
+        ModelError: a file that is missing, too large, truncated, or no ONNX model.
     """
     file = Path(path)
     if not file.is_file():
@@ -43,18 +59,31 @@ def read_checked(path: str | Path) -> tuple[bytes, dict[str, Any]]:
     data = file.read_bytes()
     try:
         model = fields_of(memoryview(data))
-        graph = one(model, 7)
+        one(model, 7)  # the graph
         metadata = {text(entry, 1): text(entry, 2) for entry in map(fields_of, model.get(14, []))}
-        opsets = [text(fields_of(entry), 1) for entry in model.get(8, [])]
     except (ValueError, TypeError) as error:
         raise ModelError(f"{file}: truncated, or not an ONNX model ({error})") from error
+    return data, model, metadata
+
+
+def card_in(file: Any, metadata: dict[str, str]) -> dict[str, Any]:
+    """The card in a file's metadata.
+
+    Raises:
+        ModelError: none, one that is not strict JSON, or of another kind or schema.
+    """
+    if CARD_KEY not in metadata:
+        raise ModelError(f"{file}: no card: its metadata has no {CARD_KEY!r}, so this is no model made by neurolens")
     try:
-        _check_graph(fields_of(graph), opsets, bool(model.get(25)))
-    except ModelError as error:
-        raise ModelError(f"{file}: {error}") from error
-    except (ValueError, TypeError) as error:
-        raise ModelError(f"{file}: truncated or damaged ({error})") from error
-    return data, _card(file, metadata)
+        card = json.loads(metadata[CARD_KEY], parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise ModelError(f"{file}: the card is not strict JSON ({error})") from error
+    kind = card.get("kind") if isinstance(card, dict) else None
+    if kind != CARD_KIND:
+        raise ModelError(f"{file}: card: kind: got {kind!r}, expected {CARD_KIND!r}")
+    if card.get("schema") != CARD_SCHEMA:
+        raise ModelError(f"{file}: card: schema: got {card.get('schema')!r}, expected {CARD_SCHEMA}")
+    return card
 
 
 def without_outputs(data: bytes, names: frozenset[str]) -> bytes:
@@ -74,25 +103,8 @@ def constants_and_nodes(data: bytes) -> tuple[dict[str, NDArray[Any]], list[Node
     graph = fields_of(one(fields_of(memoryview(data)), 7))
     constants = {}
     for tensor in (fields_of(t, _FLOATS["tensor"]) for t in graph.get(5, [])):
-        kind, raw = int(one(tensor, 2)), tensor.get(9, [b""])[-1]
-        values = np.frombuffer(raw, _TYPES[kind]) if len(raw) or kind != 1 else _floats(tensor.get(4, []))
-        constants[text(tensor, 8)] = values.reshape(integers(tensor.get(1, [])))
+        constants[text(tensor, 8)] = _values(tensor).reshape(integers(tensor.get(1, [])))
     return constants, [_node(fields_of(node)) for node in graph.get(1, [])]
-
-
-def _card(file: Path, metadata: dict[str, str]) -> dict[str, Any]:
-    if CARD_KEY not in metadata:
-        raise ModelError(f"{file}: no card: its metadata has no {CARD_KEY!r}, so this is no model made by neurolens")
-    try:
-        card = json.loads(metadata[CARD_KEY], parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
-        raise ModelError(f"{file}: the card is not strict JSON ({error})") from error
-    kind = card.get("kind") if isinstance(card, dict) else None
-    if kind != CARD_KIND:
-        raise ModelError(f"{file}: card: kind: got {kind!r}, expected {CARD_KIND!r}")
-    if card.get("schema") != CARD_SCHEMA:
-        raise ModelError(f"{file}: card: schema: got {card.get('schema')!r}, expected {CARD_SCHEMA}")
-    return card
 
 
 def _refuse_constant(name: str) -> Any:
@@ -111,7 +123,7 @@ def _check_graph(graph: Fields, opsets: list[str], functions: bool) -> None:
     known = [_shape_of_input(fields_of(value)) for value in graph.get(11, [])]
     known += [(text(t, 8), tuple(integers(t.get(1, [])))) for t in tensors]
     try:
-        check_shapes(nodes, known, {text(t, 8): _integers_of(t) for t in tensors if t.get(2) == [7]})
+        check_shapes(nodes, known, {text(t, 8): _values(t).tolist() for t in tensors if t.get(2) == [7]})
     except ValueError as error:
         raise ModelError(str(error)) from error
 
@@ -139,10 +151,12 @@ def _shape_of_input(value: Fields) -> tuple[str, Shape]:
     return text(value, 1), tuple(int(one(d, 1)) if 1 in d else RAYS for d in dimensions)
 
 
-def _integers_of(tensor: Fields) -> list[int]:
-    """The numbers of an int64 tensor held as raw bytes; none for others."""
-    raw = tensor.get(9, [b""])[-1]
-    return [int(v) for v in np.frombuffer(raw, "<i8")] if len(raw) % 8 == 0 else []
+def _values(tensor: Fields) -> NDArray[Any]:
+    """The numbers of a tensor: its raw bytes, or of float32 without any its float_data, packed or one by one."""
+    kind, raw = int(one(tensor, 2)), tensor.get(9, [b""])[-1]
+    if kind == 1 and not len(raw):
+        raw = b"".join(tensor.get(4, []))  # refuses what is no bytes
+    return np.frombuffer(raw, _TYPES[kind])
 
 
 def _check_tensor(tensor: Fields) -> None:
@@ -152,16 +166,9 @@ def _check_tensor(tensor: Fields) -> None:
     kind = int(tensor.get(2, [0])[-1])
     if kind not in _TYPES:
         raise ModelError(f"tensor {name}: data type {kind}, expected float32, float16 or integers")
-    raw = tensor.get(9, [b""])[-1]
     if kind in (3, 10) and tensor.get(5):  # the other way to hold them, which no writer of models takes
         raise ModelError(f"tensor {name}: data type {kind} as int32 numbers, expected its raw bytes")
     if kind in (1, 10):
-        packed = len(raw) or kind == 10
-        values = np.frombuffer(raw, _TYPES[kind]) if packed else _floats(tensor.get(4, []))
+        values = _values(tensor)
         if not np.isfinite(values).all():
             raise ModelError(f"tensor {name}: {int((~np.isfinite(values)).sum())} weights are NaN or infinite")
-
-
-def _floats(chunks: list[Any]) -> np.ndarray:
-    """float_data, packed or one by one."""
-    return np.frombuffer(b"".join(bytes(c) for c in chunks), "<f4")

@@ -17,11 +17,7 @@ _VARINT, _DOUBLE, _BYTES, _FLOAT = 0, 1, 2, 5  # wire types
 def fields_of(data: memoryview, fixed: frozenset[int] = frozenset()) -> Fields:
     """The fields of one message, by number; values are ints or bytes, in the order of the file.
 
-    Args:
-        fixed: fields that may be of fixed width (floats).
-
-    Raises:
-        ValueError: bytes that are no message, or another field of fixed width.
+    Raises ValueError: bytes that are no message, or a field of fixed width (a float) that is not among `fixed`.
     """
     found: Fields = {}
     if isinstance(data, int):
@@ -34,11 +30,7 @@ def fields_of(data: memoryview, fixed: frozenset[int] = frozenset()) -> Fields:
 
 
 def one(fields: Fields, number: int) -> Any:
-    """The only value of a field.
-
-    Raises:
-        ValueError: none, or several.
-    """
+    """The only value of a field. Raises ValueError: none, or several."""
     values = fields.get(number, [])
     if len(values) != 1:
         raise ValueError(f"field {number} stands {len(values)} times, expected once")
@@ -46,20 +38,12 @@ def one(fields: Fields, number: int) -> Any:
 
 
 def text(fields: Fields, number: int) -> str:
-    """The text of a field, empty where there is none.
-
-    Raises:
-        ValueError: something else than text.
-    """
+    """The text of a field, empty where there is none. Raises ValueError: something else than text."""
     return as_text(fields[number][-1]) if number in fields else ""
 
 
 def as_text(value: Any) -> str:
-    """The text that a value is.
-
-    Raises:
-        ValueError: a number, or bytes that are no text.
-    """
+    """The text that a value is. Raises ValueError: a number, or bytes that are no text."""
     if isinstance(value, int):
         raise ValueError("a number where a text should be")
     return bytes(value).decode("utf-8")
@@ -80,11 +64,7 @@ def integers(values: list[Any]) -> list[int]:
 
 
 def walk(data: memoryview) -> Iterator[tuple[int, int, Any]]:
-    """Number, wire type and value of every field of a message, in the order of the file.
-
-    Raises:
-        ValueError: bytes that are no message.
-    """
+    """Number, wire type and value of every field, in the order of the file; ValueError where it is no message."""
     at, end = 0, len(data)
     while at < end:
         key, at = _varint(data, at)

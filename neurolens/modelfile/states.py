@@ -7,7 +7,7 @@ square, what it uses as a reciprocal as a reciprocal: table and graph then agree
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -106,10 +106,7 @@ def _zoom(path: Any, axis: Axis, zoom: str | float) -> float:
 
 
 def check_states(card: Mapping[str, Any], check_node: Any) -> None:
-    """Check the table of states of a card.
-
-    Args:
-        check_node: called with the table of every node; raises what is wrong with its lens and domain.
+    """Check the table of states of a card; `check_node` raises what is wrong with a node's lens and domain.
 
     Raises:
         InputError, KeyError, TypeError, ValueError: what does not belong there.
@@ -137,27 +134,15 @@ def mix_domain(nodes: Sequence[Mapping[str, Any]], weights: Array) -> dict[str, 
 
     Wavelengths and the nearest object are those of the first node; the distances in focus are mixed as 1 / distance.
     """
-
-    def mixed(key: str) -> Any:
-        return _mixed([n[key] for n in nodes], weights)
-
-    def as_square(key: str) -> float:
-        return math.sqrt(_mixed([float(n[key]) ** 2 for n in nodes], weights))
-
     bounds = [n["bounds"] for n in nodes]
-    radius, plane = as_square("film_radius_mm"), mixed("pupil_z_mm")
-    table = {k: _mixed([b[k] for b in bounds], weights) for k in ("low_mm", "high_mm", "half_mm", "disc_mm")}
+    known = _mixed_fields(nodes, weights, "film_z_mm", "pupil_z_mm", "stop_radius_mm")
+    for key in ("film_radius_mm", "pupil_radius_mm"):
+        known[key] = math.sqrt(_mixed([float(n[key]) ** 2 for n in nodes], weights))
     nearness = [_mixed([1 / float(n["focus_m"][i]) for n in nodes], weights) for i in (0, 1)]
-    return {
-        **nodes[0],
-        "film_radius_mm": radius,
-        "film_z_mm": mixed("film_z_mm"),
-        "focus_m": [1 / v if v > _FAR else "inf" for v in nearness],
-        "pupil_z_mm": plane,
-        "pupil_radius_mm": as_square("pupil_radius_mm"),
-        "stop_radius_mm": mixed("stop_radius_mm"),
-        "bounds": {**bounds[0], **table, "pupil_z_mm": plane, "film_radius_mm": radius},
-    }
+    known["focus_m"] = [1 / v if v > _FAR else "inf" for v in nearness]
+    table = _mixed_fields(bounds, weights, "low_mm", "high_mm", "half_mm", "disc_mm")
+    table |= {k: known[k] for k in ("pupil_z_mm", "film_radius_mm")}
+    return {**nodes[0], **known, "bounds": {**bounds[0], **table}}
 
 
 def mix_lens(nodes: Sequence[Mapping[str, Any]], weights: Array) -> dict[str, Any]:
@@ -166,24 +151,22 @@ def mix_lens(nodes: Sequence[Mapping[str, Any]], weights: Array) -> dict[str, An
     The power 1 / f, the front focal distance over f and the back focal plane are sums of products of the gaps: they
     are mixed, and the principal planes follow.
     """
-
-    def of(value: Callable[[Mapping[str, Any]], Any]) -> Any:
-        return _mixed([value(n) for n in nodes], weights)
-
-    efl = 1 / of(lambda n: 1 / n["efl_mm"])
-    focal = of(lambda n: n["infinity_film_z_mm"])
-    front = efl * of(lambda n: (n["front_principal_z_mm"] - n["efl_mm"]) / n["efl_mm"]) + efl
-    linear = {k: _mixed([n[k] for n in nodes], weights) for k in ("f_number", "stop_radius_mm", "film_z_mm")}
+    linear = _mixed_fields(nodes, weights, "f_number", "stop_radius_mm", "film_z_mm", "infinity_film_z_mm")
+    efl = 1 / _mixed([1 / n["efl_mm"] for n in nodes], weights)
+    front = efl * _mixed([(n["front_principal_z_mm"] - n["efl_mm"]) / n["efl_mm"] for n in nodes], weights) + efl
     pupils = [n.get("exit_pupil_z_mm", "inf") for n in nodes]
     return {
         **nodes[0],
         **linear,
         "efl_mm": efl,
-        "infinity_film_z_mm": focal,
         "front_principal_z_mm": front,
-        "rear_principal_z_mm": focal - efl,
+        "rear_principal_z_mm": linear["infinity_film_z_mm"] - efl,
         "exit_pupil_z_mm": "inf" if "inf" in pupils else _mixed(pupils, weights),
     }
+
+
+def _mixed_fields(tables: Sequence[Mapping[str, Any]], weights: Array, *names: str) -> dict[str, Any]:
+    return {name: _mixed([table[name] for table in tables], weights) for name in names}
 
 
 def _mixed(values: Sequence[ArrayLike], weights: Array) -> Any:

@@ -14,7 +14,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurolens.base.errors import InputError
 from neurolens.graph.interpret import monomials as monomials
 from neurolens.surrogates.lightfield import LightField
 
@@ -36,18 +35,34 @@ def invariant_exponents(degree: int, *, dispersive: bool = True) -> Exponents:
         for powers in itertools.product(range(max(most, 0) + 1), repeat=3)
         if sum(powers) <= most
     ]
-    return _ordered(rows)
+    return ordered(rows)
 
 
 def raw_exponents(degree: int, *, dispersive: bool = True) -> Exponents:
     """[M, 5] exponents of p_x, p_y, u_x, u_y, w up to a total `degree`: the basis of the published lens polynomials."""
     variables = 5 if dispersive else 4
     rows = [r for r in itertools.product(range(degree + 1), repeat=variables) if sum(r) <= degree]
-    return _ordered([(*r, 0) for r in rows] if not dispersive else rows)
+    return ordered([(*r, 0) for r in rows] if not dispersive else rows)
 
 
-def _ordered(rows: Sequence[tuple[int, ...]]) -> Exponents:
+def ordered(rows: Sequence[tuple[int, ...]]) -> Exponents:
+    """[M, V] exponents, the lowest degree first."""
     return np.array(sorted(rows, key=lambda r: (sum(r), r)), dtype=np.int64)
+
+
+def united(supports: Sequence[Exponents]) -> tuple[Exponents, list[list[int]]]:
+    """Every exponent of several supports once, in the order in which they come, and the places of each support's."""
+    place: dict[tuple[int, ...], int] = {}
+    columns = [[place.setdefault(tuple(map(int, e)), len(place)) for e in support] for support in supports]
+    return np.array(list(place), dtype=np.int64), columns
+
+
+def kept(exponents: Exponents, chosen: Sequence[int]) -> tuple[Exponents, list[int]]:
+    """Exponents that chosen columns of `vector_columns` need, and where those columns are among these exponents'."""
+    count = len(exponents)
+    rows = sorted({k % count for k in chosen})
+    place = {k: i for i, k in enumerate(rows)}
+    return exponents[rows], [place[k % count] + (k >= count) * len(rows) for k in chosen]
 
 
 def raw_variables(field: LightField) -> Tensor:
@@ -98,18 +113,10 @@ def solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None) -> Te
 
 
 @contextmanager
-def pinned_threads(threads: int = 1) -> Iterator[None]:
-    """Give torch this many threads inside the block, and what it had before after it.
-
-    A fit on one thread gives the same bits anywhere, and does not crawl on a shared machine.
-
-    Raises:
-        InputError: fewer than one.
-    """
-    if threads < 1:
-        raise InputError("torch", "threads", threads, "at least 1")
+def pinned_threads() -> Iterator[None]:
+    """Give torch one thread inside the block: the same bits anywhere, and no crawling on a shared machine."""
     before = torch.get_num_threads()
-    torch.set_num_threads(threads)
+    torch.set_num_threads(1)
     try:
         yield
     finally:

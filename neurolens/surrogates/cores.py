@@ -366,7 +366,7 @@ class Network(Core):
         return sum(w.size + b.size for w, b in (*self.hidden, self.output))
 
 
-class _Parts(Core):
+class Composite(Core):
     """A core of several."""
 
     parts: tuple[Any, ...]
@@ -388,7 +388,7 @@ class _Parts(Core):
 
 
 @dataclass(frozen=True, eq=False)
-class Residual(_Parts):
+class Residual(Composite):
     """The sum of a polynomial and a network on what the polynomial leaves, both on the same invariants.
 
     The polynomial takes the bulk, which is smooth and of low degree, the network the fine structure of every output.
@@ -406,7 +406,7 @@ class Residual(_Parts):
 
 
 @dataclass(frozen=True, eq=False)
-class Partitioned(_Parts):
+class Partitioned(Composite):
     """Cores of zones of the light field, split by rho (the squared film radius): the published light-field partition.
 
     Every zone's core is evaluated for every ray, and one is chosen.

@@ -194,23 +194,17 @@ def domain_from_camera(
     stopped = lens.at(f_number=f_number, focus_m=focus_m) if f_number is not None else lens.at(focus_m=focus_m)
     corner = math.hypot(*film_mm) / 2
     radius = min(corner, image_radius_mm(lens)[0])
-    domain = domain_of(
-        stopped,
-        film_radius_mm=radius,
-        focus_m=(focus_m, focus_m),
-        wavelength_nm=wavelength_nm,
-        nearest_m=nearest_m,
+    focus = (focus_m, focus_m)
+    return stopped, domain_of(
+        stopped, film_radius_mm=radius, focus_m=focus, wavelength_nm=wavelength_nm, nearest_m=nearest_m
     )
-    return stopped, domain
 
 
 def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:
     """z (mm, lens frame; -inf at infinity focus) of the object plane in focus for each film plane z, first order."""
     data = first_order(lens)
     f = data.efl_mm
-    extension = (
-        film_z - data.rear_principal_z_mm - f
-    )  # Newton: object distance beyond the front focus is f^2 / extension
+    extension = film_z - data.rear_principal_z_mm - f  # Newton: f^2 / extension is how far beyond the front focus
     far = extension <= 1e-9 * f
     distance = f + f * f / torch.where(far, torch.ones_like(extension), extension)
     return data.front_principal_z_mm - torch.where(far, torch.full_like(distance, math.inf), distance)
@@ -222,30 +216,21 @@ def sample_domain(domain: Domain, count: int, seed: int, skip: int = 0) -> FilmR
     Scrambled Sobol points (Owen scrambling, torch): the same seed gives the same rays; `skip` continues the sequence,
     so that splits never share a ray.
     """
-    s = sobol_points(count, seed, skip)
+    s, film_z, wavelength = _drawn(domain, count, seed, skip)
     film_x, film_y = _disc(s[0], s[1], domain.film_radius_mm)
     pupil_x, pupil_y = _disc(s[2], s[3], domain.pupil_radius_mm)
-    return FilmRays(film_x, film_y, film_planes(domain, s[5]), pupil_x, pupil_y, wavelengths_of(domain, s[4]))
+    return FilmRays(film_x, film_y, film_z, pupil_x, pupil_y, wavelength)
 
 
-def sobol_points(count: int, seed: int, skip: int) -> Tensor:
-    """[6, N] scrambled Sobol points; `skip` continues a sequence."""
+def _drawn(domain: Domain, count: int, seed: int, skip: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Scrambled Sobol points: four numbers of every ray [4, N], its film plane and its wavelength."""
     engine = SobolEngine(6, scramble=True, seed=seed)
     if skip:
         engine.fast_forward(skip)
-    return engine.draw(count, dtype=torch.float64).T
-
-
-def film_planes(domain: Domain, s: Tensor) -> Tensor:
-    """One of `FILM_PLANES` film planes for each number from 0 to 1."""
-    near, far = domain.film_z_mm
-    return near + (far - near) * torch.floor(s * FILM_PLANES).clamp_max(FILM_PLANES - 1) / (FILM_PLANES - 1)
-
-
-def wavelengths_of(domain: Domain, s: Tensor) -> Tensor:
-    """The domain's wavelengths, from the shortest for 0 to the longest for 1."""
-    low, high = domain.wavelength_nm
-    return low + (high - low) * s
+    s = engine.draw(count, dtype=torch.float64).T
+    (near, far), (low, high) = domain.film_z_mm, domain.wavelength_nm
+    step = torch.floor(s[5] * FILM_PLANES).clamp_max(FILM_PLANES - 1)
+    return s[:4], near + (far - near) * step / (FILM_PLANES - 1), low + (high - low) * s[4]
 
 
 def _disc(a: Tensor, b: Tensor, radius: float) -> tuple[Tensor, Tensor]:
@@ -283,16 +268,14 @@ def sample_lit(domain: Domain, count: int, seed: int, skip: int = 0) -> tuple[Fi
     """
     edges, low, high, half, area = _boxes(domain)
     weight = (edges[1:] ** 2 - edges[:-1] ** 2) * area
-    s = sobol_points(count, seed, skip)
+    s, film_z, wavelength = _drawn(domain, count, seed, skip)
     total = torch.cumsum(weight, 0)
     ring = torch.searchsorted(total, s[0] * total[-1], right=True).clamp_max(len(weight) - 1)
     part = (s[0] * total[-1] - (total - weight)[ring]) / weight[ring]
     r = torch.sqrt(edges[ring] ** 2 + part.clamp(0, 1) * (edges[1:] ** 2 - edges[:-1] ** 2)[ring])
     u, v = low[ring] + (high - low)[ring] * s[2], half[ring] * (2 * s[3] - 1)
     cos, sin = torch.cos(2 * math.pi * s[1]), torch.sin(2 * math.pi * s[1])
-    rays = FilmRays(
-        r * cos, r * sin, film_planes(domain, s[5]), u * cos - v * sin, u * sin + v * cos, wavelengths_of(domain, s[4])
-    )
+    rays = FilmRays(r * cos, r * sin, film_z, u * cos - v * sin, u * sin + v * cos, wavelength)
     kept = rays.pupil_x**2 + rays.pupil_y**2 <= domain.pupil_radius_mm**2
     return rays.select(kept), count / lit_share(domain)
 
@@ -310,11 +293,8 @@ def _boxes(domain: Domain) -> tuple[Tensor, ...]:
     low, high, half = (torch.tensor(v, dtype=torch.float64) for v in (b.low_mm, b.high_mm, b.half_mm))
     dark = low >= high
     low, high, half = low.where(~dark, math.inf), high.where(~dark, -math.inf), half.where(~dark, 0.0)
-    low, high, half = (
-        torch.minimum(low[:-1], low[1:]),
-        torch.maximum(high[:-1], high[1:]),
-        torch.maximum(half[:-1], half[1:]),
-    )
+    low, high = torch.minimum(low[:-1], low[1:]), torch.maximum(high[:-1], high[1:])
+    half = torch.maximum(half[:-1], half[1:])
     lit = low < high
     low, high = low.where(lit, 0.0), high.where(lit, 0.0)
     spare = _BOX_MARGIN * torch.maximum((high - low) / 2, half)

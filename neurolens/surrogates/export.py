@@ -20,6 +20,7 @@ from neurolens.graph.onnx import Mixing, write_onnx
 from neurolens.graph.program import RAY
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.modelfile.axes import Axis
+from neurolens.modelfile.states import STATE
 from neurolens.optics.focusing import at_infinity
 from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.assemble import ONNX, model_graph
@@ -32,7 +33,6 @@ from neurolens.surrogates.stored import model_to_text, storable
 if TYPE_CHECKING:
     from neurolens.surrogates.states import StateModel
 
-STATE = "state"
 # A film position that lies in no domain: where the state is out of range, this takes the place of the one asked for.
 _NOWHERE = -1.0
 
@@ -63,7 +63,10 @@ def export_onnx(
         for name, by in (("scene_ray_d_film", RAY[:2]), ("scene_ray_d_pupil", RAY[2:])):
             graph.outputs[name] = graph.concat(*(graph.outputs.pop(derivative("scene_ray", row)) for row in by))
             shapes[name] = (2, 6)
-    return _write(path, write_onnx(graph, model_metadata(model, errors or {}), shapes=shapes))
+    metadata = {CARD_KEY: card_to_json(card_of(model, errors or {}))}
+    if storable(model.core):
+        metadata[MODEL_KEY] = model_to_text(model)
+    return _write(path, write_onnx(graph, metadata, shapes=shapes))
 
 
 def _write(path: str | Path, proto: Any) -> Path:
@@ -71,12 +74,6 @@ def _write(path: str | Path, proto: Any) -> Path:
     with atomic_path(target) as temporary:
         temporary.write_bytes(proto.SerializeToString())
     return target
-
-
-def model_metadata(model: LensModel, errors: dict[str, Any]) -> dict[str, str]:
-    """The card, and the coefficients where their core has a form for files."""
-    card = {CARD_KEY: card_to_json(card_of(model, errors))}
-    return {**card, MODEL_KEY: model_to_text(model)} if storable(model.core) else card
 
 
 def check_gates(model: LensModel) -> None:

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
@@ -27,7 +27,7 @@ from neurolens.surrogates.fits.polynomial import fit_paraxial, fit_polynomial
 from neurolens.surrogates.gates import choose_gates, explained
 from neurolens.surrogates.lightfield import fit_encoding
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import PairSet, RayPairs, trace_pairs
+from neurolens.surrogates.pairs import RayPairs, trace_pairs
 from neurolens.surrogates.published import fit_published
 from neurolens.surrogates.settings import NETWORKS, PLANES_SEARCHED, POLYNOMIALS, ModelSettings, PublishedName
 from neurolens.surrogates.targets import Prepared, film_equivalent, scales_of, squared_error, targets_of
@@ -146,31 +146,17 @@ def _fit_core(
             return base
         if isinstance(base, RawPolynomial):
             raise InputError("fit", "basis", settings.basis, "invariants, with a network beside the polynomial")
-        network = fit_network(
-            data,
-            units=settings.units,
-            layers=settings.layers,
-            seed=settings.seed,
-            seconds=settings.seconds,
-            steps=settings.steps,
-            base=base,
-            checkpoint=of_zone(checkpoint, next(zones)),
-            progress=progress,
-        )
+        file = of_zone(checkpoint, next(zones))
+        network = fit_network(data, settings, base=base, checkpoint=file, progress=progress)
         return network if base is None else Residual((base, network))
 
     return fit_partitioned(prepared, settings.partitions, fit)
 
 
 def reach(models: Iterable[LensModel], target_um: float, error_um: Callable[[LensModel], float]) -> LensModel:
-    """The first model whose film-equivalent RMS is at most `target_um`, else the best; what it reached in its settings.
+    """The first model whose film-equivalent RMS is at most `target_um`, else the best, with a warning.
 
-    Args:
-        models: at least one; fitted as they are asked for, so that none after the first that serves is.
-        error_um: film-equivalent RMS of a model.
-
-    Warns:
-        NeurolensWarning: none reaches it.
+    What it reached stands in its settings. Models are fitted as they are asked for: none after the first that serves.
     """
     found: list[tuple[float, LensModel]] = []
     for model in models:
@@ -206,9 +192,6 @@ def fit_partitioned(prepared: Prepared, zones: int, fit: Callable[[Prepared], Zo
     After Zheng and Zheng 2017 (adaptive sparse polynomials) and NeuroLens 2017 (networks), which both split the space
     of rays. Zones are rings of the film, so that the rotational symmetry of the invariants survives.
 
-    Args:
-        fit: fits one core to the rays of a zone.
-
     Raises:
         InputError: fewer than one zone, or several with fewer than 200 training rays each.
     """
@@ -236,10 +219,8 @@ def fit_partitioned(prepared: Prepared, zones: int, fit: Callable[[Prepared], Zo
 
 
 def _zone(prepared: Prepared, rhos: dict[str, Tensor], low: float, high: float) -> Prepared:
-    def within(name: str) -> PairSet:
-        rho, rays = rhos[name], getattr(prepared.pairs, name)
-        chosen: PairSet = rays.select((rho > low - OVERLAP) & (rho <= high + OVERLAP))
-        return chosen
-
-    zone = replace(prepared.pairs, train=within("train"), rim=within("rim"), edge=within("edge"), far=within("far"))
-    return replace(prepared, pairs=zone)
+    zone: dict[str, Any] = {
+        name: getattr(prepared.pairs, name).select((rho > low - OVERLAP) & (rho <= high + OVERLAP))
+        for name, rho in rhos.items()
+    }
+    return replace(prepared, pairs=replace(prepared.pairs, **zone))

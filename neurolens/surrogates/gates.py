@@ -19,7 +19,8 @@ from neurolens.surrogates.pairs import PairSet, RayPairs, join_pairs, reached
 
 # Rays of the boundary fits are mixed by this seed: networks use the first of them.
 _MIXING_SEED = 1
-_MOST_GATES = 10
+# Gates of either kind; rims end when this share of the blocked rays, discriminants when this share of all rays is left.
+_MOST_GATES, _UNEXPLAINED = 10, 1e-4
 
 # Only the neighbourhood of a boundary decides who passes: weights fall off beyond this distance from it, in units of
 # the gate (half as much of a rim's radius).
@@ -33,11 +34,6 @@ _TARGET, _MOST_TARGET = 0.1, 1.0
 _WEIGHT, _MOST_WEIGHT = 0.03, 1.0
 _ROUNDS = 8
 _RIDGE, _DEPENDENT = 1e-13, 1e-12  # relative
-
-
-def has_edges(gates: tuple[Gate, ...]) -> bool:
-    """Whether any gate is a discriminant."""
-    return any(gate.reason != st.RIM for gate in gates)
 
 
 def gate_reach(gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
@@ -92,15 +88,13 @@ def boundary_rays(pairs: RayPairs, gates: tuple[Gate, ...]) -> PairSet:
 
     Fits without such a gate see no lost ray.
     """
-    if not has_edges(gates) or not len(pairs.edge):
+    if all(gate.reason == st.RIM for gate in gates) or not len(pairs.edge):
         return pairs.rim
     both = join_pairs([pairs.rim, pairs.edge])
     return both.select(torch.randperm(len(both), generator=torch.Generator().manual_seed(_MIXING_SEED)))
 
 
-def choose_gates(
-    lens: Lens, blocked: PairSet, drawn: int | None = None, unexplained: float = 1e-4, most: int = _MOST_GATES
-) -> tuple[Gate, ...]:
+def choose_gates(lens: Lens, blocked: PairSet, drawn: int | None = None) -> tuple[Gate, ...]:
     """The boundaries that block anything in the domain: the one that explains most blocked rays, then the next.
 
     Rims come first, by the rays that refract all the way; then, for what the rims leave, discriminants. A gate of total
@@ -109,8 +103,6 @@ def choose_gates(
     Args:
         blocked: rays that did not pass, drawn uniformly over the domain.
         drawn: how many were drawn to find them; None: only they.
-        unexplained: rims end when this share of the blocked rays, discriminants when this share of all rays is left.
-        most: gates of either kind.
 
     Returns the gates in the order in which camera rays meet them. The stop is no gate: it is tested on its crossing.
     """
@@ -119,21 +111,21 @@ def choose_gates(
     outside = ((blocked.cross_x**2 + blocked.cross_y**2) > radii**2) & known & (blocked.meets > 0)  # [S, N]
     whole = ((blocked.meets > 0) & (blocked.refracts > 0)).all(0)
     left = outside[:, whole & ~outside[lens.stop_index]]
-    rims = _greedy(left, math.floor(unexplained * int(whole.sum())), most)
+    rims = _greedy(left, math.floor(_UNEXPLAINED * int(whole.sum())))
     stopped = outside[[*rims, lens.stop_index]].any(0)
     # Rows: total reflection, then missed. The first of equals is taken.
     lost = torch.cat([known & ~(blocked.refracts > 0), known & ~(blocked.meets > 0)])
-    edges = _greedy(lost[:, ~stopped], math.floor(unexplained * (drawn or len(blocked))), most)
+    edges = _greedy(lost[:, ~stopped], math.floor(_UNEXPLAINED * (drawn or len(blocked))))
     count = len(lens.surfaces)
     gates = [Gate(k, st.RIM) for k in rims]
     gates += [Gate(k % count, st.TOTAL_REFLECTION if k < count else st.MISSED) for k in edges]
     return tuple(sorted(gates, key=lambda g: (-g.surface, g.reason)))
 
 
-def _greedy(stops: Tensor, enough: int, most: int) -> list[int]:
+def _greedy(stops: Tensor, enough: int) -> list[int]:
     """Rows of [K, N] bool: the one with most entries, then the one with most of the rest, until `enough` or fewer."""
     chosen: list[int] = []
-    while stops.shape[1] and len(chosen) < most:
+    while stops.shape[1] and len(chosen) < _MOST_GATES:
         counts = stops.sum(1)
         best = int(counts.argmax())
         if int(counts[best]) <= max(0, enough):

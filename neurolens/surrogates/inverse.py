@@ -87,32 +87,18 @@ class Guess:
         return [a * light.p + b * light.u for a, b in zip(parts[::2], parts[1::2], strict=True)]
 
 
-class StopRays(NamedTuple):
-    """Camera rays through given stop points, [N].
+class InverseRays(NamedTuple):
+    """Camera rays that cross the stop in given points, or leave as given scene rays, [N].
 
     Attributes:
-        rays: with the pupil points found.
+        rays: with the pupil points found (of scene rays, the film points too).
         prediction: of the model for those rays. Its status is that of `neurolens.base.status`, NO_SOLUTION among them.
-        density: |d stop / d pupil|: area on the stop per area on the pupil plane, the film point held. A stop point
-            drawn with density q per mm^2 is a pupil point drawn with density q times this.
-        residual: distance between the point asked for and where the ray crosses the stop, in stop radii.
-    """
-
-    rays: FilmRays
-    prediction: Prediction
-    density: Tensor
-    residual: Tensor
-
-
-class FilmSide(NamedTuple):
-    """Camera rays that leave as given scene rays, [N].
-
-    Attributes:
-        rays: film points and pupil points found.
-        prediction: of the model for those rays, NO_SOLUTION among its status.
-        density: |d (film, pupil) / d (position, direction)|: mm^2 on the film times mm^2 on the pupil plane, per mm^2
-            of (x, y) on the front surface and steradian.
-        residual: distance from the scene ray asked for: of the front's radius, and in radians (both squared, summed).
+        density: of stop points |d stop / d pupil|: area on the stop per area on the pupil plane, the film point held. A
+            stop point drawn with density q per mm^2 is a pupil point drawn with density q times this. Of scene rays
+            |d (film, pupil) / d (position, direction)|: mm^2 on the film times mm^2 on the pupil plane, per mm^2 of
+            (x, y) on the front surface and steradian.
+        residual: distance from the stop point asked for in stop radii; from the scene ray asked for of the front's
+            radius, and in radians (both squared, summed).
     """
 
     rays: FilmRays
@@ -148,7 +134,7 @@ class InverseModel:
         stop_radius_mm: float | None = None,
         steps: int = STEPS,
         start: Tensor | None = None,
-    ) -> StopRays:
+    ) -> InverseRays:
         """The rays from film points through stop points; all [N], mm and nm, in the dtype of the inputs.
 
         Args:
@@ -160,7 +146,7 @@ class InverseModel:
         given = {"stop_rays": torch.stack([film_x, film_y, stop_x, stop_y, wavelength_nm])}
         if start is not None:
             given["start"] = start
-        return StopRays(*self._solved("stop", given, film_z, stop_radius_mm, steps))
+        return self._solved("stop", given, film_z, stop_radius_mm, steps)
 
     def from_scene(
         self,
@@ -169,7 +155,7 @@ class InverseModel:
         wavelength_nm: Tensor,
         stop_radius_mm: float | None = None,
         steps: int = STEPS,
-    ) -> FilmSide:
+    ) -> InverseRays:
         """The camera rays of light that comes along scene rays; all [N], in the dtype of the inputs.
 
         Args:
@@ -183,12 +169,12 @@ class InverseModel:
         """
         *position, v, per_steradian = front_rays(self.model, scene, film_z.dtype)
         given = {"front_rays": torch.stack([*position, *v, wavelength_nm])}
-        rays, prediction, density, residual = self._solved("scene", given, film_z, stop_radius_mm, steps)
-        return FilmSide(rays, prediction, density / per_steradian, residual)
+        found = self._solved("scene", given, film_z, stop_radius_mm, steps)
+        return found._replace(density=found.density / per_steradian)
 
     def _solved(
         self, name: str, given: dict[str, Tensor], film_z: Tensor, stop_radius_mm: float | None, steps: int
-    ) -> tuple[FilmRays, Prediction, Tensor, Tensor]:
+    ) -> InverseRays:
         radius = film_z.new_full((1, 1), self.model.checked_radius_mm(stop_radius_mm))
         graph = _exact_graph(self, name, steps, "start" in given)
         out = evaluate(graph, {**given, "film_z_mm": film_z[None], "stop_radius_mm": radius})
@@ -196,7 +182,7 @@ class InverseModel:
         rays = FilmRays(film_x, film_y, film_z, pupil_x, pupil_y, wavelength)
         density, residual = (out[n].expand(1, len(rays))[0] for n in ("density", "residual"))
         residual = torch.where(torch.isfinite(residual), residual, torch.inf)
-        return rays, prediction_of(out, len(rays)), density, residual
+        return InverseRays(rays, prediction_of(out, len(rays)), density, residual)
 
 
 def front_rays(model: LensModel, scene: Rays, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -216,9 +202,8 @@ def front_rays(model: LensModel, scene: Rays, dtype: torch.dtype) -> tuple[Tenso
 
 @lru_cache(maxsize=16)
 def _exact_graph(inverse: InverseModel, name: str, steps: int, start: bool) -> Graph:
-    if name == "stop":
-        return stop_graph(inverse, EXACT, math.pi, steps, start)
-    return scene_graph(inverse, EXACT, math.pi, steps)
+    known = (inverse, EXACT, math.pi, steps)
+    return stop_graph(*known, start) if name == "stop" else scene_graph(*known)
 
 
 def stop_system(model: LensModel) -> Graph:
@@ -320,14 +305,11 @@ def scene_graph(inverse: InverseModel, form: Form, angle: float, steps: int = ST
 
     inside, light = within_domain(model, rays, film_z, form), light_field(g, e, rays, film_z)
     series = DirectionSeries.of(model, angle, form)
-    core = with_derivatives(
-        _core_graph(model, light, units_of(model, series, form)), _SCENE, [("planes", k) for k in (2, 3, 0, 1)]
-    )
-    found = g.inline(core, {"planes": light.planes})
+    core, planes = _core_graph(model, light, units_of(model, series, form)), (2, 3, 0, 1)
+    found = g.inline(with_derivatives(core, _SCENE, [("planes", k) for k in planes]), {"planes": light.planes})
     vectors = (found["position"], found["direction"], found["stop"])
     status = add_outputs(model, CoreValues(vectors, found["transmittance"], found.get("gates")), inside, series, form)
-    planes = [f"planes_{k}" for k in (2, 3, 0, 1)]
-    area = determinant([g.concat(*(found[derivative(name, k)] for name in _SCENE)) for k in planes]).abs()
+    area = determinant([g.concat(*(found[derivative(n, f"planes_{k}")] for n in _SCENE)) for k in planes]).abs()
     # Of (p, u), scaled, per mm^2 and (kappa rad)^2.
     factor = e.film_scale_mm**2 * math.prod(e.pupil_scales_mm) * series.kappa**2
     off = g.concat(*vectors[:2]) * (1 / np.repeat([model.scales.position_mm, series.kappa], 2)) - wanted

@@ -7,7 +7,6 @@ import time
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,11 +14,11 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.interpret import monomials
 from neurolens.optics.surfaces import Rays
-from neurolens.surrogates.bases import Exponents, pinned_threads, solve
+from neurolens.surrogates.bases import Exponents, kept, ordered, pinned_threads, solve
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.fits.selection import Sweep, forward
-from neurolens.surrogates.inverse import STEPS, TOLERANCE, FilmSide, Guess, InverseModel, StopRays, scaled_film_z
+from neurolens.surrogates.inverse import STEPS, TOLERANCE, Guess, InverseModel, InverseRays, scaled_film_z
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import RayPairs, join_pairs
@@ -84,7 +83,7 @@ def convergence(inverse: InverseModel, rays: FilmRays, steps: int = STEPS) -> di
     return {"stop": _found(inverse.model, rays, stop), "scene": _found(inverse.model, rays, back)}
 
 
-def _found(model: LensModel, rays: FilmRays, out: StopRays | FilmSide) -> dict[str, Any]:
+def _found(model: LensModel, rays: FilmRays, out: InverseRays) -> dict[str, Any]:
     solved = out.residual < TOLERANCE
     away = torch.hypot(out.rays.pupil_x - rays.pupil_x, out.rays.pupil_y - rays.pupil_y)
     other = solved & (away > _OTHER * model.domain.pupil_radius_mm)
@@ -149,20 +148,16 @@ def fit_guess(
     supports = []
     for axes in ([0], [1]) if mirror else ([0, 1],):
         d, o = columns[:, axes].flatten(1), wanted[:, axes].flatten(1)
-        sweep = Sweep((d @ d.T).numpy(), (d @ o.T).numpy(), (o * o).sum(1).numpy())
+        sweep = Sweep.of_columns(d, o)
         forward(sweep, min(terms, 2 * count))
         supports.append(sorted(sweep.chosen))
-    kept = sorted({k % count for support in supports for k in support})
-    place = {k: i for i, k in enumerate(kept)}
-    all_columns = _columns(field, z, exponents[kept], mirror, slice(None)) * weight
-    ab = torch.zeros((len(outputs), 2, len(supports), len(kept)), dtype=torch.float64)
+    exponents, rows = kept(exponents, [k for support in supports for k in support])
+    all_columns = _columns(field, z, exponents, mirror, slice(None)) * weight
+    ab = torch.zeros((len(outputs), len(supports), 2 * len(exponents)), dtype=torch.float64)
     for i, support in enumerate(supports):
-        axes = [i] if mirror else [0, 1]
-        rows = [place[k % count] + (k >= count) * len(kept) for k in support]
-        found = solve(all_columns[rows][:, axes].flatten(1), (outputs * weight)[:, axes].flatten(1))
-        for column, k in enumerate(support):
-            ab[:, int(k >= count), i, place[k % count]] = found[:, column]
-    return Guess(exponents[kept], ab.numpy())
+        axes, (own, rows) = [i] if mirror else [0, 1], (rows[: len(support)], rows[len(support) :])
+        ab[:, i, own] = solve(all_columns[own][:, axes].flatten(1), (outputs * weight)[:, axes].flatten(1))
+    return Guess(exponents, ab.reshape(*ab.shape[:2], 2, -1).transpose(1, 2).numpy())
 
 
 def _candidates(degree: int, mirror: bool, dispersive: bool, moves: bool) -> Exponents:
@@ -176,7 +171,7 @@ def _candidates(degree: int, mirror: bool, dispersive: bool, moves: bool) -> Exp
         for powers in itertools.product(range(most + 1), repeat=variables)
         if sum(powers) + 2 * w + z + w * z <= most or (sum(powers) == 0 and w + z <= 2)
     ]
-    return np.array(sorted(rows, key=lambda r: (sum(r), r)), dtype=np.int64)
+    return ordered(rows)
 
 
 def _columns(field: LightField, z: Tensor, exponents: Exponents, mirror: bool, part: slice) -> Tensor:

@@ -76,6 +76,11 @@ class Encoding:
         return self.chief_y is not None
 
     @property
+    def dispersive(self) -> bool:
+        """Whether rays depend on the wavelength."""
+        return self.w_half != 0
+
+    @property
     def chiefs(self) -> tuple[float, float]:
         """k of x and of y."""
         return self.chief, self.chief if self.chief_y is None else self.chief_y
@@ -94,13 +99,9 @@ class Encoding:
 
     def __call__(self, rays: FilmRays) -> LightField:
         p, u = self.planes(rays)
-        if self.mirror:
-            u = torch.stack([(u[i] - self.chiefs[i] * p[i]) / self.pupil_scales_mm[i] for i in (0, 1)])
-        else:
-            u = (u - self.chief * p) / self.pupil_scale_mm
-        if self.w_half == 0:
-            w = torch.zeros_like(rays.wavelength_nm)
-        else:
+        u = torch.stack([(u[i] - self.chiefs[i] * p[i]) / self.pupil_scales_mm[i] for i in (0, 1)])
+        w = torch.zeros_like(rays.wavelength_nm)
+        if self.dispersive:
             w = (inverse_square_um(rays.wavelength_nm) - self.w_middle) / self.w_half
         return LightField(p / self.film_scale_mm, u, w)
 

@@ -150,11 +150,7 @@ class LensModel:
         return {"rays": columns, "film_z_mm": rays.film_z[None], "stop_radius_mm": radius}
 
     def checked_radius_mm(self, stop_radius_mm: float | None) -> float:
-        """The stop radius asked for, or the domain's.
-
-        Raises:
-            InputError: a stop wider than the model was fitted for.
-        """
+        """The stop radius asked for, or the domain's. Raises InputError: a stop wider than the model was fitted for."""
         if stop_radius_mm is not None and not 0 <= stop_radius_mm <= DOMAIN_SLACK * self.domain.stop_radius_mm:
             expected = f"0 to {self.domain.stop_radius_mm:.6g} mm, the widest stop of the fit"
             raise InputError(self.method, "stop_radius_mm", stop_radius_mm, expected)

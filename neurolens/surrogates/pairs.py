@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -62,14 +62,19 @@ class PairSet:
     def __len__(self) -> int:
         return len(self.inputs)
 
+    def columns(self) -> tuple[Tensor, ...]:
+        """All tensors, in the order of `of_columns`; rays last."""
+        surfaces = (self.cross_x, self.cross_y, self.meets, self.refracts)
+        return (*self.inputs.columns(), *self.scene, self.transmittance, self.status, *surfaces)
+
+    @staticmethod
+    def of_columns(columns: Iterable[Tensor]) -> PairSet:
+        """The set of such tensors."""
+        c = tuple(columns)
+        return PairSet(FilmRays(*c[:6]), Rays(*c[6:12]), *c[12:])
+
     def select(self, index: Tensor | slice) -> PairSet:
-        return PairSet(
-            self.inputs.select(index),
-            Rays(*(c[index] for c in self.scene)),
-            self.transmittance[index],
-            self.status[index],
-            *(c[:, index] for c in (self.cross_x, self.cross_y, self.meets, self.refracts)),
-        )
+        return PairSet.of_columns(c[..., index] for c in self.columns())
 
 
 @dataclass(frozen=True)
@@ -133,7 +138,7 @@ def make_pairs(
     drawn, tested = 0, 0.0
     if lit_share(domain) < SPARSE:  # then `draw` leaves out what is far
         everywhere = trace_pairs(lens, sample_domain(domain, _BATCH, settings.seed + 1), domain.pupil_z_mm)
-        _keep(found["far"], counts, everywhere, _is_far(lens, everywhere), "far", (settings.rim + 1) // 2)
+        _keep(found, counts, everywhere, {"far": _taught(lens, everywhere)["far"]}, settings)
     total = sum(wanted.values())
     while counts["train"] < wanted["train"] or counts["held_out"] < wanted["held_out"]:
         split = "train" if counts["train"] < wanted["train"] else "held_out"
@@ -145,19 +150,13 @@ def make_pairs(
             order = torch.nonzero(passed)[:, 0]
             used = int(order[needed - 1]) + 1 if len(order) >= needed else len(batch)
             tested += stands_for * used / max(len(batch), 1)
-            for name, chosen in (("rim", _teaches_rims), ("edge", _teaches_edges), ("far", _is_far)):
-                most = settings.rim if name == "rim" else (settings.rim + 1) // 2
-                _keep(found[name], counts, batch, chosen(lens, batch), name, most)
+            _keep(found, counts, batch, _taught(lens, batch), settings)
         found[split].append(batch.select(passed).select(slice(0, wanted[split] - counts[split])))
         counts[split] += len(found[split][-1])
         drawn += _BATCH
         if drawn > 10000 * (counts["train"] + counts["held_out"] + 10):
-            raise InputError(
-                lens.path,
-                "domain",
-                f"({drawn} rays, {sum(counts.values())} passed)",
-                "a domain that the lens can reach",
-            )
+            shown = f"({drawn} rays, {sum(counts.values())} passed)"
+            raise InputError(lens.path, "domain", shown, "a domain that the lens can reach")
         if progress:
             progress((counts["train"] + counts["held_out"]) / total)
     joined = {name: join_pairs(sets) for name, sets in found.items()}
@@ -165,24 +164,30 @@ def make_pairs(
     return RayPairs(lens, domain, settings, **joined, tested=round(tested))
 
 
-def _keep(sets: list[PairSet], counts: dict[str, int], batch: PairSet, chosen: Tensor, name: str, most: int) -> None:
-    """Add the chosen rays of a batch to a split, up to `most` in all."""
-    sets.append(batch.select(chosen).select(slice(0, most - counts[name])))
-    counts[name] += len(sets[-1])
+def _keep(
+    found: dict[str, list[PairSet]],
+    counts: dict[str, int],
+    batch: PairSet,
+    chosen: dict[str, Tensor],
+    settings: PairSettings,
+) -> None:
+    """Add the chosen rays of a batch to their splits, as far as those are not full."""
+    for name, rays in chosen.items():
+        most = settings.rim if name == "rim" else (settings.rim + 1) // 2
+        found[name].append(batch.select(rays).select(slice(0, most - counts[name])))
+        counts[name] += len(found[name][-1])
 
 
-def _is_far(lens: Lens, batch: PairSet) -> Tensor:
-    """Rays that do not pass, and of which no other split tells."""
-    return ~(_teaches_rims(lens, batch) | _teaches_edges(lens, batch) | (batch.status == st.PASSED))
-
-
-def _teaches_rims(lens: Lens, batch: PairSet) -> Tensor:
-    """Rays that refract all the way and cross no surface far beyond its rim."""
-    # Status cannot tell: a ray that a rim stops may end for another reason later. A lost ray comes back along the axis.
-    refracts = (batch.meets > 0).all(0) & (batch.refracts > 0).all(0) & torch.isfinite(batch.cross_x).all(0)
-    refracts &= ~_lost(batch)
+def _taught(lens: Lens, batch: PairSet) -> dict[str, Tensor]:
+    """Which rays tell of what, [N] bool each; see `RayPairs`."""
     radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
-    return refracts & (batch.cross_x**2 + batch.cross_y**2 <= (RIM_REACH * radii) ** 2).all(0)
+    near = batch.cross_x**2 + batch.cross_y**2 <= (RIM_REACH * radii) ** 2
+    refracts = (batch.meets > 0) & (batch.refracts > 0)
+    whole = refracts.all(0)
+    # Status cannot tell: a ray that a rim stops may end for another reason later. A lost ray comes back along the axis.
+    rim = whole & torch.isfinite(batch.cross_x).all(0) & ~_lost(batch) & near.all(0)
+    edge = ~whole & (~(reached(batch) & refracts) | near).all(0)
+    return {"rim": rim, "edge": edge, "far": ~(rim | edge | (batch.status == st.PASSED))}
 
 
 def reached(pairs: PairSet) -> Tensor:
@@ -199,14 +204,6 @@ def _lost(pairs: PairSet) -> Tensor:
     return (pairs.status >= 4) & (pairs.status % 4 != st.RIM)
 
 
-def _teaches_edges(lens: Lens, batch: PairSet) -> Tensor:
-    """Rays that end at a discriminant, and cross no surface before that far beyond its rim."""
-    lost = ~((batch.meets > 0) & (batch.refracts > 0)).all(0)
-    on_the_way = reached(batch) & (batch.meets > 0) & (batch.refracts > 0)
-    radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
-    return lost & (~on_the_way | (batch.cross_x**2 + batch.cross_y**2 <= (RIM_REACH * radii) ** 2)).all(0)
-
-
 def _without_the_rest(lost: PairSet) -> PairSet:
     """Lost rays with 0 for what they never reached, where tracing them further gave figures without meaning."""
     known = reached(lost)
@@ -218,17 +215,7 @@ def _without_the_rest(lost: PairSet) -> PairSet:
 
 def join_pairs(sets: list[PairSet]) -> PairSet:
     """One set of all the rays, in order."""
-
-    def cat(name: str, dim: int = 0) -> Tensor:
-        return torch.cat([getattr(s, name) for s in sets], dim)
-
-    return PairSet(
-        FilmRays(*(torch.cat(c) for c in zip(*(s.inputs.columns() for s in sets), strict=True))),
-        Rays(*(torch.cat(c) for c in zip(*(s.scene for s in sets), strict=True))),
-        cat("transmittance"),
-        cat("status"),
-        *(cat(name, 1) for name in ("cross_x", "cross_y", "meets", "refracts")),
-    )
+    return PairSet.of_columns(torch.cat(c, -1) for c in zip(*(s.columns() for s in sets), strict=True))
 
 
 def save_pairs(pairs: RayPairs, path: str | Path) -> None:
@@ -242,10 +229,10 @@ def save_pairs(pairs: RayPairs, path: str | Path) -> None:
     }
     arrays: dict[str, Any] = {"header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
     for name in SPLITS:
-        s: PairSet = getattr(pairs, name)
-        arrays[f"{name}_vectors"] = torch.stack([*s.inputs.columns(), *s.scene, s.transmittance]).numpy()
-        arrays[f"{name}_status"] = s.status.numpy()
-        arrays[f"{name}_surfaces"] = torch.stack([s.cross_x, s.cross_y, s.meets, s.refracts]).numpy()
+        c = getattr(pairs, name).columns()
+        arrays[f"{name}_vectors"] = torch.stack(c[:13]).numpy()
+        arrays[f"{name}_status"] = c[13].numpy()
+        arrays[f"{name}_surfaces"] = torch.stack(c[14:]).numpy()
     with atomic_path(path) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, **arrays)
 
@@ -276,6 +263,5 @@ def load_pairs(path: str | Path, lens: Lens) -> RayPairs:
 
 
 def _unpack(arrays: dict[str, Any], name: str) -> PairSet:
-    v = torch.from_numpy(arrays[f"{name}_vectors"])
-    surfaces = torch.from_numpy(arrays[f"{name}_surfaces"])
-    return PairSet(FilmRays(*v[:6]), Rays(*v[6:12]), v[12], torch.from_numpy(arrays[f"{name}_status"]), *surfaces)
+    vectors, status, surfaces = (torch.from_numpy(arrays[f"{name}_{k}"]) for k in ("vectors", "status", "surfaces"))
+    return PairSet.of_columns([*vectors, status, *surfaces])

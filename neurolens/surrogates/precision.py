@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
-from onnx import GraphProto, ModelProto, NodeProto, TensorProto, checker, helper, numpy_helper
+from onnx import ModelProto, NodeProto, TensorProto, checker, helper, numpy_helper
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
@@ -60,12 +60,15 @@ def store_weights(
     for tensor in graph.initializer:
         value = numpy_helper.to_array(tensor)
         if tensor.name in weights and value.dtype == np.float32 and value.size >= _LEAST_ENTRIES:
-            nodes, tensors = _stored(tensor.name, value, precision)
-            heads += nodes
+            made, tensors = _stored(tensor.name, value, precision)
+            heads += made
             kept += tensors
         else:
             kept.append(tensor)
-    _rebuild(graph, heads, kept)
+    nodes = [*heads, *graph.node]
+    del graph.node[:], graph.initializer[:]
+    graph.node.extend(nodes)
+    graph.initializer.extend(kept)
     checker.check_model(proto, full_check=True)
     _write_card(proto, precision, errors or {})
     path = Path(target)
@@ -90,13 +93,6 @@ def _stored(name: str, value: NDArray[np.float32], precision: Precision) -> tupl
         helper.make_node("Mul", [f"{name}_cast", scale], [name], name=f"{name}_rescale"),
     ]
     return nodes, [numpy_helper.from_array(half, packed), numpy_helper.from_array(most[:, None], scale)]
-
-
-def _rebuild(graph: GraphProto, heads: list[NodeProto], tensors: list[TensorProto]) -> None:
-    nodes = [*heads, *graph.node]
-    del graph.node[:], graph.initializer[:]
-    graph.node.extend(nodes)
-    graph.initializer.extend(tensors)
 
 
 def _write_card(proto: ModelProto, precision: Precision, errors: dict[str, Any]) -> None:

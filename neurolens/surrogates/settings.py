@@ -130,10 +130,7 @@ POLYNOMIAL_ABLATIONS: Mapping[str, Mapping[str, Any]] = {
     "raw monomials": {"basis": "raw", "degree": 5},
 }
 # Of networks.
-NETWORK_ABLATIONS: Mapping[str, Mapping[str, Any]] = {
-    "20 steps of training": {"steps": 20},
-    "one layer": {"layers": 1},
-}
+NETWORK_ABLATIONS: Mapping[str, Mapping[str, Any]] = {"20 steps of training": {"steps": 20}, "one layer": {"layers": 1}}
 
 
 def ablated(settings: ModelSettings, name: str) -> ModelSettings:

@@ -87,9 +87,8 @@ def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FR
     """
     fix.check(models[0].domain)
     angle = max(largest_angle(model) for model in models)
-    known = {
-        name: value for name, value in ((FILM_Z, fix.film_z_mm), (STOP_RADIUS, fix.stop_radius_mm)) if value is not None
-    }
+    fixed = {FILM_Z: fix.film_z_mm, STOP_RADIUS: fix.stop_radius_mm}
+    known = {name: value for name, value in fixed.items() if value is not None}
     return lower([model_graph(model, angle, SCALARS, parts) for model in models], known)
 
 
@@ -127,14 +126,11 @@ def comment_of(models: Sequence[LensModel], card: Mapping[str, Any], fix: Fix) -
         lines.append(f"Poor: {', '.join(errors['poor'])}.")
     lines.append("Units: mm, nm; directions are unit vectors, transmittance a share of the power.")
     codes = {g.status for g in model.gates}
-    told = {c: w for c, w in card["status_codes"].items() if int(c) in codes or not _is_gate(card, int(c))}
+    gone = {g["status"] for g in card["gates"]} - codes
+    told = {c: w for c, w in card["status_codes"].items() if int(c) not in gone}
     lines.append(f"Status: {'; '.join(f'{c} {w}' for c, w in told.items())}.")
     flat = [" ".join(str(line).split()) for line in lines]
     return [part for line in flat for part in textwrap.wrap(line, _WIDTH, break_long_words=False)]
-
-
-def _is_gate(card: Mapping[str, Any], code: int) -> bool:
-    return any(g["status"] == code for g in card["gates"])
 
 
 def _span(low: float, high: float) -> str:

@@ -34,11 +34,7 @@ class Fix:
     stop_radius_mm: float | None = None
 
     def check(self, domain: Domain) -> None:
-        """Refuse a film position or a stop outside a domain.
-
-        Raises:
-            InputError: as it says.
-        """
+        """Refuse a film position or a stop outside a domain. Raises InputError: as it says."""
         z, stop, (near, far), widest = self.film_z_mm, self.stop_radius_mm, domain.film_z_mm, domain.stop_radius_mm
         if z is not None and not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
             raise InputError("fix", "film_z", z, f"{near:.6g} to {far:.6g} mm, the film positions of the fit")

@@ -72,19 +72,23 @@ class StateSpace:
     def _knots(self) -> tuple[Axis, ...]:
         return tuple(replace(a, degree=1) for a in self.axes)
 
-    def _values(self, state: Sequence[float]) -> dict[str, float]:
-        return dict(zip((a.name for a in self.axes), state, strict=True))
+    def _asked(self, state: Sequence[float]) -> tuple[str | float | None, float | None]:
+        """Zoom position, and the distance (m) of internal focus where that is an axis."""
+        values = dict(zip((a.name for a in self.axes), state, strict=True))
+        vergence = values.get("focus")
+        focus_m = None if vergence is None else 1 / vergence if vergence > 0 else math.inf
+        return values.get("zoom", self.zoom), focus_m
 
     def lens_at(self, state: Sequence[float]) -> Lens:
         """The exact lens at a state; with internal focus, focused there, else at infinity focus."""
-        values = self._values(state)
-        zoom = values.get("zoom", self.zoom)
-        if "focus" not in values:
+        zoom, focus_m = self._asked(state)
+        return self._lens(zoom, focus_m)
+
+    def _lens(self, zoom: str | float | None, focus_m: float | None) -> Lens:
+        if focus_m is None:
             return self.lens.at(zoom=zoom, f_number=self.f_number)
-        focus_m = 1 / values["focus"] if values["focus"] > 0 else math.inf
-        return self.lens.at(
-            zoom=zoom, f_number=self.f_number, focus="internal", focus_m=None if math.isinf(focus_m) else focus_m
-        )
+        distance = None if math.isinf(focus_m) else focus_m
+        return self.lens.at(zoom=zoom, f_number=self.f_number, focus="internal", focus_m=distance)
 
     def domain_at(self, state: Sequence[float]) -> Domain:
         """The domain of a state: the full lit film, and the film positions that focusing by the film needs.
@@ -94,17 +98,16 @@ class StateSpace:
         return self._domain(state, float(weights(self._knots, state) @ np.array(self._planes_mm)))
 
     def _domain(self, state: Sequence[float], pupil_z_mm: float | None) -> Domain:
-        values, lens, radius, film_z = self._values(state), self.lens_at(state), self.film_radius_mm, None
-        if "focus" not in values:
+        zoom, focus_m = self._asked(state)
+        lens, radius, film_z = self._lens(zoom, focus_m), self.film_radius_mm, None
+        if focus_m is None:
             focus = self.focus_m if isinstance(self.focus_m, tuple) else self.focus_m(lens)
         else:
             # The picture's size is that of the lens at infinity focus: it breathes, the film does not.
             if radius is None:
-                radius = image_radius_mm(self.lens_at([0.0 if k == "focus" else v for k, v in values.items()]))[0]
+                radius = image_radius_mm(self._lens(zoom, math.inf))[0]
             assert lens.film_z_mm is not None
-            film_z = (lens.film_z_mm, lens.film_z_mm)
-            distance = 1 / values["focus"] if values["focus"] > 0 else math.inf
-            focus = (distance, distance)
+            film_z, focus = (lens.film_z_mm, lens.film_z_mm), (focus_m, focus_m)
         return domain_of(
             lens,
             film_radius_mm=radius,
@@ -123,10 +126,7 @@ def zoom_axis(lens: Lens, degree: int | None = None) -> Axis:
     Raises:
         InputError: a file with fewer than two zoom states.
     """
-    found: list[tuple[float, str]] = []
-    for state in infinity_states(lens):
-        found.append((float(first_order(lens.at(zoom=state.name)).efl_mm), state.name))
-    found.sort()
+    found = sorted((float(first_order(lens.at(zoom=s.name)).efl_mm), s.name) for s in infinity_states(lens))
     knots: list[float] = []
     for efl, _ in found:
         if not knots or efl > knots[-1] * (1 + _SAME):
@@ -204,11 +204,7 @@ class StateModel:
         return tuple(a.range[0] for a in self.axes)
 
     def at(self, *state: float) -> LensModel:
-        """The model of one state.
-
-        Raises:
-            InputError: another number of values than axes, or one out of range.
-        """
+        """The model of one state; InputError as `modelfile.axes.weights`."""
         w = weights(self.axes, state)
         first = self.nodes[0]
         return replace(

@@ -11,25 +11,24 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-import torch
 
 from neurolens.base.errors import InputError
 from neurolens.modelfile import axes as ax
 from neurolens.surrogates.bases import (
     Exponents,
     invariant_exponents,
+    kept,
     monomials,
     pinned_threads,
     solve,
     vector_columns,
-    vector_gram,
 )
-from neurolens.surrogates.cores import STOP, InvariantPolynomial
+from neurolens.surrogates.cores import STOP
 from neurolens.surrogates.fit import prepare
-from neurolens.surrogates.fits.boundaries import fit_scalars, fit_stop
+from neurolens.surrogates.fits.boundaries import invariant_core
 from neurolens.surrogates.fits.selection import JointSweep, Sweep, forward, replace_terms
 from neurolens.surrogates.lightfield import Encoding, fit_encoding
-from neurolens.surrogates.model import Gate, LensModel, Scales
+from neurolens.surrogates.model import LensModel, Scales
 from neurolens.surrogates.pairs import PairSettings, RayPairs, make_pairs
 from neurolens.surrogates.states import State, StateModel, StateSpace
 from neurolens.surrogates.targets import Prepared, film_equivalent, scales_of
@@ -41,7 +40,7 @@ _PASSES = 2  # of replacement
 
 @dataclass(frozen=True)
 class StateSettings:
-    """How a model of many states is fitted: see `polynomial.PolynomialSettings`; rays are those of each node."""
+    """How a model of many states is fitted: see `ModelSettings`; rays are those of each node."""
 
     terms: int = 64
     degree: int = 7
@@ -78,7 +77,9 @@ def fit_states(
             known[k] = prepare(_pairs(space, states[k], settings))
             if progress:
                 progress(0.3 * (done + 1) / len(choosers))
-        gates = _all_gates([p.gates for p in known.values()])
+        # Every gate that any node needs, in the order in which camera rays meet them.
+        needed = {g for p in known.values() for g in p.gates}
+        gates = tuple(sorted(needed, key=lambda g: (-g.surface, g.reason)))
         scales = common_encoding([d.encoding for d in known.values()])
         known = {k: replace(d, encoding=_scaled_like(scales, d.encoding)) for k, d in known.items()}
         stop_mm = max(d.pairs.lens.stop_radius_mm for d in known.values())
@@ -102,10 +103,9 @@ def _pairs(space: StateSpace, state: State, settings: StateSettings) -> RayPairs
 
 
 def common_encoding(found: Sequence[Encoding]) -> Encoding:
-    """Scales and chief ray for all nodes: the largest scales, the mean chief ray.
+    """Scales and chief ray for all nodes: the largest, and the mean.
 
-    Scales of each node's own would follow its domain, which need not be smooth in the state (a near limit that follows
-    one rule and then another); in such coordinates nor would be the lens.
+    A node's own scales follow its domain, which need not be smooth in the state; nor would be the lens in them.
     """
     return replace(
         found[0],
@@ -120,45 +120,32 @@ def _scaled_like(scales: Encoding, own: Encoding) -> Encoding:
     return replace(scales, film_plane_z_mm=own.film_plane_z_mm, pupil_plane_z_mm=own.pupil_plane_z_mm)
 
 
-def _all_gates(found: Sequence[tuple[Gate, ...]]) -> tuple[Gate, ...]:
-    """Every gate that any node needs, in the order in which camera rays meet them."""
-    return tuple(sorted({g for gates in found for g in gates}, key=lambda g: (-g.surface, g.reason)))
-
-
 def choose_jointly(data: Sequence[Prepared], settings: StateSettings) -> tuple[Exponents, list[int]]:
     """One support for all nodes: orthogonal least squares by the sum of the nodes' gains, then replacement.
 
     Returns the exponents [M, 4] kept and the columns of `bases.vector_columns` chosen among them (m p, then m u).
     """
-    dispersive = data[0].encoding.w_half != 0
+    dispersive = data[0].encoding.dispersive
     exponents = invariant_exponents(settings.degree, dispersive=dispersive)
     sweeps = []
     for d in data:
         train = d.train
         outputs = film_equivalent(d.pairs.lens, d.pairs.domain, train.vectors)
-        gram, moments = vector_gram(monomials(train.field.invariants(), exponents), train.field, outputs)
-        sweeps.append(Sweep(gram, moments, (outputs.flatten(1) ** 2).sum(1).numpy()))
+        sweeps.append(Sweep.of_vectors(monomials(train.field.invariants(), exponents), train.field, outputs))
     joint = JointSweep(sweeps)
     forward(joint, settings.terms)
     replace_terms(joint, _PASSES)
-    chosen = joint.chosen
-    count = len(exponents)
-    kept = sorted({k % count for k in chosen})
-    place = {k: i for i, k in enumerate(kept)}
-    return exponents[kept], sorted(place[k % count] + (k >= count) * len(kept) for k in chosen)
+    return kept(exponents, sorted(joint.chosen))
 
 
 def _fit_node(
     data: Prepared, exponents: Exponents, columns: list[int], stop_mm: float, settings: StateSettings
 ) -> LensModel:
     """The model of one node; its stop crossing is in units of `stop_mm`, the same at every node."""
-    pairs, train, count = data.pairs, data.train, len(exponents)
-    ab = torch.zeros((3, 2 * count), dtype=torch.float64)
+    pairs, train, scales = data.pairs, data.train, scales_of(data.pairs.lens)
     vectors = vector_columns(monomials(train.field.invariants(), exponents), train.field)[columns]
-    ab[:STOP, columns] = solve(vectors, train.vectors[:STOP].flatten(1))
-    scales = scales_of(pairs.lens)
-    ab[STOP] = fit_stop(data, exponents) * (scales.stop_mm / stop_mm)
-    core = InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), fit_scalars(data, exponents).numpy())
+    core = invariant_core(data, exponents, columns, solve(vectors, train.vectors[:STOP].flatten(1)))
+    core.ab[STOP] *= scales.stop_mm / stop_mm
     return LensModel(
         lens=pairs.lens,
         domain=pairs.domain,

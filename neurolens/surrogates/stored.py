@@ -21,7 +21,8 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError, ModelError
-from neurolens.modelfile import CARD_KEY, MODEL_KEY
+from neurolens.modelfile import MODEL_KEY
+from neurolens.modelfile.onnxfile import card_in, read_metadata
 from neurolens.optics.prescription import Coating, Lens, Surface
 from neurolens.surrogates.cores import (
     Core,
@@ -47,7 +48,6 @@ CORES: dict[str, type] = {
     "residual": Residual,
 }
 _NAMES = {kind: name for name, kind in CORES.items()}
-_MAX_FILE = 64 * 2**20
 _MAX_TEXT = 16 * 2**20  # of the JSON; the largest models known take 100 kB
 _MAX_DEPTH = 8
 _MAX_ROWS = 20_000  # of any array: terms, or units of a layer
@@ -62,11 +62,7 @@ def storable(core: Core) -> bool:
 
 
 def model_to_text(model: LensModel) -> str:
-    """The metadata entry of a model: deflated JSON in base64.
-
-    Raises:
-        InputError: a core that is not `storable`.
-    """
+    """The metadata entry of a model: deflated JSON in base64. Raises InputError: a core that is not `storable`."""
     if not storable(model.core):
         raise InputError("export", "core", type(model.core).__name__, f"one of {', '.join(CORES)}")
     data = {
@@ -85,14 +81,14 @@ def model_to_text(model: LensModel) -> str:
 def load_fitted(path: str | Path) -> LensModel:
     """The model that an exported file was made from, coefficients rounded to float32.
 
-    Its settings and fit time are the card's, and its errors are there (`card_in`).
+    Its settings and fit time are the card's.
 
     Raises:
         ModelError: a file that is missing, too large, no exported model, made without its coefficients, damaged, or
             whose coefficients do not give the card's reference rays.
     """
     file = Path(path)
-    metadata = _metadata(file)
+    _, _, metadata = read_metadata(file)
     card = card_in(file, metadata)
     if card.get("states"):
         raise ModelError(f"{file}: a model of many states (zoom, internal focus), expected one of one state")
@@ -107,7 +103,7 @@ def load_fitted(path: str | Path) -> LensModel:
             raise ModelError(f"{file}: coefficients: schema: got {data['schema']!r}, expected {SCHEMA}")
         model = LensModel(
             lens=_lens(data["lens"]),
-            domain=Domain.from_dict(_finite_focus(card["domain"])),
+            domain=Domain.from_dict(card["domain"]),
             encoding=_numbers(Encoding, data["encoding"]),
             scales=_numbers(Scales, data["scales"]),
             gates=tuple(Gate(int(k), int(r)) for k, r in data["gates"]),
@@ -123,37 +119,6 @@ def load_fitted(path: str | Path) -> LensModel:
             raise
         raise ModelError(f"{file}: its coefficients are damaged ({type(error).__name__}: {error})") from error
     return model
-
-
-def card_in(path: str | Path, metadata: dict[str, str] | None = None) -> dict[str, Any]:
-    """The card of an exported file.
-
-    Raises:
-        ModelError: as of `load_fitted`.
-    """
-    found = _metadata(Path(path)) if metadata is None else metadata
-    try:
-        card = json.loads(found[CARD_KEY])
-    except (KeyError, ValueError, RecursionError) as error:
-        raise ModelError(f"{path}: no card, or a damaged one: no model made by neurolens") from error
-    if not isinstance(card, dict):
-        raise ModelError(f"{path}: card: got {type(card).__name__}, expected a table")
-    return card
-
-
-def _metadata(file: Path) -> dict[str, str]:
-    from onnx import ModelProto  # heavy, and not needed to store
-
-    if not file.is_file():
-        raise ModelError(f"{file}: no such file, expected an exported lens model (.onnx)")
-    if file.stat().st_size > _MAX_FILE:
-        raise ModelError(f"{file}: {file.stat().st_size} bytes, expected at most {_MAX_FILE}")
-    proto = ModelProto()
-    try:
-        proto.ParseFromString(file.read_bytes())
-    except Exception as error:  # protobuf raises types of its own
-        raise ModelError(f"{file}: truncated, or not an ONNX model") from error
-    return {entry.key: entry.value for entry in proto.metadata_props}
 
 
 def _inflated(text: str) -> bytes:
@@ -248,10 +213,6 @@ def _lens(packed: dict[str, Any]) -> Lens:
             known["coating"] = Coating(str(name), tuple((float(n), float(nm)) for n, nm in layers))
         surfaces.append(Surface(**known))
     return Lens(surfaces=tuple(surfaces), **{k: packed[k] for k in _LENS})
-
-
-def _finite_focus(domain: dict[str, Any]) -> dict[str, Any]:
-    return {**domain, "focus_m": [float(f) for f in domain["focus_m"]]}
 
 
 def _check(file: Path, model: LensModel, card: dict[str, Any]) -> None:

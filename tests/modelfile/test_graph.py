@@ -10,12 +10,14 @@ import onnx
 import pytest
 
 from neurolens.base import status as st
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import load_model
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
 from neurolens.graph.scalars import lower
 from neurolens.modelfile.graph import graph_of
+from neurolens.modelfile.onnxfile import read_checked
+from neurolens.modelfile.protobuf import message, walk
 from neurolens.surrogates.precision import store_weights
 
 ROOT = Path(__file__).parents[2]
@@ -82,3 +84,13 @@ def test_graphs_that_ask_for_too_much(tmp_path: Path) -> None:
         graph = helper.make_graph([node], "g", [], [], constants)
         with pytest.raises(InputError, match="graph"):
             graph_of(tmp_path / "model.onnx", helper.make_model(graph).SerializeToString())
+
+
+def test_a_number_where_bytes_belong_takes_no_memory(tmp_path: Path) -> None:
+    """A float tensor whose data are one number: as a count of bytes it would be 32 TiB."""
+    tensor = message(iter([(1, 0, 1), (2, 0, 1), (8, 2, b"odd"), (4, 0, 2**45)]))
+    fields = list(walk(memoryview(lens_models.exported("network").read_bytes())))
+    whole = ((n, wire, message(iter([*walk(v), (5, 2, tensor)])) if n == 7 else v) for n, wire, v in fields)
+    (tmp_path / "odd.onnx").write_bytes(message(whole))
+    with pytest.raises(ModelError, match="damaged"):
+        read_checked(tmp_path / "odd.onnx")

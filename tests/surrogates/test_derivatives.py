@@ -12,7 +12,6 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import film_derivatives, trace_differentials
-from neurolens.surrogates.cores import InvariantPolynomial, Network, Residual
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel
@@ -25,19 +24,12 @@ def _outputs(model: LensModel, rays: FilmRays) -> Tensor:
     return torch.stack([*out.rays, out.stop_x, out.stop_y])
 
 
-@pytest.fixture(scope="module")
-def residual() -> LensModel:
-    """The mean of a polynomial and a network."""
-    whole, network = model("invariants"), model("network").core
-    assert isinstance(whole.core, InvariantPolynomial) and isinstance(network, Network)
-    half = replace(whole.core, ab=whole.core.ab / 2, scalars=whole.core.scalars / 2)
-    other = replace(network, output=(network.output[0] / 2, network.output[1] / 2))
-    return replace(whole, core=Residual((half, other)))
+CYLINDERS = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("cylinders", "cylinders network")]
 
 
-@pytest.mark.parametrize("kind", [*KINDS, "zones", "residual"])
-def test_derivatives_are_the_finite_differences_of_the_model(kind: str, request: pytest.FixtureRequest) -> None:
-    m = request.getfixturevalue(kind) if kind == "residual" else model(kind)
+@pytest.mark.parametrize("kind", [*KINDS, "zones", "residual", *CYLINDERS])
+def test_derivatives_are_the_finite_differences_of_the_model(kind: str) -> None:
+    m = model(kind)
     rays = sample_domain(m.domain, 3000, seed=3)
     d = m.differentiate(rays)
     ok = d.prediction.status == st.PASSED

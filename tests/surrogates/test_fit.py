@@ -5,18 +5,24 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
-from lens_models import prepared
+from lens_models import LENSES, prepared
 
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates import fit
 from neurolens.surrogates.bases import invariant_exponents, raw_exponents
 from neurolens.surrogates.card import card_of
-from neurolens.surrogates.fit import TERMS_LADDER, ModelSettings, fit_model
+from neurolens.surrogates.domain import domain_of
+from neurolens.surrogates.fit import TERMS_LADDER, ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.fits import checkpoint
+from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.settings import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
+from neurolens.surrogates.targets import targets_of
 
 
 @pytest.mark.parametrize(
@@ -29,6 +35,7 @@ from neurolens.surrogates.fits import checkpoint
         *(("layers", v) for v in (0, 9)),
         *(("steps", v) for v in (0, 10**9)),
         *(("seconds", v) for v in (0.0, -1.0, math.nan)),
+        *(("target_um", v) for v in (0.0, -1.0, math.nan, math.inf)),
     ],
 )
 def test_numbers_without_bounds_are_refused(field: str, value: Any) -> None:
@@ -86,12 +93,6 @@ def test_the_error_may_be_measured_by_the_caller() -> None:
     assert asked == [12, 28] and model.settings["reached_um"] == 4.0
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
-def test_no_such_error(value) -> None:
-    with pytest.raises(InputError, match="target_um"):
-        ModelSettings(target_um=value)
-
-
 def test_checkpoints_of_zones_are_kept_apart_and_removed_together(tmp_path: Path) -> None:
     file = tmp_path / "m.training.npz"
     settings = ModelSettings("mlp", units=3, layers=1, steps=4, partitions=2)
@@ -102,3 +103,48 @@ def test_checkpoints_of_zones_are_kept_apart_and_removed_together(tmp_path: Path
     assert fit_model(prepared(), settings, checkpoint=file).fit_s >= spent  # earlier runs count
     checkpoint.clear(file)
     assert not list(tmp_path.iterdir()) and checkpoint.spent_s(file) == 0
+
+
+# ---- what each part of a fit is worth ----
+
+
+@cache
+def _infinity(stem: str) -> Prepared:
+    lens = read_lens(LENSES / f"{stem}.toml")
+    return prepare(make_pairs(lens, domain_of(lens), PairSettings(3000, 3000, 3000)))
+
+
+@cache
+def direction_rms(settings: ModelSettings) -> float:
+    model = fit_model(_infinity("angenieux_retrofocus_35"), settings)
+    targets = targets_of(model.lens, model.encoding, _infinity("angenieux_retrofocus_35").pairs.held_out)
+    return float((model.core(targets.field)[0][1] - targets.vectors[1]).square().sum(0).mean().sqrt())
+
+
+@pytest.mark.slow
+def test_every_part_of_the_fit_is_worth_something() -> None:
+    whole = direction_rms(ModelSettings(terms=24))
+    for name in ("planes not searched", "forward selection alone", "matching pursuit", "raw monomials"):
+        assert whole < 0.8 * direction_rms(ablated(ModelSettings(terms=24), name)), name
+
+
+def test_transmittance_terms_follow_absorption() -> None:
+    """A lens whose glasses absorb the blue; the ray's own terms hold low powers of the wavelength only."""
+    stem = "laikin_double_gauss_127"
+    off = []
+    for most in (0, 16):
+        model = fit_model(_infinity(stem), ModelSettings(terms=30, growth=1, planes=False, transmittance_terms=most))
+        truth = _infinity(stem).pairs.held_out
+        off.append(float((model.predict(truth.inputs).transmittance - truth.transmittance).square().mean().sqrt()))
+    assert off[1] < 4e-4 < off[0]
+
+
+def test_ablations_name_what_exists() -> None:
+    for settings, names in ((ModelSettings(terms=20), POLYNOMIAL_ABLATIONS), (ModelSettings("mlp"), NETWORK_ABLATIONS)):
+        labels = [ablated(settings, name).label for name in names]
+        assert len(set(labels)) == len(labels)
+        assert all(
+            ablated(settings, n) != replace(settings, name=label) for n, label in zip(names, labels, strict=True)
+        )
+    with pytest.raises(InputError, match="ablation"):
+        ablated(settings, "no magic")

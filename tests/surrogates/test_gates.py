@@ -18,7 +18,7 @@ from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.gates import boundary_rays, choose_gates, gate_reach, gate_values
 from neurolens.surrogates.model import Gate, LensModel
-from neurolens.surrogates.pairs import PairSet, PairSettings, load_pairs, make_pairs, reached, save_pairs, trace_pairs
+from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, reached, trace_pairs
 
 LENSES = Path(__file__).parents[2] / "lenses"
 
@@ -91,7 +91,7 @@ def test_two_gates_for_one_reason_on_a_surface_are_refused(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("name", ["singlet", "hemisphere"])
-def test_edge_rays_are_lost_and_finite(name: str, tmp_path: Path) -> None:
+def test_edge_rays_are_lost_and_finite(name: str) -> None:
     pairs = gated(name).pairs
     edge = pairs.edge
     assert 100 < len(edge) <= 5000
@@ -103,10 +103,6 @@ def test_edge_rays_are_lost_and_finite(name: str, tmp_path: Path) -> None:
     again = trace_pairs(pairs.lens, edge.inputs, pairs.domain.pupil_z_mm)
     assert torch.equal(reached(edge), reached(again))
     assert torch.equal(edge.refracts[reached(edge)], again.refracts[reached(edge)])
-    save_pairs(pairs, tmp_path / "pairs.npz")
-    back = load_pairs(tmp_path / "pairs.npz", pairs.lens).edge
-    for a, b in ((back.meets, edge.meets), (back.status, edge.status), (back.inputs.film_x, edge.inputs.film_x)):
-        assert torch.equal(a, b)
 
 
 def test_gate_values_say_what_stopped_each_ray() -> None:

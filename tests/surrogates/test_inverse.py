@@ -18,7 +18,7 @@ from neurolens.optics.sag import sag_and_derivatives
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
-from neurolens.surrogates.inverse import InverseModel, StopRays
+from neurolens.surrogates.inverse import InverseModel, InverseRays
 from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 from neurolens.surrogates.pairs import PairSet
 
@@ -31,7 +31,7 @@ def inverse(name: str = GAUSS) -> InverseModel:
     return fit_inverse(fit_model(known, ModelSettings("dense", degree=5)), known.pairs)
 
 
-def _through(inverse: InverseModel, rays: FilmRays, x: Tensor, y: Tensor, **options: int) -> StopRays:
+def _through(inverse: InverseModel, rays: FilmRays, x: Tensor, y: Tensor, **options: int) -> InverseRays:
     return inverse.through_stop(rays.film_x, rays.film_y, rays.film_z, x, y, rays.wavelength_nm, **options)
 
 

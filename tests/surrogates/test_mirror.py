@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,14 +11,10 @@ import torch
 from lens_models import anamorphic
 from vignetting_oracle import vignetting_errors
 
-from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.model import load_model
-from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.rays import ray_errors
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model
 from neurolens.surrogates.fits.mirror import mirror_exponents
 from neurolens.surrogates.model import LensModel
@@ -70,16 +65,6 @@ def test_a_network_fits_rays_and_rims(lens: Lens, network: LensModel, prepared: 
     assert shares["false_pass"] < 0.005 and shares["false_block"] < 0.005
 
 
-def test_derivatives_are_those_of_differences(either: LensModel) -> None:
-    rays = sample_domain(either.domain, 500, 3)
-    d = either.differentiate(rays)
-    found = [*d.d_film.unbind(1), *d.d_pupil.unbind(1)]
-    for name, derivative in zip(("film_x", "film_y", "pupil_x", "pupil_y"), found, strict=True):
-        ends = [either.predict(replace(rays, **{name: getattr(rays, name) + s * 1e-4})).rays for s in (1, -1)]
-        up, down = (torch.stack(list(end)) for end in ends)
-        torch.testing.assert_close(derivative, (up - down) / 2e-4, rtol=1e-5, atol=1e-6)
-
-
 @pytest.mark.parametrize("axis", [0, 1])
 def test_mirrored_rays_have_mirrored_images(either: LensModel, axis: int) -> None:
     model = either
@@ -99,17 +84,6 @@ def test_is_not_round(model: LensModel) -> None:
     turned = replace(rays, film_x=-rays.film_y, film_y=rays.film_x, pupil_x=-rays.pupil_y, pupil_y=rays.pupil_x)
     a, b = model.predict(rays), model.predict(turned)
     assert float((a.rays.dx - b.rays.dy).abs().median()) > 0.01
-
-
-def test_graph_equals_model(either: LensModel, tmp_path: Path) -> None:
-    model = either
-    onnx = load_model(export_onnx(model, tmp_path / "anamorphic.onnx"))
-    rays = sample_domain(model.domain, 20_000, 9)
-    wanted, found = model.predict(rays), onnx_predictor(onnx)(rays)
-    assert float((wanted.status == found.status).double().mean()) > 0.999
-    passed = (wanted.status == st.PASSED) & (found.status == st.PASSED)
-    for name, limit in (("x", 2e-3), ("y", 2e-3), ("z", 2e-3), ("dx", 2e-5), ("dy", 2e-5), ("dz", 2e-5)):
-        assert float((getattr(wanted.rays, name) - getattr(found.rays, name))[passed].abs().max()) < limit
 
 
 def test_candidates_are_all_different(prepared: Prepared) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from functools import cache
 from pathlib import Path
@@ -11,8 +10,7 @@ import lens_models
 import numpy as np
 import pytest
 import torch
-from lens_models import prepared
-from onnx import ModelProto
+from lens_models import edited, prepared
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
@@ -21,7 +19,6 @@ from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.onnxmaps import OnnxDerivatives, load_inverse
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.modelfile import CARD_KEY
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_inverse, export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
@@ -168,17 +165,12 @@ def test_files_that_are_no_inverse_maps_are_refused(tmp_path: Path) -> None:
     export_inverse(inverse("invariants"), tmp_path / "m.onnx")
     with pytest.raises(ModelError, match="another lens"):
         load_inverse(tmp_path / "m.onnx", lens="0" * 64)
-    whole = (tmp_path / "m.scene.onnx").read_bytes()
+    scene = shutil.copy(tmp_path / "m.scene.onnx", tmp_path / "whole.onnx")
     for front in ({"curvature": 0.01}, {"curvature": 0.01, "conic": 0, "asphere": [4], "cylinder": None}, "flat"):
-        proto = ModelProto.FromString(whole)
-        entry = next(e for e in proto.metadata_props if e.key == CARD_KEY)
-        card = json.loads(entry.value)
-        card["inverse"]["front"] = front
-        entry.value = json.dumps(card)
-        (tmp_path / "m.scene.onnx").write_bytes(proto.SerializeToString())
+        edited(scene, tmp_path / "m.scene.onnx", lambda card, front=front: card["inverse"].update(front=front))
         with pytest.raises(ModelError, match="card: inverse"):
             load_inverse(tmp_path / "m.onnx")
-    (tmp_path / "m.scene.onnx").write_bytes(whole)
+    shutil.copy(scene, tmp_path / "m.scene.onnx")
     (tmp_path / "m.stop.onnx").unlink()
     with pytest.raises(InputError, match="map"):
         load_inverse(tmp_path / "m.onnx").through_stop(np.zeros((2, 1)), np.zeros((2, 1)), 550.0)

@@ -92,6 +92,22 @@ def test_replacement_never_raises_the_residual(seed: int) -> None:
     assert (after < before * (1 - 1e-9)) == (exchanged > 0)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_elimination_drops_the_term_that_costs_least(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    columns = rng.normal(size=(14, 80)) + 0.8 * rng.normal(size=80)
+    outputs = rng.normal(size=(2, 80))
+    sweep = sweep_of(columns, outputs)
+    forward(sweep, 9)
+    nine = list(sweep.chosen)
+    without = [residual(columns, outputs, [c for c in nine if c != k]) for k in nine]
+    assert sweep.costs() == pytest.approx([left - residual(columns, outputs, nine) for left in without], rel=1e-6)
+    backward(sweep, 8)
+    assert residual(columns, outputs, sweep.chosen) == pytest.approx(min(without))
+    backward(sweep, 20)
+    assert len(sweep.chosen) == 8
+
+
 def test_replacement_with_no_other_candidate_keeps_all() -> None:
     """All terms are in, and some are nearly spanned by the others: none may be lost for a worse one."""
     rng = np.random.default_rng(0)

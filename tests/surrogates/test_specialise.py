@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import lens_models
@@ -16,7 +15,7 @@ from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.specialise import at_wavelength
 
 
-@pytest.mark.parametrize("kind", ["invariants", "raw", "network"])
+@pytest.mark.parametrize("kind", ["invariants", "raw", "network", "zones", "residual"])
 @pytest.mark.parametrize("wavelength_nm", [400.0, 587.6])
 def test_one_wavelength(kind: str, wavelength_nm: float, tmp_path: Path) -> None:
     model = lens_models.model(kind)
@@ -33,14 +32,6 @@ def test_one_wavelength(kind: str, wavelength_nm: float, tmp_path: Path) -> None
     lens = load_model(export_onnx(fixed, tmp_path / "fixed.onnx"), model.lens.sha256)
     camera = OnnxCamera(lens, film_mm=(36.0, 24.0), focus_m=2.0)
     assert not camera.dispersive and camera.wavelength_nm == (wavelength_nm, wavelength_nm)
-
-
-def test_zones_keep_their_places() -> None:
-    model = lens_models.model("zones")
-    rays = lens_models.prepared().pairs.held_out.inputs
-    rays = replace(rays, wavelength_nm=torch.full_like(rays.wavelength_nm, 500.0))
-    for a, b in zip(model.predict(rays).rays, at_wavelength(model, 500.0).predict(rays).rays, strict=True):
-        torch.testing.assert_close(a, b, rtol=0, atol=1e-9)
 
 
 def test_wavelengths_that_the_model_does_not_know() -> None:

@@ -11,10 +11,8 @@ from lens_models import prepared
 
 from neurolens.base.errors import InputError
 from neurolens.surrogates.cores import Partitioned, Residual
-from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.specialise import at_wavelength
 from neurolens.surrogates.targets import film_equivalent, targets_of
 
 
@@ -33,21 +31,6 @@ def test_zones_lower_the_error(zoned: LensModel) -> None:
     whole = fit_model(prepared(), ModelSettings(method="adaptive", terms=16))
     assert isinstance(zoned.core, Partitioned) and len(zoned.core.parts) == 3
     assert rms_deg(zoned) < 0.8 * rms_deg(whole)
-
-
-def test_zones_keep_the_rotational_symmetry(zoned: LensModel) -> None:
-    rays = prepared().pairs.held_out.inputs.select(slice(0, 500))
-    c, s = math.cos(0.7), math.sin(0.7)
-    turned = FilmRays(
-        c * rays.film_x - s * rays.film_y,
-        s * rays.film_x + c * rays.film_y,
-        rays.film_z,
-        c * rays.pupil_x - s * rays.pupil_y,
-        s * rays.pupil_x + c * rays.pupil_y,
-        rays.wavelength_nm,
-    )
-    a, b = zoned.predict(rays).rays, zoned.predict(turned).rays
-    assert torch.allclose(c * a.dx - s * a.dy, b.dx, atol=1e-12)
 
 
 def test_more_zones_than_rays_can_fill_are_refused() -> None:
@@ -80,13 +63,6 @@ def test_it_is_the_sum_of_its_parts(model: LensModel) -> None:
     field = model.encoding(prepared().pairs.held_out.inputs.select(slice(0, 100)))
     for total, one, other in zip(model.core(field), *(part(field) for part in model.core.parts), strict=True):
         torch.testing.assert_close(total, one + other, rtol=0, atol=1e-13)
-
-
-def test_one_wavelength_of_it(model: LensModel) -> None:
-    inputs = prepared().pairs.held_out.inputs
-    inputs = type(inputs)(*inputs.columns()[:5], torch.full_like(inputs.film_x, 550.0))
-    whole, one = model.predict(inputs), at_wavelength(model, 550.0).predict(inputs)
-    assert torch.allclose(torch.stack(list(whole.rays)), torch.stack(list(one.rays)), atol=1e-10)
 
 
 def test_zones_and_what_is_refused() -> None:

@@ -1,4 +1,4 @@
-"""Models run in the forms that they are written in: ONNX by onnxruntime, C compiled, GLSL by a software OpenGL."""
+"""Models in every form: torch in float32, ONNX by onnxruntime, C compiled, GLSL by a software OpenGL."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from neurolens.graph.c import Signature
 from neurolens.graph.compiler import find_compiler
 from neurolens.graph.glsl import write_glsl
 from neurolens.graph.program import SCENE_RAY, Program
-from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.source import fused_program
 
@@ -46,6 +46,8 @@ def written_rays(language: str, kind: str, rays: Mapping[str, object]) -> Rows:
         return _compiled(kind).rays(rays)  # type: ignore[arg-type]
     if language == "glsl":
         return glsl_rays(program(kind), rays)
+    if language == "torch":
+        return _in_torch(kind, rays)
     session = onnxruntime.InferenceSession(str(lens_models.exported(kind)), providers=["CPUExecutionProvider"])
     feeds = {name: np.float32([rays[name]]) for name in ("film_z_mm", "stop_radius_mm")}
     names = ["scene_ray", "transmittance", "stop_xy_mm", "status"]
@@ -53,6 +55,19 @@ def written_rays(language: str, kind: str, rays: Mapping[str, object]) -> Rows:
     assert [a.dtype for a in (scene, power, stop, status)] == [np.float32] * 3 + [np.int32]
     found = dict(zip(SCENE_RAY, scene, strict=True))
     return {**found, "transmittance": power, "stop_x_mm": stop[0], "stop_y_mm": stop[1], "status": status}
+
+
+def _in_torch(kind: str, rays: Mapping[str, object]) -> Rows:
+    """In float32."""
+    columns = [torch.from_numpy(rays[name]) for name in COLUMNS]  # type: ignore[arg-type]
+    plane = torch.full_like(columns[0], rays["film_z_mm"])  # type: ignore[arg-type]
+    with torch.no_grad():
+        inputs = FilmRays(*columns[:2], plane, *columns[2:])
+        out = lens_models.model(kind).predict(inputs, float(np.float32(rays["stop_radius_mm"])))  # type: ignore[arg-type]
+    columns = [*out.rays, out.transmittance, out.stop_x, out.stop_y, out.status]
+    assert [c.dtype for c in columns] == [torch.float32] * 9 + [torch.int32]
+    names = (*SCENE_RAY, "transmittance", "stop_x_mm", "stop_y_mm", "status")
+    return dict(zip(names, (c.numpy() for c in columns), strict=True))
 
 
 @cache

@@ -8,24 +8,18 @@ the ray.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.surrogates.bases import (
-    Exponents,
-    invariant_exponents,
-    monomials,
-    solve,
-    vector_columns,
-    vector_gram,
-)
+from neurolens.surrogates.bases import Exponents, invariant_exponents, monomials, solve, vector_columns
+from neurolens.surrogates.cores import STOP, InvariantPolynomial
 from neurolens.surrogates.fits.selection import Sweep
 from neurolens.surrogates.gates import GateFit, gate_reach, gate_values
 from neurolens.surrogates.lightfield import LightField
-from neurolens.surrogates.pairs import PairSet
 from neurolens.surrogates.targets import Prepared
 
 # Terms are added for boundaries until each is met to this RMS: of a gate (twice the relative radius of a rim), and of
@@ -55,41 +49,47 @@ def stop_crossing(data: Prepared) -> tuple[Tensor, Tensor]:
     return crossing, data.boundary_weights[1]
 
 
+def invariant_core(
+    data: Prepared, exponents: Exponents, columns: Sequence[int], coefficients: Tensor
+) -> InvariantPolynomial:
+    """The polynomial on these monomials with all that is fitted on them after position and direction.
+
+    Args:
+        columns: places of the chosen ones among m p (first M) and m u (M more).
+        coefficients: [2, C] of those, of position and direction.
+    """
+    ab = torch.zeros((3, 2 * len(exponents)), dtype=torch.float64)
+    ab[:STOP, list(columns)] = coefficients
+    ab[STOP] = fit_stop(data, exponents)
+    return InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), fit_scalars(data, exponents).numpy())
+
+
 def fit_scalars(data: Prepared, exponents: Exponents) -> Tensor:
     """[1 + G, M]: transmittance and gates on the monomials of the invariants given."""
-
-    def features(rays: PairSet) -> Tensor:
-        return monomials(data.encoding(rays.inputs).invariants(), exponents)
-
-    train, near, far = (features(r) for r in (data.pairs.train, data.boundary, data.pairs.far))
-    return solve_scalars(data, train, data.pairs.train.transmittance, near, far)
+    return solve_scalars(data, lambda field: monomials(field.invariants(), exponents))
 
 
-def solve_scalars(
-    data: Prepared, features: Tensor, transmittance: Tensor, boundary_features: Tensor, far_features: Tensor
-) -> Tensor:
+def solve_scalars(data: Prepared, features: Callable[[LightField], Tensor]) -> Tensor:
     """Transmittance on the passing rays, each gate on the rays that get as far, most on those that it decides.
-
-    Features are those of `pairs.train`, of `boundary` and of `pairs.far`.
 
     Raises:
         InputError: no more rays near the boundaries than terms.
     """
-    if len(data.boundary) <= len(features):
-        expected = f"more rays near the rims than the {len(features)} terms"
-        raise InputError("fit", "rim", len(data.boundary), expected)
-    fit = GateFit(boundary_features, gate_values(data.pairs.lens, data.gates, data.boundary), data.boundary_weights[0])
-    values = gate_values(data.pairs.lens, data.gates, data.pairs.far)
-    fit.block(far_features, values, gate_reach(data.gates, data.pairs.far))
-    return torch.cat([solve(features, transmittance[None]), fit.coefficients()])
+    pairs = data.pairs
+    train, near, far = (features(data.encoding(rays.inputs)) for rays in (pairs.train, data.boundary, pairs.far))
+    if len(data.boundary) <= len(train):
+        raise InputError("fit", "rim", len(data.boundary), f"more rays near the rims than the {len(train)} terms")
+    fit = GateFit(near, gate_values(pairs.lens, data.gates, data.boundary), data.boundary_weights[0])
+    fit.block(far, gate_values(pairs.lens, data.gates, pairs.far), gate_reach(data.gates, pairs.far))
+    return torch.cat([solve(train, pairs.train.transmittance[None]), fit.coefficients()])
 
 
-def boundary_terms(data: Prepared, exponents: Exponents, most: int = MOST_BOUNDARY_TERMS) -> Exponents:
+def boundary_terms(data: Prepared, exponents: Exponents) -> Exponents:
     """[K, 4] further exponents, where those given [M, 4] meet the stop crossing or a gate badly; often none.
 
     Forward selection by the gain of all those boundaries together, in squares of the error that each may have.
     """
-    every = invariant_exponents(_DEGREE, dispersive=data.encoding.w_half != 0)
+    every = invariant_exponents(_DEGREE, dispersive=data.encoding.dispersive)
     known = {tuple(e) for e in exponents.tolist()}
     added = np.array([e for e in every.tolist() if tuple(e) not in known], dtype=np.int64).reshape(-1, 4)
     candidates = np.concatenate([exponents, added])
@@ -102,7 +102,7 @@ def boundary_terms(data: Prepared, exponents: Exponents, most: int = MOST_BOUNDA
     features = monomials(field.invariants(), candidates)
     fits = _boundary_fits(data, field, features, len(exponents), bad)
     chosen: list[int] = []
-    while fits and len(chosen) < min(most, len(added)):
+    while fits and len(chosen) < min(MOST_BOUNDARY_TERMS, len(added)):
         scores = np.sum([f.scores() for f in fits], axis=0)
         best = int(np.argmax(scores))
         if not scores[best] > 0:
@@ -144,15 +144,12 @@ def _boundary_fits(
     for k in range(1 + len(values)) if only is None else only:
         w = (weights[k - 1] if k else weight)[:rays]
         if k:
-            rows, outputs = features * w, (values[k - 1, :rays] * w)[None]
-            gram, moments = (rows @ rows.T).numpy(), (rows @ outputs.T).numpy()
+            sweep = Sweep.of_columns(features * w, (values[k - 1, :rays] * w)[None])
         else:
             weighed = LightField(field.p * w, field.u * w, field.w)  # only p.p, p.u and u.u of it are used
-            outputs = (crossing[:, :rays] * w)[None]
-            gram, moments = vector_gram(features, weighed, outputs)
-        squares = (outputs.flatten(1) ** 2).sum(1).numpy()
+            sweep = Sweep.of_vectors(features, weighed, (crossing[:, :rays] * w)[None])
         allowed = (GATE_ERROR if k else STOP_ERROR) ** 2 * max(float((w * w).sum()), 1e-300)
-        fit = _BoundaryFit(Sweep(gram, moments, squares), terms, 1 / allowed)
+        fit = _BoundaryFit(sweep, terms, 1 / allowed)
         for term in range(terms if start is None else start):
             fit.add(term)
         fits.append(fit)
@@ -172,10 +169,10 @@ def transmittance_terms(data: Prepared, exponents: Exponents, most: int) -> Expo
     if not float((left**2).sum()) > allowed:
         return none
     known = {tuple(e) for e in exponents.tolist()}
-    offered = [tuple(e) for e in _candidates(dispersive=data.encoding.w_half != 0).tolist()]
+    offered = [tuple(e) for e in _candidates(dispersive=data.encoding.dispersive).tolist()]
     new = np.array([e for e in offered if e not in known], dtype=np.int64).reshape(-1, 4)
     features = monomials(invariants, np.concatenate([exponents, new]))
-    sweep = Sweep((features @ features.T).numpy(), (features @ wanted.T).numpy(), (wanted**2).sum(1).numpy())
+    sweep = Sweep.of_columns(features, wanted)
     for k in range(len(exponents)):
         if sweep.scores("ols")[k] >= 0:
             sweep.add(k)

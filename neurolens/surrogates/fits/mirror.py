@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.surrogates.bases import Exponents, monomials, solve
+from neurolens.surrogates.bases import Exponents, monomials, ordered, solve, united
 from neurolens.surrogates.cores import STOP, MirrorPolynomial
 from neurolens.surrogates.fits.boundaries import solve_scalars, stop_crossing
 from neurolens.surrogates.fits.selection import Sweep, forward, replace_terms
@@ -55,7 +55,7 @@ def mirror_exponents(degree: int, axis: int, *, dispersive: bool = True) -> Expo
                 row[own], row[own + 2] = rho, tau
                 row[other : other + 3] = rho_other, sigma_other, tau_other
                 rows.append(tuple(row))
-    return np.array(sorted(rows, key=lambda r: (sum(r), r)), dtype=np.int64)
+    return ordered(rows)
 
 
 def fit_mirror(data: Prepared, method: str, terms: int, degree: int) -> MirrorPolynomial:
@@ -77,43 +77,36 @@ def fit_mirror(data: Prepared, method: str, terms: int, degree: int) -> MirrorPo
     pairs, train = data.pairs, data.train
     if len(pairs.train) <= terms:
         raise InputError("fit", "train", len(pairs.train), f"more training rays than the {terms} terms")
-    dispersive = data.encoding.w_half != 0
+    dispersive = data.encoding.dispersive
     outputs = film_equivalent(pairs.lens, pairs.domain, train.vectors)
-    place: dict[tuple[int, ...], int] = {}
-    supports = []
+    supports: list[Exponents] = []
+    sides = []  # of every column chosen, whether it is one of u
     for axis in (0, 1):
         candidates = _candidates(degree, axis, dispersive=dispersive)
         sweep = Sweep(*_normal_equations(candidates, train.field, outputs[:, axis]))
         forward(sweep, terms // 2, "ols" if method == "ols" else "omp")
         if method == "ols":
             replace_terms(sweep)
-        count = len(candidates.exponents)
-        chosen = [(tuple(int(e) for e in candidates.exponents[k % count]), k >= count) for k in sorted(sweep.chosen)]
-        supports.append([(place.setdefault(e, len(place)), of_u) for e, of_u in chosen])
-    for e in _scalar_terms(dispersive=dispersive):
-        place.setdefault(e, len(place))
-    exponents = np.array(list(place), dtype=np.int64)
+        chosen, count = np.array(sorted(sweep.chosen)), len(candidates.exponents)
+        supports.append(candidates.exponents[chosen % count])
+        sides.append((chosen >= count).astype(int))
+    exponents, places = united([*supports, _scalar_terms(dispersive=dispersive)])
     features = monomials(train.field.mirror_invariants(), exponents)
     ab = torch.zeros((3, 2, 2, len(exponents)), dtype=torch.float64)
-    for axis, support in enumerate(supports):
-        columns = torch.stack([features[i] * (train.field.u if of_u else train.field.p)[axis] for i, of_u in support])
-        found = solve(columns, train.vectors[:2, axis])
-        for (i, of_u), column in zip(support, found.T, strict=True):
-            ab[:2, int(of_u), axis, i] = column
+    for axis, (side, place) in enumerate(zip(sides, places, strict=False)):
+        vectors = torch.stack([train.field.p[axis], train.field.u[axis]])
+        ab[:2, side, axis, place] = solve(features[place] * vectors[side], train.vectors[:2, axis])
     ab[STOP] = _fit_stop(data, exponents)
-    boundary, far = (
-        monomials(data.encoding(rays.inputs).mirror_invariants(), exponents) for rays in (data.boundary, pairs.far)
-    )
-    scalars = solve_scalars(data, features, train.transmittance, boundary, far)
+    scalars = solve_scalars(data, lambda field: monomials(field.mirror_invariants(), exponents))
     return MirrorPolynomial(exponents, ab.numpy(), scalars.numpy())
 
 
-def _scalar_terms(*, dispersive: bool) -> list[tuple[int, ...]]:
+def _scalar_terms(*, dispersive: bool) -> Exponents:
     """What transmittance and gates need besides: every invariant, and high powers of w, for glass that absorbs blue."""
-    units = [tuple(int(i == k) for i in range(6)) for k in range(6)]
-    if not dispersive:
-        return [(0,) * 7, *((*e, 0) for e in units)]
-    return [*((0, 0, 0, 0, 0, 0, w) for w in range(8)), *((*e, w) for e in units for w in range(3))]
+    units = np.eye(7, dtype=np.int64)
+    w = units[6]
+    plain = [w * k for k in range(8 if dispersive else 1)]
+    return np.array([*plain, *(e + w * k for e in units[:6] for k in range(3 if dispersive else 1))])
 
 
 def _candidates(degree: int, axis: int, *, dispersive: bool) -> _Terms:

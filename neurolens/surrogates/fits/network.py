@@ -24,6 +24,7 @@ from neurolens.surrogates.fits.checkpoint import Checkpoint, fingerprint
 from neurolens.surrogates.fits.projection import Problem, Projection, Stand, activations, minimise, project
 from neurolens.surrogates.gates import boundary_weights, gate_values
 from neurolens.surrogates.pairs import PairSet
+from neurolens.surrogates.settings import ModelSettings
 from neurolens.surrogates.targets import Prepared, film_equivalent_weights, targets_of
 
 # What the other outputs weigh against film-equivalent micrometres: so many um for 1 mm at the stop; and, for each mm of
@@ -32,7 +33,8 @@ from neurolens.surrogates.targets import Prepared, film_equivalent_weights, targ
 _STOP_UM_PER_MM, _TRANSMITTANCE_UM, _GATE_UM = 30.0, 20.0, 10.0
 # Training ends at an RMS of this share of the film radius: float32 itself, which evaluates the model, has eps 1.2e-7.
 _ENOUGH = 1e-7
-FEWEST_RAYS = 2000
+FEWEST_RAYS, RAYS = 2000, 16_000
+STARTS = 3  # with random weights
 # Each start gets this share of the steps before the best goes on.
 _TRIAL_STEPS = 0.1
 # Steps between looks at the error on rays not fitted (and between checkpoints).
@@ -45,14 +47,8 @@ _LITTLE, _IDLE = 0.01, 3
 
 def fit_network(
     data: Prepared,
+    settings: ModelSettings,
     *,
-    units: int = 16,
-    layers: int = 2,
-    seed: int = 0,
-    seconds: float = 60.0,
-    steps: int = 300,
-    starts: int = 3,
-    rays: int = 16000,
     base: InvariantPolynomial | None = None,
     checkpoint: Path | None = None,
     progress: Callable[[float], None] | None = None,
@@ -64,43 +60,34 @@ def fit_network(
 
     Args:
         data: half the rays come from `pairs.train`, half from those near the boundaries and beyond (`boundary`).
-        steps: most steps of the optimiser (Levenberg-Marquardt); convergence or the time limit may end it earlier.
-        seconds: limit of the training. The same seed gives the same weights bit for bit where it does not bite.
-        starts: random starts.
-        rays: most rays used.
         base: a polynomial whose residual is fitted instead.
         checkpoint: file that takes the state every few seconds. Where it holds that of the very same fit, training
             goes on from there, to the very same weights; a file that is damaged or of another fit is replaced.
         progress: called with the share done, 0 to 1.
 
     Raises:
-        InputError: units, layers, steps, starts or seconds that are not positive, or no rays.
+        InputError: no rays.
         OSError: the checkpoint cannot be written.
     """
-    numbers = {"units": units, "layers": layers, "steps": steps, "starts": starts, "seconds": seconds, "rays": rays}
-    for name, value in numbers.items():
-        if not value > 0:
-            raise InputError("mlp", name, value, "a positive number")
     if not len(data.pairs.train):
         raise InputError("mlp", "pairs.train", "(no rays)", "at least one passing ray")
     with pinned_threads():
-        problem, shift, scale = _problem(data, rays, base)
-        key = fingerprint(problem.tensors, {**numbers, "seed": seed})
+        problem, shift, scale = _problem(data, base)
+        decisive = {name: getattr(settings, name) for name in ("units", "layers", "steps", "seconds", "seed")}
+        key = fingerprint(problem.tensors, {**decisive, "starts": STARTS, "rays": RAYS})
         enough = (_ENOUGH * 1000 * data.pairs.domain.film_radius_mm) ** 2
-        kept = Checkpoint(checkpoint, key)
-        training = Training(problem, (units, layers), seed, steps, starts, seconds, enough, kept, progress)
-        best = training.run()
+        best = Training(problem, settings, enough, Checkpoint(checkpoint, key), progress).run()
     if progress:
         progress(1.0)
     *hidden, output = ((w[:, :-1].numpy().copy(), w[:, -1].numpy().copy()) for w in (*best.hidden, best.output))
     return Network(tuple(hidden), output, shift.numpy(), scale.numpy())
 
 
-def _problem(data: Prepared, rays: int, base: InvariantPolynomial | None) -> tuple[Problem, Tensor, Tensor]:
+def _problem(data: Prepared, base: InvariantPolynomial | None) -> tuple[Problem, Tensor, Tensor]:
     """The weighted fit, and shift and scale [4] of the invariants."""
     pairs, boundary = data.pairs, data.boundary
-    train = pairs.train.select(slice(0, max(rays - len(boundary), rays - rays // 2)))
-    boundary = boundary.select(slice(0, rays - len(train)))
+    train = pairs.train.select(slice(0, max(RAYS - len(boundary), RAYS - RAYS // 2)))
+    boundary = boundary.select(slice(0, RAYS - len(train)))
     parts = [_part(data, s, base) for s in (train, boundary) if len(s)]
     inputs, *rest = (torch.cat(c, -1) for c in zip(*parts, strict=True))
     low, high = inputs.amin(1), inputs.amax(1)
@@ -165,21 +152,14 @@ class Training:
 
     Attributes:
         problem: all rays.
-        shape: units and layers.
-        seed: of the first start's weights.
-        steps, seconds: the training ends by either.
-        starts: random starts.
+        settings: units, layers, seed, steps and seconds are read.
         enough: a loss so low that the rounding of float32 evaluation is larger.
         checkpoint: what earlier runs left.
         progress: called with the share done.
     """
 
     problem: Problem
-    shape: tuple[int, int]
-    seed: int
-    steps: int
-    starts: int
-    seconds: float
+    settings: ModelSettings
     enough: float
     checkpoint: Checkpoint
     progress: Callable[[float], None] | None = None
@@ -191,19 +171,23 @@ class Training:
         """Train, from the start or from where the checkpoint was written; the last layer fits all rays."""
         halvings = max(0, (len(self.problem) // FEWEST_RAYS).bit_length() - 1)
         self._levels = [2**k for k in range(halvings, -1, -1)]
-        self._stand = Stand(random_layers(self.problem.inputs, *self.shape, self.seed))
+        self._stand = self._start(0)
         self._resume()
         self._take_rays()
-        if self.starts == 1:
+        if STARTS == 1:
             self._place.start = 1
         while not self._place.ended:
-            if self._place.start < self.starts:
+            if self._place.start < STARTS:
                 self._try_start()
             else:
                 self._go_on()
             self._save()
         self._save(now=True)
         return project(self.problem, self._stand.hidden)
+
+    def _start(self, number: int) -> Stand:
+        s = self.settings
+        return Stand(random_layers(self.problem.inputs, s.units, s.layers, s.seed + 7919 * number))
 
     def _take_rays(self) -> None:
         self._rays = self.problem.every(self._levels[self._place.level])
@@ -213,7 +197,7 @@ class Training:
     def _burst(self, steps: int, until: float) -> Projection:
         """At most `_BURST` steps, none after this share of the time."""
         place = self._place
-        deadline = time.monotonic() + until * self.seconds - self.checkpoint.elapsed_s
+        deadline = time.monotonic() + until * self.settings.seconds - self.checkpoint.elapsed_s
         count = min(_BURST, steps - place.taken)
         best, self._stand = minimise(
             self._rays, self._stand, count, deadline, lambda share: self._report(place.taken + share * count)
@@ -223,23 +207,20 @@ class Training:
 
     def _try_start(self) -> None:
         """A burst of one of the starts; the end of its trial compares it with the best so far."""
-        place, short = self._place, max(1, round(_TRIAL_STEPS * self.steps))
-        until = 0.4 * (place.start + 1) / self.starts
+        place, short = self._place, max(1, round(_TRIAL_STEPS * self.settings.steps))
+        until = 0.4 * (place.start + 1) / STARTS
         best = self._burst(short, until)
-        if place.taken < short and self.checkpoint.elapsed_s < until * self.seconds and not self._stand.stuck:
+        if place.taken < short and self.checkpoint.elapsed_s < until * self.settings.seconds and not self._stand.stuck:
             return
         if best.loss < place.least or not self._champion:
             place.least, place.champion, self._champion = best.loss, place.start, self._stand.hidden
         place.start, place.taken = place.start + 1, 0
-        if place.start < self.starts:
-            self._stand = Stand(random_layers(self.problem.inputs, *self.shape, self.seed + 7919 * place.start))
-        else:
-            self._stand = Stand(self._champion)
+        self._stand = self._start(place.start) if place.start < STARTS else Stand(self._champion)
 
     def _go_on(self) -> None:
         """A burst of the best start; then more rays, or the end."""
-        place = self._place
-        best = self._burst(self.steps, 1.0)
+        place, s = self._place, self.settings
+        best = self._burst(s.steps, 1.0)
         little = best.loss > (1 - _LITTLE) * place.previous
         place.idle = place.idle + 1 if little else 0
         place.previous = best.loss
@@ -250,15 +231,16 @@ class Training:
                 place.level, place.previous, place.idle, done = place.level + 1, math.inf, 0, False
                 self._stand = Stand(best.hidden, min(self._stand.damping, Stand.damping))
                 self._take_rays()
-        over = place.taken >= self.steps or self.checkpoint.elapsed_s >= self.seconds or self._stand.stuck
+        over = place.taken >= s.steps or self.checkpoint.elapsed_s >= s.seconds or self._stand.stuck
         place.ended = over or done
 
     def _report(self, taken: float) -> None:
         """Tell the share done; it never goes back."""
         if self.progress:
-            short = max(1, round(_TRIAL_STEPS * self.steps)) if self.starts > 1 else 0
-            done = min(self._place.start, self.starts) * short + taken
-            share = max(done / (self.starts * short + self.steps), self.checkpoint.elapsed_s / self.seconds)
+            s = self.settings
+            short = max(1, round(_TRIAL_STEPS * s.steps)) if STARTS > 1 else 0
+            done = min(self._place.start, STARTS) * short + taken
+            share = max(done / (STARTS * short + s.steps), self.checkpoint.elapsed_s / s.seconds)
             self._highest = min(1.0, max(self._highest, share))
             self.progress(self._highest)
 
@@ -272,9 +254,8 @@ class Training:
             return
         state, arrays = known
         self._place = _Place(**state)
-        layers = self.shape[1]
-        self._stand = Stand(arrays[:layers], self._place.damping, self._place.growth)
-        self._champion = arrays[layers:]
+        self._stand = Stand(arrays[: self.settings.layers], self._place.damping, self._place.growth)
+        self._champion = arrays[self.settings.layers :]
 
 
 def random_layers(inputs: Tensor, units: int, layers: int, seed: int) -> list[Tensor]:

@@ -15,7 +15,7 @@ from itertools import product
 
 import torch
 
-from neurolens.surrogates.bases import invariant_exponents, monomials, vector_gram
+from neurolens.surrogates.bases import invariant_exponents, monomials
 from neurolens.surrogates.fits.selection import Sweep, backward, forward
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.pairs import PairSet, RayPairs
@@ -99,15 +99,14 @@ def _trial(
 ) -> Callable[[Shift], float]:
     targets = targets_of(pairs.lens, encoding, rays)
     outputs = weighed_apart(pairs.lens, pairs.domain, targets.vectors, position_weight)
-    squares = (outputs.flatten(1) ** 2).sum(1).numpy()
-    exponents = invariant_exponents(_DEGREE, dispersive=encoding.w_half != 0)
+    exponents = invariant_exponents(_DEGREE, dispersive=encoding.dispersive)
 
     def residual(shift: Shift) -> float:
         moved = shifted(encoding, rays, shift)
         field = moved(rays.inputs)
         if not bool(torch.isfinite(field.p).all() & torch.isfinite(field.u).all()):
             return math.inf
-        sweep = Sweep(*vector_gram(monomials(field.invariants(), exponents), field, outputs), squares)
+        sweep = Sweep.of_vectors(monomials(field.invariants(), exponents), field, outputs)
         forward(sweep, math.ceil(_SURPLUS * terms))
         backward(sweep, terms)
         return sweep.residual

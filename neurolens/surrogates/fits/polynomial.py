@@ -23,18 +23,20 @@ from neurolens.optics.prescription import Lens
 from neurolens.surrogates.bases import (
     Exponents,
     invariant_exponents,
+    kept,
     monomials,
     raw_exponents,
     raw_variables,
     solve,
+    united,
     vector_columns,
-    vector_gram,
 )
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Basis, InvariantPolynomial, RawPolynomial
 from neurolens.surrogates.fits.boundaries import (
     boundary_terms,
     fit_scalars,
     fit_stop,
+    invariant_core,
     solve_scalars,
     stop_crossing,
     transmittance_terms,
@@ -72,7 +74,7 @@ def _fit_invariant(data: Prepared, settings: ModelSettings) -> InvariantPolynomi
     train = data.train
     invariants = train.field.invariants()
     outputs = weighed_apart(data.pairs.lens, data.pairs.domain, train.vectors, settings.position_weight)
-    dispersive = data.encoding.w_half != 0
+    dispersive = data.encoding.dispersive
     if settings.method == "adaptive":
         exponents, chosen = grow(invariants, train.field, outputs, settings.terms, dispersive=dispersive)
     else:
@@ -86,24 +88,18 @@ def _fit_invariant(data: Prepared, settings: ModelSettings) -> InvariantPolynomi
             exponents = _grown(exponents, chosen, dispersive=dispersive)
         chosen = _choose(_sweep(exponents, field, wanted), settings)
     chosen = chosen or [0]  # rays on the axis alone choose nothing
-    count = len(exponents)
-    kept = sorted({k % count for k in chosen})
-    place = {k: i for i, k in enumerate(kept)}
-    exponents = exponents[kept]
-    features = monomials(invariants, exponents)
+    exponents, columns = kept(exponents, chosen)
+    own, features = len(exponents), monomials(invariants, exponents)
     # The chosen columns only; position and direction share them.
-    columns = [place[k % count] + (k >= count) * len(kept) for k in chosen]
     coefficients = solve(vector_columns(features, train.field)[columns], train.vectors[:2].flatten(1))
     exponents = np.concatenate([exponents, boundary_terms(data, exponents)])
     exponents = np.concatenate([exponents, transmittance_terms(data, exponents, settings.transmittance_terms)])
-    ab = torch.zeros((3, 2 * len(exponents)), dtype=torch.float64)
-    ab[:2, [c if c < len(kept) else c - len(kept) + len(exponents) for c in columns]] = coefficients
-    ab[STOP] = fit_stop(data, exponents)
-    return InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), fit_scalars(data, exponents).numpy())
+    columns = [c if c < own else c - own + len(exponents) for c in columns]
+    return invariant_core(data, exponents, columns, coefficients)
 
 
 def _sweep(exponents: Exponents, field: LightField, outputs: Tensor) -> Sweep:
-    return Sweep(*vector_gram(monomials(field.invariants(), exponents), field, outputs), _squares(outputs))
+    return Sweep.of_vectors(monomials(field.invariants(), exponents), field, outputs)
 
 
 def _grown(exponents: Exponents, chosen: list[int], *, dispersive: bool) -> Exponents:
@@ -126,19 +122,14 @@ def _choose(sweep: Sweep, settings: ModelSettings) -> list[int]:
     return sorted(sweep.chosen)
 
 
-def _squares(outputs: Tensor) -> np.ndarray:
-    return (outputs.flatten(1) ** 2).sum(1).numpy()
-
-
 def _fit_raw(data: Prepared, settings: ModelSettings) -> RawPolynomial:
     """Every component with a support of its own, as published, half of `terms` each; one more for the scalars."""
     train = data.train
     # Supports are chosen on the rays near the rims, where every output has a value; coefficients on all boundary rays.
     rim = data.pairs.rim
     variables, rim_variables = raw_variables(train.field), raw_variables(data.encoding(rim.inputs))
-    dispersive = data.encoding.w_half != 0
+    dispersive = data.encoding.dispersive
     half = replace(settings, terms=max(settings.terms // 2, 1))
-    supports: dict[str, Exponents] = {}
     stop = data.pairs.lens.stop_index
     crossing = torch.stack([rim.cross_x[stop], rim.cross_y[stop]]) / data.pairs.lens.stop_radius_mm
     gates = gate_values(data.pairs.lens, data.gates, rim)
@@ -147,15 +138,11 @@ def _fit_raw(data: Prepared, settings: ModelSettings) -> RawPolynomial:
         wanted[f"stop {axis}"] = (rim_variables, crossing[axis][None])
         for vector in (POSITION, DIRECTION):
             wanted[f"{vector} {axis}"] = (variables, train.vectors[vector, axis][None])
-    for name, (inputs, outputs) in wanted.items():
-        supports[name] = _raw_support(inputs, outputs, half, dispersive)
-    place: dict[tuple[int, ...], int] = {}
-    columns = {n: [place.setdefault(tuple(map(int, e)), len(place)) for e in s] for n, s in supports.items()}
-    exponents = np.array(list(place), dtype=np.int64)
+    exponents, places = united([_raw_support(*of, half, dispersive) for of in wanted.values()])
+    columns = dict(zip(wanted, places, strict=True))
     features, boundary = monomials(variables, exponents), monomials(raw_variables(data.boundary_field), exponents)
-    far = monomials(raw_variables(data.encoding(data.pairs.far.inputs)), exponents)
     crossing, weight = stop_crossing(data)
-    components = torch.zeros((3, 2, len(place)), dtype=torch.float64)
+    components = torch.zeros((3, 2, len(exponents)), dtype=torch.float64)
     for axis in (0, 1):
         for vector in (POSITION, DIRECTION):
             at = columns[f"{vector} {axis}"]
@@ -163,8 +150,8 @@ def _fit_raw(data: Prepared, settings: ModelSettings) -> RawPolynomial:
         at = columns[f"stop {axis}"]
         components[STOP, axis, at] = solve(boundary[at], crossing[axis][None], weight)[0]
     at = columns["scalars"]
-    scalars = torch.zeros((1 + len(data.gates), len(place)), dtype=torch.float64)
-    scalars[:, at] = solve_scalars(data, features[at], train.transmittance, boundary[at], far[at])
+    scalars = torch.zeros((1 + len(data.gates), len(exponents)), dtype=torch.float64)
+    scalars[:, at] = solve_scalars(data, lambda field: monomials(raw_variables(field), exponents)[at])
     return RawPolynomial(exponents, components.numpy(), scalars.numpy())
 
 
@@ -177,10 +164,10 @@ def _raw_support(variables: Tensor, outputs: Tensor, settings: ModelSettings, di
         return exponents[chosen]
     exponents = raw_exponents(settings.degree, dispersive=dispersive)
     features = monomials(variables, exponents)
-    gram, moments = (features @ features.T).numpy(), (features @ outputs.T).numpy()
     if settings.method == "omp" and len(outputs) == 1:
+        gram, moments = (features @ features.T).numpy(), (features @ outputs.T).numpy()
         return exponents[matching_pursuit(gram, moments[:, 0], settings.terms)]
-    return exponents[_choose(Sweep(gram, moments, _squares(outputs)), settings)]
+    return exponents[_choose(Sweep.of_columns(features, outputs), settings)]
 
 
 def ideal_map(lens: Lens, encoding: Encoding, method: ParaxialMethod) -> Tensor:

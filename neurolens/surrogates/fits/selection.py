@@ -4,10 +4,6 @@ All work on the Gram matrix of the candidate columns, so that their cost does no
 sweep operator (Goodnight 1979, "A Tutorial on the SWEEP Operator") moves a column into or out of the fit in one
 rank-one update; afterwards the diagonal holds what every candidate has left after orthogonalisation, and the
 right-hand side its correlation with the residual.
-
-Growth (Zheng and Zheng 2017, "Adaptive sparse polynomial regression for camera lens simulation") knows no limit of
-degree: it starts from the lowest terms, and every term chosen brings its products with each variable into the
-candidates.
 """
 
 from __future__ import annotations
@@ -21,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurolens.surrogates.bases import Exponents, monomials, vector_columns
+from neurolens.surrogates.bases import Exponents, monomials, vector_columns, vector_gram
 from neurolens.surrogates.lightfield import LightField
 
 Floats = NDArray[np.float64]
@@ -54,6 +50,17 @@ class Sweep:
         self._start = table
         self.chosen: list[int] = []
         self._table = table.copy()
+
+    @staticmethod
+    def of_columns(columns: Tensor, outputs: Tensor) -> Sweep:
+        """Of columns [M, N] and outputs [R, N]."""
+        return Sweep((columns @ columns.T).numpy(), (columns @ outputs.T).numpy(), (outputs**2).sum(1).numpy())
+
+    @staticmethod
+    def of_vectors(features: Tensor, field: LightField, outputs: Tensor) -> Sweep:
+        """Of `vector_columns` of features [M, N], and vector outputs [R, 2, N]."""
+        gram, moments = vector_gram(features, field, outputs)
+        return Sweep(gram, moments, (outputs.flatten(1) ** 2).sum(1).numpy())
 
     @property
     def residual(self) -> float:
@@ -264,7 +271,9 @@ class _Candidates:
 def grow(
     variables: Tensor, field: LightField | None, outputs: Tensor, terms: int, *, dispersive: bool
 ) -> tuple[Exponents, list[int]]:
-    """Choose `terms` terms by growth.
+    """Choose `terms` terms by growth, which knows no limit of degree: each brings its products into the candidates.
+
+    Zheng and Zheng 2017, "Adaptive sparse polynomial regression for camera lens simulation".
 
     Args:
         variables: [V, N]: the invariants with `field`, or the raw coordinates without.

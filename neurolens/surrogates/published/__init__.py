@@ -79,18 +79,12 @@ PUBLISHED: dict[str, PublishedMethod] = {
 }
 
 
-class PublishedFit(NamedTuple):
-    """A core with the coordinates that it is written in and the tests of who passes that its scalars stand for."""
-
-    core: Core
-    encoding: Encoding
-    gates: tuple[Gate, ...]
-
-
 def fit_published(
     prepared: Prepared, settings: ModelSettings, progress: Callable[[float], None] | None = None
-) -> PublishedFit:
+) -> tuple[Core, Encoding, tuple[Gate, ...]]:
     """Fit one published method.
+
+    Returns a core, the coordinates that it is written in, and the tests of who passes that its scalars stand for.
 
     Raises:
         InputError: an unknown method, or a lens or settings that it cannot take.
@@ -112,4 +106,4 @@ def fit_published(
         core, gates = outer_pupil(data, fit_sparse(data, s.terms, s.degree))
     else:
         core, gates = outer_pupil(data, fit_adaptive(data, s.terms, s.partitions, progress))
-    return PublishedFit(core, data.encoding, gates)
+    return core, data.encoding, gates

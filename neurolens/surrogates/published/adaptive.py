@@ -22,7 +22,7 @@ from torch import Tensor
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph
 from neurolens.surrogates.bases import Exponents
-from neurolens.surrogates.cores import ROUND, Core, CoreValues, Field, RawPolynomial, Units
+from neurolens.surrogates.cores import ROUND, Composite, CoreValues, Field, RawPolynomial, Units
 from neurolens.surrogates.fits.selection import grow
 from neurolens.surrogates.pairs import PairSet
 from neurolens.surrogates.published.data import Outputs, RawData, outer_pupil, solve_outputs
@@ -36,32 +36,22 @@ _COORDINATES = (0, 2, 1)  # rho, tau, sigma: of equal errors the first is cut
 
 
 @dataclass(frozen=True, eq=False)
-class Cells(Core):
+class Cells(Composite):
     """A partition of the light field into two halves, each with a polynomial of its own or divided again.
 
     Attributes:
         variable: 0, 1 or 2: which invariant decides (rho, sigma, tau of the light field).
-        threshold: rays above it are those of `high`.
-        low, high: the halves.
+        threshold: rays above it are those of the second half.
+        parts: the halves.
     """
 
     variable: int
     threshold: float
-    low: RawPolynomial | Cells
-    high: RawPolynomial | Cells
+    parts: tuple[RawPolynomial | Cells, RawPolynomial | Cells]
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
-        low, high = (half.build(g, field, units) for half in (self.low, self.high))
+        low, high = (half.build(g, field, units) for half in self.parts)
         return low.chosen(field.products(ROUND[self.variable : self.variable + 1], w=False) <= self.threshold, high)
-
-    @property
-    def coefficients_per_vector(self) -> int:
-        """Of all cells together."""
-        return self.low.coefficients_per_vector + self.high.coefficients_per_vector
-
-    @property
-    def coefficients(self) -> int:
-        return self.low.coefficients + self.high.coefficients
 
 
 @dataclass
@@ -81,7 +71,7 @@ class _Node:
         if self.cut is None:
             return self.polynomial
         variable, threshold, low, high = self.cut
-        return Cells(variable, threshold, low.core(), high.core())
+        return Cells(variable, threshold, (low.core(), high.core()))
 
 
 def fit_adaptive(
@@ -105,14 +95,7 @@ def fit_adaptive(
             progress(done / cells)
         worst = max(root.leaves(), key=lambda leaf: leaf.error)
         variable, threshold = _where_to_cut(data, worst, invariants)
-        halves = []
-        for above in (False, True):
-            inside = worst.inside & ((invariants[variable] > threshold) == above)
-            zone = _zone(worst.data, variable, threshold, above)
-            polynomial = fit_grown(zone, terms)
-            error = _squared_error(data, polynomial, data.pairs.train.select(inside))
-            halves.append(_Node(zone, inside, polynomial, error))
-        worst.cut = (variable, threshold, halves[0], halves[1])
+        worst.cut = (variable, threshold, *_halves(data, worst, invariants, variable, threshold, terms))
     return root.core()
 
 
@@ -132,16 +115,28 @@ def _squared_error(data: RawData, polynomial: RawPolynomial, rays: PairSet) -> f
     return squared_error(data.pairs, data.encoding, outer_pupil(data, polynomial)[0], rays)
 
 
+def _halves(
+    data: RawData, cell: _Node, invariants: Tensor, variable: int, threshold: float, terms: int | None = None
+) -> tuple[_Node, _Node]:
+    """Both sides of a cut, with grown terms, or with dense cubics."""
+
+    def half(above: bool) -> _Node:
+        inside = cell.inside & ((invariants[variable] > threshold) == above)
+        zone = _zone(cell.data, variable, threshold, above)
+        polynomial = fit_dense(zone, 3) if terms is None else fit_grown(zone, terms)
+        return _Node(zone, inside, polynomial, _squared_error(data, polynomial, data.pairs.train.select(inside)))
+
+    return half(False), half(True)
+
+
 def _where_to_cut(data: RawData, cell: _Node, invariants: Tensor) -> tuple[int, float]:
     """The coordinate whose halves dense cubics fit best, and the median there."""
     best, found = float("inf"), (0, 0.0)
     for variable in _COORDINATES:
         threshold = float(invariants[variable][cell.inside].median())
         error = 0.0
-        for above in (False, True):
-            inside = cell.inside & ((invariants[variable] > threshold) == above)
-            zone = _zone(cell.data, variable, threshold, above)
-            error += _squared_error(data, fit_dense(zone, 3), data.pairs.train.select(inside))
+        for half in _halves(data, cell, invariants, variable, threshold):
+            error += half.error
         if error < best:
             best, found = error, (variable, threshold)
     return found

@@ -13,8 +13,8 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
-from neurolens.surrogates.bases import Exponents, monomials, raw_exponents, raw_variables
-from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Core, CoreValues, Field, RawPolynomial, Units
+from neurolens.surrogates.bases import Exponents, monomials, raw_exponents, raw_variables, united
+from neurolens.surrogates.cores import DIRECTION, POSITION, Core, CoreValues, Field, RawPolynomial, Units
 from neurolens.surrogates.gates import gate_reach
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import Gate
@@ -157,7 +157,7 @@ class RawData:
 
     @property
     def dispersive(self) -> bool:
-        return self.encoding.w_half != 0
+        return self.encoding.dispersive
 
     @property
     def curvature(self) -> float:
@@ -199,15 +199,16 @@ def parity_exponents(degree: int, odd: tuple[int, int], *, dispersive: bool) -> 
 
 def solve_outputs(outputs: tuple[Outputs, ...], supports: list[Exponents]) -> RawPolynomial:
     """Least squares of every output on a support of its own, as one polynomial on the union of the supports."""
-    place: dict[tuple[int, ...], int] = {}
-    columns = [[place.setdefault(tuple(int(e) for e in row), len(place)) for row in s] for s in supports]
-    exponents = np.array(list(place), dtype=np.int64)
-    rows = torch.zeros((len(outputs), len(place)), dtype=torch.float64)
+    exponents, columns = united(supports)
+    rows = torch.zeros((len(outputs), len(exponents)), dtype=torch.float64)
     for row, output, support, at in zip(rows, outputs, supports, columns, strict=True):
         row[at] = stable_solve(monomials(output.variables, support), output.values, output.weights)[0]
-    components = torch.zeros((3, 2, len(place)), dtype=torch.float64)
-    components[POSITION], components[DIRECTION], components[STOP] = rows[0:2], rows[2:4], rows[4:6]
-    return RawPolynomial(exponents, components.numpy(), rows[6:].numpy())
+    return raw_polynomial(exponents, rows)
+
+
+def raw_polynomial(exponents: Exponents, rows: Tensor) -> RawPolynomial:
+    """The polynomial of coefficients [7, M] in the order of `OUTPUTS`."""
+    return RawPolynomial(exponents, rows[:6].reshape(3, 2, -1).numpy(), rows[6:].numpy())
 
 
 def stable_solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None, cut: float = 1e-7) -> Tensor:

@@ -138,9 +138,7 @@ def _training_rays(data: RawData) -> _Rays:
     """The training rays, and blocked rays drawn over the domain."""
     pairs, scale = data.pairs, scales_of(data.pairs.lens)
     drawn = trace_pairs(
-        pairs.lens,
-        sample_domain(pairs.domain, _BLOCKED_RAYS, pairs.settings.seed + 2_000_003),
-        pairs.domain.pupil_z_mm,
+        pairs.lens, sample_domain(pairs.domain, _BLOCKED_RAYS, pairs.settings.seed + 2_000_003), pairs.domain.pupil_z_mm
     )
     blocked = drawn.select(drawn.status != st.PASSED)
     share = len(blocked) / len(drawn)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,7 +29,7 @@ from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
 from neurolens.surrogates.bases import Exponents, monomials
 from neurolens.surrogates.cores import Core, CoreValues, Field, Units
-from neurolens.surrogates.domain import Domain, FilmRays
+from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import trace_pairs
@@ -73,7 +74,7 @@ class Meridian(Core):
         y = (p[0] / safe, g.select(on_axis, 1.0, p[1] / safe))  # on the axis: the y axis itself
         slope = u * self.slope
         along = 1.0 / (g.square(slope) + 1.0).sqrt()
-        x = g.concat(radius, g.concat(*_turned(slope, y)) * along)
+        x = g.concat(radius, g.concat(*turn(slope, y)) * along)
         exponents, weight = self.exponents, self.outputs * np.array([unit, unit, 1, 1, 1, 1])[:, None]
         if field.dispersive:
             x = g.concat(x, field.raw()[4])
@@ -83,7 +84,7 @@ class Meridian(Core):
         position, direction, transmittance = g.split(g.polynomial(exponents, weight, x), [2, 3, 1])
         direction = direction * (1.0 / g.square(direction).sqrt())
         position = _turned_back(position, y)
-        crossing = _turned(p * self.film + u * self.pupil, y)
+        crossing = turn(p * self.film + u * self.pupil, y)
         vectors = (position, position, position * 0.0)
         gate = (self._ellipse(radius, crossing) - 1.0) * units.gates
         return CoreValues(vectors, transmittance, gate, g.concat(_turned_back(direction[0:2], y), -direction[2]))
@@ -108,14 +109,8 @@ class Meridian(Core):
         return int((self.outputs != 0).sum()) + self.ellipse.size
 
 
-def _turned(v: Value, y: tuple[Value, Value]) -> tuple[Value, Value]:
-    """As `turn`."""
-    a, b = v.graph.split(v, [1, 1])
-    return a * y[1] - b * y[0], a * y[0] + b * y[1]
-
-
 def _turned_back(v: Value, y: tuple[Value, Value]) -> Value:
-    """The inverse of `_turned`."""
+    """The inverse of `turn`."""
     a, b = v.graph.split(v, [1, 1])
     return v.graph.concat(a * y[1] + b * y[0], b * y[1] - a * y[0])
 
@@ -128,15 +123,15 @@ def _meridian(p: Tensor) -> Tensor:
     return torch.stack([torch.where(off, p[0] / safe, 0.0), torch.where(off, p[1] / safe, 1.0)])
 
 
-def turn(v: Tensor, y: Tensor) -> Tensor:
-    """Components of v [2, N] across and along the meridian y [2, N]: y is turned into the y axis."""
-    return torch.stack([v[0] * y[1] - v[1] * y[0], v[0] * y[0] + v[1] * y[1]])
+def turn(v: Any, y: Any) -> tuple[Any, Any]:
+    """Components of v across and along the meridian y, two rows each: y is turned into the y axis."""
+    return v[0] * y[1] - v[1] * y[0], v[0] * y[0] + v[1] * y[1]
 
 
 def meridian_variables(field: LightField, slope: float) -> tuple[Tensor, Tensor]:
     """[4, N] y, dx, dy, w of turned rays, and the meridians [2, N]."""
     y = _meridian(field.p)
-    rise = turn(slope * field.u, y)
+    rise = torch.stack(turn(slope * field.u, y))
     unit = rise * torch.rsqrt(1 + rise[0] * rise[0] + rise[1] * rise[1])
     return torch.stack([torch.hypot(field.p[0], field.p[1]), *unit, field.w]), y
 
@@ -168,28 +163,29 @@ def fit_rtf(data: RawData, degree: int) -> tuple[Meridian, tuple[Gate, ...]]:
     return core, (Gate(0 if lens.stop_index else len(lens.surfaces) - 1, st.RIM),)
 
 
-def fit_ellipses(data: RawData, positions: int = POSITIONS, count: int = _RAYS) -> tuple[Array, Array]:
+def fit_ellipses(data: RawData) -> tuple[Array, Array]:
     """Knots [K] (in units of p) and ellipses [K, 3] (radius across and along, centre along; mm on the pupil plane).
 
     Positions where no three rays pass take the ellipse of their neighbour towards the axis.
     """
-    domain, e = data.pairs.domain, data.encoding
-    knots = np.linspace(0, 1, positions)
+    e = data.encoding
+    knots = np.linspace(0, 1, POSITIONS)
     rows: list[tuple[float, float, float]] = []
     for knot in knots:
-        crossings = _passing(data, domain, float(knot) * e.film_scale_mm, count)
+        crossings = _passing(data, float(knot) * e.film_scale_mm)
         if len(crossings) >= 3:
             rows.append(least_ellipse(crossings))
         elif rows:
             rows.append(rows[-1])
-    while len(rows) < positions:
+    while len(rows) < POSITIONS:
         rows.insert(0, rows[0] if rows else (1e-9, 1e-9, 0.0))
     return knots, np.array(rows)
 
 
-def _passing(data: RawData, domain: Domain, y_mm: float, count: int) -> Array:
+def _passing(data: RawData, y_mm: float) -> Array:
     """[K, 2] where passing rays from height y in the input plane cross the pupil plane, across and along."""
-    points = torch.quasirandom.SobolEngine(3, scramble=True, seed=17).draw(count, dtype=torch.float64).T
+    domain = data.pairs.domain
+    points = torch.quasirandom.SobolEngine(3, scramble=True, seed=17).draw(_RAYS, dtype=torch.float64).T
     radius, angle = domain.pupil_radius_mm * torch.sqrt(points[0]), 2 * torch.pi * points[1]
     low, high = domain.wavelength_nm
     zero = torch.zeros_like(radius)

@@ -30,8 +30,10 @@ from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
-from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, RawPolynomial
+from neurolens.surrogates.bases import ordered
+from neurolens.surrogates.cores import RawPolynomial
 from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.published.data import raw_polynomial
 from neurolens.surrogates.targets import scales_of
 
 # Coefficients [M] of `Truncated.exponents`: a power series in several variables, cut beyond a total degree.
@@ -49,7 +51,7 @@ class Truncated:
 
     def __init__(self, variables: int, degree: int) -> None:
         rows = [e for e in itertools.product(range(degree + 1), repeat=variables) if sum(e) <= degree]
-        self.exponents: NDArray[np.int64] = np.array(sorted(rows, key=lambda e: (sum(e), e)), dtype=np.int64)
+        self.exponents: NDArray[np.int64] = ordered(rows)
         self.degree = degree
         total = self.exponents.sum(1)
         left, right = np.nonzero(total[:, None] + total[None, :] <= degree)
@@ -101,10 +103,7 @@ class Truncated:
         return self.of(taylor, a)
 
 
-@lru_cache(maxsize=8)
-def truncated(variables: int, degree: int) -> Truncated:
-    """The arithmetic of a degree; made once."""
-    return Truncated(variables, degree)
+truncated = lru_cache(maxsize=8)(Truncated)  # made once
 
 
 class RaySeries(NamedTuple):
@@ -225,9 +224,7 @@ def fit_taylor(lens: Lens, encoding: Encoding, degree: int) -> RawPolynomial:
     exponents = np.concatenate([np.pad(four, ((0, 0), (0, 1)), constant_values=i) for i in range(len(nodes))])
     used = (rows != 0).any(0)
     rows, exponents = rows[:, used], exponents[used.numpy()]
-    components = torch.zeros((3, 2, len(exponents)), dtype=torch.float64)
-    components[POSITION], components[DIRECTION], components[STOP] = rows[0:2], rows[2:4], rows[4:6]
-    return RawPolynomial(exponents, components.numpy(), rows[6:].numpy())
+    return raw_polynomial(exponents, rows)
 
 
 def _axial_transmittance(lens: Lens, encoding: Encoding, wavelength_nm: float) -> float:

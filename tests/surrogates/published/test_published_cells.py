@@ -32,7 +32,7 @@ def rms_um(model: LensModel) -> float:
 
 
 def leaves(core: RawPolynomial | Cells) -> list[RawPolynomial]:
-    return [*leaves(core.low), *leaves(core.high)] if isinstance(core, Cells) else [core]
+    return [leaf for half in core.parts for leaf in leaves(half)] if isinstance(core, Cells) else [core]
 
 
 def rays_of(count: int = 400) -> LightField:
@@ -53,7 +53,7 @@ def test_cells_give_each_ray_the_polynomial_of_its_cell() -> None:
         if isinstance(node, RawPolynomial):
             return node(one)[0]
         above = float(one.invariants()[node.variable]) > node.threshold
-        return by_hand(node.high if above else node.low, at)
+        return by_hand(node.parts[int(above)], at)
 
     vectors, _ = core(field)
     for k in range(0, 400, 13):

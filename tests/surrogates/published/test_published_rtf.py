@@ -14,7 +14,7 @@ from hypothesis import strategies as some
 
 from neurolens.base import status as st
 from neurolens.evaluate.rays import ray_errors
-from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
@@ -37,8 +37,8 @@ def test_turning_is_a_rotation_onto_the_y_axis() -> None:
     p, u, w = (torch.randn(shape, generator=generator, dtype=torch.float64) for shape in ((2, 50), (2, 50), (50,)))
     p[:, 0] = 0  # on the axis
     variables, y = meridian_variables(LightField(p, u, w), 0.3)
-    assert torch.allclose(turn(p, y), torch.stack([torch.zeros(50).double(), p.norm(dim=0)]), atol=1e-14)
-    assert torch.allclose(turn(u, y).norm(dim=0), u.norm(dim=0))
+    assert torch.allclose(torch.stack(turn(p, y)), torch.stack([torch.zeros(50).double(), p.norm(dim=0)]), atol=1e-14)
+    assert torch.allclose(torch.hypot(*turn(u, y)), u.norm(dim=0))
     slopes = variables[1:3] / torch.sqrt(1 - variables[1] ** 2 - variables[2] ** 2)
     assert torch.allclose(slopes.norm(dim=0), 0.3 * u.norm(dim=0))
 
@@ -74,16 +74,10 @@ def test_least_ellipse_of_few_points_is_finite() -> None:
         assert all(math.isfinite(v) for v in least_ellipse(np.array(points)))
 
 
-def test_fit_is_close_and_symmetric_by_construction() -> None:
+def test_fit_is_close() -> None:
     model, pairs = fitted(6), lens_models.prepared().pairs
     errors = ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict)
     assert errors.direction_rms_deg < 0.002
-    rays = pairs.held_out.inputs
-    turned = FilmRays(-rays.film_y, rays.film_x, rays.film_z, -rays.pupil_y, rays.pupil_x, rays.wavelength_nm)
-    a, b = model.predict(rays).rays, model.predict(turned).rays
-    assert torch.allclose(b.x, -a.y, atol=1e-10)
-    assert torch.allclose(b.dx, -a.dy, atol=1e-12)
-    assert torch.allclose(b.dz, a.dz, atol=1e-12)
 
 
 def test_pass_function_holds_every_passing_ray_and_blocks_most_others() -> None:
