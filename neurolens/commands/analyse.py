@@ -145,7 +145,7 @@ def _one(what: str, scene: Scene, args: argparse.Namespace) -> tuple[dict[str, A
     if what in _OF_FIELDS:
         check_light(scene, args.fields, (args.wavelengths or DEFAULT_NM)[0])
     result = analysis.compute(scene, **asked)
-    data = result if isinstance(result, dict) else result.to_dict()
+    data = result.to_dict()
     if args.output is None:
         return data, None
     across = f"_{args.axis}" if any(s.cylinder for s in scene.lens.surfaces) else ""

@@ -12,7 +12,6 @@ import torch
 
 from neurolens.analysis import layout
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.layout import refractions
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.optics.focusing import at_infinity
@@ -58,7 +57,7 @@ def describe_lens(lens: Lens, domain: Domain) -> dict[str, Any]:
         "source": lens.source,
         "rims": lens.rims,
         "sha256": lens.sha256,
-        "refractions": refractions(lens),
+        "refractions": lens.refractions,
         **{key: float(value) for key, value in asdict(data).items()},
         "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if lens.anamorphic else None,
         "working_f_number": working_f_number(lens, domain, film_z),
@@ -185,13 +184,11 @@ def warnings_of(lens: Lens, f_number: float, reached_deg: float | None, far: boo
     return found
 
 
-def layout_profile(lens: Lens, domain: Domain) -> dict[str, Any]:
+def layout_profile(lens: Lens, domain: Domain) -> layout.Layout:
     """Section of a lens with meridional fans of rays to the axis, 70% and the edge of the domain's film, d line.
 
     Args:
         lens: placed by `Lens.at`; where it is not, the film is that of the domain's farthest focus.
-
-    Returns: as `analysis.layout.layout_profile`.
     """
     if lens.film_z_mm is None:
         lens = replace(lens, film_z_mm=float(domain.film_z_mm[0]))
@@ -254,7 +251,7 @@ def _row(path: Path) -> dict[str, Any]:
         "f_number": float(data.f_number),
         "half_field_deg": lens.half_field_deg,
         "image_radius_mm": lens.image_radius_mm,
-        "refractions": refractions(lens),
+        "refractions": lens.refractions,
         "aspheres": sum(s.conic != 0 or bool(s.asphere) for s in lens.surfaces),
         "cylinders": cylinders,
         "states": len(lens.configurations),
@@ -265,7 +262,7 @@ def _row(path: Path) -> dict[str, Any]:
     }
 
 
-def sections(files: list[Path]) -> list[dict[str, Any]]:
+def sections(files: list[Path]) -> list[layout.Layout]:
     """The sections of lenses with rays, focused at infinity, as `figures.sheet` draws them.
 
     An anamorphic lens is shown in its y-z plane.
@@ -278,7 +275,7 @@ def sections(files: list[Path]) -> list[dict[str, Any]]:
         if edge is None:
             edge = _NO_FIELD * abs(data.efl_mm) if lens.half_field_deg is None else image_radius_mm(lens)[0]
         profile = layout.layout_profile(Scene(lens, math.inf, "y"), edge)
-        found.append({**profile, "title": path.stem, "subtitle": _caption(lens, data.efl_mm, data.f_number)})
+        found.append(replace(profile, title=path.stem, subtitle=_caption(lens, data.efl_mm, data.f_number)))
     return found
 
 

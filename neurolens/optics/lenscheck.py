@@ -203,10 +203,8 @@ def _through(lens: Lens, field: Tensor, heights: Tensor) -> tuple[Tensor, Tensor
 def _blur(lens: Lens, data: FirstOrder) -> Check:
     """RMS radius of the axial spot in its best focus, all rims open as tabled, over the focal length."""
     blur = axial_blur_mm(lens) / data.efl_mm
-    before = [1.0, *(float(s.n_d) for s in lens.surfaces)]
-    refractions = sum(a != b for a, b in zip(before, before[1:], strict=False))
     doubt = ""
-    if blur > BLUR_LIMIT and refractions > SIMPLE:
+    if blur > BLUR_LIMIT and lens.refractions > SIMPLE:
         doubt = f"the image on the axis is blurred to {100 * blur:.2g}% of the focal length"
     return Check("axial blur, RMS over focal length", blur, None, doubt)
 

@@ -168,6 +168,12 @@ class Lens:
         return any(s.V_d is not None or s.glass is not None for s in self.surfaces)
 
     @property
+    def refractions(self) -> int:
+        """Surfaces at which the medium changes: the stop and other surfaces in air do not count."""
+        before = [1.0, *(float(s.n_d) for s in self.surfaces)]
+        return sum(a != b for a, b in zip(before, before[1:], strict=False))
+
+    @property
     def lens_id(self) -> str:
         """Stem of the lens file: the name that models carry."""
         return Path(self.path).stem

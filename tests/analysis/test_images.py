@@ -143,12 +143,12 @@ def test_fans_are_odd_on_the_axis_and_meet_the_chief_ray() -> None:
 def test_layout_rays_end_on_the_film_and_start_at_their_field() -> None:
     given = library("shimizu_fisheye_220")
     data = layout_profile(given)
-    fields = {r["label"]: np.array(r["points"]) for r in data["rays"]}
+    fields = {r.label: r.points for r in data.rays}
     assert len(fields) == 3 and all(p[-1, 0] == pytest.approx(given.film_z_mm) for p in fields.values())
     edge = fields[next(k for k in fields if k.startswith("edge"))]
     angle = math.degrees(math.atan2(edge[0, 1] - edge[1, 1], edge[1, 0] - edge[0, 0]))
-    assert angle == pytest.approx(given.fields_at([data["film_half_height_mm"]])[0], abs=1e-6) and angle > 100
-    assert len(data["rays"]) == 21
+    assert angle == pytest.approx(given.fields_at([data.film_half_height_mm])[0], abs=1e-6) and angle > 100
+    assert len(data.rays) == 21
 
 
 def test_a_stopped_down_lens_has_smaller_spots() -> None:
