@@ -19,8 +19,8 @@ from neurolens.analysis.plots import plot_psf, plot_spots
 from neurolens.analysis.spots import mtf, spots, working_f_number
 from neurolens.analysis.wavefront import psf
 from neurolens.cli import main
+from neurolens.optics import accessories
 from neurolens.optics.lenswriter import write_lens
-from neurolens.optics.prescription import Lens
 
 GAUSS = LENSES / "laikin_double_gauss_50.toml"
 D = 587.5618
@@ -45,7 +45,7 @@ def error_of(capsys: pytest.CaptureFixture[str], *args: object) -> str:
 @pytest.fixture
 def pinhole(tmp_path: Path) -> Path:
     path = tmp_path / "pinhole.toml"
-    write_lens(replace(Lens.pinhole(50.0, 0.2, image_radius_mm=40.0), name="Pinhole", source="test"), path)
+    write_lens(replace(accessories.pinhole(50.0, 0.2, image_radius_mm=40.0), name="Pinhole", source="test"), path)
     return path
 
 

@@ -17,12 +17,12 @@ from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import layout_profile
 from neurolens.analysis.spots import diffraction_mtf, fans, mtf, spots, working_f_number
 from neurolens.analysis.wavefront import diffraction_image, psf, wavefront
-from neurolens.optics.prescription import Lens
+from neurolens.optics import accessories
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
 
 D = 587.5618
-PINHOLE = Scene(replace(Lens.pinhole(50.0, 0.2, image_radius_mm=40.0), film_z_mm=50.0))
+PINHOLE = Scene(replace(accessories.pinhole(50.0, 0.2, image_radius_mm=40.0), film_z_mm=50.0))
 
 
 def moved(given: Scene, shift_mm: float) -> Scene:
