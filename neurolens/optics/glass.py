@@ -14,11 +14,6 @@ from neurolens.optics import catalogue
 from neurolens.optics.catalogue import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
 from neurolens.optics.prescription import Surface
 
-__all__ = [
-    *("LINE_C_NM", "LINE_D_NM", "LINE_F_NM", "absorption_of", "cauchy_coefficients", "check_against_table"),
-    *("glass_of", "index_at", "index_of", "inverse_square_um", "table_notes"),
-]
-
 # How far a stated n_d or V_d may be from the catalogue's: rounding to three decimals and one, and other melts.
 TOLERANCE_N_D = 5e-4
 TOLERANCE_V_D = 0.5

@@ -98,7 +98,7 @@ def in_state(lens: Lens, c: Configuration) -> Lens:
         lens.with_gaps(dict(c.thickness_mm)),
         stated_efl_mm=c.efl_mm,
         stated_efl_x_mm=None,  # a state names one focal length
-        half_field_deg=c.half_field_deg or (None if lens.image_radius_mm else lens.half_field_deg),
+        half_field_deg=lens.half_field_in(c),
         # Where a state has no f-number its stop is that of the table, and any f-number is as good as another.
         f_number=c.f_number or (lens.f_number if same else math.nan),
     )

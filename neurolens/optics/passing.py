@@ -53,13 +53,7 @@ def media(lens: Lens, wavelength_nm: Tensor | float) -> list[Medium]:
 
 def absorption_per_mm(lens: Lens, wavelength_nm: Tensor | float) -> list[Any]:
     """Napierian absorption of the media from the scene to the film, in 1/mm; None where there is none."""
-    return [None, *(_absorption(s, wavelength_nm) for s in lens.surfaces)]
-
-
-def _absorption(s: Surface, wavelength_nm: Tensor | float) -> Any:
-    if s.glass is None and not s.absorption_per_mm:
-        return None
-    return glass.absorption_of(s, wavelength_nm)
+    return [None, *(glass.absorption_of(s, wavelength_nm) for s in lens.surfaces)]
 
 
 def _medium_key(s: Surface | None) -> Any:

@@ -45,11 +45,8 @@ def at(
 ) -> Lens:
     """The lens in another state; arguments and errors are those of `Lens.at`."""
     _check(lens, focus_m, f_number, focal_length_mm, field_deg, focus)
-    if (
-        f_number is not None
-        and lens.film_z_mm is not None
-        and (focus_m, focal_length_mm, field_deg, zoom) == (None,) * 4
-    ):
+    others = (focus_m, focal_length_mm, field_deg, zoom)
+    if f_number is not None and lens.film_z_mm is not None and others == (None,) * 4:
         # Closing the stop leaves the focus where it is.
         return lens.with_stop_radius(paraxial.stop_radius_mm(at_infinity(lens), f_number))
     lens, object_mm = at_infinity(lens), None
@@ -100,18 +97,13 @@ def in_state(lens: Lens, state: Configuration) -> Lens:
         moved = moved.with_stop_radius(state.stop_diameter_mm / 2)
     return replace(
         moved,
-        half_field_deg=half_field_in(lens, state),
+        half_field_deg=lens.half_field_in(state),
         f_number=_f_number_in(lens, state),
         stated_efl_mm=state.efl_mm,
         stated_efl_x_mm=None,
         derived="",
         infinity_mm=tuple((k, start[k]) for k, _ in state.thickness_mm) if near else (),
     )
-
-
-def half_field_in(lens: Lens, state: Configuration) -> float | None:
-    """Half field of a state: its own, else that of the image circle where the lens has one (None), else the lens's."""
-    return state.half_field_deg or (None if lens.image_radius_mm is not None else lens.half_field_deg)
 
 
 def _f_number_in(lens: Lens, state: Configuration) -> float:
