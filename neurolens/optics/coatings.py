@@ -93,7 +93,7 @@ def power_amplitudes(
     """(real, imaginary) of the s and of the p amplitude, scaled so that its squared modulus is power, each [N].
 
     Of transmission, or with `reflected` of reflection, with the signs of Born and Wolf, 1.5.2: r_p = -r_s at normal
-    incidence; s is perpendicular to the plane of incidence, p = k x s. Nothing is transmitted beyond the critical angle.
+    incidence; s is perpendicular to the plane of incidence, p = k x s. Beyond the critical angle, t is 0.
     """
     s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond=reflected)
     if reflected:

@@ -204,7 +204,7 @@ def nearest_focus_m(lens: Lens) -> float:
 
 
 def _mover(lens: Lens) -> tuple[FocusPath, Callable[[float], Lens]]:
-    """The path of a lens at infinity, and the lens with its groups moved along; the film stays with the fixed groups."""
+    """The path of a lens at infinity focus, and the lens with its groups moved along it, film fixed."""
     path, back_mm = focus_path(lens), paraxial.first_order(lens).back_focus_mm
 
     def place(s: float) -> Lens:

@@ -259,7 +259,7 @@ class Lens:
         return replace(self, surfaces=tuple(surfaces), configurations=tuple(states), infinity_mm=infinity, **stated)
 
     def half_field_in(self, state: Configuration) -> float | None:
-        """Half field in a state: its own, else that of the image circle where the lens has one (None), else the lens's."""
+        """Half field in a state: its own, else that of the image circle where there is one (None), else the lens's."""
         return state.half_field_deg or (self.half_field_deg if self.image_radius_mm is None else None)
 
     def with_stop_radius(self, radius_mm: float) -> Lens:
