@@ -1,8 +1,8 @@
 """Fields of view: chief rays from the scene, where they meet the film, and which field reaches its edge.
 
-A field is an angle from the axis in degrees in one meridional plane, that of the chief ray (through the middle of the
-stop) in front of the lens. The light comes from the positive side of the plane's axis, so that its image lies on the
-negative side; image heights are given with the sign turned, positive."""
+A field is an angle from the axis in degrees in one meridional plane, that of the chief ray (through the middle of
+the stop) before the lens. The image lies on the negative side of the plane's axis; image heights are given positive.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Accessories: filters before and behind the lens, hoods; and the pinhole, a lens without glass.
 
-Each adds a few rows to the table, so that the tracer needs no special case. Surfaces are renumbered from the scene: a
-front filter adds 2 to the number of every surface behind it, a hood 1.
+Each adds a few rows to the table: surfaces are renumbered, by 2 behind a front filter, by 1 behind a hood.
 """
 
 from __future__ import annotations

@@ -84,8 +84,8 @@ class Glass:
     def _bends(self) -> list[tuple[float, float]]:
         """The piecewise linear absorption as hinges: wavelength, and the change of the derivative there.
 
-        Several times faster than a search in a table, and torch fuses it. Counted from the red end, where absorption
-        is least, so that float32 does not lose it in the far larger values of the blue.
+        Faster than a search, fusible, and from the red end, where absorption is least, so that float32 does not lose
+        it.
         """
         points = self.absorption
         steps = [(a - b) / (right - left) for (left, a), (right, b) in zip(points[:-1], points[1:], strict=True)]

@@ -1,9 +1,8 @@
 """Focusing: groups that move inside a lens, the film plane of best focus, and breathing.
 
-Internal focusing: the groups move as the source's focus states say, between infinity and the nearest; film fixed. The
-source lists a few states: infinity, sometimes one between, and the nearest, for every zoom position. One parameter
-moves all gaps from state to state linearly (as a focus ring on straight cams would), and is solved for so that the
-paraxial image of the object lies on the film.
+Internal focusing: the source lists a few states of the groups, between infinity and the nearest, for every zoom
+position. One parameter moves all gaps from state to state linearly (as a focus ring on straight cams would), and is
+solved for so that the paraxial image of the object lies on the film, which is fixed.
 """
 
 from __future__ import annotations

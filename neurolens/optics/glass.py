@@ -26,7 +26,7 @@ _FOUND: dict[str, Glass] = {}
 
 
 def inverse_square_um(wavelength_nm: Any) -> Any:
-    """1 / lambda^2 in 1/um^2 for a wavelength in nm (number or tensor of any shape)."""
+    """1 / lambda^2 in 1/um^2 for a wavelength in nm (number or tensor)."""
     return (1000.0 / wavelength_nm) ** 2
 
 
@@ -112,11 +112,7 @@ def check_against_table(surface: Surface, file: str | Path, where: str) -> None:
 
 
 def table_notes(surface: Surface) -> list[str]:
-    """What `check_against_table` warns of, as sentences without the place; empty if all is well.
-
-    Raises:
-        InputError: a glass that the catalogue does not have.
-    """
+    """What `check_against_table` warns of, as sentences without the place; empty if all is well."""
     if surface.glass is None:
         return []
     glass, notes = glass_of(surface.glass), []

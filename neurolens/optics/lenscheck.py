@@ -1,7 +1,7 @@
 """Checks of a prescription against its source: every stated figure is recomputed, with the reason of any doubt.
 
-Tables that circulate carry dropped aspheres, swapped glasses and transposed digits. Most of these show: the focal
-length or the back focus moves, the axis blurs, elements cut each other, or no light reaches the edge of the field.
+Dropped aspheres, swapped glasses, transposed digits mostly show: the focal length or the back focus moves, the axis
+blurs, elements cut each other, or no light reaches the edge of the field.
 """
 
 from __future__ import annotations

@@ -59,11 +59,7 @@ def format_lens(lens: Lens) -> str:
 
 
 def _aperture(lens: Lens) -> str:
-    """The table of the stop's blades.
-
-    Raises:
-        InputError: a stop with a mask, which a lens file has no form for.
-    """
+    """The table of the stop's blades; a mask is refused, for a lens file has no form for it."""
     if lens.aperture is None:
         return ""
     if lens.aperture.blades is None:

@@ -1,8 +1,7 @@
-"""Pupils of the literature, to sample per lens from its film: one disc, one search, a disc per pixel, bounds by radius.
+"""Pupils of the literature, to sample per lens from its film: shapes on a plane by film radius, `RadialPupil`.
 
-All are shapes on a plane by film radius: `RadialPupil`. They differ in how they are found, in how many of the rays sent
-through them pass, and in how much light they lose. The outlines that the cameras use are in
-`neurolens.cameras.pupil_outline`.
+They differ in how they are found, how many of their rays pass, and how much light they lose. The outlines that the
+cameras use are in `neurolens.cameras.pupil_outline`.
 """
 
 from __future__ import annotations

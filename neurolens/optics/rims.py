@@ -129,7 +129,7 @@ def _moved(lens: Lens, c: Configuration) -> Lens:
 def _stop_of(lens: Lens, c: Configuration) -> float:
     """Diameter of the stop in a state; a focus state has that of the zoom state with the same tabled stop.
 
-    A source that gives a state neither f-number nor stop means the stop of the table.
+    A state without f-number and stop has that of the table.
     """
     if c.object_distance_mm is not None:
         same = [z for z in lens.configurations if z.object_distance_mm is None]

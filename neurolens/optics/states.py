@@ -1,9 +1,8 @@
 """What a photographer changes, in this order: zoom, size, f-number, focus. Called by `Lens.at`.
 
 Between the zoom states of the source, the places of all groups, measured from the film, are interpolated against log
-focal length; then the focal length and the image's place are made exact by moving the groups behind the first varying
-gap (which keeps its interpolated value); a zoom of two moving groups has no freedom left, and is solved wholly. What a
-real cam does between the states is not in the source: the result is marked as derived.
+focal length; then focal length and image are made exact by moving the groups behind the first varying gap (which
+keeps its interpolated value); a zoom of two moving groups has no freedom left. Such a lens is marked as derived.
 """
 
 from __future__ import annotations
@@ -76,11 +75,7 @@ def at(
 
 
 def state_named(lens: Lens, name: str) -> Configuration:
-    """The zoom or focus state of that name.
-
-    Raises:
-        InputError: the file has none such; it lists those it has.
-    """
+    """The zoom or focus state of that name; an error lists those of the file."""
     for c in lens.configurations:
         if c.name == name:
             return c
@@ -188,9 +183,8 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _State:
-    """A zoom state of the source: focal length as computed, and what varies.
-
-    places: distance of the groups' fronts from the film (paraxial image), scene to film, one more than `gaps`.
+    """A zoom state of the source: focal length as computed, and `places`, the distances of the groups' fronts from the
+    film (paraxial image), scene to film, one more than the gaps.
     """
 
     source: Configuration

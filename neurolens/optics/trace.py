@@ -1,7 +1,7 @@
-"""The exact tracer, in either direction, and ray differentials.
+"""The exact tracer, in either direction, and ray differentials: the reference for surrogates.
 
-This is the reference for surrogates. Rays are separate tensors of shape [N] (a structure of
-arrays); float64 for truth, float32 for speed. A ray that cannot go on carries a status and stays finite.
+Rays are separate tensors of shape [N]; float64 for truth, float32 for speed. A ray that cannot go on carries a
+status and stays finite.
 """
 
 from __future__ import annotations
@@ -148,10 +148,10 @@ def compile_trace(
 
 @cache
 def _keep_memory() -> None:
-    """Make glibc keep the memory of chunks between operators, once a process.
+    """Make glibc keep the memory of chunks between operators, once a process: half the time of a trace otherwise.
 
-    By default it returns blocks of 128 KiB to the system, and half the time of a trace would go into reallocation.
-    Freeing one larger block raises that limit to its size (mallopt(3), M_MMAP_THRESHOLD); it is never touched.
+    Freeing one block above 128 KiB raises the limit for return to the system to its size (mallopt(3),
+    M_MMAP_THRESHOLD).
     """
     torch.empty(30 << 20, dtype=torch.uint8)
 

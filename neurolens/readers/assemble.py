@@ -84,10 +84,8 @@ def smaller_stop(file: str, asked: float, limit: float | None, state: str = "") 
 
 
 def with_rims(lens: Lens) -> Lens:
-    """The lens with the rims that its file does not give derived by rule (`neurolens.optics.rims`).
-
-    Raises:
-        InputError: no field is known to derive them for, or the lens has cylinders.
+    """The lens with the rims that its file does not give derived by rule (`neurolens.optics.rims`); refused where no
+    field is known to derive them for, or the lens has cylinders.
     """
     missing = [k for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm)]
     if not missing:

@@ -1,6 +1,4 @@
-"""CODE V sequence files (.seq): one lens written as commands, S lines with radius (or curvature), thickness, glass.
-
-Three letters name a command. An unsupported command is an error with command and line."""
+"""CODE V sequence files (.seq): commands of three letters, S lines with radius or curvature, thickness, glass."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Parser state of a CODE V file: commands, media, surfaces, zoom positions.
-
-What the lens model cannot represent is an error with name and line."""
+"""Parser state of a CODE V file: commands, media, surfaces, zoom positions."""
 
 from __future__ import annotations
 

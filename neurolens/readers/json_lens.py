@@ -191,8 +191,9 @@ def _optional_text(table: Table, key: str) -> str:
 
 
 def stated_efl(lens: Lens, data: Mapping[str, Any]) -> Lens:
-    """The lens with the focal length that the file states: of several, those of an anamorphic lens by meridian, else
-    the first (the state that the table is in)."""
+    """The lens with the focal length stated: of several, an anamorphic lens's by meridian, else the first (the
+    table's).
+    """
     given = data.get("efl_mm")
     values = [given] if not isinstance(given, list) else given
     for value in values:
@@ -259,12 +260,7 @@ def image_and_field(data: Mapping[str, Any], file: str) -> dict[str, Any]:
 
 
 def read_states(lens: Lens, data: Mapping[str, Any]) -> Lens:
-    """The lens with the states of the file.
-
-    Raises:
-        InputError: an unknown key, a surface that does not exist, a value out of range, a name given twice, surfaces
-            that overlap in a state.
-    """
+    """The lens with the states of the file, checked."""
     states: list[Configuration] = []
     for place, given in enumerate(_tables(data, lens.path)):
         if not isinstance(given, Mapping):

@@ -1,8 +1,6 @@
 """OSLO lens files (.len): the simple ones, with a sphere or conic asphere of four terms per surface and round openings.
 
 "LEN NEW name focal-length surfaces", settings, then the surfaces, object first, each ended by NXT, the image by END.
-Radii (RD) or curvatures (CV), thickness to the next (TH), semi-diameters (AP), entrance beam radius (EBR), half field
-(ANG, degrees). Unsupported input is an error with command and line.
 """
 
 from __future__ import annotations

@@ -112,11 +112,7 @@ def decode(raw: bytes, path: str | Path) -> str:
 
 
 def read_lines(path: str | Path) -> list[Line]:
-    """The lines of a text file, those without content left out.
-
-    Raises:
-        InputError: see `read_bytes` and `decode`; too many lines, or one too long.
-    """
+    """The lines of a text file, those without content left out; refuses too many, or one too long."""
     file = str(path)
     rows = decode(read_bytes(path), path).splitlines()
     if len(rows) > MAX_LINES:

@@ -1,8 +1,8 @@
 """Zemax OpticStudio lens files (.zmx): sequential systems, UTF-16 or plain text.
 
-The format is a list of keywords: settings of the system, then one block "SURF n" a surface, the object first and the
-image last, then merit function, tolerances and configurations. Curvatures, semi-diameters, thickness to the next
-surface. Unsupported input is an error with keyword and line."""
+Settings of the system, then one block "SURF n" a surface, the object first and the image last, then merit function,
+tolerances and configurations. Curvatures, semi-diameters, thickness to the next surface.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Parser state of a Zemax file: surfaces, configurations, and the keywords without effect on rays.
-
-What the lens model cannot represent is an error with name and line."""
+"""Parser state of a Zemax file: surfaces, configurations, and the keywords without effect on rays."""
 
 from __future__ import annotations
 
