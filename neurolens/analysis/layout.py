@@ -162,7 +162,7 @@ def _fan_lines(scene: Scene, field: float) -> list[Array]:
     return list(torch.stack(columns, 1).numpy())
 
 
-def lens_layout(layout: Layout, path: str | Path) -> Path:
+def lens_layout(layout: Layout, path: str | Path) -> None:
     """Draw a lens with rays, light from left to right, as PNG, PDF or SVG."""
     with style():
         z, top = _limits(layout)
@@ -180,7 +180,7 @@ def lens_layout(layout: Layout, path: str | Path) -> Path:
         order = sorted(range(len(labels)), key=lambda i: labels[i] in ("stop", "film"))  # fields first
         handles, labels = [handles[i] for i in order], [labels[i] for i in order]
         figure.legend(handles, labels, loc="outside lower center", ncols=min(7, len(labels)))
-        return save(figure, path)
+        save(figure, path)
 
 
 def draw_section(axes: Any, layout: Layout, **axis: Any) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from neurolens.analysis.fields import Array, Result, Scene
 from neurolens.base.errors import InputError
 from neurolens.optics.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
-from neurolens.optics.paraxial import PathOfRay, System, is_pinhole, system_of
+from neurolens.optics.paraxial import PathOfRay, System, system_of
 from neurolens.optics.prescription import Lens, Surface
 
 NAMES = ("S1 spherical", "S2 coma", "S3 astigmatism", "S4 Petzval", "S5 distortion", "C1 axial colour", "C2 lateral")
@@ -56,8 +56,7 @@ def seidel(scene: Scene, *, wavelength_nm: float = LINE_D_NM, image_height_mm: f
     lens = scene.lens
     if lens.anamorphic:
         raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
-    if is_pinhole(lens):
-        raise InputError(lens.path, "surfaces", "(a pinhole)", "a lens with power")
+    scene.require_power()
     if image_height_mm is None:
         image_height_mm = float(scene.chief_rays([scene.edge_deg()], wavelength_nm).height_mm[0])
     system = system_of(lens, wavelength_nm)

@@ -52,7 +52,7 @@ examples:
 
 class _Analysis(NamedTuple):
     compute: Callable[..., Any]
-    draw: Callable[..., Path]
+    draw: Callable[..., None]
     table: Callable[[dict[str, Any]], str]
 
 
@@ -150,9 +150,8 @@ def _one(what: str, scene: Scene, args: argparse.Namespace) -> tuple[dict[str, A
         return data, None
     across = f"_{args.axis}" if any(s.cylinder for s in scene.lens.surfaces) else ""
     path = args.output / f"{scene.lens.lens_id}_{what}{across}.{args.format}"
-    if what == "layout":
-        return data, analysis.draw(result, path)
-    return data, analysis.draw(result, path, scene.lens.name, _subtitle(scene))
+    analysis.draw(result, path, *(() if what == "layout" else (scene.lens.name, _subtitle(scene))))
+    return data, path
 
 
 def _subtitle(scene: Scene) -> str:
