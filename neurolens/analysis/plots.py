@@ -183,11 +183,8 @@ def _spot(axes: Any, data: Spots, field: int, shift_mm: float) -> None:
         )
     angle = np.linspace(0, 2 * math.pi, 65)
     if math.isfinite(data.airy_um):
-        ring, label = (
-            data.airy_um * np.array([np.cos(angle), np.sin(angle)]),
-            f"Airy disc, radius {data.airy_um:.1f} µm",
-        )
-        axes.plot(*ring, color="black", lw=0.8, label=label)
+        ring = data.airy_um * np.array([np.cos(angle), np.sin(angle)])
+        axes.plot(*ring, color="black", lw=0.8, label=f"Airy disc, radius {data.airy_um:.1f} µm")
     rms = float(np.interp(shift_mm, data.shift_mm, data.through_focus_um[field]))
     text = f"RMS {rms:.3g} µm" if math.isfinite(rms) else "no light"
     axes.annotate(text, (0.04, 0.03), xycoords="axes fraction", fontsize=7, color="#555b63")

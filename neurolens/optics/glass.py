@@ -69,9 +69,8 @@ def index_of(surface: Surface, wavelength_nm: Any) -> Any:
     """
     if surface.glass is not None:
         if getattr(surface.n_d, "requires_grad", False):
-            raise InputError(
-                f"glass {surface.glass}", "n_d", "(a tensor)", "no catalogue glass beside an index to be optimised"
-            )
+            expected = "no catalogue glass beside an index to be optimised"
+            raise InputError(f"glass {surface.glass}", "n_d", "(a tensor)", expected)
         return glass_of(surface.glass).index(wavelength_nm)
     return index_at(surface.n_d, surface.V_d, wavelength_nm)
 

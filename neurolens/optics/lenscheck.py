@@ -79,11 +79,8 @@ def check_lens(lens: Lens) -> list[Check]:
 def doubts(checks: list[Check]) -> list[str]:
     """The doubts as sentences without a full stop, prefixed by the state; those of the table are not repeated."""
     table = {c.doubt for c in checks if not c.state}
-    return [
-        f"{c.state}: {c.doubt}" if c.state else c.doubt
-        for c in checks
-        if c.doubt and not (c.state and c.doubt in table)
-    ]
+    found = [c for c in checks if c.doubt and not (c.state and c.doubt in table)]
+    return [f"{c.state}: {c.doubt}" if c.state else c.doubt for c in found]
 
 
 def verdict(checks: list[Check]) -> str:
@@ -129,10 +126,8 @@ def _back_focus(lens: Lens, computed: float, efl: float) -> Check:
     tabled, last = float(lens.surfaces[-1].thickness_mm), float(lens.vertices_mm[-2])
     doubt = ""
     if efl > 0 and abs(computed - tabled) > FOCUS_TOLERANCE * efl:
-        doubt = (
-            f"the table's last thickness puts the film at z = {last + tabled:.2f} mm, "
-            f"its focus is at {last + computed:.2f} mm"
-        )
+        film = f"the table's last thickness puts the film at z = {last + tabled:.2f} mm"
+        doubt = f"{film}, its focus is at {last + computed:.2f} mm"
     return Check("back focus, mm", computed, tabled, doubt)
 
 

@@ -81,14 +81,12 @@ def check_rays(rays: Rays, wavelength_nm: Tensor | float) -> None:
         raise InputError("trace", "rays.x", f"({dtype})", "torch.float32 or torch.float64")
     for name, c in zip(Rays._fields, rays, strict=True):
         if c.shape != shape or c.dtype != dtype or c.ndim != 1:
-            raise InputError(
-                "trace", f"rays.{name}", f"({tuple(c.shape)}, {c.dtype})", f"[N] like x: {tuple(shape)}, {dtype}"
-            )
+            found = f"({tuple(c.shape)}, {c.dtype})"
+            raise InputError("trace", f"rays.{name}", found, f"[N] like x: {tuple(shape)}, {dtype}")
     if isinstance(wavelength_nm, Tensor):
         if wavelength_nm.ndim and wavelength_nm.shape != shape:
-            raise InputError(
-                "trace", "wavelength_nm", f"({tuple(wavelength_nm.shape)})", f"a number or a tensor {tuple(shape)}"
-            )
+            found = f"({tuple(wavelength_nm.shape)})"
+            raise InputError("trace", "wavelength_nm", found, f"a number or a tensor {tuple(shape)}")
     elif not 0 < wavelength_nm < math.inf:
         raise InputError("trace", "wavelength_nm", wavelength_nm, "a positive number")
 

@@ -239,9 +239,8 @@ class PupilBounds:
     @property
     def lit_radius_mm(self) -> float:
         """The first film radius from which on every row is empty; that of the film where its edge is lit."""
-        last = max(
-            (k for k, (low, high) in enumerate(zip(self.low_mm, self.high_mm, strict=True)) if low <= high), default=0
-        )
+        rows = enumerate(zip(self.low_mm, self.high_mm, strict=True))
+        last = max((k for k, (low, high) in rows if low <= high), default=0)
         return self.film_radius_mm * min(last + 1, len(self.low_mm) - 1) / (len(self.low_mm) - 1)
 
 
@@ -288,9 +287,8 @@ def pupil_bounds(
         by_row[i] += [box] if box else []
     boxes = [union(row) if row else None for row in by_row]
     if not any(boxes):
-        raise InputError(
-            lens.path, "surfaces", "(no ray passes the lens)", f"rays from a film of radius {film_radius_mm:.4g} mm"
-        )
+        expected = f"rays from a film of radius {film_radius_mm:.4g} mm"
+        raise InputError(lens.path, "surfaces", "(no ray passes the lens)", expected)
     merged = [union([b for b in boxes[max(i - 1, 0) : i + 2] if b]) for i in range(rows)]
     return PupilBounds(
         plane,

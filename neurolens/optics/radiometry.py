@@ -124,13 +124,7 @@ def _check(lens: Lens, radius: Array) -> None:
         raise InputError(lens.path, "film_z_mm", None, "a focused lens: lens.at(focus_m=...)")
     if lens.anamorphic or lens.aperture is not None:
         raise InputError(lens.path, "surfaces", "(cylinders or blades)", "a lens that is round about its axis")
-    if (
-        radius.ndim != 1
-        or not radius.size
-        or radius[0] != 0
-        or not (radius >= 0).all()
-        or not np.isfinite(radius).all()
-    ):
+    if radius.ndim != 1 or not radius.size or radius[0] != 0 or not ((radius >= 0) & np.isfinite(radius)).all():
         raise InputError("film_light", "film_radius_mm", radius.tolist()[:4], "radii in mm of at least 0, the first 0")
 
 

@@ -140,9 +140,8 @@ def _millimetres(text: str) -> float | str:
 def _factor_for_efl(lens: Lens, focal_length_mm: float) -> float:
     now_mm = paraxial.first_order(at_infinity(lens)).efl_mm
     if now_mm < 0:
-        raise InputError(
-            lens.path, "focal_length_mm", focal_length_mm, f"none: this lens diverges (EFL {now_mm:.4g} mm)"
-        )
+        expected = f"none: this lens diverges (EFL {now_mm:.4g} mm)"
+        raise InputError(lens.path, "focal_length_mm", focal_length_mm, expected)
     return focal_length_mm / now_mm
 
 

@@ -261,25 +261,21 @@ def trace_differentials(
     for n, derivative in enumerate(derivatives):
         for name, c, r in zip(Rays._fields, derivative, rays, strict=True):
             if c.shape != r.shape or c.dtype != r.dtype:
-                found = f"({tuple(c.shape)}, {c.dtype})"
-                raise InputError(
-                    "trace", f"derivatives[{n}].{name}", found, f"like the rays: {tuple(r.shape)}, {r.dtype}"
-                )
+                found, expected = (f"{tuple(t.shape)}, {t.dtype}" for t in (c, r))
+                raise InputError("trace", f"derivatives[{n}].{name}", f"({found})", f"like the rays: {expected}")
     traced, carried = None, []
     for derivative in derivatives:
         with forward_ad.dual_level():
-            dual = Rays(
-                *(forward_ad.make_dual(r.contiguous(), t.contiguous()) for r, t in zip(rays, derivative, strict=True))
-            )
+            pairs = zip(rays, derivative, strict=True)
+            dual = Rays(*(forward_ad.make_dual(r.contiguous(), t.contiguous()) for r, t in pairs))
             out = trace(lens, dual, wavelength_nm, towards=towards)
             parts = [forward_ad.unpack_dual(c) for c in out.rays]
             moved = (torch.zeros_like(p.primal) if p.tangent is None else p.tangent for p in parts)
             # A lost ray was replaced by one along the axis, whose derivative is 0 already; others may carry NaN.
             carried.append(Rays(*(torch.nan_to_num(s, 0.0, 0.0, 0.0) for s in moved)))
             traced = out._replace(rays=Rays(*(p.primal for p in parts)))
-    return Differentials(
-        trace(lens, rays, wavelength_nm, towards=towards) if traced is None else traced, tuple(carried)
-    )
+    traced = trace(lens, rays, wavelength_nm, towards=towards) if traced is None else traced
+    return Differentials(traced, tuple(carried))
 
 
 def film_derivatives(rays: Rays, distance_mm: Tensor | float) -> tuple[Rays, Rays]:

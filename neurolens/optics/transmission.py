@@ -143,9 +143,9 @@ class _Averaged(_Absorbed):
         coating = self._lens.surfaces[k].coating
         if coating is not None and coating.layers:
             cos_i = times(hit.q, 1 / before.n)
-            self._power = self._power * transmittance(
-                cos_i, before.n, after.n, coating.layers, self._wavelength_nm, self._sense
-            )
+            media = before.n, after.n
+            share = transmittance(cos_i, *media, coating.layers, self._wavelength_nm, self._sense)
+            self._power = self._power * share
         elif before is not after:
             self._power = self._power * fresnel_transmittance(hit.q, q, before, after)
 

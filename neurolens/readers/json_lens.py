@@ -166,12 +166,8 @@ def _glass(row: Table, catalogue: bool) -> dict[str, Any]:
     n_d = row.number("n_d", above=0)
     V_d = row.optional("V_d")
     material = _optional_text(row, "material") or None
-    return {
-        "n_d": n_d,
-        "V_d": V_d,
-        "material": material,
-        "glass": same_glass(material, n_d, V_d) if catalogue else None,
-    }
+    glass = same_glass(material, n_d, V_d) if catalogue else None
+    return {"n_d": n_d, "V_d": V_d, "material": material, "glass": glass}
 
 
 def _asphere(row: Table) -> tuple[tuple[int, float], ...]:
@@ -302,10 +298,8 @@ def _state(lens: Lens, table: Table, name: str) -> Configuration:
     if isinstance(distance, str):
         if not (math.isfinite(paraxial_mm) and paraxial_mm > 0):
             raise table.error("object_distance_mm", distance, "a distance in mm, or null")
-        warn(
-            lens.path,
-            f"{table.where}object_distance_mm {distance!r}: {paraxial_mm:.6g} mm follows from the thicknesses",
-        )
+        said = f"{table.where}object_distance_mm {distance!r}"
+        warn(lens.path, f"{said}: {paraxial_mm:.6g} mm follows from the thicknesses")
         return replace(state, object_distance_mm=paraxial_mm)
     if distance is not None:
         stated = table.number("object_distance_mm", unit="mm", above=0)
