@@ -30,21 +30,15 @@ def inverse_square_um(wavelength_nm: Any) -> Any:
     return (1000.0 / wavelength_nm) ** 2
 
 
-def cauchy_coefficients(n_d: Any, V_d: float | None) -> tuple[Any, Any]:
-    """A and B (um^2) of n = A + B / lambda^2, so that n(d) = n_d and n_F - n_C = (n_d - 1) / V_d.
+def index_at(n_d: Any, V_d: float | None, wavelength_nm: Any) -> Any:
+    """Cauchy's A + B / lambda^2 at a wavelength in nm (number, or tensor [N]); the constant n_d where V_d is unknown.
 
-    V_d None (unknown) gives the constant index n_d.
+    A and B (um^2) are such that n(d) = n_d and n_F - n_C = (n_d - 1) / V_d.
     """
     if V_d is None:
-        return n_d, 0.0
+        return n_d
     b = (n_d - 1.0) / V_d / (inverse_square_um(LINE_F_NM) - inverse_square_um(LINE_C_NM))
-    return n_d - b * inverse_square_um(LINE_D_NM), b
-
-
-def index_at(n_d: Any, V_d: float | None, wavelength_nm: Any) -> Any:
-    """Refractive index at a wavelength in nm (number, or tensor [N]); the constant n_d where V_d is unknown."""
-    a, b = cauchy_coefficients(n_d, V_d)
-    return a if V_d is None else a + b * inverse_square_um(wavelength_nm)
+    return n_d - b * inverse_square_um(LINE_D_NM) + b * inverse_square_um(wavelength_nm)
 
 
 def glass_of(name: str) -> Glass:

@@ -166,13 +166,6 @@ def test_a_diverging_lens_has_no_film_for_an_object_between_its_principal_planes
         thick(-50, 50, 60, 1.5).at(focus_m=1e-3)
 
 
-@pytest.mark.parametrize("field", ["focal_length_mm", "field_deg", "f_number", "focus_m"])
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
-def test_states_that_are_none(field: str, value: float) -> None:
-    with pytest.raises(InputError, match=field):
-        thick(50, -50, 5, 1.5).at(**{field: value})
-
-
 def test_a_diverging_lens_cannot_be_scaled_to_a_positive_focal_length() -> None:
     with pytest.raises(InputError, match="focal_length_mm"):
         thick(-50, 50, 5, 1.5).at(focal_length_mm=50.0)

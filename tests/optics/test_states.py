@@ -21,6 +21,7 @@ from neurolens.optics.focusing import (
     monotone,
     nearest_focus_m,
 )
+from neurolens.optics.lenscheck import in_state
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.paraxial import first_order
@@ -210,6 +211,11 @@ def test_the_edge_of_the_image_circle_sees_the_field_asked_for() -> None:
         ({"field_deg": 120.0}, "field_deg"),
         ({"field_deg": 400.0}, "field_deg"),
         ({"field_deg": 40.0, "focal_length_mm": 50.0}, "field_deg"),
+        *(
+            ({key: v}, key)
+            for key in ("focal_length_mm", "field_deg", "f_number", "focus_m")
+            for v in (0.0, -1.0, math.nan)
+        ),
         ({"f_number": math.inf}, "f_number"),
         ({"focal_length_mm": math.inf}, "focal_length_mm"),
         ({"focus": "manual"}, "focus"),
@@ -330,6 +336,7 @@ def test_focused_inside_near_rays_from_the_object_meet_on_a_film_that_stands_sti
         ("nikon_zoom_70_200", "135mm near", -0.1583),
         ("nikon_zoom_70_200", "196mm near", -0.2332),
         ("nikon_zoom_14_24", "14mm 1:40", -0.025),
+        ("nikon_zoom_14_24", "18mm 1:40", -0.025),
         ("nikon_zoom_14_24", "23mm 1:40", -0.025),
         ("nikon_zoom_14_24", "14mm near", -0.088),
         ("nikon_zoom_14_24", "23mm near", -0.135),
@@ -340,6 +347,9 @@ def test_magnifications_of_focus_states_are_those_the_source_states(name: str, s
     near = next(c for c in lens.configurations if c.name == state)
     assert near.object_distance_mm is not None and lens.film_z_mm is not None
     assert magnification(lens, -near.object_distance_mm) == pytest.approx(stated, rel=0.006)
+    data = first_order(in_state(tabled(name), near))
+    paraxial = -data.efl_mm / (near.object_distance_mm + data.front_principal_z_mm - data.efl_mm)
+    assert paraxial == pytest.approx(stated, rel=0.02)
     # The path from infinity passes through the state.
     focus_m = max((lens.film_z_mm + near.object_distance_mm) / 1000, nearest_focus_m(lens))
     again = lens.at(focus_m=focus_m, focus="internal")
