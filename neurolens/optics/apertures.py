@@ -94,13 +94,9 @@ class Aperture:
         return {"blades": self.blades, "rotation_deg": self.rotation_deg, "curvature": self.curvature}
 
     def inside(self, x: Any, y: Any, radius_mm: float) -> Any:
-        """Whether points of the stop lie in the opening.
+        """Whether points of the stop lie in the opening: booleans of the shape of x and y; False for NaN.
 
-        Args:
-            x, y: numpy arrays of one shape, mm; of torch tensors see `inside_on_tensors`.
-            radius_mm: of the stop.
-
-        Returns booleans of that shape; False for NaN.
+        Numpy arrays x, y and the stop's radius in mm; for torch tensors see `inside_on_tensors`.
         """
         open_ = x * x + y * y <= radius_mm * radius_mm
         if self.blades is not None:

@@ -163,10 +163,7 @@ def nearest(n_d: float, V_d: float, count: int = 3) -> list[Glass]:
 def by_code(code: str, count: int = 3) -> list[Glass]:
     """The glasses nearest to a six-digit code: "517642", also written "517.642" or "517/642", is 1.517 and 64.2.
 
-    Of those that share a code the order is that of `MAKERS`.
-
-    Raises:
-        InputError: not six digits.
+    Of those that share a code the order is that of `MAKERS`. Anything but six digits is an InputError.
     """
     digits = re.sub(r"[./ ]", "", code)
     if not re.fullmatch(r"[0-9]{6}", digits):

@@ -281,10 +281,10 @@ def design(name: str, n_before: float, n_after: float, file: str | Path = "coati
     Args:
         name: the design, and after a space its wavelength in nm where that is not 550 (broadband: 510).
         n_before, n_after: indices (n_d) on the scene's and on the film's side of the surface.
-        file, where: for error messages.
+        file, where: the place to name in an error.
 
     Raises:
-        InputError: an unknown name, a wavelength that is not a positive number, a design that the media do not allow.
+        InputError: an unknown name, a wavelength that is not positive, a design that the media do not allow.
     """
     kind, _, wavelength = name.partition(" ")
     if kind not in ("bare", "quarter-wave", "v-coat", "broadband") or (kind == "bare" and name != kind):

@@ -24,15 +24,13 @@ from neurolens.optics.trace import trace
 
 
 def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) -> list[float]:
-    """Values at a place between rows of values: exactly the row at its own place, linear between two rows.
+    """Values at a place between rows of values: exactly the row at its own place, between two rows linear or cubic.
 
     Piecewise cubic with the derivatives of Fritsch and Butland (1984), "A method for constructing local monotone
-    piecewise cubic interpolants": between two rows a value stays between theirs, so that no gap can turn negative.
+    piecewise cubic interpolants": a value stays between those of its two rows, so that no gap can turn negative.
 
     Args:
         x: [R] ascending places. rows: [R][M] values. place: from x[0] to x[-1].
-
-    Returns [M] values.
     """
     if len(x) == 1:
         return list(rows[0])

@@ -42,11 +42,7 @@ def index_at(n_d: Any, V_d: float | None, wavelength_nm: Any) -> Any:
 
 
 def glass_of(name: str) -> Glass:
-    """`catalogue.find`, cached. Before using a glass under torch.compile, look it up once.
-
-    Raises:
-        InputError: a glass that the catalogue does not have.
-    """
+    """`catalogue.find`, cached. Before using a glass under torch.compile, look it up once."""
     found = _FOUND.get(name)
     if found is None:
         found = _FOUND[name] = catalogue.find(name)
@@ -72,10 +68,7 @@ def index_of(surface: Surface, wavelength_nm: Any) -> Any:
 def absorption_of(surface: Surface, wavelength_nm: Any) -> Any:
     """Napierian absorption in 1/mm of the medium after a surface: the glass's plus the surface's own; None without any.
 
-    Beer-Lambert: t mm of it transmit exp(-absorption t).
-
-    Raises:
-        InputError: a glass that the catalogue does not have.
+    Beer-Lambert: t mm transmit exp(-absorption t). An InputError for a glass that the catalogue does not have.
     """
     own = surface.absorption_per_mm or None
     glass = None if surface.glass is None else glass_of(surface.glass).absorption_per_mm(wavelength_nm)

@@ -70,12 +70,7 @@ DEEP = 0.25
 
 
 def check_rays(rays: Rays, wavelength_nm: Tensor | float) -> None:
-    """Refuse rays and wavelengths that cannot be traced.
-
-    Raises:
-        InputError: components of unequal shapes or dtypes or of another dtype, a wavelength of another shape, or a
-            number that is not positive.
-    """
+    """Raise InputError for components of unequal or wrong shape or dtype, and such wavelengths, or one not positive."""
     shape, dtype = rays.x.shape, rays.x.dtype
     if dtype not in (torch.float32, torch.float64):
         raise InputError("trace", "rays.x", f"({dtype})", "torch.float32 or torch.float64")

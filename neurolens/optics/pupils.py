@@ -143,11 +143,11 @@ def search(
     points: int,
     film_mm: tuple[float, float] | None,
 ) -> list[Box | None]:
-    """Boxes of the passing points of grids over `boxes` (upper halves: the lens is symmetric), a step wider; None for
-    a film point whose grid no ray passes.
+    """Boxes of the passing points of grids over `boxes` (upper halves: the lens is symmetric), a step wider; None for a
+    film point whose grid no ray passes.
 
-    A coarse grid inside each is traced first. Where enough of it passes, only the points that may lie beyond its
-    extent by less than one of its steps follow; elsewhere all points near those found, or all.
+    A coarse grid is traced first. Where enough of it passes, only the points that may lie beyond its extent by less
+    than one of its steps follow; elsewhere all points near those found, or all.
 
     Args:
         places, boxes: film points and where to look from each.
@@ -301,9 +301,8 @@ def pupil_bounds(
 
 
 def _starts(lens: Lens, place: Place, plane: float, near: float, exit_z: float) -> list[Box]:
-    """Where on the pupil plane light of a film point may pass: what the rear rim bounds, and near the exit pupil.
-
-    `near` is how far from the exit pupil's middle light is looked for again where the rear rim bounds it badly, mm.
+    """Where on the pupil plane light of a film point may pass: what the rear rim bounds, and within `near` mm of the
+    exit pupil's middle where the rear rim bounds it badly.
     """
     rear = lens.surfaces[-1]
     rear_z = float(lens.vertices_mm[len(lens.surfaces) - 1])

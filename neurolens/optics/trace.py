@@ -46,11 +46,9 @@ class Traced(NamedTuple):
 
     Attributes:
         rays: point on the last surface met (lens frame, mm) and unit direction after it. Rays that missed a surface or
-            were totally reflected are replaced by a finite ray along the axis; rays that only a rim stops go on, so
-            that surrogates can be fitted to their crossings.
+            were totally reflected are replaced by a finite ray along the axis; those that only a rim stops go on.
         status: [N] int32, see `neurolens.base.status`.
-        transmittance: [N], power of unpolarised light that arrives: of surfaces (by default the product of
-            (Ts + Tp) / 2) and of absorption in the glass; None if not requested.
+        transmittance: [N], power of unpolarised light that arrives: of surfaces and absorption; None unless requested.
         crossings: surface index to `Crossing`, for the recorded surfaces.
         path: the rays on and after every surface, in the order of travel, or empty if not requested.
     """
@@ -251,9 +249,8 @@ def trace_differentials(
     """Trace rays together with their derivatives.
 
     Args:
-        lens, rays, wavelength_nm, towards: as for `trace`.
-        derivatives: of the rays with respect to some parameters, one `Rays` each (components [N]), such as
-            those of `film_derivatives`.
+        derivatives: of the rays with respect to some parameters, one `Rays` each (components [N]), such as those of
+            `film_derivatives`; the rest as for `trace`.
 
     Raises:
         InputError: as `trace`, and a derivative whose components have not the shape and dtype of the rays.

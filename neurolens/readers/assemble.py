@@ -121,8 +121,7 @@ def check_states(lens: Lens) -> None:
 def first_order(lens: Lens) -> FirstOrder:
     """First-order data in the y-z plane; of a lens without power there, in the x-z plane.
 
-    Raises:
-        InputError: a lens without power, or whose entrance pupil is a point or infinite.
+    Raises InputError for a lens without power, or whose entrance pupil is a point or infinite.
     """
     try:
         data = paraxial.first_order(lens, meridian="y")

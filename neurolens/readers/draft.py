@@ -127,11 +127,7 @@ class Draft:
 
 
 def lens_of(draft: Draft, given: Given | None = None) -> Lens:
-    """The lens of a draft, in mm, checked.
-
-    Raises:
-        InputError: see `assemble.finish`; a unit that contradicts the file's.
-    """
+    """The lens of a draft, in mm, checked as by `assemble.finish`; a unit other than the file's is an InputError."""
     given = given or Given()
     draft = _without_dummies(draft)
     unit = given.units or draft.unit or "mm"
