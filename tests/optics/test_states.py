@@ -364,17 +364,14 @@ def test_focusing_again_starts_from_infinity() -> None:
     lens = tabled("sony_sonnar_55").at()
     near = lens.at(focus_m=1.8, focus="internal")
     assert gaps(near.at()) == gaps(lens)
-    assert gaps(near.at(focus_m=4.0, focus="internal")) == pytest.approx(
-        gaps(lens.at(focus_m=4.0, focus="internal")), abs=1e-12
-    )
+    again, once = (given.at(focus_m=4.0, focus="internal") for given in (near, lens))
+    assert gaps(again) == pytest.approx(gaps(once), abs=1e-12)
     assert gaps(lens.at(focus="internal")) == gaps(lens)
     by_name = lens.at(zoom="1.7m")
     assert gaps(by_name.at()) == gaps(lens)
     # f-numbers are those of infinity, wherever the groups stand.
-    assert by_name.at(f_number=4).stop_radius_mm == pytest.approx(lens.at(f_number=4).stop_radius_mm, rel=1e-12)
-    assert near.at(f_number=4, focus_m=2, focus="internal").stop_radius_mm == pytest.approx(
-        lens.at(f_number=4).stop_radius_mm, rel=1e-12
-    )
+    for closed in (by_name.at(f_number=4), near.at(f_number=4, focus_m=2, focus="internal")):
+        assert closed.stop_radius_mm == pytest.approx(lens.at(f_number=4).stop_radius_mm, rel=1e-12)
 
 
 def test_size_and_internal_focus_go_together() -> None:

@@ -49,9 +49,8 @@ def distance_from_line(point: tuple[float, float, float], r: Rays) -> Tensor:
 @pytest.mark.parametrize("degrees", [0.0, 1e-6, 20.0, 60.0, 89.0])
 def test_snell_at_a_plane(index: float, degrees: float) -> None:
     i = math.radians(degrees)
-    out = trace(
-        lens(Surface(INF, 1, WIDE, index, stop=True)), rays((1, 2, -1, math.sin(i), 0, math.cos(i))), towards="film"
-    )
+    start = rays((1, 2, -1, math.sin(i), 0, math.cos(i)))
+    out = trace(lens(Surface(INF, 1, WIDE, index, stop=True)), start, towards="film")
     assert float(out.rays.dx[0]) == pytest.approx(math.sin(i) / index, abs=1e-15)
     assert float(out.rays.x[0]) == pytest.approx(1 + math.tan(i), rel=1e-14)
     assert (float(out.rays.y[0]), float(out.rays.z[0])) == (2.0, 0.0)
@@ -244,12 +243,8 @@ def test_fisheye_rays_from_behind_the_camera_are_reversible() -> None:
 
 def test_shorter_wavelengths_bend_more() -> None:
     singlet = focused("thorlabs_lb1471_biconvex_50")
-    out = trace(
-        singlet,
-        rays(*[(0, 5, -10, 0, 0, 1)] * 3),
-        torch.tensor([380.0, 587.5618, 780.0], dtype=torch.float64),
-        towards="film",
-    )
+    wavelength = torch.tensor([380.0, 587.5618, 780.0], dtype=torch.float64)
+    out = trace(singlet, rays(*[(0, 5, -10, 0, 0, 1)] * 3), wavelength, towards="film")
     bend = -out.rays.dy
     assert bend[0] > bend[1] > bend[2] > 0
     one = trace(singlet, rays((0, 5, -10, 0, 0, 1)), 587.5618, towards="film")
@@ -287,13 +282,8 @@ def test_chunks_change_no_bit(dtype: torch.dtype) -> None:
 
 
 def test_an_empty_batch() -> None:
-    out = trace(
-        focused("thorlabs_lb1471_biconvex_50"),
-        Rays(*torch.empty((6, 0))),
-        torch.empty(0),
-        transmittance=True,
-        record=[1],
-    )
+    singlet, none = focused("thorlabs_lb1471_biconvex_50"), Rays(*torch.empty((6, 0)))
+    out = trace(singlet, none, torch.empty(0), transmittance=True, record=[1])
     assert out.status.shape == out.rays.x.shape == out.crossings[1].x.shape == (0,)
     assert out.status.dtype == torch.int32
 
