@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from shipped import tabled
+from shipped import disc_irradiance, tabled
 
 from neurolens.base.errors import InputError
 from neurolens.optics.accessories import pinhole, with_hood
@@ -19,20 +19,6 @@ from neurolens.optics.radiometry import FilmLight, film_light, white_card
 
 def lens(name: str, **state: float) -> Lens:
     return tabled(name).at(**state)
-
-
-def disc_irradiance(radius_mm: float, distance_mm: float, height_mm: np.ndarray) -> np.ndarray:
-    """Irradiance over radiance (sr) at heights [F] from the axis of a uniform disc parallel to the film.
-
-    The exact integral, for any size of the disc: pi sin^2(theta') on the axis (Foote 1915).
-    """
-    a2, z2, h2 = radius_mm**2, distance_mm**2, np.asarray(height_mm, np.float64) ** 2
-    total = z2 + h2 + a2
-    root = np.sqrt(total * total - 4 * a2 * h2)
-    x = (total - 2 * a2) / root
-    # 1 - x loses digits for a small disc, x near 1: there it is (1 - x^2) / (1 + x).
-    small = 4 * a2 * z2 / (root * root) / (1 + np.maximum(x, 0))
-    return math.pi / 2 * np.where(x > 0, small, 1 - x)
 
 
 def product(light: FilmLight) -> np.ndarray:
