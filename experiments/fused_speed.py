@@ -30,7 +30,6 @@ from neurolens.evaluate.candidates import (
     model_candidate,
     program_candidate,
 )
-from neurolens.evaluate.describe import refractions
 from neurolens.evaluate.experiment import LensChoice
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.speed import Call, Candidate, Race, race
@@ -127,7 +126,7 @@ def measure(
     entries: list[tuple[Row, Candidate]] = []
 
     def add(name: str, work: str, candidate: Candidate, program: Program | None = None, **known: Any) -> None:
-        row = Row(Path(case.file).stem, refractions(lens), name, work, **known, **(_floor(program) if program else {}))
+        row = Row(Path(case.file).stem, lens.refractions, name, work, **known, **(_floor(program) if program else {}))
         entries.append((row, replace(candidate, name=f"{name}, {work}")))
 
     _add_exact(add, lens, domain, torch_compiled)

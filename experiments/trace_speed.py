@@ -21,7 +21,6 @@ from neurolens.base import status as st
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import whole
 from neurolens.evaluate.candidates import COMPILED_BATCHES, EAGER_BATCHES
-from neurolens.evaluate.describe import refractions
 from neurolens.evaluate.speed import POOL, Call, Candidate, Race, Unavailable, race
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
@@ -158,7 +157,7 @@ def _row(name: str, lens: Lens, timed: Race, passing: float) -> dict[str, Any]:
     kind, dtype = name.removeprefix("aspheres, ").split()
     row: dict[str, Any] = {
         "lens": Path(lens.path).stem,
-        "refractions": refractions(lens),
+        "refractions": lens.refractions,
         "surfaces": len(lens.surfaces),
         "aspheres": aspheres,
         "cylinders": sum(s.cylinder is not None for s in lens.surfaces),

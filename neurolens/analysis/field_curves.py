@@ -13,9 +13,7 @@ from torch import Tensor
 from neurolens.analysis.bundles import bundle, hexapolar, points
 from neurolens.analysis.fields import DEFAULT_NM, Array, Result, Scene, on_plane
 from neurolens.analysis.seidel import petzval_curvature
-from neurolens.base.errors import InputError
 from neurolens.optics.glass import LINE_D_NM
-from neurolens.optics.paraxial import is_pinhole
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.optics.surfaces import Rays
@@ -63,8 +61,7 @@ def colour(
     Raises:
         InputError: a pinhole, which has no focus.
     """
-    if is_pinhole(scene.lens):
-        raise InputError(scene.lens.path, "surfaces", "(a pinhole)", "a lens with power")
+    scene.require_power()
     spectrum = np.linspace(*_VISIBLE_NM, 41) if spectrum_nm is None else np.asarray(spectrum_nm, dtype=np.float64)
     axial = bundle(scene.round, [0.0], spectrum.tolist(), points(list(_ZONES), [0.0] * 3))
     crossing = -(axial.tangential_mm / axial.slopes[0])[0].numpy()
@@ -108,8 +105,7 @@ def curvature(
     Raises:
         InputError: a pinhole, which has no focus.
     """
-    if is_pinhole(scene.lens):
-        raise InputError(scene.lens.path, "surfaces", "(a pinhole)", "a lens with power")
+    scene.require_power()
     angles = np.linspace(0, scene.edge_deg() if edge_deg is None else edge_deg, fields)
     pattern = points([-_CLOSE, _CLOSE, 0.0, 0.0], [0.0, 0.0, -_CLOSE, _CLOSE])
     rays = bundle(scene.open, angles.tolist(), [wavelength_nm], pattern)

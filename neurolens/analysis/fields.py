@@ -1,14 +1,14 @@
 """Fields of view: chief rays from the scene, where they meet the film, and which field reaches its edge.
 
-A field is an angle from the axis in degrees in one meridional plane, that of the chief ray (through the middle of the
-stop) in front of the lens. The light comes from the positive side of the plane's axis, so that its image lies on the
-negative side; image heights are given with the sign turned, positive."""
+A field is an angle from the axis in degrees in one meridional plane, that of the chief ray (through the middle of
+the stop) before the lens. The image lies on the negative side of the plane's axis; image heights are given positive.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -20,7 +20,7 @@ from torch import Tensor
 from neurolens.base.errors import InputError
 from neurolens.optics.aiming import Axis, aim_at_stop, without_rims
 from neurolens.optics.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
-from neurolens.optics.paraxial import FirstOrder, first_order
+from neurolens.optics.paraxial import FirstOrder, first_order, is_pinhole
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
 from neurolens.optics.surfaces import Rays
@@ -35,7 +35,7 @@ class Result:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists, numbers and strings by field name; NaN and infinities stay floats."""
-        return {f.name: _plain(getattr(self, f.name)) for f in fields(self)}
+        return {key: _plain(value) for key, value in asdict(self).items()}
 
 
 def _plain(value: Any) -> Any:
@@ -45,8 +45,6 @@ def _plain(value: Any) -> Any:
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(v) for v in value]
-    if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
     return value
 
 
@@ -191,6 +189,11 @@ class Scene:
             return self.lens
         rows = zip(self.lens.surfaces, without_rims(self.lens).surfaces, strict=True)
         return replace(self.lens, surfaces=tuple(old if old.stop else new for old, new in rows))
+
+    def require_power(self) -> None:
+        """Raise InputError for a pinhole, which has no focus."""
+        if is_pinhole(self.lens):
+            raise InputError(self.lens.path, "surfaces", "(a pinhole)", "a lens with power")
 
     def check(self) -> None:
         """Raise InputError for a lens that forms no image on a film."""

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from neurolens.analysis.field_curves import Colour, Curvature, Distortion, Illumination
-from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, drawing, field_name, heading, wavelength_colour
+from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, drawing, field_name, wavelength_colour
 from neurolens.analysis.seidel import Seidel
 from neurolens.analysis.spots import Fans, Mtf, Spots
 from neurolens.analysis.wavefront import Psf
 
 
-def plot_colour(data: Colour, path: str | Path, title: str, subtitle: str) -> Path:
+def plot_colour(data: Colour, path: str | Path, title: str, subtitle: str) -> None:
     """Longitudinal colour by zones against wavelength, and lateral colour against field."""
     with drawing(path, 9.4, 4.6, title, f"Colour; {subtitle}") as figure:
         left, right = figure.subplots(1, 2)
@@ -31,14 +31,12 @@ def plot_colour(data: Colour, path: str | Path, title: str, subtitle: str) -> Pa
         for axes in (left, right):
             axes.grid(True)
             axes.legend()
-    return Path(path)
 
 
-def plot_curvature(data: Curvature, path: str | Path, title: str, subtitle: str) -> Path:
+def plot_curvature(data: Curvature, path: str | Path, title: str, subtitle: str) -> None:
     """Sagittal, tangential and Petzval foci (across) against image height (up), as lens catalogues draw them."""
-    with drawing(
-        path, 6.4, 5.2, title, f"Field curvature and astigmatism, {data.wavelength_nm:.0f} nm\n{subtitle}"
-    ) as figure:
+    text = f"Field curvature and astigmatism, {data.wavelength_nm:.0f} nm\n{subtitle}"
+    with drawing(path, 6.4, 5.2, title, text) as figure:
         axes = figure.add_subplot()
         axes.plot(data.sagittal_mm, data.height_mm, color=FIELD_COLOURS[0], label="sagittal")
         axes.plot(data.tangential_mm, data.height_mm, color=FIELD_COLOURS[3], label="tangential")
@@ -49,10 +47,9 @@ def plot_curvature(data: Curvature, path: str | Path, title: str, subtitle: str)
         axes.set(xlabel="focus from the film, away from the lens (mm)", ylabel="image height (mm)")
         _degrees(axes, data.height_mm, data.field_deg)
         axes.legend()
-    return Path(path)
 
 
-def plot_distortion(data: Distortion, path: str | Path, title: str, subtitle: str) -> Path:
+def plot_distortion(data: Distortion, path: str | Path, title: str, subtitle: str) -> None:
     """Distortion against the closest projections, the reference drawn thick."""
     with drawing(path, 7.4, 4.8, title, f"Distortion, {data.wavelength_nm:.0f} nm; {subtitle}") as figure:
         axes = figure.add_subplot()
@@ -60,18 +57,15 @@ def plot_distortion(data: Distortion, path: str | Path, title: str, subtitle: st
         for k, (name, error) in enumerate(data.error_percent.items()):
             chosen = name == data.reference
             label = f"against {name}{' (reference)' if chosen else ''}"
-            axes.plot(
-                data.field_deg, error, color=FIELD_COLOURS[k], lw=2.2 if chosen else 1.0, label=label,
-                zorder=3 if chosen else 2,
-            )  # fmt: skip
+            look = {"lw": 2.2, "zorder": 3} if chosen else {"lw": 1.0, "zorder": 2}
+            axes.plot(data.field_deg, error, color=FIELD_COLOURS[k], label=label, **look)
         axes.axhline(0, color=FAINT, lw=0.7)
         axes.grid(True)
         axes.set(xlabel="field (degrees)", ylabel="distortion (%)", ylim=(-limit, limit))
         figure.legend(loc="outside lower center", ncols=2)
-    return Path(path)
 
 
-def plot_vignetting(data: Illumination, path: str | Path, title: str, subtitle: str) -> Path:
+def plot_vignetting(data: Illumination, path: str | Path, title: str, subtitle: str) -> None:
     """Relative illumination and what it is made of, against image height."""
     with drawing(path, 7.4, 4.8, title, f"Vignetting and relative illumination; {subtitle}") as figure:
         axes = figure.add_subplot()
@@ -88,25 +82,18 @@ def plot_vignetting(data: Illumination, path: str | Path, title: str, subtitle: 
         axes.set_ylim(0, max(105.0, 105 * float(np.nan_to_num([data.relative, data.unvignetted]).max())))
         _degrees(axes, data.height_mm, data.field_deg, across=True)
         axes.legend(loc="lower left")
-    return Path(path)
 
 
-def plot_mtf(data: Mtf, path: str | Path, title: str, subtitle: str) -> Path:
+def plot_mtf(data: Mtf, path: str | Path, title: str, subtitle: str) -> None:
     """MTF against frequency: a colour per field, tangential solid, sagittal dashed."""
     waves = ", ".join(f"{nm:.0f}" for nm in data.wavelength_nm)
     with drawing(path, 8.4, 6.0, title, f"Geometric MTF at {waves} nm, without diffraction; {subtitle}") as figure:
         axes = figure.add_subplot()
         for k, field in enumerate(data.field_deg):
-            colour = FIELD_COLOURS[k % len(FIELD_COLOURS)]
-            axes.plot(data.frequency_per_mm, data.tangential[k], color=colour, label=f"{field_name(field)}, tangential")
-            if field:
-                axes.plot(
-                    data.frequency_per_mm,
-                    data.sagittal[k],
-                    color=colour,
-                    ls="--",
-                    label=f"{field_name(field)}, sagittal",
-                )
+            colour, look = FIELD_COLOURS[k % len(FIELD_COLOURS)], {"tangential": "-", "sagittal": "--"}
+            for name, contrast in (("tangential", data.tangential), ("sagittal", data.sagittal))[: 2 if field else 1]:
+                label = f"{field_name(field)}, {name}"
+                axes.plot(data.frequency_per_mm, contrast[k], color=colour, ls=look[name], label=label)
         if np.isfinite(data.diffraction_limit).all():
             limit = f"diffraction limit, f/{data.working_f_number:.3g}"
             axes.plot(data.frequency_per_mm, data.diffraction_limit, color=INK, ls=":", label=limit)
@@ -114,14 +101,12 @@ def plot_mtf(data: Mtf, path: str | Path, title: str, subtitle: str) -> Path:
         axes.set(xlabel="frequency (cycles/mm)", ylabel="contrast", ylim=(0, 1.02))
         axes.set_xlim(0, data.frequency_per_mm[-1])
         figure.legend(loc="outside lower center", ncols=4)
-    return Path(path)
 
 
-def plot_seidel(data: Seidel, path: str | Path, title: str, subtitle: str) -> Path:
+def plot_seidel(data: Seidel, path: str | Path, title: str, subtitle: str) -> None:
     """Seidel sums as bars, surface by surface, with their total apart."""
-    with drawing(path, max(8.4, 0.3 * len(data.surfaces) + 3), 10.0) as figure:
-        text = f"Seidel sums at {data.image_height_mm:.1f} mm image height, {data.wavelength_nm:.0f} nm; {subtitle}"
-        heading(figure, title, text)
+    text = f"Seidel sums at {data.image_height_mm:.1f} mm image height, {data.wavelength_nm:.0f} nm; {subtitle}"
+    with drawing(path, max(8.4, 0.3 * len(data.surfaces) + 3), 10.0, title, text) as figure:
         rows = figure.subplots(len(data.names), 1, sharex=True)
         place = np.arange(len(data.surfaces))
         for k, (axes, name) in enumerate(zip(rows, data.names, strict=True)):
@@ -134,7 +119,6 @@ def plot_seidel(data: Seidel, path: str | Path, title: str, subtitle: str) -> Pa
         rows[-1].set_xticks([*place[::step], len(place) + 0.5], [*map(str, place[::step]), "total"])
         rows[-1].set_xlabel("surface, counted from the scene")
         figure.legend(*rows[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    return Path(path)
 
 
 def _degrees(axes: Any, height: Any, field: Any, across: bool = False) -> None:
@@ -165,7 +149,7 @@ def _lengthened(values: Any) -> Any:
 _SHIFTS = 5
 
 
-def plot_spots(data: Spots, path: str | Path, title: str, subtitle: str) -> Path:
+def plot_spots(data: Spots, path: str | Path, title: str, subtitle: str) -> None:
     """Spots: rows are fields, columns the film moved through focus, the middle one unshifted, with the Airy disc."""
     shifts = np.linspace(data.shift_mm[0], data.shift_mm[-1], _SHIFTS)
     rows = len(data.field_deg)
@@ -187,7 +171,6 @@ def plot_spots(data: Spots, path: str | Path, title: str, subtitle: str) -> Path
                 axes.set_xlabel("sagittal (µm)", size=8.5)
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), markerscale=4)
-    return Path(path)
 
 
 def _spot(axes: Any, data: Spots, field: int, shift_mm: float) -> None:
@@ -200,18 +183,11 @@ def _spot(axes: Any, data: Spots, field: int, shift_mm: float) -> None:
         )
     angle = np.linspace(0, 2 * math.pi, 65)
     if math.isfinite(data.airy_um):
-        axes.plot(
-            data.airy_um * np.cos(angle), data.airy_um * np.sin(angle), color="black", lw=0.8,
-            label=f"Airy disc, radius {data.airy_um:.1f} µm",
-        )  # fmt: skip
+        ring = data.airy_um * np.array([np.cos(angle), np.sin(angle)])
+        axes.plot(*ring, color="black", lw=0.8, label=f"Airy disc, radius {data.airy_um:.1f} µm")
     rms = float(np.interp(shift_mm, data.shift_mm, data.through_focus_um[field]))
-    axes.annotate(
-        f"RMS {rms:.3g} µm" if math.isfinite(rms) else "no light",
-        (0.04, 0.03),
-        xycoords="axes fraction",
-        fontsize=7,
-        color="#555b63",
-    )
+    text = f"RMS {rms:.3g} µm" if math.isfinite(rms) else "no light"
+    axes.annotate(text, (0.04, 0.03), xycoords="axes fraction", fontsize=7, color="#555b63")
 
 
 def _middle(values: np.ndarray) -> float:
@@ -231,23 +207,17 @@ def _half_width(data: Spots) -> float:
     return 1.1 * max(reach, default=0.0) or 1.0
 
 
-def plot_fans(data: Fans, path: str | Path, title: str, subtitle: str) -> Path:
+def plot_fans(data: Fans, path: str | Path, title: str, subtitle: str) -> None:
     """Ray fans: a row per field, tangential left and sagittal right, one scale for all."""
     rows = len(data.field_deg)
-    both = np.concatenate([data.tangential_um.ravel(), data.sagittal_um.ravel()])
-    reach = 1.1 * float(np.nanmax(np.abs(both))) if np.isfinite(both).any() else 1.0
-    with drawing(
-        path,
-        8.6,
-        1.55 * rows + 1.5,
-        title,
-        f"Ray fans, from the chief ray at {data.wavelength_nm[0]:.0f} nm; {subtitle}",
-    ) as figure:
+    every = np.concatenate([data.tangential_um.ravel(), data.sagittal_um.ravel()])
+    reach = 1.1 * float(np.nanmax(np.abs(every))) if np.isfinite(every).any() else 1.0
+    heading = f"Ray fans, from the chief ray at {data.wavelength_nm[0]:.0f} nm; {subtitle}"
+    with drawing(path, 8.6, 1.55 * rows + 1.5, title, heading) as figure:
         grid = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False)
         for i in range(rows):
-            for axes, values, name in zip(
-                grid[i], (data.tangential_um[i], data.sagittal_um[i]), ("tangential", "sagittal"), strict=True
-            ):
+            both = (("tangential", data.tangential_um[i]), ("sagittal", data.sagittal_um[i]))
+            for axes, (name, values) in zip(grid[i], both, strict=True):
                 for k, nm in enumerate(data.wavelength_nm):
                     axes.plot(data.pupil, values[k], color=wavelength_colour(nm), lw=1.3, label=f"{nm:.0f} nm")
                 axes.axhline(0, color=FAINT, lw=0.6)
@@ -260,15 +230,13 @@ def plot_fans(data: Fans, path: str | Path, title: str, subtitle: str) -> Path:
             axes.set_xlabel("height in the stop / its radius")
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-    return Path(path)
 
 
-def plot_psf(data: Psf, path: str | Path, title: str, subtitle: str) -> Path:
+def plot_psf(data: Psf, path: str | Path, title: str, subtitle: str) -> None:
     """Point spread: geometric above, diffraction below, square root of the values so that faint light shows."""
     columns = len(data.field_deg)
-    with drawing(
-        path, max(9.0, 2.25 * columns), 6.0, title, f"Point spread, brightness as square root; {subtitle}"
-    ) as figure:
+    text = f"Point spread, brightness as square root; {subtitle}"
+    with drawing(path, max(9.0, 2.25 * columns), 6.0, title, text) as figure:
         grid = figure.subplots(2, columns, squeeze=False)
         for i in range(columns):
             half = float(np.nan_to_num(data.half_width_um[i], nan=1.0))
@@ -288,4 +256,3 @@ def plot_psf(data: Psf, path: str | Path, title: str, subtitle: str) -> Path:
         waves = ", ".join(f"{nm:.0f}" for nm in data.wavelength_nm)
         grid[0, 0].set_ylabel(f"geometric ({waves} nm)\ntangential (µm)", size=8.5)
         grid[1, 0].set_ylabel(f"diffraction ({data.wavelength_nm[0]:.0f} nm)\ntangential (µm)", size=8.5)
-    return Path(path)

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from neurolens.analysis.fields import Array, Result, Scene
 from neurolens.base.errors import InputError
-from neurolens.optics.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, index_of
-from neurolens.optics.paraxial import is_pinhole
+from neurolens.optics.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
+from neurolens.optics.paraxial import PathOfRay, System, system_of
 from neurolens.optics.prescription import Lens, Surface
 
 NAMES = ("S1 spherical", "S2 coma", "S3 astigmatism", "S4 Petzval", "S5 distortion", "C1 axial colour", "C2 lateral")
@@ -48,14 +47,6 @@ class Seidel(Result):
     odd_powers: tuple[int, ...]
 
 
-class _Ray(NamedTuple):
-    """A paraxial ray: height at every surface, slope before and after it."""
-
-    y: list[float]
-    before: list[float]
-    after: list[float]
-
-
 def seidel(scene: Scene, *, wavelength_nm: float = LINE_D_NM, image_height_mm: float | None = None) -> Seidel:
     """Seidel sums at the edge of the field, or at another paraxial image height in mm.
 
@@ -65,13 +56,13 @@ def seidel(scene: Scene, *, wavelength_nm: float = LINE_D_NM, image_height_mm: f
     lens = scene.lens
     if lens.anamorphic:
         raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
-    if is_pinhole(lens):
-        raise InputError(lens.path, "surfaces", "(a pinhole)", "a lens with power")
+    scene.require_power()
     if image_height_mm is None:
         image_height_mm = float(scene.chief_rays([scene.edge_deg()], wavelength_nm).height_mm[0])
-    n = _indices(lens, wavelength_nm)
-    spread = [a - b for a, b in zip(_indices(lens, LINE_F_NM), _indices(lens, LINE_C_NM), strict=True)]
-    marginal, chief = _rays(scene, n, image_height_mm)
+    system = system_of(lens, wavelength_nm)
+    n, blue, red = system.index, system_of(lens, LINE_F_NM).index, system_of(lens, LINE_C_NM).index
+    spread = [a - b for a, b in zip(blue, red, strict=True)]
+    marginal, chief = _rays(scene, system, image_height_mm)
     rows = np.array([_row(s, k, n, spread, marginal, chief) for k, s in enumerate(lens.surfaces)])
     bend = petzval_curvature(lens, wavelength_nm)
     return Seidel(
@@ -90,49 +81,26 @@ def petzval_curvature(lens: Lens, wavelength_nm: float = LINE_D_NM) -> float:
     """Curvature of the Petzval surface in 1/mm (positive: centre towards +z); NaN for a lens with cylinders."""
     if lens.anamorphic:
         return math.nan
-    n = _indices(lens, wavelength_nm)
-    return sum(_curvature(s) * (1 / n[k + 1] - 1 / n[k]) for k, s in enumerate(lens.surfaces))
+    system = system_of(lens, wavelength_nm)
+    n = system.index
+    return float(sum(c * (1 / n[k + 1] - 1 / n[k]) for k, c in enumerate(system.curvature)))
 
 
-def _indices(lens: Lens, wavelength_nm: float) -> list[float]:
-    return [1.0, *(float(index_of(s, wavelength_nm)) for s in lens.surfaces)]
-
-
-def _curvature(s: Surface) -> float:
-    """Curvature at the vertex: r^2 terms count."""
-    return float(s.vertex_curvature("y"))
-
-
-def _march(lens: Lens, n: list[float], y: float, u: float) -> _Ray:
-    """Paraxial ray from height y at the first surface and slope u before it."""
-    ray = _Ray([], [], [])
-    for k, s in enumerate(lens.surfaces):
-        after = (n[k] * u - y * _curvature(s) * (n[k + 1] - n[k])) / n[k + 1]
-        ray.y.append(y)
-        ray.before.append(u)
-        ray.after.append(after)
-        y, u = y + after * float(s.thickness_mm), after
-    return ray
-
-
-def _rays(scene: Scene, n: list[float], image_height_mm: float) -> tuple[_Ray, _Ray]:
+def _rays(scene: Scene, system: System, image_height_mm: float) -> tuple[PathOfRay, PathOfRay]:
     """Marginal ray to the edge of the stop, and chief ray to -image_height_mm in the paraxial image."""
-    lens, stop = scene.lens, scene.lens.stop_index
-    near = 0.0 if math.isinf(scene.focus_m) else -1 / scene.object_z_mm
-    unit = _march(lens, n, 1.0, near)
-    scale = lens.stop_radius_mm / unit.y[stop]
-    marginal = _march(lens, n, scale, scale * near)
-    level, tilted = _march(lens, n, 1.0, 0.0), _march(lens, n, 0.0, 1.0)
+    stop, near = scene.lens.stop_index, 0.0 if math.isinf(scene.focus_m) else -1 / scene.object_z_mm
+    scale = scene.lens.stop_radius_mm / system.march(1.0, near).y[stop]
+    marginal = system.march(scale, scale * near)
     # The linear combination of the two through the middle of the stop.
-    y, u = -tilted.y[stop], level.y[stop]
-    chief = _march(lens, n, y, u)
+    y, u = -system.march(0.0, 1.0).y[stop], system.march(1.0, 0.0).y[stop]
+    chief = system.march(y, u)
     image = -marginal.y[-1] / marginal.after[-1]
     scale = -image_height_mm / (chief.y[-1] + image * chief.after[-1])
-    return marginal, _march(lens, n, scale * y, scale * u)
+    return marginal, system.march(scale * y, scale * u)
 
 
-def _row(s: Surface, k: int, n: list[float], spread: list[float], m: _Ray, b: _Ray) -> list[float]:
-    before, after, c = n[k], n[k + 1], _curvature(s)
+def _row(s: Surface, k: int, n: list[float], spread: list[float], m: PathOfRay, b: PathOfRay) -> list[float]:
+    before, after, c = n[k], n[k + 1], float(s.vertex_curvature("y"))
     y, y_bar = m.y[k], b.y[k]
     a, a_bar = before * (m.before[k] + y * c), before * (b.before[k] + y_bar * c)
     h = a * y_bar - a_bar * y

@@ -13,9 +13,7 @@ from torch import Tensor
 from neurolens.analysis.bundles import Bundle, Pattern, bundle, grid, hexapolar, points
 from neurolens.analysis.fields import DEFAULT_NM, Array, Result, Scene
 from neurolens.analysis.spots import working_f_number
-from neurolens.base.errors import InputError
 from neurolens.optics.glass import LINE_D_NM
-from neurolens.optics.paraxial import is_pinhole
 
 
 @dataclass(frozen=True)
@@ -130,8 +128,7 @@ def psf(
     Raises:
         InputError: a pinhole, whose rays do not meet: it has no focus that waves could be summed about.
     """
-    if is_pinhole(scene.lens):
-        raise InputError(scene.lens.path, "surfaces", "(a pinhole)", "a lens with power")
+    scene.require_power()
     fields = scene.default_fields() if field_deg is None else field_deg
     airy = 1.22e-3 * wavelength_nm[0] * working_f_number(scene, wavelength_nm[0])
     rays = bundle(scene, fields, wavelength_nm, grid(64))

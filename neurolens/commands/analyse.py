@@ -52,7 +52,7 @@ examples:
 
 class _Analysis(NamedTuple):
     compute: Callable[..., Any]
-    draw: Callable[..., Path]
+    draw: Callable[..., None]
     table: Callable[[dict[str, Any]], str]
 
 
@@ -153,14 +153,13 @@ def _one(what: str, scene: Scene, args: argparse.Namespace) -> tuple[dict[str, A
     if what in _OF_FIELDS:
         check_light(scene, args.fields, (args.wavelengths or DEFAULT_NM)[0])
     result = analysis.compute(scene, **asked)
-    data = result if isinstance(result, dict) else result.to_dict()
+    data = result.to_dict()
     if args.output is None:
         return data, None
     across = f"_{args.axis}" if any(s.cylinder for s in scene.lens.surfaces) else ""
     path = args.output / f"{scene.lens.lens_id}_{what}{across}.{args.format}"
-    if what == "layout":
-        return data, analysis.draw(result, path)
-    return data, analysis.draw(result, path, scene.lens.name, state_text(scene))
+    analysis.draw(result, path, *(() if what == "layout" else (scene.lens.name, state_text(scene))))
+    return data, path
 
 
 def _analysis(what: str) -> _Analysis:

@@ -12,7 +12,6 @@ import torch
 
 from neurolens.analysis import layout
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.layout import refractions
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.optics.focusing import at_infinity
@@ -94,7 +93,7 @@ def describe_lens(lens: Lens, domain: Domain) -> LensFacts:
         source=lens.source,
         rims=lens.rims,
         sha256=lens.sha256,
-        refractions=refractions(lens),
+        refractions=lens.refractions,
         first_order=first_order(lens),
         efl_x_mm=float(first_order(lens, meridian="x").efl_mm) if lens.anamorphic else None,
         working_f_number=working_f_number(lens, domain, film_z),
@@ -223,13 +222,11 @@ def warnings_of(lens: Lens, f_number: float, reached_deg: float | None, far: boo
     return found
 
 
-def layout_profile(lens: Lens, domain: Domain) -> dict[str, Any]:
+def layout_profile(lens: Lens, domain: Domain) -> layout.Layout:
     """Section of a lens with meridional fans of rays to the axis, 70% and the edge of the domain's film, d line.
 
     Args:
         lens: placed by `Lens.at`; where it is not, the film is that of the domain's farthest focus.
-
-    Returns: as `analysis.layout.layout_profile`.
     """
     if lens.film_z_mm is None:
         lens = replace(lens, film_z_mm=float(domain.film_z_mm[0]))
@@ -287,7 +284,7 @@ def library_row(path: Path) -> dict[str, Any]:
         "f_number": float(data.f_number),
         "half_field_deg": lens.half_field_deg,
         "image_radius_mm": lens.image_radius_mm,
-        "refractions": refractions(lens),
+        "refractions": lens.refractions,
         "aspheres": sum(s.conic != 0 or bool(s.asphere) for s in lens.surfaces),
         "cylinders": cylinders,
         "states": len(lens.configurations),
@@ -298,14 +295,14 @@ def library_row(path: Path) -> dict[str, Any]:
     }
 
 
-def section(path: Path) -> dict[str, Any]:
+def section(path: Path) -> layout.Layout:
     """A lens in section with rays, focused at infinity, as `figures.sheet` draws it; an anamorphic one in y-z."""
     lens = read_quietly(path).at()
     data, edge = first_order(lens), film_edge_mm(lens)
     if edge is None:
         edge = _NO_FIELD * abs(data.efl_mm) if lens.half_field_deg is None else image_radius_mm(lens)[0]
     profile = layout.layout_profile(Scene(lens, math.inf, "y"), edge)
-    return {**profile, "title": path.stem, "subtitle": _caption(lens, data.efl_mm, data.f_number)}
+    return replace(profile, title=path.stem, subtitle=_caption(lens, data.efl_mm, data.f_number))
 
 
 def _caption(lens: Lens, efl_mm: float, f_number: float) -> str:

@@ -10,16 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from neurolens.analysis.layout import (
-    checked_rays,
-    checked_surfaces,
-    draw_film,
-    draw_glass,
-    draw_rays,
-    draw_rims,
-    z_range,
-)
-from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, drawing, new_figure, plain_log_ticks, save, style
+from neurolens.analysis.layout import Layout, draw_section
+from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing, new_figure, plain_log_ticks, save, style
 from neurolens.base.errors import InputError
 from neurolens.evaluate.image import ImageErrors, checked_image, to_srgb
 from neurolens.evaluate.vignetting import Illumination
@@ -245,11 +237,10 @@ _LIBRARY_COLUMNS = 6
 _CELL_IN = (2.6, 2.0)  # width and height of one section with its title
 
 
-def sheet(profiles: Sequence[Mapping[str, Any]], path: str | Path) -> Path:
+def sheet(profiles: Sequence[Layout], path: str | Path) -> Path:
     """Draw lenses in section, light from left to right, each as large as its cell allows, axes of equal scale.
 
     Args:
-        profiles: as `plot_layout.lens_layout` takes them, with title and subtitle.
         path: PNG, PDF or SVG to write.
     Raises:
         InputError: no lens at all.
@@ -264,20 +255,11 @@ def sheet(profiles: Sequence[Mapping[str, Any]], path: str | Path) -> Path:
     return Path(path)
 
 
-def _cell(axes: Any, profile: Mapping[str, Any]) -> None:
-    surfaces = checked_surfaces(profile)
-    height = max(float(s["semi_diameter_mm"]) for s in surfaces)
-    z = z_range(profile, surfaces, height)
-    top = max(height * 1.18, 1.06 * float(profile.get("film_half_height_mm") or 0))
-    axes.set(xlim=z, ylim=(-top, top), aspect="equal")
+def _cell(axes: Any, profile: Layout) -> None:
     axes.axis("off")
-    axes.plot(z, (0, 0), color=FAINT, lw=0.4, zorder=1)
-    draw_glass(axes, surfaces)
-    draw_rims(axes, surfaces, height)
-    draw_film(axes, profile)
-    draw_rays(axes, checked_rays(profile))
+    draw_section(axes, profile, lw=0.4)
     for line in axes.lines:
         line.set_linewidth(0.6 * line.get_linewidth())
     for patch in axes.patches:
         patch.set_linewidth(0.5)
-    axes.set_title(f"{profile.get('title', '')}\n{profile.get('subtitle', '')}", fontsize=6, loc="left")
+    axes.set_title(f"{profile.title}\n{profile.subtitle}", fontsize=6, loc="left")

@@ -19,7 +19,7 @@ from neurolens.base.errors import NeurolensWarning
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import EXACT, exact_candidates, exact_records, ideal_cameras, model_candidate
-from neurolens.evaluate.describe import layout_profile, refractions
+from neurolens.evaluate.describe import layout_profile
 from neurolens.evaluate.experiment import Experiment, keep_inputs
 from neurolens.evaluate.figures import illumination_plot
 from neurolens.evaluate.image import DEFAULT
@@ -203,7 +203,7 @@ def _describe_lens(lens: Lens) -> dict[str, Any]:
         "source": lens.source,
         "file": Path(lens.path).name,
         "sha256": lens.sha256,
-        "refractions": refractions(lens),
+        "refractions": lens.refractions,
         "efl_mm": data.efl_mm,
         "f_number": data.f_number,
         "half_field_deg": lens.half_field_deg,

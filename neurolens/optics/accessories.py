@@ -1,7 +1,6 @@
 """Accessories: filters before and behind the lens, hoods; and the pinhole, a lens without glass.
 
-Each adds a few rows to the table, so that the tracer needs no special case. Surfaces are renumbered from the scene: a
-front filter adds 2 to the number of every surface behind it, a hood 1.
+Each adds a few rows to the table: surfaces are renumbered, by 2 behind a front filter, by 1 behind a hood.
 """
 
 from __future__ import annotations
@@ -18,15 +17,10 @@ _WIDEST_DEG = 75.0  # half field; for a wider one an unvignetting plate would be
 
 
 def pinhole(film_distance_mm: float, radius_mm: float, *, image_radius_mm: float | None = None) -> Lens:
-    """A lens without glass: a round hole of finite size in front of the film.
+    """A lens without glass: a round hole of finite size in front of the film; lengths that are not positive are
+    refused.
 
     Its focal length is the distance to the film, its f-number that over the diameter; focusing changes nothing.
-
-    Args:
-        image_radius_mm: radius of the film that is used.
-
-    Raises:
-        InputError: a length that is not a positive number.
     """
     _require("pinhole", film_distance_mm=film_distance_mm, radius_mm=radius_mm)
     hole = Surface(math.inf, film_distance_mm, 2 * radius_mm, stop=True)

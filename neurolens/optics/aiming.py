@@ -1,9 +1,8 @@
 """Rays from a field angle through given points of the stop, found from the stop outwards.
 
-Searching the front surface for the ray that meets the stop's centre fails where the pupil moves (a fisheye's chief ray
-enters centimetres beside the paraxial pupil) and where most rays miss some surface. From the stop every start is a ray
-that exists: it is followed to the scene, its angle there grows steadily with its angle at the stop, and the wanted
-field is bracketed from the axis outwards.
+Searching the front surface for the ray that meets the stop's centre fails where the pupil moves (a fisheye's chief
+ray enters centimetres beside the paraxial pupil). From the stop every start is a ray that exists: its angle in the
+scene grows steadily with its angle at the stop, and the wanted field is bracketed from the axis outwards.
 """
 
 from __future__ import annotations
@@ -65,7 +64,6 @@ def aim_at_stop(
     target = field_rad[:, None].expand_as(height_mm).reshape(-1)
 
     def outwards(angle: Tensor) -> tuple[Rays, Tensor, Tensor]:
-        """Rays at the scene for angles [n, G] at the stop, their field angle there and whether they exist."""
         return _follow(front, heights[:, None].expand_as(angle), angle, axis, wavelength_nm)
 
     widest = math.radians(_WIDEST_DEG)
@@ -86,8 +84,7 @@ def aim_at_stop(
 def _bracket(grid: Tensor, field: Tensor, exists: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Angles at the stop [n] below and above the one that gives the target field, and whether there is one.
 
-    The search starts at the ray nearest to the axis's direction and ends where rays stop existing or turn back. Where
-    the target is not reached the bracket is that of the last ray.
+    The search starts at the ray along the axis and ends where rays stop existing or turn back: there, the last two.
     """
     count = grid.shape[1]
     places = torch.arange(count)

@@ -1,7 +1,6 @@
 """Shapes of the stop's opening: blades, and any shape from a mask, for numpy arrays (cameras) and torch tensors.
 
-A shape lies inside the round stop: its radius is that of the circle round the blades' corners, and that circle still
-stops what a mask would let through. Coordinates are those of the lens frame: x right, y up, seen from the film.
+A shape lies inside the round stop, the circle round the blades' corners. Lens frame: x right, y up, from the film.
 """
 
 from __future__ import annotations
@@ -95,13 +94,9 @@ class Aperture:
         return {"blades": self.blades, "rotation_deg": self.rotation_deg, "curvature": self.curvature}
 
     def inside(self, x: Any, y: Any, radius_mm: float) -> Any:
-        """Whether points of the stop lie in the opening.
+        """Whether points of the stop lie in the opening: booleans of the shape of x and y; False for NaN.
 
-        Args:
-            x, y: numpy arrays of one shape, mm; of torch tensors see `inside_on_tensors`.
-            radius_mm: of the stop.
-
-        Returns booleans of that shape; False for NaN.
+        Numpy arrays x, y and the stop's radius in mm; for torch tensors see `inside_on_tensors`.
         """
         open_ = x * x + y * y <= radius_mm * radius_mm
         if self.blades is not None:
@@ -178,11 +173,7 @@ def _real(value: object) -> bool:
 
 
 def _read_only(mask: ArrayLike) -> NDArray[np.bool_]:
-    """A mask as the dataclass keeps it.
-
-    Raises:
-        InputError: it is not an array of two dimensions within the limit of size, or passes no light.
-    """
+    """A mask as the dataclass keeps it; refuses what is no array of two dimensions, too large, or passes no light."""
     given = np.asarray(mask)
     if given.ndim != 2 or not 1 <= min(given.shape) <= max(given.shape) <= MAX_MASK or given.dtype.kind not in "bfiu":
         found = f"({given.dtype} {given.shape})"

@@ -84,8 +84,8 @@ class Glass:
     def _bends(self) -> list[tuple[float, float]]:
         """The piecewise linear absorption as hinges: wavelength, and the change of the derivative there.
 
-        Several times faster than a search in a table, and torch fuses it. Counted from the red end, where absorption
-        is least, so that float32 does not lose it in the far larger values of the blue.
+        Faster than a search, fusible, and from the red end, where absorption is least, so that float32 does not lose
+        it.
         """
         points = self.absorption
         steps = [(a - b) / (right - left) for (left, a), (right, b) in zip(points[:-1], points[1:], strict=True)]
@@ -163,10 +163,7 @@ def nearest(n_d: float, V_d: float, count: int = 3) -> list[Glass]:
 def by_code(code: str, count: int = 3) -> list[Glass]:
     """The glasses nearest to a six-digit code: "517642", also written "517.642" or "517/642", is 1.517 and 64.2.
 
-    Of those that share a code the order is that of `MAKERS`.
-
-    Raises:
-        InputError: not six digits.
+    Of those that share a code the order is that of `MAKERS`. Anything but six digits is an InputError.
     """
     digits = re.sub(r"[./ ]", "", code)
     if not re.fullmatch(r"[0-9]{6}", digits):

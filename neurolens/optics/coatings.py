@@ -3,16 +3,13 @@
 Powers and amplitudes follow from characteristic matrices. A lossless layer's has the form [[a, -i b], [-i c, d]] with
 real a, b, c, d and a d + b c = 1, and so has every product of them: real arithmetic suffices, which compiles well. A p
 wave is followed by its magnetic field, so that nothing is divided by a cosine that may vanish. Fields go as
-exp(-i omega t). Sources: Born and Wolf, Principles of Optics, 1.6.2; Macleod, Thin-Film Optical Filters, chapter 2.
+exp(-i omega t). Sources: Born and Wolf, Principles of Optics, 1.6.2; Macleod, Thin-Film Optical Filters, chapters 2, 3.
 
 Throughout: `cos_i` [N] is the cosine of incidence in [0, 1]; `n_before` and `n_after` (number or [N]) are the indices
 of the media as the light meets them; `layers` are (refractive index, thickness in nm) from the scene's side, as in
 `prescription.Coating`; `sense` is +1 for light towards the film and -1 for light towards the scene; `wavelength_nm`
 (in vacuum) is a number or [N]. Results are [N] in the dtype of `cos_i`, differentiable, also with respect to layers
-given as 0-d tensors. Results are never NaN: beyond the critical angle, and for a cosine that is NaN, T = 0 and R = 1.
-
-The designs are the textbook ones (Macleod, chapter 3), computed for normal incidence with layers of constant index;
-the outermost film of a design lies on the side of the lower index.
+given as 0-d tensors, and never NaN: beyond the critical angle, and for a cosine that is NaN, T = 0 and R = 1.
 """
 
 from __future__ import annotations
@@ -37,16 +34,6 @@ SMALL_PHASE2 = 1e-2
 FLOOR = 1e-30
 
 
-class Amplitudes(NamedTuple):
-    """Complex amplitudes of the electric field, each [N], with the signs of Born and Wolf, 1.5.2: at normal incidence
-    r_p = -r_s. s is perpendicular to the plane of incidence; p = k x s for every wave, k its direction."""
-
-    t_s: Tensor
-    t_p: Tensor
-    r_s: Tensor
-    r_p: Tensor
-
-
 class Powers(NamedTuple):
     """Power transmitted and reflected by polarisation, each [N], in [0, 1]."""
 
@@ -58,10 +45,10 @@ class Powers(NamedTuple):
 
 class Response(NamedTuple):
     """One polarisation: u + i v of the incident (`plus`) and the reflected (`minus`) wave that make the same wave
-    behind the stack, and the admittances around it; t = 2 before / plus, r = minus / plus.
+    behind the stack, and the admittances around it; t = 2 before fade / plus, r = minus / plus.
 
     `passes` tells where the wave behind is not evanescent; there `after` is its admittance, else that divided by i.
-    `fade` is the factor that kept evanescent layers from overflowing; t must be multiplied by it, too.
+    `fade` is the factor that kept evanescent layers from overflowing.
     """
 
     before: Tensor
@@ -94,20 +81,6 @@ def powers(cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelengt
     return Powers(_transmitted(s), _transmitted(p), _reflected(s), _reflected(p))
 
 
-def amplitudes(
-    cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int = 1
-) -> Amplitudes:
-    """Complex amplitudes of the electric field; beyond the critical angle t is that of the evanescent wave.
-
-    |t|^2 is not transmitted power: that is |t|^2 times n_after cos_t / (n_before cos_i), see `powers`.
-    """
-    s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond=True)
-    magnetic_to_electric = n_before / n_after
-    t_s, t_p = (torch.complex(*_over_plus(r, 2 * r.before * r.fade, 0.0)) for r in (s, p))
-    r_s, r_p = (torch.complex(*_reflected_amplitude(r)) for r in (s, p))
-    return Amplitudes(t_s, t_p * magnetic_to_electric, r_s, r_p)
-
-
 def power_amplitudes(
     cos_i: Tensor,
     n_before: Any,
@@ -119,7 +92,8 @@ def power_amplitudes(
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
     """(real, imaginary) of the s and of the p amplitude, scaled so that its squared modulus is power, each [N].
 
-    Transmission, or with `reflected` reflection. Beyond the critical angle nothing is transmitted.
+    Of transmission, or with `reflected` of reflection, with the signs of Born and Wolf, 1.5.2: r_p = -r_s at normal
+    incidence; s is perpendicular to the plane of incidence, p = k x s. Beyond the critical angle, t is 0.
     """
     s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond=reflected)
     if reflected:
@@ -217,10 +191,7 @@ def _response(
 
 
 def _always_propagates(index: Any, n_before: Any, n_after: Any) -> bool:
-    """Whether light that gets through cannot be evanescent in a layer of this index.
-
-    It has n sin <= n of both media, so one known medium of lower index than the layer suffices (mostly air).
-    """
+    """Whether light that gets through cannot be evanescent in a layer: its n sin is at most n of both media."""
     known = isinstance(index, float | int)
     return known and any(isinstance(n, float | int) and n < index for n in (n_before, n_after))
 
@@ -266,62 +237,41 @@ V_PAIRS = ((MAGNESIUM_FLUORIDE, TANTALA), (MAGNESIUM_FLUORIDE, ALUMINA))
 KNOWN = '"bare", "quarter-wave", "v-coat" or "broadband", the last three with an optional wavelength in nm (550; 510)'
 
 
-def bare() -> Coating:
-    """No film."""
-    return Coating("bare", ())
+def quarter_wave(at_nm: float = DESIGN_NM) -> Coating:
+    """One film of magnesium fluoride a quarter of a wave thick: R = ((n0 ns - n^2) / (n0 ns + n^2))^2 at `at_nm`."""
+    return Coating(f"quarter-wave {at_nm:g}", ((MAGNESIUM_FLUORIDE, at_nm / (4 * MAGNESIUM_FLUORIDE)),))
 
 
-def quarter_wave(index: float = MAGNESIUM_FLUORIDE, at_nm: float = DESIGN_NM) -> Coating:
-    """One film a quarter of a wave thick: R = ((n0 ns - n^2) / (n0 ns + n^2))^2 at `at_nm` and normal incidence."""
-    return Coating(f"quarter-wave {at_nm:g}", ((index, at_nm / (4 * index)),))
-
-
-def v_coat(
-    n_before: float, n_after: float, at_nm: float = DESIGN_NM, outer: float | None = None, inner: float | None = None
-) -> Coating:
+def v_coat(n_before: float, n_after: float, at_nm: float = DESIGN_NM) -> Coating:
     """Two films without any reflection at `at_nm` and normal incidence (Macleod, section 3.2: equations of tan^2).
 
-    Args:
-        n_before, n_after: media on the scene's and on the film's side.
-        at_nm: design wavelength in vacuum.
-        outer, inner: indices of the films next to the rarer and to the denser medium; both or neither. Without them
-            magnesium fluoride over tantala (2.10), over alumina (1.63) for glass above 1.90.
-
-    Of the two solutions the thinner, which is the broader, is taken.
+    Magnesium fluoride over tantala (2.10), over alumina (1.63) for glass above 1.90; of the two solutions the thinner,
+    which is the broader. `n_before` and `n_after` are the media on the scene's and on the film's side.
 
     Raises:
         InputError: no two films of these indices bring the reflection of these media to zero.
     """
-    pairs = V_PAIRS if outer is None or inner is None else ((outer, inner),)
     low, high = sorted((n_before, n_after))
-    for pair in pairs:
+    for pair in V_PAIRS:
         solution = _v_phases(low, high, *pair)
         if solution is not None:
             layers = tuple(_film(n, phase, at_nm) for n, phase in zip(pair, solution, strict=True))
             return Coating(f"v-coat {at_nm:g}", _oriented(layers, n_before, n_after))
-    tried = " or ".join(f"{a:g} over {b:g}" for a, b in pairs)
-    raise InputError(
-        "v-coat", "media", f"({n_before:g} to {n_after:g})", f"media whose reflection films of {tried} can cancel"
-    )
+    tried = " or ".join(f"{a:g} over {b:g}" for a, b in V_PAIRS)
+    expected = f"media whose reflection films of {tried} can cancel"
+    raise InputError("v-coat", "media", f"({n_before:g} to {n_after:g})", expected)
 
 
-def broadband(
-    n_before: float,
-    n_after: float,
-    at_nm: float = BROADBAND_NM,
-    outer: float = MAGNESIUM_FLUORIDE,
-    middle: float = TANTALA,
-    inner: float | None = None,
-) -> Coating:
+def broadband(n_before: float, n_after: float, at_nm: float = BROADBAND_NM) -> Coating:
     """The classic triple layer, quarter, half and quarter wave from the rarer side (Cox, Hass and Thelen 1962).
 
-    `inner` None takes outer * sqrt(n_high / n_low), which leaves no reflection at `at_nm`; mixtures of oxides have such
+    The inner film's index, outer * sqrt(n_high / n_low), leaves no reflection at `at_nm`; mixtures of oxides have such
     indices (1.7 on crown glass).
     """
     low, high = sorted((n_before, n_after))
-    inner = outer * math.sqrt(high / low) if inner is None else inner
-    quarter = math.pi / 2
-    layers = (_film(outer, quarter, at_nm), _film(middle, 2 * quarter, at_nm), _film(inner, quarter, at_nm))
+    inner, quarter = MAGNESIUM_FLUORIDE * math.sqrt(high / low), math.pi / 2
+    films = ((MAGNESIUM_FLUORIDE, quarter), (TANTALA, 2 * quarter), (inner, quarter))
+    layers = tuple(_film(index, phase, at_nm) for index, phase in films)
     return Coating(f"broadband {at_nm:g}", _oriented(layers, n_before, n_after))
 
 
@@ -331,18 +281,23 @@ def design(name: str, n_before: float, n_after: float, file: str | Path = "coati
     Args:
         name: the design, and after a space its wavelength in nm where that is not 550 (broadband: 510).
         n_before, n_after: indices (n_d) on the scene's and on the film's side of the surface.
-        file, where: for error messages.
+        file, where: the place to name in an error.
 
     Raises:
-        InputError: an unknown name, a wavelength that is not a positive number, a design that the media do not allow.
+        InputError: an unknown name, a wavelength that is not positive, a design that the media do not allow.
     """
     kind, _, wavelength = name.partition(" ")
     if kind not in ("bare", "quarter-wave", "v-coat", "broadband") or (kind == "bare" and name != kind):
         raise InputError(file, where, name, KNOWN)
     if kind == "bare":
-        return bare()
+        return Coating(name, ())
     usual_nm = BROADBAND_NM if kind == "broadband" else DESIGN_NM
-    at_nm = _wavelength(name, wavelength, file, where) if name != kind else usual_nm
+    try:
+        at_nm = float(wavelength) if name != kind else usual_nm
+    except ValueError:
+        at_nm = math.nan
+    if not 0 < at_nm < math.inf:
+        raise InputError(file, where, name, KNOWN)
     if n_before == n_after:
         raise InputError(file, where, name, f"a surface between two different media (both are {n_before:g})")
     if kind == "quarter-wave":
@@ -353,16 +308,6 @@ def design(name: str, n_before: float, n_after: float, file: str | Path = "coati
         return Coating(name, v_coat(n_before, n_after, at_nm).layers)
     except InputError as error:
         raise InputError(file, where, name, f"another design: {error}") from None
-
-
-def _wavelength(name: str, text: str, file: str | Path, where: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise InputError(file, where, name, KNOWN)
-    return value
 
 
 def _film(index: float, phase: float, at_nm: float) -> tuple[float, float]:

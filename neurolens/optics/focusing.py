@@ -1,9 +1,8 @@
 """Focusing: groups that move inside a lens, the film plane of best focus, and breathing.
 
-Internal focusing: the groups move as the source's focus states say, between infinity and the nearest; film fixed. The
-source lists a few states: infinity, sometimes one between, and the nearest, for every zoom position. One parameter
-moves all gaps from state to state linearly (as a focus ring on straight cams would), and is solved for so that the
-paraxial image of the object lies on the film.
+Internal focusing: the source lists a few states of the groups, between infinity and the nearest, for every zoom
+position. One parameter moves all gaps from state to state linearly (as a focus ring on straight cams would), and is
+solved for so that the paraxial image of the object lies on the film, which is fixed.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
 
 from neurolens.base.errors import InputError
 from neurolens.optics import paraxial
@@ -26,15 +24,13 @@ from neurolens.optics.trace import trace
 
 
 def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) -> list[float]:
-    """Values at a place between rows of values: exactly the row at its own place, linear between two rows.
+    """Values at a place between rows of values: exactly the row at its own place, between two rows linear or cubic.
 
     Piecewise cubic with the derivatives of Fritsch and Butland (1984), "A method for constructing local monotone
-    piecewise cubic interpolants": between two rows a value stays between theirs, so that no gap can turn negative.
+    piecewise cubic interpolants": a value stays between those of its two rows, so that no gap can turn negative.
 
     Args:
         x: [R] ascending places. rows: [R][M] values. place: from x[0] to x[-1].
-
-    Returns [M] values.
     """
     if len(x) == 1:
         return list(rows[0])
@@ -179,13 +175,8 @@ def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = 
     if focus_m is None and object_mm is not None:
         return replace(lens, film_z_mm=paraxial.image_z_mm(lens, -object_mm))
     lens = at_infinity(lens)
-    path = focus_path(lens)
-    back_mm = paraxial.first_order(lens).back_focus_mm
+    path, place = _mover(lens)
     wanted = 0.0 if focus_m is None else 1 / (1000 * focus_m)
-
-    def place(s: float) -> Lens:
-        return _placed(lens, path, back_mm, s)
-
     furthest = len(path.steps) - 1
     nearest = _vergence(place(furthest))
     if not nearest > 0:
@@ -205,18 +196,20 @@ def _rounded_up(value: float) -> float:
 
 def nearest_focus_m(lens: Lens) -> float:
     """Nearest distance from object to film that internal focusing reaches."""
-    lens = at_infinity(lens)
-    path = focus_path(lens)
-    back_mm = paraxial.first_order(lens).back_focus_mm
-    return 1 / _vergence(_placed(lens, path, back_mm, len(path.steps) - 1)) / 1000
+    path, place = _mover(at_infinity(lens))
+    return 1 / _vergence(place(len(path.steps) - 1)) / 1000
 
 
-def _placed(lens: Lens, path: FocusPath, back_mm: float, s: float) -> Lens:
-    """The lens with its groups moved; the film stays fixed relative to the fixed groups."""
-    added = path.moved(s)
-    gaps = {k: lens.surfaces[k].thickness_mm + v for k, v in added.items() if k != path.film}
-    moved = lens.with_gaps(gaps)
-    return replace(moved, film_z_mm=moved.vertices_mm[path.film] + back_mm + added[path.film])
+def _mover(lens: Lens) -> tuple[FocusPath, Callable[[float], Lens]]:
+    """The path of a lens at infinity focus, and the lens with its groups moved along it, film fixed."""
+    path, back_mm = focus_path(lens), paraxial.first_order(lens).back_focus_mm
+
+    def place(s: float) -> Lens:
+        added = path.moved(s)
+        moved = lens.with_gaps({k: lens.surfaces[k].thickness_mm + v for k, v in added.items() if k != path.film})
+        return replace(moved, film_z_mm=moved.vertices_mm[path.film] + back_mm + added[path.film])
+
+    return path, place
 
 
 def _vergence(lens: Lens) -> float:
@@ -280,7 +273,8 @@ def axial_rays(lens: Lens, object_z_mm: float) -> Rays:
     radius = _WIDER / 2 * data.entrance_pupil_diameter_mm * ring[:, None]
     x, y = (radius * torch.cos(spoke)).reshape(-1), (radius * torch.sin(spoke)).reshape(-1)
     # Started well in front of every lens, so that a front surface bulging towards the scene is still ahead.
-    start = -max(10.0, lens.surfaces[0].diameter_mm if math.isfinite(lens.surfaces[0].diameter_mm) else 10.0)
+    front_mm = lens.surfaces[0].diameter_mm
+    start = -max(10.0, front_mm if math.isfinite(front_mm) else 10.0)
     if math.isinf(object_z_mm):
         zero = torch.zeros_like(x)
         return Rays(x, y, zero + start, zero, zero, zero + 1)
@@ -303,15 +297,11 @@ def _least_spot_z_mm(lens: Lens, object_z_mm: float, weights: Sequence[tuple[flo
         passed = out.status == 0
         r = Rays(*(c[passed] for c in out.rays))
         tx, ty = r.dx / r.dz, r.dy / r.dz
-        along += weight * _sum((r.x - r.z * tx) * tx + (r.y - r.z * ty) * ty)
-        across += weight * _sum(tx * tx + ty * ty)
+        along += weight * float(((r.x - r.z * tx) * tx + (r.y - r.z * ty) * ty).sum())
+        across += weight * float((tx * tx + ty * ty).sum())
     if not across > 0:
         raise InputError(lens.path, "focus", "best", "a lens that axial light passes and bends")
     return -along / across
-
-
-def _sum(values: Tensor) -> float:
-    return float(values.sum())
 
 
 @dataclass(frozen=True)

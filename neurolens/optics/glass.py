@@ -14,11 +14,6 @@ from neurolens.optics import catalogue
 from neurolens.optics.catalogue import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
 from neurolens.optics.prescription import Surface
 
-__all__ = [
-    *("LINE_C_NM", "LINE_D_NM", "LINE_F_NM", "absorption_of", "cauchy_coefficients", "check_against_table"),
-    *("glass_of", "index_at", "index_of", "inverse_square_um", "table_notes"),
-]
-
 # How far a stated n_d or V_d may be from the catalogue's: rounding to three decimals and one, and other melts.
 TOLERANCE_N_D = 5e-4
 TOLERANCE_V_D = 0.5
@@ -31,33 +26,23 @@ _FOUND: dict[str, Glass] = {}
 
 
 def inverse_square_um(wavelength_nm: Any) -> Any:
-    """1 / lambda^2 in 1/um^2 for a wavelength in nm (number or tensor of any shape)."""
+    """1 / lambda^2 in 1/um^2 for a wavelength in nm (number or tensor)."""
     return (1000.0 / wavelength_nm) ** 2
 
 
-def cauchy_coefficients(n_d: Any, V_d: float | None) -> tuple[Any, Any]:
-    """A and B (um^2) of n = A + B / lambda^2, so that n(d) = n_d and n_F - n_C = (n_d - 1) / V_d.
+def index_at(n_d: Any, V_d: float | None, wavelength_nm: Any) -> Any:
+    """Cauchy's A + B / lambda^2 at a wavelength in nm (number, or tensor [N]); the constant n_d where V_d is unknown.
 
-    V_d None (unknown) gives the constant index n_d.
+    A and B (um^2) are such that n(d) = n_d and n_F - n_C = (n_d - 1) / V_d.
     """
     if V_d is None:
-        return n_d, 0.0
+        return n_d
     b = (n_d - 1.0) / V_d / (inverse_square_um(LINE_F_NM) - inverse_square_um(LINE_C_NM))
-    return n_d - b * inverse_square_um(LINE_D_NM), b
-
-
-def index_at(n_d: Any, V_d: float | None, wavelength_nm: Any) -> Any:
-    """Refractive index at a wavelength in nm (number, or tensor [N]); the constant n_d where V_d is unknown."""
-    a, b = cauchy_coefficients(n_d, V_d)
-    return a if V_d is None else a + b * inverse_square_um(wavelength_nm)
+    return n_d - b * inverse_square_um(LINE_D_NM) + b * inverse_square_um(wavelength_nm)
 
 
 def glass_of(name: str) -> Glass:
-    """`catalogue.find`, cached. Before using a glass under torch.compile, look it up once.
-
-    Raises:
-        InputError: a glass that the catalogue does not have.
-    """
+    """`catalogue.find`, cached. Before using a glass under torch.compile, look it up once."""
     found = _FOUND.get(name)
     if found is None:
         found = _FOUND[name] = catalogue.find(name)
@@ -74,9 +59,8 @@ def index_of(surface: Surface, wavelength_nm: Any) -> Any:
     """
     if surface.glass is not None:
         if getattr(surface.n_d, "requires_grad", False):
-            raise InputError(
-                f"glass {surface.glass}", "n_d", "(a tensor)", "no catalogue glass beside an index to be optimised"
-            )
+            expected = "no catalogue glass beside an index to be optimised"
+            raise InputError(f"glass {surface.glass}", "n_d", "(a tensor)", expected)
         return glass_of(surface.glass).index(wavelength_nm)
     return index_at(surface.n_d, surface.V_d, wavelength_nm)
 
@@ -84,10 +68,7 @@ def index_of(surface: Surface, wavelength_nm: Any) -> Any:
 def absorption_of(surface: Surface, wavelength_nm: Any) -> Any:
     """Napierian absorption in 1/mm of the medium after a surface: the glass's plus the surface's own; None without any.
 
-    Beer-Lambert: t mm of it transmit exp(-absorption t).
-
-    Raises:
-        InputError: a glass that the catalogue does not have.
+    Beer-Lambert: t mm transmit exp(-absorption t). An InputError for a glass that the catalogue does not have.
     """
     own = surface.absorption_per_mm or None
     glass = None if surface.glass is None else glass_of(surface.glass).absorption_per_mm(wavelength_nm)
@@ -117,11 +98,7 @@ def check_against_table(surface: Surface, file: str | Path, where: str) -> None:
 
 
 def table_notes(surface: Surface) -> list[str]:
-    """What `check_against_table` warns of, as sentences without the place; empty if all is well.
-
-    Raises:
-        InputError: a glass that the catalogue does not have.
-    """
+    """What `check_against_table` warns of, as sentences without the place; empty if all is well."""
     if surface.glass is None:
         return []
     glass, notes = glass_of(surface.glass), []

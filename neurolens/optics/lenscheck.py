@@ -1,7 +1,7 @@
 """Checks of a prescription against its source: every stated figure is recomputed, with the reason of any doubt.
 
-Tables that circulate carry dropped aspheres, swapped glasses and transposed digits. Most of these show: the focal
-length or the back focus moves, the axis blurs, elements cut each other, or no light reaches the edge of the field.
+Dropped aspheres, swapped glasses, transposed digits mostly show: the focal length or the back focus moves, the axis
+blurs, elements cut each other, or no light reaches the edge of the field.
 """
 
 from __future__ import annotations
@@ -79,11 +79,8 @@ def check_lens(lens: Lens) -> list[Check]:
 def doubts(checks: list[Check]) -> list[str]:
     """The doubts as sentences without a full stop, prefixed by the state; those of the table are not repeated."""
     table = {c.doubt for c in checks if not c.state}
-    return [
-        f"{c.state}: {c.doubt}" if c.state else c.doubt
-        for c in checks
-        if c.doubt and not (c.state and c.doubt in table)
-    ]
+    found = [c for c in checks if c.doubt and not (c.state and c.doubt in table)]
+    return [f"{c.state}: {c.doubt}" if c.state else c.doubt for c in found]
 
 
 def verdict(checks: list[Check]) -> str:
@@ -98,7 +95,7 @@ def in_state(lens: Lens, c: Configuration) -> Lens:
         lens.with_gaps(dict(c.thickness_mm)),
         stated_efl_mm=c.efl_mm,
         stated_efl_x_mm=None,  # a state names one focal length
-        half_field_deg=c.half_field_deg or (None if lens.image_radius_mm else lens.half_field_deg),
+        half_field_deg=lens.half_field_in(c),
         # Where a state has no f-number its stop is that of the table, and any f-number is as good as another.
         f_number=c.f_number or (lens.f_number if same else math.nan),
     )
@@ -129,10 +126,8 @@ def _back_focus(lens: Lens, computed: float, efl: float) -> Check:
     tabled, last = float(lens.surfaces[-1].thickness_mm), float(lens.vertices_mm[-2])
     doubt = ""
     if efl > 0 and abs(computed - tabled) > FOCUS_TOLERANCE * efl:
-        doubt = (
-            f"the table's last thickness puts the film at z = {last + tabled:.2f} mm, "
-            f"its focus is at {last + computed:.2f} mm"
-        )
+        film = f"the table's last thickness puts the film at z = {last + tabled:.2f} mm"
+        doubt = f"{film}, its focus is at {last + computed:.2f} mm"
     return Check("back focus, mm", computed, tabled, doubt)
 
 
@@ -203,10 +198,8 @@ def _through(lens: Lens, field: Tensor, heights: Tensor) -> tuple[Tensor, Tensor
 def _blur(lens: Lens, data: FirstOrder) -> Check:
     """RMS radius of the axial spot in its best focus, all rims open as tabled, over the focal length."""
     blur = axial_blur_mm(lens) / data.efl_mm
-    before = [1.0, *(float(s.n_d) for s in lens.surfaces)]
-    refractions = sum(a != b for a, b in zip(before, before[1:], strict=False))
     doubt = ""
-    if blur > BLUR_LIMIT and refractions > SIMPLE:
+    if blur > BLUR_LIMIT and lens.refractions > SIMPLE:
         doubt = f"the image on the axis is blurred to {100 * blur:.2g}% of the focal length"
     return Check("axial blur, RMS over focal length", blur, None, doubt)
 

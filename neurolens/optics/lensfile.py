@@ -120,6 +120,22 @@ class Table:
             raise self.error(key, value, expected)
         return found
 
+    def optional(self, key: str, *, above: float | None = 0.0) -> float | None:
+        """The number, above 0 unless said otherwise; None where it is absent or null."""
+        return None if self.data.get(key) is None else self.number(key, above=above)
+
+    def gaps(self, key: str, n_surfaces: int, expected: str) -> tuple[tuple[int, float], ...]:
+        """Thicknesses in mm by surface number."""
+        given = self.data.get(key, "(missing)")
+        if not isinstance(given, Mapping):
+            raise self.error(key, given, expected)
+        found = []
+        for place in given:
+            if place not in map(str, range(n_surfaces)):
+                raise self.error(key, place, f"a surface number from 0 to {n_surfaces - 1}")
+            found.append((int(place), Table(given, self.file, f"{self.where}{key}, surface ").number(place, unit="mm")))
+        return tuple(found)
+
     def text(self, key: str, *, required: bool = True) -> str:
         """A text; an empty one where a text that is not required is absent."""
         if key not in self.data and not required:
@@ -165,16 +181,12 @@ def read_lens(path: str | Path) -> Lens:
     if data.get("rims", "(missing)") not in RIMS:
         expected = 'where the diameters come from: "source", "estimated" or "derived"'
         raise table.error("rims", data.get("rims", "(missing)"), expected)
-
-    def optional(key: str) -> float | None:
-        return table.number(key, above=0) if key in table else None
-
     lens = Lens(
         name=table.text("name"),
         source=table.text("source"),
         surfaces=surfaces,
         f_number=table.number("f_number", above=0),
-        image_radius_mm=optional("image_radius_mm"),
+        image_radius_mm=table.optional("image_radius_mm"),
         half_field_deg=table.half_field(),
         designer=table.text("designer", required=False),
         notes=table.text("notes", required=False),
@@ -182,8 +194,8 @@ def read_lens(path: str | Path) -> Lens:
         configurations=_configurations(table, len(surfaces)),
         path=file,
         aperture=_aperture(table),
-        stated_efl_mm=optional("efl_mm"),
-        stated_efl_x_mm=optional("efl_x_mm"),
+        stated_efl_mm=table.optional("efl_mm"),
+        stated_efl_x_mm=table.optional("efl_x_mm"),
     )
     check_clearance(surfaces, file)
     for c in lens.configurations:
@@ -339,19 +351,10 @@ def _configurations(lens: Table, n_surfaces: int) -> tuple[Configuration, ...]:
         if name in [c.name for c in result]:
             raise table.error("name", name, "a name that no other configuration has")
         table = replace(table, where=f'configuration "{name}", ')
-        moved = given.get("thickness_mm", "(missing)")
-        if not isinstance(moved, Mapping):
-            raise table.error("thickness_mm", moved, "a table such as { 5 = 26.15 }, by surface number")
-        thickness = []
-        for key in moved:
-            if not (key.isascii() and key.isdecimal() and str(int(key)) == key and int(key) < n_surfaces):
-                raise table.error("thickness_mm", key, f"a surface number from 0 to {n_surfaces - 1}")
-            gaps = Table(moved, lens.file, f"{table.where}thickness_mm, surface ")
-            thickness.append((int(key), gaps.number(key, unit="mm")))
+        thickness = table.gaps("thickness_mm", n_surfaces, "a table such as { 5 = 26.15 }, by surface number")
         above_0 = ("efl_mm", "f_number", "stop_diameter_mm", "object_distance_mm")
-        values = {key: table.number(key, above=0) for key in above_0 if key in table}
-        if not values.keys() & {"efl_mm", "object_distance_mm"}:
+        values = {key: table.optional(key) for key in above_0}
+        if values["efl_mm"] is None and values["object_distance_mm"] is None:
             raise table.error("efl_mm", "(missing)", "the focal length of a zoom state")
-        state = {"efl_mm": None, **values}
-        result.append(Configuration(name, thickness_mm=tuple(thickness), half_field_deg=table.half_field(), **state))
+        result.append(Configuration(name, thickness_mm=thickness, half_field_deg=table.half_field(), **values))
     return tuple(result)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from neurolens.base.errors import InputError
@@ -59,11 +60,7 @@ def format_lens(lens: Lens) -> str:
 
 
 def _aperture(lens: Lens) -> str:
-    """The table of the stop's blades.
-
-    Raises:
-        InputError: a stop with a mask, which a lens file has no form for.
-    """
+    """The table of the stop's blades; a mask is refused, for a lens file has no form for it."""
     if lens.aperture is None:
         return ""
     if lens.aperture.blades is None:
@@ -116,14 +113,10 @@ def _wrapped(text: str) -> str:
     """A text in short lines. TOML drops a backslash at the end of a line and the blanks after it."""
     if len(text) <= WRAP:
         return format_value(text)
-    lines, line = [], ""
-    for position, letter in enumerate(text):
-        line += letter
-        following = text[position + 1 : position + 2]
-        end_of_word = letter == " " and following.strip() != ""
-        next_word = text[position + 1 :].split(" ", 1)[0] if end_of_word else ""
-        if end_of_word and len(line) + len(next_word) > WRAP:
-            lines.append(format_value(line)[1:-1])
-            line = ""
-    lines.append(format_value(line)[1:-1])
-    return '"""\\\n' + "\\\n".join(lines) + '"""'
+    lines: list[str] = []
+    for word in re.split(r"(?<= )(?=\S)", text):
+        if lines and len(lines[-1]) + len(word.split(" ", 1)[0]) <= WRAP:
+            lines[-1] += word
+        else:
+            lines.append(word)
+    return '"""\\\n' + "\\\n".join(format_value(line)[1:-1] for line in lines) + '"""'

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
 from neurolens.base.errors import InputError
 from neurolens.optics import film_plane
@@ -41,51 +41,62 @@ class FirstOrder:
     f_number: float
 
 
-def _march(
-    lens: Lens, indices: list[Any], y: float, u: float, start: int, stop: int, meridian: Meridian
-) -> tuple[Any, Any]:
-    """Follow a paraxial ray (height y mm, angle u rad in the medium before `start`) through surfaces start..stop-1.
+@dataclass(frozen=True)
+class System:
+    """A lens to first order: curvatures [S] in 1/mm, gaps [S - 1] between surfaces, indices [S + 1] of the media."""
 
-    Returns the height at surface stop-1 and the angle after it. y-nu trace (Smith, Modern Optical Engineering, ch. 2).
-    """
-    for k in range(start, stop):
-        if k > start:
-            y = y + u * lens.surfaces[k - 1].thickness_mm
-        u = (
-            indices[k] * u - y * lens.surfaces[k].vertex_curvature(meridian) * (indices[k + 1] - indices[k])
-        ) / indices[k + 1]
-    return y, u
+    curvature: list[Any]
+    gap_mm: list[Any]
+    index: list[Any]
 
+    def turned(self) -> System:
+        """The system as light meets it that comes from the other side."""
+        return System([-c for c in reversed(self.curvature)], self.gap_mm[::-1], self.index[::-1])
 
-def _reversed(lens: Lens) -> Lens:
-    rows = lens.surfaces
-    turned = []
-    for k in range(len(rows) - 1, -1, -1):
-        glass_before = rows[k - 1] if k else None
-        turned.append(
-            replace(
-                rows[k],
-                radius_mm=-rows[k].radius_mm,
-                asphere=tuple((p, -a) for p, a in rows[k].asphere),
-                thickness_mm=glass_before.thickness_mm if glass_before else 0.0,
-                n_d=glass_before.n_d if glass_before else 1.0,
-                V_d=glass_before.V_d if glass_before else None,
-                glass=glass_before.glass if glass_before else None,
-            )
-        )
-    return Lens(lens.name, lens.source, tuple(turned), lens.f_number, path=lens.path)
+    def behind(self, surface: int) -> System:
+        """The surfaces behind one."""
+        return System(self.curvature[surface + 1 :], self.gap_mm[surface + 1 :], self.index[surface + 1 :])
+
+    def march(self, y: Any, u: Any) -> PathOfRay:
+        """The paraxial ray of height y (mm) at the first surface and slope u before it.
+
+        Smith, Modern Optical Engineering, ch. 2.
+        """
+        path = PathOfRay([], [], [])
+        n = self.index
+        for k, c in enumerate(self.curvature):
+            y = y + u * self.gap_mm[k - 1] if k else y
+            after = (n[k] * u - y * c * (n[k + 1] - n[k])) / n[k + 1]
+            for values, value in zip(path, (y, u, after), strict=True):
+                values.append(value)
+            u = after
+        return path
 
 
-def _pupil(lens: Lens, indices: list[Any], meridian: Meridian) -> tuple[Any, Any]:
+class PathOfRay(NamedTuple):
+    """A paraxial ray: height at every surface (mm), slope before and after it."""
+
+    y: list[Any]
+    before: list[Any]
+    after: list[Any]
+
+
+def system_of(lens: Lens, wavelength_nm: float = LINE_D_NM, meridian: Meridian = "y") -> System:
+    """The lens in one meridian at one wavelength."""
+    curvature = [s.vertex_curvature(meridian) for s in lens.surfaces]
+    index = [1.0, *(index_of(s, wavelength_nm) for s in lens.surfaces)]
+    return System(curvature, [s.thickness_mm for s in lens.surfaces[:-1]], index)
+
+
+def _pupil(system: System, stop: int) -> tuple[Any, Any]:
     """Distance of the stop's image behind the last vertex, and its magnification, by the surfaces after the stop."""
-    k, n = lens.stop_index, len(lens.surfaces)
-    if k == n - 1:
+    behind = system.behind(stop)
+    if not behind.curvature:
         return 0.0, 1.0
-    gap = lens.surfaces[k].thickness_mm
-    y, u = _march(lens, indices, gap * 1.0, 1.0, k + 1, n, meridian)  # from the axial point of the stop
-    y1, u1 = _march(lens, indices, 1.0, 0.0, k + 1, n, meridian)  # parallel, at height 1 in the stop
-    distance = -y / u if u != 0 else math.inf
-    return distance, (y1 + u1 * distance if math.isfinite(distance) else math.inf)
+    slanted = behind.march(system.gap_mm[stop] * 1.0, 1.0)  # from the axial point of the stop
+    level = behind.march(1.0, 0.0)  # parallel, at height 1 in the stop
+    distance = -slanted.y[-1] / slanted.after[-1] if slanted.after[-1] != 0 else math.inf
+    return distance, (level.y[-1] + level.after[-1] * distance if math.isfinite(distance) else math.inf)
 
 
 def first_order(lens: Lens, wavelength_nm: float = LINE_D_NM, meridian: Meridian = "y") -> FirstOrder:
@@ -97,21 +108,19 @@ def first_order(lens: Lens, wavelength_nm: float = LINE_D_NM, meridian: Meridian
     Raises:
         InputError: an afocal lens (no finite focal length).
     """
-    indices = [1.0, *(index_of(s, wavelength_nm) for s in lens.surfaces)]
-    turned = _reversed(lens)
-    back_indices = [1.0, *(index_of(s, wavelength_nm) for s in turned.surfaces)]
-    n = len(lens.surfaces)
-    last_z = lens.vertices_mm[n - 1]
-    y, u = _march(lens, indices, 1.0, 0.0, 0, n, meridian)
+    system, last_z = system_of(lens, wavelength_nm, meridian), lens.vertices_mm[-2]
+    turned = system.turned()
+    ahead = system.march(1.0, 0.0)
+    y, u = ahead.y[-1], ahead.after[-1]
     if u == 0:
         if not is_pinhole(lens):
             raise InputError(lens.path, "surfaces", "(an afocal system)", "a lens with a finite focal length")
-        return _pinhole(lens, indices)
-    y_back, u_back = _march(turned, back_indices, 1.0, 0.0, 0, n, meridian)
+        return _pinhole(lens, system.index)
+    back = turned.march(1.0, 0.0)
     efl, back_focus = -1.0 / u, -y / u
-    rear_focal, front_focal = last_z + back_focus, y_back / u_back
-    exit_distance, exit_magnification = _pupil(lens, indices, meridian)
-    entrance_distance, entrance_magnification = _pupil(turned, back_indices, meridian)
+    rear_focal, front_focal = last_z + back_focus, back.y[-1] / back.after[-1]
+    exit_distance, exit_magnification = _pupil(system, lens.stop_index)
+    entrance_distance, entrance_magnification = _pupil(turned, len(lens.surfaces) - 1 - lens.stop_index)
     opening = 2 * lens.stop_radius_mm
     entrance_diameter = opening * abs(entrance_magnification)
     return FirstOrder(

@@ -53,13 +53,7 @@ def media(lens: Lens, wavelength_nm: Tensor | float) -> list[Medium]:
 
 def absorption_per_mm(lens: Lens, wavelength_nm: Tensor | float) -> list[Any]:
     """Napierian absorption of the media from the scene to the film, in 1/mm; None where there is none."""
-    return [None, *(_absorption(s, wavelength_nm) for s in lens.surfaces)]
-
-
-def _absorption(s: Surface, wavelength_nm: Tensor | float) -> Any:
-    if s.glass is None and not s.absorption_per_mm:
-        return None
-    return glass.absorption_of(s, wavelength_nm)
+    return [None, *(glass.absorption_of(s, wavelength_nm) for s in lens.surfaces)]
 
 
 def _medium_key(s: Surface | None) -> Any:
@@ -76,25 +70,18 @@ DEEP = 0.25
 
 
 def check_rays(rays: Rays, wavelength_nm: Tensor | float) -> None:
-    """Refuse rays and wavelengths that cannot be traced.
-
-    Raises:
-        InputError: components of unequal shapes or dtypes or of another dtype, a wavelength of another shape, or a
-            number that is not positive.
-    """
+    """Raise InputError for components of unequal or wrong shape or dtype, and such wavelengths, or one not positive."""
     shape, dtype = rays.x.shape, rays.x.dtype
     if dtype not in (torch.float32, torch.float64):
         raise InputError("trace", "rays.x", f"({dtype})", "torch.float32 or torch.float64")
     for name, c in zip(Rays._fields, rays, strict=True):
         if c.shape != shape or c.dtype != dtype or c.ndim != 1:
-            raise InputError(
-                "trace", f"rays.{name}", f"({tuple(c.shape)}, {c.dtype})", f"[N] like x: {tuple(shape)}, {dtype}"
-            )
+            found = f"({tuple(c.shape)}, {c.dtype})"
+            raise InputError("trace", f"rays.{name}", found, f"[N] like x: {tuple(shape)}, {dtype}")
     if isinstance(wavelength_nm, Tensor):
         if wavelength_nm.ndim and wavelength_nm.shape != shape:
-            raise InputError(
-                "trace", "wavelength_nm", f"({tuple(wavelength_nm.shape)})", f"a number or a tensor {tuple(shape)}"
-            )
+            found = f"({tuple(wavelength_nm.shape)})"
+            raise InputError("trace", "wavelength_nm", found, f"a number or a tensor {tuple(shape)}")
     elif not 0 < wavelength_nm < math.inf:
         raise InputError("trace", "wavelength_nm", wavelength_nm, "a positive number")
 

@@ -168,6 +168,12 @@ class Lens:
         return any(s.V_d is not None or s.glass is not None for s in self.surfaces)
 
     @property
+    def refractions(self) -> int:
+        """Surfaces at which the medium changes: the stop and other surfaces in air do not count."""
+        before = [1.0, *(float(s.n_d) for s in self.surfaces)]
+        return sum(a != b for a, b in zip(before, before[1:], strict=False))
+
+    @property
     def lens_id(self) -> str:
         """Stem of the lens file: the name that models carry."""
         return Path(self.path).stem
@@ -225,41 +231,36 @@ class Lens:
         if not 0 < factor < math.inf:
             raise InputError(self.path, "factor", factor, "a positive number")
 
-        def scale(value: Any) -> Any:
-            return None if value is None else value * factor
+        def lengths(table: Any, *names: str) -> dict[str, Any]:
+            return {name: value * factor for name in names if (value := getattr(table, name)) is not None}
 
         def gaps(pairs: tuple[tuple[int, Any], ...]) -> tuple[tuple[int, Any], ...]:
             return tuple((k, t * factor) for k, t in pairs)
 
-        def surface(s: Surface) -> Surface:
-            return replace(
+        surfaces = (
+            replace(
                 s,
-                radius_mm=scale(s.radius_mm),
-                thickness_mm=scale(s.thickness_mm),
-                diameter_mm=s.diameter_mm * factor,
                 asphere=tuple((p, a * factor ** (1 - p)) for p, a in s.asphere),
                 absorption_per_mm=s.absorption_per_mm / factor,
+                **lengths(s, "radius_mm", "thickness_mm", "diameter_mm"),
             )
-
-        def configuration(c: Configuration) -> Configuration:
-            return replace(
-                c,
-                efl_mm=scale(c.efl_mm),
-                thickness_mm=gaps(c.thickness_mm),
-                stop_diameter_mm=scale(c.stop_diameter_mm),
-                object_distance_mm=scale(c.object_distance_mm),
-            )
-
-        return replace(
-            self,
-            surfaces=tuple(surface(s) for s in self.surfaces),
-            configurations=tuple(configuration(c) for c in self.configurations),
-            infinity_mm=gaps(self.infinity_mm),
-            image_radius_mm=scale(self.image_radius_mm),
-            film_z_mm=scale(self.film_z_mm),
-            stated_efl_mm=scale(self.stated_efl_mm),
-            stated_efl_x_mm=scale(self.stated_efl_x_mm),
+            for s in self.surfaces
         )
+        states = (
+            replace(
+                c,
+                thickness_mm=gaps(c.thickness_mm),
+                **lengths(c, "efl_mm", "stop_diameter_mm", "object_distance_mm"),
+            )
+            for c in self.configurations
+        )
+        stated = lengths(self, "image_radius_mm", "film_z_mm", "stated_efl_mm", "stated_efl_x_mm")
+        infinity = gaps(self.infinity_mm)
+        return replace(self, surfaces=tuple(surfaces), configurations=tuple(states), infinity_mm=infinity, **stated)
+
+    def half_field_in(self, state: Configuration) -> float | None:
+        """Half field in a state: its own, else that of the image circle where there is one (None), else the lens's."""
+        return state.half_field_deg or (self.half_field_deg if self.image_radius_mm is None else None)
 
     def with_stop_radius(self, radius_mm: float) -> Lens:
         """The same lens with another opening of the stop."""
@@ -271,25 +272,6 @@ class Lens:
         """The same lens with other thicknesses, by surface index."""
         rows = (replace(s, thickness_mm=gaps_mm.get(k, s.thickness_mm)) for k, s in enumerate(self.surfaces))
         return replace(self, surfaces=tuple(rows))
-
-    @staticmethod
-    def pinhole(film_distance_mm: float, radius_mm: float, *, image_radius_mm: float | None = None) -> Lens:
-        """A lens without glass; see `neurolens.optics.accessories.pinhole`."""
-        from neurolens.optics import accessories
-
-        return accessories.pinhole(film_distance_mm, radius_mm, image_radius_mm=image_radius_mm)
-
-    def with_filter(self, thickness_mm: float = 2.0, **options: Any) -> Lens:
-        """The same lens behind a plane filter; see `neurolens.optics.accessories.with_filter`."""
-        from neurolens.optics import accessories
-
-        return accessories.with_filter(self, thickness_mm, **options)
-
-    def with_hood(self, length_mm: float, diameter_mm: float) -> Lens:
-        """The same lens in a round hood; see `neurolens.optics.accessories.with_hood`."""
-        from neurolens.optics import accessories
-
-        return accessories.with_hood(self, length_mm, diameter_mm)
 
     def with_aperture(self, aperture: Aperture | None) -> Lens:
         """The same lens with blades or a mask in its stop; None is a round stop."""

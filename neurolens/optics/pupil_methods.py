@@ -1,8 +1,7 @@
-"""Pupils of the literature, to sample per lens from its film: one disc, one search, a disc per pixel, bounds by radius.
+"""Pupils of the literature, to sample per lens from its film: shapes on a plane by film radius, `RadialPupil`.
 
-All are shapes on a plane by film radius: `RadialPupil`. They differ in how they are found, in how many of the rays sent
-through them pass, and in how much light they lose. The outlines that the cameras use are in
-`neurolens.cameras.pupil_outline`.
+They differ in how they are found, how many of their rays pass, and how much light they lose. The outlines that the
+cameras use are in `neurolens.cameras.pupil_outline`.
 """
 
 from __future__ import annotations
@@ -119,9 +118,9 @@ def hull_disc(lens: Lens, film_radius_mm: float, *, rows: int = 32, points: int 
 def wu_exit_pupil(lens: Lens, film_radius_mm: float, *, film_points: int = 24, planes: int = 241) -> RadialPupil:
     """One exit pupil, found by a search in two steps (after Wu et al. 2010, 2011).
 
-    The first follows the tangential fan of film points to its two last passing rays; the second goes perpendicular to
-    it from the middle of the fan. The pupil is the axial disc through which all those rays run, on the plane where it
-    is smallest as seen from the film.
+    The first follows the tangential fan of film points to its two last passing rays; the second goes across it from
+    the middle of the fan. The pupil is the axial disc that holds all those rays where it is smallest as seen from
+    the film.
     """
     film_z = lens.film_z_mm
     rear = float(lens.vertices_mm[len(lens.surfaces) - 1])
@@ -195,8 +194,8 @@ def radial_bounds(
 ) -> RadialPupil:
     """Bounds of the passing rays in each interval of the film radius (Pharr, Jakob and Humphreys 2016, 6.4.5).
 
-    Random film points of the interval, random points of the plane; the box about those that pass, widened by a step of
-    that many samples; "ellipse" takes the ellipse inside the box, which loses what lies in the corners.
+    The box about random points of the plane that pass, widened by a step of so many samples; "ellipse" takes the
+    ellipse inside the box, which loses what lies in the corners.
     """
     plane = pupil_plane_z_mm(lens)
     passes = passes_through(lens, plane)

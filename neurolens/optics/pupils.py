@@ -143,11 +143,11 @@ def search(
     points: int,
     film_mm: tuple[float, float] | None,
 ) -> list[Box | None]:
-    """Boxes of the passing points of grids over `boxes` (upper halves: the lens is symmetric), a step wider; None for
-    a film point whose grid no ray passes.
+    """Boxes of the passing points of grids over `boxes` (upper halves: the lens is symmetric), a step wider; None for a
+    film point whose grid no ray passes.
 
-    A coarse grid inside each is traced first. Where enough of it passes, only the points that may lie beyond its
-    extent by less than one of its steps follow; elsewhere all points near those found, or all.
+    A coarse grid is traced first. Where enough of it passes, only the points that may lie beyond its extent by less
+    than one of its steps follow; elsewhere all points near those found, or all.
 
     Args:
         places, boxes: film points and where to look from each.
@@ -239,9 +239,8 @@ class PupilBounds:
     @property
     def lit_radius_mm(self) -> float:
         """The first film radius from which on every row is empty; that of the film where its edge is lit."""
-        last = max(
-            (k for k, (low, high) in enumerate(zip(self.low_mm, self.high_mm, strict=True)) if low <= high), default=0
-        )
+        rows = enumerate(zip(self.low_mm, self.high_mm, strict=True))
+        last = max((k for k, (low, high) in rows if low <= high), default=0)
         return self.film_radius_mm * min(last + 1, len(self.low_mm) - 1) / (len(self.low_mm) - 1)
 
 
@@ -288,9 +287,8 @@ def pupil_bounds(
         by_row[i] += [box] if box else []
     boxes = [union(row) if row else None for row in by_row]
     if not any(boxes):
-        raise InputError(
-            lens.path, "surfaces", "(no ray passes the lens)", f"rays from a film of radius {film_radius_mm:.4g} mm"
-        )
+        expected = f"rays from a film of radius {film_radius_mm:.4g} mm"
+        raise InputError(lens.path, "surfaces", "(no ray passes the lens)", expected)
     merged = [union([b for b in boxes[max(i - 1, 0) : i + 2] if b]) for i in range(rows)]
     return PupilBounds(
         plane,
@@ -303,9 +301,8 @@ def pupil_bounds(
 
 
 def _starts(lens: Lens, place: Place, plane: float, near: float, exit_z: float) -> list[Box]:
-    """Where on the pupil plane light of a film point may pass: what the rear rim bounds, and near the exit pupil.
-
-    `near` is how far from the exit pupil's middle light is looked for again where the rear rim bounds it badly, mm.
+    """Where on the pupil plane light of a film point may pass: what the rear rim bounds, and within `near` mm of the
+    exit pupil's middle where the rear rim bounds it badly.
     """
     rear = lens.surfaces[-1]
     rear_z = float(lens.vertices_mm[len(lens.surfaces) - 1])

@@ -119,32 +119,12 @@ def white_card(light: FilmLight) -> dict[str, Array]:
     return {"flat": (area > 0).astype(float), "cos4": cos4, "aperture": area, "both": cos4 * area}
 
 
-def disc_irradiance(radius_mm: float, distance_mm: float, height_mm: Array) -> Array:
-    """Irradiance over radiance (sr) at heights [F] from the axis of a uniform disc parallel to the film.
-
-    The exact integral, for any size of the disc: pi sin^2(theta') on the axis (Foote 1915).
-    """
-    a2, z2, h2 = radius_mm**2, distance_mm**2, np.asarray(height_mm, np.float64) ** 2
-    total = z2 + h2 + a2
-    root = np.sqrt(total * total - 4 * a2 * h2)
-    x = (total - 2 * a2) / root
-    # 1 - x loses digits for a small disc, x near 1: there it is (1 - x^2) / (1 + x).
-    small = 4 * a2 * z2 / (root * root) / (1 + np.maximum(x, 0))
-    return math.pi / 2 * np.where(x > 0, small, 1 - x)
-
-
 def _check(lens: Lens, radius: Array) -> None:
     if lens.film_z_mm is None:
         raise InputError(lens.path, "film_z_mm", None, "a focused lens: lens.at(focus_m=...)")
     if lens.anamorphic or lens.aperture is not None:
         raise InputError(lens.path, "surfaces", "(cylinders or blades)", "a lens that is round about its axis")
-    if (
-        radius.ndim != 1
-        or not radius.size
-        or radius[0] != 0
-        or not (radius >= 0).all()
-        or not np.isfinite(radius).all()
-    ):
+    if radius.ndim != 1 or not radius.size or radius[0] != 0 or not ((radius >= 0) & np.isfinite(radius)).all():
         raise InputError("film_light", "film_radius_mm", radius.tolist()[:4], "radii in mm of at least 0, the first 0")
 
 

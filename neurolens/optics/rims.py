@@ -122,16 +122,14 @@ def _states(lens: Lens) -> Iterator[Lens]:
 
 def _moved(lens: Lens, c: Configuration) -> Lens:
     """The table with the thicknesses, field and f-number of a state."""
-    # A state without its own field has that of the image circle, if known.
-    field = c.half_field_deg or (None if lens.image_radius_mm else lens.half_field_deg)
     moved = lens.with_gaps(dict(c.thickness_mm))
-    return replace(moved, half_field_deg=field, f_number=c.f_number or lens.f_number)
+    return replace(moved, half_field_deg=lens.half_field_in(c), f_number=c.f_number or lens.f_number)
 
 
 def _stop_of(lens: Lens, c: Configuration) -> float:
     """Diameter of the stop in a state; a focus state has that of the zoom state with the same tabled stop.
 
-    A source that gives a state neither f-number nor stop means the stop of the table.
+    A state without f-number and stop has that of the table.
     """
     if c.object_distance_mm is not None:
         same = [z for z in lens.configurations if z.object_distance_mm is None]

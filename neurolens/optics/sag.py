@@ -126,9 +126,8 @@ def check_clearance(surfaces: Sequence[Surface], file: str, state: str = "") -> 
     """Raise for a rim larger than its radius of curvature and for neighbours that overlap inside their rims.
 
     The gap between two spheres is monotone from the axis outwards, so that axis and the smaller of the two rims
-    decide; other shapes are also tested in between. A stop that bends nothing (one medium on both sides) may
-    lie inside an element, in front of which (or behind which) it is then listed; what stands on both sides of it must
-    be clear of each other. A stop on a glass surface is a surface like any other.
+    decide; other shapes are also tested in between. A stop that bends nothing may lie inside an element beside which
+    it is listed; what stands on both sides of it must be clear of each other.
 
     Args:
         state: prefix of the surface in messages, for a zoom state of the file.

@@ -88,7 +88,7 @@ def _meet_quadric(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Meet cx x^2 + cy y^2 + cz z^2 = 2 z at the root next to the vertex.
 
-    Returns whether there is one, the square of the derivative of the left side along the ray and its root, and the
+    Returns whether there is one, the square of the left side's derivative along the ray and its root, and the
     parameter from the nearest approach `m` of the ray: near it where there is none.
     """
     p, (cx, cy, cz) = (r.dx, r.dy, r.dz), c
@@ -113,8 +113,8 @@ def _meet_quadric(
 def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], mode: Mode, before: Medium) -> Hit:
     """Iterate along the rays, from the conic that fits the asphere best.
 
-    All steps but the last are taken outside the graph: the last one alone carries the derivative of the solution
-    (implicit function theorem), so that gradients cost no memory for iterations.
+    All steps but the last are outside the graph: it alone carries the derivative (implicit function theorem), so
+    that gradients cost no memory for iterations.
     """
     p, sense, guard, spend = (r.dx, r.dy, r.dz), mode.sense, mode.guard, mode.spend
     (c, cz), steps = start_of(surface)
@@ -185,9 +185,8 @@ def _fitted(
 def _step(at: Vector, p: Vector, surface: Surface, w: tuple[float, float], sense: int, last: bool = False) -> Tensor:
     """Euler's step along the rays towards sag(x, y) = z: Newton's with the bend of the surface taken into account.
 
-    Newton's own step is lost where a ray all but touches the surface, for there two meetings lie close together; the
-    parabola through value, derivative and bend has both, and the sign of its root is that of the one wanted. The `last`
-    step is Newton's: by then both are the same.
+    Newton's own is lost where a ray all but touches the surface, for there two meetings lie close together; the
+    parabola has both. The `last` step is Newton's: by then both are the same.
     """
     x, y, z = at
     sag, derivative, turn = _sag(surface, w, x, y)
@@ -206,8 +205,7 @@ def _step(at: Vector, p: Vector, surface: Surface, w: tuple[float, float], sense
 
 
 def _sag(surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    """The asphere at points [N]: depth, its derivative by h over h, and the derivative of this by h over h of
-    the conic alone, None without a conic."""
+    """Depth at points [N], d sag / d h over h, and the change of this by h over h of the conic alone (None without)."""
     h2 = _height2(w, x, y)
     sag, derivative = _polynomials(surface, h2, (0, 1))
     c = surface.curvature

@@ -1,9 +1,8 @@
 """What a photographer changes, in this order: zoom, size, f-number, focus. Called by `Lens.at`.
 
 Between the zoom states of the source, the places of all groups, measured from the film, are interpolated against log
-focal length; then the focal length and the image's place are made exact by moving the groups behind the first varying
-gap (which keeps its interpolated value); a zoom of two moving groups has no freedom left, and is solved wholly. What a
-real cam does between the states is not in the source: the result is marked as derived.
+focal length; then focal length and image are made exact by moving the groups behind the first varying gap (which
+keeps its interpolated value); a zoom of two moving groups has no freedom left. Such a lens is marked as derived.
 """
 
 from __future__ import annotations
@@ -45,11 +44,8 @@ def at(
 ) -> Lens:
     """The lens in another state; arguments and errors are those of `Lens.at`."""
     _check(lens, focus_m, f_number, focal_length_mm, field_deg, focus)
-    if (
-        f_number is not None
-        and lens.film_z_mm is not None
-        and (focus_m, focal_length_mm, field_deg, zoom) == (None,) * 4
-    ):
+    others = (focus_m, focal_length_mm, field_deg, zoom)
+    if f_number is not None and lens.film_z_mm is not None and others == (None,) * 4:
         # Closing the stop leaves the focus where it is.
         return lens.with_stop_radius(paraxial.stop_radius_mm(at_infinity(lens), f_number))
     lens, object_mm = at_infinity(lens), None
@@ -79,11 +75,7 @@ def at(
 
 
 def state_named(lens: Lens, name: str) -> Configuration:
-    """The zoom or focus state of that name.
-
-    Raises:
-        InputError: the file has none such; it lists those it has.
-    """
+    """The zoom or focus state of that name; an error lists those of the file."""
     for c in lens.configurations:
         if c.name == name:
             return c
@@ -100,18 +92,13 @@ def in_state(lens: Lens, state: Configuration) -> Lens:
         moved = moved.with_stop_radius(state.stop_diameter_mm / 2)
     return replace(
         moved,
-        half_field_deg=half_field_in(lens, state),
+        half_field_deg=lens.half_field_in(state),
         f_number=_f_number_in(lens, state),
         stated_efl_mm=state.efl_mm,
         stated_efl_x_mm=None,
         derived="",
         infinity_mm=tuple((k, start[k]) for k, _ in state.thickness_mm) if near else (),
     )
-
-
-def half_field_in(lens: Lens, state: Configuration) -> float | None:
-    """Half field of a state: its own, else that of the image circle where the lens has one (None), else the lens's."""
-    return state.half_field_deg or (None if lens.image_radius_mm is not None else lens.half_field_deg)
 
 
 def _f_number_in(lens: Lens, state: Configuration) -> float:
@@ -153,9 +140,8 @@ def _millimetres(text: str) -> float | str:
 def _factor_for_efl(lens: Lens, focal_length_mm: float) -> float:
     now_mm = paraxial.first_order(at_infinity(lens)).efl_mm
     if now_mm < 0:
-        raise InputError(
-            lens.path, "focal_length_mm", focal_length_mm, f"none: this lens diverges (EFL {now_mm:.4g} mm)"
-        )
+        expected = f"none: this lens diverges (EFL {now_mm:.4g} mm)"
+        raise InputError(lens.path, "focal_length_mm", focal_length_mm, expected)
     return focal_length_mm / now_mm
 
 
@@ -196,9 +182,8 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _State:
-    """A zoom state of the source: focal length as computed, and what varies.
-
-    places: distance of the groups' fronts from the film (paraxial image), scene to film, one more than `gaps`.
+    """A zoom state of the source: focal length as computed, and `places`, the distances of the groups' fronts from the
+    film (paraxial image), scene to film, one more than the gaps.
     """
 
     source: Configuration

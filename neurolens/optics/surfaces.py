@@ -49,9 +49,8 @@ class Labels:
     """The tests at each surface (met, inside the rim, not totally reflected), in the order in which they are called.
 
     The first failure decides. A ray goes on until it misses a surface or is totally reflected; one that a rim stops
-    goes on, too, since surrogates are fitted to its crossings. This form keeps one label per ray, written at its first
-    failure: what a compiler turns into few instructions in registers, and what gradients can be taken through. `Counts`
-    has the same methods.
+    goes on, too, since surrogates are fitted to its crossings. This form keeps one label per ray: few instructions
+    for a compiler, and gradients can be taken through it. `Counts` has the same methods.
     """
 
     def __init__(self, sound: Tensor, otherwise: int) -> None:

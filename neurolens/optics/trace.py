@@ -1,7 +1,7 @@
-"""The exact tracer, in either direction, and ray differentials.
+"""The exact tracer, in either direction, and ray differentials: the reference for surrogates.
 
-This is the reference for surrogates. Rays are separate tensors of shape [N] (a structure of
-arrays); float64 for truth, float32 for speed. A ray that cannot go on carries a status and stays finite.
+Rays are separate tensors of shape [N]; float64 for truth, float32 for speed. A ray that cannot go on carries a
+status and stays finite.
 """
 
 from __future__ import annotations
@@ -46,11 +46,9 @@ class Traced(NamedTuple):
 
     Attributes:
         rays: point on the last surface met (lens frame, mm) and unit direction after it. Rays that missed a surface or
-            were totally reflected are replaced by a finite ray along the axis; rays that only a rim stops go on, so
-            that surrogates can be fitted to their crossings.
+            were totally reflected are replaced by a finite ray along the axis; those that only a rim stops go on.
         status: [N] int32, see `neurolens.base.status`.
-        transmittance: [N], power of unpolarised light that arrives: of surfaces (by default the product of
-            (Ts + Tp) / 2) and of absorption in the glass; None if not requested.
+        transmittance: [N], power of unpolarised light that arrives: of surfaces and absorption; None unless requested.
         crossings: surface index to `Crossing`, for the recorded surfaces.
         path: the rays on and after every surface, in the order of travel, or empty if not requested.
     """
@@ -148,10 +146,10 @@ def compile_trace(
 
 @cache
 def _keep_memory() -> None:
-    """Make glibc keep the memory of chunks between operators, once a process.
+    """Make glibc keep the memory of chunks between operators, once a process: half the time of a trace otherwise.
 
-    By default it returns blocks of 128 KiB to the system, and half the time of a trace would go into reallocation.
-    Freeing one larger block raises that limit to its size (mallopt(3), M_MMAP_THRESHOLD); it is never touched.
+    Freeing one block above 128 KiB raises the limit for return to the system to its size (mallopt(3),
+    M_MMAP_THRESHOLD).
     """
     torch.empty(30 << 20, dtype=torch.uint8)
 
@@ -251,9 +249,8 @@ def trace_differentials(
     """Trace rays together with their derivatives.
 
     Args:
-        lens, rays, wavelength_nm, towards: as for `trace`.
-        derivatives: of the rays with respect to some parameters, one `Rays` each (components [N]), such as
-            those of `film_derivatives`.
+        derivatives: of the rays with respect to some parameters, one `Rays` each (components [N]), such as those of
+            `film_derivatives`; the rest as for `trace`.
 
     Raises:
         InputError: as `trace`, and a derivative whose components have not the shape and dtype of the rays.
@@ -261,25 +258,21 @@ def trace_differentials(
     for n, derivative in enumerate(derivatives):
         for name, c, r in zip(Rays._fields, derivative, rays, strict=True):
             if c.shape != r.shape or c.dtype != r.dtype:
-                found = f"({tuple(c.shape)}, {c.dtype})"
-                raise InputError(
-                    "trace", f"derivatives[{n}].{name}", found, f"like the rays: {tuple(r.shape)}, {r.dtype}"
-                )
+                found, expected = (f"{tuple(t.shape)}, {t.dtype}" for t in (c, r))
+                raise InputError("trace", f"derivatives[{n}].{name}", f"({found})", f"like the rays: {expected}")
     traced, carried = None, []
     for derivative in derivatives:
         with forward_ad.dual_level():
-            dual = Rays(
-                *(forward_ad.make_dual(r.contiguous(), t.contiguous()) for r, t in zip(rays, derivative, strict=True))
-            )
+            pairs = zip(rays, derivative, strict=True)
+            dual = Rays(*(forward_ad.make_dual(r.contiguous(), t.contiguous()) for r, t in pairs))
             out = trace(lens, dual, wavelength_nm, towards=towards)
             parts = [forward_ad.unpack_dual(c) for c in out.rays]
             moved = (torch.zeros_like(p.primal) if p.tangent is None else p.tangent for p in parts)
             # A lost ray was replaced by one along the axis, whose derivative is 0 already; others may carry NaN.
             carried.append(Rays(*(torch.nan_to_num(s, 0.0, 0.0, 0.0) for s in moved)))
             traced = out._replace(rays=Rays(*(p.primal for p in parts)))
-    return Differentials(
-        trace(lens, rays, wavelength_nm, towards=towards) if traced is None else traced, tuple(carried)
-    )
+    traced = trace(lens, rays, wavelength_nm, towards=towards) if traced is None else traced
+    return Differentials(traced, tuple(carried))
 
 
 def film_derivatives(rays: Rays, distance_mm: Tensor | float) -> tuple[Rays, Rays]:

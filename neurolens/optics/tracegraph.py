@@ -1,9 +1,8 @@
-"""The exact lens as a graph, from which C is written: the best that tracing can do.
+"""The exact lens as a graph, from which C is written: the best that tracing can do, with which surrogates are compared.
 
-Surrogates are compared with it. Surfaces of every shape, stop, rims, missed surfaces, total
-reflection, dispersion; transmittance of bare surfaces (Fresnel, unpolarised, averaged at each surface) and of coated
-ones as if they were bare: coatings cost no time here. Ray tracing after Feder, J. Opt. Soc. Am. 41 (1951);
-conics, cylinders and aspheres as in `shapes`.
+Surfaces of every shape, stop, rims, missed surfaces, total reflection, dispersion; transmittance of bare surfaces
+(Fresnel, unpolarised, averaged at each surface) and of coated ones as if bare: coatings cost no time here. Ray
+tracing after Feder, J. Opt. Soc. Am. 41 (1951); conics, cylinders and aspheres as in `shapes`.
 """
 
 from __future__ import annotations
@@ -150,11 +149,7 @@ def _meet_plain(m: Value, d: Value, c: float) -> _Meeting:
 
 
 def _meet_shape(m: Value, d: Value, surface: Surface) -> _Meeting:
-    """Meet a surface that is no sphere and no plane.
-
-    Args:
-        m: the ray's point nearest to the vertex, vertex frame, mm. d: unit direction, towards -z.
-    """
+    """Meet a surface that is no sphere and no plane, as `_meet_plain`."""
     w = (float(surface.cylinder != "y"), float(surface.cylinder != "x"))
     if surface.asphere:
         return _meet_asphere(m, d, surface, w)

@@ -1,11 +1,9 @@
 """Power that arrives: what surfaces reflect and glass absorbs on the way, averaged over polarisation or with it.
 
-By default the transmittance of unpolarised light is the product over surfaces of (Ts + Tp) / 2. That differs by up to
-about 0.01 on ordinary lenses from exact polarised transmission, since one surface polarises the light that the next one
-meets. For that the field is followed as a vector in the lens frame, so that turning from the s and p directions of one
-surface to those of the next needs no angles: Yun, Crabtree and Chipman 2011, "Three-dimensional polarization
-ray-tracing calculus I", Applied Optics 50(18). Fields are scaled so that |E|^2 is power; without the factor
-n2 cos t / (n1 cos i) at every surface it would not be.
+By default the transmittance of unpolarised light is the product over surfaces of (Ts + Tp) / 2: up to about 0.01
+from exact polarised transmission, since one surface polarises the light that the next one meets. For that the field
+is followed as a vector in the lens frame, which needs no angles between s and p directions: Yun, Crabtree and
+Chipman 2011, "Three-dimensional polarization ray-tracing calculus I", Applied Optics 50(18). |E|^2 is power.
 """
 
 from __future__ import annotations
@@ -86,10 +84,7 @@ def _times(along: Tensor, real: Tensor, imaginary: Tensor) -> Tensor:
 
 
 def _across(direction: Tensor, normal: Tensor) -> Tensor:
-    """Unit vectors [3, N] across direction and normal; where these agree, any perpendicular ones.
-
-    Near normal incidence the cross product is mostly rounding, and s and p agree to within its square.
-    """
+    """Unit vectors [3, N] across direction and normal; where these agree, any perpendicular ones."""
     s = _cross(direction, normal)
     length2 = (s * s).sum(0)
     aligned = ~(length2 > torch.finfo(s.dtype).eps)
@@ -119,10 +114,9 @@ def passage(
 
 
 class _Absorbed:
-    """Power carried along while rays are traced: absorption by Beer and Lambert's law; surfaces are its children's.
-
-    These have `pass_surface`, for surface k: rays before it (in its frame), where they meet it, rays after it,
-    n' cos t, the media; and `arrived`, the power of unpolarised light that arrives, [N], without meaning for others.
+    """Power carried along while rays are traced: absorption by Beer and Lambert's law; surfaces are its children's:
+    `pass_surface` for surface k (rays before it, their hit, rays after it, n' cos t, media); `arrived`, unpolarised,
+    [N].
     """
 
     def __init__(self, lens: Lens, wavelength_nm: Tensor | float, sense: int, like: Tensor) -> None:
@@ -149,9 +143,9 @@ class _Averaged(_Absorbed):
         coating = self._lens.surfaces[k].coating
         if coating is not None and coating.layers:
             cos_i = times(hit.q, 1 / before.n)
-            self._power = self._power * transmittance(
-                cos_i, before.n, after.n, coating.layers, self._wavelength_nm, self._sense
-            )
+            media = before.n, after.n
+            share = transmittance(cos_i, *media, coating.layers, self._wavelength_nm, self._sense)
+            self._power = self._power * share
         elif before is not after:
             self._power = self._power * fresnel_transmittance(hit.q, q, before, after)
 

@@ -75,19 +75,14 @@ def smaller_stop(file: str, asked: float, limit: float | None, state: str = "") 
     """The smaller of two diameters of the stop: by pupil or f-number, and of its own aperture; warns of the latter."""
     if limit is None or not limit < asked * (1 - NARROWER):
         return asked
-    warn(
-        file,
-        f"{state}pupil or f-number ask for a stop {asked:.6g} wide, its own aperture is {limit:.6g} "
-        "(in the file's unit): the smaller is taken",
-    )
+    told = f"{state}pupil or f-number ask for a stop {asked:.6g} wide, its own aperture is {limit:.6g}"
+    warn(file, f"{told} (in the file's unit): the smaller is taken")
     return limit
 
 
 def with_rims(lens: Lens) -> Lens:
-    """The lens with the rims that its file does not give derived by rule (`neurolens.optics.rims`).
-
-    Raises:
-        InputError: no field is known to derive them for, or the lens has cylinders.
+    """The lens with the rims that its file does not give derived by rule (`neurolens.optics.rims`); refused where no
+    field is known to derive them for, or the lens has cylinders.
     """
     missing = [k for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm)]
     if not missing:
@@ -105,19 +100,14 @@ def with_rims(lens: Lens) -> Lens:
 
 
 def _filled(lens: Lens, other: Lens) -> Lens:
-    rows = (
-        replace(s, diameter_mm=o.diameter_mm) if math.isnan(s.diameter_mm) else s
-        for s, o in zip(lens.surfaces, other.surfaces, strict=True)
-    )
+    pairs = zip(lens.surfaces, other.surfaces, strict=True)
+    rows = (replace(s, diameter_mm=o.diameter_mm) if math.isnan(s.diameter_mm) else s for s, o in pairs)
     return replace(lens, surfaces=tuple(rows))
 
 
 def _spherical(lens: Lens) -> Lens:
-    curvatures = [s.vertex_curvature("y") for s in lens.surfaces]
-    rows = (
-        replace(s, radius_mm=1 / c if c else math.inf, conic=0.0, asphere=())
-        for s, c in zip(lens.surfaces, curvatures, strict=True)
-    )
+    radii = (1 / c if (c := s.vertex_curvature("y")) else math.inf for s in lens.surfaces)
+    rows = (replace(s, radius_mm=r, conic=0.0, asphere=()) for s, r in zip(lens.surfaces, radii, strict=True))
     return replace(lens, surfaces=tuple(rows))
 
 
@@ -131,8 +121,7 @@ def check_states(lens: Lens) -> None:
 def first_order(lens: Lens) -> FirstOrder:
     """First-order data in the y-z plane; of a lens without power there, in the x-z plane.
 
-    Raises:
-        InputError: a lens without power, or whose entrance pupil is a point or infinite.
+    Raises InputError for a lens without power, or whose entrance pupil is a point or infinite.
     """
     try:
         data = paraxial.first_order(lens, meridian="y")
@@ -199,11 +188,8 @@ def named_glass(
     elif not makers and said is None:
         why = "the file names no maker"
     else:
-        why = (
-            "its maker's catalogue has none of that very name"
-            if _letters(taken.name) not in _letters(said or name)
-            else ""
-        )
+        other = _letters(taken.name) not in _letters(said or name)
+        why = "its maker's catalogue has none of that very name" if other else ""
     if why:
         warn(file, f"glass {said or name} is taken as {taken} (n_d {taken.n_d:.5f}, V_d {taken.V_d:.2f}): {why}")
     return {"n_d": taken.n_d, "V_d": taken.V_d, "glass": short_name(taken), "material": name}

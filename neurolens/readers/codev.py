@@ -1,6 +1,4 @@
-"""CODE V sequence files (.seq): one lens written as commands, S lines with radius (or curvature), thickness, glass.
-
-Three letters name a command. An unsupported command is an error with command and line."""
+"""CODE V sequence files (.seq): commands of three letters, S lines with radius or curvature, thickness, glass."""
 
 from __future__ import annotations
 
@@ -12,8 +10,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_SURFACES
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.readers.assemble import UNKNOWN
+from neurolens.optics.prescription import Lens
 from neurolens.readers.codev_model import (
     LETTERS,
     NONE_BUT_0,
@@ -25,7 +22,7 @@ from neurolens.readers.codev_model import (
     private_glass,
     shape_of,
 )
-from neurolens.readers.draft import Draft, Given, Row, lens_of
+from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of
 from neurolens.readers.source import read_lines, warn
 
 
@@ -64,22 +61,17 @@ def draft_of(file: File) -> Draft:
             warn(file.path, f"{text} ({count})")
     # The image lies off the last thickness by the thickness of SI: a defocus.
     middle[-1].thickness += image.thickness
-    rows = []
-    for k, block in enumerate(middle):
-        diameter = UNKNOWN if math.isnan(block.semi_diameter) else 2 * block.semi_diameter
-        if block.solved and block is not middle[-1]:
+    for k, block in enumerate(middle[:-1]):
+        if block.solved:
             raise block.start.error("PIM", f"(on surface {k + 1})", "the last surface")
-        surface = Surface(
-            thickness_mm=block.thickness, diameter_mm=diameter, stop=block.stop, **shape_of(block), **block.medium
-        )
-        rows.append(Row(surface, aperture=not math.isnan(diameter)))
+    rows = tuple(Row(b.surface(shape_of(b)), aperture=not math.isnan(b.semi_diameter)) for b in middle)
     angles, heights = (_edge(file, pairs) for pairs in ((("XAN", "YAN"),), (("XIM", "YIM"), ("XRI", "YRI"))))
     if _edge(file, (("XOB", "YOB"),)) and not angles:
         warn(file.path, "the field is given as an object height: left out")
     return Draft(
         file=file.path,
         kind="CODE V",
-        rows=tuple(rows),
+        rows=rows,
         name=file.title,
         states=tuple(file.zoom.states(middle, first.thickness, image.thickness)),
         pupil=file.pupil,
@@ -104,7 +96,6 @@ def _edge(file: File, pairs: tuple[tuple[str, str], ...]) -> float | None:
 
 
 UNITS = {"M": "mm", "C": "cm", "I": "in"}
-INFINITE = 1e9
 ROOM = 20  # degrees, at which the catalogues measure
 FIELDS = ("XAN", "YAN", "XIM", "YIM", "XRI", "YRI", "XOB", "YOB")
 # Settings, weights, wavelengths, labels, control codes of variables, tolerances.
@@ -114,26 +105,12 @@ IGNORED = frozenset(
 )
 VIGNETTING = frozenset(["VUX", "VLX", "VUY", "VLY"])
 READ = (
-    *(
-        "S",
-        "SO",
-        "SI",
-        "RDM",
-        "TIT",
-        "DIM",
-        "EPD",
-        "FNO",
-        "TEM",
-        *FIELDS,
-        "RDY",
-        "CUY",
-        "RDX",
-        "CUX",
-        "THI",
-        "GLA",
-        "STO",
-    ),
-    *("SPH", "CON", "ASP", "CYL", "YTO", "XTO", "K", *LETTERS, *NONE_BUT_0, "CIR", "PIM", "PRV", "ZOO"),
+    *"S SO SI RDM TIT DIM EPD FNO TEM".split(),
+    *FIELDS,
+    *"RDY CUY RDX CUX THI GLA STO SPH CON ASP CYL YTO XTO K".split(),
+    *LETTERS,
+    *NONE_BUT_0,
+    *("CIR", "PIM", "PRV", "ZOO"),
 )
 
 
@@ -195,9 +172,7 @@ def _system(file: File, command: Command) -> bool:
                 raise line.error("DIM", unit, "M (mm), C (cm) or I (inch)")
             file.unit = UNITS[unit]
         case "EPD" | "FNO":
-            value = command.numbers()[0]
-            if value <= 0:
-                raise line.error(name, value, "a number above 0")
+            value = line.positive(name, words)
             file.pupil, file.f_number = (value, None) if name == "EPD" else (None, value)
         case "TEM":
             if abs(command.numbers()[0] - ROOM) > 5:

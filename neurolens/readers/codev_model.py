@@ -1,6 +1,4 @@
-"""Parser state of a CODE V file: commands, media, surfaces, zoom positions.
-
-What the lens model cannot represent is an error with name and line."""
+"""Parser state of a CODE V file: commands, media, surfaces, zoom positions."""
 
 from __future__ import annotations
 
@@ -11,8 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from neurolens.optics import catalogue
-from neurolens.readers.assemble import UNKNOWN, named_glass
-from neurolens.readers.draft import State
+from neurolens.readers import draft
+from neurolens.readers.assemble import named_glass
+from neurolens.readers.draft import INFINITE, State
 from neurolens.readers.source import Line
 
 _MAX_COMMAND = 100_000  # characters of one command with all its continuation lines
@@ -127,19 +126,12 @@ NONE_BUT_0 = ("CUF", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE")
 
 
 @dataclass
-class Block:
-    """One surface while it is read, in the file's unit."""
+class Block(draft.Block):
+    """One surface with what CODE V says of it."""
 
-    start: Line
-    curvature: float = 0.0
-    thickness: float = 0.0
     kind: str = "SPH"
     curvature_x: float | None = None
-    conic: float = 0.0
     terms: dict[str, float] = field(default_factory=dict)
-    semi_diameter: float = UNKNOWN
-    medium: dict[str, Any] = field(default_factory=dict)
-    stop: bool = False
     solved: bool = False  # whether the thickness is solved for the paraxial image
 
     def put(self, command: Command, value: float) -> None:
@@ -175,8 +167,7 @@ def shape_of(block: Block) -> dict[str, Any]:
     if block.kind in ("SPH", "CON", "ASP"):
         if block.curvature_x not in (None, block.curvature):
             raise block.start.error("CUX", block.curvature_x, "a cylinder (CYL, YTO or XTO)")
-        conic = block.conic if block.curvature else 0.0
-        return {"radius_mm": _radius(block.curvature), "conic": conic, "asphere": tuple(sorted(terms.items()))}
+        return block.rotational(sorted(terms.items()))
     x, y = block.curvature_x or 0.0, block.curvature
     if terms or (x and y):
         found = f"(curvatures {y:g} in y and {x:g} in x{', coefficients' if terms else ''})"
@@ -184,11 +175,8 @@ def shape_of(block: Block) -> dict[str, Any]:
     # K belongs to the curve that is turned: y of YTO and CYL, x of XTO.
     if block.conic and (block.kind == "XTO") != bool(x):
         raise block.start.error("K", block.conic, "0, as this cylinder's curve is a circle")
-    return {"radius_mm": _radius(x or y), "conic": block.conic, "cylinder": "x" if x else "y" if y else None}
-
-
-def _radius(curvature: float) -> float:
-    return 1 / curvature if curvature else math.inf
+    radius = 1 / (x or y) if x or y else math.inf
+    return {"radius_mm": radius, "conic": block.conic, "cylinder": "x" if x else "y" if y else None}
 
 
 MAX_POSITIONS = 200
@@ -205,11 +193,10 @@ class Zoom:
 
     count: int = 0
     titles: dict[int, str] = field(default_factory=dict)
-    thickness: dict[int, list[float]] = field(default_factory=dict)
+    thickness: dict[tuple[int, int], float] = field(default_factory=dict)  # (surface, position)
     pupil: list[float] = field(default_factory=list)
     f_number: list[float] = field(default_factory=list)
     semi_diameter: dict[int, tuple[list[float], Command]] = field(default_factory=dict)
-    waiting: dict[tuple[int, int], float] = field(default_factory=dict)
 
     def read(self, command: Command, n_blocks: int) -> None:
         """One ZOO command: the count of positions, or a quantity with one value a position."""
@@ -238,7 +225,7 @@ class Zoom:
             raise line.error(f"ZOO {name}", " ".join(values), f"{self.count} values, one a position")
         match name:
             case "THI":
-                self.thickness[surface] = numbers
+                self.thickness.update({(surface, place): value for place, value in enumerate(numbers)})
             case "EPD":
                 self.pupil = numbers
             case "FNO":
@@ -256,7 +243,7 @@ class Zoom:
         good = surface.isdecimal() and place.isdecimal() and int(surface) < n_blocks and 1 <= int(place) <= self.count
         if not good:
             raise command.line.error("THI", " ".join(command.words[:2]), f"Sk Zn with n from 1 to {self.count}")
-        self.waiting[int(surface), int(place) - 1] = command.numbers(command.words[2:])[0]
+        self.thickness[int(surface), int(place) - 1] = command.numbers(command.words[2:])[0]
 
     def states(self, middle: Sequence[Block], object_distance: float, defocus: float) -> Iterator[State]:
         """The positions of a file, by rows of the draft (surface numbers less one)."""
@@ -264,8 +251,7 @@ class Zoom:
             if not (0 < surface <= len(middle) and middle[surface - 1].stop):
                 raise command.line.error("ZOO CIR", f"S{surface}", "the stop: other rims cannot change")
         for place in range(self.count if self.count > 1 else 0):
-            gaps = {k: values[place] for k, values in self.thickness.items()}
-            gaps.update({k: value for (k, there), value in self.waiting.items() if there == place})
+            gaps = {k: value for (k, there), value in self.thickness.items() if there == place}
             distance = gaps.pop(0, object_distance)
             last = len(middle)
             gaps.pop(last + 1, None)  # the defocus of the image surface
@@ -276,6 +262,6 @@ class Zoom:
                 pupil=self.pupil[place] if self.pupil else None,
                 f_number=self.f_number[place] if self.f_number else None,
                 stop_diameter=opening,
-                object_distance=math.inf if distance >= 1e9 else distance,
+                object_distance=math.inf if distance >= INFINITE else distance,
                 film_given=not middle[-1].solved or last in gaps,
             )

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_SURFACES
 from neurolens.optics.prescription import Configuration, Lens, Surface
-from neurolens.readers.assemble import check_states, finish, first_order, smaller_stop, with_rims
-from neurolens.readers.source import unit_mm, warn
+from neurolens.readers.assemble import UNKNOWN, check_states, finish, first_order, smaller_stop, with_rims
+from neurolens.readers.source import UNITS_MM, Line, warn
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,35 @@ class Given:
     half_field_deg: float | None = None
     gap_before: bool = False
     semi_diameters: bool = False
+
+
+INFINITE = 1e9  # in any unit; programs write 1e10 or more for an object at infinity
+
+
+@dataclass
+class Block:
+    """One surface while a file is read, in the file's unit; readers add what their formats say besides."""
+
+    start: Line
+    curvature: float = 0.0
+    conic: float = 0.0
+    thickness: float = 0.0
+    semi_diameter: float = UNKNOWN
+    medium: dict[str, Any] = field(default_factory=dict)
+    stop: bool = False
+
+    @property
+    def radius(self) -> float:
+        return 1 / self.curvature if self.curvature else math.inf
+
+    def rotational(self, asphere: Iterable[tuple[int, float]] = ()) -> dict[str, Any]:
+        """Fields of `Surface` for a surface of revolution; the conic of a plane has no effect."""
+        conic = self.conic if self.curvature else 0.0
+        return {"radius_mm": self.radius, "conic": conic, "asphere": tuple((p, a) for p, a in asphere if a)}
+
+    def surface(self, shape: dict[str, Any]) -> Surface:
+        diameter = 2 * self.semi_diameter
+        return Surface(thickness_mm=self.thickness, diameter_mm=diameter, stop=self.stop, **shape, **self.medium)
 
 
 @dataclass(frozen=True)
@@ -95,17 +127,15 @@ class Draft:
 
 
 def lens_of(draft: Draft, given: Given | None = None) -> Lens:
-    """The lens of a draft, in mm, checked.
-
-    Raises:
-        InputError: see `assemble.finish`; a unit that contradicts the file's.
-    """
+    """The lens of a draft, in mm, checked as by `assemble.finish`; a unit other than the file's is an InputError."""
     given = given or Given()
     draft = _without_dummies(draft)
     unit = given.units or draft.unit or "mm"
     if given.units and draft.unit and given.units != draft.unit:
         raise InputError(draft.file, "--units", given.units, f"{draft.unit!r}, as the file itself says (or no --units)")
-    factor = unit_mm(unit, draft.file)
+    if unit not in UNITS_MM:
+        raise InputError(draft.file, "--units", unit, f"one of {', '.join(UNITS_MM)}")
+    factor = UNITS_MM[unit]
     if given.f_number is not None and (draft.f_number or draft.pupil) is not None:
         warn(draft.file, f"--f-number {given.f_number:g} is not used: the file sizes the stop itself")
     f_number = draft.f_number or given.f_number or math.nan
@@ -187,37 +217,28 @@ def _without_dummies(draft: Draft) -> Draft:
     """The draft without planes between equal media that cut no beam; gaps on both sides become one."""
     if len(draft.rows) > MAX_SURFACES:
         raise InputError(draft.file, "surfaces", f"({len(draft.rows)} of them)", f"at most {MAX_SURFACES}")
-    rows, dropped, place = list(draft.rows), [k for k in range(len(draft.rows)) if _is_dummy(draft, k)], 0
-    if not dropped:
-        return draft
+    rows = draft.rows
+    dropped = [k for k in range(len(rows)) if _is_dummy(draft, k)]
     kept = [k for k in range(len(rows)) if k not in dropped]
-    if not kept:
+    if not dropped or not kept:
         return draft
-    # To which kept row the thickness of each row belongs; those in front of all belong to the object's distance.
-    owner: list[int] = []
-    for k in range(len(rows)):
-        place += k in kept
-        owner.append(place - 1)
+    # To which kept row the thickness of each row belongs; those in front of all (-1) belong to the object's distance.
+    owner = [bisect_right(kept, k) - 1 for k in range(len(rows))]
 
-    def merged(thickness: dict[int, float]) -> tuple[dict[int, float], float]:
-        full = [thickness.get(k, rows[k].surface.thickness_mm) for k in range(len(rows))]
-        sums, front = dict.fromkeys(range(len(kept)), 0.0), 0.0
-        for k, t in enumerate(full):
-            if owner[k] < 0:
-                front += t
-            else:
-                sums[owner[k]] += t
-        return sums, front
+    def merged(thickness: dict[int, float]) -> tuple[list[float], float]:
+        sums = [0.0] * (len(kept) + 1)
+        for k, row in enumerate(rows):
+            sums[owner[k]] += thickness.get(k, row.surface.thickness_mm)
+        return sums[:-1], sums[-1]
 
     table, front = merged({})
     new = tuple(
-        replace(rows[k], surface=replace(rows[k].surface, thickness_mm=table[place])) for place, k in enumerate(kept)
+        replace(rows[k], surface=replace(rows[k].surface, thickness_mm=t)) for k, t in zip(kept, table, strict=True)
     )
     states = []
     for state in draft.states:
         sums, before = merged(state.thickness)
-        touched = {owner[k] for k in state.thickness if owner[k] >= 0}
-        gaps = {place: sums[place] for place in sorted(touched)}
+        gaps = {place: sums[place] for place in sorted({owner[k] for k in state.thickness if owner[k] >= 0})}
         states.append(replace(state, thickness=gaps, object_distance=state.object_distance + before))
     listed = ", ".join(map(str, dropped))
     warn(draft.file, f"row {listed} behind the object (from 0): a plane in one medium that cuts no beam, left out")

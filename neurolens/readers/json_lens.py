@@ -82,12 +82,12 @@ def read_json_lens(path: str | Path, given: Given | None = None, *, catalogue: b
     if not estimated and _NOT_THE_SOURCE_S.search(notes):
         warn(file, "the notes tell of diameters that are not the source's; rims are taken as estimated")
         estimated = True
-    stated = table.number("f_number", above=0) if data.get("f_number") is not None else math.nan
+    stated = table.optional("f_number")
     lens = Lens(
         name=given.name or table.text("name"),
         source=given.source or table.text("source"),
         surfaces=surfaces,
-        f_number=given.f_number if given.f_number is not None and math.isnan(stated) else stated,
+        f_number=stated or given.f_number or math.nan,
         designer=_optional_text(table, "designer"),
         notes=notes,
         rims="estimated" if estimated else "source",
@@ -150,7 +150,7 @@ def _surface(given: Any, k: int, file: str, is_last: bool, catalogue: bool) -> S
         thickness_mm=thickness,
         diameter_mm=diameter,
         stop=stop,
-        conic=row.number("conic") if given.get("conic") is not None else 0.0,
+        conic=row.optional("conic", above=None) or 0.0,
         asphere=_asphere(row),
         cylinder=SHAPES[shape],
         **_glass(row, catalogue),
@@ -164,14 +164,10 @@ def _glass(row: Table, catalogue: bool) -> dict[str, Any]:
                 raise row.error("n_d", "(null)", f"the index of the glass, as {key} is given")
         return {}
     n_d = row.number("n_d", above=0)
-    V_d = row.number("V_d", above=0) if row.data.get("V_d") is not None else None
+    V_d = row.optional("V_d")
     material = _optional_text(row, "material") or None
-    return {
-        "n_d": n_d,
-        "V_d": V_d,
-        "material": material,
-        "glass": same_glass(material, n_d, V_d) if catalogue else None,
-    }
+    glass = same_glass(material, n_d, V_d) if catalogue else None
+    return {"n_d": n_d, "V_d": V_d, "material": material, "glass": glass}
 
 
 def _asphere(row: Table) -> tuple[tuple[int, float], ...]:
@@ -191,8 +187,9 @@ def _optional_text(table: Table, key: str) -> str:
 
 
 def stated_efl(lens: Lens, data: Mapping[str, Any]) -> Lens:
-    """The lens with the focal length that the file states: of several, those of an anamorphic lens by meridian, else
-    the first (the state that the table is in)."""
+    """The lens with the focal length stated: of several, an anamorphic lens's by meridian, else the first (the
+    table's).
+    """
     given = data.get("efl_mm")
     values = [given] if not isinstance(given, list) else given
     for value in values:
@@ -259,12 +256,7 @@ def image_and_field(data: Mapping[str, Any], file: str) -> dict[str, Any]:
 
 
 def read_states(lens: Lens, data: Mapping[str, Any]) -> Lens:
-    """The lens with the states of the file.
-
-    Raises:
-        InputError: an unknown key, a surface that does not exist, a value out of range, a name given twice, surfaces
-            that overlap in a state.
-    """
+    """The lens with the states of the file, checked."""
     states: list[Configuration] = []
     for place, given in enumerate(_tables(data, lens.path)):
         if not isinstance(given, Mapping):
@@ -296,22 +288,18 @@ def _tables(data: Mapping[str, Any], file: str) -> list[Any]:
 
 def _state(lens: Lens, table: Table, name: str) -> Configuration:
     """One state; what the source leaves open (focal length, object distance) follows from its thicknesses."""
-    given: dict[str, float | None] = {
-        key: table.number(key, above=0) if table.data.get(key) is not None else None
-        for key in ("efl_mm", "efl_y_mm", "f_number", "stop_diameter_mm")
-    }
-    efl_y, distance = given.pop("efl_y_mm"), table.data.get("object_distance_mm")
-    efl = given.pop("efl_mm") if given["efl_mm"] is not None else (given.pop("efl_mm"), efl_y)[1]
-    state = Configuration(name, efl, _thickness(lens, table), **given)
+    efl, efl_y = table.optional("efl_mm"), table.optional("efl_y_mm")
+    efl, distance = efl_y if efl is None else efl, table.data.get("object_distance_mm")
+    sizes = {key: table.optional(key) for key in ("f_number", "stop_diameter_mm")}
+    gaps = table.gaps("thickness_overrides", len(lens.surfaces), 'an object such as {"5": 26.15}')
+    state = Configuration(name, efl, tuple(sorted(gaps)), **sizes)
     table_lens = lens.with_gaps(dict(state.thickness_mm))
     paraxial_mm = _object_distance_mm(table_lens)
     if isinstance(distance, str):
         if not (math.isfinite(paraxial_mm) and paraxial_mm > 0):
             raise table.error("object_distance_mm", distance, "a distance in mm, or null")
-        warn(
-            lens.path,
-            f"{table.where}object_distance_mm {distance!r}: {paraxial_mm:.6g} mm follows from the thicknesses",
-        )
+        said = f"{table.where}object_distance_mm {distance!r}"
+        warn(lens.path, f"{said}: {paraxial_mm:.6g} mm follows from the thicknesses")
         return replace(state, object_distance_mm=paraxial_mm)
     if distance is not None:
         stated = table.number("object_distance_mm", unit="mm", above=0)
@@ -327,18 +315,3 @@ def _object_distance_mm(lens: Lens) -> float:
     data = first_order(lens)
     beyond = float(lens.vertices_mm[-1]) - data.rear_focal_z_mm
     return data.efl_mm**2 / beyond - data.front_focal_z_mm if beyond else math.inf
-
-
-def _thickness(lens: Lens, table: Table) -> tuple[tuple[int, float], ...]:
-    given = table.data.get("thickness_overrides", "(missing)")
-    if not isinstance(given, Mapping):
-        raise table.error("thickness_overrides", given, 'an object such as {"5": 26.15}')
-    gaps = Table(given, lens.path, f"{table.where}thickness_overrides, surface ")
-    found = []
-    for key in given:
-        if not (key.isascii() and key.isdecimal() and len(key) < 5 and int(key) < len(lens.surfaces)):
-            expected = f"a surface number from 0 to {len(lens.surfaces) - 1}"
-            raise table.error("thickness_overrides", key, expected)
-        value = gaps.number(key, unit="mm")
-        found.append((int(key), value))
-    return tuple(sorted(found))

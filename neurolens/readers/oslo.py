@@ -1,8 +1,6 @@
 """OSLO lens files (.len): the simple ones, with a sphere or conic asphere of four terms per surface and round openings.
 
 "LEN NEW name focal-length surfaces", settings, then the surfaces, object first, each ended by NXT, the image by END.
-Radii (RD) or curvatures (CV), thickness to the next (TH), semi-diameters (AP), entrance beam radius (EBR), half field
-(ANG, degrees). Unsupported input is an error with command and line.
 """
 
 from __future__ import annotations
@@ -16,11 +14,11 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_SURFACES
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.readers import draft
 from neurolens.readers.assemble import UNKNOWN, named_glass
-from neurolens.readers.draft import Draft, Given, Row, lens_of
+from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of
 from neurolens.readers.source import UNITS_MM, Line, read_lines
 
-INFINITE = 1e9
 TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}
 # Designer, wavelengths and weights, settings of the program.
 IGNORED = frozenset("DES WV WW CALLBACK GPRT".split())
@@ -31,15 +29,11 @@ READ = (
 
 
 @dataclass
-class Block:
-    """One surface while it is read, in the file's unit."""
+class Block(draft.Block):
+    """One surface with what OSLO says of it."""
 
-    start: Line
     values: dict[str, float] = field(default_factory=dict)
-    medium: dict[str, Any] = field(default_factory=dict)
-    semi_diameter: float = UNKNOWN
     checked: bool = False
-    stop: bool = False
     solved: bool = False
 
 
@@ -145,9 +139,7 @@ def _surface(file: File, line: Line, word: str, rest: list[str]) -> None:
             if line.numbers(word, rest[:1])[0] != 0:
                 raise line.error(word, rest[0], "0: the film in the paraxial image")
             block.solved = True
-        case "RD" | "CV" | "TH" | "CC":
-            block.values[word] = line.numbers(word, rest[:1])[0]
-        case _ if word in TERMS:
+        case _ if word in ("RD", "CV", "TH", "CC", *TERMS):
             block.values[word] = line.numbers(word, rest[:1])[0]
         case _:
             raise line.unknown(word, READ)
@@ -190,15 +182,9 @@ def _draft(file: File) -> Draft:
 
 def _surface_of(block: Block) -> Surface:
     values = block.values
-    curvature = values.get("CV", 0.0)
-    radius = values.get("RD") or (1 / curvature if curvature else math.inf)
-    terms = {TERMS[name]: value for name, value in values.items() if name in TERMS and value}
-    return Surface(
-        radius_mm=radius,
-        thickness_mm=values.get("TH", 0.0),
-        diameter_mm=2 * block.semi_diameter,
-        stop=block.stop,
-        conic=values.get("CC", 0.0) if math.isfinite(radius) else 0.0,
-        asphere=tuple(sorted(terms.items())),
-        **block.medium,
-    )
+    block.curvature, block.thickness, block.conic = (values.get(key, 0.0) for key in ("CV", "TH", "CC"))
+    radius = values.get("RD") or block.radius
+    block.curvature = 1 / radius
+    terms = sorted((TERMS[name], value) for name, value in values.items() if name in TERMS)
+    # The radius as it is printed, not the inverse of its inverse.
+    return block.surface(block.rotational(terms) | {"radius_mm": radius})

@@ -50,6 +50,13 @@ class Line:
             raise self.error(keyword, word, expected)
         return value
 
+    def positive(self, keyword: str, words: Sequence[str]) -> float:
+        """The first word as a number above 0."""
+        value = self.numbers(keyword, words[:1])[0]
+        if value <= 0:
+            raise self.error(keyword, value, "a number above 0")
+        return value
+
     def numbers(self, keyword: str, words: Sequence[str], least: int = 1) -> list[float]:
         """Finite numbers from words of this line, at least so many."""
         if len(words) < least:
@@ -105,11 +112,7 @@ def decode(raw: bytes, path: str | Path) -> str:
 
 
 def read_lines(path: str | Path) -> list[Line]:
-    """The lines of a text file, those without content left out.
-
-    Raises:
-        InputError: see `read_bytes` and `decode`; too many lines, or one too long.
-    """
+    """The lines of a text file, those without content left out; refuses too many, or one too long."""
     file = str(path)
     rows = decode(read_bytes(path), path).splitlines()
     if len(rows) > MAX_LINES:
@@ -121,17 +124,6 @@ def read_lines(path: str | Path) -> list[Line]:
     if not lines:
         raise InputError(file, "file", "(empty)", "a lens file with content")
     return lines
-
-
-def unit_mm(unit: str, file: str, field: str = "--units") -> float:
-    """Length of a unit in mm.
-
-    Raises:
-        InputError: an unknown unit.
-    """
-    if unit not in UNITS_MM:
-        raise InputError(file, field, unit, f"one of {', '.join(UNITS_MM)}")
-    return UNITS_MM[unit]
 
 
 def warn(file: str, message: str) -> None:

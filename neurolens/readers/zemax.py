@@ -1,8 +1,8 @@
 """Zemax OpticStudio lens files (.zmx): sequential systems, UTF-16 or plain text.
 
-The format is a list of keywords: settings of the system, then one block "SURF n" a surface, the object first and the
-image last, then merit function, tolerances and configurations. Curvatures, semi-diameters, thickness to the next
-surface. Unsupported input is an error with keyword and line."""
+Settings of the system, then one block "SURF n" a surface, the object first and the image last, then merit function,
+tolerances and configurations. Curvatures, semi-diameters, thickness to the next surface.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_SURFACES
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.prescription import Lens
 from neurolens.readers.assemble import named_glass
 from neurolens.readers.draft import Draft, Given, Row, lens_of
 from neurolens.readers.source import Line, read_lines, warn
@@ -64,9 +64,10 @@ def draft_of(file: File) -> Draft:
     """
     *_, image = file.blocks
     for before, block in zip(file.blocks, file.blocks[1:], strict=False):
+        block.semi_diameter = block.semi_diameter if block.clear is None else block.clear
         if block.kind == "COORDBRK" and block.glass is None:
             block.medium = before.medium  # it stands in the medium of the surface before it
-    rows = tuple(Row(_surface_of(b), b.aperture) for b in file.blocks[1:-1])
+    rows = tuple(Row(b.surface(shape_of(b)), b.aperture) for b in file.blocks[1:-1])
     for block in file.blocks:
         if math.isnan(block.thickness):
             raise block.start.error("DISZ", "(missing)", "the thickness behind every surface (is the file cut off?)")
@@ -93,16 +94,6 @@ def draft_of(file: File) -> Draft:
         unit=file.unit,
         rims="estimated" if any(b.automatic and not b.stop for b in file.blocks[1:-1]) else "source",
         **dict(_field(file)),
-    )
-
-
-def _surface_of(block: Block) -> Surface:
-    return Surface(
-        thickness_mm=block.thickness,
-        diameter_mm=2 * (block.semi_diameter if block.clear is None else block.clear),
-        stop=block.stop,
-        **shape_of(block),
-        **block.medium,
     )
 
 
@@ -194,9 +185,9 @@ def _system(file: File, line: Line, word: str, rest: list[str]) -> None:
                 raise line.error(word, " ".join(rest[:1]), f"one of {', '.join(UNITS)}")
             file.unit = UNITS[rest[0].upper()]
         case "ENPD":
-            file.pupil = _above_0(line, word, rest)
+            file.pupil = line.positive(word, rest)
         case "FNUM":
-            file.f_number = _above_0(line, word, rest)
+            file.f_number = line.positive(word, rest)
             file.working = line if rest[1:2] == ["1"] else None
         case "OBNA":
             raise line.error(word, " ".join(rest), "a pupil diameter (ENPD), an f-number (FNUM) or the stop (FLOA)")
@@ -259,13 +250,6 @@ def _surface(file: File, block: Block, line: Line, word: str, rest: list[str]) -
         case "IGNR":
             if rest[:1] != ["0"]:
                 raise line.error(word, " ".join(rest), "0: a surface that is switched off cannot be left in")
-
-
-def _above_0(line: Line, word: str, rest: list[str]) -> float:
-    value = line.numbers(word, rest[:1])[0]
-    if value <= 0:
-        raise line.error(word, value, "a number above 0")
-    return value
 
 
 def _glass(line: Line, rest: list[str], makers: list[str]) -> dict[str, Any]:

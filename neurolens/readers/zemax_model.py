@@ -1,6 +1,4 @@
-"""Parser state of a Zemax file: surfaces, configurations, and the keywords without effect on rays.
-
-What the lens model cannot represent is an error with name and line."""
+"""Parser state of a Zemax file: surfaces, configurations, and the keywords without effect on rays."""
 
 from __future__ import annotations
 
@@ -11,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.readers.assemble import UNKNOWN
-from neurolens.readers.draft import State
+from neurolens.readers import draft
+from neurolens.readers.draft import INFINITE, State
 from neurolens.readers.source import Line
 
 # Settings of the program and of its analyses.
@@ -52,25 +50,18 @@ CONFIGURATION = frozenset("MOFF MCOM XFIE YFIE FLWT FVDX FVDY FVCX FVCY FVAN WAV
 
 
 TYPES = ("STANDARD", "EVENASPH", "ODDASPHE", "TOROIDAL", "BICONICX", "COORDBRK")
-INFINITE = 1e9  # in any unit; programs write 1e10 or more for an object at infinity
 
 
 @dataclass
-class Block:
-    """One SURF block while it is read, in the file's unit. Numbers stay with the line they come from."""
+class Block(draft.Block):
+    """One SURF block. Numbers stay with the line they come from."""
 
-    start: Line
-    kind: str = "STANDARD"
-    curvature: float = 0.0
-    conic: float = 0.0
     thickness: float = math.nan  # until DISZ has been read
-    semi_diameter: float = UNKNOWN
+    kind: str = "STANDARD"
     automatic: bool = True  # whether the program sized the rim from the rays
-    medium: dict[str, Any] = field(default_factory=dict)
     bends: Line | None = None  # where a curvature other than 0 is given
     glass: Line | None = None  # where the medium is given
-    stop: bool = False
-    clear: float | None = None  # semi-diameter of an aperture, which rules over the former
+    clear: float | None = None  # semi-diameter of an aperture, which rules over the other
     aperture: bool = False
     parameters: dict[int, tuple[float, Line]] = field(default_factory=dict)
     extra: dict[int, tuple[float, Line]] = field(default_factory=dict)
@@ -100,15 +91,18 @@ def shape_of(block: Block) -> dict[str, Any]:
     """
     match block.kind:
         case "STANDARD":
-            shape = _round(block, ())
+            shape = block.rotational()
         case "EVENASPH":
-            shape = _round(block, tuple((2 * i, block.parameter(i)) for i in range(1, 9)))
+            shape = block.rotational([(2 * i, block.parameter(i)) for i in range(1, 9)])
         case "ODDASPHE":
-            shape = _round(block, tuple((i, block.parameter(i)) for i in range(1, 9)))
+            terms = [(i, block.parameter(i)) for i in range(1, 9)]
+            if terms[0][1]:
+                raise block.start.error("PARM 1 of ODDASPHE", terms[0][1], "0: a cone's tip has no normal")
+            shape = block.rotational(terms)
         case "TOROIDAL" | "BICONICX":
             shape = _crossed(block)
         case "COORDBRK":
-            shape = _round(block, ())  # harmless where every tilt and decentre is 0, which is checked below
+            shape = block.rotational()  # harmless where every tilt and decentre is 0, which is checked below
     for name, table in (("PARM", block.parameters), ("XDAT", block.extra)):
         for n, (value, line) in table.items():
             # The second extra value of a toroid is a normalisation radius, with nothing to normalise.
@@ -120,20 +114,6 @@ def shape_of(block: Block) -> dict[str, Any]:
     return shape
 
 
-def _radius(curvature: float) -> float:
-    return 1 / curvature if curvature else math.inf
-
-
-def _round(block: Block, terms: tuple[tuple[int, float], ...]) -> dict[str, Any]:
-    for power, value in terms:
-        if power == 1 and value:
-            raise block.start.error("PARM 1 of ODDASPHE", value, "0: a cone's tip has no normal")
-    # The conic of a plane without other terms has no effect.
-    conic = block.conic if block.curvature else 0.0
-    asphere = tuple((power, value) for power, value in terms if value)
-    return {"radius_mm": _radius(block.curvature), "conic": conic, "asphere": asphere}
-
-
 def _crossed(block: Block) -> dict[str, Any]:
     """A toroidal or biconic surface that is a cylinder, or round; PARM 1 and 2 are radius and conic in x."""
     biconic = block.kind == "BICONICX"
@@ -141,12 +121,12 @@ def _crossed(block: Block) -> dict[str, Any]:
     if radius_x == 0 and block.curvature == 0:
         return {"radius_mm": math.inf}
     if radius_x == 0:
-        return {"radius_mm": _radius(block.curvature), "conic": block.conic, "cylinder": "y"}
+        return {"radius_mm": block.radius, "conic": block.conic, "cylinder": "y"}
     if block.curvature == 0:
         return {"radius_mm": radius_x, "conic": conic_x, "cylinder": "x"}
     if math.isclose(radius_x * block.curvature, 1.0, rel_tol=1e-12) and conic_x == block.conic:
         return {"radius_mm": radius_x, "conic": conic_x}
-    found = f"(radii {_radius(block.curvature):g} in y and {radius_x:g} in x)"
+    found = f"(radii {block.radius:g} in y and {radius_x:g} in x)"
     expected = "a cylinder: one of the two radii infinite" + ("" if biconic else " (a torus is not read)")
     raise block.start.error(block.kind, found, expected)
 
@@ -190,16 +170,12 @@ class Zoom:
             quoted = re.search('"([^"]*)"', line.text)
             self.titles[place] = (quoted[1] if quoted else " ".join(rest[2:3])).strip() or f"configuration {place + 1}"
             return
-        is_object = word == "THIC" and surface == 0
-        value = thickness(line, word, rest[2:3], is_object=is_object)
         if word == "THIC":
-            self.thickness[surface, place] = value
-        elif value <= 0:
-            raise line.error(word, value, "a number above 0")
+            self.thickness[surface, place] = thickness(line, word, rest[2:3], is_object=surface == 0)
         elif word == "APER":
-            self.aperture[place] = value
+            self.aperture[place] = line.positive(word, rest[2:3])
         else:
-            self.semi_diameter[surface, place] = (value, line)
+            self.semi_diameter[surface, place] = (line.positive(word, rest[2:3]), line)
 
 
 def draft_states(zoom: Zoom, blocks: Sequence[Block], aperture_is_f_number: bool) -> Iterator[State]:

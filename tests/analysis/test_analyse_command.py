@@ -1,20 +1,34 @@
-"""`neurolens analyse`: tables with units, JSON that parses, a picture of each with axes and legend, bad input."""
+"""`neurolens analyse`: tables with units, JSON that parses, a picture of each with axes and legend, bad input.
+
+And lenses or wishes at their limits: no light, no glass, doubtful tables, far wavelengths.
+"""
 
 from __future__ import annotations
 
 import json
+import math
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from analysis_lenses import thin
 from PIL import Image
 from shipped import LENSES
 
 from neurolens.analysis import layout, plot_style
+from neurolens.analysis.plots import plot_psf, plot_spots
+from neurolens.analysis.spots import mtf, spots
+from neurolens.analysis.wavefront import psf
 from neurolens.cli import main
 from neurolens.commands.analyse import WHATS
+from neurolens.optics import accessories
+from neurolens.optics.lenswriter import write_lens
 
+GAUSS = LENSES / "laikin_double_gauss_50.toml"
+D = 587.5618
 TESSAR = LENSES / "brendel_tessar_100.toml"
 ANAMORPHIC = LENSES / "schneider_anamorphic_31.toml"
 
@@ -74,6 +88,16 @@ def test_an_anamorphic_lens_in_both_planes(tmp_path: Path, capsys: pytest.Captur
     assert "symmetric" in capsys.readouterr().err
 
 
+def error_of(capsys: pytest.CaptureFixture[str], *args: object) -> str:
+    try:
+        code = main(["analyse", *map(str, args)])
+    except SystemExit as exit_:
+        code = int(exit_.code or 0)
+    error = capsys.readouterr().err
+    assert code == 2 and len(error.strip().splitlines()) == 1
+    return error
+
+
 @pytest.mark.parametrize(
     ("args", "words"),
     [
@@ -86,9 +110,86 @@ def test_an_anamorphic_lens_in_both_planes(tmp_path: Path, capsys: pytest.Captur
     ],
 )
 def test_bad_input_is_one_line(args: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    try:
-        code = main(["analyse", str(TESSAR), *args])
-    except SystemExit as exit_:
-        code = int(exit_.code or 0)
-    error = capsys.readouterr().err
-    assert code == 2 and words in error and len(error.strip().splitlines()) == 1
+    assert words in error_of(capsys, TESSAR, *args)
+
+
+@pytest.fixture
+def pinhole(tmp_path: Path) -> Path:
+    path = tmp_path / "pinhole.toml"
+    write_lens(replace(accessories.pinhole(50.0, 0.2, image_radius_mm=40.0), name="Pinhole", source="test"), path)
+    return path
+
+
+def test_a_stop_wider_than_the_rims(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The outermost ray that passes counts: with the stop three times as wide, the lens is as fast as its rims."""
+    lens = LENSES / "thorlabs_lb1471_biconvex_50.toml"
+    data = run_json(capsys, lens, "spots", "psf", "--f-number", 1.0, "--fields", 0, "-o", tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+    assert data["spots"]["working_f_number"] == pytest.approx(49.1 / 25.4, rel=0.06)
+    assert data["spots"]["airy_um"] == pytest.approx(1.22 * D / 1000 * data["spots"]["working_f_number"])
+
+
+def test_no_light_is_one_error_or_a_gap(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = thin(0.0)
+    rows = list(given.lens.surfaces)
+    rows.insert(0, replace(rows[-1], stop=False, thickness_mm=10.0, diameter_mm=1e-4))
+    dark = replace(given, lens=replace(given.lens, surfaces=tuple(rows), film_z_mm=given.film_z_mm + 10.0))
+    # Through this hole passes the chief ray alone, and off the axis nothing.
+    fields = [5.0]
+    assert math.isnan(spots(dark, fields).geometric_um[0]) and np.isnan(mtf(dark, fields).tangential).all()
+    image = psf(dark, fields)
+    assert np.isnan(image.half_width_um).all() and image.pupil_points[0] == 0
+    plot_spots(spots(dark, fields), tmp_path / "spots.png", "", "")
+    plot_psf(image, tmp_path / "psf.png", "", "")
+    assert "field 80: got (no light" in error_of(capsys, GAUSS, "spots", "--fields", 0, 80)
+    assert "expected at most 2" in error_of(capsys, GAUSS, "mtf", "--fields", 80)
+
+
+def test_a_stop_beyond_all_glass_warns_of_no_division(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lens = LENSES / "muller_fisheye_100.toml"
+        data = run_json(capsys, lens, "vignetting", "spots", "--f-number", 0.3, "-o", tmp_path)
+    assert data["vignetting"]["relative"][0] in (None, 1.0)
+    assert data["spots"]["working_f_number"] == pytest.approx(4, rel=0.02)
+    assert any("V_d is not given" in w for w in data["warnings"])
+
+
+def test_a_pinhole_has_no_focus(pinhole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = run_json(capsys, pinhole)
+    assert data["spots"]["working_f_number"] == pytest.approx(50 / 0.4)
+    assert data["spots"]["geometric_um"][0] == pytest.approx(200, rel=1e-5)
+    assert data["spots"]["best_shift_mm"][0] is None
+    assert not {"colour", "curvature", "psf", "seidel"} & set(data) and len(data["notes"]) == 4
+    for what in ("colour", "curvature", "psf"):
+        assert "a pinhole" in error_of(capsys, pinhole, what)
+
+
+def test_doubtful_tables_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fisheye = run_json(capsys, LENSES / "shimizu_fisheye_220.toml", "distortion")["warnings"]
+    assert any("negative thickness" in w for w in fisheye) and any("estimated" in w for w in fisheye)
+    assert run_json(capsys, GAUSS, "seidel")["warnings"] == []
+    zoom = run_json(capsys, LENSES / "nikon_zoom_70_200.toml", "distortion", "--zoom", 100)
+    assert any("interpolated" in n for n in zoom["notes"])
+    wrong = tmp_path / "wrong.toml"
+    text = (LENSES / "thorlabs_lb1471_biconvex_50.toml").read_text(encoding="utf-8")
+    wrong.write_text(text.replace('material = "N-BK7"', 'glass = "N-SF11"'), encoding="utf-8")
+    assert main(["analyse", str(wrong), "distortion"]) == 0
+    assert "Warning: surface 1, n_d = 1.5168" in capsys.readouterr().out
+
+
+def test_options_may_stand_before_what(capsys: pytest.CaptureFixture[str]) -> None:
+    data = run_json(capsys, GAUSS, "--f-number", 8, "seidel", "--axis", "x", "distortion")
+    assert "seidel" in data and "distortion" in data and "spots" not in data
+    assert "neurolens analyse --help" in error_of(capsys, GAUSS, "seidel", "--zoon", 3)
+
+
+def test_far_wavelengths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for nm in (20000, 100):
+        assert "from 300 to 2500" in error_of(capsys, GAUSS, "spots", "--wavelengths", nm)
+    acrylic = tmp_path / "acrylic.toml"
+    text = (LENSES / "thorlabs_lb1471_biconvex_50.toml").read_text(encoding="utf-8")
+    acrylic.write_text(text.replace('n_d = 1.5168, V_d = 64.17, material = "N-BK7"', 'glass = "PMMA"'), "utf-8")
+    told = run_json(capsys, acrylic, "spots", "--wavelengths", 2200)["warnings"]
+    assert any("PMMA" in w and "extrapolated at 2200 nm" in w for w in told)
+    assert any("guess" in w for w in run_json(capsys, GAUSS, "spots", "--wavelengths", 2200)["warnings"])

@@ -45,12 +45,8 @@ def test_thin_lens_in_contact_with_the_stop(bending: float, n: float) -> None:
     assert abs(h) == pytest.approx(y * height / 100)
     conjugate = -1.0  # object at infinity
     shape = bending + 2 * (n * n - 1) / (n + 2) * conjugate
-    s1 = (
-        y**4
-        * power**3
-        / 4
-        * ((n / (n - 1)) ** 2 + (n + 2) / (n * (n - 1) ** 2) * shape**2 - n / (n + 2) * conjugate**2)
-    )
+    bent = (n / (n - 1)) ** 2 + (n + 2) / (n * (n - 1) ** 2) * shape**2 - n / (n + 2) * conjugate**2
+    s1 = y**4 * power**3 / 4 * bent
     s2 = -h * y**2 * power**2 / 2 * ((n + 1) / (n * (n - 1)) * bending + (2 * n + 1) / n * conjugate)
     wanted = [s1, s2, h * h * power, h * h * power / n, 0.0, y * y * power / 60.0, 0.0]
     assert found.total.tolist() == pytest.approx(wanted, rel=1e-9, abs=1e-12)

@@ -9,6 +9,7 @@ import lens_models
 import numpy as np
 import pytest
 from camera_helpers import FILM, GAUSS, ROOT, at, camera, differences, film_rays, film_value, jittered
+from shipped import disc_irradiance
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
@@ -20,7 +21,6 @@ from neurolens.optics.apertures import Aperture
 from neurolens.optics.film_plane import film_z_mm
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
-from neurolens.optics.radiometry import disc_irradiance
 
 
 def square_grid(side: int) -> np.ndarray:

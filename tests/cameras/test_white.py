@@ -8,13 +8,13 @@ import lens_models
 import numpy as np
 import pytest
 from camera_helpers import FILM, FISHEYES, KINDS, RADII, camera, film_value, jittered, light
+from shipped import disc_irradiance
 
 from neurolens.base import status as st
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThickLens, ThinLens
 from neurolens.cameras.pinhole import PROJECTIONS
 from neurolens.optics.paraxial import first_order
-from neurolens.optics.radiometry import disc_irradiance
 
 
 def expected(kind: str) -> np.ndarray:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neurolens.base.errors import InputError
 from neurolens.optics import coatings
-from neurolens.optics.coatings import Layers, amplitudes, powers, reflectance, transmittance
+from neurolens.optics.coatings import Layers, power_amplitudes, powers, reflectance, transmittance
 
 LAM_NM = 550.0
 FROM_AIR, FROM_GLASS = (1.0, 1.52), (1.52, 1.0)
@@ -32,6 +32,12 @@ def cosines(*degrees: float, dtype: torch.dtype = torch.float64) -> Tensor:
     return torch.tensor([math.cos(math.radians(d)) for d in degrees], dtype=dtype)
 
 
+def amplitudes(*arguments: Any) -> dict[str, Tensor]:
+    """Complex amplitudes by name, those of transmission scaled to power."""
+    pairs = zip("tr", (power_amplitudes(*arguments, reflected=reflected) for reflected in (False, True)), strict=True)
+    return {f"{name}_{pol}": torch.complex(*part) for name, pair in pairs for pol, part in zip("sp", pair, strict=True)}
+
+
 NORMAL = cosines(0.0)
 FAN_DEG = (0.0, 1e-4, 20.0, 41.0, 42.0, 56.6, 75.0, 89.0)
 
@@ -47,10 +53,13 @@ def test_amplitudes_and_powers_agree_with_tmm(media: tuple[float, float], stack:
     indices = [media[0], *(n for n, _ in met), media[1]]
     thicknesses = [np.inf, *(d for _, d in met), np.inf]
     for k, degrees in enumerate(FAN_DEG):
+        cos2_t = 1 - (media[0] / media[1] * math.sin(math.radians(degrees))) ** 2
+        power_scale = math.sqrt(media[1] * math.sqrt(max(cos2_t, 0)) / (media[0] * math.cos(math.radians(degrees))))
         for pol in "sp":
             theirs: dict[str, Any] = tmm.coh_tmm(pol, indices, thicknesses, math.radians(degrees), lam_nm)
-            assert abs(getattr(ours, f"r_{pol}")[k].item() - theirs["r"]) < 1e-12
-            assert abs(getattr(ours, f"t_{pol}")[k].item() - theirs["t"]) < 1e-12 * max(1, abs(theirs["t"]))
+            t = theirs["t"] * power_scale
+            assert abs(ours[f"r_{pol}"][k].item() - theirs["r"]) < 1e-12
+            assert abs(ours[f"t_{pol}"][k].item() - t) < 1e-12
             assert abs(getattr(power, f"R_{pol}")[k].item() - theirs["R"]) < 1e-12
             assert abs(getattr(power, f"T_{pol}")[k].item() - theirs["T"]) < 1e-12
 
@@ -102,8 +111,8 @@ def test_a_film_split_in_two_and_a_film_of_the_glass_itself_change_nothing():
     cos_i = cosines(0, 30, 60, 85)
     whole = amplitudes(cos_i, 1.0, 1.52, ((2.1, 131.0),), LAM_NM)
     split = amplitudes(cos_i, 1.0, 1.52, ((2.1, 100.0), (2.1, 31.0)), LAM_NM)
-    for a, b in zip(whole, split, strict=True):
-        torch.testing.assert_close(a, b, rtol=0, atol=1e-14)
+    for name, a in whole.items():
+        torch.testing.assert_close(a, split[name], rtol=0, atol=1e-14)
     bare, film = (transmittance(cos_i, 1.0, 1.52, s, LAM_NM) for s in ((), ((1.52, 300.0),)))
     torch.testing.assert_close(bare, film, rtol=0, atol=1e-14)
 
@@ -115,9 +124,9 @@ def test_total_reflection_passes_nothing_and_stays_finite():
             p = powers(cos_i.to(dtype), *FROM_GLASS, stack, LAM_NM)
             assert (p.T_s == 0).all() and (p.T_p == 0).all() and (p.R_s == 1).all() and (p.R_p == 1).all()
             a = amplitudes(cos_i.to(dtype), *FROM_GLASS, stack, LAM_NM)
-            torch.testing.assert_close(a.r_s.abs(), torch.ones_like(a.r_s.abs()))
-            torch.testing.assert_close(a.r_p.abs(), torch.ones_like(a.r_p.abs()))
-            assert all(torch.isfinite(torch.view_as_real(v)).all() for v in a)
+            for name in ("r_s", "r_p"):
+                torch.testing.assert_close(a[name].abs(), torch.ones_like(a[name].abs()))
+            assert all(torch.isfinite(torch.view_as_real(v)).all() for v in a.values())
 
 
 def test_frustrated_total_reflection_by_an_air_gap():
@@ -151,8 +160,8 @@ def test_grazing_light_is_reflected():
                 assert all(torch.isfinite(v).all() for v in p)
                 assert p.T_s[0] == 0 and p.T_p[0] == 0 and p.R_s[0] == 1 and p.R_p[0] == 1
                 a = amplitudes(cos_i, *media, stack, LAM_NM)
-                assert all(torch.isfinite(torch.view_as_real(v)).all() for v in a)
-                assert a.r_s[0].abs() == pytest.approx(1) and a.r_p[0].abs() == pytest.approx(1)
+                assert all(torch.isfinite(torch.view_as_real(v)).all() for v in a.values())
+                assert a["r_s"][0].abs() == pytest.approx(1) and a["r_p"][0].abs() == pytest.approx(1)
 
 
 def test_what_is_no_number_passes_nothing():
@@ -217,7 +226,7 @@ def normal_reflectance(coating: Any, n_before: float, n_after: float, lam_nm: fl
 
 @pytest.mark.parametrize("glass", [1.46, 1.52, 1.7, 1.904, 2.0])
 def test_quarter_wave_closed_form(glass: float):
-    coating = coatings.quarter_wave(1.38, 600.0)
+    coating = coatings.quarter_wave(600.0)
     expected = ((glass - 1.38**2) / (glass + 1.38**2)) ** 2
     assert normal_reflectance(coating, 1.0, glass, 600.0) == pytest.approx(expected, abs=1e-15)
     assert normal_reflectance(coating, glass, 1.0, 600.0) == pytest.approx(expected, abs=1e-15)
@@ -234,13 +243,10 @@ def test_v_coat_reflects_nothing_at_its_wavelength_from_either_side(glass: float
         assert normal_reflectance(coating, *media, at_nm * 1.3) > 1e-3
 
 
-def test_v_coat_of_given_films_and_between_glasses():
+def test_v_coat_between_glasses():
     assert normal_reflectance(coatings.v_coat(1.6, 1.7), 1.6, 1.7) < 1e-28
-    assert normal_reflectance(coatings.v_coat(1.0, 1.52, LAM_NM, 1.46, 2.3), 1.0, 1.52) < 1e-28
     with pytest.raises(InputError, match=r"v-coat: media: got \(1.5 to 1.52\).*1.38 over 2.1 or 1.38 over 1.63"):
         coatings.v_coat(1.5, 1.52)
-    with pytest.raises(InputError, match="1.7 over 1.75"):
-        coatings.v_coat(1.0, 1.52, LAM_NM, 1.7, 1.75)
 
 
 @pytest.mark.parametrize("media", [(1.0, 1.52), (1.52, 1.0), (1.0, 1.75)])
@@ -262,7 +268,6 @@ def test_films_of_low_index_lie_towards_the_air():
 
 
 def test_designs_by_name():
-    assert coatings.design("bare", 1.0, 1.52) == coatings.bare()
     assert coatings.design("bare", 1.52, 1.52).layers == ()
     assert coatings.design("quarter-wave", 1.0, 1.52).layers == coatings.quarter_wave().layers
     assert coatings.design("quarter-wave 500", 1.0, 1.52).layers == coatings.quarter_wave(at_nm=500.0).layers

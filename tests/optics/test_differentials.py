@@ -30,7 +30,6 @@ def lenses() -> dict[str, Lens]:
 def film_rays(lens: Lens, fx: Tensor, fy: Tensor, px: Tensor, py: Tensor) -> tuple[Rays, Tensor]:
     """Camera rays towards points in the rear vertex plane, and their distances to these."""
     film_z, pupil_z = lens.at().film_z_mm, float(lens.vertices_mm[len(lens.surfaces) - 1])
-    assert film_z is not None
     rays = camera_rays(fx, fy, film_z, px, py, pupil_z)
     return rays, torch.sqrt((px - fx) ** 2 + (py - fy) ** 2 + (film_z - pupil_z) ** 2)
 

@@ -16,7 +16,6 @@ from neurolens.optics.glass import (
     LINE_D_NM,
     LINE_F_NM,
     absorption_of,
-    cauchy_coefficients,
     check_against_table,
     index_at,
     index_of,
@@ -53,7 +52,6 @@ def test_index_and_abbe_number_come_back(n_d: float, V_d: float) -> None:
 
 
 def test_unknown_dispersion_is_constant() -> None:
-    assert cauchy_coefficients(1.6, None) == (1.6, 0.0)
     assert index_at(1.6, None, 400.0) == index_at(1.6, None, 700.0) == 1.6
 
 

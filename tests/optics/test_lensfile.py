@@ -246,10 +246,8 @@ def test_a_half_ball_is_a_rim_of_the_whole_radius(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("sign", ["", "+", "-"])
 def test_a_plane_has_no_side(tmp_path: Path, sign: str) -> None:
-    assert (
-        read_lens(write(tmp_path, replaced("radius_mm = inf", f"radius_mm = {sign}inf"))).surfaces[3].radius_mm
-        == math.inf
-    )
+    text = replaced("radius_mm = inf", f"radius_mm = {sign}inf")
+    assert read_lens(write(tmp_path, text)).surfaces[3].radius_mm == math.inf
 
 
 def test_unknown_dispersion_is_a_warning(tmp_path: Path) -> None:

@@ -157,37 +157,13 @@ STATED = {
 }
 
 
-@pytest.mark.parametrize("name", STATED)
-def test_focal_length_and_f_number_are_those_of_the_source(name: str) -> None:
-    efl_mm, refractions = STATED[name]
-    data = first_order(tabled(name))
-    assert data.efl_mm == pytest.approx(efl_mm, rel=0.01)
-    assert data.f_number == pytest.approx(tabled(name).f_number, rel=0.03)
-    assert sum(not s.stop for s in tabled(name).surfaces) == refractions
-
-
 # The tables of the zoom and of this fisheye stand 2 mm out of focus, as their notes say.
-@pytest.mark.parametrize("name", sorted(STATED.keys() - {"ogawa_zoom_70_200", "shimizu_fisheye_220"}))
-def test_tabled_film_lies_at_the_focus(name: str) -> None:
-    table = tabled(name)
-    assert table.vertices_mm[-1] == pytest.approx(first_order(table).rear_focal_z_mm, abs=0.01 * table.vertices_mm[-1])
-
-
-@pytest.mark.parametrize(
-    ("name", "state", "magnification"),
-    [
-        ("nikon_zoom_70_200", "71mm near", -0.0868),
-        ("nikon_zoom_70_200", "135mm near", -0.1583),
-        ("nikon_zoom_70_200", "196mm near", -0.2332),
-        ("nikon_zoom_14_24", "18mm 1:40", -0.025),
-        ("nikon_zoom_14_24", "23mm near", -0.135),
-        ("sony_sonnar_55", "1.7m", -0.03333),
-    ],
-)
-def test_focus_states_have_the_magnification_of_the_source(name: str, state: str, magnification: float) -> None:
-    lens = tabled(name)
-    c = next(c for c in lens.configurations if c.name == state)
-    data = first_order(in_state(lens, c))
-    assert c.object_distance_mm is not None
-    found = -data.efl_mm / (c.object_distance_mm + data.front_principal_z_mm - data.efl_mm)
-    assert found == pytest.approx(magnification, rel=0.02)
+@pytest.mark.parametrize("name", STATED)
+def test_focal_length_f_number_and_film_are_those_of_the_source(name: str) -> None:
+    efl_mm, refractions = STATED[name]
+    table, data = tabled(name), first_order(tabled(name))
+    assert data.efl_mm == pytest.approx(efl_mm, rel=0.01)
+    assert data.f_number == pytest.approx(table.f_number, rel=0.03)
+    assert sum(not s.stop for s in table.surfaces) == refractions
+    if name not in ("ogawa_zoom_70_200", "shimizu_fisheye_220"):
+        assert table.vertices_mm[-1] == pytest.approx(data.rear_focal_z_mm, abs=0.01 * table.vertices_mm[-1])

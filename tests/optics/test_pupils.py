@@ -38,7 +38,6 @@ def outside(lens: Lens, film_radius: float, rows: int, points: int) -> tuple[int
     few of them pass where the film is near (a cover glass) or the pupil far: the others keep to twice each row's box.
     """
     film_z = lens.film_z_mm
-    assert film_z is not None
     bounds = pupil_bounds(lens, film_radius, (film_z, film_z), (587.5618, 587.5618), rows=rows, points=points)
     low, high, half = (torch.tensor(v, dtype=torch.float64) for v in (bounds.low_mm, bounds.high_mm, bounds.half_mm))
     g = torch.Generator().manual_seed(0)
@@ -84,7 +83,6 @@ def test_bounds_hold_at_a_deep_rear_surface(radius: float) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_the_pupil_plane_is_apart_from_the_film(name: str) -> None:
     lens = focused(name)
-    assert lens.film_z_mm is not None
     rear = lens.vertices_mm[len(lens.surfaces) - 1]
     assert lens.film_z_mm - pupil_plane_z_mm(lens) >= 0.25 * (lens.film_z_mm - rear)
 
@@ -149,7 +147,6 @@ def rate_and_light(some: Lens, pupil: RadialPupil, count: int = 20_000) -> tuple
     film = np.stack([FILM_RADIUS * np.sqrt((np.arange(count) + 0.5) / count), np.zeros(count)])
     points, area = pupil.sample(film, rng.random((2, count)))
     passed = passes_through(some, pupil.pupil_z_mm)(film[0], points) & (area > 0)
-    assert some.film_z_mm is not None
     distance = some.film_z_mm - pupil.pupil_z_mm
     cos2 = 1 / (1 + (((points - film) / distance) ** 2).sum(0))
     return float(passed.mean()), float((passed * area * cos2**2).mean() / distance**2)

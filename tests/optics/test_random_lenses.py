@@ -9,6 +9,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as hs
 from random_lenses import lenses
+from shipped import turned
 
 from experiments.extreme_cases import Case, disc, unit
 from experiments.extremes import measure
@@ -91,11 +92,6 @@ def test_lenses_without_cylinders_are_round(lens: Lens, seed: int, angle: float)
     passed = same & (out.status == st.PASSED)
     for a, b in zip(other.rays, turned(out.rays, angle), strict=True):
         assert ((a - b)[passed].abs() < 1e-9).all()
-
-
-def turned(r: Rays, angle: float) -> Rays:
-    c, s = math.cos(angle), math.sin(angle)
-    return Rays(c * r.x - s * r.y, s * r.x + c * r.y, r.z, c * r.dx - s * r.dy, s * r.dx + c * r.dy, r.dz)
 
 
 @SETTINGS

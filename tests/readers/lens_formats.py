@@ -23,6 +23,12 @@ def plain(lens: Lens) -> Lens:
     return replace(lens, surfaces=tuple(rows), film_z_mm=None)
 
 
+def swapped(old: str, new: str, text: str) -> str:
+    """A text with its first `old`, which must be there, replaced."""
+    assert old in text
+    return text.replace(old, new, 1)
+
+
 def pupil_mm(lens: Lens) -> float:
     return first_order(lens).entrance_pupil_diameter_mm
 

@@ -7,6 +7,8 @@ import re
 from pathlib import Path
 
 import pytest
+from lens_formats import swapped as swapped_in
+from shipped import singlet_mm
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics import catalogue
@@ -38,22 +40,20 @@ GO
 """
 
 
+def swapped(old: str, new: str, text: str = TEXT) -> str:
+    return swapped_in(old, new, text)
+
+
 def read(text: str, tmp_path: Path, given: Given | None = None) -> Lens:
     path = tmp_path / "lens.seq"
     path.write_text(text)
     return read_seq(path, given)
 
 
-def swapped(old: str, new: str, text: str = TEXT) -> str:
-    assert old in text
-    return text.replace(old, new, 1)
-
-
 @pytest.mark.parametrize("text", [TEXT, TEXT.lower(), TEXT.replace("\n", "\r\n")])
 def test_singlet_by_the_lensmakers_formula(text: str, tmp_path: Path) -> None:
     lens = read(text, tmp_path)
-    n, R, t = catalogue.find("N-BK7").n_d, 50.0, 5.0
-    efl_mm = 1 / ((n - 1) * (2 / R - (n - 1) * t / (n * R * R)))
+    efl_mm, _ = singlet_mm(catalogue.find("N-BK7").n_d)
     assert first_order(lens).efl_mm == pytest.approx(efl_mm, rel=1e-12)
     assert lens.name.lower() == "a singlet; for a test!"
     assert lens.half_field_deg == 5.0

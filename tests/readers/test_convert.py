@@ -25,11 +25,6 @@ def table(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.fixture
-def in_folder_of_table(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(table.parent)
-
-
 def test_json_has_units_in_its_keys(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["convert", str(table), "-o", str(tmp_path / "lens.toml"), "--units", "in", "--json"]) == 0
     captured = capsys.readouterr()

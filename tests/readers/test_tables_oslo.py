@@ -6,6 +6,8 @@ import math
 from pathlib import Path
 
 import pytest
+from lens_formats import swapped
+from shipped import singlet_mm
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics import catalogue
@@ -24,7 +26,7 @@ TABLE = """\
 50      5.0   1.5   20   # the front
 -50.0   0     1     20
 """
-EFL_MM = 1 / (0.5 * (2 / 50 - 0.5 * 5 / (1.5 * 2500)))
+EFL_MM, BACK_MM = singlet_mm(1.5)
 
 OSLO = """\
 // OSLO 6.1 31567 0 0
@@ -61,18 +63,13 @@ def read(text: str, suffix: str, tmp_path: Path, given: Given | None = None) -> 
     return read_len(path, given) if suffix == ".len" else read_table(path, given)
 
 
-def swapped(old: str, new: str, text: str) -> str:
-    assert old in text
-    return text.replace(old, new, 1)
-
-
 @pytest.mark.parametrize("count", ["", "3\n"])
 def test_table_by_the_lensmakers_formula(count: str, tmp_path: Path) -> None:
     lens = read(count + TABLE, ".dat", tmp_path)
     data = first_order(lens)
     assert data.efl_mm == pytest.approx(EFL_MM, rel=1e-12)
     # A last thickness of 0 stands for the paraxial focus.
-    assert lens.surfaces[-1].thickness_mm == pytest.approx(EFL_MM * (1 - 0.5 * 5 / (1.5 * 50)), rel=1e-12)
+    assert lens.surfaces[-1].thickness_mm == pytest.approx(BACK_MM, rel=1e-12)
     assert (lens.name, lens.stop_index) == ("Singlet behind a stop", 0)
     assert lens.f_number == pytest.approx(EFL_MM / data.entrance_pupil_diameter_mm)
     assert lens.dispersive is False
@@ -124,10 +121,9 @@ def test_table_refusals(old: str, new: str, message: str, tmp_path: Path) -> Non
 
 def test_oslo_by_the_lensmakers_formula(tmp_path: Path) -> None:
     lens = read(OSLO, ".len", tmp_path)
-    n, R, t = catalogue.find("BK7").n_d, 50.0, 5.0
-    efl_mm = 1 / ((n - 1) * (2 / R - (n - 1) * t / (n * R * R)))
+    efl_mm, back_mm = singlet_mm(catalogue.find("BK7").n_d)
     assert first_order(lens).efl_mm == pytest.approx(efl_mm, rel=1e-12)
-    assert lens.surfaces[-1].thickness_mm == pytest.approx(efl_mm * (1 - (n - 1) * t / (n * R)))
+    assert lens.surfaces[-1].thickness_mm == pytest.approx(back_mm)
     assert (lens.name, lens.notes, lens.half_field_deg) == ("A singlet; // for a test", "made up", 5.0)
     assert [s.diameter_mm for s in lens.surfaces] == pytest.approx([10.0, 18.0])
     assert read(swapped("UNI  1.0", "UNI  25.4", OSLO), ".len", tmp_path) == lens.scaled(25.4)

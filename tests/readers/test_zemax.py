@@ -8,6 +8,8 @@ import warnings
 from pathlib import Path
 
 import pytest
+from lens_formats import swapped as swapped_in
+from shipped import singlet_mm
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics import catalogue
@@ -69,26 +71,24 @@ MOFF   0   1 "" 0 0 0 1 1 0 0.0 ""
 """
 
 
+def swapped(old: str, new: str, text: str = HEAD + BODY + TAIL) -> str:
+    return swapped_in(old, new, text)
+
+
 def read(text: str, tmp_path: Path, given: Given | None = None, encoding: str = "utf-8") -> Lens:
     path = tmp_path / "lens.zmx"
     path.write_text(text, encoding=encoding)
     return read_zmx(path, given)
 
 
-def swapped(old: str, new: str, text: str = HEAD + BODY + TAIL) -> str:
-    assert old in text
-    return text.replace(old, new, 1)
-
-
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "latin-1"])
 def test_singlet_by_the_lensmakers_formula(encoding: str, tmp_path: Path) -> None:
     text = swapped("Singlet", "Einzellinse \u00d8 20")
     lens = read(text, tmp_path, encoding=encoding)
-    n, R, t = catalogue.find("N-BK7").n_d, 50.0, 5.0
-    efl_mm = 1 / ((n - 1) * (2 / R - (n - 1) * t / (n * R * R)))
+    efl_mm, back_mm = singlet_mm(catalogue.find("N-BK7").n_d)
     data = first_order(lens)
     assert data.efl_mm == pytest.approx(efl_mm, rel=1e-12)
-    assert data.back_focus_mm == pytest.approx(efl_mm * (1 - (n - 1) * t / (n * R)), rel=1e-12)
+    assert data.back_focus_mm == pytest.approx(back_mm, rel=1e-12)
     assert (lens.name, lens.notes) == ("Einzellinse \u00d8 20 for a test", "made up")
     assert lens.surfaces[0].glass == "N-BK7"
     assert lens.half_field_deg == 5.0  # the third field point, not the unused fourth
