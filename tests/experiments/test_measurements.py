@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import pytest
@@ -22,13 +22,14 @@ from neurolens.evaluate.speed import Race
 
 def test_rows_of_an_earlier_run_are_kept_or_refused(tmp_path: Path) -> None:
     file = tmp_path / "rows.json"
-    assert lab.kept_rows(file, "lenses", "lens", "a command") == {}
+    kept = partial(lab.kept_rows, file, "a command", lambda row: row["lens"], "lenses")
+    assert kept() == {}
     file.write_text('{"lenses": [{"lens": "a", "n": 1}, {"lens": "b"}]}', encoding="utf-8")
-    assert lab.kept_rows(file, "lenses", "lens", "a command") == {"a": {"lens": "a", "n": 1}, "b": {"lens": "b"}}
+    assert kept() == {"a": {"lens": "a", "n": 1}, "b": {"lens": "b"}}
     for text in ("", "[]", "{}", '{"lenses": 3}', '{"lenses": [{"n": 1}]}', '{"lenses": ["a"]}'):
         file.write_text(text, encoding="utf-8")
-        with pytest.raises(InputError, match=r"rows\.json: file: .*records of a command"):
-            lab.kept_rows(file, "lenses", "lens", "a command")
+        with pytest.raises(InputError, match=r"rows\.json: file: .*rows of a command"):
+            kept()
 
 
 def test_goals_cannot_be_missed_unseen() -> None:
