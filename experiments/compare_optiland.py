@@ -31,7 +31,7 @@ from neurolens.base.progress import Progress
 from neurolens.evaluate.speed import POOL, Call, Candidate, Race, race
 from neurolens.optics import glass
 from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.prescription import Lens
 from neurolens.optics.trace import Rays, compile_trace, trace
 from neurolens.surrogates.domain import FilmRays
 
@@ -73,7 +73,7 @@ def optiland_lens(lens: Lens) -> Optic:
         optic.surfaces.add(
             index=k + 1,
             thickness=float(s.thickness_mm),
-            material=IdealMaterial(_index(s)),
+            material=IdealMaterial(float(glass.index_of(s, glass.LINE_D_NM))),
             is_stop=s.stop,
             aperture=s.diameter_mm,
             **shape,
@@ -81,15 +81,15 @@ def optiland_lens(lens: Lens) -> Optic:
     return optic
 
 
-def _index(s: Surface) -> float:
-    return float(glass.index_of(s, glass.LINE_D_NM))
-
-
 def theirs(lens: Lens, backend: str, dtype: str) -> tuple[Callable[[FilmRays], Call], Callable[[FilmRays], np.ndarray]]:
     """What prepares Optiland's call, and what gives its landing points and directions, [6, N]."""
 
     def prepare(rays: FilmRays) -> Call:
-        start, optic = _prepared(lens, backend, dtype, rays)
+        be.set_backend(backend)
+        be.set_precision(dtype)
+        columns: list[Any] = list(light(lens, rays, DTYPES[dtype]))
+        columns += [torch.ones_like(columns[0]), torch.full_like(columns[0], glass.LINE_D_NM / 1000)]
+        start, optic = [c.numpy() if backend == "numpy" else c for c in columns], optiland_lens(lens)
 
         def call() -> RealRays:
             be.set_backend(backend)
@@ -106,14 +106,6 @@ def theirs(lens: Lens, backend: str, dtype: str) -> tuple[Callable[[FilmRays], C
         return np.where(be.to_numpy(found.i) > 0, out, np.nan)
 
     return prepare, land
-
-
-def _prepared(lens: Lens, backend: str, dtype: str, rays: FilmRays) -> tuple[list[Any], Optic]:
-    be.set_backend(backend)
-    be.set_precision(dtype)
-    columns: list[Any] = list(light(lens, rays, DTYPES[dtype]))
-    columns += [torch.ones_like(columns[0]), torch.full_like(columns[0], glass.LINE_D_NM / 1000)]
-    return ([c.numpy() for c in columns] if backend == "numpy" else columns), optiland_lens(lens)
 
 
 def ours(lens: Lens, dtype: str, compiled: bool) -> Callable[[FilmRays], Call]:

@@ -1,7 +1,4 @@
-"""Equal time and equal samples: error of each camera's picture after given seconds, against the exact lens.
-
-Renders are kept, one file a render, named by everything that it depends on, so that a run may be resumed.
-"""
+"""Equal time and equal samples: error of each camera's picture after given seconds, against the exact lens."""
 
 from __future__ import annotations
 
@@ -11,6 +8,7 @@ import math
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +29,7 @@ from experiments.equal_time_errors import (
     squared_error,
     weights,
 )
-from neurolens.base.files import atomic_path
+from neurolens.base.files import atomic_path, sha256_of
 from neurolens.base.tomlfile import read_toml
 from neurolens.cameras.build import FUSED, Shot, make_camera
 from neurolens.cameras.contract import Camera
@@ -85,22 +83,23 @@ def scene_cameras(root: Path, shot: CameraSettings) -> tuple[dict[str, Camera], 
     return cameras, ExactCamera(lens, dtype="float64", **same)
 
 
-_SOURCES = ("cameras", "optics", "programs", "render")  # folders of the package that a picture depends on
+_SOURCES = ("base", "cameras", "graph", "modelfile", "optics", "render")  # folders that a picture depends on
 
 
-@dataclass(frozen=True)
 class Shelf:
-    """The renders of one scene through one camera.
+    """The renders of one scene through one camera, in a folder whose name has the hash of all that they depend on."""
 
-    Attributes:
-        folder: of its files; its name ends in the hash of scene, camera, film, size and source.
-    """
-
-    folder: Path
-    scene: Scene
-    camera: Camera
-    film: FilmSettings
-    size: tuple[int, int]
+    def __init__(
+        self, run: Path, file: Path, scene: Scene, name: str, camera: Camera, film: FilmSettings, size: tuple[int, int]
+    ) -> None:
+        about = [neurolens.__version__, _source(), _scene_bytes(file), plain(camera.settings), film.__dict__, size]
+        model = camera.settings.get("model")
+        if model is not None:
+            about.append(sha256_of(model))
+        digest = hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()
+        self.folder = run / scene.name / f"{name.replace(' ', '-')}-{digest[:16]}"
+        self.size = size
+        self.render = partial(render, scene, camera, width=size[0], height=size[1], film=film)
 
     def file(self, samples: int, seed: int, threads: int) -> Path:
         return self.folder / f"{samples}-{seed}-{threads}.npz"
@@ -110,15 +109,11 @@ class Shelf:
 
         A file that is broken is made again. Raises what `render` does.
         """
-        width, height = self.size
         file = self.file(samples, seed, threads)
-        known = _read(file, (height, width, 3))
+        known = _read(file, (*self.size[::-1], 3))
         if known is not None:
             return known
-        found = render(
-            self.scene, self.camera, width=width, height=height, samples=samples, seed=seed, threads=threads,
-            film=self.film,
-        )  # fmt: skip
+        found = self.render(samples=samples, seed=seed, threads=threads)
         self.folder.mkdir(parents=True, exist_ok=True)
         with atomic_path(file) as temporary:
             np.savez(temporary, rgb=found.rgb, seconds=np.float64(found.stats["seconds"]))
@@ -126,20 +121,7 @@ class Shelf:
 
     def warm_up(self) -> None:
         """An untimed sample per pixel: the first render of a camera loads code and fills caches."""
-        width, height = self.size
-        render(self.scene, self.camera, width=width, height=height, samples=1, threads=1, film=self.film)
-
-
-def shelf(
-    run: Path, scene_file: Path, scene: Scene, name: str, camera: Camera, film: FilmSettings, size: tuple[int, int]
-) -> Shelf:
-    """The shelf of a camera in the folder of a run."""
-    about = [neurolens.__version__, _source(), _scene_bytes(scene_file), plain(camera.settings), film.__dict__, size]
-    model = camera.settings.get("model")
-    if model is not None:
-        about.append(hashlib.sha256(Path(model).read_bytes()).hexdigest())
-    digest = hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()
-    return Shelf(run / scene.name / f"{name.replace(' ', '-')}-{digest[:16]}", scene, camera, film, size)
+        self.render(samples=1, threads=1)
 
 
 def _read(file: Path, shape: tuple[int, ...]) -> tuple[NDArray[np.float32], float] | None:
@@ -279,7 +261,7 @@ def measure_scene(
     shot = scene.settings.camera
     cameras, truth = scene_cameras(root, shot)
     film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
-    shelves = {name: shelf(run, file, scene, name, c, film, counts.size) for name, c in cameras.items()}
+    shelves = {name: Shelf(run, file, scene, name, c, film, counts.size) for name, c in cameras.items()}
     halves, rendered = _render(shelves, counts, threads, report)
     maps = {name: film_map(truth, c, wavelengths_nm=shot.wavelengths_nm) for name, c in cameras.items()}
     reference = (halves[0] + halves[1]) / 2

@@ -207,7 +207,8 @@ def from_film(lens: Lens, count: int, g: torch.Generator, *, share: float = 1.02
 
     Film points lie within `film` times the image radius, where that is unknown the rear rim's.
     """
-    rear, z = lens.surfaces[-1].semi_diameter_mm, _film_z_mm(lens)
+    rear = lens.surfaces[-1].semi_diameter_mm
+    z = float(lens.film_z_mm if lens.film_z_mm is not None else lens.vertices_mm[-1])
     rear_z = float(lens.vertices_mm[len(lens.surfaces) - 1])
     data = first_order(lens)
     pupil_z, pupil = data.exit_pupil_z_mm, abs(data.exit_pupil_diameter_mm) / 2
@@ -221,16 +222,14 @@ def from_film(lens: Lens, count: int, g: torch.Generator, *, share: float = 1.02
     return Rays(fx, fy, torch.full_like(fx, z), *unit(px * radius - fx, py * radius - fy, depth))
 
 
-def _film_z_mm(lens: Lens) -> float:
-    return float(lens.film_z_mm if lens.film_z_mm is not None else lens.vertices_mm[-1])
-
-
 def from_scene(lens: Lens, count: int, g: torch.Generator, *, slope: float, wide: float = 1.0) -> Rays:
     """Light from in front of the lens to `wide` times its front rim, at slopes up to `slope`."""
     x, y = disc(g, count, wide * lens.surfaces[0].semi_diameter_mm)
     sx, sy = disc(g, count, slope)
     d = unit(sx, sy, torch.ones_like(sx))
-    front = torch.full_like(x, min(0.0, _rim_sag(lens.surfaces[0])) - 1.0)
+    first, radius = lens.surfaces[0], float(lens.surfaces[0].radius_mm)
+    rim = torch.tensor([min(first.semi_diameter_mm, abs(radius)), 0.0], dtype=torch.float64)
+    front = torch.full_like(x, min(0.0, float(sag(radius, rim))) - 1.0)
     return Rays(x - sx, y - sy, front, *d)
 
 
@@ -277,8 +276,3 @@ def sag(radius: float, at: Sequence[Tensor] | Tensor) -> Tensor:
     """Depth of a sphere behind its vertex at points x, y."""
     ratio2 = (at[0] ** 2 + at[1] ** 2) / radius
     return ratio2 / (1 + torch.sqrt((1 - ratio2 / radius).clamp_min(0)))
-
-
-def _rim_sag(s: Surface) -> float:
-    height = torch.tensor([min(s.semi_diameter_mm, abs(float(s.radius_mm))), 0.0], dtype=torch.float64)
-    return float(sag(float(s.radius_mm), height))

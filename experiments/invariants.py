@@ -33,7 +33,6 @@ import resource
 import runpy
 import subprocess
 import sys
-import tempfile
 import time
 import traceback
 import zlib
@@ -498,7 +497,7 @@ def check_picture(old: Path, new: Path, cache: Path, **_: Any) -> Out:
 
 
 def check_start(golden: Path, new: Path, **_: Any) -> Out:
-    """Processor time of fresh processes in pairs, and what must run without the packages of the extra "train"."""
+    """Processor time of fresh processes in pairs. What must run without torch is for tests/test_imports.py."""
     found: Out = {}
     old = Path(json.loads((golden / "tree.json").read_text())["tree"])
     jobs = {"import": ["-c", "import neurolens.cameras.model"], "help": ["-m", "neurolens", "--help"]}
@@ -512,21 +511,13 @@ def check_start(golden: Path, new: Path, **_: Any) -> Out:
                 times[tree].append(after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
         found[f"{name} s"] = min(times[new][1:])
         found[name] = min(times[new][1:]) / min(times[old][1:])
-    blocked = "torch sklearn onnx matplotlib flip_evaluator"
-    without = f"import sys; sys.modules.update(dict.fromkeys('{blocked}'.split())); sys.argv = ['neurolens', *{{}}]; "
-    without += "import neurolens.cameras.model, runpy; runpy.run_module('neurolens', run_name='__main__')"
-    words = f"experiments/scenes/room.toml -o {tempfile.gettempdir()}/without_torch.exr --restart --quiet --threads 1"
-    words += " --film 36x27 --width 8 --height 6 --samples 1"
-    commands = [["--help"], ["render", "--help"]]
-    commands += [["render", *words.split(), *CAMERAS[c].split()] for c in ("thin", "onnx", "fused-model", "zoom")]
-    failed = [c for c in commands if in_tree(new, ["-c", without.format(c)], capture_output=True).returncode]
-    return found | {"no torch": len(failed)} | ({"why": str(failed[0][:2])} if failed else {})
+    return found
 
 
 # What may not be more, summed over the files or, of `SIZES`, the largest; all else is told only.
 LIMITS: dict[str, float] = {"ulp": 2.0, "derivative ulp": 4.0, "slower": 1.03, "import": 1.05, "help": 1.05}
 LIMITS |= dict.fromkeys(("status", "cards", "differs", "signature", "message", "operations"), 0.0)
-LIMITS |= dict.fromkeys(("broken", "convergence", "no torch"), 0.0)
+LIMITS |= dict.fromkeys(("broken", "convergence"), 0.0)
 SIZES = ("ulp", "derivative ulp", "slower", "import", "help", "relative", "import s", "help s")
 # The folder and endings of an item's goldens, the comparison of two files, and its share of --rays.
 ITEMS: dict[str, tuple[str, tuple[str, ...], Callable[..., Out], float]] = {

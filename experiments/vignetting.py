@@ -148,12 +148,8 @@ def _errors(opening: str, rows: Sequence[Row], choose: Choose) -> str:
     )
 
 
-def _light(rows: Sequence[Row], choose: Choose) -> str:
-    return _percent((r["illumination"]["max_difference"] for r in rows), choose)
-
-
 _CHOSEN: dict[str, Callable[[Sequence[Row], Choose], str]] = {n: partial(_errors, n) for n in OPENINGS}
-_CHOSEN["light"] = _light
+_CHOSEN["light"] = lambda rows, choose: _percent((r["illumination"]["max_difference"] for r in rows), choose)
 _COLUMNS = lab.columns(
     ("lens", "lens"),
     *((title, lambda r, cell=cell: cell([r], max)) for title, cell in _CHOSEN.items()),
