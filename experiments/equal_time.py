@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 import neurolens
+from experiments import lab
 from experiments.equal_time_errors import (
     Estimate,
     FilmMap,
@@ -53,17 +54,16 @@ FUSED_EXACT = "fused exact"
 EXACTS = (EXACT, FUSED_EXACT)
 
 
-def scene_cameras(root: Path, shot: CameraSettings) -> tuple[dict[str, Camera], ExactCamera]:
+def scene_cameras(shot: CameraSettings) -> tuple[dict[str, Camera], ExactCamera]:
     """The cameras of a scene by name, the exact one first, and the exact one in float64 for film-space errors.
 
     All of the lens share the pupil bounds of the models' domain, so that the same random numbers are the same rays.
     """
-    lens = read_lens(root / "lenses" / f"{LENS}.toml")
+    lens = read_lens(lab.LENSES / f"{LENS}.toml")
     data = first_order(lens)
     widest = shot.f_number is None or shot.f_number < data.f_number
     f_number = data.f_number if widest else float(shot.f_number or 0)
-    card = load_model(root / "models" / next(iter(MODELS.values()))).card
-    bounds = Domain.from_dict(card["domain"]).bounds
+    bounds = Domain.from_dict(load_model(lab.MODELS / MODELS["ols-28"]).card["domain"]).bounds
     film = (shot.film_width_mm, shot.film_height_mm)
     set_ = Shot(film, shot.focus_m, None if widest else f_number, wavelength_nm=shot.wavelengths_nm)
 
@@ -76,8 +76,7 @@ def scene_cameras(root: Path, shot: CameraSettings) -> tuple[dict[str, Camera], 
     }
     cameras: dict[str, Camera] = {EXACT: ExactCamera(lens, **same)}
     for name, model in MODELS.items():
-        spec = str(root / "models" / model)
-        cameras[name] = make_camera(FUSED + spec if name.startswith("fused") else spec, set_)
+        cameras[name] = make_camera(f"{FUSED if name.startswith('fused') else ''}{lab.MODELS / model}", set_)
     cameras[FUSED_EXACT] = FusedExactCamera(lens, **same)
     cameras[THIN] = make_camera("thin", replace(set_, efl_mm=data.efl_mm, f_number=f_number))
     return cameras, ExactCamera(lens, dtype="float64", **same)
@@ -252,14 +251,12 @@ class SceneResult:
     cameras: dict[str, CameraResult]
 
 
-def measure_scene(
-    file: Path, root: Path, run: Path, counts: Counts, threads: int, report: Callable[[float], None]
-) -> SceneResult:
+def measure_scene(file: Path, run: Path, counts: Counts, threads: int, report: lab.Report) -> SceneResult:
     """Render and measure one scene; what an earlier run left in `run` is not rendered again."""
     torch.set_num_threads(1)  # in this process; workers do so themselves
     scene = load_scene(file)
     shot = scene.settings.camera
-    cameras, truth = scene_cameras(root, shot)
+    cameras, truth = scene_cameras(shot)
     film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
     shelves = {name: Shelf(run, file, scene, name, c, film, counts.size) for name, c in cameras.items()}
     halves, rendered = _render(shelves, counts, threads, report)
@@ -285,7 +282,7 @@ class Rendered:
 
 
 def _render(
-    shelves: Mapping[str, Shelf], counts: Counts, threads: int, report: Callable[[float], None]
+    shelves: Mapping[str, Shelf], counts: Counts, threads: int, report: lab.Report
 ) -> tuple[list[Floats], dict[str, Rendered]]:
     """The reference's halves, and every camera's renders; the cameras take turns, so that load affects all equally."""
     jobs = counts.jobs
@@ -361,13 +358,13 @@ def _levels(own: Rendered, halves: list[Floats], by: Mapping[str, Floats], count
         yield level(together * counts.pass_samples, pictures, [together * t for t in times])
 
 
-def scene_file(name: str, root: Path) -> Path:
+def scene_file(name: str) -> Path:
     """The file of a scene of the project by name, or of any by its path; read, so that mistakes are found before the
     work.
 
     Raises:
         InputError: as `load_scene`.
     """
-    file = root / "experiments" / "scenes" / f"{name}.toml" if name in SCENES else Path(name)
+    file = lab.SCENES / f"{name}.toml" if name in SCENES else Path(name)
     load_scene(file)
     return file

@@ -385,11 +385,11 @@ def run(args: argparse.Namespace) -> None:
     counts = QUICK if args.quick else Counts()
     folder = args.folder or lab.ROOT / "runs" / ("equal_time_quick" if args.quick else "equal_time")
     out = args.out or (folder / "results" if args.quick else lab.RESULTS / "equal_time")
-    files = [scene_file(name, lab.ROOT) for name in args.scene or SCENES]
+    files = [scene_file(name) for name in args.scene or SCENES]
     progress = Progress({file.stem: 1.0 for file in files}, quiet=args.quiet)
     done: list[SceneResult] = []
     for file in files:
         with progress.stage(file.stem) as report:
-            done.append(measure_scene(file, lab.ROOT, folder, counts, args.threads, report))
+            done.append(measure_scene(file, folder, counts, args.threads, report))
         text = write(done, out)
     print(f"{text}\nWritten to {out}")

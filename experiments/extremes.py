@@ -357,7 +357,7 @@ def run(args: argparse.Namespace) -> int:
     lab.quiet_glasses()
     done = []
     with Progress(quiet=args.quiet).stage("extremes") as report:
-        cases = list(all_cases(lab.LENSES, args.rays))
+        cases = list(all_cases(args.rays))
         for case in cases:
             done.append(measure(case))
             report(len(done) / len(cases))

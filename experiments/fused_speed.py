@@ -73,8 +73,8 @@ class Case:
     efl_mm: float | None = None
     configuration: str | None = None
 
-    def lens(self, folder: Path) -> Lens:
-        return LensChoice(folder / self.file, self.efl_mm, self.configuration).read()
+    def lens(self) -> Lens:
+        return LensChoice(lab.LENSES / self.file, self.efl_mm, self.configuration).read()
 
 
 CASES = (
@@ -130,9 +130,9 @@ def small_enough(prepared: Prepared, choices: Sequence[ModelSettings]) -> tuple[
     return model, rms
 
 
-def measure(case: Case, folder: Path, *, rounds: int, torch_compiled: bool, report: Report) -> list[Row]:
+def measure(case: Case, *, rounds: int, torch_compiled: bool, report: Report) -> list[Row]:
     """Fit, race and hold against the exact tracers; one row per candidate."""
-    lens = case.lens(folder)
+    lens = case.lens()
     domain = domain_of(lens, film_radius_mm=case.film_radius_mm, focus_m=(math.inf, case.near_m))
     prepared = prepare(make_pairs(lens, domain, PairSettings()))
     fitted = [small_enough(prepared, choices) for choices in (POLYNOMIALS, NETWORKS)]
@@ -331,6 +331,6 @@ def run(args: argparse.Namespace) -> None:
     rows, text = earlier(args.out, [Path(c.file).stem for c in cases]), ""
     for case in cases:
         with progress.stage(case.file) as report:
-            rows += measure(case, lab.LENSES, rounds=rounds, torch_compiled=not args.quick, report=report)
+            rows += measure(case, rounds=rounds, torch_compiled=not args.quick, report=report)
         text = write(rows, args.out, rounds)
     print(text)

@@ -108,16 +108,16 @@ class Passage:
     by_radius: dict[str, NDArray[np.float64]]
 
 
-def camera_of(case: Case, folder: Path) -> ExactCamera:
-    """The lens of a case, read from `folder`, on `FILM_MM`, focused at infinity."""
-    lens = read_lens(folder / f"{case.lens}.toml").at(focal_length_mm=case.focal_length_mm, f_number=case.f_number)
+def camera_of(case: Case) -> ExactCamera:
+    """The lens of a case on `FILM_MM`, focused at infinity."""
+    lens = read_lens(lab.LENSES / f"{case.lens}.toml").at(focal_length_mm=case.focal_length_mm, f_number=case.f_number)
     return ExactCamera(lens, film_mm=FILM_MM, focus_m=math.inf)
 
 
-def measure(case: Case, folder: Path, samples: int = SAMPLES) -> Passage:
+def measure(case: Case, samples: int = SAMPLES) -> Passage:
     """Rates of every method for a case, in light of 400 to 700 nm."""
     start = time.perf_counter()
-    camera = camera_of(case, folder)
+    camera = camera_of(case)
     found = time.perf_counter() - start
     outline = camera.film.outline
     film, square, wavelength = _samples(samples, 1, outline.film_radius_mm)
@@ -230,13 +230,13 @@ def _profile(radius: Any, passed: Any, end: float, bins: int = 24) -> NDArray[np
     return np.bincount(place, weights=passed, minlength=bins) / np.maximum(count, 1)
 
 
-def pixel_rates(folder: Path, samples: int = SAMPLES) -> Iterator[tuple[float, float, float]]:
+def pixel_rates(samples: int = SAMPLES) -> Iterator[tuple[float, float, float]]:
     """f-number, percent that passes from the pixel of Table 5.3 through the rear rim, and theirs; 36 x 27 mm film."""
     radius = math.hypot(128, 96) * 36 / 512
     r, angle = SobolEngine(2, scramble=True, seed=1).draw(samples).double().numpy().T
     r, angle = np.sqrt(r), 2 * math.pi * angle
     for f_number, theirs in TABLE_5_3.items():
-        lens = read_lens(folder / "brendel_tessar_100.toml").at(focal_length_mm=50.0, f_number=f_number)
+        lens = read_lens(lab.LENSES / "brendel_tessar_100.toml").at(focal_length_mm=50.0, f_number=f_number)
         rim = known.rear_rim(lens, radius)
         points = rim.along[0] * np.stack([r * np.cos(angle), r * np.sin(angle)])
         passed = known.passes_through(lens, rim.pupil_z_mm)(np.full(samples, radius), points)
@@ -328,7 +328,7 @@ def draw(passages: Sequence[Passage], path: Path) -> None:
             above.set(ylim=(0, 103), xlim=(0, p.lit_radius_mm), xlabel="film radius (mm)")
             above.set_title(f"{p.case.name}, f/{p.case.f_number:g}", loc="left")
             above.grid(axis="y")
-            _draw_outlines(below, camera_of(p.case, lab.LENSES))
+            _draw_outlines(below, camera_of(p.case))
         axes[0, 0].set_ylabel("rays that pass (%)")
         axes[0, 0].legend(loc="lower left")
         axes[1, 0].set_ylabel("y on the pupil plane (mm)")
@@ -382,9 +382,9 @@ def run(args: argparse.Namespace) -> None:
     with Progress(quiet=args.quiet).stage("pupils") as report:
         done = []
         for case in cases:
-            done.append(measure(case, lab.LENSES, args.rays))
+            done.append(measure(case, args.rays))
             report(len(done) / (len(cases) + 1))
-        pixel = [] if args.only else list(pixel_rates(lab.LENSES, args.rays))
+        pixel = [] if args.only else list(pixel_rates(args.rays))
     data = {"film_mm": FILM_MM, "samples": args.rays, "cases": [_json(p) for p in done], "tessar_pixel": pixel}
     print(lab.write_results(args.out, "passage", page(done, pixel, args.rays), data))
     draw([p for p in done if p.case in DRAWN] or done[:1], args.out / "passage.png")

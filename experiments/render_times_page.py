@@ -287,10 +287,10 @@ def run(args: argparse.Namespace) -> None:
     lab.quiet_glasses()
     torch.set_num_threads(1)
     found = Found(Size(64, 36, 16, 1) if args.quick else Size())
-    scenes = bench.load_scenes(lab.ROOT, args.quick)
+    scenes = bench.load_scenes(args.quick)
     progress = Progress({"cameras": 25, "cameras alone": 5, "renders": 65, "stop shapes": 5}, quiet=args.quiet)
     with progress.stage("cameras") as report:
-        found.subjects = bench.make_subjects(lab.ROOT, args.quick, report)
+        found.subjects = bench.make_subjects(args.quick, report)
     with progress.stage("cameras alone") as report:
         bench.time_alone(found.subjects, report)
     write(found, args.out)
@@ -298,6 +298,6 @@ def run(args: argparse.Namespace) -> None:
         found.rows = bench.time_renders(found.subjects, scenes, found.size, report)
     write(found, args.out)
     with progress.stage("stop shapes") as report:
-        found.shapes = bench.time_shapes(lab.ROOT, scenes["cheap"], found.size, report)
+        found.shapes = bench.time_shapes(scenes["cheap"], found.size, report)
     draw(found, args.out / "render_times.png")
     print(write(found, args.out))

@@ -28,35 +28,25 @@ from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import Rays, compile_trace, trace
 from neurolens.surrogates.domain import FilmRays
 
-# Lens files by number of refractions; the first that is there is taken.
-
-
+# Lens files by number of refractions.
 LENSES = {
-    2: "thorlabs_lb1471*",
-    7: "brendel_tessar*",
-    10: "tronnier_double_gauss*",
+    2: "thorlabs_lb1471_biconvex_50",
+    7: "brendel_tessar_100",
+    10: "tronnier_double_gauss_100",
     12: "laikin_double_gauss_50",
-    18: "itoh*",
-    25: "ikemori*",
-    33: "ogawa*",
-    57: "panavision*",
+    18: "itoh_zoom_100_146",
+    25: "ikemori_retrofocus_14",
+    33: "ogawa_zoom_70_200",
+    57: "panavision_anamorphic_zoom_21",
 }
 MAIN = 12  # the double Gauss on which the goals stand, with and without aspheres
 ASPHERIC_SURFACES = (0, 12)  # of that double Gauss: first and last, where aspheres are used
 DTYPES = (torch.float32, torch.float64)
 
 
-def chosen_lenses(folder: Path) -> tuple[dict[int, Lens], list[str]]:
-    """The lenses of the table that have a file, by nominal number of refractions, and what is missing."""
-    found: dict[int, Lens] = {}
-    missing = []
-    for count, pattern in LENSES.items():
-        paths = sorted(folder.glob(f"{pattern}.toml"))
-        if paths:
-            found[count] = read_lens(paths[0]).at()
-        else:
-            missing.append(f"{count} refractions ({pattern}.toml)")
-    return found, missing
+def lens_of(count: int) -> Lens:
+    """The lens of so many refractions."""
+    return read_lens(lab.LENSES / f"{LENSES[count]}.toml").at()
 
 
 def with_aspheres(lens: Lens) -> Lens:
@@ -226,7 +216,7 @@ class Found:
 
     Attributes:
         rows: of `time_lens`. memory: of `memory_of`.
-        missing: lenses without a file, and what could not be measured, as sentences.
+        missing: what could not be measured, as sentences.
     """
 
     rounds: int
@@ -293,10 +283,8 @@ OPTIONS = (
 def run(args: argparse.Namespace) -> None:
     """Time the tracer, lens by lens; the table is written after each."""
     lab.quiet_glasses()
-    lenses, missing = chosen_lenses(lab.LENSES)
-    lenses = {MAIN: lenses[MAIN]} if args.quick else lenses
-    lenses = {n: lenses[n] for n in lab.chosen(list(lenses), lambda n: Path(lenses[n].path).stem, args.only, "trace")}
-    found = Found(lab.rounds_of(args), missing=[] if args.quick or args.only else missing)
+    counts = lab.chosen([MAIN] if args.quick else list(LENSES), lambda n: LENSES[n], args.only, "trace")
+    lenses, found = {n: lens_of(n) for n in counts}, Found(lab.rounds_of(args))
     threads = args.threads[:1] if args.quick else args.threads
     plan = {f"{n} refractions": (2.0 if n == MAIN else 1.0) * (8 + n + n * len(threads)) for n in lenses}
     progress = Progress(plan | {"memory": 10.0}, quiet=args.quiet)

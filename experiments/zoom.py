@@ -51,9 +51,9 @@ class Case:
         focus = "-focus" if self.internal else ""
         return f"{self.lens}{focus}{'' if self.position is None else '-' + self.position}"
 
-    def space(self, lenses: Path) -> StateSpace:
+    def space(self) -> StateSpace:
         """The states, with the domain that `neurolens train` takes where nothing is stated."""
-        lens = read_lens(lenses / f"{self.lens}.toml").with_aperture(None)
+        lens = read_lens(lab.LENSES / f"{self.lens}.toml").with_aperture(None)
         return StateSpace(
             lens,
             axes_of(lens, zoom=self.zoom, internal=self.internal, state=self.position),
@@ -75,14 +75,14 @@ CASES = (
 )
 
 
-def measure_case(case: Case, lenses: Path, folder: Path, states: int, report: Report) -> dict[str, Any]:
+def measure_case(case: Case, folder: Path, states: int, report: Report) -> dict[str, Any]:
     """Fit and measure one case.
 
     Args:
         folder: for the model, which is kept; see `train_states.fit_and_measure_states`.
         states: random states of the measurement.
     """
-    space = case.space(lenses)
+    space = case.space()
     settings = StateSettings(terms=TERMS, rays=RAYS, name=case.name)
     record = fit_and_measure_states(space, settings, folder, states=states, report=lambda done: report(0.8 * done))
     fixed = []
@@ -199,6 +199,6 @@ def run(args: argparse.Namespace) -> None:
     with pinned_threads():
         for case in missing:
             with progress.stage(case.name) as report:
-                records[case.name] = measure_case(case, lab.LENSES, args.models, args.states, report)
+                records[case.name] = measure_case(case, args.models, args.states, report)
             text = write_records(records, args.out)
     print(text)

@@ -150,7 +150,7 @@ SAMPLES = 2**13
 @cache
 def measured(lens: str, f_number: float) -> passage.Passage:
     case = next(c for c in CASES if (c.lens, c.f_number) == (lens, f_number))
-    return passage.measure(case, LENSES, SAMPLES)
+    return passage.measure(case, SAMPLES)
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def test_every_case_is_a_lens_of_the_library_and_every_figure_a_method() -> None
 
 
 def test_pixel_of_table_5_3() -> None:
-    rows = list(passage.pixel_rates(LENSES, SAMPLES))
+    rows = list(passage.pixel_rates(SAMPLES))
     assert [n for n, _, _ in rows] == list(TABLE_5_3)
     # Once vignetting is past, the rate goes with the area of the stop.
     areas = [rate * n**2 for n, rate, _ in rows[1:6]]
@@ -190,4 +190,4 @@ def test_pixel_of_table_5_3() -> None:
 def test_a_lens_with_one_wavelength() -> None:
     """Without known dispersion the outline is for one wavelength."""
     case = Case("muller_fisheye_100", 14.0, 4.0)
-    assert len(passage.camera_of(case, LENSES).film.outline.wavelength_nm) == 1
+    assert len(passage.camera_of(case).film.outline.wavelength_nm) == 1

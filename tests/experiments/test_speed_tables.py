@@ -19,9 +19,9 @@ from experiments.trace_speed import (
     ASPHERIC_SURFACES,
     LENSES,
     MAIN,
-    chosen_lenses,
     film_rays,
     launched,
+    lens_of,
     memory_of,
     with_aspheres,
 )
@@ -97,9 +97,7 @@ FOLDER = Path(__file__).parents[2] / "lenses"
 
 
 def test_lenses_have_the_refractions_that_the_table_says() -> None:
-    lenses, missing = chosen_lenses(FOLDER)
-    assert missing == []
-    assert set(lenses) == set(LENSES)
+    lenses = {count: lens_of(count) for count in LENSES}
     for count, lens in lenses.items():
         # The anamorphic zoom's table leaves its last plane to the reader.
         assert refractions(lens) in (count, count - 1)
@@ -108,7 +106,7 @@ def test_lenses_have_the_refractions_that_the_table_says() -> None:
 
 
 def test_two_aspheres_change_the_rays_and_little_else() -> None:
-    plain = chosen_lenses(FOLDER)[0][MAIN]
+    plain = lens_of(MAIN)
     aspheric = with_aspheres(plain)
     changed = [k for k, s in enumerate(aspheric.surfaces) if s.asphere]
     assert changed == list(ASPHERIC_SURFACES)
@@ -122,7 +120,7 @@ def test_two_aspheres_change_the_rays_and_little_else() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_rays_have_wavelengths_of_their_own(dtype: torch.dtype) -> None:
-    lens = chosen_lenses(FOLDER)[0][MAIN]
+    lens = lens_of(MAIN)
     rays, wavelength = launched(lens, film_rays(lens, 1000), dtype)
     assert {c.dtype for c in (*rays, wavelength)} == {dtype}
     assert all(c.is_contiguous() for c in rays)
