@@ -1,6 +1,7 @@
 """Every method on a set of lenses, or on the whole library: `neurolens bench surrogates` with lenses chosen here.
 
-Without LENS: a standard lens, a long zoom, one that is hard for its aperture, a fisheye, and one of steep aspheres.
+Without LENS: laikin_double_gauss_50 (a standard lens), ogawa_zoom_70_200 (a long zoom), schaefter_primoplan_100 (hard
+for its aperture), horimoto_fisheye_16 and phone_lens_6 (steep aspheres).
 """
 
 from __future__ import annotations
