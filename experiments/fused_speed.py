@@ -27,7 +27,6 @@ from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxsession import open_session
 from neurolens.evaluate.candidates import (
     exact_candidates,
-    find_compiler,
     fused_candidate,
     model_candidate,
     program_candidate,
@@ -36,7 +35,7 @@ from neurolens.evaluate.describe import refractions
 from neurolens.evaluate.experiment import LensChoice
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.speed import Call, Candidate, race
-from neurolens.graph.compiler import FLAGS
+from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
 from neurolens.optics.prescription import Lens
@@ -124,7 +123,7 @@ def small_enough(prepared: Prepared, choices: Sequence[ModelSettings]) -> tuple[
     pairs = prepared.pairs
     for settings in choices:
         model = fit_model(prepared, settings)
-        rms = float(ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict)["rms_um"])
+        rms = float(ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict).rms_um)
         if rms <= WITHIN_UM:
             break
     return model, rms

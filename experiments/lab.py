@@ -24,7 +24,7 @@ from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
 from neurolens.commands.arguments import whole
-from neurolens.evaluate.records import markdown_table
+from neurolens.evaluate.pages import markdown_table
 
 ROOT = Path(__file__).parents[1]
 LENSES, SCENES, MODELS = ROOT / "lenses", ROOT / "experiments" / "scenes", ROOT / "models"

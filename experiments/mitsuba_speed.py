@@ -27,6 +27,7 @@ import numpy as np
 import neurolens
 from experiments import lab
 from experiments.lab import Report
+from experiments.mitsuba_scenes import our_scene, with_our_spectra
 from experiments.renderer_speed import thin_camera
 from neurolens import mitsuba
 from neurolens.base.errors import NeurolensError
@@ -36,7 +37,6 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.records import plain
 from neurolens.mitsuba import require_mitsuba
 from neurolens.mitsuba.library import libraries
-from neurolens.mitsuba.scenes import our_scene, with_our_spectra
 from neurolens.render.film import FilmSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene, load_scene

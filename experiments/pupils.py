@@ -360,16 +360,11 @@ def _draw_outlines(axes: Any, camera: ExactCamera) -> None:
 
 def _polygon(outline: PupilOutline, radius: float) -> tuple[Any, Any]:
     """The closed outline of a film radius at 550 nm, on the pupil plane, mm."""
-
-    row, step, _ = (a[0] for a in outline.place(np.array([radius], np.float32)))
-    share = outline.share(np.array([550], np.float32))[0] if len(outline.wavelength_nm) > 1 else 0.0
-    after = min(row + 1, outline.centre.size - 1)
-
-    def at(values: Any) -> Any:
-        return (1 - step) * values[row] + step * values[after]
-
-    x, y = ((1 - share) * at(c[0]) + share * at(c[-1]) for c in (outline.x, outline.y))
-    return at(outline.centre) + np.concatenate([x, x[::-1]]), np.concatenate([y, -y[::-1]])
+    way = np.linspace(0, 4, 513)[:, None] - np.array([3.5, 0.5])  # round the edge of the unit square
+    square = np.clip(np.abs((way + 2) % 4 - 2) - 0.5, 0, 1).T.astype(np.float32)
+    film = np.repeat(np.array([[radius], [0]], np.float32), square.shape[1], 1)
+    x, y = outline.sample(film, square, np.full(square.shape[1], 550, np.float32))[0]
+    return x, y
 
 
 OPTIONS = (lab.count("rays", SAMPLES, "rays per method (default 131072)", 1000), lab.ONLY, lab.out())

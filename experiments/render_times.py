@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -205,11 +206,28 @@ def time_renders(subjects: Sequence[Subject], scenes: dict[str, Scene], size: Si
 def one_render(scene: Scene, camera: Camera, size: Size, differentials: bool = False) -> dict[str, float]:
     """Statistics of one render."""
     film = FilmSettings(wavelengths="one")
+    if differentials:
+        camera = _WithDifferentials(camera)
     done = render(
-        scene, camera, width=size.width, height=size.height, samples=size.samples, seed=1, threads=1, film=film,
-        differentials=differentials,
+        scene, camera, width=size.width, height=size.height, samples=size.samples, seed=1, threads=1, film=film
     )  # fmt: skip
     return done.stats
+
+
+class _WithDifferentials:
+    """A camera that computes the differentials of all its rays, which the renderer does not use: to time them."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self.sample = camera.sample_differentials  # type: ignore[attr-defined]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._camera, name)
+
+    def for_worker(self) -> _WithDifferentials:
+        """This camera about the one that the camera has for a worker."""
+        opener = getattr(self._camera, "for_worker", None)
+        return _WithDifferentials(opener() if opener else self._camera)
 
 
 @dataclass

@@ -14,6 +14,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -110,7 +111,7 @@ def measure(file: Path, domain: str, rays: int) -> dict[str, Any]:
                 "monomials": len(getattr(model.core, "exponents", ())),
                 "seconds": seconds,
                 "openings": opening_errors(model.lens, model, rays),
-                "illumination": light,
+                "illumination": asdict(light),
             }
         except NeurolensError as error:
             row["failed"] = str(error)

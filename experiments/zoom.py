@@ -107,7 +107,7 @@ def _fixed(space: StateSpace, place: float) -> dict[str, float]:
     pairs = make_pairs(lens, domain, PairSettings(RAYS, TESTS, RAYS))
     model = fit_model(prepare(pairs), ModelSettings("ols", terms=TERMS))
     errors = ray_errors(lens, domain, pairs.held_out, model.predict)
-    return {axis.name: value, "rms_um": errors["rms_um"], "direction_rms_deg": errors["direction_rms_deg"]}
+    return {axis.name: value, "rms_um": errors.rms_um, "direction_rms_deg": errors.direction_rms_deg}
 
 
 _HEAD = """\

@@ -15,40 +15,39 @@ from hypothesis import strategies as st
 
 from neurolens.base.config import apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, atomic_write_text
+from neurolens.base.files import atomic_path, atomic_write_text, check_writable
 from neurolens.base.progress import Progress, duration
 
 
-def test_writes_and_replaces(tmp_path: Path) -> None:
-    target = tmp_path / "results.json"
-    for text in ("first", "zweite, größer: α"):
-        atomic_write_text(target, text)
-        assert target.read_text(encoding="utf-8") == text
-    assert list(tmp_path.iterdir()) == [target]
-
-
-def test_a_failure_leaves_the_old_file_and_no_other(tmp_path: Path) -> None:
-    target = tmp_path / "model.onnx"
-    target.write_bytes(b"old")
-    with pytest.raises(RuntimeError, match="stopped"), atomic_path(target) as temporary:
-        temporary.write_bytes(b"half")
-        raise RuntimeError("stopped")
-    assert target.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [target]
-
-
-def test_nothing_is_at_the_name_before_the_end(tmp_path: Path) -> None:
+def test_files_are_whole_or_as_before(tmp_path: Path) -> None:
     target = tmp_path / "film.exr"
     with atomic_path(target) as temporary:
         assert temporary.suffix == ".exr" and temporary.parent == tmp_path
         temporary.write_bytes(b"film")
         assert not target.exists()
     assert target.read_bytes() == b"film"
-
-
-def test_a_writer_that_wrote_nothing_is_an_error(tmp_path: Path) -> None:
+    for text in ("first", "zweite, größer: α"):
+        atomic_write_text(target, text)
+        assert target.read_text(encoding="utf-8") == text
+    with pytest.raises(RuntimeError, match="stopped"), atomic_path(target) as temporary:
+        temporary.write_bytes(b"half")
+        raise RuntimeError("stopped")
     with pytest.raises(FileNotFoundError), atomic_path(tmp_path / "empty.png"):
         pass
+    assert target.read_text(encoding="utf-8") == text and list(tmp_path.iterdir()) == [target]
+
+
+def test_errors_name_the_target_not_the_temporary_file(tmp_path: Path) -> None:
+    target = tmp_path / "gone" / "a.json"
+    with pytest.raises(OSError) as error, atomic_path(target) as temporary:
+        temporary.write_text("x")
+    assert error.value.filename == str(target)
+    with pytest.raises(OSError) as error:
+        check_writable(target)
+    assert error.value.filename == str(target)
+    with pytest.raises(IsADirectoryError):
+        check_writable(tmp_path)
+    check_writable(tmp_path / "fine.exr")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -70,7 +69,7 @@ class Experiment:
     focus_m: float = math.inf
     wavelength_nm: tuple[float, float] = (400.0, 700.0)
     f_numbers: tuple[float, ...] = ()
-    names: list[str] = field(default_factory=list)
+    names: tuple[str, ...] = ()
     dispersion: bool = True
     note: str = ""
     fit: Fit = Fit()
@@ -104,30 +103,19 @@ def write(tmp_path: Path, text: str | bytes) -> Path:
 def test_reads_every_kind_of_field(tmp_path: Path) -> None:
     read = read_config(Experiment, write(tmp_path, FULL))
     assert read == Experiment(
-        lens=Path("lenses/a.toml"),
-        focus_m=2.0,
-        wavelength_nm=(450.0, 650.5),
-        f_numbers=(1.8, 4.0),
-        names=["a", "b"],
-        fit=Fit(terms=20, seed=1),
-        extra_fits=(Fit(terms=3), Fit(method="omp")),
-        limits={"rms_um": 2.0},
-        crop=None,
-    )
+        lens=Path("lenses/a.toml"), focus_m=2.0, wavelength_nm=(450.0, 650.5), f_numbers=(1.8, 4.0), names=("a", "b"),
+        fit=Fit(terms=20, seed=1), extra_fits=(Fit(terms=3), Fit(method="omp")), limits={"rms_um": 2.0}, crop=None,
+    )  # fmt: skip
     assert isinstance(read.focus_m, float) and isinstance(read.wavelength_nm[0], float)
-
-
-def test_what_is_left_out_takes_its_default(tmp_path: Path) -> None:
-    assert read_config(Experiment, write(tmp_path, "lens = 'x.toml'")) == Experiment(lens=Path("x.toml"))
+    # What is left out takes its default; a byte order mark and Windows lines are read.
+    marked = write(tmp_path, b"\xef\xbb\xbflens = 'x.toml'\r\nfocus_m = 3\r\n")
+    assert read_config(Experiment, marked) == Experiment(lens=Path("x.toml"), focus_m=3.0)
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (
-            "lens = 'a'\n[fit]\ntersm = 4",
-            ["fit.tersm", "unknown key", "terms, method, ridge, seed", "did you mean 'terms'"],
-        ),
+        ("lens = 'a'\n[fit]\ntersm = 4", ["fit.tersm", "terms, method, ridge, seed", "did you mean 'terms'"]),
         ("lens = 'a'\nfocus = 4", ["focus:", "did you mean 'focus_m'"]),
         ("lens = 'a'\nzzz = 4", ["zzz", "known keys: lens"]),
         ("focus_m = 1", ["lens", "(missing)", "a path"]),
@@ -174,35 +162,19 @@ def test_no_such_file(tmp_path: Path, name: str, word: str) -> None:
         read_config(Experiment, tmp_path / name)
 
 
-def test_a_byte_order_mark_and_windows_lines_are_read(tmp_path: Path) -> None:
-    path = write(tmp_path, b"\xef\xbb\xbflens = 'a'\r\nfocus_m = 3\r\n")
-    assert read_config(Experiment, path).focus_m == 3
-
-
 def test_overrides_win_over_the_file(tmp_path: Path) -> None:
     path = write(tmp_path, FULL)
-    given = [
-        "fit.terms=7",
-        "fit.method=omp",
-        "focus_m = inf",
-        "f_numbers=[2, 2.8]",
-        "note=a=b",
-        "limits.p99_um=1",
-        "names=[]",
-    ]
-    read = read_config(Experiment, path, given)
+    given = ("fit.terms=7", "fit.method=omp", "focus_m = inf", "f_numbers=[2, 2.8]", "note=a=b", "limits.p99_um=1")
+    read = read_config(Experiment, path, [*given, "names=[]"])
     assert (read.fit.terms, read.fit.method, read.fit.seed) == (7, "omp", 1)
-    assert (read.focus_m, read.f_numbers, read.note, read.names) == (math.inf, (2.0, 2.8), "a=b", [])
+    assert (read.focus_m, read.f_numbers, read.note, read.names) == (math.inf, (2.0, 2.8), "a=b", ())
     assert read.limits == {"rms_um": 2.0, "p99_um": 1.0}
 
 
 def test_overrides_leave_the_given_tables_alone() -> None:
     data: dict[str, Any] = {"fit": {"terms": 1}}
-    assert apply_overrides(data, ["fit.terms=2", "new.deep.key=word"]) == {
-        "fit": {"terms": 2},
-        "new": {"deep": {"key": "word"}},
-    }
-    assert data == {"fit": {"terms": 1}}
+    changed = apply_overrides(data, ["fit.terms=2", "new.deep.key=word"])
+    assert changed == {"fit": {"terms": 2}, "new": {"deep": {"key": "word"}}} and data == {"fit": {"terms": 1}}
 
 
 @pytest.mark.parametrize(
@@ -224,9 +196,7 @@ def test_a_bad_override_names_the_option(tmp_path: Path, override: str, words: l
         read_config(Experiment, write(tmp_path, FULL), [override])
     for word in ["--set", *words]:
         assert word in str(caught.value)
-
-
-def test_a_mistake_of_the_file_stays_the_files(tmp_path: Path) -> None:
+    # A mistake of the file stays the file's.
     with pytest.raises(InputError, match=r"experiment\.toml: focus_m"):
         read_config(Experiment, write(tmp_path, "lens = 'a'\nfocus_m = 'x'"), ["fit.terms=3"])
 
@@ -242,7 +212,7 @@ numbers = st.floats(allow_nan=False)
         focus_m=numbers,
         wavelength_nm=st.tuples(numbers, numbers),
         f_numbers=st.lists(numbers, max_size=3).map(tuple),
-        names=st.lists(texts, max_size=3),
+        names=st.lists(texts, max_size=3).map(tuple),
         dispersion=st.booleans(),
         note=texts,
         fit=st.builds(Fit, terms=st.integers(1, 10**20), seed=st.none() | st.integers(), ridge=numbers),
@@ -289,22 +259,17 @@ def test_a_slow_stage_corrects_the_plan() -> None:
     clock, stream = Clock(), io.StringIO()
     progress = Progress({"trace": 10, "fit": 60}, stream=stream, clock=clock)
     with progress.stage("trace"):
-        clock.now += (
-            40  # four times as long as planned: the 60 s to come take longer too, though not for sure four times
-        )
+        clock.now += 40  # four times as long as planned: the 60 s to come take longer, too, though not four times
     words = stream.getvalue().split("in all ")[1].split()
     assert 60 < 60 * int(words[0]) + int(words[2]) <= 240
 
 
-@pytest.mark.parametrize("fraction", [-1.0, 0.0, 1.0, 7.0])
-def test_any_fraction_is_taken(fraction: float) -> None:
-    stream = io.StringIO()
-    with Progress({"a": 0, "b": 0}, stream=stream, interval_s=0).stage("a") as report:
-        report(fraction)
-    assert "%" in stream.getvalue()
-
-
-def test_quiet_prints_nothing() -> None:
+def test_any_fraction_is_taken_and_quiet_prints_nothing() -> None:
+    for fraction in (-1.0, 0.0, 1.0, 7.0):
+        stream = io.StringIO()
+        with Progress({"a": 0, "b": 0}, stream=stream, interval_s=0).stage("a") as report:
+            report(fraction)
+        assert "%" in stream.getvalue()
     stream = Terminal()
     progress = Progress(quiet=True, stream=stream)
     progress.note("hello")

@@ -46,6 +46,11 @@ def alive(pid: int) -> bool:
         return False
 
 
+def full(path: Path, *_: object, **__: object) -> None:
+    """A writer on a full disk."""
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+
 def wait(condition: Any) -> None:
     deadline = time.monotonic() + 60
     while not condition():
@@ -126,59 +131,34 @@ def test_samples_that_are_not_finite_are_one_warning(
     assert np.all(np.isfinite(picture)) and told["render"]["dropped_samples"] == half
 
 
-def test_a_picture_that_cannot_be_written_keeps_the_render_and_the_older_picture(
+def test_a_full_disk_keeps_what_it_can_and_says_what_is_lost(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out = tmp_path / "a.exr"
+    out, part = tmp_path / "a.exr", tmp_path / "a.exr.part"
     write_exr(out, np.full((2, 2, 3), 7.0))
-    common = ("render", scene, "--camera", "thin", "--quiet", "-o", out)
+    common = ("render", scene, "--camera", "thin", "--quiet", "-o", out, "--threads", 1)
 
-    def full(path: Path, *_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-
-    # There is no checkpoint yet, then there is one that no other can take the place of: it has everything.
-    for writers in (["pictures.write_exr"], ["pictures.write_exr", "renderer.write_checkpoint"]):
+    def said(writers: list[str], *more: object) -> str:
         with monkeypatch.context() as patch:
             for writer in writers:
                 patch.setattr(f"neurolens.render.{writer}", full)
-            line = failure(capsys, *common)
-        assert line == (
-            f"neurolens: {out}: No space left on device; the render is kept: the same command resumes from {out}.part"
-        )
+            assert main([*map(str, (*common, *more))]) == 2
         assert np.all(read_exr(out)[0] == 7)
+        first, _, why = capsys.readouterr().err.splitlines()[-1].partition("; ")
+        assert first == f"neurolens: {out}: No space left on device"
+        return why
+
+    picture, both = ["pictures.write_exr"], ["pictures.write_exr", "renderer.write_checkpoint"]
+    resumes, disk = f"the same command resumes from {part}", f"({part}: No space left on device)"
+    lost = f"the render is lost, for the checkpoint cannot be written either {disk}"
+    assert said(both, "--samples", 32) == lost
+    # There is no checkpoint yet, then there is one that no other can take the place of: it has everything.
+    for writers in (picture, both):
+        assert said(writers) == f"the render is kept: {resumes}"
+    assert said(both, "--samples", 32) == f"only a part of the render is kept {disk}: {resumes}"
     data = run_json(capsys, *common)
-    assert data["complete"] and read_exr(out)[0].shape == (36, 64, 3) and sorted(os.listdir(tmp_path)) == [
-        "a.exr", "a.png", "ball.toml",
-    ]  # fmt: skip
-
-
-def test_a_disk_without_room_for_picture_and_checkpoint_is_told_as_it_is(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "a.exr"
-
-    def full(path: Path, *_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-
-    common = ("render", scene, "--camera", "thin", "--quiet", "-o", out, "--threads", 1)
-    run_json(capsys, *common, "--keep-checkpoint")
-    for writer in ("pictures.write_exr", "renderer.write_checkpoint"):
-        monkeypatch.setattr(f"neurolens.render.{writer}", full)
-
-    def said() -> str:
-        assert main([*map(str, common), "--samples", "32"]) == 2
-        return capsys.readouterr().err.splitlines()[-1]
-
-    why = f"({out}.part: No space left on device)"
-    assert said() == (
-        f"neurolens: {out}: No space left on device; only a part of the render is kept {why}: "
-        f"the same command resumes from {out}.part"
-    )
-    (tmp_path / "a.exr.part").unlink()
-    assert said() == (
-        f"neurolens: {out}: No space left on device; the render is lost, for the checkpoint cannot be written "
-        f"either {why}"
-    )
+    assert data["complete"] and read_exr(out)[0].shape == (36, 64, 3)
+    assert sorted(os.listdir(tmp_path)) == ["a.exr", "a.png", "ball.toml"]
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.png", "a.exr.part"])

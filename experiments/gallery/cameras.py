@@ -70,7 +70,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Surrogate:
-    """An exported model, the domain it was fitted to, and its record (`rms_um`, ...; see `records.ModelRecord`)."""
+    """An exported model, the domain it was fitted to, and its record (`rms_um`, ...; see `records.Results`)."""
 
     file: Path
     domain: Domain
@@ -162,7 +162,7 @@ def fitted(
     made = sorted(folder.glob(f"{fit.label}.json"))
     if made and file.is_file():
         told = json.loads(made[0].read_text(encoding="utf-8"))
-        record = known_record(made[0], file, told.get("fingerprint", ""))
+        record = known_record(file, told.get("fingerprint", ""))
         if record is not None:
             return Surrogate(file, Domain.from_dict(load_model(file).card["domain"]), record)
     folder.mkdir(parents=True, exist_ok=True)

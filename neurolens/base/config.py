@@ -1,9 +1,9 @@
 """Settings as frozen dataclasses, read strictly from TOML, with `--set fit.terms=40` on top.
 
 A settings class is a plain frozen dataclass; nested dataclasses are TOML tables. Field types understood: bool, int,
-float (takes an integer too, refuses NaN), str, Path, Literal, Optional and other unions, tuple, list, dict with text
-keys. Checks of values belong in `__post_init__`, as `raise InputError("settings", field, value, expected)`: file and
-table are added here.
+float (takes an integer too, refuses NaN), str, Path, Literal, Optional and other unions, tuple, dict with text keys.
+Checks of values belong in `__post_init__`, as `raise InputError("settings", field, value, expected)`: file and table
+are added here.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
     hints = get_type_hints(cls)
     values: dict[str, Any] = {}
     for name, field in fields.items():
-        place = f"{prefix}.{name}" if prefix else name
+        place = _join(prefix, name)
         if name in data:
             values[name] = _convert(data[name], hints[name], file, place)
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
@@ -103,31 +103,34 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
     try:
         return cls(**values)
     except InputError as error:
-        raise InputError(
-            file, f"{prefix}.{error.field}" if prefix else error.field, error.value, error.expected
-        ) from None
+        raise InputError(file, _join(prefix, error.field), error.value, error.expected) from None
+
+
+def _join(prefix: str, name: str) -> str:
+    return f"{prefix}.{name}" if prefix else name
 
 
 def _convert(value: Any, kind: Any, file: str | Path, place: str) -> Any:
     """`value` as the type `kind`, or an InputError."""
     origin, args = get_origin(kind), get_args(kind)
-    if kind is Any:
-        return value
     if origin in (Union, types.UnionType):
         return _convert_union(value, args, file, place)
-    if origin is Literal:
-        if any(value == choice and type(value) is type(choice) for choice in args):
-            return value
-    elif dataclasses.is_dataclass(kind) and isinstance(kind, type):
-        if isinstance(value, Mapping):
-            return from_dict(kind, value, file, place)
-        if isinstance(value, kind):
-            return value
-    elif origin in (tuple, list, dict):
-        return _convert_collection(value, kind, file, place)
-    elif (scalar := _convert_scalar(value, kind)) is not None:
-        return scalar
-    raise InputError(file, place, value, _describe(kind))
+    if origin is dict and isinstance(value, Mapping):
+        return {str(k): _convert(v, args[1], file, f"{place}.{k}") for k, v in value.items()}
+    if origin is tuple and isinstance(value, list | tuple):
+        kinds = (args[0],) * len(value) if Ellipsis in args else args
+        if len(kinds) == len(value):
+            return tuple(
+                _convert(v, k, file, f"{place}[{i}]") for i, (v, k) in enumerate(zip(value, kinds, strict=True))
+            )
+    if dataclasses.is_dataclass(kind) and isinstance(kind, type) and isinstance(value, Mapping):
+        return from_dict(kind, value, file, place)
+    if origin is Literal and any(value == choice and type(value) is type(choice) for choice in args):
+        return value
+    scalar = _convert_scalar(value, kind)
+    if scalar is None:
+        raise InputError(file, place, value, _describe(kind))
+    return scalar
 
 
 def _convert_scalar(value: Any, kind: Any) -> Any:
@@ -159,21 +162,6 @@ def _convert_union(value: Any, kinds: tuple[Any, ...], file: str | Path, place: 
     raise InputError(file, place, value, " or ".join(_describe(kind) for kind in kinds))
 
 
-def _convert_collection(value: Any, kind: Any, file: str | Path, place: str) -> Any:
-    origin, args = get_origin(kind), get_args(kind)
-    if origin is dict:
-        if not isinstance(value, Mapping):
-            raise InputError(file, place, value, _describe(kind))
-        return {str(k): _convert(v, args[1], file, f"{place}.{k}") for k, v in value.items()}
-    if not isinstance(value, list | tuple):
-        raise InputError(file, place, value, _describe(kind))
-    fixed = origin is tuple and not (len(args) == 2 and args[1] is Ellipsis)
-    if fixed and len(value) != len(args):
-        raise InputError(file, place, value, _describe(kind))
-    kinds = args if fixed else (args[0],) * len(value)
-    return origin(_convert(v, k, file, f"{place}[{i}]") for i, (v, k) in enumerate(zip(value, kinds, strict=True)))
-
-
 def _describe(kind: Any) -> str:
     origin, args = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
@@ -182,7 +170,7 @@ def _describe(kind: Any) -> str:
         return "one of: " + ", ".join(map(repr, args))
     if origin is tuple and Ellipsis not in args:
         return "a list of " + ", ".join(_describe(a) for a in args)
-    if origin in (tuple, list):
+    if origin is tuple:
         return f"a list, each {_describe(args[0])}"
     if dataclasses.is_dataclass(kind):
         return "a table with " + ", ".join(f.name for f in dataclasses.fields(kind) if f.init)

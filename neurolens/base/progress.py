@@ -70,15 +70,9 @@ class Progress:
         self._waiting.update(stages)
 
     @contextmanager
-    def stage(self, name: str, seconds_expected: float | None = None) -> Iterator[Report]:
-        """Time one stage; gives the function that reports the fraction done, from 0 to 1.
-
-        Args:
-            seconds_expected: replaces the planned time; also for unplanned stages.
-        """
+    def stage(self, name: str) -> Iterator[Report]:
+        """Time one stage; gives the function that reports the fraction done, from 0 to 1."""
         expected = self._waiting.pop(name, None)
-        if seconds_expected is not None:
-            expected = seconds_expected
         began = self._clock()
         self._printed_at = began  # the first line comes after a whole interval: short stages print one line only
 
@@ -127,13 +121,16 @@ class Progress:
             return ""
         return f" (in all {duration(left + self._pace() * sum(self._waiting.values()))} left)"
 
+    def _output(self) -> TextIO | None:
+        return None if self._quiet else self._stream or sys.stderr
+
     def _terminal(self) -> bool:
-        stream = self._stream or sys.stderr
-        return not self._quiet and stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
+        stream = self._output()
+        return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
 
     def _show(self, text: str, last: bool = False) -> None:
-        stream = self._stream or sys.stderr
-        if self._quiet or stream is None:
+        stream = self._output()
+        if stream is None:
             return
         now = self._clock()
         if self._terminal():
@@ -150,8 +147,8 @@ class Progress:
         stream.flush()
 
     def _end_line(self) -> None:
-        if self._open_line:
-            stream = self._stream or sys.stderr
+        stream = self._output()
+        if self._open_line and stream is not None:
             stream.write("\n")
             stream.flush()
             self._open_line = False

@@ -16,11 +16,11 @@ MAX_BYTES = 1_000_000
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
-def read_toml(path: str | Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
+def read_toml(path: str | Path) -> dict[str, Any]:
     """The tables of a TOML file.
 
     Raises:
-        InputError: no regular file, unreadable, larger than `max_bytes`, not UTF-8, broken TOML, or empty.
+        InputError: no regular file, unreadable, larger than `MAX_BYTES`, not UTF-8, broken TOML, or empty.
     """
     path = Path(path)
     if not path.exists():
@@ -29,11 +29,11 @@ def read_toml(path: str | Path, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
         raise InputError(path, "file", "(not a regular file)", "a TOML file")
     try:
         with path.open("rb") as file:
-            raw = file.read(max_bytes + 1)
+            raw = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise InputError(path, "file", f"({error.strerror})", "a readable TOML file") from None
-    if len(raw) > max_bytes:
-        raise InputError(path, "file", f"(more than {max_bytes} bytes)", f"at most {max_bytes} bytes")
+    if len(raw) > MAX_BYTES:
+        raise InputError(path, "file", f"(more than {MAX_BYTES} bytes)", f"at most {MAX_BYTES} bytes")
     try:
         data = tomllib.loads(raw.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
@@ -76,11 +76,8 @@ def format_value(value: Any) -> str:
         case str():
             return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
         case Mapping():
-            return (
-                "{ " + ", ".join(f"{format_key(k)} = {format_value(v)}" for k, v in value.items()) + " }"
-                if value
-                else "{}"
-            )
+            pairs = ", ".join(f"{format_key(k)} = {format_value(v)}" for k, v in value.items())
+            return f"{{ {pairs} }}" if pairs else "{}"
         case list() | tuple():
             return "[" + ", ".join(format_value(v) for v in value) + "]"
     raise TypeError(f"TOML has no form for {type(value).__name__}")

@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FloatArray, RayDifferentials
-from neurolens.cameras.fusedsource import Setting, camera_source
-from neurolens.cameras.lens_film import LensFilm
-from neurolens.cameras.model import UNIT_SLACK, ModelScene, OnnxCamera
+from neurolens.cameras.cameragraph import camera_graph
+from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FloatArray
+from neurolens.cameras.lens_film import LensFilm, camera_rays
+from neurolens.cameras.model import ModelScene, OnnxCamera
+from neurolens.graph.c import Signature, padded_columns, write_blocks
 from neurolens.graph.compiler import load_compiled
-from neurolens.graph.derive import derivative
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import with_film_derivatives, with_low_order_derivatives
-from neurolens.graph.program import FILM_X_Y
+from neurolens.graph.passes import pruned
+from neurolens.graph.program import row_names
 from neurolens.graph.scalars import lower
 from neurolens.modelfile.graph import graph_of
 from neurolens.optics.apertures import Aperture
@@ -63,29 +64,11 @@ class FusedFilm:
     ) -> None:
         if film.pupil is not film.outline:
             raise InputError("camera", "pupil", "(another)", "outline: the only one that fused cameras sample")
-        self._graph = graph
+        self._film, self._graph, self._film_mm = film, graph, film_mm
         self._aperture, self._stop_radius_mm = aperture, stop_radius_mm
         self._stopped = np.int32(st.blocked(stop_surface, st.RIM))
-        self._outline, self._film_mm = film.outline, film_mm
-        self._edges, self._centres = _tables(film)
-        outline = film.outline
-        waves = [w**-2 for w in outline.wavelength_nm]
-        self._setting = Setting(
-            self._edges.ctypes.data,
-            self._centres.ctypes.data,
-            outline.centre.size,
-            outline.x.shape[2] - 1,
-            1 / outline.film_radius_mm,
-            waves[0],
-            1 / (waves[1] - waves[0]) if len(waves) > 1 else 0.0,
-            1 / film.distance_mm,
-            1 / (film.distance_mm**2 * film.exposure),
-            film.film_z_mm,
-            stop_radius_mm,
-            1e-3 * film.film_z_mm,
-        )
-        self._rays: Any = _compiled(graph)
-        self._rays_and_moves: Any = None
+        self._rays = self._compiled(graph)
+        self._rays_and_moves: _Compiled | None = None
         self.moves_error: float | None = None
 
     def sample(
@@ -96,44 +79,40 @@ class FusedFilm:
         count = film.shape[1]
         if film.shape != (2, count) or square.shape != (2, count) or wavelength.shape != (count,):
             raise ValueError(f"film {film.shape}, square {square.shape}, wavelengths {wavelength.shape}")
-        origin, direction = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
-        weight, status = np.empty(count, np.float32), np.empty(count, np.int32)
-        stop = np.empty((2, count), np.float32) if self._aperture is not None else None
-        moves = np.empty((2, 3, 2, count), np.float32) if differentials else None
-        arrays = [film, square, wavelength, origin, direction, weight, status, stop, moves]
-        self._call(moves is not None)(count, ctypes.byref(self._setting), *map(_address, arrays))
-        if self._aperture is not None and stop is not None:
-            inside = self._aperture.inside(stop[0], stop[1], self._stop_radius_mm)
-            shut = ~inside & (status == st.PASSED)
-            weight[shut], status[shut] = 0, self._stopped
-        found = None if moves is None else RayDifferentials(moves[0], moves[1])
-        return CameraRays(origin, direction, weight, status, found)
+        if differentials and self._rays_and_moves is None:
+            self._rays_and_moves = self._compiled(self._with_differentials())
+        run = self._rays_and_moves if differentials and self._rays_and_moves is not None else self._rays
+        found = run({"film_mm": film, "square": square, "wavelength_nm": wavelength[None]})
+        if self._aperture is not None:
+            inside = self._aperture.inside(found["stop_xy_mm"][0], found["stop_xy_mm"][1], self._stop_radius_mm)
+            shut = ~inside & (found["status"][0] == st.PASSED)
+            found["weight"][0, shut], found["status"][0, shut] = 0, self._stopped
+        return camera_rays(found)
 
-    def _call(self, differentials: bool) -> Any:
-        if not differentials:
-            return self._rays
-        if self._rays_and_moves is None:
-            self._rays_and_moves = _compiled(self._with_differentials())
-        return self._rays_and_moves
+    def _compiled(self, lens: Graph) -> _Compiled:
+        outputs = {k: v for k, v in lens.outputs.items() if k != "stop_xy_mm" or self._aperture is not None}
+        outline = self._film.outline
+        numbers = outline.numbers | self._film.numbers | {"stop_radius_mm": self._stop_radius_mm}
+        groups = outline.table.reshape(len(outline.table), -1, 5)
+        table = np.pad(groups, ((0, 0), (0, 0), (0, padded_columns(5) - 5)))
+        return _Compiled(camera_graph(pruned(lens, outputs), outline.x.shape[2] - 1, len(outline.x)), numbers, table)
 
     def _with_differentials(self) -> Graph:
-        """The graph with differentials, points in metres."""
+        """The lens with differentials."""
         fitted = with_low_order_derivatives(self._graph, self._samples())
         self.moves_error = None if fitted is None else fitted.error
         graph = with_film_derivatives(self._graph) if fitted is None else fitted.graph
-        for name in (derivative("scene_ray", by) for by in FILM_X_Y):
-            graph.outputs[name] = graph.outputs[name] * [1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0]
         return graph
 
     def _samples(self) -> dict[str, FloatArray]:
         """Inputs of the graph for rays all over film, pupil and wavelengths."""
-        rng, outline = np.random.default_rng(0), self._outline
+        rng, outline = np.random.default_rng(0), self._film.outline
         film = (rng.random((2, _SAMPLES)) - 0.5) * np.array(self._film_mm)[:, None]
         film *= np.minimum(1, 0.99 * outline.film_radius_mm / np.hypot(*film))
         wavelength = rng.uniform(outline.wavelength_nm[0], outline.wavelength_nm[-1], _SAMPLES).astype(np.float32)
         film, square = film.astype(np.float32), rng.random((2, _SAMPLES), np.float32)
         rays = np.stack([*film, *outline.sample(film, square, wavelength)[0], wavelength])
-        per_call = {"film_z_mm": self._setting.film_z_mm, "stop_radius_mm": self._setting.stop_radius_mm}
+        per_call = {"film_z_mm": self._film.film_z_mm, "stop_radius_mm": self._stop_radius_mm}
         return {"rays": rays} | {name: np.array([[value]], np.float32) for name, value in per_call.items()}
 
 
@@ -176,21 +155,32 @@ class FusedCamera(OnnxCamera):
         return self._fused.moves_error
 
 
-def _tables(film: LensFilm) -> tuple[FloatArray, FloatArray]:
-    """The outline as `Setting` has it: edges [R * K, 16], centres [R, 2]."""
-    outline = film.outline
-    edges = outline.edges  # [W, 8, R * K]
-    both = np.zeros((2, *edges.shape[1:]), np.float32)
-    both[: len(edges)] = edges
-    return np.ascontiguousarray(both.reshape(16, -1).T), np.ascontiguousarray(outline.centres.T)
+class _Compiled:
+    """A camera's graph as a compiled function, with numbers of the call and the outline's table."""
 
+    def __init__(self, graph: Graph, numbers: dict[str, float], table: FloatArray) -> None:
+        program = lower(graph).in_order_of_need()
+        self._rows = {name: (v.rows, np.int32 if name == "status" else np.float32) for name, v in graph.outputs.items()}
+        self._signature = s = Signature.of(program, "camera")
+        self._numbers, self._table = np.array([numbers[name] for name in s.per_call], np.float32), table
+        self._call = load_compiled(write_blocks(program, "camera")).camera
+        pointer = ctypes.c_void_p
+        self._call.argtypes = [ctypes.c_size_t, pointer, pointer, pointer, ctypes.c_int, pointer, pointer]
+        self._call.restype = None
 
-def _compiled(graph: Graph) -> Any:
-    program = lower(graph).in_order_of_need()
-    function = load_compiled(camera_source(program, st.PASSED, st.OUTSIDE_DOMAIN, UNIT_SLACK)).neurolens_camera
-    function.argtypes, function.restype = [ctypes.c_size_t] + [ctypes.c_void_p] * 10, None
-    return function
-
-
-def _address(array: NDArray[Any] | None) -> int | None:
-    return None if array is None else int(array.__array_interface__["data"][0])
+    def __call__(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
+        """Outputs [R, N] of the graph for inputs [R, N]."""
+        count = rays["film_mm"].shape[1]
+        found: dict[str, NDArray[Any]] = {
+            name: np.empty((rows, count), kind) for name, (rows, kind) in self._rows.items()
+        }
+        places: dict[str, int] = {}
+        for name, array in (rays | found).items():
+            address, step = array.ctypes.data, array.strides[0]
+            places |= {row: address + k * step for k, row in enumerate(row_names(name, len(array)))}
+        given, out = (
+            np.array([places[r] for r in rows], np.uintp) for rows in (self._signature.per_ray, self._signature.outputs)
+        )
+        numbers, table = self._numbers.ctypes.data, self._table.ctypes.data
+        self._call(count, given.ctypes.data, numbers, table, len(self._table), out.ctypes.data, places["status"])
+        return found

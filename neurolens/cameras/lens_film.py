@@ -5,7 +5,7 @@ One code for both, so that they send the same rays for the same random numbers.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -13,13 +13,16 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.cameras.cameragraph import D_FILM, weight_graph
 from neurolens.cameras.contract import CameraRays, FloatArray, RayDifferentials
 from neurolens.cameras.pupil_boxes import Passes, PupilTable
 from neurolens.cameras.pupil_search import FINE, Detail, outline_of
 from neurolens.cameras.sampling import stratified
+from neurolens.graph.interpret import evaluate
 
 # Points a side of the quadrature of the exposure on the axis.
 _QUADRATURE = 256
+_AHEAD = np.array([[0], [0], [0], [0], [0], [-1]], np.float32)
 
 
 class SceneRays(NamedTuple):
@@ -98,55 +101,38 @@ class LensFilm:
         pupil, area = self.pupil.sample(film_mm, square, wavelength_nm)
         lit = area > 0
         if lit.all():
-            return self._rays(scene, film_mm, pupil, area, wavelength_nm)
-        # A film point that nothing reaches is dark: no ray is traced. A model calls it outside its domain, and so does
-        # this.
+            return camera_rays(self._weighted(scene, film_mm, pupil, area, wavelength_nm))
+        # A film point that nothing reaches is dark: no ray is traced.
         some = np.flatnonzero(lit)
-        film, pupil = film_mm.take(some, axis=1), pupil.take(some, axis=1)
-        rays = self._rays(scene, film, pupil, area.take(some), wavelength_nm.take(some))
-        place = np.cumsum(lit)
-        place *= lit
+        found = self._weighted(scene, film_mm[:, some], pupil[:, some], area[some], wavelength_nm[some])
+        whole = {name: np.zeros((len(part), lit.size), part.dtype) for name, part in found.items()}
+        whole["status"][:] = st.OUTSIDE_DOMAIN
+        for name, part in found.items():
+            whole[name][:, some] = part
+        return camera_rays(whole)
 
-        def spread(values: NDArray[Any], dark: float) -> NDArray[Any]:
-            """Values of the lit points in their places among all points."""
-            padded = np.empty((*values.shape[:-1], some.size + 1), values.dtype)
-            padded[..., 0], padded[..., 1:] = dark, values
-            return padded.take(place, axis=-1)
-
-        direction = spread(rays.direction, -1)
-        direction[:2] *= lit
-        moves = rays.differentials
-        if moves is not None:
-            moves = RayDifferentials(spread(moves.origin_m, 0), spread(moves.direction, 0))
-        status = spread(rays.status, st.OUTSIDE_DOMAIN)
-        return CameraRays(spread(rays.origin_m, 0), direction, spread(rays.weight, 0), status, moves)
-
-    def _rays(
+    def _weighted(
         self, scene: SceneFunction, film: FloatArray, pupil: FloatArray, area: FloatArray, wavelength_nm: FloatArray
-    ) -> CameraRays:
-        """Rays of lit film points [2, N] through pupil points [2, N] of the densities 1 / area [N]."""
+    ) -> dict[str, NDArray[Any]]:
+        """Outputs of `weight_graph` for lit film points [2, N] through pupil points [2, N], densities 1 / area [N]."""
         out = scene(film, pupil, wavelength_nm)
-        # w = T A cos^4 / Z^2, over the exposure on the axis.
-        cos2 = self._cos2(film, pupil)
-        scale = np.float32(1 / (self.distance_mm**2 * self.exposure))
-        weight = np.maximum(out.transmittance, 0) * area * cos2 * cos2 * scale
-        weight = np.where(out.status == st.PASSED, weight, np.float32(0))
-        origin = out.scene_ray[:3] * np.float32(1e-3)
-        origin[2] -= np.float32(1e-3 * self.film_z_mm)
-        moves = None
-        if out.d_film is not None:
-            moves = RayDifferentials(out.d_film[:3] * np.float32(1e-3), out.d_film[3:])
-        direction = np.ascontiguousarray(out.scene_ray[3:])
-        return CameraRays(origin, direction, weight.astype(np.float32), out.status.astype(np.int32), moves)
+        given = {"film_mm": film, "pupil_mm": pupil, "area_mm2": area[None], "scene_ray": out.scene_ray}
+        given |= {"transmittance": out.transmittance[None], "lens_status": out.status[None].astype(np.float32)}
+        given |= {} if out.d_film is None else dict(zip(D_FILM, np.moveaxis(out.d_film, 1, 0), strict=True))
+        given |= {name: np.array([[value]], np.float32) for name, value in self.numbers.items()}
+        return evaluate(weight_graph(() if out.d_film is None else D_FILM), given)
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The inputs of the call of `cameragraph.weight_graph`."""
+        scale = 1 / (self.distance_mm**2 * self.exposure)
+        return {"per_distance": 1 / self.distance_mm, "scale": scale, "film_z_mm": self.film_z_mm}
 
     def natural(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
         """cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
-        return np.square(self._cos2(film_mm, self.pupil.sample(film_mm, square, wavelength_nm)[0]))
-
-    def _cos2(self, film: FloatArray, pupil: FloatArray) -> FloatArray:
-        slope = (pupil - film) * np.float32(1 / self.distance_mm)
-        cos2: FloatArray = 1 / (1 + np.einsum("in,in->n", slope, slope))
-        return cos2
+        slope = (self.pupil.sample(film_mm, square, wavelength_nm)[0] - film_mm) * np.float32(1 / self.distance_mm)
+        cos4: FloatArray = np.square(1 / (1 + np.einsum("in,in->n", slope, slope)))
+        return cos4
 
     def _exposure_on_axis(self, wavelength_nm: tuple[float, float]) -> float:
         """Integral of T cos over solid angle at the film's centre, mean over the wavelengths."""
@@ -160,3 +146,17 @@ class LensFilm:
     def _passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
         """Whether rays of film points [2, N] through pupil points [2, N] pass at one wavelength."""
         return self.scene(film, pupil, np.full(film.shape[1], wavelength_nm, np.float32)).status == st.PASSED
+
+
+def camera_rays(found: Mapping[str, NDArray[Any]]) -> CameraRays:
+    """Rays of the outputs of `cameragraph.weight_graph`, [R, N] each; those that do not pass look ahead."""
+    ray, moves = found["ray"], None
+    lost = np.flatnonzero(found["status"][0] != st.PASSED)
+    if lost.size:
+        ray[:, lost] = _AHEAD
+        for name in D_FILM if D_FILM[0] in found else ():
+            found[name][:, lost] = 0
+    if D_FILM[0] in found:
+        both = np.stack([found[name] for name in D_FILM], 1)
+        moves = RayDifferentials(both[:3], both[3:])
+    return CameraRays(ray[:3], ray[3:], found["weight"][0], found["status"][0], moves)

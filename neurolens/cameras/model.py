@@ -13,15 +13,19 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
-from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
+from neurolens.cameras.cameragraph import UNIT_SLACK, weight_graph
+from neurolens.cameras.contract import RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
-from neurolens.cameras.lens_film import LensFilm, SceneRays
+from neurolens.cameras.lens_film import LensFilm, SceneRays, camera_rays
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.onnxmaps import OnnxDerivatives, OnnxInverse, load_inverse
+from neurolens.cameras.onnxsession import joined, open_session, padded, run_session
 from neurolens.cameras.pupil_boxes import PupilTable
+from neurolens.cameras.pupil_outline import pupil_graph
 from neurolens.cameras.sampling import arrived, check_film, positive
+from neurolens.graph.ir import Graph
 from neurolens.modelfile import DOMAIN_SLACK
-from neurolens.modelfile.states import state_for
+from neurolens.modelfile.states import STATE, state_for
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.film_plane import film_z_mm
 
@@ -29,9 +33,11 @@ __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 
 # Parts of the card that the metadata of pictures leave out.
 _NOT_KEPT = ("reference", "units", "frame", "status_codes", "states")
-# How far the squared length of a direction may be from 1: where a poor network decodes none, the ray is no ray.
-UNIT_SLACK = 1e-3
-_NO_RAY = np.array([[0], [0], [0], [0], [0], [-1]], np.float32)
+# Of the graph of a whole camera.
+_INPUTS = {"film_mm": ("tensor(float)", 2, None), "square": ("tensor(float)", 2, None)}
+_INPUTS |= {"wavelength_nm": ("tensor(float)", 1, None)}
+_OUTPUTS = {"ray": ("tensor(float)", 6, None), "weight": ("tensor(float)", None), "status": ("tensor(int32)", None)}
+_OUTPUTS |= {"stop_xy_mm": ("tensor(float)", 2, None)}
 _NOMINAL = 1.02  # f-numbers are engraved rounded: up to this much wider than the widest stop means the widest stop
 
 
@@ -72,6 +78,7 @@ class OnnxCamera:
         card = model.card
         lens, domain = card["lens"], card["domain"]
         self.model = model
+        self._whole: OnnxFilm | None = None
         self._derivatives: OnnxDerivatives | None = None
         self._inverse: tuple[OnnxInverse, FrontAim] | None = None
         self.name = str(lens.get("name", model.path.stem))
@@ -106,7 +113,9 @@ class OnnxCamera:
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
-        return self.film.sample(film_mm, pupil, wavelength_nm)
+        if self._whole is None:
+            self._whole = OnnxFilm(self.film, self.model)
+        return self._whole.sample(film_mm, pupil, wavelength_nm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `sample`, with the differentials of the rays.
@@ -159,11 +168,60 @@ class OnnxCamera:
     def for_worker(self) -> OnnxCamera:
         """The same camera with a session of its own, for another process or thread."""
         other = copy(self)
-        other.model, other.film, other._derivatives = self.model.reopened(), copy(self.film), None
-        other._inverse = None
+        other.model, other.film = self.model.reopened(), copy(self.film)
+        other._whole = other._derivatives = other._inverse = None
         assert isinstance(self.film.scene, ModelScene)
         other.film.scene = replace(self.film.scene, model=other.model)
         return other
+
+
+class OnnxFilm:
+    """Film, pupil and model of a camera as one graph of onnxruntime: the model's own, and around it the camera's.
+
+    Args:
+        film: of the model at one focus and stop, whose numbers are constants of the graph.
+    """
+
+    def __init__(self, film: LensFilm, model: OnnxLens) -> None:
+        from neurolens.graph.onnx import write_onnx  # the package onnx takes a quarter of a second
+
+        scene, outline = film.scene, film.outline
+        assert isinstance(scene, ModelScene) and film.pupil is outline
+        self._path, self._scene = model.path, scene
+        before = Graph()
+        found = before.inline(pupil_graph(outline.x.shape[2] - 1, len(outline.x)), {})
+        rays = before.concat(before.input("film_mm", 2), found["pupil_mm"], before.input("wavelength_nm"))
+        before.outputs = {"rays": rays, **found}
+        numbers: dict[str, Any] = outline.numbers | film.numbers | {"stop_radius_mm": scene.stop_radius_mm}
+        constants = (
+            {STATE: model.state} | {name: [value] for name, value in numbers.items()} | {"outline": outline.table}
+        )
+        self._outputs = {name: _OUTPUTS[name] for name in _OUTPUTS if scene.aperture or name != "stop_xy_mm"}
+        parts = [write_onnx(before, {}), model.data, write_onnx(weight_graph(), {})]
+        whole = joined(parts, constants, tuple(self._outputs), {"status": "lens_status"})
+        self._session = open_session(model.path, whole, model.threads, _INPUTS, self._outputs)
+
+    def sample(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """As `LensFilm.sample`."""
+        count = film_mm.shape[1]
+        rows = {"ray": 6, "stop_xy_mm": 2}
+        found: dict[str, NDArray[Any]] = {
+            name: np.empty((rows.get(name, 1), count), np.int32 if name == "status" else np.float32)
+            for name in self._outputs
+        }
+        for start in range(0, count, RAYS_A_CALL):
+            part = slice(start, start + RAYS_A_CALL)
+            given = {"film_mm": film_mm[:, part], "square": square[:, part], "wavelength_nm": wavelength_nm[None, part]}
+            done = run_session(
+                self._path, self._session, tuple(self._outputs), {k: padded(v) for k, v in given.items()}
+            )
+            for whole, piece in zip(found.values(), done, strict=True):
+                whole[:, part] = piece[..., : min(RAYS_A_CALL, count - start)]
+        if self._scene.aperture is not None:
+            stopped = self._scene.stopped(found["status"][0], found["stop_xy_mm"])
+            found["weight"][:, stopped != found["status"][0]] = 0
+            found["status"][0] = stopped
+        return camera_rays(found)
 
 
 @dataclass(frozen=True)
@@ -179,10 +237,8 @@ class ModelScene:
         out = self.model.rays(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm)
         status, ray = out.status, out.scene_ray
         squared = np.einsum("in,in->n", ray[3:], ray[3:])
-        if not (squared.min(initial=1) >= 1 - UNIT_SLACK and squared.max(initial=1) <= 1 + UNIT_SLACK):
-            unit = np.abs(squared - 1) <= UNIT_SLACK  # false for NaN
-            status = np.where(unit | (status != st.PASSED), status, np.int32(st.OUTSIDE_DOMAIN))
-            ray = np.where(unit, ray, _NO_RAY)
+        unit = np.abs(squared - 1) <= UNIT_SLACK  # false for NaN
+        status = np.where(unit | (status != st.PASSED), status, np.int32(st.OUTSIDE_DOMAIN))
         return SceneRays(ray, out.transmittance, self.stopped(status, out.stop_xy_mm))
 
     def stopped(self, status: NDArray[np.int32], stop_xy_mm: FloatArray) -> NDArray[np.int32]:

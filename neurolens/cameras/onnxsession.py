@@ -37,6 +37,66 @@ def open_session(
     return session
 
 
+def joined(
+    models: Sequence[Any], constants: Mapping[str, Any], outputs: Sequence[str], renamed: Mapping[str, str]
+) -> bytes:
+    """Models after one another as one: an input takes what an earlier one gives, or is given, under its name.
+
+    Args:
+        models: of the package onnx, or their bytes.
+        constants: inputs that become numbers. outputs: wanted of all that the models give.
+        renamed: what models give, where a later one takes it under another name.
+    """
+    import onnx  # takes a quarter of a second
+    from onnx import helper, numpy_helper
+
+    parts = [onnx.load_from_string(m) if isinstance(m, bytes) else m for m in models]
+    graph, known = onnx.GraphProto(name="camera"), dict[str, Any]()  # what is given: a name here, and its description
+    for k, part in enumerate(parts):
+        names = {"": ""}  # of the part: names here
+        for value in part.graph.input:
+            name, kind = value.name, value.type.tensor_type.elem_type
+            if name not in known:
+                known[name] = name, value
+                if name in constants:
+                    graph.initializer.append(numpy_helper.from_array(np.array(constants[name], np.float32), name))
+                else:
+                    graph.input.append(value)
+            names[name], given = known[name]
+            if given.type.tensor_type.elem_type != kind:
+                graph.node.append(helper.make_node("Cast", [names[name]], [f"{k}_{name}_cast"], to=kind))
+                names[name] = f"{k}_{name}_cast"
+        for tensor in part.graph.initializer:
+            names[tensor.name] = tensor.name = f"{k}_{tensor.name}"
+            graph.initializer.append(tensor)
+        for node in part.graph.node:
+            names |= {name: f"{k}_{name}" for name in node.output}
+            node.name, node.input[:], node.output[:] = (
+                f"{k}_{node.name}",
+                [names[i] for i in node.input],
+                [names[o] for o in node.output],
+            )
+            graph.node.append(node)
+        last = part is parts[-1]
+        known |= {v.name if last else renamed.get(v.name, v.name): (names[v.name], v) for v in part.graph.output}
+    for name in outputs:
+        graph.node.append(helper.make_node("Identity", [known[name][0]], [name]))
+        graph.output.append(known[name][1])
+    whole = helper.make_model(graph, opset_imports=parts[0].opset_import, ir_version=parts[0].ir_version)
+    return bytes(whole.SerializeToString())
+
+
+def padded(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The same columns [R, N] and further ones of zeros where N would make onnxruntime slow.
+
+    Rows a power of two apart share cache lines, which makes matrix products a third slower.
+    """
+    rows, count = values.shape
+    whole = np.zeros((rows, count + 16 if count % 1024 == 0 else count), np.float32)
+    whole[:, :count] = values
+    return whole
+
+
 def run_session(
     path: Path, session: Any, outputs: Sequence[str], feeds: Mapping[str, NDArray[np.float32]]
 ) -> list[NDArray[Any]]:

@@ -9,12 +9,16 @@ over the visible range in a double Gauss, and so do the polygons.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph, Value
+
+_HAIR = 1e-18  # mm
 
 
 @dataclass(frozen=True)
@@ -44,10 +48,7 @@ class PupilOutline:
     def sample(
         self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Points that fill the polygons of film points evenly.
-
-        The square's concentric squares become concentric copies of the polygon, as for Shirley and Chiu's disk (1997):
-        neighbours stay neighbours, and inside each triangle between centre and edge areas stay in proportion.
+        """Points that fill the polygons of film points evenly; see `pupil_point`.
 
         Args:
             film_mm: [2, N].
@@ -58,90 +59,95 @@ class PupilOutline:
         where nothing passes: the inverse of its probability density. It varies little over a polygon, whose area is
         its mean.
         """
-        radius = np.sqrt(np.einsum("in,in->n", film_mm, film_mm))
-        row, step, lit = self.place(radius)
-        a = square[0] * np.float32(2)
-        a -= np.float32(1)
-        b = square[1] * np.float32(2)
-        b -= np.float32(1)
-        height = np.abs(b)
-        size = np.maximum(np.abs(a), height)
-        # Along the upper half of a concentric square, from 0 at +x over 2 at +y to 4 at -x; the centre has no place.
-        scale = np.float32(1) / np.maximum(size, np.float32(1e-30))
-        along = np.float32(2) - a * scale * (np.float32(2) - height * scale)
-        segments = self.x.shape[2] - 1
-        along *= np.float32(segments / 4)
-        with np.errstate(invalid="ignore"):  # NaN is in no segment: any will do
-            edge = np.clip(along.astype(np.intp), 0, segments - 1)
-        along -= edge
-        x, y, dx, dy = self._edge(row * segments + edge, step, wavelength_nm)
-        area = x * dy
-        area -= y * dx
-        area *= np.float32(segments)
-        area *= lit
-        # Where the light ends, rows between which the outline turns leave slivers of negative area: nothing (1e-6).
-        np.maximum(area, np.float32(0), out=area)
-        dx *= along
-        dx += x
-        dx *= size
-        dy *= along
-        dy += y
-        dy *= np.copysign(size, b)
-        centre, centre_step = self.centres.take(row, axis=1)
-        centre_step *= step
-        dx += centre
-        dx += centre_step
-        return turned(dx, dy, film_mm, radius), area
-
-    def place(self, radius: FloatArray) -> tuple[NDArray[np.intp], FloatArray, NDArray[np.bool_]]:
-        """Row below each film radius [N], the fraction of the way to the next, and whether light arrives there."""
-        last = self.centre.size - 1
-        inner = np.float32(1) - radius * np.float32(1 / self.film_radius_mm)
-        lit = inner >= 0
-        # NaN and what lies beyond the end are taken for the axis; they carry no area.
-        place = np.float32(last) * (np.float32(1) - np.sqrt(np.where(lit, inner, np.float32(1))))
-        row = np.minimum(place.astype(np.intp), last)
-        return row, place - row, lit
+        given = {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None], "outline": self.table}
+        given |= {name: np.array([[value]], np.float32) for name, value in self.numbers.items()}
+        found = evaluate(pupil_graph(self.x.shape[2] - 1, len(self.x)), given)
+        area = found["area_mm2"][0]
+        return found["pupil_mm"], np.where(area > 0, area, np.float32(0))
 
     def radii(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Film radii in mm of (fractional) rows: the inverse of `place`."""
+        """Film radii in mm of (fractional) rows."""
         return self.film_radius_mm * (1 - (1 - place / (self.centre.size - 1)) ** 2)
 
-    def _edge(self, index: NDArray[np.intp], step: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """First vertex (x, y) and edge (dx, dy) [4, N] at a fraction of the way to the next row, for wavelengths."""
-        known = self.edges.take(index, axis=2)
-        rows = known[:, 4:]
-        rows *= step
-        here = known[:, :4]
-        here += rows
-        if len(known) == 1:
-            return here[0]
-        change = here[1]
-        change *= self.share(wavelength_nm)
-        change += here[0]
-        return change
-
-    def share(self, wavelength_nm: FloatArray) -> FloatArray:
-        """How far each wavelength [N] lies from the first of the outline's to the second, in 1 / wavelength^2."""
-        first, second = (w**-2 for w in self.wavelength_nm)
-        share = wavelength_nm**-2
-        share -= np.float32(first)
-        share *= np.float32(1 / (second - first))
-        return np.clip(share, np.float32(0), np.float32(1), out=share)
+    @cached_property
+    def numbers(self) -> dict[str, float]:
+        """The inputs of the call of `pupil_point`."""
+        waves = [w**-2 for w in self.wavelength_nm]
+        numbers = {"per_radius": 1 / self.film_radius_mm, "last_row": float(self.centre.size - 1)}
+        if len(self.x) > 1:
+            numbers |= {"wave_first": waves[0], "wave_scale": 1 / (waves[1] - waves[0])}
+        return numbers
 
     @cached_property
-    def edges(self) -> FloatArray:
-        """[W, 8, R * K]: first vertex and edge at each row, their steps to the next row; second the change of all."""
-        first = np.stack([self.x[..., :-1], self.y[..., :-1], np.diff(self.x), np.diff(self.y)], axis=1)
-        steps = np.diff(first, axis=2, append=first[:, :, -1:])
-        both = np.concatenate([first, steps], axis=1)
-        both[1:] -= both[:1]
-        return np.ascontiguousarray(both.reshape(len(both), 8, -1), np.float32)
+    def table(self) -> FloatArray:
+        """The table of `pupil_point`, [R * (K + 1), 10 W]; each column is contiguous.
 
-    @cached_property
-    def centres(self) -> FloatArray:
-        """[2, R]: centre at each row and its step to the next."""
-        return np.stack([self.centre, np.diff(self.centre, append=self.centre[-1:])]).astype(np.float32)
+        Groups of columns (weights 1, step, share, share step): first vertex and edge (x, y, dx, dy) at a row, and
+        centre; their steps to the next row; and of two wavelengths the change of both from the first to the second.
+        The last cell of a row is its end, which belongs to the last edge.
+        """
+        edges = [np.diff(c, append=2 * c[..., -1:] - c[..., -2:-1]) for c in (self.x, self.y)]
+        centre = np.broadcast_to(self.centre[:, None], self.x.shape)
+        here = np.stack([self.x, self.y, *edges, centre], 1)  # [W, 5, R, K + 1]
+        here[1:] -= here[:1]
+        groups = np.stack([here, np.diff(here, axis=2, append=here[:, :, -1:])], 1)
+        return np.ascontiguousarray(groups.reshape(10 * len(here), -1), np.float32).T
+
+
+@cache
+def pupil_graph(segments: int, wavelengths: int) -> Graph:
+    """`pupil_mm` [2] and `area_mm2` of `film_mm` [2], `square` [2] and `wavelength_nm`; see `pupil_point`."""
+    g = Graph()
+    point, area = pupil_point(
+        g, g.input("film_mm", 2), g.input("square", 2), g.input("wavelength_nm"), segments, wavelengths
+    )
+    g.outputs = {"pupil_mm": point, "area_mm2": area}
+    return g
+
+
+def pupil_point(
+    g: Graph, film: Value, square: Value, wavelength: Value, segments: int, wavelengths: int
+) -> tuple[Value, Value]:
+    """The pupil point [2] of a film point [2], of a point of the unit square and a wavelength, and its area.
+
+    The square's concentric squares become concentric copies of the polygon, as for Shirley and Chiu's disk (1997):
+    neighbours stay neighbours, and inside each triangle between centre and edge areas stay in proportion.
+
+    Args:
+        segments: K, of the upper half of a polygon. wavelengths: of the outline, 1 or 2.
+
+    Of the call: the table `outline` (`PupilOutline.table`), `per_radius` (1 / the last film radius), `last_row`, and
+    of two wavelengths `wave_first`, `wave_scale`: the share of the second is (1 / wavelength^2 - first) scale.
+
+    The area is that of `PupilOutline.sample`, but negative or NaN where nothing passes; points mean nothing there.
+    """
+    per_radius, last_row = (g.input(name, per_call=True) for name in ("per_radius", "last_row"))
+    radius = g.square(film).sqrt()
+    inner = 1.0 - radius * per_radius
+    place = (1.0 - inner.maximum(0.0).sqrt()) * last_row
+    row = place.floor()
+    step = place - row
+    # a, b from -1 to 1, and the sign of b: a clamped multiple.
+    a, b, large = g.split(g.affine([[2.0, 0.0], [0.0, 2.0], [0.0, 2e30]], square, [-1.0, -1.0, -1e30]), (1, 1, 1))
+    height = b.abs()
+    size = a.abs().maximum(height)
+    # Along the upper half of a concentric square, from 0 at +x over 2 at +y to 4 at -x; the centre has no place.
+    per_size = 1.0 / size.maximum(1e-30)
+    along = (2.0 - a * per_size * (2.0 - height * per_size)) * (segments / 4)
+    edge = along.floor()
+    cell, weights = row * (segments + 1.0) + edge, g.concat(g.constant(1.0), step)
+    if wavelengths > 1:
+        first, scale = (g.input(name, per_call=True) for name in ("wave_first", "wave_scale"))
+        share = ((1.0 / (wavelength * wavelength) - first) * scale).clip(0.0, 1.0)
+        weights = g.concat(weights, share, share * step)
+    vertex, side, centre = g.split(g.lookup(g.table("outline", 10 * wavelengths), cell, weights), (2, 2, 1))
+    products = vertex * g.affine([[0.0, 1.0], [1.0, 0.0]], side)
+    area = g.affine([[float(segments), -float(segments)]], products).minimum(inner * 1e30)  # none beyond the end
+    point = (vertex + side * (along - edge)) * g.concat(size, size * large.clip(-1.0, 1.0))
+    x, y = g.split(point, (1, 1))
+    # Turned to the azimuth of the film point; on the axis (a hair beside it, far below rounding) that is 0.
+    turn = (film + [_HAIR, 0.0]) / (radius + _HAIR)
+    return turn * (x + centre) + g.affine([[0.0, -1.0], [1.0, 0.0]], turn) * y, area
 
 
 def wavelength_between(wavelength_nm: tuple[float, ...], share: float) -> float:

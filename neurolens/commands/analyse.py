@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.commands.arguments import add_json, add_lens_state, between, focus_of, state_of
-from neurolens.commands.output import number, print_json, table
+from neurolens.commands.arguments import add_json, add_lens_state, between, check_run_folder, focus_of, state_of
+from neurolens.commands.output import answer, number, table
 
 if TYPE_CHECKING:
     from neurolens.analysis.fields import Scene
@@ -63,7 +63,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("file", metavar="LENS", type=Path, help="lens file (lenses/*.toml)")
     parser.add_argument("what", metavar="WHAT", nargs="*", help="what to show (default: all)")
-    add_lens_state(parser, {"efl": "as tabled", "f_number": "the tabled stop", "focus": "inf"})
+    add_lens_state(parser, efl="as tabled", f_number="the tabled stop")
     parser.add_argument(
         "--fields", metavar="DEG", nargs="+", type=between(0, 179, "degrees"),
         help="fields of spots, fans, mtf and psf (default: axis, 50%%, 70%%, 85%% and edge of the field)",
@@ -91,12 +91,13 @@ def run(args: argparse.Namespace) -> int:
     if args.full and not args.json:
         raise InputError("neurolens analyse", "--full", "(given)", "this option only with --json")
     if args.output is not None:
-        if args.output.exists() and not args.output.is_dir():
-            raise InputError(args.output, "--output", str(args.output), "a folder")
+        check_run_folder(args.output, args.output, "--output")
         args.output.mkdir(parents=True, exist_ok=True)
 
+    from neurolens.analysis.layout import state_text
+
     began = time.perf_counter()
-    scene, doubts = scene_of(args)
+    scene, doubts = _scene_of(args)
     scene.check()
     found, pictures, notes = {}, {}, [f"derived: {scene.lens.derived}"] if scene.lens.derived else []
     for what in args.what or WHATS:
@@ -111,26 +112,32 @@ def run(args: argparse.Namespace) -> int:
             pictures[what] = str(picture)
     head = {"file": str(args.file), "name": scene.lens.name, "axis": scene.axis, "focus_m": scene.focus_m}
     more = {"pictures": pictures, "notes": notes, "warnings": doubts, "seconds": time.perf_counter() - began}
-    if args.json:
-        bulk = {} if args.full else _BULK
-        shown = {w: {k: v for k, v in d.items() if k not in bulk.get(w, ())} for w, d in found.items()}
-        print_json({**head, **shown, **more})
-    else:
-        parts = [f"{scene.lens.name}\n{_subtitle(scene)}", *(_analysis(w).table(d) for w, d in found.items())]
+    bulk = {} if args.full else _BULK
+    shown = {w: {k: v for k, v in d.items() if k not in bulk.get(w, ())} for w, d in found.items()}
+
+    def text() -> str:
+        parts = [f"{scene.lens.name}\n{state_text(scene)}", *(_analysis(w).table(d) for w, d in found.items())]
         parts += [*(f"Note: {n}" for n in notes), *(f"Warning: {w}" for w in doubts)]
         if pictures:
             parts.append(f"{len(pictures)} pictures drawn in {args.output}")
-        print("\n\n".join(parts))
-    return 0
+        return "\n\n".join(parts)
+
+    return answer(args, {**head, **shown, **more}, text)
 
 
-def scene_of(args: argparse.Namespace) -> tuple[Scene, list[str]]:
+def _scene_of(args: argparse.Namespace) -> tuple[Scene, list[str]]:
     """The lens with its object in the state of the arguments of `add_lens_state`, and warnings."""
     from neurolens.analysis.fields import DEFAULT_NM, Scene
+    from neurolens.evaluate.describe import file_doubts, rim_doubts
+    from neurolens.optics.lensfile import read_lens
 
-    tabled, notes = read_with_warnings(args.file)
+    with warnings.catch_warnings(record=True) as caught:  # glasses that contradict the catalogue, constant indices
+        warnings.simplefilter("always", NeurolensWarning)
+        tabled = read_lens(args.file)
     lens = state_of(args, tabled)
-    notes += table_warnings(tabled, lens, args.zoom) + wavelength_warnings(lens, args.wavelengths or DEFAULT_NM)
+    notes = [str(w.message).removeprefix(f"{tabled.path}: ") for w in caught]
+    notes += rim_doubts(lens) + file_doubts(tabled, states=bool(args.zoom))
+    notes += _wavelength_warnings(lens, args.wavelengths or DEFAULT_NM)
     return Scene(lens, focus_of(args, tabled, lens), args.axis), notes
 
 
@@ -138,6 +145,7 @@ def _one(what: str, scene: Scene, args: argparse.Namespace) -> tuple[dict[str, A
     """One analysis as plain data, and its picture where a folder is given."""
     from neurolens.analysis.bundles import check_light
     from neurolens.analysis.fields import DEFAULT_NM
+    from neurolens.analysis.layout import state_text
 
     analysis = _analysis(what)
     options = {"field_deg": args.fields, "wavelength_nm": args.wavelengths}
@@ -152,13 +160,7 @@ def _one(what: str, scene: Scene, args: argparse.Namespace) -> tuple[dict[str, A
     path = args.output / f"{scene.lens.lens_id}_{what}{across}.{args.format}"
     if what == "layout":
         return data, analysis.draw(result, path)
-    return data, analysis.draw(result, path, scene.lens.name, _subtitle(scene))
-
-
-def _subtitle(scene: Scene) -> str:
-    from neurolens.analysis.layout import state_text
-
-    return state_text(scene)
+    return data, analysis.draw(result, path, scene.lens.name, state_text(scene))
 
 
 def _analysis(what: str) -> _Analysis:
@@ -184,33 +186,7 @@ def _analysis(what: str) -> _Analysis:
     }[what]
 
 
-def read_with_warnings(path: str | Path) -> tuple[Lens, list[str]]:
-    """A lens file and the reader's warnings: glasses that contradict the catalogue, indices taken as constant."""
-    from neurolens.optics.lensfile import read_lens
-
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", NeurolensWarning)
-        lens = read_lens(path)
-    return lens, [str(w.message).removeprefix(f"{lens.path}: ") for w in caught]
-
-
-def table_warnings(tabled: Lens, lens: Lens, zoom: str | None) -> list[str]:
-    """Doubts about the table and, if `zoom` selects a state, about its states; see `neurolens.optics.lenscheck`.
-
-    `tabled` is the lens of the file, `lens` the analysed state.
-    """
-    from neurolens.optics.lenscheck import check_lens, doubts
-
-    found = {
-        "estimated": ["rim diameters are estimated, not the source's: vignetting is a guess"],
-        "derived": ["rim diameters are derived by a rule, the source has none: vignetting follows that rule"],
-    }.get(lens.rims, [])
-    # A smaller stop than stated is a choice, not a doubt.
-    checks = [c for c in check_lens(tabled) if c.quantity != "f-number" or (c.computed or 0.0) > (c.stated or 0.0)]
-    return found + doubts([c for c in checks if zoom or not c.state])
-
-
-def wavelength_warnings(lens: Lens, wavelength_nm: Iterable[float]) -> list[str]:
+def _wavelength_warnings(lens: Lens, wavelength_nm: Iterable[float]) -> list[str]:
     """Glasses of a lens that their source does not state at a wavelength in use."""
     from neurolens.optics.glass import glass_of
 

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
+from neurolens.base.errors import InputError
+
 if TYPE_CHECKING:
     from neurolens.optics.apertures import Aperture
     from neurolens.optics.prescription import Lens
@@ -108,16 +110,13 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def add_lens_state(parser: argparse.ArgumentParser, defaults: dict[str, str]) -> None:
-    """Add --efl, --field, --zoom, --f-number, --focus, --focusing and the stop's shape.
-
-    `defaults` describes the defaults of efl, f_number and focus for the help.
-    """
+def add_lens_state(parser: argparse.ArgumentParser, *, efl: str, f_number: str, focus: str = "inf") -> None:
+    """Add --efl, --field, --zoom, --f-number, --focus, --focusing and the stop's shape; texts describe defaults."""
     group = parser.add_argument_group("state of the lens")
     size = group.add_mutually_exclusive_group()
     size.add_argument(
         "--efl", metavar="MM", type=between(1e-3, 1e6, "a focal length in mm"),
-        help=f"scale the whole lens to this focal length in mm (default: {defaults['efl']})",
+        help=f"scale the whole lens to this focal length in mm (default: {efl})",
     )  # fmt: skip
     size.add_argument(
         "--field", metavar="DEG", type=between(0.001, 359.0, "degrees"),
@@ -130,11 +129,11 @@ def add_lens_state(parser: argparse.ArgumentParser, defaults: dict[str, str]) ->
     )  # fmt: skip
     group.add_argument(
         "--f-number", metavar="N", type=positive("an f-number"),
-        help=f"focal length over entrance-pupil diameter at infinity focus (default: {defaults['f_number']})",
+        help=f"focal length over entrance-pupil diameter at infinity focus (default: {f_number})",
     )  # fmt: skip
     group.add_argument(
         "--focus", metavar="M", type=positive("a distance in metres", infinite=True),
-        help=f"distance from the film to the object in focus in metres, or inf (default: {defaults['focus']})",
+        help=f"distance from the film to the object in focus in metres, or inf (default: {focus})",
     )  # fmt: skip
     group.add_argument(
         "--focusing", choices=("film", "best", "internal"), default="film",
@@ -201,8 +200,37 @@ def given_options(args: argparse.Namespace) -> list[str]:
     return given + (["--focusing"] if args.focusing != "film" else [])
 
 
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Add --json."""
+def add_exposure(parser: argparse._ActionsContainer) -> None:
+    """Add --exposure."""
+    parser.add_argument(
+        "--exposure", metavar="STOPS", type=between(-40, 40, "stops"), default=0.0,
+        help="brightens the preview only (default: 0)",
+    )  # fmt: skip
+
+
+def add_json(parser: argparse.ArgumentParser, quiet: bool = False) -> None:
+    """Add --json, and --quiet before it where a command shows its progress."""
+    if quiet:
+        parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     parser.add_argument(
         "--json", action="store_true", help="print one JSON object on stdout instead of the text; keys carry their unit"
     )
+
+
+def check_folder(path: Path, option: str) -> None:
+    """Refuse a file to write whose folder is missing, before the work; raises InputError."""
+    if not path.parent.is_dir():
+        raise InputError(path, option, str(path.parent), "a folder that exists")
+
+
+def check_run_folder(path: Path, command: str | Path, option: str) -> None:
+    """Refuse a file where a folder is to be made or filled; raises InputError."""
+    if path.exists() and not path.is_dir():
+        raise InputError(command, option, str(path), "a folder, not a file")
+
+
+def check_suffix(path: Path, option: str, suffixes: tuple[str, ...]) -> None:
+    """Refuse a file to write of another kind, before the work; raises InputError."""
+    if path.suffix.lower() not in suffixes:
+        expected = suffixes[0] if len(suffixes) == 1 else f"one of {', '.join(suffixes)}"
+        raise InputError(path, option, path.suffix or "(no suffix)", expected)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
-from neurolens.commands.arguments import Parser, whole
+from neurolens.commands.arguments import Parser, check_run_folder, whole
 
 if TYPE_CHECKING:
     from neurolens.evaluate.methods import BenchSettings
@@ -78,8 +78,7 @@ def run_surrogates(args: argparse.Namespace) -> int:
 
     rows, settings, out = chosen_rows(args.methods), _settings(args), args.out
     files = _lens_files(args.lenses)
-    if out.exists() and not out.is_dir():
-        raise InputError("neurolens bench surrogates", "--out", str(out), "a folder, not a file")
+    check_run_folder(out, "neurolens bench surrogates", "--out")
     benches = [Bench(LensChoice(file), settings, out) for file in files]
     out.mkdir(parents=True, exist_ok=True)
     config = {
@@ -93,13 +92,10 @@ def run_surrogates(args: argparse.Namespace) -> int:
     atomic_write_text(out / "config.json", json.dumps(plain(config), indent=1) + "\n")
     facts = f"{_conditions(args, settings)} {NOTES}"
     found: dict[str, Any] = {}
-
-    def done(bench: Bench, records: list[dict[str, Any]]) -> None:
+    for bench, records in run_bench(benches, rows, Progress(quiet=args.quiet), again=args.again):
         found[bench.name] = records
         write_lens(bench.name, records, facts, out)
         atomic_write_text(out / "summary.md", summary_page(found, facts))
-
-    run_bench(benches, rows, again=args.again, progress=Progress(quiet=args.quiet), done=done)
     print(f"{summary_page(found, facts)}\nLook at\n  {out / 'summary.md'}\n  {out / (benches[0].name + '.md')}, ...")
     return 0
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_path
-from neurolens.commands.arguments import add_json, between, positive
-from neurolens.commands.output import number, print_json
+from neurolens.commands.arguments import add_json, between, check_folder, check_suffix, positive
+from neurolens.commands.output import answer, number
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens
@@ -62,31 +62,25 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Convert one file and print what was read."""
-    check_output(args.output, args.force)
+    check_suffix(args.output, "--output", (".toml",))
+    check_folder(args.output, "--output")
+    if args.output.exists() and not args.force:
+        raise InputError(args.output, "--output", "(an existing file)", "a new file, or --force to replace it")
     from neurolens.readers.any_format import read_any
     from neurolens.readers.draft import Given
 
     given = Given(
-        name=args.name,
-        source=args.source,
-        f_number=args.f_number,
-        units=args.units,
-        half_field_deg=args.half_field,
-        gap_before=args.gap_before,
-        semi_diameters=args.semi_diameters,
-    )
+        name=args.name, source=args.source, f_number=args.f_number, units=args.units, half_field_deg=args.half_field,
+        gap_before=args.gap_before, semi_diameters=args.semi_diameters,
+    )  # fmt: skip
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", NeurolensWarning)
         lens = read_any(args.file, given)
         write_checked(lens, args.output)
     told = [str(w.message).removeprefix(f"{args.file}: ") for w in caught if issubclass(w.category, NeurolensWarning)]
-    data = summary(lens, list(dict.fromkeys([*told, *_doubts(lens)])))
-    data = {"file": str(args.file), "output": str(args.output), **data}
-    if args.json:
-        print_json(data)
-    else:
-        print(_text(data))
-    return 0
+    notes = list(dict.fromkeys([*told, *_doubts(lens)]))
+    data = {"file": str(args.file), "output": str(args.output), **_summary(lens, notes)}
+    return answer(args, data, lambda: _text(data))
 
 
 def _doubts(lens: Lens) -> list[str]:
@@ -99,20 +93,6 @@ def _doubts(lens: Lens) -> list[str]:
             return doubts(check_lens(lens))
     except InputError as error:
         return [f"the lens cannot be checked: {error.field}: expected {error.expected}"]
-
-
-def check_output(path: Path, force: bool) -> None:
-    """Refuse an output file that cannot be written, or that exists, before the work.
-
-    Raises:
-        InputError: another suffix, no such folder, an existing file without --force.
-    """
-    if path.suffix.lower() != ".toml":
-        raise InputError(path, "--output", path.suffix or "(no suffix)", ".toml")
-    if not path.parent.is_dir():
-        raise InputError(path, "--output", str(path.parent), "a folder that exists")
-    if path.exists() and not force:
-        raise InputError(path, "--output", "(an existing file)", "a new file, or --force to replace it")
 
 
 def write_checked(lens: Lens, path: Path) -> None:
@@ -136,7 +116,7 @@ def write_checked(lens: Lens, path: Path) -> None:
             raise InputError(path, "content", "(another lens when read back)", "the lens that was read")
 
 
-def summary(lens: Lens, told: list[str]) -> dict[str, Any]:
+def _summary(lens: Lens, told: list[str]) -> dict[str, Any]:
     """Figures of the lens for text and --json; mm."""
     from neurolens.optics import paraxial
     from neurolens.readers.assemble import first_order

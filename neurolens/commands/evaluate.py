@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_json, whole
-from neurolens.commands.output import number, print_json, table
+from neurolens.commands.output import answer, number, table
 
 if TYPE_CHECKING:
-    from neurolens.cameras.model import OnnxLens
     from neurolens.evaluate.check import Promise
 
 _DESCRIPTION = """\
@@ -63,25 +63,19 @@ def add_parser(subparsers: Any) -> None:
         "--seed", metavar="N", type=whole(0), help="of the rays (default: one that differs from the fit's)"
     )
     parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=1, help="for the timing (default: 1)")
-    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
-    add_json(parser)
+    add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="nothing is written")
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure, compare, time; 1 where a promise does not hold."""
     from neurolens.cameras.model import load_model
-    from neurolens.evaluate.check import check_model, lens_of_card
+    from neurolens.evaluate.candidates import time_model
+    from neurolens.evaluate.check import check_model, check_states, lens_of_card, space_of_card
 
     model = load_model(args.model)  # on one thread: the race distributes batches
-    space = None
-    if model.axes:
-        from neurolens.evaluate.check import check_states, space_of_card
-
-        space = space_of_card(model.card, model.axes, args.lens, args.model)
-        lens = space.lens
-    else:
-        lens = lens_of_card(model.card, args.lens, args.model)
+    space = space_of_card(model.card, model.axes, args.lens, args.model) if model.axes else None
+    lens = space.lens if space else lens_of_card(model.card, args.lens, args.model)
     progress = Progress({"measure": 10, "time": 2}, quiet=args.quiet)
     with progress.stage("measure"):
         if space is not None:
@@ -89,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             figures, promises = check_model(model, lens, rays=args.rays, seed=args.seed)
     with progress.stage("time"):
-        timing = _time(model, args.model.stem, args.threads)
+        timing = time_model(model, args.model.stem, rounds=10, threads=args.threads)
     holds = all(p.holds for p in promises)
     data = {
         "model": str(args.model),
@@ -97,29 +91,12 @@ def run(args: argparse.Namespace) -> int:
         "method": model.card["fit"]["method"],
         **figures,
         "ns_per_ray": timing,
-        "promises": [
-            {"key": p.key, "promised": p.promised, "measured": p.measured, "allowed": p.allowed, "holds": p.holds}
-            for p in promises
-        ],
+        "promises": [{**asdict(p), "holds": p.holds} for p in promises],
         "holds": holds,
         "poor": model.card["errors"].get("poor") or [],
     }
-    if args.json:
-        print_json(data)
-    else:
-        print(_text(data, promises))
+    answer(args, data, lambda: _text(data, promises))
     return 0 if holds else 1
-
-
-def _time(model: OnnxLens, name: str, threads: int) -> Any:
-    """Nanoseconds per ray, in the model's best batch size."""
-    from neurolens.evaluate.candidates import model_candidate
-    from neurolens.evaluate.speed import race
-    from neurolens.surrogates.domain import Domain
-
-    domain = Domain.from_dict(model.card["domain"])
-    candidate = model_candidate(name, model, domain.stop_radius_mm)
-    return race([candidate], domain, threads=threads, rounds=10).timing(name)
 
 
 def _text(data: dict[str, Any], promises: list[Promise]) -> str:
@@ -136,14 +113,12 @@ def _text(data: dict[str, Any], promises: list[Promise]) -> str:
     if broken:
         verdict = f"Does not hold: {', '.join(broken)}."
     lens = data["lens"]
-    return "\n\n".join(
-        [
-            f"{data['model']}: {data['method']} of {lens['name']} ({lens['file']})\n"
-            f"{data['rays']} fresh rays, seed {data['seed']}",
-            table(header, rows),
-            f"{timing['min']:.1f} ns per ray (median {timing['median']:.1f}), {timing['threads']} thread(s), "
-            f"batches of {timing['batch']}",
-            *([f"Poor, as the card says: {', '.join(data['poor'])}."] if data["poor"] else []),
-            verdict,
-        ]
-    )
+    parts = [
+        f"{data['model']}: {data['method']} of {lens['name']} ({lens['file']})\n"
+        f"{data['rays']} fresh rays, seed {data['seed']}",
+        table(header, rows),
+        f"{timing['min']:.1f} ns per ray (median {timing['median']:.1f}), {timing['threads']} thread(s), "
+        f"batches of {timing['batch']}",
+    ]
+    parts += [f"Poor, as the card says: {', '.join(data['poor'])}."] if data["poor"] else []
+    return "\n\n".join([*parts, verdict])

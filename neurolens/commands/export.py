@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, check_writable
 from neurolens.commands.arguments import add_json
-from neurolens.commands.output import print_json
+from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
     from neurolens.surrogates.model import LensModel
@@ -99,13 +99,10 @@ def run(args: argparse.Namespace) -> int:
         bands = [m.domain.wavelength_nm[0] for m in models] if s.bands > 1 else []
         about = {"function": s.name, "inputs": s.inputs, "outputs": [*s.outputs, "status"], "bands_nm": bands}
         about["operations_per_ray"] = written.operations
-    if args.json:
-        print_json({"file": str(args.out), "to": args.to, "bytes": args.out.stat().st_size, **about})
-    else:
-        print(args.out)
-        for found in about.get("inverse", {}).values():
-            print(f"{found['file']}: finds {found['converged']:.3%} of the model's rays in three steps")
-    return 0
+    data = {"file": str(args.out), "to": args.to, "bytes": args.out.stat().st_size, **about}
+    maps = about.get("inverse", {}).values()
+    said = [f"{m['file']}: finds {m['converged']:.3%} of the model's rays in three steps" for m in maps]
+    return answer(args, data, lambda: "\n".join([str(args.out), *said]))
 
 
 def model_file(path: Path) -> Path:
@@ -169,7 +166,7 @@ def _fix(given: dict[str, list[float]], model: LensModel) -> Fix:
 def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] | None, derivatives: bool) -> None:
     """The graph with its card: the errors of the card given, or measured anew for what was fixed."""
     from neurolens.cameras.model import load_model
-    from neurolens.evaluate.measure import measure_errors
+    from neurolens.evaluate.measure import fresh_rays, measure_on
     from neurolens.surrogates.export import export_onnx
 
     if len(models) > 1:
@@ -182,7 +179,8 @@ def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] |
     seed, held_out = _seed(model), _pairs(model, train=1).held_out
     with atomic_path(out) as measured:  # a file without its errors never has the final name
         export_onnx(model, measured, {})
-        errors = measure_errors(load_model(measured), model.lens, model.domain, held_out, _VIGNETTING, seed + 1)
+        rays = fresh_rays(model.lens, model.domain, held_out, count=_VIGNETTING, seed=seed + 1)
+        errors = measure_on(rays, load_model(measured))
         export_onnx(model, measured, errors, derivatives=derivatives)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
 from neurolens.commands.arguments import add_json
-from neurolens.commands.output import number, print_json, table
+from neurolens.commands.output import answer, number, table
 
 if TYPE_CHECKING:
     from neurolens.optics.catalogue import Glass
@@ -52,9 +52,10 @@ def run(args: argparse.Namespace) -> int:
             catalogue.find(name, "argument", "NAME")
             found += catalogue.same_name(name)
     rows = [_record(glass) for glass in dict.fromkeys(found)]
-    if args.json:
-        print_json({"glasses": rows})
-        return 0
+    return answer(args, {"glasses": rows}, lambda: _text(rows))
+
+
+def _text(rows: list[dict[str, Any]]) -> str:
     header = ("glass", "n_d", "V_d", "nm from", "to", *(f"10 mm at {nm:.0f} nm" for nm in _TRANSMITTED_NM))
     lines = [
         [
@@ -63,8 +64,7 @@ def run(args: argparse.Namespace) -> int:
         ]
         for row in rows
     ]
-    print(table(header, lines))
-    return 0
+    return table(header, lines)
 
 
 def _near(code: str) -> list[Glass]:

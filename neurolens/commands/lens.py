@@ -11,10 +11,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.commands.arguments import add_json, add_lens_state, between, focus_of, given_options, state_of
-from neurolens.commands.output import number, print_json, table
+from neurolens.commands.arguments import (
+    add_json,
+    add_lens_state,
+    between,
+    check_folder,
+    check_suffix,
+    focus_of,
+    given_options,
+    state_of,
+)
+from neurolens.commands.output import answer, number, table
 
 if TYPE_CHECKING:
+    from neurolens.evaluate.describe import LensFacts
     from neurolens.optics.prescription import Lens
     from neurolens.optics.rims import Rim, RimRule
 
@@ -47,7 +57,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "folder", metavar="FOLDER", type=Path, nargs="?", help='of lens files, after "list" (default: those that ship)'
     )
-    add_lens_state(parser, {"efl": "as tabled", "f_number": "the tabled stop", "focus": "inf"})
+    add_lens_state(parser, efl="as tabled", f_number="the tabled stop")
     parser.add_argument(
         "--layout", metavar="OUT.png", type=Path,
         help="draw the lens with rays from three field points: axis, 70%% and edge of the film (.png, .pdf, .svg)",
@@ -90,9 +100,10 @@ def run(args: argparse.Namespace) -> int:
         return _run_list(args)
     if args.derive_rims:
         return _run_rims(args)
-    for option in ("layout", "breathing"):
-        if getattr(args, option) is not None:
-            check_layout_path(getattr(args, option), f"--{option}")
+    for option, path in (("--layout", args.layout), ("--breathing", args.breathing)):
+        if path is not None:
+            check_suffix(path, option, _LAYOUT_SUFFIXES)
+            check_folder(path, option)
     from neurolens.evaluate.describe import describe_lens, file_doubts, glass_table, layout_profile
     from neurolens.optics.lensfile import read_lens
     from neurolens.surrogates.domain import domain_of
@@ -107,9 +118,11 @@ def run(args: argparse.Namespace) -> int:
     configurations = [
         {"name": c.name, "efl_mm": c.efl_mm, "object_distance_mm": c.object_distance_mm} for c in tabled.configurations
     ]
+    facts = describe_lens(lens, domain)
+    facts.warnings.extend(file_doubts(tabled))
     data = {
         "file": str(args.file),
-        **describe_lens(lens, domain),
+        **facts.to_dict(),
         "zoom": args.zoom,
         "focusing": args.focusing,
         "derived": lens.derived,
@@ -119,7 +132,6 @@ def run(args: argparse.Namespace) -> int:
         "layout": None if args.layout is None else str(args.layout),
         "breathing_plot": None if args.breathing is None else str(args.breathing),
     }
-    data["warnings"] += file_doubts(tabled)
     if args.layout is not None:
         from neurolens.analysis.layout import lens_layout
 
@@ -130,30 +142,13 @@ def run(args: argparse.Namespace) -> int:
         found = draw_breathing(lens, args.breathing)
         data["breathing"] = {name: [asdict(b) for b in breaths] for name, breaths in found.items()}
     data["seconds"] = time.perf_counter() - began
-    if args.json:
-        print_json(data)
-    else:
-        print(lens_text(data))
-    return 0
+    return answer(args, data, lambda: _lens_text(facts, data))
 
 
-def check_layout_path(path: Path, option: str = "--layout") -> None:
-    """Refuse a picture that cannot be written before the work.
-
-    Raises:
-        InputError: another suffix, or no such folder.
-    """
-    if path.suffix.lower() not in _LAYOUT_SUFFIXES:
-        raise InputError(path, option, path.suffix or "(no suffix)", f"one of {', '.join(_LAYOUT_SUFFIXES)}")
-    if not path.parent.is_dir():
-        raise InputError(path, option, str(path.parent), "a folder that exists")
-
-
-def lens_text(data: dict[str, Any]) -> str:
-    """The data of `neurolens lens` as a page of text."""
-    by = f", {data['designer']}" if data["designer"] else ""
-    head = f"{data['name']}{by}\n{data['source']}"
-    parts = [head, _first_order(data), _light(data), _surfaces(data)]
+def _lens_text(facts: LensFacts, data: dict[str, Any]) -> str:
+    """The facts with the rest of what is printed as JSON, as a page of text."""
+    by = f", {facts.designer}" if facts.designer else ""
+    parts = [f"{facts.name}{by}\n{facts.source}", _first_order(facts), _light(facts), _surfaces(data["surfaces"])]
     if data["configurations"]:
         zoom = [f"{c['name']} ({number(c['efl_mm'])} mm)" for c in data["configurations"] if not _near(c)]
         near = [f"{c['name']} ({number(c['object_distance_mm'])} mm)" for c in data["configurations"] if _near(c)]
@@ -161,7 +156,7 @@ def lens_text(data: dict[str, Any]) -> str:
         parts += [f"Focus states (--zoom, or --focusing internal): {', '.join(near)} to the object"] if near else []
     if data["derived"]:
         parts.append(f"Derived: {data['derived']}")
-    parts += [f"Warning: {text}" for text in data["warnings"]]
+    parts += [f"Warning: {text}" for text in facts.warnings]
     if data["layout"]:
         parts.append(f"Layout drawn in {data['layout']}")
     if data["breathing_plot"]:
@@ -173,42 +168,41 @@ def _near(configuration: dict[str, Any]) -> bool:
     return configuration["object_distance_mm"] is not None
 
 
-def _first_order(data: dict[str, Any]) -> str:
-    focus = "infinity" if math.isinf(data["focus_m"]) else f"{data['focus_m']:g} m"
-
-    def mm(key: str) -> str:
-        return f"{number(data[key], 6)} mm"
-
+def _first_order(facts: LensFacts) -> str:
+    data = facts.first_order
+    focus = "infinity" if math.isinf(facts.focus_m) else f"{facts.focus_m:g} m"
+    across = facts.efl_x_mm is not None
     rows = [
-        ("focal length", mm("efl_mm"), "" if data["efl_x_mm"] is None else "in the y-z plane, as all that follows"),
-        *(() if data["efl_x_mm"] is None else (("", mm("efl_x_mm"), "in the x-z plane"),)),
-        ("back focus", mm("back_focus_mm"), "last vertex to rear focal point"),
-        ("f-number", f"f/{number(data['f_number'])}", "focal length over entrance pupil"),
-        ("working f-number", f"f/{number(data['working_f_number'])}", "of the real marginal ray at this focus"),
-        ("principal planes", f"{mm('front_principal_z_mm')}, {mm('rear_principal_z_mm')}", "front H, rear H'"),
-        ("entrance pupil", mm("entrance_pupil_z_mm"), f"diameter {mm('entrance_pupil_diameter_mm')}"),
-        ("exit pupil", mm("exit_pupil_z_mm"), f"diameter {mm('exit_pupil_diameter_mm')}"),
-        ("film plane", mm("film_z_mm"), f"focus at {focus}"),
-        ("stop", f"surface {data['stop_surface']}", f"diameter {mm('stop_diameter_mm')}"),
-        ("refractions", str(data["refractions"]), ""),
+        ("focal length", _mm(data.efl_mm), "in the y-z plane, as all that follows" if across else ""),
+        *((("", _mm(facts.efl_x_mm), "in the x-z plane"),) if across else ()),
+        ("back focus", _mm(data.back_focus_mm), "last vertex to rear focal point"),
+        ("f-number", f"f/{number(data.f_number)}", "focal length over entrance pupil"),
+        ("working f-number", f"f/{number(facts.working_f_number)}", "of the real marginal ray at this focus"),
+        ("principal planes", f"{_mm(data.front_principal_z_mm)}, {_mm(data.rear_principal_z_mm)}", "front H, rear H'"),
+        ("entrance pupil", _mm(data.entrance_pupil_z_mm), f"diameter {_mm(data.entrance_pupil_diameter_mm)}"),
+        ("exit pupil", _mm(data.exit_pupil_z_mm), f"diameter {_mm(data.exit_pupil_diameter_mm)}"),
+        ("film plane", _mm(facts.film_z_mm), f"focus at {focus}"),
+        ("stop", f"surface {facts.stop_surface}", f"diameter {_mm(facts.stop_diameter_mm)}"),
+        ("refractions", str(facts.refractions), ""),
     ]
     return _columns(rows)
 
 
-def _light(data: dict[str, Any]) -> str:
-    reached, stated = data["half_field_reached_deg"], data["half_field_deg"]
-    anamorphic = data["efl_x_mm"] is not None
+def _mm(value: float | None) -> str:
+    return f"{number(value, 6)} mm"
+
+
+def _light(facts: LensFacts) -> str:
+    stated, anamorphic = facts.half_field_deg, facts.efl_x_mm is not None
     along, states = " along y" if anamorphic else "", "" if stated is None else f"; the file states {stated:g}"
+    share_of = "of rays uniform over the film and over the disc of all passing rays, 5% wider"
+    reached = f"reached at the edge of the film{along}{states}"
     rows = [
-        ("image radius", f"{number(data['image_radius_mm'])} mm", f"from {data['image_radius_from']}"),
-        ("half field", _degrees(reached), f"reached at the edge of the film{along}{states}"),
-        *((("", _degrees(data["half_field_reached_x_deg"]), "along x"),) if anamorphic else ()),
-        (
-            "rays that pass",
-            f"{100 * data['passing_share']:.1f}%",
-            "of rays uniform over the film and over the disc of all passing rays, 5% wider",
-        ),
-        *(("", f"{100 * e['share']:.1f}%", e["text"]) for e in data["ended"]),
+        ("image radius", f"{number(facts.image_radius_mm)} mm", f"from {facts.image_radius_from}"),
+        ("half field", _degrees(facts.half_field_reached_deg), reached),
+        *((("", _degrees(facts.half_field_reached_x_deg), "along x"),) if anamorphic else ()),
+        ("rays that pass", f"{100 * facts.passing_share:.1f}%", share_of),
+        *(("", f"{100 * e['share']:.1f}%", e["text"]) for e in facts.ended),
     ]
     return _columns(rows)
 
@@ -222,21 +216,21 @@ def _columns(rows: list[tuple[str, str, str]]) -> str:
     return "\n".join(f"{name:18}{value:{wide}}  {note}".rstrip() for name, value, note in rows)
 
 
-def _surfaces(data: dict[str, Any]) -> str:
+def _surfaces(surfaces: list[dict[str, Any]]) -> str:
     header = ["surface", "radius mm", "thickness mm", "diameter mm", "n_d", "V_d", "", ""]
     rows = []
-    for s in data["surfaces"]:
+    for s in surfaces:
         radius = "plane" if math.isinf(s["radius_mm"]) else f"{s['radius_mm']:.4f}"
         glass = ("", "") if s["n_d"] == 1 else (f"{s['n_d']:.4f}", "-" if s["V_d"] is None else f"{s['V_d']:.2f}")
         name = "stop" if s["stop"] else s["glass"] or s["material"] or ""
         size = f"{s['thickness_mm']:.4f}", f"{s['diameter_mm']:.4f}"
-        rows.append([str(s["surface"]), radius, *size, *glass, name, surface_words(s)])
+        rows.append([str(s["surface"]), radius, *size, *glass, name, _surface_words(s)])
     if not any(row[-1] for row in rows):
         header, rows = header[:-1], [row[:-1] for row in rows]
     return table(header, rows)
 
 
-def surface_words(row: dict[str, Any]) -> str:
+def _surface_words(row: dict[str, Any]) -> str:
     """Properties of a row of `evaluate.describe.glass_table` besides radius and glass; empty for a sphere."""
     powers = sorted(map(int, row["asphere"]))
     span = "" if not powers else f"asphere {powers[0]}" + (f"-{powers[-1]}" if len(powers) > 1 else "")
@@ -250,31 +244,26 @@ def surface_words(row: dict[str, Any]) -> str:
     return ", ".join(word for word in words if word)
 
 
-HEADER = ("lens", "name", "EFL mm", "f/", "half field", "refr.", "asph.", "cyl.", "states", "rims", "verdict")
+_LIST_HEADER = ("lens", "name", "EFL mm", "f/", "half field", "refr.", "asph.", "cyl.", "states", "rims", "verdict")
 
 
 def _run_list(args: argparse.Namespace) -> int:
-    from neurolens.evaluate.describe import lens_files, library, project_root, sections
+    from neurolens.evaluate.describe import lens_files, library_row, project_root, section
 
-    if args.layouts is not None and not args.layouts.parent.is_dir():
-        raise InputError(args.layouts, "--layouts", str(args.layouts.parent), "a folder that exists")
-    files = lens_files(args.folder or project_root() / "lenses")
-    rows = library(files)
+    if args.layouts is not None:
+        check_folder(args.layouts, "--layouts")
+    rows = [library_row(file) for file in lens_files(args.folder or project_root() / "lenses")]
     if args.layouts is not None:
         from neurolens.evaluate.figures import sheet
 
-        sheet(sections([Path(r["file"]) for r in rows if "name" in r]), args.layouts)
-    if args.json:
-        print_json({"lenses": rows, "layouts": None if args.layouts is None else str(args.layouts)})
-    else:
-        print(_list_text(rows))
-        if args.layouts is not None:
-            print(f"\nSections drawn in {args.layouts}")
-    return 0
+        sheet([section(Path(r["file"])) for r in rows if "name" in r], args.layouts)
+    drawn = None if args.layouts is None else str(args.layouts)
+    note = f"\n\nSections drawn in {drawn}" if drawn else ""
+    return answer(args, {"lenses": rows, "layouts": drawn}, lambda: _list_text(rows) + note)
 
 
 def _list_text(rows: list[dict[str, Any]]) -> str:
-    text = table(HEADER, [_cells(row) for row in rows], left=2)
+    text = table(_LIST_HEADER, [_cells(row) for row in rows], left=2)
     doubtful = [row for row in rows if row["doubts"]]
     found = f"\n\n{len(rows)} lenses, {len(doubtful)} of them doubtful"
     lines = [f"  {row['lens']}: {doubt}" for row in doubtful for doubt in row["doubts"]]
@@ -313,8 +302,8 @@ def _run_rims(args: argparse.Namespace) -> int:
     from neurolens.optics.lenswriter import write_lens
     from neurolens.optics.rims import RimRule, derive_rims, half_field_deg
 
-    if args.output is not None and not args.output.parent.is_dir():
-        raise InputError(args.output, "-o", str(args.output.parent), "a folder that exists")
+    if args.output is not None:
+        check_folder(args.output, "-o")
     lens = read_quietly(args.file)
     rule = RimRule(vignetting=0.5 if args.vignetting is None else args.vignetting, half_field_deg=args.half_field)
     derived, rims = derive_rims(lens, rule)
@@ -330,11 +319,7 @@ def _run_rims(args: argparse.Namespace) -> int:
         "rims": [vars(rim) for rim in rims],
         "output": None if args.output is None else str(args.output),
     }
-    if args.json:
-        print_json(data)
-    else:
-        print(_rims_text(lens, data, rims))
-    return 0
+    return answer(args, data, lambda: _rims_text(lens, data, rims))
 
 
 def _notes(lens: Lens, rule: RimRule, field: float) -> str:

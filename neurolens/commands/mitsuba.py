@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
 from neurolens.base.progress import Progress, duration
-from neurolens.commands.arguments import add_json, add_lens_state, aperture_of, between, positive, whole
-from neurolens.commands.output import print_json
+from neurolens.commands.arguments import add_exposure, add_json, add_lens_state, aperture_of, positive, whole
+from neurolens.commands.output import answer
 from neurolens.commands.render import film_size
-from neurolens.commands.render_files import Files
+from neurolens.commands.render_files import Files, warn
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
@@ -54,20 +53,11 @@ def add_parser(subparsers: Any) -> None:
         "--units-per-m", metavar="N", type=positive("scene units in a metre"), default=1.0,
         help="of the scene (default: 1; 1000 for one in millimetres)",
     )  # fmt: skip
-    parser.add_argument(
-        "--exposure", metavar="STOPS", type=between(-40, 40, "stops"), default=0.0,
-        help="brightens the preview only (default: 0)",
-    )  # fmt: skip
+    add_exposure(parser)
     add_lens_state(
-        parser,
-        {
-            "efl": "as tabled; 50 for thin and pinhole; a model has its own",
-            "f_number": "the widest; 4 for thin",
-            "focus": "inf",
-        },
+        parser, efl="as tabled; 50 for thin and pinhole; a model has its own", f_number="the widest; 4 for thin"
     )
-    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
-    add_json(parser)
+    add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="no picture was written; older files of that name are untouched")
 
 
@@ -83,12 +73,11 @@ def run(args: argparse.Namespace) -> int:
     width, height = (int(v) for v in scene.sensors()[0].film().size())
     camera = make_camera(args.camera, _shot(args, height / width))
     for note in camera.settings.get("notes", ()):
-        print(f"neurolens: warning: {note}", file=sys.stderr)
+        warn(note)
     began = time.perf_counter()
     with Progress(quiet=args.quiet).stage(f"render {args.scene}, {camera.name}") as report:
-        picture = render(
-            scene, camera, spp=args.samples, seed=args.seed, units_per_m=args.units_per_m, progress=report
-        )  # fmt: skip
+        given = {"spp": args.samples, "seed": args.seed, "units_per_m": args.units_per_m}
+        picture = render(scene, camera, **given, progress=report)
     mi, _ = libraries()
     stats = {
         "scene": args.scene,
@@ -100,18 +89,12 @@ def run(args: argparse.Namespace) -> int:
         "mitsuba": mi.__version__,
         "variant": mi.variant(),
     }
-    write_exr(
-        args.out, picture, metadata={"version": __version__, "camera": plain(camera.settings), "render": plain(stats)}
-    )
+    metadata = {"version": __version__, "camera": plain(camera.settings), "render": plain(stats)}
+    write_exr(args.out, picture, metadata=metadata)
     write_png(preview, picture, args.exposure)
-    if args.json:
-        print_json({"file": str(args.out), "preview": str(preview), **stats, "camera": camera.settings})
-    else:
-        took = duration(float(stats["seconds"]))
-        print(
-            f"{args.scene} through {camera.name}: {width} x {height} in {took} ({mi.variant()})\n{args.out}\n{preview}"
-        )
-    return 0
+    said = f"{width} x {height} in {duration(float(stats['seconds']))} ({mi.variant()})"
+    data = {"file": str(args.out), "preview": str(preview), **stats, "camera": camera.settings}
+    return answer(args, data, lambda: f"{args.scene} through {camera.name}: {said}\n{args.out}\n{preview}")
 
 
 def _shot(args: argparse.Namespace, shape: float) -> Shot:

@@ -10,8 +10,17 @@ from typing import TYPE_CHECKING, Any
 from neurolens import __version__
 from neurolens.base.errors import NeurolensError
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import CAMERAS_HELP, add_camera, add_json, add_lens_state, aperture_of, between, whole
-from neurolens.commands.output import print_json
+from neurolens.commands.arguments import (
+    CAMERAS_HELP,
+    add_camera,
+    add_exposure,
+    add_json,
+    add_lens_state,
+    aperture_of,
+    between,
+    whole,
+)
+from neurolens.commands.output import answer
 from neurolens.commands.render_files import (
     Files,
     Stopping,
@@ -83,10 +92,7 @@ def add_parser(subparsers: Any) -> None:
     picture.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the random numbers (default: 0)")
     picture.add_argument("--max-depth", metavar="N", type=whole(1, 1000), help="bounces (default: the scene's)")
     picture.add_argument("--half", action="store_true", help="16-bit floats in the EXR (default: 32-bit)")
-    picture.add_argument(
-        "--exposure", metavar="STOPS", type=between(-40, 40, "stops"), default=0.0,
-        help="brightens the preview only (default: 0)",
-    )  # fmt: skip
+    add_exposure(picture)
     picture.add_argument(
         "--layers", choices=("all", "beauty"), default="all",
         help="of the EXR: colour alone, or also samples, variance (of the pixel's luminance), Z (depth in m along the "
@@ -96,18 +102,15 @@ def add_parser(subparsers: Any) -> None:
     add_safety(parser)
     add_lens_state(
         parser,
-        {
-            "efl": "as tabled; 50 for thin and pinhole, 14 for fisheyes; a model has its own",
-            "f_number": "the scene's, or the widest that the lens opens to; 4 for thin",
-            "focus": "the scene's",
-        },
+        efl="as tabled; 50 for thin and pinhole, 14 for fisheyes; a model has its own",
+        f_number="the scene's, or the widest that the lens opens to; 4 for thin",
+        focus="the scene's",
     )
     parser.add_argument(
         "--threads", metavar="N", type=whole(1, 256), default=2,
         help="workers, each pinned to a core if there are as many as cores (default: 2)",
     )  # fmt: skip
-    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
-    add_json(parser)
+    add_json(parser, quiet=True)
     parser.set_defaults(run=run_kept, kept="no picture was written; older files of that name are untouched")
 
 
@@ -198,11 +201,8 @@ def _deliver(
     if not args.keep_checkpoint:
         files.checkpoint.unlink(missing_ok=True)
     stats = plain(result.stats)
-    if args.json:
-        print_json({"file": str(files.out), "preview": str(files.preview), **stats, "camera": camera.settings})
-    else:
-        print(summary(stats, files))
-    return 0
+    data = {"file": str(files.out), "preview": str(files.preview), **stats, "camera": camera.settings}
+    return answer(args, data, lambda: summary(stats, files))
 
 
 def shot_of(settings: CameraSettings, args: argparse.Namespace, aperture: Aperture | None = None) -> Shot:
@@ -232,10 +232,8 @@ def picture_size(settings: CameraSettings, width: int | None, height: int | None
     shape = settings.film_width_mm / settings.film_height_mm
     if width is None and height is None:
         return settings.width, settings.height
-    if height is None:
-        assert width is not None
-        return width, max(1, round(width / shape))
-    return (max(1, round(height * shape)) if width is None else width), height
+    found_width = max(1, round((height or 0) * shape)) if width is None else width
+    return found_width, max(1, round(found_width / shape)) if height is None else height
 
 
 def film_size(text: str) -> tuple[float, float]:

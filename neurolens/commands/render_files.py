@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import check_writable
 from neurolens.base.progress import duration
-from neurolens.commands.arguments import positive
+from neurolens.commands.arguments import check_folder, check_suffix, positive
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
@@ -56,10 +56,8 @@ class Files:
             InputError: not .exr, or no such folder.
             OSError: a folder that cannot be written, a folder of that name.
         """
-        if out.suffix.lower() != ".exr":
-            raise InputError(out, "--out", out.suffix or "(no suffix)", "a name that ends in .exr")
-        if not out.parent.is_dir():
-            raise InputError(out, "--out", str(out.parent), "a folder that exists")
+        check_suffix(out, "--out", (".exr",))
+        check_folder(out, "--out")
         files = cls(out, out.with_suffix(".png"), out.with_name(f"{out.name}.part"))
         for path in (files.out, files.preview, files.checkpoint):
             check_writable(path)

@@ -10,8 +10,8 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_json
-from neurolens.commands.output import number, print_json, table
+from neurolens.commands.arguments import add_json, check_run_folder
+from neurolens.commands.output import answer, number, table
 
 _DESCRIPTION = """\
 Run an experiment: trace ray pairs of the lens, fit the surrogates, export them as ONNX,
@@ -46,11 +46,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("experiment", metavar="EXPERIMENT.toml", nargs="?", type=Path, help="experiment file")
     parser.add_argument("--lens", metavar="FILE", type=Path, help="lens file, instead of an experiment")
     parser.add_argument(
-        "--out",
-        metavar="DIR",
-        type=Path,
+        "--out", metavar="DIR", type=Path,
         help="run folder, made if needed (default: runs/NAME of the experiment or lens file)",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--set", metavar="KEY=VALUE", dest="overrides", action="append", default=[],
         help="change a setting, for example --set pairs.train=10000; values are TOML, may be repeated",
@@ -63,8 +61,7 @@ def add_parser(subparsers: Any) -> None:
         "--internal-focus", action="store_true",
         help="of --lens: one model of internal focus, infinity to the near limit (input \"state\", in 1/m)",
     )  # fmt: skip
-    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
-    add_json(parser)
+    add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="fitted models are kept in the run folder; the same command resumes")
 
 
@@ -84,11 +81,8 @@ def run(args: argparse.Namespace) -> int:
         experiment = read_experiment(args.experiment, args.overrides)
     progress = Progress(quiet=args.quiet)
     results = run_experiment(experiment, folder, progress=progress, command=_command(args))
-    if args.json:
-        print_json({"folder": str(folder), "report": str(folder / "report.html"), **results})
-    else:
-        print(_text(results, folder))
-    return 0
+    data = {"folder": str(folder), "report": str(folder / "report.html"), **results}
+    return answer(args, data, lambda: _text(results, folder))
 
 
 def _run_folder(args: argparse.Namespace) -> Path:
@@ -101,8 +95,7 @@ def _run_folder(args: argparse.Namespace) -> Path:
         found = "(neither)" if args.lens is None else "(both)"
         raise InputError("neurolens train", "EXPERIMENT.toml or --lens", found, "one of them")
     folder: Path = args.out if args.out is not None else Path("runs") / (args.experiment or args.lens).stem
-    if folder.exists() and not folder.is_dir():
-        raise InputError("neurolens train", "--out", str(folder), "a folder, not a file")
+    check_run_folder(folder, "neurolens train", "--out")
     return folder
 
 
@@ -141,20 +134,8 @@ def _text(results: Mapping[str, Any], folder: Path) -> str:
 
 
 def _row(model: Mapping[str, Any]) -> tuple[str, ...]:
-    timing = model.get("ns_per_ray") or {}
-
-    def percent(key: str) -> str:
-        value = model.get(key)
-        return "-" if value is None else f"{100 * value:.2f}%"
-
-    return (
-        str(model.get("name")),
-        number(model.get("rms_um"), 3),
-        number(model.get("p99_um"), 3),
-        number(model.get("direction_rms_deg"), 3),
-        percent("false_pass"),
-        percent("false_block"),
-        number(timing.get("min"), 3),
-        number(model.get("speedup_over_compiled"), 3),
-        number(model.get("fit_s"), 3),
-    )
+    errors = (number(model.get(key), 3) for key in ("rms_um", "p99_um", "direction_rms_deg"))
+    shares = (model.get(key) for key in ("false_pass", "false_block"))
+    times = ((model.get("ns_per_ray") or {}).get("min"), model.get("speedup_over_compiled"), model.get("fit_s"))
+    percent = ("-" if share is None else f"{100 * share:.2f}%" for share in shares)
+    return (str(model.get("name")), *errors, *percent, *(number(value, 3) for value in times))

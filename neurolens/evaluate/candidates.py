@@ -6,6 +6,7 @@ import ctypes
 import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 from threading import get_ident
 from typing import Any
@@ -17,12 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import ThinLens
+from neurolens.cameras.model import OnnxLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.rays import frame_width_mm
-from neurolens.evaluate.speed import Call, Candidate, Unavailable
-from neurolens.graph import compiler
+from neurolens.evaluate.records import ExactRecord, Timing
+from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, race
 from neurolens.graph.c import Signature, write_c
-from neurolens.graph.compiler import FLAGS, compile_c
+from neurolens.graph.compiler import FLAGS, compile_c, find_compiler
 from neurolens.graph.program import Program
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -35,6 +37,7 @@ from neurolens.surrogates.source import FREE, fused_program
 from neurolens.surrogates.specialise import Fix
 from neurolens.surrogates.stored import load_fitted
 
+EXACT = ("exact eager", "exact compiled")  # names of `exact_candidates` of a whole camera
 EAGER_BATCHES = (8192, 16384, 32768)
 COMPILED_BATCHES = (16384,)  # each further size costs half a minute of compilation
 
@@ -43,13 +46,12 @@ def exact_candidates(
     lens: Lens,
     domain: Domain,
     *,
-    dtype: torch.dtype = torch.float32,
     transmittance: bool = True,
     build_rays: bool = True,
     compiled: bool = True,
     label: str = "exact",
 ) -> list[Candidate]:
-    """The exact tracer, eager and compiled: every surface, stop, rims and dispersion, status out.
+    """The exact tracer in float32, eager and compiled: every surface, stop, rims and dispersion, status out.
 
     Args:
         transmittance: whether to follow it, as surrogates do.
@@ -58,37 +60,36 @@ def exact_candidates(
         label: names are "{label} eager" and "{label} compiled".
     """
 
-    def whole(fx: Any, fy: Any, fz: Any, px: Any, py: Any, wavelength: Any) -> Traced:
-        return trace(lens, camera_rays(fx, fy, fz, px, py, domain.pupil_z_mm), wavelength, transmittance=transmittance)
-
     def tracing(rays: Any, wavelength: Any) -> Traced:
         return trace(lens, rays, wavelength, transmittance=transmittance)
 
-    run: Callable[..., Traced] = whole if build_rays else tracing
+    def whole(fx: Any, fy: Any, fz: Any, px: Any, py: Any, wavelength: Any) -> Traced:
+        return tracing(camera_rays(fx, fy, fz, px, py, domain.pupil_z_mm), wavelength)
 
     def arguments(rays: FilmRays) -> tuple[Any, ...]:
-        fx, fy, fz, px, py, wavelength = columns = [c.to(dtype).contiguous() for c in rays.columns()]
-        columns[2] = fz = fz[0].clone()  # one film plane, as in a picture
-        return tuple(columns) if build_rays else (camera_rays(fx, fy, fz, px, py, domain.pupil_z_mm), wavelength)
+        fx, fy, fz, px, py, wavelength = (c.to(torch.float32).contiguous() for c in rays.columns())
+        fz = fz[0].clone()  # one film plane, as in a picture
+        places = fx, fy, fz, px, py
+        return (*places, wavelength) if build_rays else (camera_rays(*places, domain.pupil_z_mm), wavelength)
 
-    def eager(rays: FilmRays) -> Call:
-        given = arguments(rays)
-        return lambda: run(*given)
-
+    run: Callable[..., Traced] = whole if build_rays else tracing
     fast = torch.compile(run, dynamic=False, fullgraph=True)
 
     def faster(rays: FilmRays) -> Call:
         given = arguments(rays)
         try:
             fast(*given)
-        except (
-            Exception
-        ) as error:  # torch raises many types: no compiler, a compiler that fails, an unsupported platform
+        except Exception as error:  # of many types: no compiler, a compiler that fails, an unsupported platform
             raise Unavailable(f"torch cannot compile here: {_first_line(error)}") from error
-        return lambda: fast(*given)
+        return partial(fast, *given)
 
-    found = [Candidate(f"{label} eager", eager, EAGER_BATCHES)]
+    found = [Candidate(f"{label} eager", lambda rays: partial(run, *arguments(rays)), EAGER_BATCHES)]
     return [*found, Candidate(f"{label} compiled", faster, COMPILED_BATCHES)] if compiled else found
+
+
+def exact_records(timed: Race) -> list[ExactRecord]:
+    """Those of the exact tracers that a race timed, or that could not run."""
+    return [timed.record(name) for name in EXACT if name in timed.ns or name in timed.unavailable]
 
 
 def _first_line(error: BaseException) -> str:
@@ -106,8 +107,7 @@ def camera_candidate(camera: Camera, domain: Domain, name: str | None = None) ->
         film = np.ascontiguousarray(torch.stack([rays.film_x, rays.film_y]).numpy(), dtype=np.float32)
         square = torch.stack([rays.pupil_x, rays.pupil_y]) / (2 * domain.pupil_radius_mm) + 0.5
         pupil = np.ascontiguousarray(square.numpy(), dtype=np.float32)
-        wavelength = rays.wavelength_nm.numpy().astype(np.float32)
-        return lambda: camera.sample(film, pupil, wavelength)
+        return partial(camera.sample, film, pupil, rays.wavelength_nm.numpy().astype(np.float32))
 
     return Candidate(name or camera.name, prepare)
 
@@ -121,30 +121,23 @@ def ideal_cameras(lens: Lens, domain: Domain) -> list[Candidate]:
     return [camera_candidate(thin, domain, "thin lens"), camera_candidate(pinhole, domain, "pinhole")]
 
 
-def model_candidate(name: str, model: Any, stop_radius_mm: float) -> Candidate:
-    """An exported model (`cameras.model.OnnxLens`, loaded with one thread: the race shares out batches)."""
+def model_candidate(name: str, model: OnnxLens, stop_radius_mm: float) -> Candidate:
+    """An exported model, loaded with one thread: the race shares out batches."""
 
     def prepare(rays: FilmRays) -> Call:
         columns = [np.ascontiguousarray(c.numpy(), dtype=np.float32) for c in rays.columns()]
         film, pupil, film_z_mm = np.stack(columns[0:2]), np.stack(columns[3:5]), float(rays.film_z[0])
-        return lambda: model.rays(film, pupil, columns[5], film_z_mm, stop_radius_mm)
+        return partial(model.rays, film, pupil, columns[5], film_z_mm, stop_radius_mm)
 
     return Candidate(name, prepare)
 
 
-_NAME = "lens"
-
-
-def find_compiler() -> str:
-    """A C compiler: $CC, else cc, gcc or clang.
-
-    Raises:
-        Unavailable: none is found.
-    """
-    try:
-        return compiler.find_compiler()
-    except InputError as error:
-        raise Unavailable("no C compiler (looked for $CC, cc, gcc, clang)") from error
+def time_model(model: OnnxLens, name: str, *, rounds: int, threads: int = 1) -> Timing | None:
+    """Nanoseconds per ray of an exported model over its domain."""
+    domain = Domain.from_dict(model.card["domain"])
+    return race([model_candidate(name, model, domain.stop_radius_mm)], domain, threads=threads, rounds=rounds).timing(
+        name
+    )
 
 
 class CompiledSource:
@@ -155,12 +148,10 @@ class CompiledSource:
     """
 
     def __init__(self, program: Program, flags: tuple[str, ...] = FLAGS) -> None:
-        self.signature = Signature.of(program, _NAME)
+        self.signature = Signature.of(program, "lens")
         self._folder = tempfile.TemporaryDirectory(prefix="neurolens-source-")
-        folder = Path(self._folder.name)
-        library = folder / "lens.so"
-        text = write_c(program, _NAME, ["A timed model."]) + self._wrapper()
-        find_compiler()
+        library = Path(self._folder.name) / "lens.so"
+        text = write_c(program, "lens", ["A timed model."]) + self._wrapper()
         try:
             self.warnings = compile_c(text, library, flags)
         except InputError as error:
@@ -174,7 +165,7 @@ class CompiledSource:
         kinds = ["(const float *)a[{}]"] * len(s.per_ray) + ["*(const float *)a[{}]"] * len(s.per_call)
         kinds += ["*(const int *)a[{}]"] * (s.bands > 1) + ["(float *)a[{}]"] * len(s.outputs) + ["(int *)a[{}]"]
         given = ", ".join(kind.format(i) for i, kind in enumerate(kinds))
-        return f"void neurolens_run(size_t n, void **a) {{ {_NAME}_rays(n, {given}); }}\n"
+        return f"void neurolens_run(size_t n, void **a) {{ lens_rays(n, {given}); }}\n"
 
     def outputs(self, count: int) -> dict[str, NDArray[Any]]:
         """Arrays for the results of so many rays."""
@@ -210,18 +201,12 @@ FUSED_BATCHES = (2048, 4096, 8192, 16384)
 
 
 def program_candidate(name: str, program: Program, domain: Domain, stop_radius_mm: float | None = None) -> Candidate:
-    """A program of `surrogates.fused`, compiled when the race prepares it.
-
-    Args:
-        stop_radius_mm: None takes the domain's.
-    """
-    compiled: list[CompiledSource] = []
+    """A program of `surrogates.source`, compiled when the race prepares it; no stop radius: the domain's."""
+    compiled = cache(lambda: CompiledSource(program))
     room: dict[tuple[int, int], dict[str, NDArray[Any]]] = {}
 
     def prepare(rays: FilmRays) -> Call:
-        if not compiled:
-            compiled.append(CompiledSource(program))
-        source = compiled[0]
+        source = compiled()
         names = ("film_x_mm", "film_y_mm", "film_z_mm", "pupil_x_mm", "pupil_y_mm", "wavelength_nm")
         columns: dict[str, Any] = {n: c.numpy().astype(np.float32) for n, c in zip(names, rays.columns(), strict=False)}
         columns["film_z_mm"] = columns["film_z_mm"][0]
@@ -248,14 +233,16 @@ def fused_candidate(
 ) -> Candidate | None:
     """A model, or that of an exported file, as compiled C; None without a compiler or a form in C.
 
-    Args:
-        model: one, or one for each fixed wavelength (of which the first is timed).
+    Of a model for each fixed wavelength the first is timed.
     """
     try:
         find_compiler()
+    except InputError:
+        return None
+    try:
         found = load_fitted(model) if isinstance(model, Path) else model
         models = [found] if isinstance(found, LensModel) else found
         program = fused_program(models, parts, fix)
-    except (Unavailable, ModelError, TypeError):
+    except (ModelError, TypeError):
         return None
     return program_candidate(name, program, domain, fix.stop_radius_mm)

@@ -160,8 +160,8 @@ def _numbers(table: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
             yield key, float(value)
 
 
-def _count(table: Mapping[str, Any], key: str) -> int | None:
-    return dict(_numbers(table)).get(key)  # type: ignore[return-value]
+def _count(table: Mapping[str, Any], key: str) -> float | None:
+    return dict(_numbers(table)).get(key)
 
 
 def _error(place: str, promised: float, measured: float | None, each: EachRay, promised_of: float | None) -> Promise:
@@ -228,14 +228,8 @@ def find_lens(lens_id: str, model_file: Path) -> Path:
     Raises:
         InputError: no such file.
     """
-    name = f"{Path(lens_id).name}.toml"
-    roots = (
-        model_file.resolve().parent,
-        model_file.resolve().parent.parent,
-        Path("."),
-        Path(neurolens.__file__).parents[1],
-    )
-    for root in roots:
+    name, beside = f"{Path(lens_id).name}.toml", model_file.resolve().parent
+    for root in (beside, beside.parent, Path("."), Path(neurolens.__file__).parents[1]):
         if (root / "lenses" / name).is_file():
             return root / "lenses" / name
     raise InputError(model_file, "lens", lens_id, f"lenses/{name}, or a lens file given with --lens")
@@ -274,7 +268,7 @@ def random_states(axes: Sequence[Axis], count: int, seed: int) -> list[State]:
 
 
 def errors_at(model: OnnxLens, space: StateSpace, state: State, rays: int, seed: int) -> dict[str, Any]:
-    """Figures of one state: `RAY_KEYS` of `rays.ray_errors`, `SHARES` of four times as many rays, the state by axis.
+    """Figures of one state: `RAY_KEYS` of `rays.RayErrors`, `SHARES` of four times as many rays, the state by axis.
 
     What is not finite is None. `film_z_um`: how far the card's first film plane is from the exact lens's, um.
     """
@@ -286,7 +280,7 @@ def errors_at(model: OnnxLens, space: StateSpace, state: State, rays: int, seed:
     ray = ray_errors(lens, domain, pairs.held_out, predict)
     fresh = fresh_rays(lens, domain, pairs.held_out, count=_VIGNETTING * rays, seed=seed)
     share = false_shares(fresh.passes, predict(fresh.drawn, domain.stop_radius_mm).status == st.PASSED)
-    figures = {**{k: ray[k] for k in RAY_KEYS}, **{k: share[k] for k in SHARES}}
+    figures = {k: getattr(ray, k) for k in RAY_KEYS} | share
     assert lens.film_z_mm is not None
     return {
         **dict(zip((a.name for a in model.axes), state, strict=True)),
@@ -299,15 +293,14 @@ def errors_at(model: OnnxLens, space: StateSpace, state: State, rays: int, seed:
 def card_errors(rows: Sequence[Mapping[str, Any]], rays: int) -> dict[str, Any]:
     """The errors for a card: the worst over the measured states, their median, and every state."""
 
-    def over(key: str, how: Any) -> float | None:
-        values = [r[key] for r in rows]
-        return None if any(v is None for v in values) else float(how(values))
+    def over(how: Any) -> dict[str, float | None]:
+        columns = {key: [r[key] for r in rows] for key in (*RAY_KEYS, *SHARES)}
+        return {key: None if None in values else float(how(values)) for key, values in columns.items()}
 
-    keys = (*RAY_KEYS, *SHARES)
-    passing = 0.0 if not rows else _VIGNETTING * rays * float(np.mean([r["passing_share"] for r in rows]))
+    passing = _VIGNETTING * rays * float(np.mean([r["passing_share"] for r in rows]))
     return {
-        **{k: over(k, max) for k in keys},
-        "median": {k: over(k, np.median) for k in keys},
+        **over(max),
+        "median": over(np.median),
         "states": [dict(r) for r in rows],
         "rays": rays,
         "passing": int(passing),
@@ -344,13 +337,10 @@ def check_states(
     rows = [errors_at(model, space, s, rays, seed) for s in random_states(model.axes, count, seed)]
     found, promises = card_errors(rows, rays), []
     errors = model.card["errors"]
-    for key in (*RAY_KEYS, *SHARES):
-        promised = errors.get(key)
-        if isinstance(promised, bool) or not isinstance(promised, int | float):
-            continue
-        allowed = None if key == "max_um" else promised * (1 + TOLERANCE) + _FLOOR
+    for key, promised in _numbers(errors):
         if key in SHARES:
-            promises.append(share_promise(key, promised, found[key], found["passing"], errors.get("passing")))
-            continue
-        promises.append(Promise(key, float(promised), found[key], allowed))
+            promises.append(share_promise(key, promised, found[key], found["passing"], _count(errors, "passing")))
+        elif key in RAY_KEYS:
+            allowed = None if key == "max_um" else promised * (1 + TOLERANCE) + _FLOOR
+            promises.append(Promise(key, promised, found[key], allowed))
     return {**found, "seed": seed}, promises

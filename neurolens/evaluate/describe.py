@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,7 +19,7 @@ from neurolens.optics.focusing import at_infinity
 from neurolens.optics.glass import glass_of, table_notes
 from neurolens.optics.lenscheck import check_lens, doubts, film_edge_mm, verdict
 from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order
+from neurolens.optics.paraxial import FirstOrder, first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, image_radius_mm
 from neurolens.optics.trace import trace
@@ -29,18 +29,54 @@ _RAYS = 65536
 _NEGLIGIBLE = 1e-4  # share of the rays below which a blocking surface is not listed
 
 
-def describe_lens(lens: Lens, domain: Domain) -> dict[str, Any]:
-    """Figures of a lens placed by `Lens.at`, over a domain; d line unless stated otherwise.
+@dataclass(frozen=True)
+class LensFacts:
+    """A lens placed by `Lens.at`, over a domain; d line unless stated otherwise.
 
-    Returns: name, designer, source, rims, sha256; the first-order data of `paraxial.FirstOrder`, of an anamorphic lens
-        in the y-z plane; efl_x_mm in its x-z plane, None of a round lens; working_f_number of the real marginal ray
-        (y-z); film_z_mm, focus_m, refractions, stop_surface, stop_diameter_mm; image_radius_mm and
-        image_radius_from; half_field_deg as the file states it and half_field_reached_deg, the mean angle of the rays
-        that reach the edge of the domain's film, along y of an anamorphic lens, whose half_field_reached_x_deg is not
-        None; passing_share of rays uniform over the film and pupil discs of the
-        domain; ended: what stops the others, a list of {status, text, share}, largest share first; warnings.
+    Attributes:
+        first_order: of an anamorphic lens in the y-z plane.
+        efl_x_mm: in the x-z plane; None of a round lens.
+        working_f_number: of the real marginal ray (y-z); None where no ray passes.
+        image_radius_from: what the radius follows from.
+        half_field_deg: as the file states it.
+        half_field_reached_deg: mean angle of the rays that reach the edge of the domain's film, along y of an
+            anamorphic lens; None where none does. half_field_reached_x_deg is None of a round lens, too.
+        passing_share: of rays uniform over the film and pupil discs of the domain.
+        ended: what stops the others, a list of {status, text, share}, largest share first.
     """
-    data = first_order(lens)
+
+    name: str
+    designer: str
+    source: str
+    rims: str
+    sha256: str
+    refractions: int
+    first_order: FirstOrder
+    efl_x_mm: float | None
+    working_f_number: float | None
+    film_z_mm: float
+    focus_m: float
+    stop_surface: int
+    stop_diameter_mm: float
+    image_radius_mm: float
+    image_radius_from: str
+    half_field_deg: float | None
+    half_field_reached_deg: float | None
+    half_field_reached_x_deg: float | None
+    passing_share: float
+    ended: list[dict[str, Any]]
+    warnings: list[str]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Flat, for JSON."""
+        found = dict[str, Any]()
+        for key, value in asdict(self).items():
+            found |= {k: float(v) for k, v in value.items()} if key == "first_order" else {key: value}
+        return found
+
+
+def describe_lens(lens: Lens, domain: Domain) -> LensFacts:
+    """Figures of a lens placed by `Lens.at`."""
     radius, radius_from = image_radius_mm(lens)
     film_z = float(lens.film_z_mm if lens.film_z_mm is not None else domain.film_z_mm[0])
     passing, ended = passing_share(lens, domain)
@@ -52,37 +88,34 @@ def describe_lens(lens: Lens, domain: Domain) -> dict[str, Any]:
         where = " and ".join(axis for axis, deg in (("y", reached), ("x", reached_x)) if deg is None)
         along = f", along {where}" if lens.anamorphic else ""
         notes.append(f"no ray reaches the edge of the film ({domain.film_radius_mm:.4g} mm from the axis{along})")
-    return {
-        "name": lens.name,
-        "designer": lens.designer,
-        "source": lens.source,
-        "rims": lens.rims,
-        "sha256": lens.sha256,
-        "refractions": refractions(lens),
-        **{key: float(value) for key, value in asdict(data).items()},
-        "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if lens.anamorphic else None,
-        "working_f_number": working_f_number(lens, domain, film_z),
-        "film_z_mm": film_z,
-        "focus_m": domain.focus_m[0],
-        "stop_surface": lens.stop_index,
-        "stop_diameter_mm": 2 * lens.stop_radius_mm,
-        "image_radius_mm": radius,
-        "image_radius_from": radius_from,
-        "half_field_deg": lens.half_field_deg,
-        "half_field_reached_deg": reached,
-        "half_field_reached_x_deg": reached_x if lens.anamorphic else None,
-        "passing_share": passing,
-        "ended": ended,
-        "warnings": notes,
-    }
+    return LensFacts(
+        name=lens.name,
+        designer=lens.designer,
+        source=lens.source,
+        rims=lens.rims,
+        sha256=lens.sha256,
+        refractions=refractions(lens),
+        first_order=first_order(lens),
+        efl_x_mm=float(first_order(lens, meridian="x").efl_mm) if lens.anamorphic else None,
+        working_f_number=working_f_number(lens, domain, film_z),
+        film_z_mm=film_z,
+        focus_m=domain.focus_m[0],
+        stop_surface=lens.stop_index,
+        stop_diameter_mm=2 * lens.stop_radius_mm,
+        image_radius_mm=radius,
+        image_radius_from=radius_from,
+        half_field_deg=lens.half_field_deg,
+        half_field_reached_deg=reached,
+        half_field_reached_x_deg=reached_x if lens.anamorphic else None,
+        passing_share=passing,
+        ended=ended,
+        warnings=notes,
+    )
 
 
 def glass_table(lens: Lens) -> list[dict[str, Any]]:
-    """The prescription row by row, every figure of it.
-
-    Returns: of each surface: surface (its index), z_mm, radius_mm, thickness_mm, diameter_mm, n_d and V_d (those of the
-        catalogue where a glass rules), material, stop, conic, asphere ({power: coefficient}), cylinder, glass,
-        absorption_per_mm, coating (None or {name, layers: [[index, thickness in nm], ...]}).
+    """The prescription row by row, every figure of it: n_d and V_d are the catalogue's where a glass rules; asphere is
+    {power: coefficient}; coating None or {name, layers: [[index, thickness in nm], ...]}.
     """
     return [
         {
@@ -155,10 +188,19 @@ def passing_share(lens: Lens, domain: Domain, seed: int = 5) -> tuple[float, lis
     return passed, ended
 
 
-def file_doubts(tabled: Lens) -> list[str]:
-    """Doubts about a lens file as sentences; for a stop that is too wide see `warnings_of`."""
-    checks = check_lens(tabled)
-    return doubts([c for c in checks if c.quantity != "f-number" or (c.computed or 0.0) > (c.stated or 0.0)])
+def file_doubts(tabled: Lens, states: bool = True) -> list[str]:
+    """Doubts about a lens file as sentences; without its states where not asked for. See also `warnings_of`."""
+    # A smaller stop than stated is a choice, not a doubt.
+    checks = [c for c in check_lens(tabled) if c.quantity != "f-number" or (c.computed or 0.0) > (c.stated or 0.0)]
+    return doubts([c for c in checks if states or not c.state])
+
+
+def rim_doubts(lens: Lens) -> list[str]:
+    """That rims are not the source's, as a sentence."""
+    return {
+        "estimated": ["rim diameters are estimated, not the source's: vignetting is a guess"],
+        "derived": ["rim diameters are derived by a rule, the source has none: vignetting follows that rule"],
+    }.get(lens.rims, [])
 
 
 def warnings_of(lens: Lens, f_number: float, reached_deg: float | None, far: bool) -> list[str]:
@@ -169,11 +211,7 @@ def warnings_of(lens: Lens, f_number: float, reached_deg: float | None, far: boo
         reached_deg: half field that reaches the edge of the film.
         far: whether the lens is focused at infinity, where its source states the field.
     """
-    found = []
-    if lens.rims == "estimated":
-        found.append("rim diameters are estimated, not the source's: vignetting is a guess")
-    if lens.rims == "derived":
-        found.append("rim diameters are derived by a rule, the source has none: vignetting follows that rule")
+    found = rim_doubts(lens)
     unknown = [str(k) for k, s in enumerate(lens.surfaces) if s.n_d != 1 and s.V_d is None]
     if unknown:
         found.append(f"V_d is unknown after surface {', '.join(unknown)}: the index there is constant")
@@ -198,7 +236,6 @@ def layout_profile(lens: Lens, domain: Domain) -> dict[str, Any]:
     return layout.layout_profile(Scene(lens, domain.focus_m[0]), domain.film_radius_mm)
 
 
-UNREADABLE = "unreadable"
 _NO_FIELD = 0.2  # film radius over focal length at which a lens of unknown field is drawn
 
 
@@ -225,23 +262,19 @@ def read_quietly(path: Path) -> Lens:
         return read_lens(path)
 
 
-def library(files: list[Path]) -> list[dict[str, Any]]:
-    """One row per lens file.
+def library_row(path: Path) -> dict[str, Any]:
+    """A lens file in the table of its folder.
 
     Returns: lens, file, name, efl_mm and efl_x_mm computed (the latter of an anamorphic lens only), stated_efl_mm,
         f_number of the stop, half_field_deg as stated, image_radius_mm as stated, refractions, aspheres, cylinders,
         states (zoom or focus), rims, verdict ("ok", "doubtful", or "unreadable" with the error as its doubt), doubts,
         and checks: a list of {state, quantity, computed, stated, doubt}.
     """
-    return [_row(path) for path in files]
-
-
-def _row(path: Path) -> dict[str, Any]:
     try:
         lens = read_quietly(path)
         checks = check_lens(lens)
     except NeurolensError as error:
-        return {"lens": path.stem, "file": str(path), "verdict": UNREADABLE, "doubts": [str(error)]}
+        return {"lens": path.stem, "file": str(path), "verdict": "unreadable", "doubts": [str(error)]}
     data = first_order(lens)
     cylinders = sum(s.cylinder is not None for s in lens.surfaces)
     return {
@@ -265,21 +298,14 @@ def _row(path: Path) -> dict[str, Any]:
     }
 
 
-def sections(files: list[Path]) -> list[dict[str, Any]]:
-    """The sections of lenses with rays, focused at infinity, as `figures.sheet` draws them.
-
-    An anamorphic lens is shown in its y-z plane.
-    """
-    found = []
-    for path in files:
-        lens = read_quietly(path).at()
-        data = first_order(lens)
-        edge = film_edge_mm(lens)
-        if edge is None:
-            edge = _NO_FIELD * abs(data.efl_mm) if lens.half_field_deg is None else image_radius_mm(lens)[0]
-        profile = layout.layout_profile(Scene(lens, math.inf, "y"), edge)
-        found.append({**profile, "title": path.stem, "subtitle": _caption(lens, data.efl_mm, data.f_number)})
-    return found
+def section(path: Path) -> dict[str, Any]:
+    """A lens in section with rays, focused at infinity, as `figures.sheet` draws it; an anamorphic one in y-z."""
+    lens = read_quietly(path).at()
+    data, edge = first_order(lens), film_edge_mm(lens)
+    if edge is None:
+        edge = _NO_FIELD * abs(data.efl_mm) if lens.half_field_deg is None else image_radius_mm(lens)[0]
+    profile = layout.layout_profile(Scene(lens, math.inf, "y"), edge)
+    return {**profile, "title": path.stem, "subtitle": _caption(lens, data.efl_mm, data.f_number)}
 
 
 def _caption(lens: Lens, efl_mm: float, f_number: float) -> str:

@@ -6,12 +6,12 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from neurolens.base.config import from_dict, read_config
+from neurolens.base.config import apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
 from neurolens.optics.glass import glass_of
@@ -35,11 +35,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 def check_names(field: str, names: Sequence[str]) -> None:
-    """Refuse names that are not valid in file names.
-
-    Raises:
-        InputError: a name with other than letters, digits, dots, underscores and dashes, or that starts with a mark.
-    """
+    """Refuse names that are not valid in file names, as an InputError."""
     for name in names:
         if not _NAME.fullmatch(name):
             expected = "a name of letters, digits, '.', '_' and '-', a letter or digit first"
@@ -108,10 +104,8 @@ class DomainChoice:
         if not behind > lens.vertices_mm[len(lens.surfaces) - 1]:
             expected = "a lens whose focus at infinity lies behind its last surface"
             raise InputError(lens.path, "surfaces", f"(focus at z = {behind:.4g} mm)", expected)
-        focus_m, wavelengths = (
-            self.focus_m or (math.inf, near_limit_m(lens)),
-            self.wavelength_nm or wavelengths_nm(lens),
-        )
+        focus_m = self.focus_m or (math.inf, near_limit_m(lens))
+        wavelengths = self.wavelength_nm or wavelengths_nm(lens)
         domain = domain_of(lens, film_radius_mm=self.film_radius_mm, focus_m=focus_m, wavelength_nm=wavelengths)
         lit_mm, film_mm, asked = domain.bounds.lit_radius_mm, domain.film_radius_mm, self.film_radius_mm is not None
         if lit_mm > DARK_FROM * film_mm:
@@ -122,7 +116,7 @@ class DomainChoice:
 
 
 def near_limit_m(lens: Lens) -> float:
-    """Default distance from the film to the nearest object in focus; see above."""
+    """Default distance from the film to the nearest object in focus."""
     data = first_order(lens)
     f, film_z = abs(data.efl_mm), data.rear_focal_z_mm
     separation = data.rear_principal_z_mm - data.front_principal_z_mm
@@ -221,21 +215,16 @@ class Experiment:
         if chosen.zoom is not None and chosen.configuration is not None:
             raise InputError("settings", "lens.configuration", chosen.configuration, 'left out beside zoom = "range"')
         lens = read_lens(chosen.file).with_aperture(None)
+        internal = chosen.focusing == "internal"
         return StateSpace(
             lens,
-            axes_of(
-                lens, zoom=chosen.zoom is not None, internal=chosen.focusing == "internal", state=chosen.configuration
-            ),
+            axes_of(lens, zoom=chosen.zoom is not None, internal=internal, state=chosen.configuration),
             zoom=chosen.configuration,
             f_number=chosen.f_number,
             film_radius_mm=domain.film_radius_mm,
             focus_m=domain.focus_m or (lambda state: (math.inf, near_limit_m(state))),
             wavelength_nm=domain.wavelength_nm or wavelengths_nm(lens),
         )
-
-    def domain_of(self, lens: Lens) -> Domain:
-        """The domain of the lens in this experiment."""
-        return self.domain.of(lens)
 
 
 def read_experiment(path: str | Path, overrides: Sequence[str] = ()) -> Experiment:
@@ -244,29 +233,11 @@ def read_experiment(path: str | Path, overrides: Sequence[str] = ()) -> Experime
     Raises:
         InputError: names file, key, value and what was expected.
     """
-    experiment = read_config(Experiment, path, overrides)
     folder = Path(path).parent
-    lens = replace(experiment.lens, file=folder / experiment.lens.file)
-    scenes = tuple(folder / s for s in experiment.render.scenes)
-    gain = experiment.scene_domain
-    return replace(
-        experiment,
-        lens=lens,
-        render=replace(experiment.render, scenes=scenes),
-        scene_domain=None if gain is None else replace(gain, scene=folder / gain.scene),
-    )
+    return _with_files(read_config(Experiment, path, overrides), lambda file: folder / file)
 
 
-def relative_to(experiment: Experiment, folder: Path) -> Experiment:
-    """The same experiment with its files named relative to `folder`, as `read_experiment` takes a file's there."""
-
-    def moved(path: Path) -> Path:
-        place = path.parent.resolve() / path.name
-        try:
-            return Path(os.path.relpath(place, folder.resolve()))
-        except ValueError:  # another drive
-            return place
-
+def _with_files(experiment: Experiment, moved: Callable[[Path], Path]) -> Experiment:
     gain = experiment.scene_domain
     return replace(
         experiment,
@@ -276,18 +247,30 @@ def relative_to(experiment: Experiment, folder: Path) -> Experiment:
     )
 
 
-def keep_lens(experiment: Experiment, folder: Path) -> None:
-    """Copy the lens file to lenses/ of a run folder, where `check.find_lens` looks for it."""
+def keep_inputs(experiment: Experiment, folder: Path) -> dict[str, Any]:
+    """Write config.toml, and the lens file to lenses/ of a run folder, where `check.find_lens` looks for it.
+
+    Returns the resolved settings, files named relative to the folder.
+    """
+
+    def moved(path: Path) -> Path:
+        place = path.parent.resolve() / path.name
+        try:
+            return Path(os.path.relpath(place, folder.resolve()))
+        except ValueError:  # another drive
+            return place
+
+    resolved = _with_files(experiment, moved)
+    atomic_write_text(folder / "config.toml", to_toml(resolved))
     source, kept = experiment.lens.file, folder / "lenses" / experiment.lens.file.name
     kept.parent.mkdir(parents=True, exist_ok=True)
     if not (kept.exists() and kept.samefile(source)):
         atomic_write_text(kept, source.read_text(encoding="utf-8-sig"))
+    return to_dict(resolved)
 
 
 def default_experiment(lens_file: str | Path, overrides: Sequence[str] = ()) -> Experiment:
     """The experiment of `neurolens train --lens FILE`: a polynomial and a network, no renders."""
-    from neurolens.base.config import apply_overrides
-
     tables = {
         "title": f"Models of {Path(lens_file).stem}",
         "lens": {"file": str(lens_file)},

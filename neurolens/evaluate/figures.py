@@ -21,7 +21,8 @@ from neurolens.analysis.layout import (
 )
 from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, drawing, new_figure, plain_log_ticks, save, style
 from neurolens.base.errors import InputError
-from neurolens.evaluate.image import checked_image, to_srgb
+from neurolens.evaluate.image import ImageErrors, checked_image, to_srgb
+from neurolens.evaluate.vignetting import Illumination
 from neurolens.optics.focusing import Breath, breathing, field_change, focus_states, nearest_focus_m
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
@@ -62,11 +63,13 @@ def side_by_side(
         figure, places, bar_place = _page(len(pictures), height / width, bool(maps), title)
         shown = None
         for (name, picture), (top, below) in zip(pictures.items(), places, strict=True):
-            axes = _picture_axes(figure, top)
+            axes = figure.add_axes(top)
+            axes.set_axis_off()
             axes.imshow(to_srgb(picture, exposure), interpolation="nearest")
             axes.set_title(name, fontsize=10.5, fontweight="bold", pad=4)
             if name in maps:
-                axes = _picture_axes(figure, below)
+                axes = figure.add_axes(below)
+                axes.set_axis_off()
                 shown = axes.imshow(maps[name], cmap="magma", vmin=0, vmax=scale, interpolation="nearest")
             _caption(axes, (captions or {}).get(name, ""))
         if shown is not None:
@@ -76,14 +79,12 @@ def side_by_side(
         return save(figure, path)
 
 
-def image_caption(figures: Mapping[str, Any]) -> str:
-    """Two lines from the result of `image.compare`: FLIP and relative MSE, each beside its noise floor."""
-    parts = []
-    for name, key in (("FLIP", "flip"), ("relMSE", "rel_mse")):
-        value, floor = figures.get(key), figures.get(f"noise_floor_{key}")
-        if value is not None:
-            parts.append(f"{name} {value:.3g}" + ("" if floor is None else f" (noise {floor:.3g})"))
-    return "\n".join(parts)
+def image_caption(errors: ImageErrors) -> str:
+    """Two lines: FLIP and relative MSE, each beside its noise floor."""
+    return (
+        f"FLIP {errors.flip:.3g} (noise {errors.noise_floor_flip:.3g})\n"
+        f"relMSE {errors.rel_mse:.3g} (noise {errors.noise_floor_rel_mse:.3g})"
+    )
 
 
 def _check_shapes(pictures: Mapping[str, Any], maps: Mapping[str, Any]) -> None:
@@ -128,17 +129,9 @@ def _page(count: int, aspect: float, maps: bool, title: str) -> tuple[Any, list[
     return figure, places, box(page[0] - bar + 0.08, head + name, 0.14, page[1] - head - name - words)
 
 
-def _picture_axes(figure: Any, box: _Box) -> Any:
-    axes = figure.add_axes(box)
-    axes.set_axis_off()
-    return axes
-
-
 def _rounded_up(maps: Mapping[str, Any]) -> float:
     """99.5th percentile of all maps (not the maximum: fireflies), rounded up to 1, 2 or 5 times a power of ten."""
-    if not maps:
-        return 1.0
-    value = float(np.percentile(np.concatenate([m.ravel() for m in maps.values()]), 99.5))
+    value = float(np.percentile(np.concatenate([m.ravel() for m in maps.values()]), 99.5)) if maps else 0.0
     if value <= 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))
@@ -152,26 +145,30 @@ def _caption(axes: Any, text: str) -> None:
     )  # fmt: skip
 
 
-def illumination_plot(light: Mapping[str, Any], path: str | Path, title: str = "Relative illumination") -> Path:
+def illumination_plot(
+    curves: Mapping[str, Illumination], path: str | Path, title: str = "Relative illumination"
+) -> Path:
     """Relative illumination against film radius: the exact lens as a line, models dashed on it, differences below.
 
     Args:
-        light: film_radius_mm [N]; exact [N] and models (name to [N]), shares of the exact value on the axis.
+        curves: of models by name, all against the same exact lens.
         path: PNG, PDF or SVG to write.
     Raises:
-        InputError: no radius, curves of another length, values that are not finite.
+        InputError: no model, values that are not finite.
     """
-    radius = np.asarray(light["film_radius_mm"], dtype=np.float64)
-    exact = _curve("exact", light["exact"], radius)
-    curves = {name: _curve(name, values, radius) for name, values in light["models"].items()}
+    if not curves or not all(np.isfinite([c.exact, c.model]).all() for c in curves.values()):
+        raise InputError("illumination plot", "curves", f"({', '.join(curves) or 'none'})", "finite values of a model")
+    first = next(iter(curves.values()))
+    radius, exact = first.film_radius_mm, np.asarray(first.exact)
+    models = {name: np.asarray(curve.model) for name, curve in curves.items()}
     with drawing(path, 7.6, 5.4) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": (3, 1.2)})
         upper.plot(radius, exact, color=INK, lw=2.6, alpha=0.45, label="exact")
-        for number, (name, values) in enumerate(curves.items()):
+        for number, (name, values) in enumerate(models.items()):
             colour = FIELD_COLOURS[number % len(FIELD_COLOURS)]
             upper.plot(radius, values, color=colour, lw=1.4, ls=(0, (4, 2 + number)), label=name)
             lower.plot(radius, 100 * (values - exact), color=colour, lw=1.4, marker=".", ms=4)
-        upper.set_ylim(0, 1.04 * max(1.0, float(exact.max()), *(float(v.max()) for v in curves.values())))
+        upper.set_ylim(0, 1.04 * max(1.0, float(exact.max()), *(float(v.max()) for v in models.values())))
         upper.set_ylabel("illumination (share of the axis)")
         upper.set_title(title, loc="left", fontweight="bold")
         upper.legend(loc="lower left")
@@ -181,15 +178,6 @@ def illumination_plot(light: Mapping[str, Any], path: str | Path, title: str = "
         for axes in (upper, lower):
             axes.grid(True)
     return Path(path)
-
-
-def _curve(name: str, values: Any, radius: Any) -> Any:
-    curve = np.asarray(values, dtype=np.float64)
-    if radius.size == 0 or curve.shape != radius.shape or not np.isfinite(curve).all():
-        raise InputError(
-            "illumination plot", name, f"({curve.shape})", f"finite values, one per film radius, {radius.shape}"
-        )
-    return curve
 
 
 _DASHES = ((0, ()), (0, (5, 2)), (0, (1.5, 1.5)))
@@ -214,11 +202,8 @@ def breathing_plot(ways: Mapping[str, Sequence[Breath]], path: str | Path, title
             near = sorted((b for b in breaths if b.focus_m < 1e9), key=lambda b: b.focus_m)
             if len(near) < 2:
                 raise InputError("breathing plot", name, f"({len(near)} distances)", "two finite distances or more")
-            look = {
-                "color": FIELD_COLOURS[number % len(FIELD_COLOURS)],
-                "ls": _DASHES[number % len(_DASHES)],
-                "lw": 1.8,
-            }
+            colour, dashes = FIELD_COLOURS[number % len(FIELD_COLOURS)], _DASHES[number % len(_DASHES)]
+            look = {"color": colour, "ls": dashes, "lw": 1.8}
             distance = [b.focus_m for b in near]
             change = f"{name} (picture grows by {100 * field_change(breaths):.1f}%)"
             panels[0].plot(distance, [b.field_deg for b in near], label=change, **look)

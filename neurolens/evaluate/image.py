@@ -1,14 +1,9 @@
-"""Image error: relative MSE on linear radiance, FLIP on a display, and the noise floor of both.
-
-Renders through a surrogate and the exact lens differ by Monte Carlo noise. `compare` tests whether they differ by more
-than exact renders of different seeds differ from each other.
-"""
+"""Image error: relative MSE on linear radiance, FLIP on a display, and the noise floor of both."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -113,13 +108,9 @@ def flip_map(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DE
         raise NeurolensError("FLIP needs flip-evaluator: pip install '.[train]' in the project's folder") from error
     shown_a, shown_b = (np.ascontiguousarray(to_srgb(x, settings.exposure), dtype=np.float32) for x in (a, b))
     errors, _, _ = flip_evaluator.evaluate(
-        shown_b,
-        shown_a,
-        "LDR",
-        applyMagma=False,
-        computeMeanError=False,
+        shown_b, shown_a, "LDR", applyMagma=False, computeMeanError=False,
         parameters={"ppd": settings.pixels_per_degree},
-    )
+    )  # fmt: skip
     return np.asarray(errors, dtype=np.float64).reshape(a.shape[:2])
 
 
@@ -139,9 +130,25 @@ def seed_pairs(count: int) -> list[tuple[int, int]]:
     return [(i, (i + 1) % count) for i in range(count)]
 
 
+@dataclass(frozen=True)
+class ImageErrors:
+    """Errors of a camera's renders: means over `pairs` pairs, the noise floor over all pairs of exact renders.
+
+    Attributes:
+        flip_ratio: FLIP over the noise floor of the same pairs; None where that is 0.
+    """
+
+    flip: float
+    rel_mse: float
+    noise_floor_flip: float
+    noise_floor_rel_mse: float
+    flip_ratio: float | None
+    pairs: int
+
+
 def compare(
     renders: Sequence[ArrayLike], exact_renders: Sequence[ArrayLike], settings: ImageSettings = DEFAULT
-) -> dict[str, Any]:
+) -> ImageErrors:
     """Error of a surrogate's renders against exact ones, beside the noise floor.
 
     Render i of the surrogate is compared with exact render j != i of `seed_pairs`, never with its own seed: noise
@@ -152,51 +159,25 @@ def compare(
     Args:
         renders: one or more [H, W, 3] linear renders; number i has the seed of exact render i.
         exact_renders: at least four, and at least as many as `renders`.
-    Returns:
-        flip, rel_mse: mean over the pairs; noise_floor_flip, noise_floor_rel_mse: mean over all exact pairs;
-        flip_ratio, rel_mse_ratio: over the floor of the same pairs, None where that floor is 0;
-        flip_same_seed: mean FLIP of render i against exact render i, where shared noise cancels (what the lens
-        alone changes, if both cameras use the random numbers alike); pairs; settings.
+
     Raises:
         InputError: too few renders, or pictures that do not fit each other.
     """
     ring = seed_pairs(len(exact_renders))
     if not (1 <= len(renders) <= len(ring)):
         raise InputError("image", "surrogate renders", len(renders), f"1 to {len(ring)}, one for each exact render")
-    pairs = ring[: len(renders)]
-    flips, errors = _over_pairs(renders, exact_renders, pairs, settings)
-    floor_flips, floor_errors = _over_pairs(exact_renders, exact_renders, ring, settings)
-    used = len(pairs)
-    return {
-        "flip": _mean(flips),
-        "rel_mse": _mean(errors),
-        "noise_floor_flip": _mean(floor_flips),
-        "noise_floor_rel_mse": _mean(floor_errors),
-        "flip_ratio": _ratio(_mean(flips), _mean(floor_flips[:used])),
-        "rel_mse_ratio": _ratio(_mean(errors), _mean(floor_errors[:used])),
-        "flip_same_seed": _mean(flip(a, b, settings) for a, b in zip(renders, exact_renders, strict=False)),
-        "pairs": used,
-        "exposure": settings.exposure,
-        "pixels_per_degree": settings.pixels_per_degree,
-        "eps": settings.eps,
-        "trim": settings.trim,
-    }
 
+    def errors(tests: Sequence[ArrayLike], measure: Callable[..., float]) -> list[float]:
+        """Of each pair (i, j): test i against exact render j."""
+        return [measure(tests[i], exact_renders[j], settings) for i, j in ring[: len(tests)]]
 
-def _over_pairs(
-    tests: Sequence[ArrayLike],
-    references: Sequence[ArrayLike],
-    pairs: Iterable[tuple[int, int]],
-    settings: ImageSettings,
-) -> tuple[list[float], list[float]]:
-    """FLIP and relative MSE of each pair (i, j): test i against reference j."""
-    both = [(flip(tests[i], references[j], settings), rel_mse(tests[i], references[j], settings)) for i, j in pairs]
-    return [pair[0] for pair in both], [pair[1] for pair in both]
-
-
-def _mean(values: Iterable[float]) -> float:
-    return float(np.mean(list(values)))
-
-
-def _ratio(value: float, floor: float) -> float | None:
-    return value / floor if floor > 0 else None
+    flips, floor_flips = errors(renders, flip), errors(exact_renders, flip)
+    of_same_pairs = float(np.mean(floor_flips[: len(flips)]))
+    return ImageErrors(
+        flip=float(np.mean(flips)),
+        rel_mse=float(np.mean(errors(renders, rel_mse))),
+        noise_floor_flip=float(np.mean(floor_flips)),
+        noise_floor_rel_mse=float(np.mean(errors(exact_renders, rel_mse))),
+        flip_ratio=float(np.mean(flips)) / of_same_pairs if of_same_pairs > 0 else None,
+        pairs=len(flips),
+    )

@@ -1,7 +1,6 @@
 """Errors of models by zone, on rays not used in any fit, traced once through the exact lens.
 
-Zones are thirds of the film radius (`vignetting.ZONES`), at full aperture and stopped down. A smaller stop changes no
-ray, only which of them pass: the crossing with the stop, kept from the one exact trace, tells.
+A smaller stop changes no ray, only which of them pass: the crossing with the stop, kept from the one trace, tells.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from neurolens.base import status as st
 from neurolens.base.files import atomic_write_text, fingerprint_of, sha256_of
 from neurolens.base.progress import Report
 from neurolens.cameras.model import OnnxLens, load_model
-from neurolens.evaluate.rays import PIXELS_ACROSS, EachRay, each_ray, ray_errors, ray_figures
+from neurolens.evaluate.rays import PIXELS_ACROSS, EachRay, Predict, RayErrors, each_ray, ray_errors
 from neurolens.evaluate.vignetting import NEAR_RIM, ZONES, deciding_rim_ratio, false_shares
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
@@ -44,9 +43,6 @@ LEAST_RAYS = 100
 # deviation is above KNOWN.
 MORE, MOST, KNOWN = 8, 1_000_000, 0.08
 _BATCH = 65536
-
-Predict = Callable[..., Any]
-"""FilmRays and a stop radius in mm (None: the domain's) to what `LensModel.predict` gives."""
 
 
 @dataclass(frozen=True)
@@ -79,17 +75,14 @@ class FreshRays:
 
 def fresh_rays(lens: Lens, domain: Domain, held_out: PairSet, *, count: int, seed: int) -> FreshRays:
     """Draw and trace `count` rays for the vignetting; `seed` must not be that of a fit's pairs."""
-    drawn, kept = [], []
+    parts = []
     for start in range(0, count, _BATCH):
         rays = sample_domain(domain, min(_BATCH, count - start), seed, start)
         exact = trace_pairs(lens, rays, domain.pupil_z_mm)
         near = (deciding_rim_ratio(lens, exact) - 1).abs() <= NEAR_RIM
-        drawn.append(rays.columns())
-        kept.append((exact.status == st.PASSED, _stop_square(lens, exact), near))
-    columns = FilmRays(*(torch.cat(c) for c in zip(*drawn, strict=True)))
-    return FreshRays(
-        lens, domain, held_out, _stop_square(lens, held_out), columns, *(torch.cat(c) for c in zip(*kept, strict=True))
-    )
+        parts.append((*rays.columns(), exact.status == st.PASSED, _stop_square(lens, exact), near))
+    *drawn, passes, square, near = (torch.cat(c) for c in zip(*parts, strict=True))
+    return FreshRays(lens, domain, held_out, _stop_square(lens, held_out), FilmRays(*drawn), passes, square, near)
 
 
 def with_more(fresh: FreshRays, seed: int) -> FreshRays:
@@ -111,8 +104,7 @@ def _stop_square(lens: Lens, pairs: PairSet) -> Tensor:
 
 def _without_crossings(pairs: PairSet) -> PairSet:
     """The same rays without the data per surface, which is most of their memory."""
-    names = ("cross_x", "cross_y", "meets", "refracts")
-    return replace(pairs, **{name: getattr(pairs, name)[:0] for name in names})
+    return replace(pairs, **{name: getattr(pairs, name)[:0] for name in ("cross_x", "cross_y", "meets", "refracts")})
 
 
 @dataclass(frozen=True)
@@ -120,7 +112,7 @@ class Findings:
     """Errors of one model on `FreshRays`.
 
     Attributes:
-        figures: those of `rays.ray_errors`, false_pass, false_block and both near rims at full aperture.
+        figures: those of `rays.RayErrors`, false_pass, false_block and both near rims at full aperture.
         stopped_down: false_pass and false_block of the states of `STOPS` but the first.
         zones: by state of `ZONED` and zone: rms_um, direction_rms_deg of `rays` rays, and false_pass, false_block of
             `passing` rays that the exact lens passes. None with fewer than `LEAST_RAYS`, or where an RMS is not
@@ -148,7 +140,7 @@ def measure(fresh: FreshRays, predict: Predict) -> Findings:
     near = false_shares(exact["full"][fresh.near], said["full"][fresh.near])
     full = {**shares.pop("full"), **{f"{key}_near_rim": value for key, value in near.items()}}
     zones = {s: {z: _zone(fresh, each, s, z, exact[s], said[s]) for z in ZONES} for s in ZONED}
-    return Findings({**ray_figures(fresh.lens, fresh.domain, each), **full}, shares, zones, each)
+    return Findings({**asdict(RayErrors.over(fresh.lens, fresh.domain, each)), **full}, shares, zones, each)
 
 
 def well_known(fresh: FreshRays, each: EachRay) -> bool:
@@ -181,16 +173,14 @@ def _within(domain: Domain, rays: FilmRays, zone: str) -> Tensor:
 def _zone(fresh: FreshRays, each: EachRay, state: str, zone: str, exact: Tensor, said: Tensor) -> dict[str, Any]:
     part = zone_of(fresh, each, state, zone)
     within = _within(fresh.domain, fresh.drawn, zone)
-    found: dict[str, Any] = {
+    passing, shares = int(exact[within].sum()), false_shares(exact[within], said[within])
+    return {
         "rms_um": _rms(part.focus_um),
         "direction_rms_deg": _rms(part.direction_deg),
         "rays": len(part.inside),
-        **false_shares(exact[within], said[within]),
-        "passing": int(exact[within].sum()),
+        **(shares if passing >= LEAST_RAYS else dict.fromkeys(shares)),
+        "passing": passing,
     }
-    if found["passing"] < LEAST_RAYS:
-        found |= {"false_pass": None, "false_block": None}
-    return found
 
 
 def _rms(values: Tensor) -> float | None:
@@ -230,8 +220,8 @@ class Measured:
         return float(found if found is not None else self.record.get("direction_rms_deg") or 1e9)
 
 
-def onnx_predictor(model: OnnxLens) -> Any:
-    """An exported model as `rays` and `vignetting` want it: film rays and a stop radius in, `Prediction` out."""
+def onnx_predictor(model: OnnxLens) -> Predict:
+    """An exported model as `rays` and `vignetting` want it."""
 
     def predict(rays: FilmRays, stop_radius_mm: float | None = None) -> Prediction:
         columns = [np.ascontiguousarray(c.numpy(), dtype=np.float32) for c in rays.columns()]
@@ -245,21 +235,8 @@ def onnx_predictor(model: OnnxLens) -> Any:
     return predict
 
 
-def measure_errors(
-    model: OnnxLens, lens: Lens, domain: Domain, held_out: PairSet, vignetting_rays: int, seed: int
-) -> dict[str, Any]:
-    """Errors of an exported model on held-out rays for a card; keys with units, None if not finite.
-
-    `seed` is of the rays that test the vignetting; it must not be that of the fit's pairs.
-    """
-    rays = fresh_rays(lens, domain, held_out, count=vignetting_rays, seed=seed)
-    return measure_on(rays, model)
-
-
 def shared_rays(prepared: Prepared, vignetting_rays: int) -> FreshRays:
-    """The test rays of all models of one lens and domain: many, as a card's errors must be reproducible on other rays,
-    and a few bad rays, one in ten thousand, may dominate them.
-    """
+    """The test rays of all models of one lens and domain; many, as a few bad ones, one in 10,000, may dominate."""
     pairs = prepared.pairs
     seed = pairs.settings.seed + FRESH
     rays = fresh_rays(pairs.lens, pairs.domain, pairs.held_out, count=vignetting_rays, seed=seed)
@@ -267,7 +244,7 @@ def shared_rays(prepared: Prepared, vignetting_rays: int) -> FreshRays:
 
 
 def measure_on(rays: FreshRays, model: OnnxLens) -> dict[str, Any]:
-    """The same on rays that several models share."""
+    """Errors of an exported model for its card; keys with units, None if not finite."""
     errors = measure(rays, onnx_predictor(model)).errors(CARD_KEYS)
     return {**errors, "poor": what_is_poor(errors), "rays": len(rays.held_out), "passing": int(rays.passes.sum())}
 
@@ -293,20 +270,18 @@ def fit_and_measure(
 ) -> Measured:
     """Fit, export and measure one model, or take an existing one of the same settings and version from the folder.
 
-    `rays`, where several models share them, gives `shared_rays(prepared, vignetting_rays)`.
-
-    The errors are those of the exported float32 graph in onnxruntime.
+    Errors are of the exported float32 graph in onnxruntime. `rays`: `shared_rays`, where several models share them.
     """
-    file, note = folder / f"{settings.label}.onnx", folder / f"{settings.label}.json"
-    fingerprint = _fingerprint(prepared, settings, vignetting_rays)
-    known = known_record(note, file, fingerprint)
+    file, pairs = folder / f"{settings.label}.onnx", prepared.pairs
+    made_of = (pairs.domain.to_dict(), asdict(pairs.settings), asdict(settings), vignetting_rays)
+    fingerprint = fingerprint_of([__version__, pairs.lens.sha256, *made_of])
+    known = known_record(file, fingerprint)
     if known is not None:
         return Measured(settings, file, known)
     training = folder / f"{settings.label}.training.npz"  # left by a killed run
 
     def error_um(model: LensModel) -> float:
-        pairs = prepared.pairs
-        return ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict)["rms_um"]
+        return ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict).rms_um
 
     model = fit_model(prepared, settings, report, checkpoint=training, error_um=error_um)
     export_onnx(model, file, errors={})
@@ -325,15 +300,9 @@ def fit_and_measure(
         "fit_s": model.fit_s,
         "load_s": seconds_to_load(file),
     }
-    note_record(note, file, fingerprint, record)
+    note_record(file, fingerprint, record)
     checkpoint.clear(training)
     return Measured(settings, file, record)
-
-
-def _fingerprint(prepared: Prepared, settings: ModelSettings, vignetting_rays: int) -> str:
-    pairs = prepared.pairs
-    made_of = (pairs.domain.to_dict(), asdict(pairs.settings), asdict(settings), vignetting_rays)
-    return fingerprint_of([__version__, pairs.lens.sha256, *made_of])
 
 
 def seconds_to_load(file: Path) -> float:
@@ -342,16 +311,16 @@ def seconds_to_load(file: Path) -> float:
     return time.perf_counter() - start
 
 
-def note_record(note: Path, file: Path, fingerprint: str, record: dict[str, Any]) -> None:
+def note_record(file: Path, fingerprint: str, record: dict[str, Any]) -> None:
     """Write the record of a finished fit beside its model, for `known_record`."""
     made = {"fingerprint": fingerprint, "sha256": sha256_of(file), "record": record}
-    atomic_write_text(note, json.dumps(made, indent=1, allow_nan=False))
+    atomic_write_text(file.with_suffix(".json"), json.dumps(made, indent=1, allow_nan=False))
 
 
-def known_record(note: Path, file: Path, fingerprint: str) -> dict[str, Any] | None:
+def known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
     """The record of an earlier finished fit of the same settings whose model file is unchanged."""
     try:
-        data = json.loads(note.read_text(encoding="utf-8"))
+        data = json.loads(file.with_suffix(".json").read_text(encoding="utf-8"))
         same = data["fingerprint"] == fingerprint and data["sha256"] == sha256_of(file)
         return data["record"] if same else None
     except (OSError, ValueError, KeyError, TypeError):

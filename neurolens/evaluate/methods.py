@@ -1,14 +1,11 @@
-"""Every method on the same rays of a lens: the rows of `neurolens bench surrogates`, their records, errors and times.
-
-Existing records of the same settings and version are kept.
-"""
+"""Every method on the same rays of a lens: the rows of `bench surrogates`, their records, errors and times."""
 
 from __future__ import annotations
 
 import json
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -19,18 +16,17 @@ from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text, fingerprint_of, sha256_of
 from neurolens.base.progress import Progress, Report
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.candidates import exact_candidates, fused_candidate, model_candidate
+from neurolens.evaluate.candidates import EXACT, exact_candidates, exact_records, fused_candidate, model_candidate
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
 from neurolens.evaluate.measure import FreshRays, measure, onnx_predictor, seconds_to_load, shared_rays
 from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
-from neurolens.evaluate.records import break_even_rays, plain
+from neurolens.evaluate.records import plain
 from neurolens.evaluate.speed import Race, race
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model, prepare
-from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.precision import Precision, store_weights
 from neurolens.surrogates.published import PUBLISHED
@@ -147,8 +143,7 @@ class Bench:
 
     @property
     def name(self) -> str:
-        parts = [self.choice.file.stem, self.choice.configuration or ""]
-        return "-".join(p for p in parts if p)
+        return "-".join(part for part in (self.choice.file.stem, self.choice.configuration) if part)
 
     @cached_property
     def lens(self) -> Lens:
@@ -165,11 +160,6 @@ class Bench:
     @cached_property
     def rays(self) -> FreshRays:
         return shared_rays(self.prepared, self.settings.vignetting_rays)
-
-    @cached_property
-    def per_reference(self) -> float:
-        """Micrometres at an image radius of 21.6 mm for one of this lens."""
-        return REFERENCE_RADIUS_MM / image_radius_mm(self.lens)[0]
 
     def record_file(self, row: Row) -> Path:
         return self.folder / "records" / self.name / f"{row.name}.json"
@@ -188,23 +178,13 @@ class Bench:
 
 
 def run_bench(
-    benches: Sequence[Bench],
-    rows: Sequence[Row],
-    *,
-    again: bool = False,
-    progress: Progress,
-    done: Callable[[Bench, list[dict[str, Any]]], None] = lambda bench, records: None,
-) -> dict[str, list[dict[str, Any]]]:
-    """Records of every lens, by its name; `done` is called after each lens.
-
-    Args:
-        again: recompute existing records, too.
-    """
+    benches: Sequence[Bench], rows: Sequence[Row], progress: Progress, *, again: bool = False
+) -> Iterator[tuple[Bench, list[dict[str, Any]]]]:
+    """Lens by lens, the records of its rows; existing ones are recomputed only `again`."""
+    slow = (*NETWORKS, "neurolens2017")
     for bench in benches:
-        slow = (*NETWORKS, "neurolens2017")
         progress.plan({f"{bench.name}: {r.name}": 30.0 if r.settings.method in slow else 4.0 for r in rows})
         progress.plan({f"{bench.name}: race": 60.0 if bench.settings.compile_exact else 15.0})
-    found = {}
     for bench in benches:
         records = []
         with warnings.catch_warnings():
@@ -214,36 +194,27 @@ def run_bench(
                     records.append(_record(bench, row, again, report))
             with progress.stage(f"{bench.name}: race") as report:
                 _add_times(bench, rows, records, report)
-        found[bench.name] = records
-        done(bench, records)
-    return found
+        yield bench, records
 
 
 def _record(bench: Bench, row: Row, again: bool, report: Report) -> dict[str, Any]:
     """An existing record of the same settings, or a new one, with its failure if it fails."""
-    file = bench.record_file(row)
+    file, mark = bench.record_file(row), ""
     head = {"lens": bench.name, "method": row.name, "group": row.group, "source": row.source}
     try:
         mark = bench.fingerprint(row)
-        known = None if again else read_record(file, mark)
+        known = None if again else _known_record(file, mark)
         if known is not None and (known["failed"] or known["not_exported"] or bench.model_file(row).is_file()):
             return known
         file.unlink(missing_ok=True)  # an interruption must not leave a record of removed files
         made = {"failed": None, **_fit_and_measure(bench, row, report)}
     except Exception as error:  # a row with the reason; other methods and lenses continue
         # Expected errors are permanent; unexpected ones are retried by the next run.
-        mark = _mark(bench, row) if isinstance(error, NeurolensError) else ""
+        mark = mark if isinstance(error, NeurolensError) else ""
         made = {"failed": _reason(error), "not_exported": None}
     record = plain({"fingerprint": mark, **head, "settings": asdict(row.settings), **made})
     _write(file, record)
     return record
-
-
-def _mark(bench: Bench, row: Row) -> str:
-    try:
-        return bench.fingerprint(row)
-    except NeurolensError:  # no such lens
-        return ""
 
 
 def _reason(error: Exception) -> str:
@@ -255,17 +226,22 @@ def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
     """Errors of the exported graph in onnxruntime; of the float64 model where a method has no graph."""
     prepared, file = bench.prepared, bench.model_file(row)
     model = fit_model(prepared, row.settings, report)
-    refused = _export(model, file)
-    if row.weights and refused is None:
-        store_weights(file, file, row.weights, {})
-    predict: Any = model.predict
-    load_s = None
-    if refused is None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    load_s, refused, predict = None, None, model.predict
+    try:
+        export_onnx(model, file, {})
+    except (NeurolensError, NotImplementedError, TypeError) as error:
+        refused = _reason(error)
+    else:
+        if row.weights:
+            store_weights(file, file, row.weights, {})
         load_s, predict = seconds_to_load(file), onnx_predictor(load_model(file))
     found = measure(bench.rays, predict)
     figures = {key: found.figures[key] for key in _FIGURES}
+    # Micrometres at the common scale of lenses of different size.
+    scale = REFERENCE_RADIUS_MM / image_radius_mm(bench.lens)[0]
     scaled = {
-        f"{key}_at_21_6": None if figures[key] is None else bench.per_reference * figures[key]  # type: ignore[operator]
+        f"{key}_at_21_6": None if (value := figures[key]) is None else scale * value
         for key in ("p99_um", "max_um", "position_rms_um")
     }
     network = row.settings.method in NETWORKS
@@ -286,15 +262,6 @@ def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
     }
 
 
-def _export(model: LensModel, file: Path) -> str | None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        export_onnx(model, file, {})
-    except (NeurolensError, NotImplementedError, TypeError) as error:
-        return _reason(error)
-    return None
-
-
 def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]], report: Report) -> None:
     """Race all models of one lens and the exact tracer, and add the times to the records, unless that was done."""
     s, files = bench.settings, {}
@@ -307,21 +274,21 @@ def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]],
     mark = fingerprint_of([hashes, s.rounds, s.threads, s.compile_exact])
     if all(record.get("race") == mark for record in records if record["method"] in files):
         return
-    timed = race_models(bench.lens, bench.domain, files, s.rounds, s.threads, s.compile_exact, report)
+    timed = _race(bench, files, report)
     for i, (row, record) in enumerate(zip(rows, records, strict=True)):
         if row.name in files:
-            records[i] = plain({**record, **times_of(record, timed), "race": mark})
+            records[i] = plain({**record, **_times_of(record, timed), "race": mark})
             _write(bench.record_file(row), records[i])
 
 
-def read_record(file: Path, fingerprint: str | None = None) -> dict[str, Any] | None:
+def _known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
     """A record; None if missing, unreadable or of other settings."""
     try:
         record = json.loads(file.read_text(encoding="utf-8"))
         good = isinstance(record, dict) and {"lens", "method", "failed", "not_exported"} <= record.keys()
     except (OSError, ValueError):
         return None
-    return record if good and fingerprint in (None, record.get("fingerprint")) else None
+    return record if good and record.get("fingerprint") == fingerprint else None
 
 
 def _write(file: Path, record: dict[str, Any]) -> None:
@@ -329,39 +296,32 @@ def _write(file: Path, record: dict[str, Any]) -> None:
     atomic_write_text(file, json.dumps(record, indent=1, allow_nan=False) + "\n")
 
 
-EXACT = ("exact eager", "exact compiled")
-
-
-def race_models(
-    lens: Lens, domain: Domain, files: Mapping[str, Path], rounds: int, threads: int, compiled: bool, report: Report
-) -> Race:
+def _race(bench: Bench, files: Mapping[str, Path], report: Report) -> Race:
     """Race exported models, by name, and the exact tracer; "NAME fused" where a C compiler makes one."""
-    candidates = exact_candidates(lens.with_stop_radius(domain.stop_radius_mm), domain, compiled=compiled)
+    s, domain = bench.settings, bench.domain
+    candidates = exact_candidates(bench.lens.with_stop_radius(domain.stop_radius_mm), domain, compiled=s.compile_exact)
     for name, file in files.items():
         candidates.append(model_candidate(name, load_model(file), domain.stop_radius_mm))
-        fused = fused_candidate(f"{name} fused", file, domain) if threads == 1 else None
+        fused = fused_candidate(f"{name} fused", file, domain) if s.threads == 1 else None
         if fused is not None:
             candidates.append(fused)
-    return race(candidates, domain, rounds=rounds, threads=threads, report=report)
+    return race(candidates, domain, rounds=s.rounds, threads=s.threads, report=report)
 
 
-def times_of(record: Mapping[str, Any], timed: Race) -> dict[str, Any]:
+def _times_of(record: Mapping[str, Any], timed: Race) -> dict[str, Any]:
     """Times of one model for its record, held against the fastest exact tracer of the same race.
 
     Returns: ns_per_ray, speedup (by the minima), break_even_rays (after which fitting and loading pay off; "never"
         where the exact tracer is as fast), the same with "fused_" before, and exact: the tracers' times.
     """
-    name, found = record["method"], dict[str, Any]()
     best = EXACT[1] if EXACT[1] in timed.ns else EXACT[0]
-    exact = timed.timing(best)
-    for prefix, candidate in (("", name), ("fused_", f"{name} fused")):
-        timing, ratio = timed.timing(candidate), timed.speedup(candidate, best)
-        pays: float | str | None = None
-        if exact and timing:
-            pays = break_even_rays(record["fit_s"], record["load_s"], exact["min"], timing["min"]) or "never"
+    found = dict[str, Any]()
+    for prefix, name in (("", record["method"]), ("fused_", f"{record['method']} fused")):
+        gain = timed.gain(name, best, record["fit_s"], record["load_s"])
+        never = "never" if gain.speedup is not None else None
         found |= {
-            f"{prefix}ns_per_ray": timing,
-            f"{prefix}speedup": ratio["min"] if ratio else None,
-            f"{prefix}break_even_rays": pays,
+            f"{prefix}ns_per_ray": gain.ns_per_ray,
+            f"{prefix}speedup": gain.speedup,
+            f"{prefix}break_even_rays": gain.break_even_rays or never,
         }
-    return {**found, "exact": [timed.record(n) for n in EXACT if n in timed.ns or n in timed.unavailable]}
+    return {**found, "exact": exact_records(timed)}

@@ -2,37 +2,17 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from neurolens.analysis.plot_style import INK, new_figure, plain_log_ticks, save, style
 from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.methods import GROUPS
+from neurolens.evaluate.pages import DASH, Column, Record, markdown_table, number, show
 from neurolens.evaluate.plots import place_labels
-from neurolens.evaluate.records import markdown_table, number, pareto_front
-
-Record = Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class Column:
-    """A figure of a record: its heading, its key (dots go into nested tables), a factor and significant digits."""
-
-    heading: str
-    key: str
-    factor: float = 1.0
-    digits: int = 3
-
-    def cell(self, record: Record) -> str:
-        if record.get(self.key) == "never":
-            return "never"
-        value = number(record, self.key)
-        return "–" if value is None else _digits(value * self.factor, self.digits)
-
+from neurolens.evaluate.records import pareto_front
 
 COLUMNS = (
     Column("RMS um", "rms_um_at_21_6"),
@@ -95,7 +75,7 @@ def lens_page(name: str, records: Sequence[Record], facts: str) -> str:
         rows.append([record["method"], *cells])
     for exact in _exact(records):
         time = number(exact, "ns_per_ray.min")
-        cells = ["–" if c.key != "ns_per_ray.min" or time is None else _digits(time, 3) for c in COLUMNS]
+        cells = [DASH if c.key != "ns_per_ray.min" or time is None else show(time, 3) for c in COLUMNS]
         rows.append([exact["name"], *cells])
     lines = markdown_table(["method", *(c.heading for c in COLUMNS)], rows)
     apart = [f"- {r['method']} has no graph: {r['not_exported']}" for r in records if r["not_exported"]]
@@ -144,10 +124,10 @@ def _exact(records: Sequence[Record]) -> list[Record]:
 def _median_and_worst(column: Column, records: Sequence[Record]) -> str:
     values = [v for r in records if (v := number(r, column.key)) is not None]
     if not values:
-        return "–"
+        return DASH
     worst = _WORST.get(column.key, max)(values)
     median = statistics.median(values)
-    return f"{_digits(column.factor * median, column.digits)}, {_digits(column.factor * worst, column.digits)}"
+    return f"{show(column.factor * median, column.digits)}, {show(column.factor * worst, column.digits)}"
 
 
 def _by_lens(found: Mapping[str, Sequence[Record]], methods: Sequence[str]) -> list[str]:
@@ -159,16 +139,10 @@ def _by_lens(found: Mapping[str, Sequence[Record]], methods: Sequence[str]) -> l
         return -((number(first, "direction_rms_deg") if first else None) or 0.0)
 
     def cell(record: Record | None) -> str:
-        return "–" if record is None else " / ".join(c.cell(record) for c in _OF_A_LENS)
+        return DASH if record is None else " / ".join(c.cell(record) for c in _OF_A_LENS)
 
     lines = ([lens, *(cell(rows[lens].get(m)) for m in methods)] for lens in sorted(rows, key=worst))
     return markdown_table(["lens", *methods], lines)
-
-
-def _digits(value: float, digits: int) -> str:
-    if value and not 1e-4 <= abs(value) < 1e7:
-        return f"{value:.{max(digits - 1, 1)}e}" if math.isfinite(value) else str(value)
-    return f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.0f}"
 
 
 def _cell(text: str) -> str:

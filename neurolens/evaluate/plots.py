@@ -2,36 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from neurolens.analysis.plot_style import FAINT, INK, drawing, plain_log_ticks
 from neurolens.base.errors import InputError
-from neurolens.evaluate.records import FAMILIES, VARIABLES, number, pareto_front
+from neurolens.evaluate.pages import Record, number
+from neurolens.evaluate.records import pareto_front
 
-# Okabe and Ito's colours, distinguishable by colour-blind readers; black is kept for the exact tracer.
-FAMILY_COLOURS = {
-    "paraxial": "#7f7f7f",
-    "dense": "#56b4e9",
-    "omp": "#e69f00",
-    "ols": "#0072b2",
-    "adaptive": "#009e73",
-    "mlp": "#d55e00",
-}
-FAMILY_NAMES = {
-    "paraxial": "paraxial",
-    "dense": "dense",
-    "omp": "OMP",
-    "ols": "orthogonal LS",
-    "adaptive": "adaptive",
-    "mlp": "MLP",
+# Names and colours (Okabe and Ito's), distinguishable by colour-blind readers; black is kept for the exact tracer.
+FAMILIES = {
+    "paraxial": ("paraxial", "#7f7f7f"),
+    "dense": ("dense", "#56b4e9"),
+    "omp": ("OMP", "#e69f00"),
+    "ols": ("orthogonal LS", "#0072b2"),
+    "adaptive": ("adaptive", "#009e73"),
+    "mlp": ("MLP", "#d55e00"),
 }
 OTHER_COLOUR = "#cc79a7"
+_VARIABLES = ("raw", "invariants")
 
 
 def family_colour(family: str | None) -> str:
-    return FAMILY_COLOURS.get(str(family), OTHER_COLOUR)
+    return FAMILIES.get(str(family), ("", OTHER_COLOUR))[1]
 
 
 def place_labels(axes: Any, points: Sequence[tuple[float, float]], labels: Sequence[str], **text: Any) -> None:
@@ -78,8 +72,6 @@ def _cost(box: tuple[float, float, float, float], points: Sequence[Any], taken: 
     return cost
 
 
-Record = Mapping[str, Any]
-
 ERROR_LABELS = {
     "rms_um": "film-equivalent error, RMS (µm)",
     "p99_um": "film-equivalent error, 99th percentile (µm)",
@@ -106,7 +98,7 @@ def pareto_plot(
     markers are coefficients per vector output.
 
     Args:
-        records: `records.ModelRecord`s; those with no time or no error are left out, and their number is stated.
+        records: `records.Results.models`; those with no time or no error are left out, and their number is stated.
         path: PNG, PDF or SVG to write.
         exact: `records.ExactRecord`s; the reason is shown for one that is not available.
         error: the key on the y axis, of ERROR_LABELS.
@@ -125,9 +117,7 @@ def pareto_plot(
         axes.grid(True, which="major")
         plain_log_ticks(axes.xaxis, axes.yaxis)
         _plot_exact(axes, exact)
-        axes.set_title(title, loc="left", fontweight="bold")
-        _note_left_out(axes, len(records) - len(shown), "without a time or an error")
-        figure.legend(loc="outside right upper")
+        _finish(axes, title, len(records) - len(shown), "without a time or an error")
         counts = [number(r, "coefficients_per_vector") for r in shown]
         labels = [f"{n:.0f}" if n else str(r.get("name", "")) for n, r in zip(counts, shown, strict=True)]
         place_labels(axes, points, labels, fontsize=7.6, color="#333333")
@@ -143,7 +133,7 @@ def error_against_coefficients_plot(
     """Error (log) against coefficients per vector output, a line for each family; models without such a count across.
 
     Args:
-        records: `records.ModelRecord`s; an MLP and the paraxial map count no coefficients: a dotted line each.
+        records: `records.Results.models`; an MLP and the paraxial map count no coefficients: a dotted line each.
         path: PNG, PDF or SVG to write.
         error: the key on the y axis, of ERROR_LABELS.
     Raises:
@@ -162,9 +152,7 @@ def error_against_coefficients_plot(
         _plot_lines_across(axes, lines, error)
         axes.grid(True, which="major")
         plain_log_ticks(axes.yaxis)
-        axes.set_title(title, loc="left", fontweight="bold")
-        _note_left_out(axes, len(records) - len(shown), "without an error")
-        figure.legend(loc="outside right upper")
+        _finish(axes, title, len(records) - len(shown), "without an error")
     return Path(path)
 
 
@@ -185,12 +173,12 @@ def _with_numbers(records: Sequence[Record], error: str, *keys: str) -> list[Rec
 
 
 def _series(records: Sequence[Record]) -> list[tuple[str, str, list[int]]]:
-    """(family, variables, indices) in the order of FAMILIES and VARIABLES; unknown families come last."""
+    """(family, variables, indices) in the order of FAMILIES and _VARIABLES; unknown families come last."""
     found = {(str(r.get("family")), str(r.get("variables"))) for r in records}
 
-    def rank(key: tuple[str, str]) -> tuple[int, int, tuple[str, str]]:
-        family = FAMILIES.index(key[0]) if key[0] in FAMILIES else len(FAMILIES)
-        return family, VARIABLES.index(key[1]) if key[1] in VARIABLES else len(VARIABLES), key
+    def rank(key: tuple[str, str]) -> tuple[Any, ...]:
+        places = ((*known, name).index(name) for name, known in zip(key, (FAMILIES, _VARIABLES), strict=True))
+        return *places, key
 
     def members(key: tuple[str, str]) -> list[int]:
         return [i for i, r in enumerate(records) if (str(r.get("family")), str(r.get("variables"))) == key]
@@ -205,7 +193,7 @@ def _plot_models(axes: Any, records: Sequence[Record], points: Sequence[tuple[fl
         line = sorted(points[i] for i in members)
         axes.plot(*zip(*line, strict=True), color=colour, lw=1, alpha=0.35, zorder=2)
         fill = colour if variables != "raw" else "white"
-        name = FAMILY_NAMES.get(family, family) + (f", {variables}" if variables in VARIABLES else "")
+        name = FAMILIES.get(family, (family,))[0] + (f", {variables}" if variables in _VARIABLES else "")
         look = {"ms": 7, "mfc": fill, "mec": colour, "mew": 1.5, "ls": "none", "zorder": 3, "label": name}
         axes.plot(*zip(*line, strict=True), _MARKERS.get(variables, "D"), **look)
         for i in members:
@@ -251,9 +239,8 @@ def _plot_exact(axes: Any, exact: Sequence[Record]) -> None:
     axes.text(0.008, 0.82 * _BAND, words, transform=axes.transAxes, va="center", fontsize=8.2, color="#555b63")
     low, high = axes.get_ylim()
     for minor in (False, True):  # no ticks beside the band
-        axes.set_yticks(
-            [t for t in axes.get_yticks(minor=minor) if low * (high / low) ** _BAND < t < high], minor=minor
-        )
+        above = [t for t in axes.get_yticks(minor=minor) if low * (high / low) ** _BAND < t < high]
+        axes.set_yticks(above, minor=minor)
     timed = sorted((t, str(r["name"])) for r in exact if (t := _exact_time(r)))
     if timed:
         axes.axvspan(timed[0][0], axes.get_xlim()[1], color="#000000", alpha=0.035, lw=0, zorder=0)
@@ -292,7 +279,9 @@ def _time_label(records: Sequence[Record]) -> str:
     return f"time per ray (ns, least of the repeats; whisker to the median{stated})"
 
 
-def _note_left_out(axes: Any, count: int, why: str) -> None:
-    if count:
-        text = f"{count} model{'s' if count > 1 else ''} {why} not shown"
+def _finish(axes: Any, title: str, left_out: int, why: str) -> None:
+    axes.set_title(title, loc="left", fontweight="bold")
+    axes.figure.legend(loc="outside right upper")
+    if left_out:
+        text = f"{left_out} model{'s' if left_out > 1 else ''} {why} not shown"
         axes.text(1, 1.012, text, transform=axes.transAxes, ha="right", fontsize=8, color=FAINT)

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,13 +31,8 @@ REFERENCE_RADIUS_MM = 21.6  # half the diagonal of 36 x 24 mm film: the common s
 PIXELS_ACROSS = 4000
 
 
-class Predicted(Protocol):
-    """What `predict` gives for N rays: scene-side rays (lens frame, mm) and transmittance [N]."""
-
-    @property
-    def rays(self) -> Rays: ...
-    @property
-    def transmittance(self) -> Tensor: ...
+Predict = Callable[..., Any]
+"""FilmRays and a stop radius in mm (None: the domain's) to what `LensModel.predict` gives."""
 
 
 def frame_width_mm(radius_mm: float) -> float:
@@ -50,14 +45,69 @@ def pixel_um(domain: Domain) -> float:
     return 1000 * frame_width_mm(domain.film_radius_mm) / PIXELS_ACROSS
 
 
-def ray_errors(
-    lens: Lens,
-    domain: Domain,
-    held_out: PairSet,
-    predict: Callable[[FilmRays], Predicted],
-    *,
-    pitch_um: float | None = None,
-) -> dict[str, float]:
+@dataclass(frozen=True)
+class RayErrors:
+    """Errors over rays that the exact lens passes.
+
+    Micrometres are NaN where all rays lie beyond 60 degrees. A NaN in a prediction makes its figures NaN; a ray that
+    points away from the plane makes the micrometres infinite.
+
+    Attributes:
+        rms_um, p99_um, max_um: film-equivalent error on the plane in focus of each ray's film position.
+        rms_infinity_um, p99_infinity_um, max_infinity_um: the same on the plane at infinity.
+        rms_px, p99_px, max_px, pixel_um: in pixels, and their pitch.
+        rms_um_at_21_6: rms_um after scaling the lens to an image radius of 21.6 mm.
+        direction_rms_deg, direction_p99_deg, direction_max_deg: angle between the exact and the predicted direction.
+        position_rms_um, position_p99_um: perpendicular distance from the predicted point to the exact ray.
+        rays, share_beyond_60_deg: number of rays, and the share excluded from the micrometres.
+    """
+
+    rms_um: float
+    p99_um: float
+    max_um: float
+    rms_infinity_um: float
+    p99_infinity_um: float
+    max_infinity_um: float
+    rms_px: float
+    p99_px: float
+    max_px: float
+    pixel_um: float
+    rms_um_at_21_6: float
+    direction_rms_deg: float
+    direction_p99_deg: float
+    direction_max_deg: float
+    position_rms_um: float
+    position_p99_um: float
+    transmittance_rms: float
+    transmittance_max: float
+    rays: float
+    share_beyond_60_deg: float
+
+    @classmethod
+    def over(cls, lens: Lens, domain: Domain, each: EachRay) -> RayErrors:
+        """Of errors ray by ray."""
+        pitch, focus = pixel_um(domain), _spread(each.focus_um)
+        position, transmittance = _spread(each.position_um), _spread(each.transmittance)
+        return cls(
+            *focus,
+            *_spread(each.infinity_um),
+            *(focus[0] / pitch, focus[1] / pitch, focus[2] / pitch, pitch),
+            focus[0] * REFERENCE_RADIUS_MM / image_radius_mm(lens)[0],
+            *_spread(each.direction_deg),
+            *(position[0], position[1]),
+            *(transmittance[0], transmittance[2]),
+            float(len(each.inside)),
+            float((~each.inside).double().mean()),
+        )
+
+
+def _spread(values: Tensor) -> tuple[float, float, float]:
+    """RMS, 99th percentile, largest; NaN without values."""
+    rms = float(torch.sqrt((values * values).mean()))
+    return (rms, float(torch.quantile(values, 0.99)), float(values.max())) if len(values) else (rms, math.nan, math.nan)
+
+
+def ray_errors(lens: Lens, domain: Domain, held_out: PairSet, predict: Predict) -> RayErrors:
     """Errors over rays that the exact lens passes.
 
     Args:
@@ -65,52 +115,11 @@ def ray_errors(
         domain: of the model.
         held_out: rays uniform over the domain that the lens passes, not used in the fit.
         predict: the model.
-        pitch_um: pixel pitch; None takes `pixel_um`.
-
-    Returns, all floats:
-        rms_um, p99_um, max_um: film-equivalent error on the plane in focus of each ray's film position.
-        rms_infinity_um, p99_infinity_um, max_infinity_um: the same on the plane at infinity.
-        rms_px, p99_px, max_px, pixel_um: in pixels, and their pitch.
-        rms_um_at_21_6: rms_um after scaling the lens to an image radius of 21.6 mm.
-        direction_rms_deg, direction_p99_deg, direction_max_deg: angle between the exact and the predicted direction.
-        position_rms_um, position_p99_um: perpendicular distance from the predicted point to the exact ray.
-        transmittance_rms, transmittance_max.
-        rays, share_beyond_60_deg: number of rays, and the share excluded from the micrometres.
-        Micrometres are NaN where all rays lie beyond 60 degrees. A NaN in a prediction makes its figures NaN; a ray
-        that points away from the plane makes the micrometres infinite.
 
     Raises:
         InputError: no rays, or rays that the exact lens blocks.
     """
-    return ray_figures(lens, domain, each_ray(lens, domain, held_out, predict), pitch_um)
-
-
-def ray_figures(lens: Lens, domain: Domain, each: EachRay, pitch_um: float | None = None) -> dict[str, float]:
-    """What `ray_errors` returns, of errors ray by ray."""
-    focus, infinity, inside = each.focus_um, each.infinity_um, each.inside
-    pitch = pixel_um(domain) if pitch_um is None else pitch_um
-    return {
-        "rms_um": _rms(focus),
-        "p99_um": _p99(focus),
-        "max_um": _max(focus),
-        "rms_infinity_um": _rms(infinity),
-        "p99_infinity_um": _p99(infinity),
-        "max_infinity_um": _max(infinity),
-        "rms_px": _rms(focus) / pitch,
-        "p99_px": _p99(focus) / pitch,
-        "max_px": _max(focus) / pitch,
-        "pixel_um": pitch,
-        "rms_um_at_21_6": _rms(focus) * REFERENCE_RADIUS_MM / image_radius_mm(lens)[0],
-        "direction_rms_deg": _rms(each.direction_deg),
-        "direction_p99_deg": _p99(each.direction_deg),
-        "direction_max_deg": _max(each.direction_deg),
-        "position_rms_um": _rms(each.position_um),
-        "position_p99_um": _p99(each.position_um),
-        "transmittance_rms": _rms(each.transmittance),
-        "transmittance_max": _max(each.transmittance),
-        "rays": float(len(inside)),
-        "share_beyond_60_deg": float((~inside).double().mean()),
-    }
+    return RayErrors.over(lens, domain, each_ray(lens, domain, held_out, predict))
 
 
 @dataclass(frozen=True)
@@ -138,7 +147,7 @@ class EachRay:
         return EachRay(self.inside[part], self.focus_um[kept], self.infinity_um[kept], *rest)
 
 
-def each_ray(lens: Lens, domain: Domain, held_out: PairSet, predict: Callable[[FilmRays], Predicted]) -> EachRay:
+def each_ray(lens: Lens, domain: Domain, held_out: PairSet, predict: Predict) -> EachRay:
     """Errors of every ray; arguments and what they raise as `ray_errors`."""
     if len(held_out) == 0 or bool((held_out.status != st.PASSED).any()):
         raise InputError(
@@ -205,18 +214,6 @@ def pupil_disc_share(lens: Lens, domain: Domain, count: int = 400_000, seed: int
     return min(1.0, float(weight[held].sum() / weight.sum()))
 
 
-def _rms(values: Tensor) -> float:
-    return float(torch.sqrt((values * values).mean()))
-
-
-def _p99(values: Tensor) -> float:
-    return float(torch.quantile(values, 0.99)) if len(values) else math.nan
-
-
-def _max(values: Tensor) -> float:
-    return float(values.max()) if len(values) else math.nan
-
-
 # Central differences over this share of the film radius: truncation and float64 rounding both stay below 1e-6.
 _STEP = 1e-4
 # Lower bound of the Jacobian, as a share of the paraxial one.
@@ -250,7 +247,9 @@ def film_equivalent_mm(
     dx, dy = plane_coordinates(rays, vergence) - plane_coordinates(exact, vergence)
     least = _LEAST / abs(first_order(lens).efl_mm)
     if lens.anamorphic:
-        along_x, along_y = _jacobian_columns(lens, domain, inputs, vergence)
+        # Of each ray itself, which passes: no one plane holds its chief ray.
+        along_x, along_y, _ = _differences(lens, domain, inputs, vergence)
+        along_x, along_y = along_x / _step_mm(domain), along_y / _step_mm(domain)
         area = (along_x[0] * along_y[1] - along_x[1] * along_y[0]).abs()
         area = area.clamp_min(least / abs(first_order(lens, meridian="x").efl_mm))
         return torch.hypot((dx * along_y[1] - dy * along_y[0]) / area, (dy * along_x[0] - dx * along_x[1]) / area)
@@ -271,54 +270,40 @@ def local_jacobian(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tenso
     stands in.
     """
     radius = torch.hypot(inputs.film_x, inputs.film_y)
-    middle, across = pupil_middle(domain, radius), torch.zeros_like(radius)
-    jacobian, found = _differences(lens, domain, inputs, radius, middle, across, vergence)
+    zero, middle = torch.zeros_like(radius), pupil_middle(domain, radius)
+    chief = replace(inputs, film_x=radius, film_y=zero, pupil_x=middle, pupil_y=zero)
+    radial, tangential, found = _differences(lens, domain, chief, vergence)
     if not bool(found.all()):
         lost = ~found
         part, r = inputs.select(lost), radius[lost]
         safe = torch.where(r > 0, r, 1.0)
         u = torch.where(r > 0, (part.pupil_x * part.film_x + part.pupil_y * part.film_y) / safe, part.pupil_x)
         v = torch.where(r > 0, (part.pupil_y * part.film_x - part.pupil_x * part.film_y) / safe, part.pupil_y)
-        jacobian[:, lost] = _differences(lens, domain, part, r, u, v, vergence[lost])[0]
-    return jacobian[0], jacobian[1]
+        turned = replace(part, film_x=r, film_y=zero[lost], pupil_x=u, pupil_y=v)
+        radial[:, lost], tangential[:, lost], _ = _differences(lens, domain, turned, vergence[lost])
+    length, step = torch.linalg.vector_norm, _step_mm(domain)
+    return length(radial, dim=0) / step, length(tangential, dim=0) / step
 
 
-def _jacobian_columns(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives [2, N] of `plane_coordinates` by film_x and by film_y, 1/mm, of a lens with cylinders.
+def _step_mm(domain: Domain) -> float:
+    return 2 * _STEP * domain.film_radius_mm
 
-    Central differences of each ray itself, which passes: no one plane holds its chief ray.
+
+def _differences(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Central differences [2, N] of `plane_coordinates` over `_step_mm` of film_x and of film_y, the pupil point kept.
+
+    Also [N], whether all four rays could be followed.
     """
     h = _STEP * domain.film_radius_mm
     steps = torch.tensor([[h, -h, 0, 0], [0, 0, h, -h]], dtype=torch.float64).repeat_interleave(len(inputs), 1)
-    film_x, film_y = inputs.film_x.repeat(4) + steps[0], inputs.film_y.repeat(4) + steps[1]
-    film_z, pupil_x, pupil_y = (c.repeat(4) for c in (inputs.film_z, inputs.pupil_x, inputs.pupil_y))
-    rays = camera_rays(film_x, film_y, film_z, pupil_x, pupil_y, domain.pupil_z_mm)
+    film_x, film_y, film_z, pupil_x, pupil_y, wavelength = (c.repeat(4) for c in inputs.columns())
+    rays = camera_rays(film_x + steps[0], film_y + steps[1], film_z, pupil_x, pupil_y, domain.pupil_z_mm)
     with torch.no_grad():
-        out = trace(lens, rays, inputs.wavelength_nm.repeat(4))
-    points = plane_coordinates(out.rays, vergence.repeat(4)).reshape(2, 4, -1)
-    return (points[:, 0] - points[:, 1]) / (2 * h), (points[:, 2] - points[:, 3]) / (2 * h)
-
-
-def _differences(
-    lens: Lens, domain: Domain, inputs: FilmRays, radius: Tensor, u: Tensor, v: Tensor, vergence: Tensor
-) -> tuple[Tensor, Tensor]:
-    """[2, N] radial and tangential derivative at film points (radius, 0) through pupil points (u, v), four rays each.
-
-    Also [N], whether all four passed.
-    """
-    h = _STEP * domain.film_radius_mm
-    zero = torch.zeros_like(radius)
-    film_x = torch.cat([radius + h, radius - h, radius, radius])
-    film_y = torch.cat([zero, zero, zero + h, zero - h])
-    rays = camera_rays(film_x, film_y, inputs.film_z.repeat(4), u.repeat(4), v.repeat(4), domain.pupil_z_mm)
-    with torch.no_grad():
-        out = trace(lens, rays, inputs.wavelength_nm.repeat(4))
+        out = trace(lens, rays, wavelength)
     # Rays that only a rim stops go on; the others come back along the axis and would give a wrong derivative.
     lost = (out.status != st.PASSED) & (out.rays.dz == -1.0) & (out.rays.x == 0.0)
     points = plane_coordinates(out.rays, vergence.repeat(4)).reshape(2, 4, -1)
-    radial = torch.linalg.vector_norm(points[:, 0] - points[:, 1], dim=0) / (2 * h)
-    tangential = torch.linalg.vector_norm(points[:, 2] - points[:, 3], dim=0) / (2 * h)
-    return torch.stack([radial, tangential]), ~lost.reshape(4, -1).any(0)
+    return points[:, 0] - points[:, 1], points[:, 2] - points[:, 3], ~lost.reshape(4, -1).any(0)
 
 
 def pupil_middle(domain: Domain, radius: Tensor) -> Tensor:

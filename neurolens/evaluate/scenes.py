@@ -5,7 +5,7 @@ restricted to one shot.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -78,15 +78,9 @@ def render_all(
             seeds = choice.seeds if name == EXACT or name in models else 1
             for seed in range(seeds):
                 result = render(
-                    scene,
-                    camera,
-                    width=choice.width,
-                    height=choice.height,
-                    samples=choice.samples,
-                    seed=seed,
-                    threads=choice.threads,
-                    film=film,
-                )
+                    scene, camera, width=choice.width, height=choice.height, samples=choice.samples, seed=seed,
+                    threads=choice.threads, film=film,
+                )  # fmt: skip
                 renders.setdefault(name, []).append(result.rgb)
                 if seed == 0:
                     found.cameras.append(_camera_record(scene, name, result.stats))
@@ -125,18 +119,17 @@ def _compare_scene(
             "samples": choice.samples,
         }
         if name != EXACT:
-            figures = compare(pictures, exact)
-            record.update({k: figures[k] for k in figures if k in _COMPARED})
-            captions[name] = image_caption(figures)
+            errors = compare(pictures, exact)
+            record |= asdict(errors)
+            captions[name] = image_caption(errors)
             # The second exact seed, so that what shows is the noise of two renders and not the shared random numbers.
             maps[name] = flip_map(pictures[0], exact[1])
         found.images.append(record)
     maps[EXACT] = flip_map(exact[0], exact[1])
     captions[EXACT] = "two seeds: the noise floor"
     file = folder / f"{scene.name}-side-by-side.png"
-    side_by_side(
-        {n: r[0] for n, r in renders.items()}, maps, file, captions, title=f"{scene.name}, error against exact"
-    )
+    first = {name: pictures[0] for name, pictures in renders.items()}
+    side_by_side(first, maps, file, captions, title=f"{scene.name}, error against exact")
     found.figures.append(
         {
             "file": f"{folder.name}/{file.name}",
@@ -147,13 +140,10 @@ def _compare_scene(
     )
 
 
-_COMPARED = ("flip", "rel_mse", "noise_floor_flip", "noise_floor_rel_mse", "flip_ratio", "pairs")
-
-
 def scene_gain(experiment: Experiment, folder: Path, progress: Progress) -> dict[str, Any] | None:
     """One model for the whole lens, the same for one shot, and for the shot half of it: error, size and time.
 
-    Returns a `records.DomainGain`, None where the experiment names no scene.
+    Returns `records.Results.domain_gain`, None where the experiment names no scene.
     """
     choice = experiment.scene_domain
     if choice is None:
@@ -173,7 +163,7 @@ def scene_gain(experiment: Experiment, folder: Path, progress: Progress) -> dict
     )
     half = replace(choice.model, name="", terms=max(choice.model.terms // 2, 2), units=max(choice.model.units // 2, 2))
     states = (
-        ("whole lens", lens, experiment.domain_of(lens), (choice.model,)),
+        ("whole lens", lens, experiment.domain.of(lens), (choice.model,)),
         (scene.name, shot_lens, shot_domain, (choice.model, half)),
     )
     rows: list[dict[str, Any]] = []

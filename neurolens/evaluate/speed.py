@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from neurolens.base.errors import InputError, NeurolensError
-from neurolens.evaluate.records import ExactRecord, Timing
+from neurolens.evaluate.records import ExactRecord, Timing, break_even_rays
 from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
 
@@ -54,6 +54,18 @@ class Candidate:
     prepare: Callable[[FilmRays], Call]
     batches: tuple[int, ...] = BATCHES
     domain: Domain | None = None
+
+
+@dataclass(frozen=True)
+class Gain:
+    """A model on the clock: its times, how many times faster it is (by the minima), after how many rays it pays off.
+
+    None where one of the two was not timed; break_even_rays also where the model is no faster.
+    """
+
+    ns_per_ray: Timing | None
+    speedup: float | None
+    break_even_rays: float | None
 
 
 @dataclass(frozen=True)
@@ -96,6 +108,12 @@ class Race:
         ratios = [b / a for a, b in zip(self.ns[name], self.ns[over], strict=True)]
         return {"min": min(self.ns[over]) / min(self.ns[name]), "median": statistics.median(ratios)}
 
+    def gain(self, name: str, exact: str, fit_s: float | None, load_s: float | None) -> Gain:
+        """What a model that took `fit_s` to fit and `load_s` to load gains over an exact tracer."""
+        timing, ratio, slow = self.timing(name), self.speedup(name, exact), self.timing(exact)
+        pays = break_even_rays(fit_s, load_s, slow["min"], timing["min"]) if slow and timing else None
+        return Gain(timing, ratio["min"] if ratio else None, pays)
+
     def record(self, name: str) -> ExactRecord:
         """Row for the list of exact tracers in `results.json`."""
         if name in self.unavailable:
@@ -109,7 +127,6 @@ def race(
     *,
     threads: int = 1,
     rounds: int = 20,
-    seed: int = 3,
     fresh: bool = True,
     report: Callable[[float], None] = lambda share: None,
 ) -> Race:
@@ -137,7 +154,7 @@ def race(
             torch._dynamo.reset()  # torch limits the number of recompilations of a function
         for i, c in enumerate(candidates):
             try:
-                passes[c.name] = _best_batch(c, _pool(c.domain or domain, seed), team)
+                passes[c.name] = _best_batch(c, _pool(c.domain or domain), team)
             except Unavailable as reason:
                 unavailable[c.name] = str(reason)
             report(_PREPARING * (i + 1) / len(candidates))
@@ -152,11 +169,11 @@ def race(
     return Race(ns, {n: p.batch for n, p in passes.items()}, threads, rounds, unavailable, before, _load())
 
 
-def _pool(domain: Domain | FilmRays, seed: int) -> FilmRays:
+def _pool(domain: Domain | FilmRays) -> FilmRays:
     """The rays of one pass: `POOL` of them, from the domain's film plane nearest to the lens."""
     if isinstance(domain, FilmRays):
         return domain
-    rays = sample_domain(domain, POOL, seed)
+    rays = sample_domain(domain, POOL, seed=3)
     return replace(rays, film_z=torch.full_like(rays.film_z, domain.film_z_mm[0]))
 
 

@@ -6,7 +6,8 @@ import functools
 import platform
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -14,25 +15,23 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.analysis.layout import lens_layout
-from neurolens.base.config import to_dict, to_toml
 from neurolens.base.errors import NeurolensWarning
-from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
+from neurolens.evaluate.candidates import EXACT, exact_candidates, exact_records, ideal_cameras, model_candidate
 from neurolens.evaluate.describe import layout_profile, refractions
-from neurolens.evaluate.experiment import Experiment, keep_lens, relative_to
+from neurolens.evaluate.experiment import Experiment, keep_inputs
 from neurolens.evaluate.figures import illumination_plot
 from neurolens.evaluate.image import DEFAULT
 from neurolens.evaluate.measure import FRESH, MORE, Measured, fit_and_measure, onnx_predictor, shared_rays, what_is_poor
 from neurolens.evaluate.plots import error_against_coefficients_plot, pareto_plot
 from neurolens.evaluate.rays import pixel_um, pupil_disc_share
-from neurolens.evaluate.records import break_even_rays, write_results
+from neurolens.evaluate.records import Results, write_results
 from neurolens.evaluate.report import write_report
 from neurolens.evaluate.scenes import Pictures, domain_facts, render_all, scene_gain
 from neurolens.evaluate.speed import Race, race
 from neurolens.evaluate.train_states import run_states
-from neurolens.evaluate.vignetting import relative_illumination
+from neurolens.evaluate.vignetting import Illumination, relative_illumination
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.bases import pinned_threads
@@ -64,16 +63,14 @@ def run_experiment(
     if experiment.lens.many_states:
         return run_states(experiment, folder, progress=progress, command=command)
     models, pictures = folder / "models", folder / "pictures"
-    resolved = relative_to(experiment, folder)
     progress.plan(_plan(experiment))
     with warnings.catch_warnings(record=True) as heard, pinned_threads():
         warnings.simplefilter("always")
         lens = experiment.lens.read()
-        domain = experiment.domain_of(lens)
+        domain = experiment.domain.of(lens)
         for each in (models, pictures):  # only now, so that an invalid lens leaves no folder
             each.mkdir(parents=True, exist_ok=True)
-        atomic_write_text(folder / "config.toml", to_toml(resolved))
-        keep_lens(experiment, folder)
+        settings = keep_inputs(experiment, folder)
         with progress.stage("trace ray pairs") as report:
             pairs = make_pairs(lens, domain, experiment.pairs, report)
             if experiment.save_pairs:
@@ -81,42 +78,43 @@ def run_experiment(
             prepared = prepare(pairs)
         measured, count = [], experiment.evaluation.vignetting_rays
         fresh = functools.cache(lambda: shared_rays(prepared, count))
-        for settings in experiment.model:
-            with progress.stage(f"fit {settings.label}") as report:
-                measured.append(fit_and_measure(prepared, settings, models, count, report, fresh))
+        for model in experiment.model:
+            with progress.stage(f"fit {model.label}") as report:
+                measured.append(fit_and_measure(prepared, model, models, count, report, fresh))
             _say_what_is_poor(measured[-1])
         timed = _race(experiment, prepared, measured, progress)
         with progress.stage("illumination"):
-            shown = [m for m in measured if m.settings.label in _shown(experiment, measured)]
+            names = experiment.render.models or best_models(measured)
+            shown = {m.settings.label: m for m in measured if m.settings.label in names}
             light = _illumination(shown, lens, domain, pairs.settings.seed)
         gain = scene_gain(experiment, folder / "models", progress)
-        drawn = _render(experiment, lens, domain, measured, pictures, progress)
-    results = {
-        "title": experiment.title,
-        "command": command,
-        "lens": _describe_lens(lens),
-        "domain": _describe_domain(lens, pairs),
-        "settings": to_dict(resolved),
-        "models": [m.record for m in measured],
-        "exact": [
-            timed.record(name)
-            for name in ("exact eager", "exact compiled")
-            if name in timed.ns or name in timed.unavailable
-        ],
-        "cameras": [{"name": n, "ns_per_ray": timed.timing(n)} for n in _IDEAL] + drawn.cameras,
-        "images": drawn.images,
-        "image_settings": asdict(DEFAULT) if drawn.images else None,
-        "domain_gain": gain,
-        "figures": _draw(lens, domain, measured, timed, light, pictures) + drawn.figures,
-        "versions": versions(),
-        "seed": experiment.pairs.seed,
-        "started": started.isoformat(timespec="seconds"),
-        "wall_s": time.perf_counter() - clock,
-        "warnings": sorted({str(w.message) for w in heard if issubclass(w.category, UserWarning)}),
-    }
+        drawn = Pictures()
+        if experiment.render.scenes:
+            with progress.stage("render") as report:
+                files = {name: m.file for name, m in shown.items()}
+                drawn = render_all(experiment.render, lens, domain, files, pictures, report)
+    results = Results(
+        title=experiment.title,
+        command=command,
+        lens=_describe_lens(lens),
+        domain=_describe_domain(lens, pairs),
+        settings=settings,
+        models=[m.record for m in measured],
+        exact=exact_records(timed),
+        cameras=[*({"name": n, "ns_per_ray": timed.timing(n)} for n in _IDEAL), *drawn.cameras],
+        images=drawn.images,
+        image_settings=asdict(DEFAULT) if drawn.images else None,
+        domain_gain=gain,
+        figures=_draw(pairs, measured, timed, light, pictures) + drawn.figures,
+        versions=versions(),
+        seed=experiment.pairs.seed,
+        started=started.isoformat(timespec="seconds"),
+        wall_s=time.perf_counter() - clock,
+        warnings=sorted({str(w.message) for w in heard if issubclass(w.category, UserWarning)}),
+    )
     write_results(folder / "results.json", results)
     write_report(folder, results)
-    return results
+    return asdict(results)
 
 
 def _say_what_is_poor(m: Measured) -> None:
@@ -148,47 +146,22 @@ def _race(experiment: Experiment, prepared: Prepared, measured: Sequence[Measure
     candidates += ideal_cameras(lens, domain)
     with progress.stage("race for speed"):
         timed = race(candidates, domain, threads=chosen.threads, rounds=chosen.rounds)
-    compiled = timed.timing("exact compiled")
     for m in measured:
-        timing, speedup = timed.timing(m.settings.label), timed.speedup(m.settings.label, "exact compiled")
-        m.record["ns_per_ray"] = timing
-        m.record["speedup_over_compiled"] = speedup["min"] if speedup else None
-        if compiled and timing:
-            m.record["break_even_rays"] = break_even_rays(
-                m.record["fit_s"], m.record["load_s"], compiled["min"], timing["min"]
-            )
+        gain = timed.gain(m.settings.label, EXACT[1], m.record["fit_s"], m.record["load_s"])
+        m.record.update(ns_per_ray=gain.ns_per_ray, speedup_over_compiled=gain.speedup)
+        if gain.speedup is not None:
+            m.record["break_even_rays"] = gain.break_even_rays
     return timed
 
 
-def _render(
-    experiment: Experiment, lens: Lens, domain: Domain, measured: Sequence[Measured], folder: Path, progress: Progress
-) -> Pictures:
-    if not experiment.render.scenes:
-        return Pictures()
-    names = _shown(experiment, measured)
-    files = {m.settings.label: m.file for m in measured if m.settings.label in names}
-    with progress.stage("render") as report:
-        return render_all(experiment.render, lens, domain, files, folder, report)
+def _illumination(shown: Mapping[str, Measured], lens: Lens, domain: Domain, seed: int) -> dict[str, Illumination]:
+    """Curves of models by name; `seed` of the rays of the fit is avoided."""
 
+    def of(file: Path) -> Illumination:
+        predict = onnx_predictor(load_model(file))
+        return relative_illumination(lens, domain, predict, points=_LIT_RAYS, seed=seed + FRESH)
 
-def _illumination(measured: Sequence[Measured], lens: Lens, domain: Domain, seed: int) -> dict[str, Any]:
-    """Curves at full aperture for `illumination_plot`: film_radius_mm, exact, models (name to list).
-
-    Args:
-        seed: of the rays of the fit, which is avoided.
-    """
-    light: dict[str, Any] = {"film_radius_mm": [], "exact": [], "models": {}}
-    for m in measured:
-        predict = onnx_predictor(load_model(m.file))
-        curves = relative_illumination(lens, domain, predict, points=_LIT_RAYS, seed=seed + FRESH)
-        light["film_radius_mm"], light["exact"] = curves["film_radius_mm"], curves["exact"]
-        light["models"][m.settings.label] = curves["model"]
-    return light
-
-
-def _shown(experiment: Experiment, measured: Sequence[Measured]) -> tuple[str, ...]:
-    """Names of the models that are rendered and whose illumination is drawn."""
-    return experiment.render.models or best_models(measured)
+    return {name: of(m.file) for name, m in shown.items()}
 
 
 def best_models(measured: Sequence[Measured]) -> tuple[str, ...]:
@@ -202,11 +175,12 @@ def best_models(measured: Sequence[Measured]) -> tuple[str, ...]:
 
 
 def _draw(
-    lens: Lens, domain: Domain, measured: Sequence[Measured], timed: Race, light: dict[str, Any], folder: Path
+    pairs: RayPairs, measured: Sequence[Measured], timed: Race, light: Mapping[str, Illumination], folder: Path
 ) -> list[dict[str, Any]]:
-    """Plots of errors, the lens and its illumination; `light` as of `_illumination`."""
+    """Plots of errors, the lens and its illumination."""
+    lens, domain = pairs.lens, pairs.domain
     records = [m.record for m in measured]
-    exact = [timed.record(n) for n in ("exact eager", "exact compiled") if n in timed.ns]
+    exact = [timed.record(n) for n in EXACT if n in timed.ns]
     error = "rms_um" if any(r.get("rms_um") for r in records) else "direction_rms_deg"
     pareto_plot(records, folder / "pareto.png", exact=exact, error=error, title=f"{lens.name}: error against time")
     error_against_coefficients_plot(records, folder / "coefficients.png", error, title=f"{lens.name}: error, size")
@@ -216,7 +190,7 @@ def _draw(
         ("coefficients", "Error against coefficients", "Coefficients per vector output, A and B terms both counted."),
         ("layout", "The lens", "Rays of three fields, traced exactly."),
     ]
-    if light["models"]:
+    if light:
         illumination_plot(light, folder / "illumination.png", title=f"{lens.name}: relative illumination")
         texts.append(("illumination", "Relative illumination", "Of a uniform scene, full aperture, far focus."))
     return [{"file": f"{folder.name}/{stem}.png", "title": t, "caption": c} for stem, t, c in texts]
@@ -257,8 +231,6 @@ def versions() -> dict[str, str]:
     """Versions of the packages that a result depends on."""
     found = {"python": platform.python_version()}
     for name in _PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:
-            continue
     return found

@@ -13,19 +13,17 @@ from typing import Any
 
 from neurolens import __version__
 from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing, plain_log_ticks
-from neurolens.base.config import to_dict, to_toml
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text, fingerprint_of
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.candidates import model_candidate
+from neurolens.evaluate import pages
+from neurolens.evaluate.candidates import time_model
 from neurolens.evaluate.check import card_errors, errors_at, random_states
-from neurolens.evaluate.experiment import Experiment, keep_lens, relative_to
-from neurolens.evaluate.measure import known_record, note_record, seconds_to_load
+from neurolens.evaluate.experiment import Experiment, keep_inputs
+from neurolens.evaluate.measure import FRESH, known_record, note_record, seconds_to_load
 from neurolens.evaluate.records import plain
-from neurolens.evaluate.speed import race
 from neurolens.modelfile.axes import Axis
-from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.export import export_states
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.states import StateSpace
@@ -33,8 +31,6 @@ from neurolens.surrogates.states_fit import StateSettings, fit_states
 
 # States at which a model is measured for its card, and the rays of each (that pass).
 STATES, RAYS = 16, 8_000
-# Added to the seed of the fit's rays.
-_FRESH = 104729
 
 
 def state_settings(settings: ModelSettings, rays: int, seed: int) -> StateSettings:
@@ -55,24 +51,23 @@ def fit_and_measure_states(
     folder: Path,
     *,
     states: int = STATES,
-    report: Callable[[float], None] | None = None,
+    report: Callable[[float], None] = lambda done: None,
 ) -> dict[str, Any]:
     """Fit, export and measure one model, or take an existing one of the same settings and version from the folder.
 
     Errors are those of the exported float32 graph, in onnxruntime, at random states: the record's own are the worst.
     """
-    file, note = folder / f"{settings.label}.onnx", folder / f"{settings.label}.json"
+    file = folder / f"{settings.label}.onnx"
     fingerprint = _fingerprint(space, settings, states)
-    known = known_record(note, file, fingerprint)
+    known = known_record(file, fingerprint)
     if known is not None:
         return known
-    tell = report or (lambda _: None)
-    model = fit_states(space, settings, lambda done: tell(0.6 * done))
+    model = fit_states(space, settings, lambda done: report(0.6 * done))
     export_states(model, file)
     loaded, rows = load_model(file), []
-    for state in random_states(space.axes, states, settings.seed + _FRESH):
-        rows.append(errors_at(loaded, space, state, RAYS, settings.seed + _FRESH))
-        tell(0.6 + 0.4 * len(rows) / states)
+    for state in random_states(space.axes, states, settings.seed + FRESH):
+        rows.append(errors_at(loaded, space, state, RAYS, settings.seed + FRESH))
+        report(0.6 + 0.4 * len(rows) / states)
     errors = card_errors(rows, RAYS)
     export_states(model, file, errors)
     core = model.nodes[0].core
@@ -89,7 +84,7 @@ def fit_and_measure_states(
         "fit_s": model.fit_s,
         "load_s": seconds_to_load(file),
     }
-    note_record(note, file, fingerprint, record)
+    note_record(file, fingerprint, record)
     return record
 
 
@@ -105,12 +100,10 @@ def run_states(experiment: Experiment, folder: Path, *, progress: Progress, comm
     started, clock = datetime.now(UTC), time.perf_counter()
     models = folder / "models"
     models.mkdir(parents=True, exist_ok=True)
-    resolved = relative_to(experiment, folder)
-    atomic_write_text(folder / "config.toml", to_toml(resolved))
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
         space = experiment.states()
-        keep_lens(experiment, folder)
+        given = keep_inputs(experiment, folder)
         wanted = [m for m in experiment.model if m.method == "ols"]
         if not wanted:
             raise InputError("settings", "model", [m.label for m in experiment.model], 'a model of method "ols"')
@@ -121,14 +114,14 @@ def run_states(experiment: Experiment, folder: Path, *, progress: Progress, comm
                 records.append(fit_and_measure_states(space, settings, models, report=report))
         left_out = [m.label for m in experiment.model if m not in wanted]
     for record in records:
-        record["ns_per_ray"] = _time(folder / record["file"], record["name"])
+        record["ns_per_ray"] = time_model(load_model(folder / record["file"]), record["name"], rounds=8)
     states_plot({r["name"]: r["states"] for r in records}, space.axes[0], folder / "states.png")
     results = {
         "title": experiment.title,
         "command": command,
         "lens": {"name": space.lens.name, "file": Path(space.lens.path).name, "source": space.lens.source},
         "axes": [a.to_dict() for a in space.axes],
-        "settings": plain(to_dict(resolved)),
+        "settings": plain(given),
         "models": records,
         "seed": experiment.pairs.seed,
         "started": started.isoformat(timespec="seconds"),
@@ -141,15 +134,7 @@ def run_states(experiment: Experiment, folder: Path, *, progress: Progress, comm
     return results
 
 
-def _time(file: Path, name: str) -> Any:
-    model = load_model(file)
-    domain = Domain.from_dict(model.card["domain"])
-    return race([model_candidate(name, model, domain.stop_radius_mm)], domain, rounds=8).timing(name)
-
-
 def _page(results: Mapping[str, Any]) -> str:
-    from neurolens.evaluate import report as markup
-
     keys = ("rms_um", "p99_um", "direction_rms_deg", "false_pass", "false_block")
     names = [a["name"] for a in results["axes"]]
     rows = []
@@ -157,12 +142,12 @@ def _page(results: Mapping[str, Any]) -> str:
         for row in sorted(record["states"], key=lambda r: [r[n] for n in names]):
             cells = [record["name"], *(f"{row[n]:.5g}" for n in names)]
             rows.append([*cells, *("–" if row[k] is None else f"{row[k]:.3g}" for k in keys)])
-    head = "".join(f"<th>{markup.text(h)}</th>" for h in ("model", *names, *keys))
-    body = "".join("<tr>" + "".join(f"<td>{markup.text(c)}</td>" for c in row) + "</tr>" for row in rows)
-    title = markup.text(results["title"])
+    head = "".join(f"<th>{pages.text(h)}</th>" for h in ("model", *names, *keys))
+    body = "".join("<tr>" + "".join(f"<td>{pages.text(c)}</td>" for c in row) + "</tr>" for row in rows)
+    title = pages.text(results["title"])
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><h1>{title}</h1>'
-        f"<p>{markup.text(results['lens']['name'])}, one model of many states, at random states; rays not fitted."
+        f"<p>{pages.text(results['lens']['name'])}, one model of many states, at random states; rays not fitted."
         f'</p><p><img src="states.png" alt="error over the state" style="max-width:100%"></p>'
         f"<table border=1 cellpadding=4><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></html>\n"
     )

@@ -1,20 +1,15 @@
-"""Vignetting of a surrogate against the exact lens: rays passed or blocked in error, and relative illumination.
-
-False pass: rays that the model passes and the exact lens blocks, over the rays that the model passes. False block: rays
-that the model blocks and the exact lens passes, over the rays that the exact lens passes. Rays are uniform over the lit
-film and over the domain's pupil disc, which is that of all passing rays enlarged by 5%.
-"""
+"""Vignetting of a surrogate against the exact lens: rays passed or blocked in error, and relative illumination."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Protocol
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.evaluate.rays import Predict
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
@@ -26,18 +21,12 @@ ZONES = {"centre": (0.0, 1 / 3), "mid": (1 / 3, 2 / 3), "edge": (2 / 3, 1.0)}  #
 SEED = 104729  # unlikely as the seed of a fit's rays
 
 
-class Lit(Protocol):
-    """What `predict` gives for N rays: status [N], 0 where the ray passes, and transmittance [N]."""
-
-    @property
-    def status(self) -> Tensor: ...
-
-    @property
-    def transmittance(self) -> Tensor: ...
-
-
 def false_shares(exact_passes: Tensor, model_passes: Tensor) -> dict[str, float | None]:
-    """false_pass and false_block of [N] booleans; None where the denominator is empty."""
+    """false_pass and false_block of [N] booleans of rays uniform over the lit film and the domain's pupil disc.
+
+    False pass: rays that the model passes and the exact lens blocks, over those that the model passes. False block:
+    rays that the model blocks and the exact lens passes, over those that the exact lens passes. None over no rays.
+    """
     wrong_pass, wrong_block = model_passes & ~exact_passes, exact_passes & ~model_passes
     return {"false_pass": _share(wrong_pass, model_passes), "false_block": _share(wrong_block, exact_passes)}
 
@@ -62,35 +51,41 @@ def deciding_rim_ratio(lens: Lens, pairs: PairSet) -> Tensor:
     return largest
 
 
+@dataclass(frozen=True)
+class Illumination:
+    """Shares of the exact lens's value on the axis, by film radius.
+
+    Attributes:
+        film_radius_mm, exact, model: one value a radius.
+        max_difference: of the two.
+    """
+
+    film_radius_mm: list[float]
+    exact: list[float]
+    model: list[float]
+    max_difference: float
+
+
 def relative_illumination(
-    lens: Lens,
-    domain: Domain,
-    predict: Callable[[FilmRays, float | None], Lit],
-    *,
-    film_z_mm: float | None = None,
-    stop_radius_mm: float | None = None,
-    points: int = 16384,
-    rows: int = 17,
-    seed: int = SEED,
-) -> dict[str, Any]:
+    lens: Lens, domain: Domain, predict: Predict, *, points: int = 16384, rows: int = 17, seed: int = SEED
+) -> Illumination:
     """Film irradiance of a uniform environment by film radius, of the exact lens and of the model.
 
     The weight of a ray is T cos^4(theta) / Z^2 over the pupil disc, T the transmittance; wavelengths are uniform over
     the domain. Both curves are divided by the exact lens's value on the axis, so that a uniformly dark model is
-    visible.
+    visible. The film plane is the domain's nearest to the lens (its farthest focus), the stop the domain's.
 
     Args:
-        film_z_mm: film plane; None takes the domain's nearest to the lens (its farthest focus).
-        stop_radius_mm: None takes the domain's.
         points: rays per film radius, the same pupil points and wavelengths for all.
+        rows: film radii.
 
-    Returns: film_radius_mm, exact, model (lists of `rows`), max_difference (of the two, a share of the axis value).
+    Raises:
+        InputError: no ray passes on the axis.
     """
-    plane = domain.film_z_mm[0] if film_z_mm is None else film_z_mm
-    radius = domain.stop_radius_mm if stop_radius_mm is None else stop_radius_mm
+    radius = domain.stop_radius_mm
     stopped = lens.with_stop_radius(radius)
     sample = sample_domain(domain, points, seed)
-    film_z = torch.full_like(sample.film_z, plane)
+    film_z = torch.full_like(sample.film_z, domain.film_z_mm[0])
     radii = [domain.film_radius_mm * i / (rows - 1) for i in range(rows)]
     sums: tuple[list[float], list[float]] = ([], [])
     for r in radii:
@@ -98,17 +93,12 @@ def relative_illumination(
         start = camera_rays(rays.film_x, rays.film_y, film_z, rays.pupil_x, rays.pupil_y, domain.pupil_z_mm)
         with torch.no_grad():
             traced = trace(stopped, start, rays.wavelength_nm, transmittance=True)
-        said = predict(rays, radius)
-        assert traced.transmittance is not None
-        both = ((traced.status, traced.transmittance), (said.status, said.transmittance))
-        for values, (status, transmittance) in zip(sums, both, strict=True):
-            power = torch.where(status == st.PASSED, transmittance.to(torch.float64), 0.0)
+        for values, given in zip(sums, (traced, predict(rays, radius)), strict=True):
+            power = torch.where(given.status == st.PASSED, given.transmittance.to(torch.float64), 0.0)
             values.append(float((power * start.dz**4).sum()))  # one film plane and pupil plane: Z is the same for all
     on_axis = sums[0][0]
     if not on_axis > 0:
-        raise InputError(
-            lens.path, "domain", "(no ray passes on the axis)", "a lens that illuminates the centre of the film"
-        )
+        expected = "a lens that illuminates the centre of the film"
+        raise InputError(lens.path, "domain", "(no ray passes on the axis)", expected)
     exact, model = ([v / on_axis for v in values] for values in sums)
-    difference = max(abs(a - b) for a, b in zip(exact, model, strict=True))
-    return {"film_radius_mm": radii, "exact": exact, "model": model, "max_difference": difference}
+    return Illumination(radii, exact, model, max(abs(a - b) for a, b in zip(exact, model, strict=True)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neurolens.graph.program import Argument, Program, Step, is_per_call
+from neurolens.graph.program import Argument, Program, Step
 
 _HEAD = """\
 /*
@@ -76,6 +76,15 @@ _CLAMP = """
     return a.f;
 }}
 """
+# A cell of a table, whatever the index is: NaN is above nothing.
+_CELL = """
+{macro}_INLINE int {name}_cell(float index, int cells)
+{{
+    const float last = (float)(cells - 1);
+    const float inside = index < last ? index : last;
+    return (int)(inside > 0.0f ? inside : 0.0f);
+}}
+"""
 
 
 @dataclass(frozen=True)
@@ -83,32 +92,35 @@ class Signature:
     """Names of a written function.
 
     Attributes:
-        name: of the function. inputs: in order. outputs: floats in order, then status.
+        name: of the function. per_ray, per_call: inputs, in order.
+        outputs: floats in order; then comes status, where the program has one.
         bands: wavelengths of the coefficient tables; a function of several takes `band`, a number from 0.
+        tables: each is an array [cells, columns], which its number of cells follows, NAME_cells.
     """
 
     name: str
-    inputs: tuple[str, ...]
+    per_ray: tuple[str, ...]
+    per_call: tuple[str, ...]
     outputs: tuple[str, ...]
     bands: int = 1
+    tables: tuple[str, ...] = ()
+    status: bool = True
 
     @staticmethod
     def of(program: Program, name: str) -> Signature:
         """The inputs that a program names, in its order, and its outputs."""
-        steps = (program.steps[k] for k in program.live())
-        inputs = [s.name for s in steps if s.kind == "input"]
-        outputs = [o for o in program.outputs if o != "status"]
-        # What holds for a whole call goes last.
-        ordered = [i for i in inputs if not is_per_call(i)] + [i for i in inputs if is_per_call(i)]
-        return Signature(name, tuple(ordered), tuple(outputs), program.tables)
+        steps = [program.steps[k] for k in program.live()]
+        per_ray, per_call = (
+            tuple(s.name for s in steps if s.kind == "input" and s.per_call is whole) for whole in (False, True)
+        )
+        tables = tuple(dict.fromkeys(s.name for s in steps if s.kind == "lookup"))
+        outputs = tuple(o for o in program.outputs if o != "status")
+        return Signature(name, per_ray, per_call, outputs, program.tables, tables, "status" in program.outputs)
 
     @property
-    def per_ray(self) -> tuple[str, ...]:
-        return tuple(i for i in self.inputs if not is_per_call(i))
-
-    @property
-    def per_call(self) -> tuple[str, ...]:
-        return tuple(i for i in self.inputs if is_per_call(i))
+    def inputs(self) -> tuple[str, ...]:
+        """Numbers of one ray, then those of the whole call."""
+        return self.per_ray + self.per_call
 
 
 def write_c(program: Program, name: str, comment: Sequence[str]) -> str:
@@ -127,10 +139,16 @@ def write_c(program: Program, name: str, comment: Sequence[str]) -> str:
         text += _SQRT.format(name=name, macro=macro)
     if any(program.steps[k].kind == "clamp" for k in live):
         text += _CLAMP.format(name=name, macro=macro)
-    writer = Writer(program, f"{name}_sqrt", f"{macro}_FMA", clamp=f"{name}_clamp")
+    if any(program.steps[k].kind == "floor" for k in live):
+        text += "#include <math.h>\n"
+    if signature.tables:
+        text += _CELL.format(name=name, macro=macro)
+    lookup = f"{{table}}[{name}_cell({{index}}, {{table}}_cells) * {{width}} + {{place}}]"
+    writer = Writer(program, f"{name}_sqrt", f"{macro}_FMA", clamp=f"{name}_clamp", floor="floorf", lookup=lookup)
     body = [f"    const float t{k} = {writer.step(program.steps[k])};" for k in live if not _input(program, k)]
     results = [f"    ray.{o} = {writer.value(program.outputs[o].argument)};" for o in signature.outputs]
-    results.append(f"    ray.status = (int){writer.value(program.outputs['status'].argument)};")
+    if "status" in program.outputs:
+        results.append(f"    ray.status = (int){writer.value(program.outputs['status'].argument)};")
     if writer.table:
         rows = ",\n".join("    {" + ", ".join(literal(v) for v in row) + "}" for row in np.array(writer.table).T)
         text += f"\nstatic const float {name}_table[{program.tables}][{len(writer.table)}] = {{\n{rows}}};\n"
@@ -143,27 +161,30 @@ def _input(program: Program, k: int) -> bool:
 
 
 def _functions(s: Signature, macro: str, body: list[str], results: list[str]) -> str:
-    fields = "\n".join(f"    float {o};" for o in s.outputs)
+    fields = "\n".join([*(f"    float {o};" for o in s.outputs), *["    int status;"] * s.status])
     band = ["int band"] if s.bands > 1 else []
     guard = [f"    const int known = band >= 0 && band < {s.bands};", "    if (!known) band = 0;"] if band else []
     if band:
         results = [*results, "    if (!known) ray.status = 1;"]
-    one = ",\n    ".join([*(f"float {i}" for i in s.inputs), *band])
+    tables = [f"const float *{macro}_RESTRICT {t}, int {t}_cells" for t in s.tables]
+    one = ",\n    ".join([*(f"float {i}" for i in s.inputs), *tables, *band])
     many = ",\n    ".join(
         [
             "size_t count",
             *(f"const float *{macro}_RESTRICT {i}" for i in s.per_ray),
             *(f"float {i}" for i in s.per_call),
+            *tables,
             *band,
             *(f"float *{macro}_RESTRICT {o}" for o in s.outputs),
-            f"int *{macro}_RESTRICT status",
+            *[f"int *{macro}_RESTRICT status"] * s.status,
         ]
     )
-    given = ", ".join([*(f"{i}[i]" for i in s.per_ray), *s.per_call, *(["band"] if band else [])])
-    stores = "\n".join(f"        {o}[i] = ray.{o};" for o in (*s.outputs, "status"))
+    known = [*s.per_call, *(f"{t}, {t}_cells" for t in s.tables), *(["band"] if band else [])]
+    given = ", ".join([*(f"{i}[i]" for i in s.per_ray), *known])
+    stores = "\n".join(f"        {o}[i] = ray.{o};" for o in (*s.outputs, *["status"] * s.status))
     unused = "".join(f"    (void){i};\n" for i in s.inputs)
     return (
-        f"\ntypedef struct {{\n{fields}\n    int status;\n}} {s.name}_ray;\n"
+        f"\ntypedef struct {{\n{fields}\n}} {s.name}_ray;\n"
         f"\n{macro}_INLINE {s.name}_ray {s.name}(\n    {one})\n{{\n{unused}    {s.name}_ray ray;\n"
         + "\n".join([*guard, *body, *results])
         + "\n    return ray;\n}\n"
@@ -173,19 +194,94 @@ def _functions(s: Signature, macro: str, body: list[str], results: list[str]) ->
     )
 
 
+def padded_columns(columns: int) -> int:
+    """How many floats a group of columns of a table takes in compiled code: whole registers."""
+    return -(-columns // 8) * 8
+
+
+def write_blocks(program: Program, name: str) -> str:
+    """A function of arrays for a program with lookups, in three loops on what fits the first cache.
+
+    Compilers make vectors of the loops before and after the lookups; of lookups themselves they make none, or slow
+    ones. NAME(count, per_ray, per_call, table, cells, outputs, status) takes pointers in the order of the signature;
+    groups of the table's columns are padded to `padded_columns`.
+    """
+    before, lookups, after = program.around_lookups()
+    whole, first, last = (
+        Signature.of(p, f"{name}{part}") for p, part in ((program, ""), (before, "_before"), (after, "_after"))
+    )
+    columns, groups = lookups[0].columns, len(lookups[0].arguments) - 1
+    made = [*first.outputs, *(f"column_{c}" for c in range(columns))]
+    places = {row: f"in[{k}] + at" for k, row in enumerate(whole.per_ray)}
+    places |= {number: f"call[{k}]" for k, number in enumerate(whole.per_call)}
+    places |= {row: f"made[{k}]" for k, row in enumerate(made)}
+    width = padded_columns(columns)
+    terms = (f"made[{made.index(f'weight_{g}')}][i] * cell[{width * g} + c]" for g in range(groups))
+    loops = _BLOCKS.format(
+        name=name,
+        block=BLOCK,
+        made=len(made),
+        columns=columns,
+        width=width,
+        row=width * groups,
+        total=" + ".join(terms),
+        first=", ".join(places[row] for row in (*first.inputs, *first.outputs)),
+        last=", ".join(places[row] for row in last.inputs),
+        out="".join(f", out[{k}] + at" for k in range(len(whole.outputs))),
+        index=made.index("index"),
+        looked=made.index("column_0"),
+    )
+    text = write_c(before, first.name, ["Before the lookups."]) + write_c(after, last.name, ["After them."])
+    return text + _CELL.format(name=name, macro=last.name.upper()) + loops
+
+
+BLOCK = 256  # rays
+_BLOCKS = """
+void {name}(
+    size_t count, const float *const *in, const float *call, const float *table, int cells, float *const *out,
+    int *status)
+{{
+    float made[{made}][{block}], sums[{block}][{width}];
+    for (size_t at = 0; at < count; at += {block}) {{
+        const size_t n = count - at < {block} ? count - at : {block};
+        {name}_before_rays(n, {first});
+        for (size_t i = 0; i < n; i++) {{
+            const float *const cell = table + {row} * {name}_cell(made[{index}][i], cells);
+            for (int c = 0; c < {width}; c++)
+                sums[i][c] = {total};
+        }}
+        for (int c = 0; c < {columns}; c++)
+            for (size_t i = 0; i < n; i++)
+                made[{looked} + c][i] = sums[i][c];
+        {name}_after_rays(n, {last}{out}, status + at);
+    }}
+}}
+"""
+
+
 class Writer:
     """Steps as expressions of C, and of GLSL, which has the same ones.
 
     Args:
-        sqrt, fma, clamp: functions of those; without one its operations are written.
-        place: of the table's coefficient {}.
+        sqrt, fma, clamp, floor: functions of those; without one its operations are written.
+        place: of the table's coefficient {}. lookup: of a column of a table of the caller.
 
     Attributes:
         table: coefficients that differ between tables, each a row of one value a table, in the order of their use.
     """
 
-    def __init__(self, program: Program, sqrt: str, fma: str = "", place: str = "c[{}]", clamp: str = "") -> None:
+    def __init__(
+        self,
+        program: Program,
+        sqrt: str,
+        fma: str = "",
+        place: str = "c[{}]",
+        clamp: str = "",
+        floor: str = "floor",
+        lookup: str = "",
+    ) -> None:
         self.program, self.sqrt, self.fma, self.place, self.clamp = program, sqrt, fma, place, clamp
+        self.floor, self.lookup = floor, lookup
         self.table: list[tuple[float, ...]] = []
 
     def value(self, argument: Argument) -> str:
@@ -213,8 +309,15 @@ class Writer:
             return f"{self.clamp}({x}, {limit})" if self.clamp else f"max(min({x}, {limit}), -{limit})"
         if step.kind == "neg":
             return f"-({given[0]})"
-        if step.kind == "sqrt":
-            return f"{self.sqrt}({given[0]})"
+        if step.kind == "lookup":
+            width = step.columns * (len(given) - 1)
+            places = range(step.column, width, step.columns)
+            return " + ".join(
+                f"{weight} * {self.lookup.format(table=step.name, index=given[0], width=width, place=place)}"
+                for weight, place in zip(given[1:], places, strict=True)
+            )
+        if step.kind in ("sqrt", "floor"):
+            return f"{getattr(self, step.kind)}({given[0]})"
         return f"{self.fma}({', '.join(given)})" if self.fma else "{} * {} + {}".format(*given)
 
 

@@ -19,8 +19,9 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
 
 # -march=native takes what the machine has; the others let square roots and divisions become vectors, also where only
-# one side of a choice needs them. NaN and infinity stay what they are.
-FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math")
+# one side of a choice needs them. NaN and infinity stay what they are. A function put into its caller loses what is
+# known of its arguments, that arrays do not overlap; functions of single rays are marked to be put into theirs still.
+FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-inline")
 _SECONDS = 300  # the largest models known compile in ten
 _KEPT = 64  # libraries of 50 to 200 kB
 

@@ -298,6 +298,11 @@ def _series(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Mov
     return _times(d[0], y.graph.series(x[0], coefficients if len(coefficients) > 1 else [*coefficients, 0.0]))
 
 
+def _lookup(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
+    """Cells are those of an index that does not move."""
+    return None if d[2] is None else y.graph.lookup(x[0], x[1], d[2])[list(node.static)]
+
+
 def _product(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
     if x[0] == x[1]:
         return _times(d[0], x[0] * 2.0)
@@ -326,6 +331,7 @@ _RULES: dict[str, Rule] = {
     "affine": _affine,
     "quadratic": _quadratic,
     "series": _series,
+    "lookup": _lookup,
     "add": lambda node, y, x, d: _sum(d),
     "sub": lambda node, y, x, d: _sum([d[0], _minus(d[1])]),
     "mul": _product,

@@ -17,13 +17,15 @@ _HEAD = """\
  * may ignore NaN cannot promise the status of one: rays handed in must be numbers.
  */
 """
+# Tables of the caller are textures of one float a texel, a cell a line; NaN is less than nothing in no language.
+_LOOKUP = "texelFetch({table}, ivec2({place}, clamp(int({index}), 0, textureSize({table}, 0).y - 1)), 0).r"
 
 
 def write_glsl(program: Program, name: str, comment: Sequence[str]) -> str:
     """The text of a function; arguments as of `c.write_c`."""
     signature = Signature.of(program, name)
     lines = "\n".join(f" * {line}".rstrip() for line in comment).replace("*/", "* /")
-    writer = Writer(program, "sqrt", "", f"{name}_table[band_first + {{}}]")
+    writer = Writer(program, "sqrt", place=f"{name}_table[band_first + {{}}]", lookup=_LOOKUP)
     live = program.live()
     body = [f"    float t{k} = {writer.step(program.steps[k])};" for k in live if program.steps[k].kind != "input"]
     results = [f"    {o} = {writer.value(program.outputs[o].argument)};" for o in signature.outputs]
@@ -40,7 +42,8 @@ def write_glsl(program: Program, name: str, comment: Sequence[str]) -> str:
         first = f"    int band_first = {len(writer.table)} * clamp(band, 0, {signature.bands - 1});"
         body = [first, *body]
         results.append(f"    if (band < 0 || band >= {signature.bands}) status = 1;")
-    arguments = [*(f"in float {i}" for i in signature.inputs), *band]
+    tables = [f"in highp sampler2D {t}" for t in signature.tables]
+    arguments = [*(f"in float {i}" for i in signature.inputs), *tables, *band]
     arguments += [*(f"out float {o}" for o in signature.outputs), "out int status"]
     parameters = ",\n    ".join(arguments)
     return text + f"\nvoid {name}(\n    {parameters})\n{{\n" + "\n".join([*body, *results]) + "\n}\n"

@@ -23,7 +23,7 @@ def evaluate(graph: Graph, inputs: Mapping[str, Rows]) -> dict[str, Rows]:
 
     Args:
         inputs: by name, [R, N] or, of the call, [R, 1]: all numpy arrays or all torch tensors of one floating dtype.
-            Torch follows its gradients.
+            Torch follows its gradients. Tables [cells, columns] are read fastest where columns are contiguous.
 
     Raises:
         KeyError: an input that is missing.
@@ -36,7 +36,7 @@ def evaluate(graph: Graph, inputs: Mapping[str, Rows]) -> dict[str, Rows]:
         for number, node in enumerate(graph.nodes):
             if number in live:
                 given = [known[k] for k in node.inputs]
-                known[number] = inputs[node.name] if node.kind == "input" else _value(space, node, given)
+                known[number] = inputs[node.name] if node.name else _value(space, node, given)
     return {name: known[v.number] for name, v in graph.outputs.items()}
 
 
@@ -56,7 +56,7 @@ class _Space:
         library: Any = self.torch or np
         self.sqrt, self.tanh, self.where, self.ones_like = library.sqrt, library.tanh, library.where, library.ones_like
         self.maximum, self.minimum, self.clip = library.maximum, library.minimum, library.clip
-        self.concat = library.cat if self.torch else np.concatenate
+        self.floor, self.concat = library.floor, library.cat if self.torch else np.concatenate
 
     def numbers(self, array: NDArray[Any]) -> Rows:
         """Coefficients in the precision (and place) of the rays."""
@@ -120,6 +120,15 @@ def _series(space: _Space, node: Node, given: list[Rows]) -> Rows:
     return total
 
 
+def _lookup(space: _Space, node: Node, given: list[Rows]) -> Rows:
+    table, index = given[0].T, given[1][0]
+    whole = index.long() if space.torch else index.astype(np.intp)
+    found = table[:, space.clip(whole, 0, table.shape[1] - 1)] if space.torch else table.take(whole, 1, mode="clip")
+    weights = given[2]
+    groups = found.reshape(len(weights), -1, found.shape[1])[:, list(node.static)]
+    return functools.reduce(operator.add, (w * group for w, group in zip(weights, groups, strict=True)))
+
+
 def _between(space: _Space, node: Node, given: list[Rows]) -> Rows:
     low, high = (space.numbers(c[:, None]) for c in node.arrays[0].T)
     return space.cast((given[0] >= low) & (given[0] <= high))
@@ -142,6 +151,7 @@ _EACH: dict[str, Callable[..., Rows]] = {
     "sqrt": lambda s, a: s.sqrt(a),
     "tanh": lambda s, a: s.tanh(a),
     "abs": lambda s, a: abs(a),
+    "floor": lambda s, a: s.floor(a),
     "max": lambda s, a, b: s.maximum(a, b),
     "min": lambda s, a, b: s.minimum(a, b),
     "le": lambda s, a, b: s.cast(a <= b),
@@ -158,6 +168,7 @@ _WHOLE: dict[str, Callable[[_Space, Node, list[Rows]], Rows]] = {
     "quadratic": _quadratic,
     "polynomial": _polynomial,
     "series": _series,
+    "lookup": _lookup,
     "between": _between,
     "first_failure": _first_failure,
 }

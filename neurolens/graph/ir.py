@@ -4,14 +4,15 @@ A value has R rows and one column a ray, or one for the whole call (a film posit
 `polynomial`, `quadratic` and `series` stay whole and are lowered late: to matrix products and few passes over the rays
 for ONNX (`graph.onnx`), to fused multiply-adds for C and GLSL (`graph.scalars`). A new reader is one rule an operator:
 
-    input, constant             named rows of the caller; numbers
+    input, table, constant      named rows of the caller; a table of numbers of the caller; numbers
     take, concat                rows of a value; rows of several values below each other
     affine                      W x + b; W may be W0 + s W1 with s of the call, and rows may be added
     quadratic                   sums of products of two rows of x, plus constants
     polynomial                  W m with m the monomials of the rows of x
     series                      a polynomial in one row, lowest coefficient first
     add sub mul div max min     row by row; one row meets any number of rows
-    neg sqrt tanh abs clip      (clip between two numbers)
+    neg sqrt tanh abs floor clip (clip between two numbers)
+    lookup                      a weighted sum of parts of the row of a table at an index
     le between and select       truths: 1 where x <= y, and where low <= x <= high (0 for NaN); choice by a truth
     first_failure               the code of the first test that fails, 0 where none does
     whole                       a number as an integer
@@ -108,6 +109,9 @@ class Value:
     def abs(self) -> Value:
         return self.graph.each("abs", self)
 
+    def floor(self) -> Value:
+        return self.graph.each("floor", self)
+
     def maximum(self, other: Operand) -> Value:
         return self.graph.each("max", self, other)
 
@@ -168,6 +172,19 @@ class Graph:
 
     def input(self, name: str, rows: int = 1, *, per_call: bool = False) -> Value:
         return self.add("input", (), rows, name=name, per_call=per_call)
+
+    def table(self, name: str, columns: int) -> Value:
+        """Numbers [cells, columns] of the caller, for `lookup` alone."""
+        return self.add("table", (), columns, name=name, per_call=True)
+
+    def lookup(self, table: Value, index: Value, weights: Value) -> Value:
+        """The sum of weight g times group g of the columns of a table, in the cell of an index: interpolation.
+
+        The index's fraction is cut off. One beyond the table's ends, or NaN, takes some cell of the table: never
+        anything outside it. There are as many groups, of equally many columns, as weights.
+        """
+        rows = table.rows // weights.rows
+        return self.add("lookup", (table, index, weights), rows, static=tuple(range(rows)), per_call=False)
 
     def constant(self, value: ArrayLike) -> Value:
         """Numbers, one a row."""
@@ -279,7 +296,7 @@ class Graph:
 
     def like(self, node: Node, inputs: Sequence[Value]) -> Value:
         """Append the operation of a node of any graph."""
-        per_call = node.per_call if node.kind in ("input", "constant") else None
+        per_call = node.per_call if node.kind in ("input", "table", "constant", "lookup") else None
         return self.add(
             node.kind, inputs, node.rows, name=node.name, arrays=node.arrays, static=node.static, per_call=per_call
         )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import product
 
 Exponent = tuple[int, ...]
 Pair = tuple[Exponent, Exponent]
+Block = tuple[str, list[Exponent]]  # a name, and the monomials of its rows
 Made = tuple[Exponent, tuple[Exponent, Exponent] | None]  # a monomial and the two that it is the product of
 
 
@@ -87,3 +89,24 @@ def plan_products(exponents: list[Exponent], variables: int) -> dict[int, dict[E
                 queue = sorted([*queue, part], key=lambda e: (sum(e), e))
     levels = sorted({level_of(e) for e in parents})
     return {n: {e: pair for e, pair in parents.items() if level_of(e) == n} for n in levels}
+
+
+def by_block(blocks: Sequence[Block], pairs: dict[Exponent, Pair]) -> list[dict[Exponent, Pair]]:
+    """Products grouped by the blocks in which their two factors lie."""
+    home = {e: i for i, (_, known) in enumerate(blocks) for e in known}
+    groups: dict[tuple[int, int], dict[Exponent, Pair]] = {}
+    for e, (a, b) in sorted(pairs.items()):
+        groups.setdefault((home[a], home[b]), {})[e] = (a, b)
+    return list(groups.values())
+
+
+def blocks_alone(blocks: Sequence[Block]) -> int:
+    """How many blocks matrix products take one by one; the others are joined, where copying costs less."""
+    copy_row, one_product = 0.07, 1.2  # ns a ray, measured in onnxruntime (12 outputs)
+    best, alone = math.inf, 0
+    for first in range(len(blocks)):
+        rows = sum(len(known) for _, known in blocks[first:])
+        cost = one_product * first + (copy_row * rows if first < len(blocks) - 1 else 0.0)
+        if cost < best:
+            best, alone = cost, first
+    return alone

@@ -17,7 +17,7 @@ from onnx import ModelProto, NodeProto, TensorProto, checker, helper, numpy_help
 
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Node
-from neurolens.graph.monomials import Exponent, Pair, plan_products
+from neurolens.graph.monomials import Block, Exponent, Pair, blocks_alone, by_block, plan_products
 from neurolens.graph.passes import pruned, same_structure
 
 Array = NDArray[np.float64]
@@ -61,12 +61,12 @@ def write_onnx(
         raise InputError("export", "nodes", "(graphs that differ)", "models of one structure at every node")
     writer = _Writer(kept, mixing)
     body = writer.body(shapes or {})
-    inputs = {n.name: n for g in ([mixing.graph] if mixing else []) + [kept[0]] for n in g.nodes if n.kind == "input"}
+    inputs = {n.name: n for g in ([mixing.graph] if mixing else []) + [kept[0]] for n in g.nodes if n.name}
     ordered = sorted(inputs.values(), key=lambda n: (n.per_call, n.name == "state"))
     graph = helper.make_graph(
         body,
         "neurolens",
-        [helper.make_tensor_value_info(n.name, FLOAT, [n.rows] if n.per_call else [n.rows, "N"]) for n in ordered],
+        [helper.make_tensor_value_info(n.name, FLOAT, _shape(n)) for n in ordered],
         [helper.make_tensor_value_info(*info) for info in writer.results],
         writer.tensors,
     )
@@ -76,6 +76,13 @@ def write_onnx(
     helper.set_model_props(model, dict(metadata))
     checker.check_model(model, full_check=True)
     return model
+
+
+def _shape(node: Node) -> list[int | str]:
+    """Of an input or a table."""
+    if node.kind == "table":
+        return ["cells", node.rows]
+    return [node.rows] if node.per_call else [node.rows, "N"]
 
 
 @dataclass(frozen=True)
@@ -359,7 +366,7 @@ def _polynomial(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str
     units = [tuple(int(i == v) for i in range(variables)) for v in range(variables)]
     blocks = [(w.name(node.inputs[0]), units)]
     for level, pairs in plan_products(list(table), variables).items():
-        made = [_products(w, blocks, group) for group in _by_block(blocks, pairs)]
+        made = [_products(w, blocks, group) for group in by_block(blocks, pairs)]
         if level == 1:
             # Degrees 1 and 2 are the factors of all that follows: together they need one gather, not two.
             names, lists = zip(*blocks, *made, strict=True)
@@ -367,7 +374,9 @@ def _polynomial(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str
         else:
             blocks += made
     out, nothing = "", np.zeros(weight.shape[:2])
-    for name, known in _joined(w, blocks):
+    alone = blocks_alone(blocks)
+    names, lists = zip(*blocks[alone:], strict=True)
+    for name, known in [*blocks[:alone], (w.concat(names), [e for each in lists for e in each])]:
         part = np.stack([table.get(e, nothing) for e in known], axis=2)
         if not out:
             out = w.affine(part, name, table.get((0,) * variables, nothing))
@@ -435,8 +444,30 @@ def _first_failure(w: _Writer, number: int, node: Node, arrays: list[Array]) -> 
     return w.op("Max", *failed.values())
 
 
+def _lookup(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
+    """Whole cells are copied, then turned so that rays are the last axis: columns one by one take five times that."""
+    table, index = (w.name(k) for k in node.inputs[:2])
+    # onnxruntime refuses an index beyond the table.
+    last = w.op("Sub", w.op("Gather", w.op("Shape", table), w.const(0, np.int64)), w.const(1, np.int64))
+    whole = w.op("Cast", w.op("Squeeze", index, w.const([0], np.int64)), to=INT32)
+    cell = w.op("Clip", whole, w.const(0, np.int32), w.op("Cast", last, to=INT32))
+    rows = w.op("Transpose", w.op("Gather", table, cell, axis=0), perm=[1, 0])
+    columns, groups = (w.graphs[0].nodes[k].rows for k in (node.inputs[0], node.inputs[2]))
+    parts = w.op("Reshape", rows, w.const([groups, columns // groups, -1], np.int64))
+    weights = w.op("Reshape", w.name(node.inputs[2]), w.const([groups, 1, -1], np.int64))
+    # Summed by a product with ones: ReduceSum takes seven times as long.
+    flat = w.op("Reshape", w.op("Mul", parts, weights), w.const([groups, -1], np.int64))
+    total = w.op("MatMul", w.const(np.ones((1, groups))), flat)
+    total = w.op("Reshape", total, w.const([columns // groups, -1], np.int64))
+    wanted = list(node.static)
+    if wanted == list(range(columns // groups)):
+        return total
+    return w.op("Gather", total, w.const(wanted, np.int64), axis=0)
+
+
 _SIMPLE = {
     "add": "Add", "sub": "Sub", "mul": "Mul", "min": "Min", "neg": "Neg", "sqrt": "Sqrt", "tanh": "Tanh", "abs": "Abs",
+    "floor": "Floor",
     "le": "LessOrEqual", "and": "And", "select": "Where",
 }  # fmt: skip
 _RULES: dict[str, Callable[[_Writer, int, Node, list[Array]], str | _Linear | _Longer]] = {
@@ -453,33 +484,10 @@ _RULES: dict[str, Callable[[_Writer, int, Node, list[Array]], str | _Linear | _L
     "clip": _clip,
     "between": _between,
     "first_failure": _first_failure,
+    "table": lambda w, number, node, arrays: node.name,
+    "lookup": _lookup,
     "whole": lambda w, number, node, arrays: w.op("Cast", w.name(node.inputs[0]), to=INT32),
 }
-
-
-Block = tuple[str, list[Exponent]]
-
-
-def _by_block(blocks: list[Block], pairs: dict[Exponent, Pair]) -> list[dict[Exponent, Pair]]:
-    """Products grouped by the blocks in which their two factors lie."""
-    home = {e: i for i, (_, known) in enumerate(blocks) for e in known}
-    groups: dict[tuple[int, int], dict[Exponent, Pair]] = {}
-    for e, (a, b) in sorted(pairs.items()):
-        groups.setdefault((home[a], home[b]), {})[e] = (a, b)
-    return list(groups.values())
-
-
-def _joined(w: _Writer, blocks: list[Block]) -> list[Block]:
-    """Blocks as the matrix products take them: joined where copying them costs less than another product."""
-    copy_row, product = 0.07, 1.2  # ns a ray, measured in onnxruntime (12 outputs)
-    best, cut = math.inf, 0
-    for first in range(len(blocks)):  # blocks before `first` stay alone, the others become one
-        rows = sum(len(known) for _, known in blocks[first:])
-        cost = product * first + (copy_row * rows if first < len(blocks) - 1 else 0.0)
-        if cost < best:
-            best, cut = cost, first
-    names, lists = zip(*blocks[cut:], strict=True)
-    return [*blocks[:cut], (w.concat(names), [e for known in lists for e in known])]
 
 
 def _products(w: _Writer, blocks: list[Block], pairs: dict[Exponent, Pair]) -> Block:

@@ -32,6 +32,9 @@ def live_rows(graph: Graph, outputs: Mapping[str, Value]) -> dict[int, set[int]]
                 if mine:
                     ask(k, mine)
                 start = end
+        elif node.kind == "lookup":
+            for k in node.inputs:
+                ask(k, range(graph.nodes[k].rows))
         elif node.kind in ("affine", "polynomial", "quadratic", "first_failure"):
             for k in node.inputs[:1] if node.kind == "affine" else node.inputs:
                 ask(k, range(graph.nodes[k].rows))
@@ -66,8 +69,8 @@ def pruned(graph: Graph, outputs: Mapping[str, Value] | None = None) -> Graph:
         if number not in live:
             continue
         every, rows = list(range(node.rows)), sorted(live[number])
-        if node.kind == "input":
-            place[number], kept[number] = found.input(node.name, node.rows, per_call=node.per_call), every
+        if node.kind in ("input", "table"):
+            place[number], kept[number] = found.like(node, ()), every
             continue
         kept[number] = rows
         if node.kind == "constant":
@@ -104,6 +107,9 @@ def _kept_rows(found: Graph, graph: Graph, node: Node, rows: list[int], rows_of:
         if node.kind == "quadratic":
             static = tuple(node.static[r] for r in rows)
         return found.add(node.kind, inputs, len(rows), arrays=arrays, static=static)
+    if node.kind == "lookup":
+        static = tuple(node.static[r] for r in rows)
+        return found.add(node.kind, [whole(k) for k in node.inputs], len(rows), static=static, per_call=False)
     if node.kind == "first_failure":
         return found.add(node.kind, [whole(k) for k in node.inputs], 1, static=node.static)
     arrays = [a[rows] if node.kind == "between" else a for a in node.arrays]

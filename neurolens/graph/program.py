@@ -7,7 +7,7 @@ program (one table, unless several wavelengths are fixed), so that all tables sh
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.base.errors import InputError
 
 # select(a, b, x, y) is x where a <= b, else y; so NaN in a or b gives y. clamp(x, limit) is x within -limit and limit,
-# at the one on its side beyond; NaN becomes one of the two (not in GLSL). Its limit is a number above 0.
+# at the one on its side beyond; NaN becomes one of the two (not in GLSL). Its limit is a number above 0. lookup(index,
+# weights ...) is the sum of each weight times its group's column of a table, in the cell at the index (`Graph.lookup`).
 KINDS = {
-    "neg": 1, "add": 2, "sub": 2, "mul": 2, "div": 2, "sqrt": 1, "max": 2, "min": 2, "clamp": 2, "fma": 3, "select": 4,
+    "neg": 1, "add": 2, "sub": 2, "mul": 2, "div": 2, "sqrt": 1, "floor": 1, "max": 2, "min": 2, "clamp": 2, "fma": 3,
+    "select": 4,
 }  # fmt: skip
 
 # Names of the rows of what a lens is given and gives: millimetres and nanometres, lens frame.
@@ -27,7 +29,7 @@ FILM_X_Y, WAVELENGTH = RAY[:2], "wavelength_nm"
 FILM_Z, STOP_RADIUS = "film_z_mm", "stop_radius_mm"  # for a whole call
 SCENE_RAY = ("x_mm", "y_mm", "z_mm", "dx", "dy", "dz")
 TRANSMITTANCE, STOP, STATUS = "transmittance", ("stop_x_mm", "stop_y_mm"), "status"
-_ROWS = {"rays": (*RAY, WAVELENGTH), "scene_ray": SCENE_RAY, "stop_xy_mm": STOP}
+_ROWS = {"rays": (*RAY, WAVELENGTH), "film_mm": FILM_X_Y, "scene_ray": SCENE_RAY, "stop_xy_mm": STOP}
 
 # tanh x = x P(x^2) / Q(x^2) on [-9.02, 9.02], beyond which float32 has 1: the rational function of these degrees of
 # least relative error (2.1e-8), by reweighted least squares. Evaluated in float32 the error is at most 3.1e-7.
@@ -49,18 +51,21 @@ def row_names(name: str, rows: int) -> tuple[str, ...]:
     return (name,) if rows == 1 else tuple(f"{name}_{k}" for k in range(rows))
 
 
-def is_per_call(name: str) -> bool:
-    """Whether an input is one number for all rays of a call."""
-    return name in (FILM_Z, STOP_RADIUS)
-
-
 @dataclass(frozen=True)
 class Step:
-    """One assignment: an operation of `KINDS`, or "input" with its name in `name`."""
+    """One assignment: an operation of `KINDS`, or "input".
+
+    Attributes:
+        name: of an input, or of the table that a lookup reads. per_call: whether an input is one number for all rays.
+        column, columns: of each group of the table's columns, and how many these are.
+    """
 
     kind: str
     arguments: tuple[Argument, ...]
     name: str = ""
+    per_call: bool = False
+    column: int = 0
+    columns: int = 0
 
 
 @dataclass(frozen=True)
@@ -102,6 +107,7 @@ _FOLDED: dict[str, Callable[..., Any]] = {
     "mul": lambda a, b: a * b,
     "div": lambda a, b: a / b,
     "sqrt": np.sqrt,
+    "floor": np.floor,
     "max": np.maximum,
     "min": np.minimum,
     "clamp": lambda x, limit: np.where(np.abs(x) < limit, x, np.copysign(limit, x)),
@@ -123,8 +129,13 @@ class Program:
     outputs: dict[str, Expr] = field(default_factory=dict)
     _known: dict[Step, int] = field(default_factory=dict)
 
-    def input(self, name: str) -> Expr:
-        return self._append(Step("input", (), name))
+    def input(self, name: str, per_call: bool = False) -> Expr:
+        return self._append(Step("input", (), name, per_call))
+
+    def lookup(self, table: str, columns: int, column: int, index: Expr, weights: Sequence[Expr]) -> Expr:
+        """A column of groups of so many, in the cell of an index: the sum over the groups."""
+        arguments = (index.argument, *(w.argument for w in weights))
+        return self._append(Step("lookup", arguments, table, column=column, columns=columns))
 
     def literal(self, value: ArrayLike) -> Expr:
         """A number, or one for each table.
@@ -242,9 +253,43 @@ class Program:
 
         found = Program(self.tables)
         for step in (self.steps[k] for k in order):
-            found._append(Step(step.kind, tuple(moved(a) for a in step.arguments), step.name))
+            found._append(replace(step, arguments=tuple(moved(a) for a in step.arguments)))
         found.outputs = {name: Expr(found, moved(e.argument)) for name, e in self.outputs.items()}
         return found
+
+    def around_lookups(self) -> tuple[Program, list[Step], Program]:
+        """The steps that lookups need, the lookups, and the steps after them, which take what was made as inputs.
+
+        The first has outputs `index`, `weight_0` ..., and `step_K` that the last takes; of lookups it takes `column_C`.
+
+        Raises:
+            ValueError: no lookups, or others than columns of one table at one index.
+        """
+        live = self.live()
+        lookups = [self.steps[k] for k in live if self.steps[k].kind == "lookup"]
+        if len({(s.name, s.arguments) for s in lookups}) != 1:
+            raise ValueError("lookups: expected columns of one table at one index")
+        index, *weights = (Expr(self, a) for a in lookups[0].arguments)
+        before = replace(self, outputs={"index": index} | {f"weight_{g}": w for g, w in enumerate(weights)})
+        early = set(before.live())
+        late = [self.steps[k] for k in live if k not in early]
+        taken = {a for step in late if step.kind != "lookup" for a in step.arguments}
+        taken |= {e.argument for e in self.outputs.values()}
+        kept = [k for k in live if k in early & taken and self.steps[k].kind != "input"]
+        before.outputs |= {f"step_{k}": Expr(self, k) for k in kept}
+        after, place = Program(self.tables), dict[int, Expr]()
+        for k in (k for k in live if k not in early or k in kept or self.steps[k].kind == "input"):
+            step = self.steps[k]
+            if step.kind == "lookup" or k in kept:
+                place[k] = after.input(f"step_{k}" if k in kept else f"column_{step.column}")
+            else:
+                arguments = tuple(place[a].argument if isinstance(a, int) else a for a in step.arguments)
+                place[k] = after._append(replace(step, arguments=arguments))
+        after.outputs = {
+            name: place[e.argument] if isinstance(e.argument, int) else Expr(after, e.argument)
+            for name, e in self.outputs.items()
+        }
+        return before, lookups, after
 
     def count(self) -> dict[str, int]:
         """Operations by kind: the floor of the work."""
@@ -252,7 +297,11 @@ class Program:
         return {kind: kinds.count(kind) for kind in sorted(set(kinds) - {"input"})}
 
     def evaluate(self, inputs: Mapping[str, ArrayLike], table: int = 0) -> dict[str, NDArray[np.float32]]:
-        """Results in float32, step by step as the written sources have them (fma rounds once)."""
+        """Results in float32, step by step as the written sources have them (fma rounds once).
+
+        Args:
+            inputs: rows [N] by their names, and tables [cells, columns].
+        """
         found: dict[int, NDArray[np.float32]] = {}
 
         def value(argument: Argument) -> NDArray[np.float32]:
@@ -265,6 +314,13 @@ class Program:
                     found[k] = np.asarray(inputs[step.name], dtype=np.float32)
                     continue
                 given = [value(a) for a in step.arguments]
+                if step.kind == "lookup":
+                    groups = np.asarray(inputs[step.name], np.float32)[:, step.column :: step.columns].T
+                    cell = np.asarray(given[0]).astype(np.intp)
+                    found[k] = sum(
+                        w * group.take(cell, mode="clip") for w, group in zip(given[1:], groups, strict=True)
+                    )
+                    continue
                 if step.kind == "fma":  # the product is exact in float64
                     given = [g.astype(np.float64) for g in given]
                 found[k] = np.asarray(_FOLDED[step.kind](*given), dtype=np.float32)

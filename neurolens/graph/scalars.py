@@ -99,7 +99,7 @@ def _input(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Arra
     if node.name in at.fixed:
         return [at.program.literal(v) for v in np.atleast_1d(np.asarray(at.fixed[node.name], np.float64))]
     # An input without a use is no argument: steps are appended when something takes them.
-    return [at.program.input(name) for name in row_names(node.name, node.rows)]
+    return [at.program.input(name, node.per_call) for name in row_names(node.name, node.rows)]
 
 
 def _affine(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
@@ -186,6 +186,12 @@ def _clip(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array
     return [at.program.op("min", at.program.op("max", x, low), high) for x in given[0]]
 
 
+def _lookup(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
+    table = at.graphs[0].nodes[node.inputs[0]]
+    columns, (index,), weights = table.rows // len(given[2]), *given[1:]
+    return [at.program.lookup(table.name, columns, column, index, weights) for column in node.static]
+
+
 def _first_failure(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
     status = at.program.literal(0.0)
     for k in range(len(node.static) - 1, -1, -1):
@@ -205,4 +211,6 @@ _RULES: dict[str, Callable[[_Lowering, Node, list[Any], list[Array]], list[Any]]
     "series": _series,
     "between": _between,
     "first_failure": _first_failure,
+    "table": lambda at, node, given, arrays: [],
+    "lookup": _lookup,
 }

@@ -16,10 +16,9 @@ DEFAULT_VARIANT = "llvm_ad_spectral"
 
 
 def libraries() -> tuple[Any, Any]:
-    """The modules mitsuba and drjit; untyped, as the attributes of Mitsuba depend on its variant.
+    """The modules mitsuba and drjit, untyped: what Mitsuba has depends on its variant.
 
-    Raises:
-        NeurolensError: they are not installed.
+    NeurolensError: they are not installed.
     """
     try:
         return importlib.import_module("mitsuba"), importlib.import_module("drjit")

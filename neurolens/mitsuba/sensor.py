@@ -190,11 +190,7 @@ def _initialise(self: Any, props: Any, camera: Camera | None = None) -> None:
 
 
 def _camera_of(props: Any, shape: float) -> Camera:
-    """The camera that a scene's parameters describe, for a picture of `shape`, its height over its width.
-
-    Raises:
-        InputError, ModelError: as `make_camera`.
-    """
+    """The camera that a scene's parameters describe, for a picture of `shape`, its height over its width."""
     width_mm = _number_of(props, "film_width_mm", FILM_WIDTH_MM)
     height_mm = _number_of(props, "film_height_mm", width_mm * shape)
     name = props.get("camera", None)

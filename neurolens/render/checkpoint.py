@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from neurolens import __version__
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path
+from neurolens.base.files import atomic_path, fingerprint_of
 from neurolens.cameras.contract import Camera
-from neurolens.render.film import Film, FilmSettings, Tiling
+from neurolens.render.film import CHUNK_BYTES, Film, FilmSettings, Tiling
 from neurolens.render.job import Job
 from neurolens.render.mesh import tracer
 
@@ -34,7 +34,7 @@ from neurolens.render.mesh import tracer
 _NO_MATTER = ("model", "notes")
 _NOTHING = "(nothing)"  # a place that one of two identities lacks
 _PROBES, _DIGITS = 1024, 16
-_FORMAT = 2
+_FORMAT = 3
 _ABOUT, _SUMS, _DONE = "about.json", "sums.npy", "done.npy"
 SPENT = ("seconds", "camera_thread_seconds", "thread_seconds")
 _LARGEST_ABOUT = 8 << 20
@@ -57,15 +57,8 @@ def identity(job: Job) -> dict[str, Any]:
         "neurolens": __version__,
         "scene": digest(bare),
         "camera": {"name": camera.name, **kept, "rays": _rays(camera)},
-        "width": job.grid.width,
-        "height": job.grid.height,
         "film_mm": list(job.grid.film_mm),
-        "seed": job.seed,
-        "max_depth": job.max_depth,
-        "wavelengths": job.settings.wavelengths,
-        "wavelength_sampling": job.settings.wavelength_sampling,
-        "white_balance": job.settings.white_balance,
-        "differentials": job.differentials,
+        **job.asked(),
     }
     if scene.triangles:
         told["meshes traced by"] = tracer()
@@ -83,34 +76,20 @@ def _leaves(tree: Any, place: str = "") -> dict[str, Any]:
 
 def digest(value: Any) -> str:
     """Hexadecimal digest of a value made of dataclasses, mappings, sequences, arrays and plain values."""
-    hasher = hashlib.sha256()
-    _feed(hasher, value)
-    return hasher.hexdigest()[:_DIGITS]
+    return fingerprint_of([_plain(value)])[:_DIGITS]
 
 
-def _feed(hasher: Any, value: Any) -> None:
-    """Every part is preceded by its type and length, so that different values never give the same bytes."""
+def _plain(value: Any) -> Any:
+    """The value for JSON, every part with its type, so that different values never give the same text."""
     if isinstance(value, np.ndarray):
-        hasher.update(f"array {value.dtype.str} {value.shape};".encode())
-        hasher.update(np.ascontiguousarray(value).data)
-    elif isinstance(value, Mapping):
-        hasher.update(f"mapping {len(value)};".encode())
-        for key in sorted(value, key=str):
-            _feed(hasher, str(key))
-            _feed(hasher, value[key])
-    elif isinstance(value, (tuple, list)):
-        hasher.update(f"sequence {len(value)};".encode())
-        for item in value:
-            _feed(hasher, item)
-    elif is_dataclass(value):
-        _feed(hasher, type(value).__name__)
-        _feed(hasher, {field.name: getattr(value, field.name) for field in fields(value)})
-    elif hasattr(value, "__dict__"):
-        _feed(hasher, type(value).__name__)
-        _feed(hasher, vars(value))
-    else:
-        text = repr(value)
-        hasher.update(f"{type(value).__name__} {len(text)} {text};".encode())
+        return [value.dtype.str, value.shape, hashlib.sha256(np.ascontiguousarray(value).data).hexdigest()]
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    if is_dataclass(value):
+        return [type(value).__name__, {field.name: _plain(getattr(value, field.name)) for field in fields(value)}]
+    return f"{type(value).__name__} {value!r}"
 
 
 def _rays(camera: Camera) -> str:
@@ -167,30 +146,26 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
             members = {info.filename: info for info in archive.infolist()}
             stored = all(i.compress_type == zipfile.ZIP_STORED and not i.flag_bits & 1 for i in members.values())
             if sorted(members) != sorted((_ABOUT, _SUMS, _DONE)) or not stored:
-                raise _corrupt(path, "other contents")
+                raise ValueError("other contents")
             if members[_ABOUT].file_size > _LARGEST_ABOUT:
-                raise _corrupt(path, "settings too long")
+                raise ValueError("settings too long")
             about = json.loads(archive.read(_ABOUT))
             _check_render(path, about, identity)
             _check_tiling(path, about, film.tiling)
             done = np.empty_like(film.done)
-            _fill(path, archive, members[_DONE], done)
+            _fill(archive, members[_DONE], done)
             _check_samples(path, about["samples"], film.tiling, done)
-            _fill(path, archive, members[_SUMS], film.sums)
+            _fill(archive, members[_SUMS], film.sums)
             film.done[:] = done
             return {name: float(value) for name, value in about["spent"].items()}
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(path, "file", "(missing)", "a checkpoint of this render") from None
-    except (zipfile.BadZipFile, ValueError, KeyError, TypeError, AttributeError, EOFError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise _corrupt(path, str(error) or type(error).__name__) from None
-    except (NotImplementedError, RuntimeError) as error:  # raised by zipfile for features that are never written here
-        raise _corrupt(path, str(error)) from None
-
-
-def _corrupt(path: Path, why: str) -> InputError:
-    return InputError(path, "file", f"({why})", f"a whole checkpoint of a render, {_AGAIN}")
+    # RuntimeError: deep JSON, and features of zip that are never written here.
+    except (zipfile.BadZipFile, ValueError, KeyError, TypeError, AttributeError, EOFError, RuntimeError) as error:
+        why = str(error) or type(error).__name__
+        raise InputError(path, "file", f"({why})", f"a whole checkpoint of a render, {_AGAIN}") from None
 
 
 def _check_render(path: Path, about: dict[str, Any], identity: dict[str, Any]) -> None:
@@ -212,10 +187,10 @@ def _short(value: Any) -> str:
 def _check_tiling(path: Path, about: dict[str, Any], tiling: Tiling) -> None:
     """Tiles and passes must be the same; only below 16 samples they depend on the number of samples."""
     if not isinstance(about["samples"], int) or not 1 <= about["samples"] < 1 << 31:
-        raise _corrupt(path, f"{about['samples']} samples")
+        raise ValueError(f"{about['samples']} samples")
     spent = about["spent"]
     if set(spent) != set(SPENT) or not all(0 <= float(value) < math.inf for value in spent.values()):
-        raise _corrupt(path, "impossible times")
+        raise ValueError("impossible times")
     if (about["tile"], about["step"]) != (tiling.tile, tiling.step):
         expected = f"{tiling.samples} as asked now: below {max(tiling.step, about['step'])} samples none can be added"
         raise InputError(path, "samples", about["samples"], f"{expected}; give the same, {_AGAIN}")
@@ -224,7 +199,7 @@ def _check_tiling(path: Path, about: dict[str, Any], tiling: Tiling) -> None:
 def _check_samples(path: Path, samples: int, tiling: Tiling, done: NDArray[np.int64]) -> None:
     """The passes of every tile must be a part of the requested ones."""
     if done.min() < 0 or done.max() > -(-samples // tiling.step):
-        raise _corrupt(path, "impossible numbers of passes")
+        raise ValueError("impossible numbers of passes")
     had, counts = np.minimum(done * tiling.step, samples), tiling.samples_done(done)
     if np.array_equal(had, counts):
         return
@@ -241,19 +216,18 @@ def _header(array: NDArray[Any]) -> bytes:
     return out.getvalue()
 
 
-def _fill(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, array: NDArray[Any]) -> None:
+def _fill(archive: zipfile.ZipFile, info: zipfile.ZipInfo, array: NDArray[Any]) -> None:
     """Read a member into an array of exactly its size and type; anything else is refused before memory is used."""
     header = _header(array)
     if info.file_size != len(header) + array.nbytes:
-        raise _corrupt(path, f"{info.filename} of {info.file_size} bytes")
+        raise ValueError(f"{info.filename} of {info.file_size} bytes")
     with archive.open(info) as member:
         if member.read(len(header)) != header:
-            raise _corrupt(path, f"{info.filename} of another shape or type")
-        memory, place = array.reshape(-1).data.cast("B"), 0
-        while place < len(memory):
-            got = member.readinto(memory[place : place + (1 << 24)])  # type: ignore[attr-defined]
-            if not got:
+            raise ValueError(f"{info.filename} of another shape or type")
+        memory = array.reshape(-1).data.cast("B")
+        for start in range(0, len(memory), CHUNK_BYTES):
+            part = memory[start : start + CHUNK_BYTES]
+            if member.readinto(part) != len(part):  # type: ignore[attr-defined]
                 raise EOFError("it ends too early")
-            place += got
         if member.read(1):
-            raise _corrupt(path, f"{info.filename} too long")
+            raise ValueError(f"{info.filename} too long")

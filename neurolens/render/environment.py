@@ -139,7 +139,7 @@ class Surroundings(LightGroup):
         self.dark = self._table is None and not palette.means(rows[:1]).any()
 
     def radiance(self, direction: FloatArray, bins: Index) -> FloatArray:
-        """Radiance [..., N] along unit directions [3, N] at wavelength bins [N]."""
+        """Radiance [lanes, N] along unit directions [3, N] at wavelength bins [N]."""
         spectra = [self._palette.look_up(np.full(len(bins), row), bins) for row in self._rows]
         if self._coefficients is None:
             return spectra[0]

@@ -28,6 +28,7 @@ WAVELENGTH_MODES: tuple[str, ...] = get_args(WavelengthMode)
 WAVELENGTH_SAMPLINGS: tuple[str, ...] = get_args(WavelengthSampling)
 
 FORKS = sys.platform.startswith("linux")
+CONTEXT: Any = multiprocessing.get_context("fork" if FORKS else None)
 BATCH = 32768  # paths; fewer, and calling numpy costs more than computing; many more, and their state leaves the cache
 SAMPLES_A_PASS = 16
 CHUNK_BYTES = 16 << 20  # of the sums that are copied at a time
@@ -95,11 +96,7 @@ class PixelGrid:
 
 
 def check_memory(width: int, height: int) -> None:
-    """Refuse a picture that is too large before memory is allocated.
-
-    Raises:
-        InputError: its film alone would fill the machine.
-    """
+    """Refuse (InputError) a picture whose film alone would fill the machine, before memory is allocated."""
     try:
         most = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):
@@ -109,17 +106,8 @@ def check_memory(width: int, height: int) -> None:
         raise InputError("picture", "width x height", (width, height), expected)
 
 
-def fork_context() -> Any:
-    """The multiprocessing context: fork on Linux."""
-    return multiprocessing.get_context("fork" if FORKS else None)
-
-
 def shared(shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
-    """Zeros that forked workers share.
-
-    Raises:
-        MemoryError: not enough memory.
-    """
+    """Zeros that forked workers share; MemoryError where there is not enough of it."""
     size = int(np.prod(shape, dtype=np.float64)) * np.dtype(dtype).itemsize
     try:
         return np.frombuffer(mmap.mmap(-1, size), dtype).reshape(shape)
@@ -185,7 +173,7 @@ class Film:
         self.tiling = tiling
         self.sums = shared((tiling.pixels, COLUMNS), np.float64)
         self.done = shared((tiling.tiles,), np.int64)
-        self.lock = fork_context().Lock()
+        self.lock = CONTEXT.Lock()
 
     def add(self, tile: int, sums: NDArray[np.float64]) -> None:
         """Add one pass to a tile."""
@@ -195,11 +183,7 @@ class Film:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Block changes of all tiles inside the block.
-
-        Raises:
-            NeurolensError: the lock is not released, as a worker was killed while it held it.
-        """
+        """Block changes of all tiles inside the block; NeurolensError where a worker was killed that held the lock."""
         if not self.lock.acquire(timeout=_LONGEST_WAIT_S):
             raise NeurolensError("a render worker was killed while it wrote to the film")
         try:

@@ -66,10 +66,9 @@ def daylight_weights(x: FloatArray64, y: FloatArray64) -> FloatArray64:
 
 
 def check_spectrum(file: Path, field: str, rows: Sequence[Sequence[float]], most: float | None = None) -> Spectrum:
-    """The rows (nm, value) as two arrays: scaled to the largest value 1, or with `most` as they are and at most that.
+    """Rows (nm, value) as two arrays: scaled to the largest value 1, or with `most` as they are and at most that.
 
-    Raises:
-        InputError: names the row at fault.
+    An InputError names the row at fault.
     """
     if not 2 <= len(rows) <= _MOST_ROWS:
         raise InputError(file, field, f"({len(rows)} rows)", f"2 to {_MOST_ROWS} rows of nm, value")
@@ -147,11 +146,7 @@ def illuminant(name: str, measured: Mapping[str, Spectrum] | None = None) -> Spe
 
 
 def check_name(file: str | Path, field: str, name: str, measured: Mapping[str, object]) -> None:
-    """Refuse an unknown name of a spectrum.
-
-    Raises:
-        InputError: names file, field and what is known.
-    """
+    """Refuse an unknown name of a spectrum; the InputError says what is known."""
     if name in measured or illuminant(name) is not None:
         return
     known = [*CIE_NAMES, *measured]

@@ -32,8 +32,8 @@ class Paths:
     """The paths still alive.
 
     Attributes:
-        origin, direction: [3, N] of their rays. throughput: [N], or [lanes, N] where a path carries several
-            wavelengths, the hero first. bins: [N] wavelength bin, of the hero.
+        origin, direction: [3, N] of their rays. throughput: [lanes, N], of the wavelengths of a path, the hero first.
+        bins: [N] wavelength bin, of the hero.
         slot: [N] place in the batch.
         density: [N] per solid angle with which the ray's direction was chosen.
         alone: [N] whether the other lanes have left the hero, bent another way.
@@ -55,15 +55,12 @@ class Paths:
 
 
 def lit(value: FloatArray | NDArray[np.bool_]) -> Index:
-    """Where a number [N], or any lane of [lanes, N], is not 0."""
-    return np.flatnonzero(value if value.ndim == 1 else value.any(axis=0))
+    """Where any lane of numbers [lanes, N] is not 0."""
+    return np.flatnonzero(value.any(axis=0))
 
 
 def deposit(radiance: FloatArray, slot: Index, value: FloatArray) -> None:
-    """Add values [..., n] to the slots [n] of a batch, none of which occurs twice."""
-    if radiance.ndim == 1:
-        radiance[slot] += value
-        return
+    """Add values [lanes, n] to the slots [n] of a batch, none of which occurs twice."""
     for lane, part in zip(radiance, value, strict=True):
         lane[slot] += part
 
@@ -114,7 +111,7 @@ class Vertex:
         coat = world.palette.look_up(world.specular_row.take(surface), self.paths.bins[g])
         table, row = world.coat, world.coat_row.take(surface)
         out = -self.paths.direction[:, g]
-        return GlossyLobes(self.shading[:, g], out, self.base[..., g], coat, world.alpha.take(surface), table, row)
+        return GlossyLobes(self.shading[:, g], out, self.base[:, g], coat, world.alpha.take(surface), table, row)
 
     def _absorb(self, surface: Index, distance: FloatArray) -> None:
         """Dim the paths that reach their glass from inside, by Beer and Lambert's law."""
@@ -122,7 +119,7 @@ class Vertex:
         rows = inside + self.glass.start
         absorbed = self.world.palette.look_up(self.world.absorption_row.take(surface[inside]), self.paths.bins[rows])
         absorbed *= -(distance[inside] + _STEP_M)  # the ray set out that far from where it entered
-        self.paths.throughput[..., rows] *= np.exp(absorbed)
+        self.paths.throughput[:, rows] *= np.exp(absorbed)
 
     def start(self, side: FloatArray | None = None) -> FloatArray:
         """Origins [3, N] of rays that leave on the near side, or where `side` is negative on the far side."""
@@ -133,7 +130,7 @@ class Vertex:
         d, g = self.diffuse, self.glossy
         cosine = np.maximum(dot(self.shading[:, d], inward[:, d]), np.float32(0))
         cosine *= _ONE_OVER_PI
-        value = self.base[..., d] * cosine
+        value = self.base[:, d] * cosine
         if g.start == g.stop:
             return value, cosine
         shiny, density = self.gloss.evaluate(inward[:, g])
@@ -178,7 +175,7 @@ def scatter(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int) -> Pat
         m = vertex.mirror
         travel, normal = paths.direction[:, m], vertex.shading[:, m]
         direction[:, m] = travel - normal * (2 * dot(travel, normal))
-        paths.throughput[..., m] *= vertex.base[..., m]
+        paths.throughput[:, m] *= vertex.base[:, m]
     side = None
     if vertex.glass.stop > vertex.glass.start:
         refracts = _scatter_glass(vertex, sampler, keys, first, direction)
@@ -196,14 +193,14 @@ def _scatter_rough(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int,
     d, g, paths = vertex.diffuse, vertex.glossy, vertex.paths
     square = sampler.draw2(keys.cut(0, vertex.rough), first + dims.SCATTER)
     direction[:, d], cosine = cosine_direction(vertex.shading[:, d], square[:, d])
-    paths.throughput[..., d] *= vertex.base[..., d]
+    paths.throughput[:, d] *= vertex.base[:, d]
     cosine *= _ONE_OVER_PI
     if g.start == g.stop:
         return cosine
     lobe = sampler.draw(keys.cut(g.start, g.stop), first + dims.LOBE)
     direction[:, g] = vertex.gloss.sample(square[:, g], lobe)
     value, density = vertex.gloss.evaluate(direction[:, g])
-    paths.throughput[..., g] *= value / density
+    paths.throughput[:, g] *= value / density
     return np.concatenate([cosine, density])
 
 
@@ -218,9 +215,6 @@ def _scatter_glass(
     g, index = vertex.glass, vertex.index()
     choice = sampler.draw(keys.cut(g.start, g.stop), first + dims.LOBE)
     travel, normal, outside = vertex.paths.direction[:, g], vertex.shading[:, g], vertex.outside[g]
-    if index.ndim == 1:
-        direction[:, g], refracts = glass_direction(travel, normal, outside, index, choice)
-        return refracts
     alone = vertex.paths.alone[g]
     cosine = np.clip(-dot(travel, normal), 0, 1)
     reflectance, _ = fresnel_dielectric(cosine, np.where(outside, index, 1 / index))
@@ -252,11 +246,11 @@ def trace(
     aim: bool = True,
     first_distance: FloatArray | None = None,
 ) -> FloatArray:
-    """Weight times radiance [N] that arrives along camera rays; [lanes, N] where paths carry several wavelengths.
+    """Weight times radiance [lanes, N] that arrives along camera rays, of the wavelengths of each path.
 
     Args:
         keys: random numbers of the paths. origin, direction: [3, N], m.
-        weight: [N] or [lanes, N]; paths of weight 0 cost nothing. bins: [N] wavelength bins, of the first lane.
+        weight: [lanes, N]; paths of weight 0 cost nothing. bins: [N] wavelength bins, of the first lane.
         max_depth: number of surfaces along a path at which light is scattered.
         aim: sample lights directly; without it the mean is the same, found by scattering alone.
         first_distance: [N], where to write the distance in m to what camera rays hit first, inf for nothing; paths of
@@ -337,9 +331,8 @@ def _arrive(world: World, paths: Paths, surface: Index, point: FloatArray, dista
 
 def _roulette(paths: Paths, sample: FloatArray) -> None:
     """End faint paths by chance; those that go on carry the light of those that end."""
-    brightest = paths.throughput
-    if brightest.ndim == 2:
-        brightest = brightest.max(axis=0) * np.where(paths.alone, np.float32(1), np.float32(len(brightest)))
+    lanes = np.float32(len(paths.throughput))
+    brightest = paths.throughput.max(axis=0) * np.where(paths.alone, np.float32(1), lanes)
     survival = np.clip(brightest, np.float32(0.05), np.float32(1))
     paths.throughput /= survival
     paths.throughput *= sample < survival

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
+from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.render import film as columns
 from neurolens.render.colour import SRGB, balance
 from neurolens.render.film import Film, FilmSettings, PixelGrid, Tiling, shared
@@ -20,7 +20,7 @@ from neurolens.render.spectrum import Index
 from neurolens.render.wavelengths import LANES, mode_for, spectral_range
 from neurolens.render.world import World
 
-WeightedRays = tuple[FloatArray, FloatArray, FloatArray]  # origin, direction [3, N] and weight [N] or [lanes, N]
+WeightedRays = tuple[FloatArray, FloatArray, FloatArray]  # origin, direction [3, N] and weight ([lanes,] N)
 # Of a sample's luminance; sums of colours up to a million times as bright stay within float32.
 _BRIGHTEST_SAMPLE = 1e30
 
@@ -38,7 +38,7 @@ class Job:
     """One render: the scene made ready, and memory shared by the workers.
 
     Attributes:
-        scene, camera, grid, seed, max_depth, settings, differentials: as requested; settings are those of the film.
+        scene, camera, grid, seed, max_depth, settings: as requested; settings are those of the film.
         mode: how wavelengths are taken. balance: matrix [3, 3] on the film's linear sRGB that makes the light of the
             white balance neutral; where there is none, `neutral`. luminance_row: [3], of the film's sRGB after that.
         paths_a_sample: lanes of a sample; film: see `Film`.
@@ -55,10 +55,9 @@ class Job:
         seed: int,
         max_depth: int,
         settings: FilmSettings,
-        differentials: bool = False,
     ) -> None:
         self.scene, self.camera, self.grid = scene, camera, grid
-        self.seed, self.max_depth, self.settings, self.differentials = seed, max_depth, settings, differentials
+        self.seed, self.max_depth, self.settings = seed, max_depth, settings
         pose = scene.settings.camera
         self.mode = mode_for(camera, grid, pose.wavelengths_nm, settings)
         self.spectral = spectral_range(scene, camera, settings, LANES if self.mode == "hero" else 1)
@@ -67,8 +66,7 @@ class Job:
         self.neutral, self.balance = white is None, np.eye(3)
         if white is not None:
             self.balance = balance(self.spectral.film_rgb(self.world.palette.illuminant(white)))
-        response = self.spectral.rotated(self.spectral.response)
-        self._response = response.reshape(-1, 3, self.spectral.bins)  # [lanes, 3, bins]
+        self._response = self.spectral.rotated(self.spectral.response)  # [lanes, 3, bins]
         self.luminance_row = SRGB.to_xyz[1] @ self.balance
         self._luminance = np.einsum("c,lcb->lb", self.luminance_row, self._response).astype(np.float32)
         self.sampler = Sampler(samples, seed)
@@ -79,6 +77,13 @@ class Job:
         self.film = Film(self.tiling)
         self.seconds = shared((2,), np.float64)
         self.message, self.stop = shared((4096,), np.uint8), shared((1,), np.uint8)
+
+    def asked(self) -> dict[str, Any]:
+        """What the picture depends on besides scene and camera, for its metadata and its checkpoint."""
+        settings = asdict(self.settings)
+        del settings["colour_space"]  # of the file alone
+        size = {"width": self.grid.width, "height": self.grid.height}
+        return {**size, "seed": self.seed, "max_depth": self.max_depth, **settings}
 
     def render_tile(self, camera: Camera, tile: int, part: int) -> tuple[NDArray[np.float64], float]:
         """Sums [pixels, columns] of one pass of one tile, and the seconds that the camera took."""
@@ -116,15 +121,14 @@ class Job:
         Paths whose light is not finite, or beyond any sum, are counted and add nothing: one would spoil its pixel and
         with it the whole file.
         """
-        value = value.reshape(-1, len(bins))
         luminance = np.einsum("ln,ln->n", self._luminance.take(bins, axis=-1), value)
         dropped = ~(np.abs(luminance) <= _BRIGHTEST_SAMPLE)
         if dropped.any():
             value, luminance = np.where(dropped, np.float32(0), value), np.where(dropped, np.float32(0), luminance)
         sums[:, columns.DROPPED] = np.count_nonzero(dropped.reshape(shape), axis=1)
         luminance = luminance.reshape(shape)
-        colour = self._response.take(bins, axis=-1).reshape(-1, 3, *shape)
-        sums[:, columns.RGB] = np.einsum("lcps,lps->pc", colour, value.reshape(-1, *shape))
+        colour = self._response.take(bins, axis=-1).reshape(len(value), 3, *shape)
+        sums[:, columns.RGB] = np.einsum("lcps,lps->pc", colour, value.reshape(len(value), *shape))
         if self.paths_a_sample > 1:
             luminance = np.add.reduceat(luminance, np.arange(0, shape[1], self.paths_a_sample), axis=1)
         sums[:, columns.LUMINANCE2] = np.einsum("ps,ps->p", luminance, luminance, dtype=np.float64)
@@ -143,24 +147,20 @@ class Job:
         sums[:, columns.HITS] = np.count_nonzero(hit.reshape(shape), axis=1)
 
     def _hero_rays(self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, hue: FloatArray) -> WeightedRays:
-        """Rays of the hero wavelengths, with the weights of all lanes where there are several."""
-        sample = camera.sample_differentials if self.differentials else camera.sample  # type: ignore[attr-defined]
-        rays = self._camera_rays(sample, film_mm, pupil, self._camera_wavelengths(hue))
+        """Rays of the hero wavelengths, with the weights of all lanes."""
+        origin, direction, hero = self._camera_rays(camera, film_mm, pupil, self._camera_wavelengths(hue))
         lanes = self.spectral.lanes
-        if lanes == 1:
-            return rays
-        weight = np.empty((lanes, len(hue)), np.float32)
-        weight[:] = rays[2]
+        weight = np.repeat(hero[None], lanes, axis=0)
         if camera.dispersive or not getattr(camera, "achromatic", False):
             for lane in range(1, lanes):
                 wavelength_nm = self._camera_wavelengths(_turned(hue, np.float32(lane / lanes)))
-                weight[lane] = self._camera_rays(camera.sample, film_mm, pupil, wavelength_nm)[2]
-            weight *= rays[2] > 0  # the hero's ray must exist
+                weight[lane] = self._camera_rays(camera, film_mm, pupil, wavelength_nm)[2]
+            weight *= hero > 0  # the hero's ray must exist
         weight /= lanes
-        return rays[0], rays[1], weight
+        return origin, direction, weight
 
     def _camera_rays(
-        self, sample: Callable[..., CameraRays], film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray
+        self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray
     ) -> WeightedRays:
         """Rays in the scene; their weight is 0 where they do not pass."""
         count = len(wavelength_nm)
@@ -170,7 +170,7 @@ class Job:
         for start in range(0, count, at_once):
             part = slice(start, start + at_once)
             inputs = (film_mm[:, part], pupil[:, part], wavelength_nm[part])
-            rays = sample(*(np.ascontiguousarray(x) for x in inputs))
+            rays = camera.sample(*(np.ascontiguousarray(x) for x in inputs))
             np.add(self._axes @ rays.origin_m, self._position[:, None], out=origin[:, part])
             np.matmul(self._axes, rays.direction, out=direction[:, part])
             weight[part] = np.where(rays.status == 0, rays.weight, np.float32(0))

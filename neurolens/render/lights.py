@@ -43,10 +43,9 @@ class LightSamples:
 
 
 class LightGroup:
-    """Lights of one kind, numbered from 0.
+    """Lights of one kind: `count` of them, numbered from 0.
 
-    Attributes:
-        count: how many. sizeless: whether `sample` gives the irradiance of intensity 1 in place of inverse densities.
+    Of `sizeless` ones `sample` gives the irradiance of intensity 1 in place of inverse densities.
     """
 
     count: int
@@ -66,12 +65,7 @@ class LightGroup:
 
 
 class Lights:
-    """Lights of several kinds, numbered one group after the other.
-
-    Args:
-        groups: some may be empty.
-        target_m: the point whose light matters most.
-    """
+    """Lights of several kinds, numbered group after group (some may be empty); at `target_m` light matters most."""
 
     def __init__(self, groups: Sequence[LightGroup], target_m: Vector = BLACK) -> None:
         self._groups: list[tuple[int, LightGroup]] = []

@@ -1,8 +1,8 @@
 """How surfaces scatter: Lambert, a GGX coat over a Lambert base, mirror, smooth glass.
 
-Reflectances are numbers [N], or [lanes, N] where paths carry several wavelengths; what is drawn then depends on the
-lanes together, not on one of them, so that all give a path the same density. Directions are unit vectors [3, N] that
-point away from the surface, normals lie on the side of the incoming ray.
+Reflectances are [lanes, N], of the wavelengths of each path; what is drawn depends on the lanes together, so that all
+give a path the same density. Directions are unit vectors [3, N] that point away from the surface, normals lie on the
+side of the incoming ray.
 
 Light that a coat scatters once is not all that it reflects: the rest goes on from facet to facet. Tables hold the
 albedo of one scattering by a GGX coat of Fresnel reflectance F = F0 + (1 - F0)(1 - cos)^5 (Schlick 1994), split as
@@ -61,11 +61,7 @@ def visible_normal(out: FloatArray, alpha: FloatArray, square: FloatArray) -> Fl
 
 
 class CoatTable:
-    """S and T by cosine for some GGX widths.
-
-    Args:
-        alphas: the widths, one row each.
-    """
+    """S and T by cosine for some GGX widths, one row each."""
 
     def __init__(self, alphas: Sequence[float]) -> None:
         cosine = (np.arange(_ENTRIES) + 0.5) / _ENTRIES
@@ -122,8 +118,8 @@ class GlossyLobes:
 
     Args:
         normal, out: [3, N], out towards the camera.
-        base: diffuse reflectance [..., N]. coat: Fresnel reflectance head on [..., N]. alpha: GGX width [N], roughness
-            squared. table, row: the coat's albedo, and which of its rows [N].
+        base: diffuse reflectance [lanes, N]. coat: Fresnel reflectance head on [lanes, N]. alpha: GGX width [N], the
+            squared roughness. table, row: the coat's albedo, and which of its rows [N].
     """
 
     def __init__(
@@ -151,13 +147,12 @@ class GlossyLobes:
         self._left_out, once = 1 - whole, coat * (whole - power) + power
         self._through_out = np.maximum(1 - once - self._left_out * self._more, 0)
         rest = self._left_out * self._more + self._through_out * base
-        if once.ndim > 1:
-            once, rest = once.mean(axis=0), rest.mean(axis=0)
+        once, rest = once.mean(axis=0), rest.mean(axis=0)
         # At least 1/5: highlights are narrow and bright.
         self._choice = np.clip(once / np.maximum(once + rest, np.float32(1e-6)), np.float32(0.2), np.float32(1))
 
     def evaluate(self, inward: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Scattering times cosine [..., N] towards light in directions [3, N], and the density of `sample` there."""
+        """Scattering times cosine [lanes, N] towards light in directions [3, N], and the density of `sample` there."""
         cos_out, cos_in = self._cos_out, dot(self._normal, inward)
         half = self._out + inward
         half /= np.sqrt(np.maximum(dot(half, half), np.float32(1e-12)))
@@ -216,20 +211,20 @@ def glass_direction(
     outside: NDArray[np.bool_],
     index: FloatArray,
     choice: FloatArray,
-    chance: FloatArray | None = None,
+    chance: FloatArray,
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Reflected or refracted travel directions [3, N], each chosen with its Fresnel probability, and which refract [N].
+    """Reflected or refracted travel directions [3, N], and which refract [N].
 
     Args:
-        direction: of travel. outside: whether the ray comes from outside. index: of the glass. choice: in [0, 1).
-        chance: probability of reflection to use instead of Fresnel's.
+        direction: of travel. outside: whether the ray comes from outside. index: of the glass.
+        choice: in [0, 1). chance: probability of reflection, 1 where it is total.
 
     The throughput stays: the factor n^2 of radiance inside glass cancels on the way out, and no light stands in glass.
     """
     relative = np.where(outside, index, 1 / index)
     cos_in = np.clip(-dot(direction, normal), 0, 1)
-    reflectance, cos_out = fresnel_dielectric(cos_in, relative)
-    refracts = choice >= (reflectance if chance is None else chance)
+    _, cos_out = fresnel_dielectric(cos_in, relative)
+    refracts = choice >= chance
     along = np.where(refracts, 1 / relative, np.float32(1))
     across = np.where(refracts, cos_in / relative - cos_out, 2 * cos_in)
     result = direction * along + normal * across

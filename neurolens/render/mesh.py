@@ -71,11 +71,7 @@ def _tree(centres: FloatArray64, low: FloatArray64, high: FloatArray64) -> tuple
 
 
 class Mesh:
-    """Triangles with a tree over them; triangle k is surface `first` + k.
-
-    Args:
-        first: number of the first triangle's surface. vertices: [V, 3] in metres. faces: [T, 3].
-    """
+    """Triangles [T, 3] of vertices [V, 3] in m with a tree over them; triangle k is surface `first` + k."""
 
     def __init__(self, first: int, vertices: FloatArray64, faces: NDArray[np.int64]) -> None:
         self.first = first
@@ -197,11 +193,7 @@ def _library() -> tuple[Any, Any]:
 
 
 class EmbreeMesh:
-    """Triangles in an Embree scene; arguments as for `Mesh`.
-
-    Raises:
-        ImportError: embreex is not installed.
-    """
+    """Triangles in an Embree scene, arguments as for `Mesh`; ImportError where embreex is not installed."""
 
     def __init__(self, first: int, vertices: FloatArray64, faces: NDArray[np.int64]) -> None:
         mesh_construction, rtcore_scene = _library()

@@ -1,8 +1,7 @@
-"""Reads triangle meshes: OBJ and PLY files through trimesh, or tables of the scene itself.
+"""Reads triangle meshes: OBJ and PLY files, or tables of the scene itself; nothing is merged or repaired.
 
-trimesh ignores what it does not understand. Files are therefore checked first, so that no vertex and no face is lost
-silently; its loaders then read them, without merging or repairing. Texture coordinates
-and normals of an OBJ file count where every face has them.
+Files are checked so that no vertex and no face is lost silently; PLY is then read by trimesh, which ignores what it
+does not understand. Texture coordinates and normals of an OBJ file count where every face has them.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ import io
 import math
 import re
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -104,10 +104,9 @@ def _check(scene: Path, field: str, mesh: TriangleSet) -> None:
 
 
 def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
-    """The triangles of an OBJ or PLY file (ASCII or binary) in its own units; polygons are cut into triangles.
+    """The triangles of an OBJ or PLY file (ASCII or binary) in its own units, polygons cut into triangles.
 
-    Raises:
-        InputError: see `read_mesh`.
+    Errors as of `read_mesh`.
     """
     kind = path.suffix.lower()
     try:
@@ -118,74 +117,68 @@ def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
         if path.stat().st_size > LARGEST_FILE:
             raise InputError(scene, field, str(path), f"a file of at most {LARGEST_FILE} bytes")
         content = path.read_bytes()
-        mesh, least = (_read_obj if kind == ".obj" else _read_ply)(scene, field, path, content)
+        return (_read_obj if kind == ".obj" else _read_ply)(scene, field, path, content)
     except (InputError, MemoryError):
         raise
     except OSError as error:
         raise InputError(scene, field, str(path), f"a mesh file that can be read ({error.strerror})") from None
     except Exception as error:  # trimesh raises exceptions of many types
         raise InputError(scene, field, str(path), f"a mesh file that trimesh can read ({error})") from None
-    if len(mesh.faces) < least:
-        raise InputError(scene, field, str(path), f"{least} triangles, as the file says, not {len(mesh.faces)}")
-    return mesh
 
 
-def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[TriangleSet, int]:
-    """The triangles of an OBJ file, and how many its faces should give.
-
-    The loader ignores lines that it does not understand; here they are refused. So are indices beyond the lines
-    before, which it takes for missing texture coordinates or normals. It gets the lines in one form, their
-    indices counted from 1, also those that the file counts back from the line before: -1 is the last one so far.
-    """
-    from trimesh.exchange.obj import load_obj
-
+def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> TriangleSet:
+    """The triangles of an OBJ file. A vertex of the mesh is a corner as its faces write it; polygons become fans."""
     if b"\0" in content:
         raise InputError(scene, field, str(path), "a text file, without zero bytes")
     # Only comments and names can hold more than ASCII, in any encoding. A line may go on after a backslash.
     text = content.decode("utf-8-sig", "replace").replace("\\\r\n", " ").replace("\\\n", " ")
-    lines, triangles = [""], 0
-    counts = dict.fromkeys(_OBJ_LINES, 0)
+    values: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
+    corners: dict[tuple[int, ...], int] = {}
+    faces = []
     for number, line in enumerate(text.splitlines(), 1):
-        words = line.partition("#")[0].split()
-        if not words or words[0] not in _OBJ_LINES:
+        kind, *words = line.partition("#")[0].split() or [""]
+        if kind not in _OBJ_LINES:
             continue
-        pattern, form = _OBJ_LINES[words[0]]
+        pattern, form = _OBJ_LINES[kind]
         place = f"{field} {path.name}, line {number}"
-        if not pattern.fullmatch(" ".join(words)):
+        if not pattern.fullmatch(" ".join([kind, *words])):
             raise InputError(scene, place, line[:60], form)
-        counts[words[0]] += 1
-        if words[0] == "f":
-            triangles += len(words) - 3
-            words[1:] = _counted_from_one(scene, place, words[1:], counts)
-        lines.append(" ".join(words))
-    # One part, as groups and materials are left out.
-    parts = load_obj(io.StringIO("\n".join(lines) + "\n"), skip_materials=True).get("geometry", {})
-    return _triangles(next(iter(parts.values()), {})), triangles
+        if kind == "f":
+            first, *rest = (corners.setdefault(c, len(corners)) for c in _corners(scene, place, words, values))
+            faces += [(first, *edge) for edge in pairwise(rest)]
+        else:
+            values[kind].append([float(word) for word in words[: 2 if kind == "vt" else 3]])
+    rows = np.array(list(corners), np.intp).reshape(-1, 3).T
+    vertices, uv, normals = (
+        None if (row < 0).any() else np.array(values[kind], np.float64).reshape(-1, 2 if kind == "vt" else 3)[row]
+        for kind, row in zip(values, rows, strict=True)
+    )
+    assert vertices is not None  # every corner has one
+    return TriangleSet(vertices, np.array(faces, np.int64).reshape(-1, 3), uv, normals)
 
 
-def _counted_from_one(scene: Path, field: str, corners: list[str], counts: dict[str, int]) -> list[str]:
-    """Corners of a face with all indices counted from 1.
+def _corners(scene: Path, field: str, words: list[str], values: dict[str, list[list[float]]]) -> list[tuple[int, ...]]:
+    """Corners of a face as rows of `values`, -1 for what they leave out; the file may count back from the last one.
 
     Refused are corners that refer to something that does not come before them, and corners of unlike forms.
     """
-    if len({tuple(map(bool, corner.split("/"))) for corner in corners}) > 1:  # the loader would confuse them
-        raise InputError(scene, field, " ".join(corners)[:60], "corners of the same form, as in 1/1 2/2 3/3")
-    counted = []
-    for corner in corners:
-        indices = corner.split("/")
-        for k, (index, kind) in enumerate(zip(indices, ("v", "vt", "vn"), strict=False)):
-            if not index:
-                continue
-            number = int(index) + (counts[kind] + 1 if index.startswith("-") else 0)
-            if not 1 <= number <= counts[kind]:
-                raise InputError(scene, field, corner, f"{kind} from 1 to {counts[kind]}, the lines before")
-            indices[k] = str(number)
-        counted.append("/".join(indices))
-    return counted
+    if len({tuple(map(bool, word.split("/"))) for word in words}) > 1:
+        raise InputError(scene, field, " ".join(words)[:60], "corners of the same form, as in 1/1 2/2 3/3")
+    corners = []
+    for word in words:
+        corner = [-1, -1, -1]
+        for k, (kind, index) in enumerate(zip(values, word.split("/"), strict=False)):
+            if index:
+                count = len(values[kind])
+                corner[k] = int(index) + (count if index.startswith("-") else -1)
+                if not 0 <= corner[k] < count:
+                    raise InputError(scene, field, word, f"{kind} from 1 to {count}, the lines before")
+        corners.append(tuple(corner))
+    return corners
 
 
-def _read_ply(scene: Path, field: str, path: Path, content: bytes) -> tuple[TriangleSet, int]:
-    """The triangles of a PLY file, and the number of faces in its header, at most as many as the file can hold."""
+def _read_ply(scene: Path, field: str, path: Path, content: bytes) -> TriangleSet:
+    """The triangles of a PLY file, no fewer than the faces of its header, which are no more than the file can hold."""
     from trimesh.exchange.ply import load_ply
 
     head, end, _ = content[:_LARGEST_HEADER].partition(b"end_header")
@@ -196,18 +189,17 @@ def _read_ply(scene: Path, field: str, path: Path, content: bytes) -> tuple[Tria
         if count > len(content):
             found = f"({count} elements {name.decode()} in {len(content)} bytes)"
             raise InputError(scene, f"{field} {path.name}, header", found, "no more elements than bytes")
-    return _triangles(load_ply(io.BytesIO(content), skip_materials=True)), promised.get(b"face", 0)
-
-
-def _triangles(loaded: dict[str, Any]) -> TriangleSet:
-    """What trimesh has loaded, polygons of more than three corners cut into fans."""
+    loaded: dict[str, Any] = load_ply(io.BytesIO(content), skip_materials=True)
     vertices = np.asarray(loaded.get("vertices", ()), np.float64).reshape(-1, 3)
     faces = np.asarray(loaded.get("faces", ()), np.int64)
     if faces.ndim == 2 and faces.shape[1] > 3:
         faces = np.stack([faces[:, [0, k, k + 1]] for k in range(1, faces.shape[1] - 1)], axis=1)
+    faces = faces.reshape(-1, 3)
+    if len(faces) < (least := promised.get(b"face", 0)):
+        raise InputError(scene, field, str(path), f"{least} triangles, as the file says, not {len(faces)}")
     uv, normals = getattr(loaded.get("visual"), "uv", None), loaded.get("vertex_normals")
     extra = [None if x is None or len(x) != len(vertices) else np.asarray(x, np.float64) for x in (uv, normals)]
-    return TriangleSet(vertices, faces.reshape(-1, 3), *extra)
+    return TriangleSet(vertices, faces, *extra)
 
 
 def encloses(mesh: TriangleSet, point: NDArray[np.float64]) -> bool:

@@ -122,11 +122,7 @@ def read_exr(path: str | Path) -> tuple[FloatArray, dict[str, Any]]:
 
 
 def read_layers(path: str | Path) -> dict[str, FloatArray]:
-    """The channels [H, W] float32 besides R, G and B by name; Z is called depth.
-
-    Raises:
-        InputError: missing, no OpenEXR file, or truncated.
-    """
+    """The channels [H, W] float32 besides R, G and B by name, Z as depth; errors as of `read_exr`."""
     planes, _ = _read_channels(Path(path))
     return {"depth" if name == _DEPTH else name: plane for name, plane in planes.items() if name not in _COLOURS}
 
@@ -167,8 +163,7 @@ def _read_channels(
 def write_png(path: str | Path, rgb: ArrayLike, exposure: float = 0.0) -> None:
     """Write an 8-bit sRGB preview of a linear picture [H, W, 3], brighter by `exposure` stops, atomically.
 
-    Raises:
-        InputError: another shape.
+    InputError: another shape.
     """
     picture = _shaped(path, np.asarray(rgb, np.float32))
     encoded = np.rint(255 * linear_to_srgb(picture * np.float32(2.0**exposure))).astype(np.uint8)

@@ -258,8 +258,8 @@ class Spheres:
     ) -> None:
         """Test pairs of spheres and rays.
 
-        The discriminant comes from the distance between centre and ray, which stays exact in float32 for a small
-        sphere far away (Haines et al. 2019, "Precision improvements for ray/sphere intersection").
+        The discriminant comes from the distance between centre and ray: exact in float32 for a small sphere far away
+        (Haines et al. 2019, "Precision improvements for ray/sphere intersection").
         """
         direction: Any = rays.direction.take(ray, axis=1).astype(self._kind, copy=False)
         if self._kind is np.float64:

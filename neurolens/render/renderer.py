@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -51,11 +52,7 @@ class Watch:
 
 
 class Keeper:
-    """Carries out a `Watch` for one job.
-
-    Attributes:
-        resumed: share of the work that was done before.
-    """
+    """Carries out a `Watch` for one job; `resumed` is the share of the work that was done before."""
 
     def __init__(self, job: Job, watch: Watch, progress: Progress | None) -> None:
         self._job, self._watch, self._progress = job, watch, progress
@@ -160,7 +157,6 @@ def render(
     threads: int = 2,
     max_depth: int | None = None,
     film: FilmSettings | None = None,
-    differentials: bool = False,
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> RenderResult:
@@ -176,14 +172,13 @@ def render(
         width, height, samples, max_depth: as in `CameraSettings`; left out, those of the scene.
         film: spectral sampling and white balance; left out, those of the scene.
         threads: workers. A camera may have `for_worker() -> Camera`, called once in each, to open its own sessions.
-        differentials: also compute ray differentials, which are not used: to measure their cost.
         progress: called with the fraction done and the estimated seconds left.
         watch: previews, checkpoints and an early end.
 
     Raises:
         InputError: a size or count below 1 or beyond memory, an unknown illuminant, picture and film of different
-            shape, a camera that disperses and does not cover the scene's wavelengths, or one without the differentials
-            asked for; a checkpoint that is not whole or of another render.
+            shape, a camera that disperses and does not cover the scene's wavelengths; a checkpoint that is not whole or
+            of another render.
         NeurolensError: a worker failed; what was done is in the checkpoint.
     """
     settings, film = scene.settings.camera, film or scene.settings.film
@@ -194,9 +189,7 @@ def render(
     threads = _count("threads", threads)
     grid = PixelGrid(width or settings.width, height or settings.height, camera.film_mm)
     check_memory(grid.width, grid.height)
-    if differentials:
-        _check_differentials(camera)
-    job = Job(scene, camera, grid, samples, seed, max_depth, film, differentials)
+    job = Job(scene, camera, grid, samples, seed, max_depth, film)
     keeper = Keeper(job, watch or Watch(), progress)
     try:
         idle = watch is None and progress is None
@@ -217,24 +210,18 @@ def render(
 
 
 def _stats(job: Job, seconds: float) -> dict[str, Any]:
-    grid, tiling = job.grid, job.tiling
+    tiling = job.tiling
     pixels = np.minimum(tiling.tile, tiling.pixels - tiling.tile * np.arange(tiling.tiles))
     paths = int(np.sum(pixels * tiling.samples_done(job.film.done)))
     camera_s, thread_s = (float(s) for s in job.seconds)
     return {
         "camera": job.camera.name,
-        "width": grid.width,
-        "height": grid.height,
         "samples": tiling.samples,
         "samples_done": paths / tiling.pixels,
         "complete": job.film.fraction == 1,
-        "seed": job.seed,
-        "max_depth": job.max_depth,
-        "wavelengths_nm": [job.spectral.low_nm, job.spectral.high_nm],
+        **job.asked(),
         "wavelengths": job.mode,
-        "wavelength_sampling": job.settings.wavelength_sampling,
-        "white_balance": job.settings.white_balance,
-        "differentials": job.differentials,
+        "wavelengths_nm": [job.spectral.low_nm, job.spectral.high_nm],
         "seconds": seconds,
         "paths": paths,
         "mpaths_per_s": paths / seconds * 1e-6,
@@ -246,16 +233,8 @@ def _stats(job: Job, seconds: float) -> dict[str, Any]:
     }
 
 
-def _check_differentials(camera: Camera) -> None:
-    """Compute the differentials of one ray, to reject a camera without them before the work."""
-    ask = getattr(camera, "sample_differentials", None)
-    if ask is None:
-        raise InputError("render", "differentials", True, f"left out: camera {camera.name} has none")
-    low, high = camera.wavelength_nm or (550.0, 550.0)
-    ask(np.zeros((2, 1), np.float32), np.full((2, 1), 0.5, np.float32), np.full(1, (low + high) / 2, np.float32))
-
-
-def _count(field: str, value: int, most: int | None = None) -> int:
-    if value < 1 or (most is not None and value > most):
-        raise InputError("render", field, value, f"an integer above 0{'' if most is None else f', at most {most}'}")
+def _count(field: str, value: int, most: float = math.inf) -> int:
+    if not 1 <= value <= most:
+        at_most = f", at most {most}" if most < math.inf else ""
+        raise InputError("render", field, value, f"an integer above 0{at_most}")
     return value

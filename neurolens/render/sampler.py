@@ -58,7 +58,7 @@ def sobol(count: int, dimensions: int = _SOBOL_DIMENSIONS) -> UInt32Array:
     index = np.arange(count, dtype=np.uint32)
     points = np.zeros((dimensions, count), np.uint32)
     for dimension in range(dimensions):
-        for k, number in enumerate(_direction_numbers(dimension)):
+        for k, number in enumerate(_direction_numbers(dimension)[: count.bit_length()]):
             points[dimension] ^= (index >> np.uint32(k) & np.uint32(1)) * np.uint32(number)
     return points
 
@@ -93,12 +93,9 @@ def _to_unit(bits: UInt32Array) -> FloatArray:
 
 @dataclass(frozen=True)
 class PathKeys:
-    """Keys of paths for the sampler.
+    """Keys of paths [N] for the sampler: the hashed pixel number and seed, the sample's index in its pixel.
 
-    Attributes:
-        pixel: [N] hashed pixel number and seed.
-        sample: [N] index of the sample in its pixel.
-        path: [N] hash of both, for the dimensions beyond the Sobol' sequence.
+    `path` is a hash of both, for the dimensions beyond the Sobol' sequence.
     """
 
     pixel: UInt32Array
@@ -115,12 +112,7 @@ class PathKeys:
 
 
 class Sampler:
-    """Samples for a picture of `samples` samples per pixel.
-
-    Args:
-        samples: samples per pixel; a power of two stratifies best.
-        seed: of the random numbers.
-    """
+    """Samples for a picture of so many samples per pixel (a power of two stratifies best), of one seed."""
 
     def __init__(self, samples: int, seed: int) -> None:
         self._sobol_reversed = np.stack([_reverse_bits(points) for points in sobol(samples)])

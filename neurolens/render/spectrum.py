@@ -110,13 +110,11 @@ class SpectralRange:
         return (sample * np.float32(self.bins)).astype(np.intp)
 
     def rotated(self, table: NDArray[Any]) -> NDArray[Any]:
-        """A table [..., bins] as it is for one lane; else [lanes, ..., bins], each lane's turned to its own bin.
+        """A table [..., bins] as [lanes, ..., bins], each lane's turned to its own bin.
 
         Lane k of a path whose hero is in bin b is in bin b + k bins / lanes, counted round: as probable as the hero's,
         for all bins are equally probable (Wilkie et al. 2014).
         """
-        if self.lanes == 1:
-            return table
         step = self.bins // self.lanes
         return np.stack([np.roll(table, -lane * step, axis=-1) for lane in range(self.lanes)])
 
@@ -223,11 +221,10 @@ class Palette:
     def freeze(self) -> None:
         """Lay the rows out for `look_up`."""
         rows = np.stack(self._rows) if self._rows else np.zeros((1, self._spectral.bins), np.float32)
-        rows = self._spectral.rotated(rows)
-        self._flat = rows.reshape(*rows.shape[:-2], -1)
+        self._flat = self._spectral.rotated(rows).reshape(self._spectral.lanes, -1)
 
     def look_up(self, row: Index, bins: Index) -> FloatArray:
-        """Values [N] of rows [N] at wavelength bins [N]; [lanes, N] where a path carries several wavelengths."""
+        """Values [lanes, N] of rows [N] at wavelength bins [N] of the first lane."""
         where = row * self._spectral.bins
         where += bins
         return self._flat.take(where, axis=-1)

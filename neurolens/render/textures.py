@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.scenetables import Texture, Vector
-from neurolens.render.spectrum import Index, SpectralRange
+from neurolens.render.scenetables import Texture
+from neurolens.render.spectrum import Index, Palette, SpectralRange
 
 Frame = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ class TextureTable:
     Args:
         textures: by name. images: linear RGB [H, W, 3] of those of kind "image".
         surfaces: for surfaces in a row how many, the name of their texture and their frames [count, 2, 5] (one of the
-            functions above), or None. colour: gives a colour's row of the palette.
+            functions above), or None. palette: with the rows of their colours.
     """
 
     def __init__(
@@ -73,14 +73,14 @@ class TextureTable:
         textures: dict[str, Texture],
         images: dict[str, FloatArray],
         surfaces: Sequence[tuple[int, str | None, Frame | None]],
-        colour: Callable[[Vector], int],
+        palette: Palette,
         spectral: SpectralRange,
     ) -> None:
         self._textures = list(textures.items())
-        self._images = images
+        self._images, self._palette = images, palette
         self._basis = spectral.rotated(spectral.basis.astype(np.float32))
         numbers = {name: k for k, name in enumerate(textures)}
-        self._rows = [np.array([colour(c) for c in t.colours or ()], np.intp) for t in textures.values()]
+        self._rows = [np.array([palette.colour(c) for c in t.colours or ()], np.intp) for t in textures.values()]
         total = sum(count for count, _, _ in surfaces)
         self._number, self._frames = np.full(total, -1), np.zeros((2, 4, total), np.float32)
         first = 0
@@ -95,15 +95,8 @@ class TextureTable:
             first += count
         self._used = bool(np.any(self._number >= 0))
 
-    def apply(
-        self,
-        value: FloatArray,
-        surface: Index,
-        point: FloatArray,
-        bins: Index,
-        look_up: Callable[[Index, Index], FloatArray],
-    ) -> None:
-        """Write the reflectance at points [3, N] into `value` [..., N] where surfaces [N] have a texture."""
+    def apply(self, value: FloatArray, surface: Index, point: FloatArray, bins: Index) -> None:
+        """Write the reflectance at points [3, N] into `value` [lanes, N] where surfaces [N] have a texture."""
         if not self._used:
             return
         number = self._number.take(surface)
@@ -114,7 +107,7 @@ class TextureTable:
             at, frame = point.take(rows, axis=1), self._frames.take(surface[rows], axis=2)
             u, v = frame[:, 0] * at[0] + frame[:, 1] * at[1] + frame[:, 2] * at[2] + frame[:, 3]
             if texture.kind == "image":
-                value[..., rows] = self._picture(self._images[name], u, v, bins[rows])
+                value[:, rows] = self._picture(self._images[name], u, v, bins[rows])
                 continue
             if texture.kind == "checker":
                 # 2e-4 of a cell of slack: a shape that begins on a cell's edge shows no speckle of rounding there.
@@ -123,12 +116,12 @@ class TextureTable:
                 reach = np.float32(0.5 * (texture.line_m or 0) / (texture.cell_m or 1))
                 on_line = (np.abs(u - np.rint(u)) <= reach) | (np.abs(v - np.rint(v)) <= reach)
                 which = 1 - on_line.astype(np.intp)
-            value[..., rows] = look_up(self._rows[k].take(which), bins[rows])
+            value[:, rows] = self._palette.look_up(self._rows[k].take(which), bins[rows])
 
     def _picture(self, image: FloatArray, u: FloatArray, v: FloatArray, bins: Index) -> FloatArray:
-        """Reflectance [..., N] of the texel at (u, v), in pictures from the lower left corner; the film smooths it."""
+        """Reflectance [lanes, N] of the texel at (u, v), in pictures from the lower left corner."""
         height, width = image.shape[:2]
         column = ((u - np.floor(u)) * width).astype(np.intp)
         row = ((1 - (v - np.floor(v))) * height).astype(np.intp)
         rgb = image[np.minimum(row, height - 1), np.minimum(column, width - 1)]
-        return np.einsum("nc,...cn->...n", rgb, self._basis.take(bins, axis=-1))
+        return np.einsum("nc,lcn->ln", rgb, self._basis.take(bins, axis=-1))

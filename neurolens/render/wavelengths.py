@@ -25,11 +25,7 @@ _FARTHEST_M = 1e4
 
 
 def spectral_range(scene: Scene, camera: Camera, film: FilmSettings, lanes: int = 1) -> SpectralRange:
-    """The scene's wavelengths, which a camera that disperses must cover, in bins by their importance.
-
-    Raises:
-        InputError: it does not.
-    """
+    """The scene's wavelengths, in bins by their importance; InputError where a camera that disperses lacks some."""
     settings = scene.settings.camera
     low, high = settings.wavelengths_nm
     accepted = camera.wavelength_nm
@@ -88,8 +84,7 @@ def _lamps(scene: Scene) -> Iterator[tuple[str, Vector, float]]:
 def mode_for(camera: Camera, grid: PixelGrid, limits_nm: tuple[float, float], film: FilmSettings) -> WavelengthMode:
     """The mode that "auto" selects for a camera: "hero" where one ray serves all wavelengths, else "one".
 
-    Raises:
-        InputError: "hero" is asked for and the camera disperses.
+    InputError: "hero" is asked for and the camera disperses.
     """
     if film.wavelengths in ("one", "lanes"):
         return film.wavelengths

@@ -19,27 +19,23 @@ from typing import Any
 import numpy as np
 
 from neurolens.base.errors import NeurolensError
-from neurolens.render.film import FORKS, fork_context
+from neurolens.render.film import CONTEXT, FORKS
 from neurolens.render.job import Job
 
 _POLL_S, _PATIENCE_S = 0.05, 5.0
 
 
 def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None:
-    """Do the remaining work, in this process or in forked ones.
-
-    Args:
-        watch: polled; True ends the work early, between tiles.
+    """Do the remaining work, in this process or in forked ones; `watch` is polled and ends it early, between tiles.
 
     Raises:
         NeurolensError: a worker failed or was killed; the film's tiles stay consistent.
     """
-    context = fork_context()
-    claimed = context.Value("q", int(job.film.done.min()) * job.tiling.tiles)
+    claimed = CONTEXT.Value("q", int(job.film.done.min()) * job.tiling.tiles)
     if workers == 1 and watch is None:
         _work(job, claimed)
         return
-    kind: Any = context.Process if FORKS else threading.Thread
+    kind: Any = CONTEXT.Process if FORKS else threading.Thread
     team = [kind(target=_quiet, args=(job, claimed, k, workers, os.getpid()), daemon=True) for k in range(workers)]
     killed: list[int] = []
     try:

@@ -29,16 +29,12 @@ _KINDS = {"diffuse": DIFFUSE, "glossy": GLOSSY, "mirror": MIRROR, "glass": GLASS
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Surfaces in a row that differ only in where they are.
-
-    Attributes:
-        normals: [count, 3]. frames: [count, 2, 5] of textures. emitter: what shines, None if it does not.
-    """
+    """Surfaces in a row that differ only in where they are: normals [count, 3], `frames` [count, 2, 5] of textures."""
 
     normals: NDArray[np.float64]
     material: Material | None = None
     frames: NDArray[np.float64] | None = None
-    emitter: Emitter | None = None
+    emitter: Emitter | None = None  # what shines
 
 
 def _unit(vector: Vector) -> NDArray[np.float64]:
@@ -181,7 +177,7 @@ class World:
         named = [m.texture if m else None for m in materials]
         framed = [(n, t, part.frames) for n, t, part in zip(counts, named, parts, strict=True)]
         tables, images = self.scene.settings.textures or {}, self.scene.images
-        self.textures = textures.TextureTable(tables, images, framed, colour, spectral)
+        self.textures = textures.TextureTable(tables, images, framed, palette, spectral)
 
     def _emission(self, emitter: Emitter | None) -> int:
         return 0 if emitter is None else self.palette.light(emitter.emission, emitter.illuminant)
@@ -282,22 +278,22 @@ class World:
         return normal, shading
 
     def reflectance(self, surface: Index, point: FloatArray, bins: Index) -> FloatArray:
-        """Reflectance [..., N] at wavelength bins [N], textures included."""
+        """Reflectance [lanes, N] at wavelength bins [N], textures included."""
         value = self.palette.look_up(self.reflectance_row.take(surface), bins)
-        self.textures.apply(value, surface, point, bins, self.palette.look_up)
+        self.textures.apply(value, surface, point, bins)
         return value
 
     def aimed_emission(self, aimed: LightSamples, rows: Index, bins: Index) -> FloatArray:
-        """Emission [..., n] of the lights that some rows [n] aim at, at wavelength bins [n]."""
+        """Emission [lanes, n] of the lights that some rows [n] aim at, at wavelength bins [n]."""
         light = aimed.light[rows]
         emitted = self.palette.look_up(self.light_emission_row.take(light), bins)
         if self._sky_number >= 0:
             far = np.flatnonzero(light == self._sky_number)
-            emitted[..., far] = self._sky.radiance(aimed.direction.take(rows[far], axis=1), bins[far])
+            emitted[:, far] = self._sky.radiance(aimed.direction.take(rows[far], axis=1), bins[far])
         return emitted
 
     def environment(self, direction: FloatArray, bins: Index, density: FloatArray | None = None) -> FloatArray:
-        """Radiance [..., N] from infinitely far along directions [3, N].
+        """Radiance [lanes, N] from infinitely far along directions [3, N].
 
         With `density` [N], with which scattering chose them, each part is weighted against aiming at it.
         """
@@ -310,7 +306,7 @@ class World:
             sun = self.palette.look_up(np.full(len(rows), self.light_emission_row[self._sun_number]), bins[rows])
             if density is not None:
                 sun /= self._rivals(self._sun_number, aimed[rows], density[rows])
-            light[..., rows] += sun
+            light[:, rows] += sun
         return light
 
     def _rivals(self, light: int, pdf: FloatArray, density: FloatArray) -> FloatArray:

@@ -17,16 +17,7 @@ from vignetting_oracle import vignetting_errors
 
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.check import check_model, share_promise
-from neurolens.evaluate.measure import (
-    STOPS,
-    ZONED,
-    fresh_rays,
-    measure,
-    measure_errors,
-    measure_on,
-    what_is_poor,
-    with_more,
-)
+from neurolens.evaluate.measure import STOPS, ZONED, fresh_rays, measure, measure_on, what_is_poor, with_more
 from neurolens.evaluate.vignetting import ZONES
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
@@ -37,7 +28,9 @@ RAYS = 6000
 def errors() -> dict[str, Any]:
     """What the exported polynomial's card would promise."""
     pairs = make_pairs(lens(), domain(), PairSettings(train=1, held_out=RAYS, rim=1, seed=3))
-    return measure_errors(load_model(exported("invariants")), lens(), domain(), pairs.held_out, 4 * RAYS, seed=55)
+    return measure_on(
+        fresh_rays(lens(), domain(), pairs.held_out, count=4 * RAYS, seed=55), load_model(exported("invariants"))
+    )
 
 
 def broken(errors: dict[str, Any], seed: int | None = None) -> set[str]:

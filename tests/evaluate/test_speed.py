@@ -41,9 +41,7 @@ def test_a_race_of_cameras_and_the_eager_tracer(domain: Domain) -> None:
     assert list(result.ns) == ["exact eager", "pinhole", "thin"]
     for name in result.ns:
         timing = result.timing(name)
-        assert timing is not None
-        assert 0 < timing["min"] <= timing["median"]
-        assert timing["repeats"] == 3
+        assert timing is not None and 0 < timing["min"] <= timing["median"] and timing["repeats"] == 3
     there, back = result.speedup("thin", "exact eager"), result.speedup("exact eager", "thin")
     assert there is not None and back is not None
     assert there["min"] * back["min"] == pytest.approx(1)
@@ -74,12 +72,8 @@ def test_what_cannot_run_is_reported_with_its_reason(domain: Domain) -> None:
 
     result = race([Candidate("absent", refuse), camera_candidate(Pinhole(50.0), domain)], domain, rounds=1)
     assert result.unavailable == {"absent": "no such thing here"}
-    assert result.record("absent") == {
-        "name": "absent",
-        "available": False,
-        "reason": "no such thing here",
-        "ns_per_ray": None,
-    }
+    known = {"name": "absent", "available": False, "reason": "no such thing here", "ns_per_ray": None}
+    assert result.record("absent") == known
     assert result.record("pinhole")["available"]
     assert result.timing("absent") is None
     assert result.speedup("pinhole", "absent") is None
@@ -98,12 +92,11 @@ def test_without_a_compiler_the_compiled_tracer_is_unavailable(domain: Domain) -
 
 def test_bad_settings_are_refused(domain: Domain) -> None:
     pinhole = camera_candidate(Pinhole(50.0), domain)
-    with pytest.raises(InputError, match="threads"):
-        race([pinhole], domain, threads=0)
-    with pytest.raises(InputError, match="differ"):
-        race([pinhole, pinhole], domain)
-    with pytest.raises(InputError, match="round"):
-        race([pinhole], domain, rounds=0)
+    for words, candidates, options in (
+        ("threads", [pinhole], {"threads": 0}), ("differ", [pinhole] * 2, {}), ("round", [pinhole], {"rounds": 0}),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=words):
+            race(candidates, domain, **options)
 
 
 def test_candidates_of_several_domains_run_in_one_race() -> None:

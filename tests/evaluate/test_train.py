@@ -88,14 +88,11 @@ def test_leaves_everything_in_one_folder(run: tuple[Path, dict]) -> None:
     assert "67" in (out / "report.html").read_text().partition("Image comparison")[2][:400]
 
 
-def test_errors_are_in_the_order_that_physics_gives(run: tuple[Path, dict]) -> None:
+def test_errors_are_in_the_order_that_physics_gives_and_hold_when_stopped_down(run: tuple[Path, dict]) -> None:
     thick, fitted, network = run[1]["models"]
     assert thick["rms_um"] > 20 * fitted["rms_um"] > 0
     assert network["rms_um"] < thick["rms_um"] / 5
     assert fitted["false_pass"] < 0.005 and fitted["false_block"] < 0.005
-
-
-def test_models_hold_when_stopped_down(run: tuple[Path, dict]) -> None:
     stopped = {m["name"]: m["stopped_down"] for m in run[1]["models"]}
     for shares in stopped["ols-24"].values():
         assert shares["false_pass"] < 0.02 and shares["false_block"] < 0.02
@@ -117,7 +114,7 @@ def test_a_model_file_that_was_changed_is_fitted_again(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text('title = "a"\n[lens]\nfile = "a"\n[[model]]\nterms = 6\nplanes = false\n')
     settings = read_experiment(tmp_path / "a.toml", [lens, *small, "lens.f_number=8", "domain.film_radius_mm=21"])
     lens_ = settings.lens.read()
-    prepared = prepare(make_pairs(lens_, settings.domain_of(lens_), settings.pairs))
+    prepared = prepare(make_pairs(lens_, settings.domain.of(lens_), settings.pairs))
     first = fit_and_measure(prepared, settings.model[0], tmp_path, 2000, lambda _: None)
     whole = first.file.read_bytes()
     assert fit_and_measure(prepared, settings.model[0], tmp_path, 2000, lambda _: None).record == first.record
@@ -130,7 +127,8 @@ def test_a_model_file_that_was_changed_is_fitted_again(tmp_path: Path) -> None:
 def test_resolved_configuration_runs_again_without_fitting(run: tuple[Path, dict]) -> None:
     out = run[0] / "out"
     before = {f: f.stat().st_mtime_ns for f in (out / "models").glob("*.onnx")}
-    again = run_experiment(read_experiment(out / "config.toml"), out)
+    quick = ["render.scenes=[]", "scene_domain=none"]
+    again = run_experiment(read_experiment(out / "config.toml", quick), out)
     assert {f: f.stat().st_mtime_ns for f in (out / "models").glob("*.onnx")} == before
     assert [m["rms_um"] for m in again["models"]] == [m["rms_um"] for m in run[1]["models"]]
 
@@ -171,20 +169,17 @@ def test_experiments_ask_for_states() -> None:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "field"),
-    [(['lens.zoom="range"', "lens.efl_mm=50"], "lens.efl_mm"),
-     (['lens.zoom="range"', 'lens.configuration="135mm"'], "lens.configuration")],
-)  # fmt: skip
-def test_states_that_cannot_be_asked_for(overrides: list[str], field: str) -> None:
+    ("file", "overrides", "field"),
+    [
+        (ZOOM, ['lens.zoom="range"', "lens.efl_mm=50"], "lens.efl_mm"),
+        (ZOOM, ['lens.zoom="range"', 'lens.configuration="135mm"'], "lens.configuration"),
+        (lens_models.LENSES / "laikin_double_gauss_50.toml", ['lens.zoom="range"'], "zoom"),
+        (lens_models.LENSES / "laikin_double_gauss_50.toml", ['lens.focusing="internal"'], "focus"),
+    ],
+)
+def test_states_that_cannot_be_asked_for(file: Path, overrides: list[str], field: str) -> None:
     with pytest.raises(InputError, match=field):
-        default_experiment(ZOOM, overrides).states()
-
-
-def test_lens_files_without_states_are_refused() -> None:
-    fixed = lens_models.LENSES / "laikin_double_gauss_50.toml"
-    for override, field in (('lens.zoom="range"', "zoom"), ('lens.focusing="internal"', "focus")):
-        with pytest.raises(InputError, match=field):
-            default_experiment(fixed, [override]).states()
+        default_experiment(file, overrides).states()
 
 
 @pytest.mark.parametrize(

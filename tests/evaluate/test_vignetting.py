@@ -55,24 +55,21 @@ def stopped_down(lens: Lens, domain: Domain, predict: Any, count: int) -> list[d
     return [vignetting_errors(lens, domain, predict, stop_radius_mm=r, count=count) for r in radii]
 
 
-def test_the_true_opening_has_no_false_rays() -> None:
-    result = vignetting_errors(*hole(10.0), opening(1.0), count=32768)
-    assert not any(result[k] for k in ("false_pass", "false_block", "false_pass_near_rim", "false_block_near_rim"))
+@pytest.mark.parametrize(
+    ("factor", "wrong", "share", "near_rim"),
+    [
+        (1.0, "false_pass", 0.0, 0.0),
+        # Too large, it passes the ring; too small, it blocks it.
+        (1.01, "false_pass", (1.01**2 - 1) / 1.01**2, (1.01**2 - 1) / (1.01**2 - 0.98**2)),
+        (0.99, "false_block", 1 - 0.99**2, (1 - 0.99**2) / (1 - 0.98**2)),
+    ],
+)
+def test_false_shares_of_a_hole(factor: float, wrong: str, share: float, near_rim: float) -> None:
+    result = vignetting_errors(*hole(10.0), opening(factor), count=131072)
+    assert result[wrong] == pytest.approx(share, rel=0.02)
+    assert result[f"{wrong}_near_rim"] == pytest.approx(near_rim, rel=0.02)
+    assert result["false_block" if wrong == "false_pass" else "false_pass"] == 0
     assert result["passing_share"] == pytest.approx(1 / 1.05**2, rel=2e-3)
-
-
-def test_an_opening_too_large_passes_the_ring() -> None:
-    result = vignetting_errors(*hole(10.0), opening(1.01), count=131072)
-    assert result["false_pass"] == pytest.approx((1.01**2 - 1) / 1.01**2, rel=0.02)
-    assert result["false_pass_near_rim"] == pytest.approx((1.01**2 - 1) / (1.01**2 - 0.98**2), rel=0.02)
-    assert result["false_block"] == 0
-
-
-def test_an_opening_too_small_blocks_the_ring() -> None:
-    result = vignetting_errors(*hole(10.0), opening(0.99), count=131072)
-    assert result["false_block"] == pytest.approx(1 - 0.99**2, rel=0.02)
-    assert result["false_block_near_rim"] == pytest.approx((1 - 0.99**2) / (1 - 0.98**2), rel=0.02)
-    assert result["false_pass"] == 0
 
 
 def test_stopping_down_keeps_the_shares_of_a_hole() -> None:
@@ -91,11 +88,11 @@ def test_zones_tell_where_on_the_film() -> None:
 
 def test_illumination_of_a_small_hole_is_cos4() -> None:
     result = relative_illumination(*hole(0.2), opening(1.0, 0.9), points=4096, rows=9)
-    expected = [math.cos(math.atan2(r, FILM_Z)) ** 4 for r in result["film_radius_mm"]]
-    assert result["exact"] == pytest.approx(expected, rel=1e-4)
-    assert result["model"] == pytest.approx([0.9 * e for e in expected], rel=1e-4)
-    assert result["max_difference"] == pytest.approx(0.1, rel=1e-4)
-    assert result["film_radius_mm"][-1] == FILM_RADIUS
+    expected = [math.cos(math.atan2(r, FILM_Z)) ** 4 for r in result.film_radius_mm]
+    assert result.exact == pytest.approx(expected, rel=1e-4)
+    assert result.model == pytest.approx([0.9 * e for e in expected], rel=1e-4)
+    assert result.max_difference == pytest.approx(0.1, rel=1e-4)
+    assert result.film_radius_mm[-1] == FILM_RADIUS
 
 
 def test_the_deciding_rim_agrees_with_the_tracer() -> None:
@@ -121,7 +118,5 @@ def test_a_real_lens_against_itself_stopped_down() -> None:
     for result in stopped_down(lens, domain, exactly, count=32768):
         assert result["false_pass"] == result["false_block"] == 0
     light = relative_illumination(lens, domain, exactly, points=2048, rows=5)
-    assert light["max_difference"] == 0
-    assert (
-        light["exact"][0] == 1 and light["exact"][-1] < 0.5
-    )  # a fast double Gauss darkens by over a stop in the corner
+    assert light.max_difference == 0
+    assert light.exact[0] == 1 and light.exact[-1] < 0.5  # a fast double Gauss darkens by over a stop in the corner

@@ -51,8 +51,8 @@ def test_every_opening_with_one_fit(fisheye: LensModel) -> None:
 
 def test_a_fisheye_darkens_as_the_exact_lens_does(fisheye: LensModel) -> None:
     found = relative_illumination(fisheye.lens, fisheye.domain, fisheye.predict, points=4096, rows=9)
-    assert found["max_difference"] < 0.003
-    assert found["exact"][-1] < 0.9 * found["exact"][0]
+    assert found.max_difference < 0.003
+    assert found.exact[-1] < 0.9 * found.exact[0]
 
 
 @pytest.mark.parametrize("share", [0.0, 0.7, 1.0])

@@ -7,16 +7,18 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 
 from neurolens.base.errors import InputError
 from neurolens.graph import derive
-from neurolens.graph.c import write_c
+from neurolens.graph.c import write_blocks, write_c
 from neurolens.graph.compiler import compile_c
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
+from neurolens.graph.onnx import write_onnx
 from neurolens.graph.passes import pruned
 from neurolens.graph.program import row_names
 from neurolens.graph.scalars import lower
@@ -55,6 +57,8 @@ CASES: dict[str, Callable[[Graph, Value, Value, Value], Value]] = {
     "max": lambda g, x, y, s: (x * x).maximum(y * y),
     "min": lambda g, x, y, s: (x * x).minimum(y * y),
     "clip": lambda g, x, y, s: (x * y).clip(0.4, 0.9),
+    "floor": lambda g, x, y, s: x.floor() * y + x,
+    "lookup": lambda g, x, y, s: g.lookup(g.table("t", 6), x[0] * 3.0, g.concat(x[1], y[0] * s)) * x,
     "select": lambda g, x, y, s: g.select(x <= y, x * x, y * s),
     "select by several": lambda g, x, y, s: g.select((x <= y) & x.between(0.5, 1.2), x * y, 3.0),
     "constant": lambda g, x, y, s: g.constant([1.0, 2.0]) + s * 0.0,
@@ -71,9 +75,10 @@ def inputs(count: int = 400) -> dict[str, Array]:
     """Numbers apart from those at which choices change."""
     x, y = np.random.default_rng(1).uniform(0.3, 1.4, (2, 3, 8 * count))
     edges = [np.abs(x - y), np.abs(x * x - y * y), *(np.abs(x * y - e) for e in (0.4, 0.9))]
-    edges += [np.abs(x - e) for e in (0.5, 1.2)]
+    edges += [np.abs(x - e) for e in (0.5, 1.2, 1 / 3, 2 / 3, 1, 4 / 3)]
     far = (np.min(edges, axis=0) > 2e-3).all(0)
-    return {"x": x[:, far][:, :count], "y": y[:, far][:, :count], "s": np.array([[0.7]])}
+    table = np.random.default_rng(2).normal(size=(5, 6))
+    return {"x": x[:, far][:, :count], "y": y[:, far][:, :count], "s": np.array([[0.7]]), "t": table}
 
 
 def test_every_rule_is_tested() -> None:
@@ -108,8 +113,9 @@ def test_torch_and_single_steps_give_what_numpy_gives(name: str) -> None:
         by = [evaluate(with_derivatives(graph, ["out"], [("x", k)]), given) for k in range(3)]
         rows = [(d[derivative("out", f"x_{k}")] + 0 * wanted).sum(0) for k, d in enumerate(by)]
         np.testing.assert_allclose(0 * np.stack(rows) if slope is None else slope, np.stack(rows), rtol=0, atol=1e-12)
-    steps = {name: row for k, v in given.items() for name, row in zip(row_names(k, len(v)), v, strict=True)}
-    rows = list(lower(graph).evaluate(steps).values())
+    rays = {k: v for k, v in given.items() if k != "t"}
+    steps = {name: row for k, v in rays.items() for name, row in zip(row_names(k, len(v)), v, strict=True)}
+    rows = list(lower(graph).evaluate(steps | {"t": given["t"]}).values())
     for row, value in zip(rows, wanted, strict=True):
         np.testing.assert_allclose(row + 0 * value, value, rtol=0, atol=2e-6 * (1 + np.abs(value).max()))
 
@@ -164,4 +170,62 @@ def test_status_and_truths_of_any_float_in_every_reader(tmp_path: Path) -> None:
 _CALL = """
 void call(size_t n, const float *x, const float *y, const float *s, int *status)
 { for (size_t i = 0; i < n; i++) { const f_ray r = f(x[i], y[i], s[i]); status[i] = r.status; } }
+"""
+
+
+def test_lookups_of_any_float_stay_inside_the_table(tmp_path: Path) -> None:
+    """Interpolation by weights in every reader, in loops of C and one ray at a time; NaN takes some cell."""
+    g = Graph()
+    x, y = g.input("x"), g.input("y")
+    g.outputs["out"] = g.lookup(g.table("t", 10), x * 2.0, g.concat(g.constant(1.0), y))[[4, 1]] + x * 0.0
+    g.outputs["status"] = (y <= 0.5).whole()
+    table = np.random.default_rng(0).normal(size=(7, 10)).astype(np.float32)
+    some = np.float32([0, 0.49, 0.5, 3.2, 3.49, 3.5, 1e9, -1e9, np.inf, -np.inf, np.nan])
+    x = np.concatenate([some, np.random.default_rng(1).uniform(0, 3.5, 1000).astype(np.float32)])
+    y = np.random.default_rng(2).uniform(0, 1, x.size).astype(np.float32)
+    known = np.isfinite(x)
+    with np.errstate(invalid="ignore"):
+        cell = np.clip(np.nan_to_num(2 * x), 0, 6).astype(int)
+    wanted = (table[cell, :5] + y[:, None] * table[cell, 5:]).T[[4, 1]]
+    given = {"x": x[None], "y": y[None], "t": table}
+    program = lower(g)
+    with np.errstate(invalid="ignore"):
+        steps = program.evaluate({"x": x, "y": y, "t": table})
+    found = [
+        evaluate(g, given)["out"],
+        evaluate(g, {k: torch.from_numpy(v) for k, v in given.items()})["out"].numpy(),
+        np.stack([steps["out_0"], steps["out_1"]]),
+        onnxruntime.InferenceSession(write_onnx(g, {}).SerializeToString()).run(["out"], given)[0],
+    ]
+    try:
+        compile_c(write_blocks(program, "f") + write_c(program, "g", []) + _LOOKUP_CALL, tmp_path / "f.so")
+    except InputError as reason:
+        found.append(found[0])
+        assert "compiler" in str(reason)
+    else:
+        library, padded = ctypes.CDLL(str(tmp_path / "f.so")), np.zeros((7, 2, 8), np.float32)
+        padded[..., :5] = table.reshape(7, 2, 5)
+        for name, cells in (("f", padded), ("call", table)):
+            out, status = np.empty((2, x.size), np.float32), np.empty(x.size, np.int32)
+            ins, outs = (np.array([a.ctypes.data for a in arrays], np.uintp) for arrays in ((x, y), (*out,)))
+            given_, table_, found_, status_ = (ctypes.c_void_p(a.ctypes.data) for a in (ins, cells, outs, status))
+            count = ctypes.c_size_t(x.size)
+            getattr(library, name)(count, given_, None, table_, len(cells), found_, status_)
+            assert np.array_equal(status, y <= 0.5)
+            found.append(out)
+    for values in found:
+        np.testing.assert_allclose(values[:, known], wanted[:, known], rtol=0, atol=1e-6)
+        assert values.shape == (2, x.size)
+
+
+_LOOKUP_CALL = """
+void call(
+    size_t n, const float *const *in, const float *none, const float *t, int cells, float *const *out, int *status)
+{
+    (void)none;
+    for (size_t i = 0; i < n; i++) {
+        const g_ray ray = g(in[0][i], in[1][i], t, cells);
+        out[0][i] = ray.out_0; out[1][i] = ray.out_1; status[i] = ray.status;
+    }
+}
 """

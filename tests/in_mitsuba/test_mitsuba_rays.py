@@ -7,11 +7,10 @@ import sys
 import numpy as np
 import pytest
 
-from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.errors import NeurolensError
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.mitsuba import load_scene
-from neurolens.mitsuba.scenes import our_scene
 from neurolens.mitsuba.sensor import BATCH, ChannelWavelengths, FilmRays, wavelength_samples
 from neurolens.render.film import PixelGrid
 from neurolens.render.spectrum import SpectralRange
@@ -118,27 +117,3 @@ def test_without_mitsuba_one_error_names_the_extra(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     with pytest.raises(NeurolensError, match=r"pip install '\.\[mitsuba\]'"):
         load_scene("cornell-box")
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"type": "sphere"}, "ball.type: got 'sphere'"),
-        ({"type": "rectangle", "bsdf": {"type": "ref", "id": "gone"}}, "ball.bsdf: got 'gone', expected one of: grey"),
-        ({"type": "rectangle", "bsdf": {"id": "grey"}, "emitter": {"type": "spot"}}, "ball.emitter: got 'spot'"),
-        ({"type": "diffuse", "reflectance": {"type": "bitmap"}}, "ball: colour: got 'bitmap', expected rgb"),
-    ],
-)
-def test_scenes_that_are_not_ours_are_refused(change: dict[str, object], words: str) -> None:
-    class At:
-        matrix = np.eye(4)
-
-    scene = {
-        "type": "scene",
-        "integrator": {"type": "path"},
-        "sensor": {"to_world": At, "film": {"width": 8, "height": 8}},
-        "grey": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
-        "ball": {"to_world": At, **change},
-    }
-    with pytest.raises(InputError, match=words.replace("[", r"\[")):
-        our_scene(scene, (20.0, 20.0))

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from experiments.mitsuba_scenes import our_scene, with_our_spectra
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cli import main
 from neurolens.mitsuba import camera, load_scene, register, render, require_mitsuba
-from neurolens.mitsuba.scenes import our_scene, with_our_spectra
 from neurolens.render.pictures import read_exr
 from neurolens.render.renderer import render as our_render
 from neurolens.render.scene import scene_from_tables

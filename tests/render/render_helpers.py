@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import math
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
+from neurolens.cameras.ideal import ThinLens
+from neurolens.cameras.pinhole import Pinhole
 from neurolens.render.integrator import trace
 from neurolens.render.sampler import Sampler
 from neurolens.render.scene import Scene, scene_from_tables
@@ -17,6 +22,7 @@ CAMERA: dict[str, Any] = {"position_m": [0, 0, 1], "look_at_m": [0, 0, 0], "focu
 FILM = (36.0, 24.0)
 SIZE: dict[str, Any] = {"width": 36, "height": 24}
 WHITE = {"colour": [1, 1, 1]}
+THIN, PINHOLE = ThinLens(50.0, 2.0, 3.0, FILM), Pinhole(50.0, FILM)
 
 
 def scene(camera: dict[str, Any] | None = None, **tables: Any) -> Scene:
@@ -39,6 +45,22 @@ MATERIALS: dict[str, Any] = {
     "plastic": {"kind": "glossy", "specular": [0.05] * 3, "roughness": 0.3, "reflectance": [0.5] * 3},
 }
 FLOOR = {"point_m": [0, 0, 0], "normal": [0, 1, 0], "material": "grey"}
+
+
+def on_floor(**tables: Any) -> World:
+    """A grey floor, or as `planes` says, and what else is given."""
+    return world(**({"materials": MATERIALS, "planes": [FLOOR]} | tables))
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """What the system says of a longer file is what it says of a full disk, but for the words."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def lit_scene(red: float = 0.7, camera: dict[str, Any] | None = None) -> Scene:
@@ -66,8 +88,9 @@ def radiance(
     pixel, sample = np.divmod(np.arange(count), samples)
     rays = [np.repeat(np.float32(v)[:, None], count, axis=1) for v in (origin, direction)]
     bins = np.arange(count) * 256 // count if pixels == 1 else np.full(count, 128)
-    weight = np.ones(count if lanes == 1 else (lanes, count), np.float32)
-    return trace(made, sampler, sampler.keys(pixel, sample), *rays, weight, bins, max_depth, aim=aim)
+    weight = np.ones((lanes, count), np.float32)
+    found = trace(made, sampler, sampler.keys(pixel, sample), *rays, weight, bins, max_depth, aim=aim)
+    return found if lanes > 1 else found[0]
 
 
 def assert_aimed(made: World, towards: list[float], noise: float, resolved: float = 0.03, max_depth: int = 3) -> None:

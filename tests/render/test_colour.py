@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 import pytest
+from command_line import failure, run_json
 
-from neurolens.cli import main
 from neurolens.render.colour import (
     ACESCG,
     BRADFORD,
@@ -92,37 +91,22 @@ def test_srgb_encoding_round_trip() -> None:
     assert linear_to_srgb(np.array([-1.0, np.nan, 9.0])) == pytest.approx([0, 0, 1], abs=1e-6)
 
 
-SCENE = """
-[camera]
-position_m = [0, 0, 0]
-look_at_m = [0, 0, -1]
-focus_m = 2
-width = 36
-height = 24
-film_height_mm = 24
-samples = 64
-[environment]
-colour = [1, 1, 1]
-illuminant = "3200 K"
-"""
-
-
-def test_the_command_line_chooses_space_and_white(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "s.toml").write_text(SCENE)
+def test_the_command_line_chooses_space_and_white(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    white = 'illuminant = "3200 K"\n'
+    scene.write_text(scene.read_text().partition("[materials]")[0] + white)
     out = tmp_path / "o.exr"
-    base = ["render", str(tmp_path / "s.toml"), "--camera", "pinhole", "--efl", "400", "-o", str(out), "--quiet"]
-    assert main([*base, "--colour-space", "ACEScg", "--white-balance", "3200 K", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["white_balance"] == "3200 K"
+    base = ("render", scene, "--camera", "pinhole", "--efl", 400, "--samples", 64, "-o", out, "--quiet")
+    data = run_json(capsys, *base, "--colour-space", "ACEScg", "--white-balance", "3200 K")
+    assert data["white_balance"] == "3200 K"
     rgb, metadata = read_exr(out)
     assert metadata["colour"] == {"space": "ACEScg", "white_xy": [0.32168, 0.33767], "adaptation": "Bradford"}
     assert rgb.mean(axis=(0, 1)) == pytest.approx([1, 1, 1], abs=0.01)
-    assert main(base) == 0
+    run_json(capsys, *base)
     warm = read_exr(out)[0].mean(axis=(0, 1))
     assert warm[0] > 1.3 and warm[2] < 0.5
-    capsys.readouterr()
-    assert main([*base, "--white-balance", "F99"]) == 2
-    said = capsys.readouterr().err
-    assert "s.toml: --white-balance: got 'F99', expected one of: D65, D50, A, E" in said
-    (tmp_path / "s.toml").write_text(SCENE.replace("[environment]", '[film]\ncolour_space = "Rec2020"\n[environment]'))
-    assert main(base) == 2
-    assert "s.toml: film.colour_space: got 'Rec2020', expected one of: 'sRGB', 'ACEScg'" in capsys.readouterr().err
+    said = failure(capsys, *base, "--white-balance", "F99")
+    assert "ball.toml: --white-balance: got 'F99', expected one of: D65, D50, A, E" in said
+    scene.write_text('[film]\ncolour_space = "Rec2020"\n' + scene.read_text())
+    assert "film.colour_space: got 'Rec2020', expected one of: 'sRGB', 'ACEScg'" in failure(capsys, *base)

@@ -34,7 +34,7 @@ def test_cornell_box_agrees_with_mitsuba(nm: float) -> None:
     assert settings.up == (0, 1, 0) and settings.look_at_m[:2] == settings.position_m[:2]
     origin = axes @ rays.origin_m + np.float32(settings.position_m)[:, None]
     bins = np.zeros(count, np.intp)
-    found = trace(world, sampler, keys, origin, axes @ rays.direction, np.ones(count, np.float32), bins, 40)
+    found = trace(world, sampler, keys, origin, axes @ rays.direction, np.ones((1, count), np.float32), bins, 40)
 
     (lamp,) = scene.settings.quads
     parts = found.reshape(8, PIXELS // 8, 8, PIXELS // 8, SAMPLES) / lamp.emission[0]

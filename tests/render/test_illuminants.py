@@ -130,22 +130,6 @@ def test_a_measured_spectrum_of_lines(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("tables", "said"),
-    [
-        ({"environment": WHITE | {"illuminant": "F99"}}, r"environment\.illuminant: got 'F99', expected one of: D65,"),
-        ({"environment": WHITE | {"illuminant": "100 K"}}, r"environment\.illuminant: got '100 K'.*500 K to 100000 K"),
-        ({"film": {"white_balance": "D60"}}, r"film\.white_balance: got 'D60'.*did you mean 'D65'"),
-        ({"illuminants": {"lamp": {"spectrum": TRIPLE, "file": "a.csv"}}}, "either spectrum or file"),
-        ({"illuminants": {"A": {"spectrum": [[380, 1], [780, 1]]}}}, r"illuminants\.A: got 'A', expected a name"),
-    ],
-)
-def test_each_mistake_is_named(tables: dict[str, Any], said: str) -> None:
-    with pytest.raises(InputError, match=said) as caught:
-        scene(**tables)
-    assert str(caught.value).startswith("test.toml: ")
-
-
-@pytest.mark.parametrize(
     ("rows", "said"),
     [
         ([[400, 1]], r"lamp\.spectrum: got \(1 rows\), expected 2 to 10000"),

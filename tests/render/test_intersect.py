@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,14 @@ def rays(count: int, spread: float = 3.0) -> Rays:
     direction[:, :30] = np.repeat(np.eye(3), 10, axis=1) * RANDOM.choice([-1, 1], 30)
     direction /= np.linalg.norm(direction, axis=0)
     return Rays.of(origin.astype(np.float32), direction.astype(np.float32))
+
+
+def hits(mesh: Any, batch: Rays, limit: Any = np.inf) -> tuple[np.ndarray, np.ndarray]:
+    """Distances and surfaces [N], of hits nearer than the limit."""
+    count = batch.origin.shape[1]
+    best, found = np.full(count, limit, np.float32), np.full(count, -1, np.int32)
+    mesh.nearer(batch, best, found)
+    return best, found
 
 
 def meet_triangles(corners: np.ndarray, batch: Rays) -> np.ndarray:
@@ -49,8 +58,7 @@ def test_mesh_of_any_size_matches_every_triangle_in_turn(count: int) -> None:
     corners = centre + RANDOM.normal(size=(count, 3, 3)) * (2.0 / count**0.4)
     batch = rays(1500)
     mesh = Mesh(5, corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))
-    best, found = np.full(1500, np.inf, np.float32), np.full(1500, -1, np.int32)
-    mesh.nearer(batch, best, found)
+    best, found = hits(mesh, batch)
     expected = meet_triangles(corners, batch)
     agree(best, expected)
     hit = np.flatnonzero(found >= 0)
@@ -76,8 +84,7 @@ def test_closed_mesh_has_no_seams() -> None:
     direction = direction[:, np.abs(direction[1]) < 0.99]  # but for the holes at the poles
     count = direction.shape[1]
     origin = np.repeat([[2.0], [1.0], [-3.0]], count, axis=1) + RANDOM.normal(size=(3, count)) * 0.002
-    best, found = np.full(count, np.inf, np.float32), np.full(count, -1, np.int32)
-    mesh.nearer(Rays.of(origin.astype(np.float32), direction.astype(np.float32)), best, found)
+    best, found = hits(mesh, Rays.of(origin.astype(np.float32), direction.astype(np.float32)))
     assert np.all(found >= 0) and np.ptp(best) < 0.02
 
 
@@ -97,19 +104,12 @@ def test_shapes_match_float64_formulas() -> None:
     batch = rays(20000)
     best, found = made.nearest(batch)
     o, d = batch.origin.astype(float), batch.direction.astype(float)
-    triangles = []
-    for quad in quads:
-        a, u, v = (np.array(quad[k], float) for k in ("corner_m", "edge_u_m", "edge_v_m"))
-        triangles += [[a, a + u, a + v], [a + u + v, a + u, a + v]]
-    x0, x1 = np.array([-2, -1, 0.0]), np.array([-1, 0, 1.0])
-    for axis in range(3):
-        for side in (x0, x1):
-            k, m = [j for j in range(3) if j != axis]
-            a, b, c, e = (side * (np.arange(3) == axis) for _ in range(4))
-            for corner, (first, second) in zip((a, b, c, e), ((x0, x0), (x1, x0), (x0, x1), (x1, x1)), strict=True):
-                corner[k], corner[m] = first[k], second[m]
-            triangles += [[a, b, c], [e, b, c]]
-    expected = meet_triangles(np.array(triangles), batch)
+    low, sides = np.array([-2, -1, 0.0]), np.eye(3)
+    faces = [(np.array(q["corner_m"]), np.array(q["edge_u_m"]), np.array(q["edge_v_m"])) for q in quads]
+    for k in range(3):
+        faces += [(low + far * sides[k], sides[k - 1], sides[k - 2]) for far in (0, 1)]
+    triangles = [[a, a + u, a + v] for a, u, v in faces] + [[a + u + v, a + u, a + v] for a, u, v in faces]
+    expected = meet_triangles(np.array(triangles, float), batch)
     for sphere in spheres:
         f = np.array(sphere["centre_m"])[:, None] - o
         middle = np.sum(f * d, axis=0)
@@ -186,12 +186,7 @@ def test_embree_and_the_tree_give_the_same_hits() -> None:
     on = corners[faces].mean(axis=1)[RANDOM.integers(500, size=5000)].T.astype(np.float32)
     batch.origin[:, :5000] = on + batch.direction[:, :5000] * np.float32(1e-3)
     limit = np.where(RANDOM.random(20000) < 0.5, np.inf, RANDOM.uniform(0, 12, 20000)).astype(np.float32)
-    hits = []
-    for made in (Mesh(7, corners, faces), EmbreeMesh(7, corners, faces)):
-        best, found = limit.copy(), np.full(20000, -1, np.int32)
-        made.nearer(batch, best, found)
-        hits.append((best, found))
-    (a, tree), (b, embree) = hits
+    (a, tree), (b, embree) = (hits(made(7, corners, faces), batch, limit) for made in (Mesh, EmbreeMesh))
     # The tree's triangles are a hair larger.
     same = (tree == embree) & ((tree < 0) | np.isclose(a, b, rtol=1e-5, atol=1e-5))
     assert np.mean(~same) < 2e-3 and 0.2 < np.mean(tree >= 0) < 0.9

@@ -23,16 +23,27 @@ def box_of_lights(half: float, emission: float) -> list[dict[str, Any]]:
     return [q | {"material": "grey", "emission": [emission] * 3} for q in quads]
 
 
-@pytest.mark.parametrize("material", ["white", "mirror", "glass"])
-def test_what_absorbs_nothing_vanishes_in_uniform_light(material: str) -> None:
+def coat(roughness: float, specular: float = 0.04) -> dict[str, Any]:
+    """A coat over white, or white metal."""
+    base = 1 if specular < 1 else 0
+    return {"kind": "glossy", "specular": [specular] * 3, "roughness": roughness, "reflectance": [base] * 3}
+
+
+COATS = [coat(roughness, specular) for roughness in (0.05, 0.3, 1.0) for specular in (0.04, 1)]
+
+
+@pytest.mark.parametrize("material", [*(MATERIALS[name] for name in ("white", "mirror", "glass")), *COATS])
+def test_what_absorbs_nothing_vanishes_in_uniform_light(material: dict[str, Any]) -> None:
     made = world(
-        materials=MATERIALS,
+        materials=MATERIALS | {"m": material},
         environment=WHITE,
-        spheres=[{"centre_m": [0, 0, 0], "radius_m": 1, "material": material}],
+        spheres=[{"centre_m": [0, 0, 0], "radius_m": 1, "material": "m"}],
         boxes=[{"min_m": [0.5, -2, -2], "max_m": [2, 2, 2], "material": "white"}],
     )
-    values = radiance(made, [0, 0.3, 5], [0, 0.2, 0], samples=2048, max_depth=300)
-    assert np.abs(values.mean() - 1) < 0.01
+    for height in (0, 0.2, 0.95):
+        values = radiance(made, [0, 0.3, 5], [0, height, 0], samples=8192, max_depth=300)
+        # The directions that a smooth normal sends below the surface are the only loss.
+        assert abs(values.mean() - 1) < 5e-3 + 4 * values.std() / math.sqrt(8192)
 
 
 def test_closed_box_of_glowing_walls_reaches_the_geometric_sum() -> None:
@@ -41,31 +52,13 @@ def test_closed_box_of_glowing_walls_reaches_the_geometric_sum() -> None:
     assert values.mean() == pytest.approx(0.75 / (1 - 0.5), rel=0.01)
 
 
-@pytest.mark.parametrize("roughness", [0.05, 0.3, 1.0])
-def test_a_glossy_object_that_absorbs_nothing_vanishes_in_uniform_light(roughness: float) -> None:
-    painted = {"kind": "glossy", "specular": [0.04] * 3, "roughness": roughness, "reflectance": [1, 1, 1]}
-    metal = {"kind": "glossy", "specular": [1, 1, 1], "roughness": roughness, "reflectance": [0, 0, 0]}
-    for material in (painted, metal):
-        made = world(
-            {"position_m": [0, 0, 5]},
-            materials={"m": material},
-            environment=WHITE,
-            spheres=[{"centre_m": [0, 0, 0], "radius_m": 1, "material": "m"}],
-        )
-        for target in ([0, 0, 0], [0, 0.95, 0]):
-            values = radiance(made, [0, 0, 5], target, samples=16384)
-            # The directions that a smooth normal sends below the surface are the only loss.
-            assert abs(values.mean() - 1) < 5e-3 + 4 * values.std() / 128
-
-
 def test_a_closed_furnace_of_all_kinds_reaches_the_light_of_its_lamp() -> None:
     # Everything in a closed white room reflects all light, and a lamp of emission 1 fills a wall: after enough
     # reflections there is 1 everywhere, in the glass too, as all that is seen is the lamp.
     lamp = {"corner_m": [-1, 1, -1], "edge_u_m": [2, 0, 0], "edge_v_m": [0, 0, 2], "emission": [1, 1, 1]}
     made = world(
         {"position_m": [0, 0, 0.9]},
-        materials=MATERIALS
-        | {"coat": {"kind": "glossy", "specular": [0.04] * 3, "roughness": 0.3, "reflectance": [1] * 3}},
+        materials=MATERIALS | {"coat": coat(0.3)},
         rooms=[{"min_m": [-1, -1, -1], "max_m": [1, 1.001, 1], "material": "white", "floor": "coat"}],
         quads=[lamp],
         spheres=[{"centre_m": [0, -0.4, 0], "radius_m": 0.5, "material": "glass"}],
@@ -153,12 +146,10 @@ def test_light_is_seen_in_a_mirror_and_through_glass() -> None:
     assert straight.mean() == pytest.approx(2 * (1 - reflectance) / (1 + reflectance), rel=0.01)
 
 
-def test_a_room_is_seen_from_behind_its_walls_and_keeps_light_out() -> None:
+def test_a_room_is_seen_from_behind_its_walls() -> None:
     room = {"min_m": [-1, -1, -1], "max_m": [1, 1, 1], "material": "grey"}
     lamp = {"corner_m": [-0.5, 0.9, -0.5], "edge_u_m": [1, 0, 0], "edge_v_m": [0, 0, 1], "emission": [3, 3, 3]}
     made = world(materials=MATERIALS, rooms=[room], quads=[lamp])
     outside = radiance(made, [0, 0, 3], [0, -0.2, -1], samples=16384, max_depth=2)
     inside = radiance(made, [0, -0.1, 1], [0, -0.2, -1], samples=16384, max_depth=2)
     assert outside.mean() == pytest.approx(inside.mean(), rel=0.01) and inside.mean() > 0.1
-    dark = world(materials=MATERIALS, environment=WHITE, rooms=[room])
-    assert not radiance(dark, [0, 0, 3], [0, -0.2, -1], max_depth=5).any()

@@ -23,8 +23,8 @@ def full(value: float, count: int = COUNT) -> np.ndarray:
 
 def glossy(normal: np.ndarray, out: np.ndarray, base: float, coat: float, alpha: float) -> GlossyLobes:
     count = normal.shape[1]
-    numbers = [full(value, count) for value in (base, coat, alpha)]
-    return GlossyLobes(normal, out, *numbers, CoatTable([alpha]), np.zeros(count, np.intp))
+    base_coat = [full(value, count)[None] for value in (base, coat)]
+    return GlossyLobes(normal, out, *base_coat, full(alpha, count), CoatTable([alpha]), np.zeros(count, np.intp))
 
 
 def test_cosine_directions_have_the_moments_of_the_cosine_law() -> None:
@@ -114,15 +114,14 @@ def test_glass_bends_by_snell_and_splits_by_fresnel(outside: bool) -> None:
     angle = math.radians(35)
     travel, normal = repeated((math.sin(angle), 0, -math.cos(angle))), repeated((0, 0, 1))
     index = full(1.5)
-    direction, refracts = glass_direction(
-        travel, normal, np.full(COUNT, outside), index, RANDOM.random(COUNT, np.float32)
-    )
     relative = 1.5 if outside else 1 / 1.5
+    reflectance, _ = fresnel_dielectric(full(math.cos(angle)), full(relative))
+    choice, outsides = RANDOM.random(COUNT, np.float32), np.full(COUNT, outside)
+    direction, refracts = glass_direction(travel, normal, outsides, index, choice, reflectance)
     assert np.allclose(direction[0, refracts], math.sin(angle) / relative, atol=1e-6) and np.all(
         direction[2, refracts] < 0
     )
     assert np.allclose(direction[:, ~refracts].T, (math.sin(angle), 0, math.cos(angle)), atol=1e-6)
-    reflectance, _ = fresnel_dielectric(full(math.cos(angle), 1), full(relative, 1))
     assert np.mean(~refracts) == pytest.approx(float(reflectance[0]), abs=2e-3)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from render_helpers import diffuse, radiance, scene, world
+from render_helpers import WHITE, diffuse, radiance, scene, world
 
 from neurolens.base.errors import InputError
 from neurolens.render import meshfile
@@ -115,21 +115,18 @@ def test_a_picture_lies_on_a_mesh_as_its_coordinates_say(tmp_path: Path) -> None
         textures={"p": {"kind": "image", "file": str(tmp_path / "p.png")}},
         materials={"m": {"kind": "diffuse", "texture": "p"}},
         meshes=[{"file": str(tmp_path / "a.ply"), "material": "m", "translate_m": [0, 0, -2]}],
-        environment={"colour": [1, 1, 1]},
+        environment=WHITE,
     )
-    for (x, y), shown in {
-        (0.25, 0.25): 0.0,
-        (0.25, 0.75): 1.0,
-        (0.75, 0.25): (1, 0, 0),
-        (0.75, 0.75): (0, 1, 0),
-    }.items():
-        values = radiance(made, [x, y, 0], [x, y, -2], samples=256, max_depth=1)
-        other = world(
-            materials={"m": diffuse(*np.broadcast_to(shown, 3).astype(float))},
+    for x, y, shown in ((1, 1, (0, 0, 0)), (1, 3, (1, 1, 1)), (3, 1, (1, 0, 0)), (3, 3, (0, 1, 0))):
+        plain = world(
+            materials={"m": diffuse(*shown)},
             planes=[{"point_m": [0, 0, -2], "normal": [0, 0, 1], "material": "m"}],
-            environment={"colour": [1, 1, 1]},
+            environment=WHITE,
         )
-        assert np.allclose(values, radiance(other, [x, y, 0], [x, y, -2], samples=256, max_depth=1), atol=2e-3)
+        seen, expected = (
+            radiance(w, [x / 4, y / 4, 0], [x / 4, y / 4, -2], samples=256, max_depth=1) for w in (made, plain)
+        )
+        assert np.allclose(seen, expected, atol=2e-3)
 
 
 @pytest.mark.parametrize(("smooth", "tilted"), [(None, True), (True, True), (False, False)])

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from render_helpers import FILM, SIZE, WHITE, diffuse, lit_scene, scene
+from render_helpers import FILM, PINHOLE, SIZE, THIN, WHITE, diffuse, lit_scene, scene
 
 from neurolens.base.errors import InputError, ModelError, NeurolensError
 from neurolens.cameras.contract import CameraRays
@@ -66,8 +66,7 @@ def test_uniform_light_falls_off_with_the_fourth_power_of_the_cosine() -> None:
 
 def test_workers_do_not_change_the_picture_and_seeds_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("neurolens.render.film.BATCH", 1024)
-    made, camera = lit_scene(), ThinLens(50.0, 2.0, 3.0, FILM)
-    options = SIZE | {"samples": 40}
+    made, camera, options = lit_scene(), THIN, SIZE | {"samples": 40}
     one = render(made, camera, threads=1, **options)
     seen: list[float] = []
     two = render(made, camera, threads=2, progress=lambda fraction, left: seen.append(fraction), **options)
@@ -81,29 +80,10 @@ def test_workers_do_not_change_the_picture_and_seeds_do(monkeypatch: pytest.Monk
 def test_cameras_share_their_noise() -> None:
     made = lit_scene()
     options = SIZE | {"samples": 4, "threads": 1}
-    pinhole = render(made, Pinhole(50.0, FILM), **options).rgb
+    pinhole = render(made, PINHOLE, **options).rgb
     almost = render(made, ThinLens(50.0, 1e5, np.inf, FILM), **options).rgb
-    other = render(made, Pinhole(50.0, FILM), seed=1, **options).rgb
+    other = render(made, PINHOLE, seed=1, **options).rgb
     assert np.abs(pinhole - almost).mean() < 0.02 * np.abs(pinhole - other).mean()
-
-
-def test_differentials_are_asked_for_and_change_nothing() -> None:
-    made, options = lit_scene(), SIZE | {"samples": 4, "threads": 1}
-    asked = 0
-
-    class Counting(ThinLens):
-        def sample_differentials(self, *at: Any) -> CameraRays:
-            nonlocal asked
-            asked += at[0].shape[1]
-            return super().sample_differentials(*at)
-
-    camera = Counting(50.0, 2.0, 3.0, FILM)
-    plain, with_them = render(made, camera, **options), render(made, camera, differentials=True, **options)
-    assert asked >= 36 * 24 * 4 and np.array_equal(plain.rgb, with_them.rgb)
-    assert 0 < with_them.stats["camera_thread_seconds"] < with_them.stats["thread_seconds"]
-    with pytest.raises(InputError, match="differentials"):
-        camera.sample_differentials = None  # type: ignore[assignment, method-assign]
-        render(made, camera, differentials=True, **options)
 
 
 class HalfBlocked(Pinhole):
@@ -230,7 +210,7 @@ def test_errors_are_clear() -> None:
         ({"width": 3_000_000, "height": 2_000_000}, "width x height.*164 bytes"),
     ):
         with pytest.raises(InputError, match=field):
-            render(made, Pinhole(50.0, FILM), **(small | change))
+            render(made, PINHOLE, **(small | change))
     with pytest.raises(InputError, match="450-650 nm"):
         render(made, Prism(50.0, FILM), **small)
     narrow = scene({"wavelengths_nm": [460, 640]}, environment=WHITE)

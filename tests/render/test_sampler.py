@@ -32,15 +32,11 @@ def test_every_pixel_is_stratified_in_each_dimension(dimension: int) -> None:
         assert sorted(strata) == list(range(64))
 
 
-@pytest.mark.parametrize("first", [FILM, PUPIL])
-def test_film_and_pupil_are_stratified_in_two_dimensions(first: int) -> None:
+def test_film_and_pupil_are_stratified_in_two_dimensions() -> None:
     sampler = Sampler(64, seed=5)
-    u, v = pixel_samples(sampler, 9, 64, first), pixel_samples(sampler, 9, 64, first + 1)
-    if first == FILM:
-        cells = np.floor(u * 8) * 8 + np.floor(v * 8)
-        assert len(set(cells)) == 64
-    else:
-        assert len(set(np.floor(u * 4) * 4 + np.floor(v * 4))) == 16
+    for first, side in ((FILM, 8), (PUPIL, 4)):
+        u, v = pixel_samples(sampler, 9, 64, first), pixel_samples(sampler, 9, 64, first + 1)
+        assert len(set(np.floor(u * side) * side + np.floor(v * side))) == side**2
 
 
 def test_pixels_seeds_and_dimensions_differ_and_repeat() -> None:

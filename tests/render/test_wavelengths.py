@@ -57,9 +57,9 @@ def test_upsampling_conserves_energy_and_reciprocates_over_the_cube() -> None:
     cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
     spectra = spectral.spectrum(cube)
     assert spectra.min() >= 0 and spectra.max() <= 1 + 1e-6 and np.allclose(spectra[-1], 1, atol=1e-6)
-    assert spectra.astype(float) @ spectral.response.T / spectral.bins == pytest.approx(cube, abs=1e-5)
+    assert np.allclose(spectra.astype(float) @ spectral.response.T / spectral.bins, cube, rtol=0, atol=1e-5)
     # Complementary colours are complementary at every wavelength.
-    assert spectral.spectrum(cube) + spectral.spectrum(1 - cube) == pytest.approx(np.ones_like(spectra), abs=1e-6)
+    assert np.allclose(spectral.spectrum(cube) + spectral.spectrum(1 - cube), 1, rtol=0, atol=1e-6)
 
 
 def test_the_importance_is_the_response_times_the_light() -> None:
@@ -87,29 +87,6 @@ def test_the_light_of_a_scene() -> None:
     assert np.all(np.isfinite(one[1]))
 
 
-def coloured_room() -> object:
-    wall = {"point_m": [0, 0, -2], "normal": [0, 0, 1], "material": "m"}
-    ball = {"centre_m": [0.2, 0.1, -1.5], "radius_m": 0.3, "material": "g"}
-    lamp = {"centre_m": [0.6, 0.6, -1], "radius_m": 0.1, "emission": [9, 9, 9], "illuminant": "3000 K"}
-    glossy = {"kind": "glossy", "specular": [0.1, 0.05, 0.02], "roughness": 0.4, "reflectance": [0.1, 0.2, 0.6]}
-    return scene(
-        environment={"colour": [0.3, 0.3, 0.3]},
-        materials={"m": diffuse(0.7, 0.3, 0.1), "g": glossy},
-        planes=[wall],
-        spheres=[ball, lamp],
-    )
-
-
-def test_importance_changes_the_noise_and_not_the_mean() -> None:
-    made, options = coloured_room(), {"width": 18, "height": 12, "samples": 16, "threads": 1, "max_depth": 3}
-    even, drawn = (
-        np.stack([render(made, CAMERA, seed=k, film=film, **options).rgb for k in range(24)])
-        for film in (FilmSettings(wavelength_sampling=s, wavelengths="one") for s in ("uniform", "importance"))
-    )
-    assert_same_mean(even, drawn, 0.01)
-    assert drawn.var(axis=0).mean() < 0.8 * even.var(axis=0).mean()
-
-
 @pytest.mark.parametrize("limits", [(587.5618, 587.5618), (540, 560)])
 def test_light_of_one_wavelength_makes_a_grey_picture(limits: tuple[float, float]) -> None:
     spectral = SpectralRange(*limits)
@@ -125,7 +102,7 @@ def test_cauchy_index_has_the_asked_abbe_number() -> None:
     assert np.all(SpectralRange(400, 700).refractive_index(1.5, None) == np.float32(1.5))
 
 
-SMALL: dict[str, Any] = {"width": 12, "height": 8, "threads": 1}
+SMALL: dict[str, Any] = {"width": 24, "height": 16, "threads": 1}
 MATERIALS: dict[str, Any] = {
     "red": diffuse(0.8, 0.1, 0.05),
     "tiles": {"kind": "diffuse", "texture": "tiles"},
@@ -157,8 +134,10 @@ def room(tmp_path: Path, material: str) -> Scene:
     )
 
 
-def renders(made: Scene, camera: Any, mode: str, seeds: int, **options: Any) -> np.ndarray:
-    film = FilmSettings(wavelengths=mode)  # type: ignore[arg-type]
+def renders(
+    made: Scene, camera: Any, mode: Any, seeds: int, wavelength_sampling: Any = "importance", **options: Any
+) -> np.ndarray:
+    film = FilmSettings(wavelengths=mode, wavelength_sampling=wavelength_sampling)
     options = SMALL | {"samples": 16, "max_depth": 5} | options
     return np.stack([render(made, camera, seed=seed, film=film, **options).rgb for seed in range(seeds)])
 
@@ -168,10 +147,17 @@ def colour_noise(pictures: np.ndarray) -> float:
     return float((pictures[..., [0, 2]] - pictures[..., 1:2]).var(axis=0).mean())
 
 
+def test_importance_changes_the_noise_and_not_the_mean(tmp_path: Path) -> None:
+    made = room(tmp_path, "copper")
+    even, drawn = (renders(made, CAMERA, "one", 14, wavelength_sampling=s) for s in ("uniform", "importance"))
+    assert_same_mean(even, drawn, 0.01)
+    assert drawn.var(axis=0).mean() < 0.8 * even.var(axis=0).mean()
+
+
 @pytest.mark.parametrize("material", ["red", "copper", "mirror", "plain", "flint"])
 def test_hero_paths_have_the_same_mean_and_less_colour_noise(material: str, tmp_path: Path) -> None:
     made, camera = room(tmp_path, material), Pinhole(40.0, FILM)
-    one, hero = (renders(made, camera, mode, 48) for mode in ("one", "hero"))
+    one, hero = (renders(made, camera, mode, 12) for mode in ("one", "hero"))
     assert_same_mean(one, hero, 0.02)
     # Where dispersion parts them at every path, nothing is left to gain.
     assert colour_noise(hero) < (1.1 if material == "flint" else 0.4) * colour_noise(one)
@@ -182,17 +168,14 @@ def test_roulette_and_many_reflections_in_dispersive_glass_lose_nothing() -> Non
     spheres = [{"centre_m": [0, 0, -1.5], "radius_m": 0.9, "material": "flint"}]
     made = scene(environment=WHITE, materials={"flint": MATERIALS["flint"]}, spheres=spheres)
     for mode in ("one", "hero", "lanes"):
-        pictures = renders(made, Pinhole(400.0, FILM), mode, 24, samples=64, max_depth=200)
+        pictures = renders(made, Pinhole(400.0, FILM), mode, 1, width=48, height=32, samples=96, max_depth=200)
         assert pictures.mean(axis=(0, 1, 2)) == pytest.approx(np.ones(3), abs=8e-3)
 
 
 def test_companions_are_as_probable_as_the_hero() -> None:
-    spectral = SpectralRange(400, 700, lanes=4)
-    table = np.arange(256.0)
-    turned = spectral.rotated(table)
+    table, turned = np.arange(256.0), SpectralRange(400, 700, lanes=4).rotated(np.arange(256.0))
     assert turned.shape == (4, 256) and np.all(np.sort(turned, axis=1) == table)
     assert turned[:, 3].tolist() == [3, 67, 131, 195] and turned[:, 200].tolist() == [200, 8, 72, 136]
-    assert SpectralRange(400, 700).rotated(table) is table
 
 
 class Prism(Pinhole):
@@ -240,9 +223,9 @@ def test_a_camera_that_disperses_gets_one_wavelength_a_path() -> None:
 def test_modes_of_a_dispersive_camera_have_the_same_mean(shift: float, mode: str, tmp_path: Path) -> None:
     # The prism's tint is in the weights of each lane, its fringes in the rays.
     made = room(tmp_path, "mirror")
-    one, other = (renders(made, prism(shift), m, 48) for m in ("one", mode))
+    one, other = (renders(made, prism(shift), m, 12) for m in ("one", mode))
     assert_same_mean(one, other, 0.02)
-    grey = renders(scene(environment=WHITE), prism(shift), mode, 4, samples=256).mean(axis=(0, 1, 2))
+    grey = renders(scene(environment=WHITE), prism(shift), mode, 1, samples=256).mean(axis=(0, 1, 2))
     assert grey[2] > 1.2 * grey[0]
     assert colour_noise(other) < (0.4 if mode == "hero" else 0.85) * colour_noise(one)
 
@@ -254,27 +237,16 @@ def test_one_wavelength_of_light_makes_the_same_grey_with_four_lanes() -> None:
         assert pictures == pytest.approx(np.full_like(pictures, 0.5), abs=1e-4)
 
 
-@pytest.mark.parametrize("mode", ["hero", "lanes"])
-def test_workers_do_not_change_the_picture(mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.film.BATCH", 256)
-    film = FilmSettings(wavelengths=mode)  # type: ignore[arg-type]
-    made = room(tmp_path, "flint")
-    one, two = (
-        render(made, Pinhole(40.0, FILM), width=12, height=8, samples=22, film=film, threads=n).rgb for n in (1, 2)
-    )
-    assert np.array_equal(one, two)
-
-
 def test_a_lens_that_disperses_less_than_a_pixel_shows() -> None:
     # Small enough a picture, and one ray serves all wavelengths; each lane still has the lens's transmittance for it.
-    lens = Path(__file__).parents[2] / "lenses" / "laikin_double_gauss_50.toml"
-    camera = make_camera(lens, Shot(FILM, 3.0, 2.8))
+    model = Path(__file__).parents[2] / "models" / "laikin_double_gauss_50.ols-60.onnx"
+    camera = make_camera(model, Shot(FILM, 3.0, 2.8))
     assert camera.dispersive
     limits = (400.0, 700.0)
     assert mode_for(camera, PixelGrid(24, 16, FILM), limits, FilmSettings()) == "hero"
     assert mode_for(camera, PixelGrid(720, 480, FILM), limits, FilmSettings()) == "one"
     ball = {"centre_m": [0, 0, -2], "radius_m": 0.4, "emission": [1, 2, 4], "illuminant": "A"}
     made = scene(environment=WHITE, spheres=[ball])
-    one, hero = (renders(made, camera, mode, 16, width=24, height=16) for mode in ("one", "hero"))
+    one, hero = (renders(made, camera, mode, 8, samples=32) for mode in ("one", "hero"))
     assert_same_mean(one, hero, 0.01)
     assert colour_noise(hero) < 0.3 * colour_noise(one)

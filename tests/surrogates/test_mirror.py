@@ -44,10 +44,10 @@ def model(prepared: Prepared) -> LensModel:
 
 def test_fits_rays_and_rims(lens: Lens, model: LensModel, prepared: Prepared) -> None:
     errors = ray_errors(lens, model.domain, prepared.pairs.held_out, model.predict)
-    assert errors["direction_rms_deg"] < 0.002
-    assert errors["rms_um"] < 1.5
-    assert errors["position_rms_um"] < 10
-    assert errors["transmittance_rms"] < 5e-4
+    assert errors.direction_rms_deg < 0.002
+    assert errors.rms_um < 1.5
+    assert errors.position_rms_um < 10
+    assert errors.transmittance_rms < 5e-4
     shares = vignetting_errors(lens, model.domain, model.predict, count=30_000)
     assert shares["false_pass"] < 0.005 and shares["false_block"] < 0.005
 
@@ -65,7 +65,7 @@ def either(request: pytest.FixtureRequest) -> LensModel:
 
 def test_a_network_fits_rays_and_rims(lens: Lens, network: LensModel, prepared: Prepared) -> None:
     errors = ray_errors(lens, network.domain, prepared.pairs.held_out, network.predict)
-    assert errors["direction_rms_deg"] < 0.004
+    assert errors.direction_rms_deg < 0.004
     shares = vignetting_errors(lens, network.domain, network.predict, count=30_000)
     assert shares["false_pass"] < 0.005 and shares["false_block"] < 0.005
 

@@ -22,8 +22,9 @@ from writers import compiled, rays_of, written_rays
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.candidates import FLAGS, CompiledSource, find_compiler
+from neurolens.evaluate.candidates import CompiledSource
 from neurolens.graph.c import literal
+from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.program import SCENE_RAY
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.optics.paraxial import first_order

@@ -16,9 +16,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from neurolens.evaluate.candidates import CompiledSource, find_compiler
-from neurolens.evaluate.speed import Unavailable
+from neurolens.base.errors import InputError
+from neurolens.evaluate.candidates import CompiledSource
 from neurolens.graph.c import Signature
+from neurolens.graph.compiler import find_compiler
 from neurolens.graph.glsl import write_glsl
 from neurolens.graph.program import SCENE_RAY, Program
 from neurolens.surrogates.domain import sample_domain
@@ -68,7 +69,7 @@ def compiled(program: Program) -> CompiledSource:
     """Without optimisation beyond -O1, quick to compile; that -O3 gives the same is a test of its own."""
     try:
         find_compiler()
-    except Unavailable as reason:
+    except InputError as reason:
         pytest.skip(f"the C form is not compiled here: {reason}")
     return CompiledSource(program, ("-std=c99", "-O1", "-march=native", "-Wall", "-Wextra", "-Werror"))
 

@@ -28,7 +28,7 @@ NETWORKS = ModelSettings("neurolens2017", basis="raw", units=16, layers=2, steps
 
 def rms_um(model: LensModel) -> float:
     pairs = lens_models.prepared().pairs
-    return ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict)["rms_um"]
+    return ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict).rms_um
 
 
 def leaves(core: RawPolynomial | Cells) -> list[RawPolynomial]:

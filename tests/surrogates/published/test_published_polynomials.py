@@ -126,7 +126,7 @@ def test_more_terms_and_degrees_leave_less() -> None:
 
     def rms_deg(settings: ModelSettings) -> float:
         model = fit_model(prepared, settings)
-        return ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict)["direction_rms_deg"]
+        return ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict).direction_rms_deg
 
     dense = [rms_deg(ModelSettings("hanika", basis="raw", degree=degree)) for degree in (1, 3, 5)]
     sparse = [rms_deg(ModelSettings("schrade", basis="raw", degree=5, terms=terms)) for terms in (4, 12, 32)]

@@ -77,7 +77,7 @@ def test_least_ellipse_of_few_points_is_finite() -> None:
 def test_fit_is_close_and_symmetric_by_construction() -> None:
     model, pairs = fitted(6), lens_models.prepared().pairs
     errors = ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict)
-    assert errors["direction_rms_deg"] < 0.002
+    assert errors.direction_rms_deg < 0.002
     rays = pairs.held_out.inputs
     turned = FilmRays(-rays.film_y, rays.film_x, rays.film_z, -rays.pupil_y, rays.pupil_x, rays.wavelength_nm)
     a, b = model.predict(rays).rays, model.predict(turned).rays

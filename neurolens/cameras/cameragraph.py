@@ -1,0 +1,76 @@
+"""Lens cameras as graphs: from film point, two random numbers and wavelength to the ray, its weight and its status.
+
+What stands around a lens is written here, and in `pupil_outline`, once: onnxruntime and compiled cameras run it whole,
+together with the graph of their lens; cameras whose lens is a function (a trace) have its two halves evaluated.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+from neurolens.base import status as st
+from neurolens.cameras.pupil_outline import pupil_graph
+from neurolens.graph.derive import derivative
+from neurolens.graph.ir import Graph
+from neurolens.graph.program import FILM_X_Y
+
+# How far the squared length of a direction may be from 1: where a poor network decodes none, the ray is no ray.
+UNIT_SLACK = 1e-3
+# Areas below (mm^2) are none: the outline at the end of the light.
+_NO_AREA = 1e-30
+# Outputs of a lens's graph with derivatives by the film point.
+D_FILM = tuple(derivative("scene_ray", by) for by in FILM_X_Y)
+_METRES = [1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0]
+
+
+def camera_graph(lens: Graph, segments: int, wavelengths: int) -> Graph:
+    """The graph of a camera with the graph of its lens inside.
+
+    Args:
+        lens: inputs `rays` [5] (film and pupil point, wavelength), `film_z_mm` and `stop_radius_mm`; outputs
+            `scene_ray` [6], `transmittance`, `status`, and any others, which the camera has, too: derivatives of
+            `scene_ray` are taken for those by the film point.
+        segments, wavelengths: of the outline; see `pupil_point`.
+
+    Inputs: those of `pupil_graph` and `weight_graph`. Outputs: those of `weight_graph`.
+    """
+    g = Graph()
+    pupil = g.inline(pupil_graph(segments, wavelengths), {})
+    film, wavelength = g.input("film_mm", 2), g.input("wavelength_nm")
+    found = g.inline(lens, {"rays": g.concat(film, pupil["pupil_mm"], wavelength)})
+    derivatives = tuple(name for name in found if "_by_" in name)
+    g.outputs = {
+        **found,
+        **g.inline(weight_graph(derivatives), {"film_mm": film, **pupil, **found, "lens_status": found["status"]}),
+    }
+    del g.outputs["scene_ray"], g.outputs["transmittance"]
+    return g
+
+
+@cache
+def weight_graph(derivatives: tuple[str, ...] = ()) -> Graph:
+    """Weighted rays in the camera's frame, of rays of a lens.
+
+    w = T A cos^4 / Z^2 over the exposure on the axis; see `cameras.contract`. Film points that nothing reaches (area 0
+    or NaN) are outside the domain; what does not pass weighs nothing, and is no ray.
+
+    Inputs: `film_mm`, `pupil_mm` [2], `area_mm2`, `scene_ray` [6] (mm, lens frame), `transmittance`, `lens_status`, and
+    derivatives [6] of the ray; of the call `film_z_mm`, `per_distance` (1 / Z), `scale` (1 / (Z^2 exposure)).
+    Outputs: `ray` [6] (metres, camera frame), `weight`, `status`, and derivatives of the ray.
+    """
+    g = Graph()
+    film, pupil, area, ray = g.input("film_mm", 2), g.input("pupil_mm", 2), g.input("area_mm2"), g.input("scene_ray", 6)
+    through, status = g.input("transmittance"), g.input("lens_status")
+    per_distance, scale, film_z = (g.input(name, per_call=True) for name in ("per_distance", "scale", "film_z_mm"))
+    unit = g.square(ray[3:]).between(1 - UNIT_SLACK, 1 + UNIT_SLACK)
+    lit, outside = g.constant(_NO_AREA) <= area, float(st.OUTSIDE_DOMAIN)
+    passed = (status <= float(st.PASSED)) & unit & lit
+    cos2 = 1.0 / (1.0 + g.square((pupil - film) * per_distance))
+    weight = through.maximum(0.0) * area * cos2 * cos2 * scale
+    place = g.concat(g.constant([0.0, 0.0]), film_z * -1e-3, g.constant([0.0, 0.0, 0.0]))
+    g.outputs["ray"] = ray * _METRES + place
+    g.outputs["weight"] = g.select(passed, weight, 0.0)
+    g.outputs["status"] = g.select(passed, float(st.PASSED), g.select(lit, status, outside).maximum(outside)).whole()
+    for name in derivatives:
+        g.outputs[name] = g.input(name, 6) * _METRES
+    return g
