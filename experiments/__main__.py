@@ -1,6 +1,7 @@
 """`python -m experiments NAME`: the measurements behind the README's tables, the gallery, and the models that ship.
 
-Run from the project's folder. A measurement is a module of this folder with `ABOUT`, `add_arguments` and `run`.
+Run from the project's folder. A measurement is a module of this folder with `OPTIONS` and `run`, its docstring is the
+help; see `lab`.
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ NAMES = {
     "mitsuba": ("mitsuba_speed", "speed of the renderer beside Mitsuba 3"),
     "renderer": ("renderer_speed", "speed of the renderer on one scene, and of its meshes"),
     "promises": ("promises", "models against the speed that their index promises"),
+    "white-cards": ("white_cards", "light on the film, by integral and rendered four ways"),
+    "spectral-noise": ("spectral_noise", "noise of the ways to sample wavelengths"),
+    "refine-spacing": ("refine_spacing", "a spacing refined by gradients through the tracer"),
     "gallery": ("gallery.run", "what real lenses do: figures and numbers"),
     "optiland": ("compare_optiland", "speed of the exact tracer beside Optiland"),
 }
@@ -44,9 +48,10 @@ def build_parser(argv: Sequence[str]) -> Parser:
         chosen = kinds.add_parser(name, help=text)
         if argv[:1] == [name]:
             found = import_module(f"experiments.{module}")
-            chosen.description = found.ABOUT
-            chosen.set_defaults(run=found.run, kept="what was finished is kept")
-            found.add_arguments(chosen)
+            chosen.description = found.__doc__
+            chosen.set_defaults(run=lambda args, run=found.run: run(args) or 0, kept="what was finished is kept")
+            for add in found.OPTIONS:
+                add(chosen)
     return parser
 
 

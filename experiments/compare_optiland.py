@@ -24,13 +24,14 @@ import numpy as np
 import torch
 
 from experiments import lab
+from experiments.lab import Row
 from experiments.trace_speed import film_rays, with_aspheres
 from neurolens.base.errors import NeurolensError
 from neurolens.base.progress import Progress
-from neurolens.evaluate.speed import Call, Candidate, Race, race
+from neurolens.evaluate.speed import POOL, Call, Candidate, Race, race
 from neurolens.optics import glass
 from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.prescription import Lens
 from neurolens.optics.trace import Rays, compile_trace, trace
 from neurolens.surrogates.domain import FilmRays
 
@@ -72,7 +73,7 @@ def optiland_lens(lens: Lens) -> Optic:
         optic.surfaces.add(
             index=k + 1,
             thickness=float(s.thickness_mm),
-            material=IdealMaterial(_index(s)),
+            material=IdealMaterial(float(glass.index_of(s, glass.LINE_D_NM))),
             is_stop=s.stop,
             aperture=s.diameter_mm,
             **shape,
@@ -80,15 +81,15 @@ def optiland_lens(lens: Lens) -> Optic:
     return optic
 
 
-def _index(s: Surface) -> float:
-    return float(glass.index_of(s, glass.LINE_D_NM))
-
-
 def theirs(lens: Lens, backend: str, dtype: str) -> tuple[Callable[[FilmRays], Call], Callable[[FilmRays], np.ndarray]]:
     """What prepares Optiland's call, and what gives its landing points and directions, [6, N]."""
 
     def prepare(rays: FilmRays) -> Call:
-        start, optic = _prepared(lens, backend, dtype, rays)
+        be.set_backend(backend)
+        be.set_precision(dtype)
+        columns: list[Any] = list(light(lens, rays, DTYPES[dtype]))
+        columns += [torch.ones_like(columns[0]), torch.full_like(columns[0], glass.LINE_D_NM / 1000)]
+        start, optic = [c.numpy() if backend == "numpy" else c for c in columns], optiland_lens(lens)
 
         def call() -> RealRays:
             be.set_backend(backend)
@@ -105,14 +106,6 @@ def theirs(lens: Lens, backend: str, dtype: str) -> tuple[Callable[[FilmRays], C
         return np.where(be.to_numpy(found.i) > 0, out, np.nan)
 
     return prepare, land
-
-
-def _prepared(lens: Lens, backend: str, dtype: str, rays: FilmRays) -> tuple[list[Any], Optic]:
-    be.set_backend(backend)
-    be.set_precision(dtype)
-    columns: list[Any] = list(light(lens, rays, DTYPES[dtype]))
-    columns += [torch.ones_like(columns[0]), torch.full_like(columns[0], glass.LINE_D_NM / 1000)]
-    return ([c.numpy() for c in columns] if backend == "numpy" else columns), optiland_lens(lens)
 
 
 def ours(lens: Lens, dtype: str, compiled: bool) -> Callable[[FilmRays], Call]:
@@ -144,7 +137,7 @@ def contest(lens: Lens, dtype: str, rounds: int, report: Callable[[float], None]
     return timed, {"passing_share": float(np.isfinite(own[0]).mean()), "against": found}
 
 
-def compare(own: np.ndarray, other: np.ndarray) -> dict[str, Any]:
+def compare(own: np.ndarray, other: np.ndarray) -> Row:
     """Largest distance of landing points (mm) and of directions (rad), and rays that only one of us passes."""
     a, b = np.isfinite(own).all(0), np.isfinite(other).all(0)
     offset = (own.astype(float) - other)[:, a & b]
@@ -155,7 +148,7 @@ def compare(own: np.ndarray, other: np.ndarray) -> dict[str, Any]:
     }
 
 
-def rows_of(timed: Race, dtype: str, lens: Lens, agreement: dict[str, Any]) -> list[dict[str, Any]]:
+def rows_of(timed: Race, dtype: str, lens: Lens, agreement: dict[str, Any]) -> list[Row]:
     """Plain tables, units in the keys."""
     rows = []
     for name in timed.ns:
@@ -169,55 +162,71 @@ def rows_of(timed: Race, dtype: str, lens: Lens, agreement: dict[str, Any]) -> l
     return rows
 
 
-def page(rows: list[dict[str, Any]], rounds: int) -> str:
+def _times(backend: str) -> Callable[[Row], str | None]:
+    """Times as fast as Optiland with a backend."""
+
+    def cell(row: Row) -> str | None:
+        found = row.get("faster_than", {}).get(f"Optiland, {backend}")
+        return None if found is None else lab.best_median(found["min"], found["median"], ".1f")
+
+    return cell
+
+
+_COLUMNS = lab.columns(
+    ("lens", "lens"),
+    ("precision", "dtype"),
+    ("tracer", "name"),
+    ("Mray/s, best (median)", lambda r: lab.best_median(1000 / r["min"], 1000 / r["median"])),
+    ("batch", "batch"),
+    ("times Optiland numpy", _times("numpy")),
+    ("times Optiland torch", _times("torch")),
+)
+_AGREEMENT = lab.columns(
+    ("lens", "lens"),
+    ("precision", "dtype"),
+    ("Optiland", "backend"),
+    ("mm", "position_mm", ".1e"),
+    ("rad", "angle_rad", ".1e"),
+    ("rays", "one_passes"),
+    ("of", lambda r: POOL),
+)
+_SAME = """\
+The same rays from the scene through the same 13 surfaces (12 refractions, every rim, the stop), one wavelength, one \
+thread; {rounds} rounds in turn. Ratios: by the best times (median within rounds)."""
+
+
+def page(rows: list[Row], rounds: int) -> str:
     """The result as Markdown."""
-    m, loads = lab.machine(), [v for r in rows for v in r["load"] if v is not None]
-    lines = [
-        "# Beside Optiland",
-        "",
-        "`python -m experiments optiland`",
-        "",
-        "The same rays from the scene through the same 13 surfaces (12 refractions, every rim, the stop), one "
-        f"wavelength, one thread; {rounds} rounds in turn. Ratios: by the best times (median within rounds).",
-        "",
-        f"{m['processor']}, {m['vectors']}; Python {m['python']}, torch {m['torch']}, numpy {m['numpy']}, "
-        f"Optiland {optiland.__version__ if hasattr(optiland, '__version__') else '0.6.3'}. "
-        f"Load average meanwhile up to {max(loads, default=0.0):.1f}.",
-        "",
-        "| lens | precision | tracer | Mray/s, best (median) | batch | times Optiland numpy | times Optiland torch |",
-        "|---|---|---|---|---|---|---|",
+    m, version = lab.machine(), getattr(optiland, "__version__", "0.6.3")
+    first = {(r["lens"], r["dtype"]): r for r in reversed(rows)}
+    landed = [
+        {"lens": lens, "dtype": dtype, "backend": backend, **found}
+        for lens, dtype in dict.fromkeys((r["lens"], r["dtype"]) for r in rows)
+        for backend, found in first[lens, dtype]["against"].items()
     ]
-    for r in rows:
-        ratios = r.get("faster_than") or {}
-        shown = [f"{v['min']:.1f} ({v['median']:.1f})" for v in ratios.values()] or ["", ""]
-        speed = f"{1000 / r['min']:.2f} ({1000 / r['median']:.2f})"
-        lines.append(f"| {r['lens']} | {r['dtype']} | {r['name']} | {speed} | {r['batch']} | {' | '.join(shown)} |")
-    lines += ["", "Where rays land on the last surface, and rays that only one of the two passes:", ""]
-    lines += ["| lens | precision | Optiland | mm | rad | rays | of |", "|---|---|---|---|---|---|---|"]
-    for lens, dtype in dict.fromkeys((r["lens"], r["dtype"]) for r in rows):
-        row = next(r for r in rows if (r["lens"], r["dtype"]) == (lens, dtype))
-        for name, a in row["against"].items():
-            figures = f"{a['position_mm']:.1e} | {a['angle_rad']:.1e} | {a['one_passes']}"
-            lines.append(f"| {lens} | {dtype} | {name} | {figures} | 65536 |")
-    lines += ["", f"Goal: eager at least {GOAL:g} times Optiland, numpy and torch, in the same precision."]
+    goals = [f"Goal: eager at least {GOAL:g} times Optiland, numpy and torch, in the same precision."]
     for dtype in DTYPES:
         eager = [r for r in rows if r["name"] == "neurolens, eager" and r["dtype"] == dtype]
         least = min(v["min"] for r in eager for v in r["faster_than"].values())
-        lines.append(f"{dtype}: {'reached' if least >= GOAL else 'missed'}, at least {least:.1f} times.")
-    lines.append("Optiland's numpy backend meets conics in a kernel that numba compiles; ours above is plain torch.")
-    return "\n".join(lines) + "\n"
+        goals.append(f"{dtype}: {'reached' if least >= GOAL else 'missed'}, at least {least:.1f} times.")
+    goals.append("Optiland's numpy backend meets conics in a kernel that numba compiles; ours above is plain torch.")
+    return lab.page(
+        "# Beside Optiland",
+        "`python -m experiments optiland`",
+        _SAME.format(rounds=rounds),
+        f"{m['processor']}, {m['vectors']}; Python {m['python']}, torch {m['torch']}, numpy {m['numpy']}, "
+        f"Optiland {version}. Load average meanwhile up to {lab.most_load(rows) or 0.0:.1f}.",
+        lab.table(_COLUMNS, rows),
+        "Where rays land on the last surface, and rays that only one of the two passes:",
+        lab.table(_AGREEMENT, landed),
+        "\n".join(goals),
+    )
 
 
-ABOUT = __doc__
+OPTIONS = (lab.option("--quick", action="store_true", help="few rounds"), lab.out())
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m experiments optiland`."""
-    parser.add_argument("--quick", action="store_true", help="few rounds")
-    lab.add_out(parser)
-
-
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Race, print and write."""
     warnings.simplefilter("ignore")
     be.set_backend("torch")
@@ -226,11 +235,9 @@ def run(args: argparse.Namespace) -> int:
     lens = read_lens(LENS).at()
     contests = [(table, dtype) for table in (lens, with_aspheres(lens)) for dtype in DTYPES]
     progress = Progress({f"{table.name}, {dtype}": 40.0 for table, dtype in contests}, quiet=args.quiet)
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for table, dtype in contests:
         with progress.stage(f"{table.name}, {dtype}") as report:
             timed, agreement = contest(table, dtype, rounds, report)
         rows += rows_of(timed, dtype, table, agreement)
-    lab.write_results(args.out, "optiland", page(rows, rounds), {"machine": lab.machine(), "rows": rows})
-    print(page(rows, rounds))
-    return 0
+    print(lab.write_results(args.out, "optiland", page(rows, rounds), {"machine": lab.machine(), "rows": rows}))

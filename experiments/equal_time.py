@@ -1,7 +1,4 @@
-"""Equal time and equal samples: error of each camera's picture after given seconds, against the exact lens.
-
-Renders are kept, one file a render, named by everything that it depends on, so that a run may be resumed.
-"""
+"""Equal time and equal samples: error of each camera's picture after given seconds, against the exact lens."""
 
 from __future__ import annotations
 
@@ -9,8 +6,9 @@ import hashlib
 import json
 import math
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 import neurolens
+from experiments import lab
 from experiments.equal_time_errors import (
     Estimate,
     FilmMap,
@@ -31,7 +30,7 @@ from experiments.equal_time_errors import (
     squared_error,
     weights,
 )
-from neurolens.base.files import atomic_path
+from neurolens.base.files import atomic_path, sha256_of
 from neurolens.base.tomlfile import read_toml
 from neurolens.cameras.build import FUSED, Shot, make_camera
 from neurolens.cameras.contract import Camera
@@ -55,17 +54,16 @@ FUSED_EXACT = "fused exact"
 EXACTS = (EXACT, FUSED_EXACT)
 
 
-def scene_cameras(root: Path, shot: CameraSettings) -> tuple[dict[str, Camera], ExactCamera]:
+def scene_cameras(shot: CameraSettings) -> tuple[dict[str, Camera], ExactCamera]:
     """The cameras of a scene by name, the exact one first, and the exact one in float64 for film-space errors.
 
     All of the lens share the pupil bounds of the models' domain, so that the same random numbers are the same rays.
     """
-    lens = read_lens(root / "lenses" / f"{LENS}.toml")
+    lens = read_lens(lab.LENSES / f"{LENS}.toml")
     data = first_order(lens)
     widest = shot.f_number is None or shot.f_number < data.f_number
     f_number = data.f_number if widest else float(shot.f_number or 0)
-    card = load_model(root / "models" / next(iter(MODELS.values()))).card
-    bounds = Domain.from_dict(card["domain"]).bounds
+    bounds = Domain.from_dict(load_model(lab.MODELS / MODELS["ols-28"]).card["domain"]).bounds
     film = (shot.film_width_mm, shot.film_height_mm)
     set_ = Shot(film, shot.focus_m, None if widest else f_number, wavelength_nm=shot.wavelengths_nm)
 
@@ -78,29 +76,29 @@ def scene_cameras(root: Path, shot: CameraSettings) -> tuple[dict[str, Camera], 
     }
     cameras: dict[str, Camera] = {EXACT: ExactCamera(lens, **same)}
     for name, model in MODELS.items():
-        spec = str(root / "models" / model)
-        cameras[name] = make_camera(FUSED + spec if name.startswith("fused") else spec, set_)
+        cameras[name] = make_camera(f"{FUSED if name.startswith('fused') else ''}{lab.MODELS / model}", set_)
     cameras[FUSED_EXACT] = FusedExactCamera(lens, **same)
     cameras[THIN] = make_camera("thin", replace(set_, efl_mm=data.efl_mm, f_number=f_number))
     return cameras, ExactCamera(lens, dtype="float64", **same)
 
 
-_SOURCES = ("cameras", "optics", "programs", "render")  # folders of the package that a picture depends on
+_SOURCES = ("base", "cameras", "graph", "modelfile", "optics", "render")  # folders that a picture depends on
 
 
-@dataclass(frozen=True)
 class Shelf:
-    """The renders of one scene through one camera.
+    """The renders of one scene through one camera, in a folder whose name has the hash of all that they depend on."""
 
-    Attributes:
-        folder: of its files; its name ends in the hash of scene, camera, film, size and source.
-    """
-
-    folder: Path
-    scene: Scene
-    camera: Camera
-    film: FilmSettings
-    size: tuple[int, int]
+    def __init__(
+        self, run: Path, file: Path, scene: Scene, name: str, camera: Camera, film: FilmSettings, size: tuple[int, int]
+    ) -> None:
+        about = [neurolens.__version__, _source(), _scene_bytes(file), plain(camera.settings), film.__dict__, size]
+        model = camera.settings.get("model")
+        if model is not None:
+            about.append(sha256_of(model))
+        digest = hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()
+        self.folder = run / scene.name / f"{name.replace(' ', '-')}-{digest[:16]}"
+        self.size = size
+        self.render = partial(render, scene, camera, width=size[0], height=size[1], film=film)
 
     def file(self, samples: int, seed: int, threads: int) -> Path:
         return self.folder / f"{samples}-{seed}-{threads}.npz"
@@ -110,15 +108,11 @@ class Shelf:
 
         A file that is broken is made again. Raises what `render` does.
         """
-        width, height = self.size
         file = self.file(samples, seed, threads)
-        known = _read(file, (height, width, 3))
+        known = _read(file, (*self.size[::-1], 3))
         if known is not None:
             return known
-        found = render(
-            self.scene, self.camera, width=width, height=height, samples=samples, seed=seed, threads=threads,
-            film=self.film,
-        )  # fmt: skip
+        found = self.render(samples=samples, seed=seed, threads=threads)
         self.folder.mkdir(parents=True, exist_ok=True)
         with atomic_path(file) as temporary:
             np.savez(temporary, rgb=found.rgb, seconds=np.float64(found.stats["seconds"]))
@@ -126,20 +120,7 @@ class Shelf:
 
     def warm_up(self) -> None:
         """An untimed sample per pixel: the first render of a camera loads code and fills caches."""
-        width, height = self.size
-        render(self.scene, self.camera, width=width, height=height, samples=1, threads=1, film=self.film)
-
-
-def shelf(
-    run: Path, scene_file: Path, scene: Scene, name: str, camera: Camera, film: FilmSettings, size: tuple[int, int]
-) -> Shelf:
-    """The shelf of a camera in the folder of a run."""
-    about = [neurolens.__version__, _source(), _scene_bytes(scene_file), plain(camera.settings), film.__dict__, size]
-    model = camera.settings.get("model")
-    if model is not None:
-        about.append(hashlib.sha256(Path(model).read_bytes()).hexdigest())
-    digest = hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()
-    return Shelf(run / scene.name / f"{name.replace(' ', '-')}-{digest[:16]}", scene, camera, film, size)
+        self.render(samples=1, threads=1)
 
 
 def _read(file: Path, shape: tuple[int, ...]) -> tuple[NDArray[np.float32], float] | None:
@@ -270,16 +251,14 @@ class SceneResult:
     cameras: dict[str, CameraResult]
 
 
-def measure_scene(
-    file: Path, root: Path, run: Path, counts: Counts, threads: int, report: Callable[[float], None]
-) -> SceneResult:
+def measure_scene(file: Path, run: Path, counts: Counts, threads: int, report: lab.Report) -> SceneResult:
     """Render and measure one scene; what an earlier run left in `run` is not rendered again."""
     torch.set_num_threads(1)  # in this process; workers do so themselves
     scene = load_scene(file)
     shot = scene.settings.camera
-    cameras, truth = scene_cameras(root, shot)
+    cameras, truth = scene_cameras(shot)
     film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
-    shelves = {name: shelf(run, file, scene, name, c, film, counts.size) for name, c in cameras.items()}
+    shelves = {name: Shelf(run, file, scene, name, c, film, counts.size) for name, c in cameras.items()}
     halves, rendered = _render(shelves, counts, threads, report)
     maps = {name: film_map(truth, c, wavelengths_nm=shot.wavelengths_nm) for name, c in cameras.items()}
     reference = (halves[0] + halves[1]) / 2
@@ -303,7 +282,7 @@ class Rendered:
 
 
 def _render(
-    shelves: Mapping[str, Shelf], counts: Counts, threads: int, report: Callable[[float], None]
+    shelves: Mapping[str, Shelf], counts: Counts, threads: int, report: lab.Report
 ) -> tuple[list[Floats], dict[str, Rendered]]:
     """The reference's halves, and every camera's renders; the cameras take turns, so that load affects all equally."""
     jobs = counts.jobs
@@ -379,13 +358,13 @@ def _levels(own: Rendered, halves: list[Floats], by: Mapping[str, Floats], count
         yield level(together * counts.pass_samples, pictures, [together * t for t in times])
 
 
-def scene_file(name: str, root: Path) -> Path:
+def scene_file(name: str) -> Path:
     """The file of a scene of the project by name, or of any by its path; read, so that mistakes are found before the
     work.
 
     Raises:
         InputError: as `load_scene`.
     """
-    file = root / "experiments" / "scenes" / f"{name}.toml" if name in SCENES else Path(name)
+    file = lab.SCENES / f"{name}.toml" if name in SCENES else Path(name)
     load_scene(file)
     return file

@@ -1,19 +1,23 @@
-"""`python -m experiments equal-time` and its output: the page, every point as CSV, records, the pictures."""
+"""Error over time of the exact lens, a polynomial, a network and a thin lens in three scenes.
+
+Against a converged exact render with other seeds: bias and variance told apart, seconds per sample, from when the exact
+lens is ahead, equal time and equal samples, FLIP maps and film-space error maps in micrometres; the exact lens and the
+network as compiled C, too. Renders are kept in the run folder: an interrupted run resumes, and
+what would give another picture is rendered again. Needs the extra "train" (torch, matplotlib, flip-evaluator) and a C
+compiler. Writes README.md, equal_time.csv, equal_time.json and three pictures a scene (about ten minutes).
+"""
 
 from __future__ import annotations
 
 import argparse
-import csv
-import io
-import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from PIL import Image
 
 from experiments import lab
@@ -31,11 +35,9 @@ from experiments.equal_time import (
     scene_file,
 )
 from experiments.equal_time_errors import Estimate, crossover_s, log_interpolate
-from neurolens.analysis.plot_style import FAINT, INK, drawing, heading, plain_log_ticks
-from neurolens.base.errors import InputError
+from neurolens.analysis.plot_style import FAINT, INK, drawing, plain_log_ticks
 from neurolens.base.files import atomic_path, atomic_write_text
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import whole
 from neurolens.evaluate.figures import side_by_side
 from neurolens.evaluate.plots import family_colour
 from neurolens.evaluate.records import plain
@@ -46,7 +48,7 @@ _INTRO = """\
 `python -m experiments equal-time`: {lens} exact in torch, through surrogates in onnxruntime, both as compiled
 C (fused), and as a thin lens of its focal length and f-number. Against the exact lens with other seeds and {reference}
 samples per pixel, in two halves. Every camera draws the same random numbers, one wavelength per path. Times are the
-render's own seconds (best; median in brackets), {threads} thread{s}, {size} pixels; making a camera, its fit and the
+render's own seconds (best; median in brackets), {threads}, {size} pixels; making a camera, its fit and the
 scene's tables are not in them.
 
 - *Error*: relative RMSE, the root of the mean of (a - b)^2 / (b^2 + 0.01) on linear radiance, in percent; mean FLIP.
@@ -66,30 +68,40 @@ scene's tables are not in them.
 
 def write(results: Sequence[SceneResult], folder: Path) -> str:
     """Write tables of all scenes and the pictures of each; returns the page."""
-    folder.mkdir(parents=True, exist_ok=True)
-    text = page(results)
-    atomic_write_text(folder / "equal_time.csv", _csv(results))
     data = {"machine": lab.machine(), "scenes": [_scene_data(r) for r in results]}
-    atomic_write_text(folder / "equal_time.json", json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
+    lab.write_json(folder / "equal_time.json", plain(data))
+    points = [(r, c, level) for r in results for c in r.cameras.values() for level in c.levels]
+    atomic_write_text(folder / "equal_time.csv", lab.csv_text(_POINTS, points))
     for result in results:
         draw(result, folder)
+    text = page(results)
     atomic_write_text(folder / "README.md", text)
     return text
 
 
+def _threads(result: SceneResult) -> str:
+    return f"{result.threads} thread" + "s" * (result.threads != 1)
+
+
 def page(results: Sequence[SceneResult]) -> str:
     """The tables in Markdown."""
-    counts, threads = results[0].counts, results[0].threads
-    parts = [
-        _INTRO.format(
-            lens=LENS, reference=2 * counts.reference, threads=threads, s="" if threads == 1 else "s",
-            size="{} x {}".format(*counts.size), pass_samples=counts.pass_samples, passes=counts.passes,
-        )
-    ]  # fmt: skip
-    parts += [_scene_text(result) for result in results]
-    about = lab.machine()
-    parts.append(f"{about['processor']}, {about['cores']} cores, Python {about['python']}, numpy {about['numpy']}.\n")
-    return "\n".join(parts)
+    counts, about = results[0].counts, lab.machine()
+    told = {"reference": 2 * counts.reference, "pass_samples": counts.pass_samples, "passes": counts.passes}
+    parts = [_INTRO.format(lens=LENS, threads=_threads(results[0]), size="{} x {}".format(*counts.size), **told)]
+    for result in results:
+        noise, cameras = 100 * math.sqrt(result.noise2["rel_mse"]), list(result.cameras.values())
+        parts += [
+            f"## {result.name}",
+            f"Focused at {result.settings.focus_m:g} m, f/{result.f_number:.3g}. "
+            f"The reference's own noise: {noise:.3g}%; FLIP between its halves {result.flip_halves:.3g}.",
+            lab.table(_law_columns(result), cameras),
+            lab.table(_equal_columns(result), cameras),
+            f"![Error against time]({result.name}-error.png)",
+            f"![FLIP maps]({result.name}-flip.png)",
+            f"![Film-space error]({result.name}-film.png)",
+        ]
+    machine = f"{about['processor']}, {about['cores']} cores, Python {about['python']}, numpy {about['numpy']}."
+    return lab.page(*parts, machine)
 
 
 def equal_time_s(result: SceneResult) -> float:
@@ -97,65 +109,45 @@ def equal_time_s(result: SceneResult) -> float:
     return min(c.levels[-1].seconds_min for c in result.cameras.values())
 
 
-def _scene_text(result: SceneResult) -> str:
-    most, seconds = next(iter(result.cameras.values())).levels[-1].samples, equal_time_s(result)
-    noise = 100 * math.sqrt(result.noise2["rel_mse"])
-    stem = result.name
-    return "\n".join(
-        [
-            f"## {stem}\n",
-            f"Focused at {result.settings.focus_m:g} m, f/{result.f_number:.3g}."
-            f" The reference's own noise: {noise:.3g}%; FLIP between its halves {result.flip_halves:.3g}.\n",
-            lab.table(
-                ["camera", "bias paired %", "bias alone %", "variance a sample", "ms a sample", "efficiency 1/s"]
-                + [f"{name} ahead" for name in _exacts(result)],
-                [_law_cells(result, c) for c in result.cameras.values()],
-            ),
-            "",
-            lab.table(
-                ["camera", f"{most} samples: error %", "FLIP", f"{seconds:.3g} s: samples", "error %", "FLIP"]
-                + ["FLIP paired", "film median", "film 99%"],
-                [_equal_cells(result, c, seconds) for c in result.cameras.values()],
-            ),
-            f"\n![Error against time]({stem}-error.png)\n",
-            f"![FLIP maps]({stem}-flip.png)\n\n![Film-space error]({stem}-film.png)\n",
-        ]
+def _law_columns(result: SceneResult) -> Sequence[lab.Column]:
+    samples = result.counts.pass_samples
+    return lab.columns(
+        ("camera", "name"),
+        ("bias paired %", lambda c: "0" if c.name == EXACT else _root(c.bias2["rel_mse"])),
+        ("bias alone %", lambda c: _root(c.extrapolated2["rel_mse"])),
+        ("variance a sample", "variance.rel_mse.value", ".3g", samples),
+        ("ms a sample", lambda c: "{:.3g} ({:.3g})".format(*(1000 * s / samples for s in c.pass_s))),
+        ("efficiency 1/s", lambda c: 1 / (c.variance["rel_mse"].value * c.pass_s[0]), ".3g"),
+        *((f"{name} ahead", partial(_crossover_text, result, name)) for name in _exacts(result)),
     )
 
 
-def _law_cells(result: SceneResult, camera: CameraResult) -> list[str]:
-    exact = camera.name == EXACT
-    samples, best, middle = result.counts.pass_samples, *camera.pass_s
-    variance = camera.variance["rel_mse"].value
-    return [
-        camera.name,
-        "0" if exact else _root(camera.bias2["rel_mse"]),
-        _root(camera.extrapolated2["rel_mse"]),
-        f"{samples * variance:.3g}",
-        f"{1000 * best / samples:.3g} ({1000 * middle / samples:.3g})",
-        f"{1 / (variance * best):.3g}",
-        *("–" if camera.name in EXACTS else _crossover_text(result, camera, name) for name in _exacts(result)),
-    ]
+def _equal_columns(result: SceneResult) -> Sequence[lab.Column]:
+    most, seconds = next(iter(result.cameras.values())).levels[-1].samples, equal_time_s(result)
 
+    def flip_then(camera: CameraResult) -> float:
+        return log_interpolate(seconds, sorted((level.seconds_min, level.flip) for level in camera.levels))
 
-def _equal_cells(result: SceneResult, camera: CameraResult, seconds: float) -> list[str]:
-    last = camera.levels[-1]
-    seen = log_interpolate(seconds, sorted((level.seconds_min, level.flip) for level in camera.levels))
-    return [
-        camera.name,
-        _percent(last.rel_mse),
-        f"{last.flip:.3g}",
-        f"{seconds * result.counts.pass_samples / camera.pass_s[0]:.0f}",
-        _percent(camera.law("rel_mse").at(seconds)),
-        f"{seen:.3g}",
-        "0" if camera.name == EXACT else f"{camera.flip_same:.2g}",
-        um_text(camera.film.p50_um),
-        um_text(camera.film.p99_um),
-    ]
+    return lab.columns(
+        ("camera", "name"),
+        (f"{most} samples: error %", lambda c: _percent(c.levels[-1].rel_mse)),
+        ("FLIP", lambda c: c.levels[-1].flip, ".3g"),
+        (f"{seconds:.3g} s: samples", lambda c: seconds * result.counts.pass_samples / c.pass_s[0], ".0f"),
+        ("error %", lambda c: _percent(c.law("rel_mse").at(seconds))),
+        ("FLIP", flip_then, ".3g"),
+        ("FLIP paired", lambda c: "0" if c.name == EXACT else f"{c.flip_same:.2g}"),
+        ("film median", lambda c: um_text(c.film.p50_um)),
+        ("film 99%", lambda c: um_text(c.film.p99_um)),
+    )
 
 
 def _percent(square: float) -> str:
     return f"{100 * math.sqrt(square):.3g}" if square > 0 else "~0"
+
+
+def um_text(value: float) -> str:
+    """Micrometres with two figures, whole from 100 on."""
+    return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
 
 
 def _root(square: Estimate) -> str:
@@ -179,7 +171,9 @@ def crossovers_s(result: SceneResult, camera: CameraResult, exact: str) -> tuple
     return times[0], times[1], times[2]
 
 
-def _crossover_text(result: SceneResult, camera: CameraResult, exact: str) -> str:
+def _crossover_text(result: SceneResult, exact: str, camera: CameraResult) -> str:
+    if camera.name in EXACTS:
+        return "–"
     middle, early, late = crossovers_s(result, camera, exact)
     if middle == 0.0:
         return "from the first sample"
@@ -198,28 +192,27 @@ def _time(seconds: float) -> str:
     return f"{float(f'{seconds / size:.2g}'):g} {name}"
 
 
-def _csv(results: Iterable[SceneResult]) -> str:
-    """Every measured point: squared errors as their roots; an empty cell where noise made the square negative."""
-    out = io.StringIO()
-    table = csv.writer(out, lineterminator="\n")
-    table.writerow(["scene", "camera", "samples", "seconds_min", "seconds_median", "rmse", "relative_rmse", "flip"])
-    for result in results:
-        for camera in result.cameras.values():
-            for level in camera.levels:
-                roots = [f"{math.sqrt(e):.5g}" if e > 0 else "" for e in (level.mse, level.rel_mse)]
-                times = [f"{t:.5g}" for t in (level.seconds_min, level.seconds_median)]
-                table.writerow([result.name, camera.name, level.samples, *times, *roots, f"{level.flip:.5g}"])
-    return out.getvalue()
+# Every measured point: squared errors as their roots; an empty cell where noise made the square negative.
+_POINTS = lab.columns(
+    ("scene", lambda p: p[0].name),
+    ("camera", lambda p: p[1].name),
+    ("samples", lambda p: p[2].samples),
+    ("seconds_min", lambda p: p[2].seconds_min, ".5g"),
+    ("seconds_median", lambda p: p[2].seconds_median, ".5g"),
+    ("rmse", lambda p: math.sqrt(p[2].mse) if p[2].mse > 0 else None, ".5g"),
+    ("relative_rmse", lambda p: math.sqrt(p[2].rel_mse) if p[2].rel_mse > 0 else None, ".5g"),
+    ("flip", lambda p: p[2].flip, ".5g"),
+)
 
 
-def _scene_data(result: SceneResult) -> dict[str, Any]:
-    def camera_data(c: CameraResult) -> dict[str, Any]:
+def _scene_data(result: SceneResult) -> lab.Row:
+    def camera_data(c: CameraResult) -> lab.Row:
         return {
             "name": c.name,
             "levels": [asdict(level) for level in c.levels],
             "pass_s_min": c.pass_s[0],
             "pass_s_median": c.pass_s[1],
-            **{key: {m: asdict(getattr(c, key)[m]) for m in MEASURES} for key in _ESTIMATES},
+            **{k: {m: asdict(getattr(c, k)[m]) for m in MEASURES} for k in ("bias2", "extrapolated2", "variance")},
             "flip_same_seeds": c.flip_same,
             "film_p50_um": c.film.p50_um,
             "film_p99_um": c.film.p99_um,
@@ -239,93 +232,8 @@ def _scene_data(result: SceneResult) -> dict[str, Any]:
     }
 
 
-_ESTIMATES = ("bias2", "extrapolated2", "variance")
-
-
 _MOST_BYTES = 150_000  # of a picture
 _TITLES = {"mse": "RMSE (linear radiance)", "rel_mse": "relative RMSE (share of 1)"}
-
-
-def draw(result: SceneResult, folder: Path) -> list[Path]:
-    """Three pictures: error over time, FLIP maps at equal samples, film-space maps."""
-    shot, counts = result.settings, result.counts
-    threads = f"{result.threads} thread" + ("" if result.threads == 1 else "s")
-    where = f"{result.name}, f/{result.f_number:.3g}, focused at {shot.focus_m:g} m"
-    size = f"{counts.size[0]} x {counts.size[1]} pixels"
-    over_time = error_over_time_plot(
-        [*(_root_panel(result, measure) for measure in MEASURES), _flip_panel(result)],
-        folder / f"{result.name}-error.png",
-        f"Error against render time: {where}",
-        f"{size}, {threads}; markers: 1, 2, 4 ... samples per pixel; the reference has {2 * counts.reference}",
-    )
-    total = counts.pass_samples * counts.passes
-    shown = {n: c for n, c in result.cameras.items() if not n.startswith("fused")}  # whose pictures are their models'
-    flips = side_by_side(
-        {"reference": result.reference} | {n: c.picture for n, c in shown.items()},
-        {n: c.flip_map for n, c in shown.items()},
-        folder / f"{result.name}-flip.png",
-        {n: _flip_caption(c) for n, c in shown.items()},
-        title=f"{result.name}: FLIP against the reference, {total} samples each",
-    )
-    films = film_maps_plot(
-        {n: c.film.median_um for n, c in result.cameras.items()},
-        (shot.film_width_mm, shot.film_height_mm),
-        folder / f"{result.name}-film.png",
-        f"Film-space error: {where}",
-        "against the exact ray in float64 of the same film and pupil point; median over pupil and wavelengths",
-        {
-            n: f"all rays: median {um_text(c.film.p50_um)}, 99% {um_text(c.film.p99_um)} µm"
-            for n, c in result.cameras.items()
-        },
-    )
-    for picture in (over_time, flips, films):
-        _fewer_colours(picture)
-    return [over_time, flips, films]
-
-
-def um_text(value: float) -> str:
-    """Micrometres with two figures, whole from 100 on."""
-    return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
-
-
-def _flip_caption(camera: CameraResult) -> str:
-    same = "" if camera.name == EXACT else f"\nfrom exact, same random numbers: {camera.flip_same:.2g}"
-    return f"FLIP {camera.flip_map.mean():.3g}{same}"
-
-
-def _root_panel(result: SceneResult, measure: str) -> Panel:
-    def curve(camera: CameraResult) -> tuple[list[float], list[float]]:
-        squares = [getattr(level, measure) for level in camera.levels]
-        return [level.seconds_min for level in camera.levels], [math.sqrt(s) if s > 0 else math.nan for s in squares]
-
-    biased = {n: math.sqrt(c.bias2[measure].value) for n, c in result.cameras.items() if c.bias2[measure].resolved}
-    curves = {n: curve(c) for n, c in result.cameras.items()}
-    return Panel(_TITLES[measure], curves, math.sqrt(result.noise2[measure]), "noise of the reference", biased)
-
-
-def _flip_panel(result: SceneResult) -> Panel:
-    curves = {
-        n: ([level.seconds_min for level in c.levels], [level.flip for level in c.levels])
-        for n, c in result.cameras.items()
-    }
-    return Panel("mean FLIP (0 to 1)", curves, result.flip_halves, "between halves of the reference", {})
-
-
-def _fewer_colours(picture: Path) -> None:
-    """Keep at most 256 colours of a PNG, half as many and so on until it is small enough for the repository."""
-    with Image.open(picture) as full:
-        pixels = full.convert("RGB")
-    for colours in (256, 128, 64, 32):
-        with atomic_path(picture) as temporary:
-            pixels.quantize(colours, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
-                temporary, optimize=True
-            )
-        if picture.stat().st_size <= _MOST_BYTES:
-            return
-
-
-_MARKERS = "osD^vP"
-_FUSED = "fused "
 
 
 @dataclass(frozen=True)
@@ -345,22 +253,65 @@ class Panel:
     levels: Mapping[str, float]
 
 
-def error_over_time_plot(panels: Sequence[Panel], path: str | Path, title: str, subtitle: str) -> Path:
-    """Panels side by side, log-log, one line per camera, with the reference's own noise and the biases.
+def _panels(result: SceneResult) -> list[Panel]:
+    """RMSE, relative RMSE and FLIP."""
+    cameras, panels = result.cameras.items(), []
+    seconds = {n: [level.seconds_min for level in c.levels] for n, c in cameras}
+    for measure, title in _TITLES.items():
+        squares = {n: np.array([getattr(level, measure) for level in c.levels]) for n, c in cameras}
+        roots = {n: (seconds[n], list(np.sqrt(np.maximum(s, 0)))) for n, s in squares.items()}
+        biased = {n: math.sqrt(c.bias2[measure].value) for n, c in cameras if c.bias2[measure].resolved}
+        panels.append(Panel(title, roots, math.sqrt(result.noise2[measure]), "noise of the reference", biased))
+    flips = {n: (seconds[n], [level.flip for level in c.levels]) for n, c in cameras}
+    return [*panels, Panel("mean FLIP (0 to 1)", flips, result.flip_halves, "between halves of the reference", {})]
 
-    Raises:
-        InputError: nothing to draw.
-    """
-    if not panels or not any(panel.curves for panel in panels):
-        raise InputError("error over time", "panels", "(none)", "at least one panel with a curve")
-    with drawing(path, 3.5 * len(panels), 4.1) as figure:
-        row = figure.subplots(1, len(panels), squeeze=False)[0]
+
+def draw(result: SceneResult, folder: Path) -> None:
+    """Three pictures: error over time, FLIP maps at equal samples, film-space maps."""
+    shot, counts = result.settings, result.counts
+    over_time, flips, films = (folder / f"{result.name}-{kind}.png" for kind in ("error", "flip", "film"))
+    where = f"{result.name}, f/{result.f_number:.3g}, focused at {shot.focus_m:g} m"
+    size = f"{counts.size[0]} x {counts.size[1]} pixels, {_threads(result)}"
+    note = f"{size}; markers: 1, 2, 4 ... samples per pixel; the reference has {2 * counts.reference}"
+    panels = _panels(result)
+    with drawing(over_time, 3.5 * len(panels), 4.1, f"Error against render time: {where}", note) as figure:
         handles: dict[str, Any] = {}
-        for axes, panel in zip(row, panels, strict=True):
+        for axes, panel in zip(figure.subplots(1, len(panels)), panels, strict=True):
             handles |= _draw(axes, panel)
-        heading(figure, title, subtitle)
         figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
-    return Path(path)
+    shown = {n: c for n, c in result.cameras.items() if not n.startswith(_FUSED)}  # whose pictures are their models'
+    side_by_side(
+        {"reference": result.reference} | {n: c.picture for n, c in shown.items()},
+        {n: c.flip_map for n, c in shown.items()},
+        flips,
+        {n: _flip_caption(c) for n, c in shown.items()},
+        title=f"{result.name}: FLIP against the reference, {counts.pass_samples * counts.passes} samples each",
+    )
+    _film_maps(result, films, f"Film-space error: {where}")
+    for picture in (over_time, flips, films):
+        _fewer_colours(picture)
+
+
+def _flip_caption(camera: CameraResult) -> str:
+    same = "" if camera.name == EXACT else f"\nfrom exact, same random numbers: {camera.flip_same:.2g}"
+    return f"FLIP {camera.flip_map.mean():.3g}{same}"
+
+
+def _fewer_colours(picture: Path) -> None:
+    """Keep at most 256 colours of a PNG, half as many and so on until it is small enough for the repository."""
+    with Image.open(picture) as full:
+        pixels = full.convert("RGB")
+    for colours in (256, 128, 64, 32):
+        with atomic_path(picture) as temporary:
+            pixels.quantize(colours, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+                temporary, optimize=True
+            )
+        if picture.stat().st_size <= _MOST_BYTES:
+            return
+
+
+_MARKERS = "osD^vP"
+_FUSED = "fused "
 
 
 def _draw(axes: Any, panel: Panel) -> dict[str, Any]:
@@ -388,42 +339,27 @@ def _draw(axes: Any, panel: Panel) -> dict[str, Any]:
     return handles
 
 
-def film_maps_plot(
-    maps: Mapping[str, ArrayLike],
-    film_mm: tuple[float, float],
-    path: str | Path,
-    title: str,
-    subtitle: str,
-    captions: Mapping[str, str] | None = None,
-) -> Path:
-    """Film-space errors over the film, as the picture shows it, each with its own colour bar: they differ too much.
-
-    Args:
-        maps: camera to [rows, columns] in um; NaN (no ray) stays white.
-        film_mm: width and height.
-        captions: below the name of a camera.
-    Raises:
-        InputError: no map.
-    """
-    if not maps:
-        raise InputError("film maps", "maps", "(none)", "at least one map")
-    columns = 2 if len(maps) in (2, 4) else min(len(maps), 3)
-    rows = -(-len(maps) // columns)
-    with drawing(path, 4.0 * columns, 0.7 + 2.3 * rows) as figure:
+def _film_maps(result: SceneResult, path: Path, title: str) -> None:
+    """Errors over the film, as the picture shows it, each with its own colour bar: they differ too much."""
+    note = "against the exact ray in float64 of the same film and pupil point; median over pupil and wavelengths"
+    count = len(result.cameras)
+    columns = 2 if count in (2, 4) else min(count, 3)
+    rows = -(-count // columns)
+    with drawing(path, 4.0 * columns, 0.7 + 2.3 * rows, title, note) as figure:
         places = figure.subplots(rows, columns, squeeze=False).ravel()
-        across, up = film_mm[0] / 2, film_mm[1] / 2
-        for axes, (name, values) in zip(places, maps.items(), strict=False):
-            shown = axes.imshow(np.asarray(values), cmap="magma", vmin=0, extent=(-across, across, -up, up))
-            axes.set_title(f"{name}\n{(captions or {}).get(name, '')}", fontsize=9.5)
+        across, up = result.settings.film_width_mm / 2, result.settings.film_height_mm / 2
+        for axes, (name, camera) in zip(places, result.cameras.items(), strict=False):
+            film = camera.film
+            shown = axes.imshow(film.median_um, cmap="magma", vmin=0, extent=(-across, across, -up, up))
+            caption = f"all rays: median {um_text(film.p50_um)}, 99% {um_text(film.p99_um)} µm"
+            axes.set_title(f"{name}\n{caption}", fontsize=9.5)
             axes.set(xlabel="across the picture (mm on the film)", ylabel="up (mm)")
             axes.xaxis.label.set_size(8.5)
             bar = figure.colorbar(shown, ax=axes, shrink=0.85)
             bar.set_label("median error (µm)", fontsize=8.5)
             bar.outline.set_visible(False)
-        for axes in places[len(maps) :]:
+        for axes in places[count:]:
             axes.set_axis_off()
-        heading(figure, title, subtitle)
-    return Path(path)
 
 
 def _colour(name: str) -> str:
@@ -434,45 +370,26 @@ def _colour(name: str) -> str:
     return family_colour("paraxial" if kind.startswith("thin") else kind.split("-")[0])
 
 
-ABOUT = """\
-Error over time of the exact lens, a polynomial, a network and a thin lens in three scenes, against a
-converged exact render with other seeds: bias and variance told apart, seconds per sample, from when the
-exact lens is ahead, equal time and equal samples, FLIP maps and film-space error maps in micrometres.
-Best and median seconds; the exact lens and the network as compiled C, too.
-Renders are kept in the run folder: an interrupted run resumes, and what would give
-another picture is rendered again. Needs the extra "train" (torch, matplotlib, flip-evaluator) and a C
-compiler. Writes README.md, equal_time.csv, equal_time.json and three pictures a scene (about ten minutes)."""
+OPTIONS = (
+    lab.option("--scene", metavar="SCENE", action="append", help="grid, lights, room or a file (default: all)"),
+    lab.option("--quick", action="store_true", help="tiny pictures (a minute); results stay in the run folder"),
+    lab.count("threads", 1, "of the timed renders (default 1)", 1, 256),
+    lab.option("--folder", metavar="DIR", type=Path, help="of the kept renders (default: runs/equal_time)"),
+    lab.option("--out", metavar="DIR", type=Path, help="default: experiments/results/equal_time"),
+    lab.QUIET,
+)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m experiments equal-time`."""
-    parser.add_argument(
-        "--scene", metavar="SCENE", action="append",
-        help="grid, lights, room or a scene file; again for more (default: all three)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--quick", action="store_true", help="tiny pictures, few samples (a minute); results stay in the run folder"
-    )
-    parser.add_argument(
-        "--threads", metavar="N", type=whole(1, 256), default=1, help="of the timed renders (default 1)"
-    )
-    parser.add_argument("--folder", metavar="DIR", type=Path, help="of the kept renders (default: runs/equal_time)")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="default: experiments/results/equal_time")
-    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
-
-
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Measure scene by scene; the page is written after each."""
     counts = QUICK if args.quick else Counts()
     folder = args.folder or lab.ROOT / "runs" / ("equal_time_quick" if args.quick else "equal_time")
     out = args.out or (folder / "results" if args.quick else lab.RESULTS / "equal_time")
-    files = [scene_file(name, lab.ROOT) for name in args.scene or SCENES]
+    files = [scene_file(name) for name in args.scene or SCENES]
     progress = Progress({file.stem: 1.0 for file in files}, quiet=args.quiet)
     done: list[SceneResult] = []
     for file in files:
         with progress.stage(file.stem) as report:
-            done.append(measure_scene(file, lab.ROOT, folder, counts, args.threads, report))
+            done.append(measure_scene(file, folder, counts, args.threads, report))
         text = write(done, out)
-    print(text)
-    print(f"Written to {out}")
-    return 0
+    print(f"{text}\nWritten to {out}")

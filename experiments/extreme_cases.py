@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from experiments import lab
 from neurolens.base import status as st
 from neurolens.optics import glass
 from neurolens.optics.lensfile import read_lens
@@ -38,21 +38,14 @@ class Case:
     towards: Towards
 
 
-def all_cases(lenses: Path, count: int) -> Iterator[Case]:
+def all_cases(count: int) -> Iterator[Case]:
     """Every case, `count` rays each (some have a few less)."""
-    yield from apertures(lenses, count)
-    yield from wide_fields(lenses, count)
-    yield from radii(count)
-    yield from grazing(count)
-    yield from total_reflection(count)
-    yield from near_equal_indices(count)
-    yield from wavelengths(lenses, count)
-    yield from object_distances(lenses, count)
-    yield from shapes(count)
-    yield from library(lenses, count)
+    bent = (apertures, wide_fields, radii, grazing, total_reflection, near_equal_indices)
+    for kind in (*bent, wavelengths, object_distances, shapes, library):
+        yield from kind(count)
 
 
-def apertures(lenses: Path, count: int) -> Iterator[Case]:
+def apertures(count: int) -> Iterator[Case]:
     """f/0.6 to f/45: a ball and a hyperbolic lens wide open, and a double Gauss stopped down."""
     ball = _lens(
         "ball", Surface(10.0, 20.0, 19.999, 1.71), Surface(-10.0, 5.0, 19.999), Surface(INF, 2.0, 30, stop=True)
@@ -66,16 +59,16 @@ def apertures(lenses: Path, count: int) -> Iterator[Case]:
     for lens in (ball, hyperbola):
         f_number = abs(first_order(lens).efl_mm) / lens.surfaces[0].diameter_mm
         yield _case("f-number", f"{lens.name} f/{f_number:.2g}", lens, from_scene(lens, count, g, slope=0.05), "film")
-    whole = read_lens(lenses / f"{DOUBLE_GAUSS}.toml")
+    whole = read_lens(lab.LENSES / f"{DOUBLE_GAUSS}.toml")
     for number in (1.8, 5.6, 16, 45):
         lens = whole.at(f_number=number)
         rays = from_film(lens, count, g, share=1.1 * lens.stop_radius_mm / whole.stop_radius_mm)
         yield _case("f-number", f"double Gauss f/{number:g}", lens, rays, "scene")
 
 
-def wide_fields(lenses: Path, count: int) -> Iterator[Case]:
+def wide_fields(count: int) -> Iterator[Case]:
     """A fisheye of 220 degrees, from the film to beyond its edge, and back from the scene."""
-    lens = read_lens(lenses / f"{FISHEYE}.toml").at()
+    lens = read_lens(lab.LENSES / f"{FISHEYE}.toml").at()
     rays = from_film(lens, 4 * count, generator(), film=1.3)
     yield _case("field", "fisheye of 220 degrees, to the scene", lens, rays, "scene")
     yield _case("field", "fisheye of 220 degrees, to the film", lens, returning(lens, rays, count), "film")
@@ -137,18 +130,18 @@ def near_equal_indices(count: int) -> Iterator[Case]:
         yield _case("cement", f"index step {step:g}", lens, rays, "film")
 
 
-def wavelengths(lenses: Path, count: int) -> Iterator[Case]:
+def wavelengths(count: int) -> Iterator[Case]:
     """The ends of the visible."""
-    lens = read_lens(lenses / f"{DOUBLE_GAUSS}.toml").at()
+    lens = read_lens(lab.LENSES / f"{DOUBLE_GAUSS}.toml").at()
     for wavelength in (380.0, 780.0):
         rays = from_film(lens, count, generator())
         case = _case("wavelength", f"double Gauss, {wavelength:g} nm", lens, rays, "scene")
         yield replace(case, wavelength_nm=wavelength)
 
 
-def object_distances(lenses: Path, count: int) -> Iterator[Case]:
+def object_distances(count: int) -> Iterator[Case]:
     """Light from points 1e-6 mm to 1e6 m away, along the ray, from where it enters the front surface."""
-    lens = read_lens(lenses / f"{DOUBLE_GAUSS}.toml").at()
+    lens = read_lens(lab.LENSES / f"{DOUBLE_GAUSS}.toml").at()
     for distance_mm in (1e-6, 1e-3, 1.0, 1e3, 1e6, 1e9):
         g = generator()
         x, y = disc(g, count, lens.surfaces[0].semi_diameter_mm)
@@ -176,9 +169,9 @@ def shapes(count: int) -> Iterator[Case]:
         yield _case("shape", name, lens, from_scene(lens, count, generator(), slope=0.3), "film")
 
 
-def library(lenses: Path, count: int) -> Iterator[Case]:
+def library(count: int) -> Iterator[Case]:
     """Every lens file in every state, both ways."""
-    for path in sorted(lenses.glob("*.toml")):
+    for path in sorted(lab.LENSES.glob("*.toml")):
         table = read_lens(path)
         for name in (None, *(c.name for c in table.configurations)):
             lens = table.at(zoom=name)
@@ -207,7 +200,8 @@ def from_film(lens: Lens, count: int, g: torch.Generator, *, share: float = 1.02
 
     Film points lie within `film` times the image radius, where that is unknown the rear rim's.
     """
-    rear, z = lens.surfaces[-1].semi_diameter_mm, _film_z_mm(lens)
+    rear = lens.surfaces[-1].semi_diameter_mm
+    z = float(lens.film_z_mm if lens.film_z_mm is not None else lens.vertices_mm[-1])
     rear_z = float(lens.vertices_mm[len(lens.surfaces) - 1])
     data = first_order(lens)
     pupil_z, pupil = data.exit_pupil_z_mm, abs(data.exit_pupil_diameter_mm) / 2
@@ -221,16 +215,14 @@ def from_film(lens: Lens, count: int, g: torch.Generator, *, share: float = 1.02
     return Rays(fx, fy, torch.full_like(fx, z), *unit(px * radius - fx, py * radius - fy, depth))
 
 
-def _film_z_mm(lens: Lens) -> float:
-    return float(lens.film_z_mm if lens.film_z_mm is not None else lens.vertices_mm[-1])
-
-
 def from_scene(lens: Lens, count: int, g: torch.Generator, *, slope: float, wide: float = 1.0) -> Rays:
     """Light from in front of the lens to `wide` times its front rim, at slopes up to `slope`."""
     x, y = disc(g, count, wide * lens.surfaces[0].semi_diameter_mm)
     sx, sy = disc(g, count, slope)
     d = unit(sx, sy, torch.ones_like(sx))
-    front = torch.full_like(x, min(0.0, _rim_sag(lens.surfaces[0])) - 1.0)
+    first, radius = lens.surfaces[0], float(lens.surfaces[0].radius_mm)
+    rim = torch.tensor([min(first.semi_diameter_mm, abs(radius)), 0.0], dtype=torch.float64)
+    front = torch.full_like(x, min(0.0, float(sag(radius, rim))) - 1.0)
     return Rays(x - sx, y - sy, front, *d)
 
 
@@ -277,8 +269,3 @@ def sag(radius: float, at: Sequence[Tensor] | Tensor) -> Tensor:
     """Depth of a sphere behind its vertex at points x, y."""
     ratio2 = (at[0] ** 2 + at[1] ** 2) / radius
     return ratio2 / (1 + torch.sqrt((1 - ratio2 / radius).clamp_min(0)))
-
-
-def _rim_sag(s: Surface) -> float:
-    height = torch.tensor([min(s.semi_diameter_mm, abs(float(s.radius_mm))), 0.0], dtype=torch.float64)
-    return float(sag(float(s.radius_mm), height))

@@ -1,10 +1,14 @@
-"""Numerics at the extremes: float32 against float64, and float64 against 50 digits, as a table.
+"""Errors of float32 from float64, and of float64 from 50 digits, at the ends of what optics allows.
+
+f/0.6 to f/45, 220 degrees, radii from the semi-diameter to a plane, grazing rays, the critical angle, cemented equal
+indices, near and far objects, every lens file, both ways.
 
 Both precisions trace the same rays: each ray is rounded to float32 first, and its direction made unit again in float64.
 Where the two disagree on what ends a ray, the ray must pass an edge (a rim, the end of a sphere, the critical angle)
 more closely than float32 can tell: some ray within the case's tolerance of it has, in float64, the status that float32
 gave. The tolerance is what float32 itself shows on the passing rays of the case: their largest errors of position and
-of direction.
+of direction. Exit code 1 where a number is not finite or a status differs away from any edge.
+Writes extremes.md and extremes.json.
 """
 
 from __future__ import annotations
@@ -24,7 +28,6 @@ from experiments import lab
 from experiments.extreme_cases import Case, all_cases
 from neurolens.base import status as st
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import whole
 from neurolens.optics import glass
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays, Traced, trace
@@ -156,7 +159,6 @@ def failures(rows: Sequence[Row]) -> list[str]:
     return found
 
 
-_HEAD = "case|rays|pass|float32: mm|of the size|rad|status differs within|beyond|NaN|float64: mm|rad|status differs"
 _NOTES = """\
 Largest errors over the rays that pass. float32 is held against float64 on the same rays (rounded to float32 first):
 mm at the last surface, the same over the largest coordinate that occurs, and rad of the direction. A status may differ
@@ -165,36 +167,35 @@ largest coordinate. float64 is held against 50 decimal digits on a few rays per 
 result that is not finite."""
 
 
+_COLUMNS = lab.columns(
+    ("case", "name"),
+    ("rays", "rays"),
+    ("pass", "passed"),
+    ("float32: mm", "position_mm", ".1e"),
+    ("of the size", "relative", ".1e"),
+    ("rad", "angle_rad", ".1e"),
+    ("status differs within", "within"),
+    ("beyond", "beyond"),
+    ("NaN", "not_finite"),
+    ("float64: mm", "exact_mm", ".1e"),
+    ("rad", "exact_rad", ".1e"),
+    ("status differs", "exact_status"),
+)
+
+
 def page(rows: Sequence[Row], bad: Sequence[str]) -> str:
     """The whole page: notes, totals, what failed, and a table per group in Markdown."""
-    rays, within = sum(r.rays for r in rows), sum(r.within for r in rows)
-    beyond, nan, exact = (sum(getattr(r, k) for r in rows) for k in ("beyond", "not_finite", "exact_status"))
+    keys = ("rays", "within", "beyond", "not_finite", "exact_status", "exact_rays")
+    rays, within, beyond, nan, exact, exact_rays = (sum(getattr(r, k) for r in rows) for k in keys)
     totals = (
         f"{len(rows)} cases, {rays:,} rays in each precision: {within} statuses differ within tolerance of an edge, "
-        f"{beyond} beyond; {nan} numbers not finite; {exact} of {sum(r.exact_rays for r in rows)} rays have another "
-        "status with 50 digits."
+        f"{beyond} beyond; {nan} numbers not finite; {exact} of {exact_rays} rays have another status with 50 digits."
     )
-    parts = [
-        "# Numerics at the extremes",
-        "`python -m experiments extremes`",
-        _NOTES,
-        totals,
-        *(f"FAILED: {b}" for b in bad),
-    ]
-    return "\n\n".join(parts) + "\n" + table(rows)
-
-
-def table(rows: Sequence[Row]) -> str:
-    """The rows as tables in Markdown, one per group."""
-    lines: list[str] = []
+    parts = ["# Numerics at the extremes", "`python -m experiments extremes`", _NOTES, totals]
+    parts += [f"FAILED: {b}" for b in bad]
     for group in dict.fromkeys(r.group for r in rows):
-        cells = []
-        for r in (r for r in rows if r.group == group):
-            errors = [f"{v:.1e}" for v in (r.position_mm, r.relative, r.angle_rad)]
-            exact = [f"{r.exact_mm:.1e}", f"{r.exact_rad:.1e}", r.exact_status]
-            cells.append([r.name, r.rays, r.passed, *errors, r.within, r.beyond, r.not_finite, *exact])
-        lines += [f"\n## {group}\n", lab.table(_HEAD, cells)]
-    return "\n".join(lines) + "\n"
+        parts += [f"## {group}", lab.table(_COLUMNS, [r for r in rows if r.group == group])]
+    return lab.page(*parts)
 
 
 DIGITS = 50
@@ -348,33 +349,20 @@ def _refract(d: Vector, normal: Vector, mu: Any) -> Vector | None:
     return mu * d[0] + pull * n[0], mu * d[1] + pull * n[1], mu * d[2] + pull * n[2]
 
 
-ABOUT = """\
-Errors of float32 from float64, and of float64 from 50 digits, at the ends of what optics allows:
-f/0.6 to f/45, 220 degrees, radii from the semi-diameter to a plane, grazing rays, the critical
-angle, cemented equal indices, near and far objects, every lens file, both ways.
-Exit code 1 where a number is not finite or a status differs away from any edge.
-Writes extremes.md and extremes.json."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m experiments extremes`."""
-    parser.add_argument("--rays", metavar="N", type=whole(100), default=20000, help="rays per case (default 20000)")
-    lab.add_out(parser)
+OPTIONS = (lab.count("rays", 20000, "rays per case (default 20000)", 100), lab.out())
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure every case; 1 where there are violations."""
     lab.quiet_glasses()
+    done = []
     with Progress(quiet=args.quiet).stage("extremes") as report:
-        cases = list(all_cases(lab.LENSES, args.rays))
-        done = []
+        cases = list(all_cases(args.rays))
         for case in cases:
             done.append(measure(case))
             report(len(done) / len(cases))
     bad = failures(done)
-    text = page(done, bad)
-    lab.write_results(args.out, "extremes", text, [asdict(row) for row in done])
-    print(text)
+    print(lab.write_results(args.out, "extremes", page(done, bad), [asdict(row) for row in done]))
     for line in bad:
         print(f"experiments: {line}", file=sys.stderr)
     return 1 if bad else 0

@@ -1,7 +1,8 @@
-"""Convergence of inverse maps: a direct fit with limited Newton steps, beside Newton's method as published.
+"""Fit a model and its inverse maps to every lens file, and count the rays that three Newton steps do not find.
 
-As published (Hanika and Dachsbacher 2014; Schrade et al. 2016): from the first-order map, undamped, a fixed number of
-steps, with the Jacobian of the polynomial. Both work on the same model, so that only the iteration differs.
+Beside it Newton's method as published (Hanika and Dachsbacher 2014; Schrade et al. 2016): from the first-order map,
+undamped, a fixed number of steps, with the Jacobian of the polynomial. Both work on the same model, so that only the
+iteration differs. 10 to 30 s a lens; lenses that are in the table are kept. Writes inverse.md and inverse.json.
 """
 
 from __future__ import annotations
@@ -10,7 +11,6 @@ import argparse
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,10 @@ import torch
 from torch import Tensor
 
 from experiments import lab
+from experiments.lab import Row
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import whole
 from neurolens.evaluate.experiment import LensChoice
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
@@ -44,21 +44,12 @@ AWAY = 1.0
 _STARTS = 7
 
 
-@dataclass(frozen=True)
-class BenchSettings:
-    """What is measured: `rays` that pass a lens (a tenth otherwise than by three steps), `uniform` stop points.
+def measure_lens(file: Path, rays: int, uniform: int = 10_000, terms: int = 64, raw: bool = False) -> Row:
+    """One record: lens, focus_m, and the shares of rays that each iteration finds.
 
-    `raw`: whether a model as published too, of raw monomials chosen by matching pursuit, is inverted both ways.
-    """
-
-    rays: int = 100_000
-    uniform: int = 10_000
-    terms: int = 64
-    raw: bool = False
-
-
-def measure_lens(file: Path, settings: BenchSettings) -> dict[str, Any]:
-    """One record: lens, focus_m, passing share of rays, and for "stop" and "scene" the shares of `_Shares`.
+    Args:
+        rays: that pass the lens (a tenth otherwise than by three steps). uniform: stop points.
+        raw: whether a model as published too, of raw monomials chosen by matching pursuit, is inverted both ways.
 
     Raises:
         InputError: a lens that cannot be fitted.
@@ -67,27 +58,27 @@ def measure_lens(file: Path, settings: BenchSettings) -> dict[str, Any]:
         warnings.simplefilter("ignore", NeurolensWarning)
         lens = LensChoice(file).read()
         domain = _domain(lens)
-        known = prepare(make_pairs(lens, domain, PairSettings(train=15000, held_out=settings.rays, rim=15000)))
-        model = fit_model(known, ModelSettings("ols", terms=settings.terms))
+        known = prepare(make_pairs(lens, domain, PairSettings(train=15000, held_out=rays, rim=15000)))
+        model = fit_model(known, ModelSettings("ols", terms=terms))
         inverse = fit_inverse(model, known.pairs)
-        rays = known.pairs.held_out.inputs
-        few = rays.select(slice(0, settings.rays // 10))
-        record: dict[str, Any] = {
+        held_out = known.pairs.held_out.inputs
+        few = held_out.select(slice(0, rays // 10))
+        record: Row = {
             "lens": file.stem,
             "focus_m": ["inf" if math.isinf(f) else f for f in domain.focus_m],
             "fit": inverse.report,
             "ours": {
-                dtype: convergence(inverse, FilmRays(*(c.to(getattr(torch, dtype)) for c in rays.columns())))
+                dtype: convergence(inverse, FilmRays(*(c.to(getattr(torch, dtype)) for c in held_out.columns())))
                 for dtype in ("float64", "float32")
             },
             "two_steps": convergence(inverse, few, steps=2),
             "published": _published(inverse, few),
-            "uniform": _uniform(inverse, settings.uniform),
-            "rays": settings.rays,
+            "uniform": _uniform(inverse, uniform),
+            "rays": rays,
         }
-        if settings.raw:
-            raw = fit_inverse(fit_model(known, ModelSettings("omp", basis="raw", terms=40)), known.pairs)
-            record["raw"] = {"published": _published(raw, few), "ours": convergence(raw, few)}
+        if raw:
+            made = fit_inverse(fit_model(known, ModelSettings("omp", basis="raw", terms=40)), known.pairs)
+            record["raw"] = {"published": _published(made, few), "ours": convergence(made, few)}
         return record
 
 
@@ -186,34 +177,6 @@ def _reachable(inverse: InverseModel, rays: FilmRays, x: Tensor, y: Tensor) -> T
     return found
 
 
-def write_records(records: Sequence[dict[str, Any]], folder: Path) -> str:
-    """Write inverse.json and inverse.md; returns the page."""
-    rows = sorted(records, key=lambda r: str(r["lens"]))
-    text = page(rows)
-    lab.write_results(folder, "inverse", text, {"lenses": rows})
-    return text
-
-
-def page(records: Sequence[dict[str, Any]]) -> str:
-    """The tables in Markdown."""
-    done = [r for r in records if "ours" in r]
-    lines = [_INTRODUCTION.format(steps=STEPS, tolerance=TOLERANCE), ""]
-    lines += [*_table(done, "stop"), "", *_table(done, "scene")]
-    lines += ["", "## Stop points uniform over the stop", "", _UNIFORM, ""]
-    rows = []
-    for r in done:
-        u = r["uniform"]
-        shares = [u[k] for k in ("passed", "blocked", "outside", "unsolved", "missed")]
-        shares += [*u["published_missed"].values(), u["published_away"][str(max(PUBLISHED_STEPS))]]
-        rows.append([r["lens"], *map(_percent, shares)])
-    head = "lens|passed|blocked|outside|no ray|missed|published: 3|5|10|20|away"
-    lines.append(lab.table(head, rows))
-    raw = [r for r in done if "raw" in r]
-    lines += ["", *_raw_table(raw)] if raw else []
-    refused = [f"- {r['lens']}: {r['refused']}" for r in records if "refused" in r]
-    return "\n".join([*lines, *(["", "Not measured:", "", *refused] if refused else [])]) + "\n"
-
-
 _INTRODUCTION = """\
 # Inverse maps
 
@@ -235,64 +198,96 @@ The same where the model is as published: raw monomials, 20 coefficients per com
 Its polynomials vary more off the data, and full steps from the first-order map leave the data."""
 
 
-def _raw_table(done: Sequence[dict[str, Any]]) -> list[str]:
-    rows = []
-    for r in done:
-        for which in ("stop", "scene"):
-            p = r["raw"]["published"][which]
-            shares = [*p["missed"].values(), p["away"][str(max(PUBLISHED_STEPS))]]
-            shares.append(1 - r["raw"]["ours"][which]["converged"])
-            rows.append([r["lens"], which, *map(_percent, shares)])
-    table = lab.table("lens|map|published: 3|5|10|20|away|ours: 3", rows)
-    return ["## A model of raw monomials", "", _RAW, "", table]
+def _share(title: str, path: str, rest: bool = False) -> lab.Column:
+    """A share in percent; `rest`: what is missing to 1."""
+
+    def cell(row: Row) -> str:
+        share = 1 - lab.look_up(row, path) if rest else lab.look_up(row, path)
+        return "0" if share < 5e-7 else f"{100 * share:.4f}" if share < 0.01 else f"{100 * share:.2f}"
+
+    return lab.Column(title, cell)
 
 
-def _table(done: Sequence[dict[str, Any]], which: str) -> list[str]:
-    title = {"stop": "Film point and stop point to ray", "scene": "Scene ray to film"}[which]
-    rows = []
-    for r in done:
-        p = r["published"][which]
-        ours = [1 - r["two_steps"][which]["converged"]]
-        ours += [1 - r["ours"][dtype][which]["converged"] for dtype in ("float64", "float32")]
-        other = r["ours"]["float64"][which]["other"]
-        cells = [*p["missed"].values(), p["away"][str(max(PUBLISHED_STEPS))], *ours, other]
-        rows.append([r["lens"], r["rays"], *map(_percent, cells), f"{r['fit']['seconds']:.1f}"])
-    head = "lens|rays|published: 3|5|10|20|away|ours: 2|3|3, float32|other|fit s"
-    return [f"## {title}", "", lab.table(head, rows)]
+def _published_columns(missed: str, away: str) -> list[lab.Column]:
+    """What the published iteration misses, by steps, and what ran away after the most."""
+    first, *more = PUBLISHED_STEPS
+    heads = {first: f"published: {first}"} | {n: str(n) for n in more}
+    return [*(_share(head, f"{missed}.{n}") for n, head in heads.items()), _share("away", f"{away}.{more[-1]}")]
 
 
-def _percent(share: float) -> str:
-    return "0" if share < 5e-7 else f"{100 * share:.4f}" if share < 0.01 else f"{100 * share:.2f}"
+_MAPS = {"stop": "Film point and stop point to ray", "scene": "Scene ray to film"}
 
 
-ABOUT = """\
-Fit a model and its inverse maps to every lens file and count the rays that three Newton steps do not
-find, beside Newton's method as published (10 to 30 s a lens). Lenses that are in the table are kept.
-Writes inverse.md and inverse.json."""
+def _map_columns(which: str) -> list[lab.Column]:
+    return [
+        *lab.columns(("lens", "lens"), ("rays", "rays")),
+        *_published_columns(f"published.{which}.missed", f"published.{which}.away"),
+        _share("ours: 2", f"two_steps.{which}.converged", rest=True),
+        _share("3", f"ours.float64.{which}.converged", rest=True),
+        _share("3, float32", f"ours.float32.{which}.converged", rest=True),
+        _share("other", f"ours.float64.{which}.other"),
+        lab.Column("fit s", "fit.seconds", ".1f"),
+    ]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m experiments inverse`."""
-    lab.add_only(parser)
-    parser.add_argument("--rays", metavar="N", type=whole(1000), default=100_000, help="per lens (default: 100000)")
-    parser.add_argument("--raw", action="store_true", help="also invert a model of raw monomials (30 s per lens)")
-    parser.add_argument("--again", action="store_true", help="measure the chosen lenses again")
-    lab.add_out(parser)
+_UNIFORM_KEYS = {
+    "passed": "passed",
+    "blocked": "blocked",
+    "outside": "outside",
+    "no ray": "unsolved",
+    "missed": "missed",
+}
+_UNIFORM_COLUMNS = [
+    lab.Column("lens", "lens"),
+    *(_share(title, f"uniform.{key}") for title, key in _UNIFORM_KEYS.items()),
+    *_published_columns("uniform.published_missed", "uniform.published_away"),
+]
+_RAW_COLUMNS = [
+    *lab.columns(("lens", "lens"), ("map", "map")),
+    *_published_columns("missed", "away"),
+    _share("ours: 3", "converged", rest=True),
+]
 
 
-def run(args: argparse.Namespace) -> int:
+def page(records: Sequence[Row]) -> str:
+    """The tables in Markdown."""
+    done = [r for r in records if "ours" in r]
+    parts = [_INTRODUCTION.format(steps=STEPS, tolerance=TOLERANCE)]
+    for which, title in _MAPS.items():
+        parts += [f"## {title}", lab.table(_map_columns(which), done)]
+    parts += ["## Stop points uniform over the stop", _UNIFORM, lab.table(_UNIFORM_COLUMNS, done)]
+    raw = [
+        {"lens": r["lens"], "map": m, **r["raw"]["published"][m], "converged": r["raw"]["ours"][m]["converged"]}
+        for r in done
+        for m in (_MAPS if "raw" in r else ())
+    ]
+    parts += ["## A model of raw monomials", _RAW, lab.table(_RAW_COLUMNS, raw)] if raw else []
+    refused = [f"- {r['lens']}: {r['refused']}" for r in records if "refused" in r]
+    return lab.page(*parts, *(["Not measured:", "\n".join(refused)] if refused else []))
+
+
+OPTIONS = (
+    lab.ONLY,
+    lab.count("rays", 100_000, "per lens (default: 100000)", 1000),
+    lab.option("--raw", action="store_true", help="also invert a model of raw monomials (30 s per lens)"),
+    lab.option("--again", action="store_true", help="measure the chosen lenses again"),
+    lab.out(),
+)
+
+
+def run(args: argparse.Namespace) -> None:
     """Measure what is missing, and write the tables after each lens."""
     files = lab.chosen(sorted(lab.LENSES.glob("*.toml")), lambda f: f.stem, args.only, "inverse")
-    records = lab.kept_rows(args.out / "inverse.json", "lenses", "lens", "experiments inverse")
+    records = lab.kept_rows(args.out / "inverse.json", "experiments inverse", lambda r: r["lens"], "lenses")
     missing = [f for f in files if args.again or f.stem not in records]
     progress = Progress({f.stem: 20.0 for f in missing}, quiet=args.quiet)
     text = page(list(records.values()))
     for file in missing:
         with progress.stage(file.stem):
             try:
-                records[file.stem] = measure_lens(file, BenchSettings(rays=args.rays, raw=args.raw))
+                records[file.stem] = measure_lens(file, args.rays, raw=args.raw)
             except InputError as error:
                 records[file.stem] = {"lens": file.stem, "refused": str(error).removeprefix(f"{lab.ROOT}/")}
-        text = write_records(list(records.values()), args.out)
+        rows = sorted(records.values(), key=lambda r: str(r["lens"]))
+        text = lab.write_results(args.out, "inverse", page(rows), {"lenses": rows})
     print(text)
-    return 0

@@ -1,40 +1,86 @@
-"""Shared by the measurements: folders, arguments, the machine, tables and goals, atomic files."""
+"""The frame of all measurements: folders, options, tables of columns, goals, kept rows, results, the machine.
+
+A measurement is a module whose docstring is its help, with `OPTIONS` and `run(args)`; what it finds is rows
+(dataclasses, or tables as of JSON), and its page is some words and tables, each a sequence of `Column`.
+"""
 
 from __future__ import annotations
 
 import argparse
+import csv
+import io
 import json
 import os
 import platform
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
+from neurolens.commands.arguments import whole
 from neurolens.evaluate.pages import markdown_table
 
 ROOT = Path(__file__).parents[1]
 LENSES, SCENES, MODELS = ROOT / "lenses", ROOT / "experiments" / "scenes", ROOT / "models"
 RESULTS = ROOT / "experiments" / "results"
 T = TypeVar("T")
+Row = dict[str, Any]
+Report = Callable[[float], None]
 
 
-def add_out(parser: argparse.ArgumentParser, out: Path = RESULTS, what: str = "folder for the tables") -> None:
-    """Add --out and --quiet."""
-    shown = out.relative_to(ROOT)
-    parser.add_argument("--out", metavar="DIR", type=Path, default=out, help=f"{what} (default: {shown})")
-    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+# ---- Options. --------------------------------------------------------------------------------------------------------
+
+Option = Callable[[argparse.ArgumentParser], object]
 
 
-def add_only(parser: argparse.ArgumentParser) -> None:
-    """Add --only."""
-    parser.add_argument("--only", metavar="TEXT", default="", help="lens files whose name holds this text")
+def option(*names: str, **settings: Any) -> Option:
+    """An option as of `ArgumentParser.add_argument`."""
+    return lambda parser: parser.add_argument(*names, **settings)
+
+
+def count(name: str, default: int | None, text: str, least: int = 1, most: int | None = None) -> Option:
+    """An option that takes a whole number."""
+    return option(f"--{name}", metavar="N", type=whole(least, most), default=default, help=text)
+
+
+def out(folder: Path = RESULTS, what: str = "folder for the tables") -> Option:
+    """--out and --quiet."""
+
+    def add(parser: argparse.ArgumentParser) -> None:
+        shown = folder.relative_to(ROOT)
+        parser.add_argument("--out", metavar="DIR", type=Path, default=folder, help=f"{what} (default: {shown})")
+        QUIET(parser)
+
+    return add
+
+
+QUIET = option("--quiet", action="store_true", help="no progress on stderr")
+ONLY = option("--only", metavar="TEXT", default="", help="lens files whose name holds this text")
+ROUNDS = count("rounds", None, "rounds (default 20; quick 5)")
+
+
+def rounds_of(args: argparse.Namespace) -> int:
+    """Of a race, by --rounds and --quick."""
+    return int(args.rounds or (5 if args.quick else 20))
+
+
+def chosen(items: Sequence[T], name: Callable[[T], str], only: str, what: str) -> list[T]:
+    """Those whose name holds the text of --only.
+
+    Raises:
+        InputError: none does; `what` names the measurement.
+    """
+    found = [item for item in items if only in name(item)]
+    if not found:
+        known = ", ".join(dict.fromkeys(name(item) for item in items))
+        raise InputError(f"experiments {what}", "--only", only, f"part of one of: {known}")
+    return found
 
 
 def quiet_glasses() -> None:
@@ -42,33 +88,68 @@ def quiet_glasses() -> None:
     warnings.simplefilter("ignore", NeurolensWarning)
 
 
-def write_results(folder: Path, name: str, page: str, data: Any) -> None:
-    """Write NAME.md and NAME.json, each atomically."""
-    folder.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(folder / f"{name}.md", page)
-    atomic_write_text(folder / f"{name}.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
+# ---- Pages. ----------------------------------------------------------------------------------------------------------
 
 
-def kept_rows(path: Path, listed: str, named: str, maker: str) -> dict[str, dict[str, Any]]:
-    """Rows of an earlier run of a benchmark, by name; none where there is no such file.
+class Column(NamedTuple):
+    """A column: title, what of a row it shows (a key or attribute, with dots into inner ones, or a function), format.
+
+    The value is multiplied by `scale` and written in `form`, as of `format`; None leaves the cell to `missing`.
+    """
+
+    title: str
+    value: str | Callable[[Any], Any]
+    form: str = ""
+    scale: float = 1
+
+    def cell(self, row: Any) -> str | None:
+        value = self.value(row) if callable(self.value) else look_up(row, self.value)
+        return None if value is None else format(value if self.scale == 1 else self.scale * value, self.form)
+
+
+def look_up(row: Any, path: str) -> Any:
+    """What lies at a path of keys or attributes; None where a part of it is missing or None."""
+    for part in path.split("."):
+        row = row.get(part) if isinstance(row, Mapping) else getattr(row, part, None)
+    return row
+
+
+def columns(*described: tuple[Any, ...]) -> tuple[Column, ...]:
+    """Columns from tuples of title, value, form, scale."""
+    return tuple(Column(*one) for one in described)
+
+
+def table(header: Sequence[Column] | Sequence[str] | str, rows: Iterable[Any], missing: str = "") -> str:
+    """A table in Markdown.
 
     Args:
-        listed, named: keys of the list of rows, and of a row's name. maker: the command that writes the file.
-
-    Raises:
-        InputError: a file that holds something else.
+        header: columns; or titles, also in one string cut at "|", where rows are cells already.
+        missing: stands for cells that are None.
     """
-    if not path.is_file():
-        return {}
-    try:
-        return {str(row[named]): dict(row) for row in json.loads(path.read_text(encoding="utf-8"))[listed]}
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(path, "file", f"({type(error).__name__})", f"records of {maker}") from error
+    if header and isinstance(header[0], Column):
+        made: Sequence[Column] = header  # type: ignore[assignment]
+        return table([c.title for c in made], ([c.cell(row) for c in made] for row in rows), missing)
+    titles: Any = header.split("|") if isinstance(header, str) else header
+    return "\n".join(markdown_table(titles, rows, missing))
 
 
-def table(header: str | Sequence[str], rows: Iterable[Sequence[Any]], missing: str = "") -> str:
-    """A table in Markdown; a header in one string is cut at "|", `missing` stands for cells that are None."""
-    return "\n".join(markdown_table(header.split("|") if isinstance(header, str) else header, rows, missing))
+def csv_text(header: Sequence[Column], rows: Iterable[Any]) -> str:
+    """Rows as comma-separated values, cells that are None empty."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(
+        [[c.title for c in header], *([c.cell(r) for c in header] for r in rows)]
+    )
+    return text.getvalue()
+
+
+def page(*parts: str) -> str:
+    """Paragraphs as a page; empty ones are left out."""
+    return "\n\n".join(part.rstrip("\n") for part in parts if part) + "\n"
+
+
+def best_median(best: float, median: float, form: str = ".2f") -> str:
+    """Two figures of a race: "best (median)"."""
+    return f"{best:{form}} ({median:{form}})"
 
 
 @dataclass(frozen=True)
@@ -92,28 +173,52 @@ class Goal:
     def bound(self) -> str:
         return "at least" if self.at_least else "at most"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Row:
         return asdict(self) | {"verdict": self.verdict}
 
 
 def goal_table(heading: str, goals: Iterable[Goal]) -> str:
     """Goals as a table, and whether they are reached."""
-    measured = ((g, "" if g.measured is None else f"{g.measured:.3g}") for g in goals)
-    rows = ([g.text, f"{g.bound} {g.wanted:g}", value, g.verdict] for g, value in measured)
-    return table([heading, "wanted", "measured", ""], rows)
+    wanted = Column("wanted", lambda g: f"{g.bound} {g.wanted:g}")
+    return table([Column(heading, "text"), wanted, *columns(("measured", "measured", ".3g"), ("", "verdict"))], goals)
 
 
-def chosen(items: Sequence[T], name: Callable[[T], str], only: str, what: str) -> list[T]:
-    """Those whose name holds the text of --only.
+# ---- Results. --------------------------------------------------------------------------------------------------------
+
+
+def write_results(folder: Path, name: str, text: str, data: Any) -> str:
+    """Write NAME.md and NAME.json, each atomically; returns the page."""
+    folder.mkdir(parents=True, exist_ok=True)
+    atomic_write_text(folder / f"{name}.md", text)
+    write_json(folder / f"{name}.json", data)
+    return text
+
+
+def write_json(file: Path, data: Any) -> None:
+    """Write JSON atomically, its folder made."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    atomic_write_text(file, json.dumps(data, indent=1, allow_nan=False) + "\n")
+
+
+def kept_rows(path: Path, maker: str, key: Callable[[Row], Hashable], listed: str = "") -> dict[Any, Row]:
+    """Rows of an earlier run by their key; none where there is no such file.
+
+    Args:
+        maker: the command that writes the file. listed: the key of the list in the file, where it is no bare list.
 
     Raises:
-        InputError: none does; `what` names the measurement.
+        InputError: a file that holds something else.
     """
-    found = [item for item in items if only in name(item)]
-    if not found:
-        known = ", ".join(dict.fromkeys(name(item) for item in items))
-        raise InputError(f"experiments {what}", "--only", only, f"part of one of: {known}")
-    return found
+    if not path.is_file():
+        return {}
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        return {key(row): dict(row) for row in (data[listed] if listed else data)}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(path, "file", f"({type(error).__name__})", f"rows of {maker}") from error
+
+
+# ---- The machine. ----------------------------------------------------------------------------------------------------
 
 
 def machine_line(before_versions: str = "") -> str:
@@ -122,7 +227,7 @@ def machine_line(before_versions: str = "") -> str:
     return f"{m['processor']}, {m['cores']} cores{before_versions}; Python {m['python']}, torch {m['torch']}."
 
 
-def machine() -> dict[str, Any]:
+def machine() -> Row:
     """Processor, cores and versions."""
     import numpy
     import torch
@@ -147,11 +252,16 @@ def _processor() -> str:
     return named[0] if named else platform.processor() or platform.machine()
 
 
+def most_load(rows: Iterable[Row]) -> float | None:
+    """The highest load average of races, whose rows have it as "load", before and after."""
+    return max((load for row in rows for load in row["load"] if load is not None), default=None)
+
+
 class Unmeasured(NeurolensError):
     """Something cannot be measured here; the message says why."""
 
 
-def in_child(function: Callable[..., dict[str, Any]], *args: str | float) -> dict[str, Any]:
+def in_child(function: Callable[..., Row], *args: str | float) -> Row:
     """Result of a function of a module of this folder for plain arguments, called in a new process.
 
     Raises:
@@ -163,7 +273,7 @@ def in_child(function: Callable[..., dict[str, Any]], *args: str | float) -> dic
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     if done.returncode != 0:
         raise Unmeasured(f"{name}{args} in a child process: {done.stderr.strip().splitlines()[-1:]}")
-    found: dict[str, Any] = json.loads(done.stdout)
+    found: Row = json.loads(done.stdout)
     return found
 
 

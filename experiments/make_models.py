@@ -1,8 +1,8 @@
-"""Makes the models that ship, as experiments/models.toml lists them: `python -m experiments models`, `make models`.
+"""Fit, check on fresh rays and time the models that experiments/models.toml lists (`make models`).
 
-Entry by entry: fit, check the card on fresh rays, race the exact tracer, write the files, then the index (index.json
-for programs, README.md for people). An entry whose files are there as they were written by the same settings and
-version is not made again.
+Entry by entry the files are written, then the index (index.json for programs, README.md for people). Models of the same
+settings and version are kept: an interrupted run resumes where it stopped.
+Exit code 1 where a lens could not be done or a card does not hold.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ import os
 import sys
 import tempfile
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from experiments import lab
+from experiments.lab import Row
 from experiments.promises import read_index
 from neurolens import __version__
 from neurolens.base.config import read_config
@@ -41,6 +42,8 @@ from neurolens.optics.pupils import image_radius_mm
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
+
+_LIST = lab.ROOT / "experiments" / "models.toml"
 
 
 def _default_models() -> tuple[ModelSettings, ...]:
@@ -142,51 +145,41 @@ over the whole lit film, full aperture, focus from infinity to near and all wave
 of a few lenses also faster ones. Errors on held-out rays (`neurolens.evaluate.rays`), micrometres at an image radius of
 21.6 mm; every card was checked on fresh rays. Times on one core in onnxruntime, with stop, rims and transmittance;
 speed-up over the compiled exact tracer doing the same work in the same run. Check a model with
-`neurolens evaluate models/FILE`; `make bench` holds those of the first lenses to the speed-ups that the index promises.
-
-| model | RMS um | p99 um | direction deg | position um | T RMS | false pass / block % | coefficients | kB | ns per ray | speed-up |
-|---|---|---|---|---|---|---|---|---|---|---|
-"""  # noqa: E501
+`neurolens evaluate models/FILE`; `make bench` holds those of the first lenses to the speed-ups that the index promises."""  # noqa: E501
 
 
-def write_index(rows: Sequence[Mapping[str, Any]], left_out: Mapping[str, str], out: Path) -> None:
+def _reference(key: str) -> Callable[[Row], Any]:
+    """A figure at the reference radius, where a row has it."""
+    return lambda r: r.get(f"{key}_at_21_6", r.get(key))
+
+
+def _shares(row: Row) -> str:
+    """False passes and blocks in percent."""
+    return " / ".join("–" if (v := row[k]) is None else f"{100 * v:.3g}" for k in ("false_pass", "false_block"))
+
+
+_COLUMNS = lab.columns(
+    ("model", lambda r: r["file"] + (" (card does not hold)" if r.get("broken") else "")),
+    ("RMS um", _reference("rms_um"), ".3g"),
+    ("p99 um", _reference("p99_um"), ".3g"),
+    ("direction deg", "direction_rms_deg", ".3g"),
+    ("position um", _reference("position_rms_um"), ".3g"),
+    ("T RMS", "transmittance_rms", ".3g"),
+    ("false pass / block %", _shares),
+    ("coefficients", lambda r: r["coefficients_per_vector"] or r["parameters"]),
+    ("kB", "bytes", ".0f", 1e-3),
+    ("ns per ray", "ns_per_ray.min", ".3g"),
+    ("speed-up", "speedup_over_compiled", ".3g"),
+)
+
+
+def write_index(rows: Sequence[Row], left_out: Mapping[str, str], out: Path) -> None:
     """Write both; `left_out` gives the reason for each entry that has no models."""
-    index = {
-        "schema": 2,
-        "command": "python -m experiments models",
-        "versions": versions(),
-        "models": list(rows),
-        "left_out": dict(left_out),
-    }
-    atomic_write_text(out / "index.json", json.dumps(index, indent=1, allow_nan=False) + "\n")
-    lines = [_line(row) for row in rows]
-    if left_out:
-        lines += ["", "Not made:", "", *(f"- {state}: {reason}" for state, reason in left_out.items())]
-    atomic_write_text(out / "README.md", _HEAD + "\n".join(lines) + "\n")
-
-
-def _line(row: Mapping[str, Any]) -> str:
-    um, p99, position = (
-        row.get(f"{key}_at_21_6", row.get(key)) for key in ("rms_um", "p99_um", "position_rms_um")
-    )  # fmt: skip
-    cells = [
-        row["file"] + (" (card does not hold)" if row.get("broken") else ""),
-        _n(um),
-        _n(p99),
-        _n(row["direction_rms_deg"]),
-        _n(position),
-        _n(row["transmittance_rms"]),
-        f"{_n(row['false_pass'], 100)} / {_n(row['false_block'], 100)}",
-        str(row["coefficients_per_vector"] or row["parameters"]),
-        f"{row['bytes'] / 1000:.0f}",
-        _n((row["ns_per_ray"] or {}).get("min")),
-        _n(row["speedup_over_compiled"]),
-    ]
-    return "| " + " | ".join(cells) + " |"
-
-
-def _n(value: float | None, factor: float = 1.0) -> str:
-    return "–" if value is None else f"{value * factor:.3g}"
+    index = {"schema": 2, "command": "python -m experiments models", "versions": versions()}
+    lab.write_json(out / "index.json", index | {"models": list(rows), "left_out": dict(left_out)})
+    reasons = "\n".join(f"- {state}: {reason}" for state, reason in left_out.items())
+    parts = ["Not made:", reasons] if left_out else []
+    atomic_write_text(out / "README.md", lab.page(_HEAD, lab.table(_COLUMNS, rows, "–"), *parts))
 
 
 # The bench fails below this share of the speed-up measured here: machines and days differ, regressions differ more.
@@ -212,7 +205,7 @@ def make_models(
         progress.plan({f"{entry.state}: {m.label}": 40.0 if m.method in NETWORKS else 10.0 for m in entry.models})
         progress.plan({f"{entry.state}: race": 60.0})
     for entry in todo:
-        made, reason = list[dict[str, Any]](), ""
+        made, reason = list[Row](), ""
         try:
             made = make_entry(entry, library, out, progress)
         except NeurolensError as error:
@@ -238,7 +231,7 @@ def make_models(
     return [*(f"{state}: left out: {reason}" for state, reason in left_out.items()), *broken]
 
 
-def _known(out: Path) -> tuple[list[dict[str, Any]], dict[str, str]]:
+def _known(out: Path) -> tuple[list[Row], dict[str, str]]:
     """Rows and left-out entries of an existing index; empty for an unreadable one, which is replaced."""
     try:
         rows = [row for row in read_index(out) if row.keys() >= {*_KEPT, "ns_per_ray", "speedup_over_compiled"}]
@@ -250,7 +243,7 @@ def _known(out: Path) -> tuple[list[dict[str, Any]], dict[str, str]]:
     return rows, dict(left_out)
 
 
-def _ordered(rows: Sequence[dict[str, Any]], library: Library) -> list[dict[str, Any]]:
+def _ordered(rows: Sequence[Row], library: Library) -> list[Row]:
     """In the order of the list, others last."""
     place = {entry.state: i for i, entry in enumerate(library.entry)}
     return sorted(rows, key=lambda row: place.get(row["entry"], len(place)))
@@ -271,7 +264,7 @@ def fingerprint(entry: Entry, pairs: PairSettings) -> str:
     return fingerprint_of(asked)
 
 
-def _stands(entry: Entry, pairs: PairSettings, known: Sequence[dict[str, Any]], out: Path) -> bool:
+def _stands(entry: Entry, pairs: PairSettings, known: Sequence[Row], out: Path) -> bool:
     """Whether the models of an entry exist unchanged, made by the same settings and version."""
     mine = [row for row in known if row["entry"] == entry.state]
     try:
@@ -283,11 +276,9 @@ def _stands(entry: Entry, pairs: PairSettings, known: Sequence[dict[str, Any]], 
         return False
 
 
-def make_entry(entry: Entry, library: Library, out: Path, progress: Progress) -> list[dict[str, Any]]:
+def make_entry(entry: Entry, library: Library, out: Path, progress: Progress) -> list[Row]:
     """Fit, check and time the models of one lens; writes their files and returns their rows of the index."""
-    make = _make_of_one_state
-    if entry.lens.many_states:
-        make = functools.partial(make_state_entry, kept=_KEPT)
+    make = _make_of_many_states if entry.lens.many_states else _make_of_one_state
     common = {
         "entry": entry.state,
         "fingerprint": fingerprint(entry, library.pairs),
@@ -296,7 +287,7 @@ def make_entry(entry: Entry, library: Library, out: Path, progress: Progress) ->
     return [{**row, **common} for row in make(entry, library, out, progress)]
 
 
-def _make_of_one_state(entry: Entry, library: Library, out: Path, progress: Progress) -> list[dict[str, Any]]:
+def _make_of_one_state(entry: Entry, library: Library, out: Path, progress: Progress) -> list[Row]:
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as scratch:
         warnings.simplefilter("ignore", NeurolensWarning)
         lens = entry.lens.read()
@@ -323,9 +314,7 @@ def _make_of_one_state(entry: Entry, library: Library, out: Path, progress: Prog
                 "speedup_over_compiled": speedup["min"] if speedup else None,
                 "promised_speedup": round(PROMISE * speedup["min"], 2) if speedup and entry.promise else None,
             }
-            with atomic_path(out / row["file"]) as temporary:
-                temporary.write_bytes(m.file.read_bytes())
-            rows.append(row)
+            rows.append(_shipped(row, m.file, out))
     return rows
 
 
@@ -337,7 +326,7 @@ def best_of_each_kind(measured: Sequence[Measured]) -> list[Measured]:
     return [kinds[kind] for kind in (False, True) if kind in kinds]
 
 
-def _row(entry: Entry, lens: Lens, domain: Domain, m: Measured) -> dict[str, Any]:
+def _row(entry: Entry, lens: Lens, domain: Domain, m: Measured) -> Row:
     """What the index says of a model but its times; its card is checked on fresh rays."""
     scale = REFERENCE_RADIUS_MM / image_radius_mm(lens)[0]
     widest = lens.with_stop_radius(domain.stop_radius_mm)
@@ -362,14 +351,8 @@ def _row(entry: Entry, lens: Lens, domain: Domain, m: Measured) -> dict[str, Any
 _CHECKED = 4  # states at which a card is checked on fresh rays
 
 
-def make_state_entry(
-    entry: Entry, library: Library, out: Path, progress: Progress, kept: tuple[str, ...]
-) -> list[dict[str, Any]]:
-    """Fit, check and time the models of one lens in many states; figures are the worst over states at random.
-
-    Args:
-        kept: figures of a record that the index has.
-    """
+def _make_of_many_states(entry: Entry, library: Library, out: Path, progress: Progress) -> list[Row]:
+    """Figures are the worst over states at random."""
     experiment = Experiment(entry.state, entry.lens, entry.models, entry.domain, library.pairs)
     rows = []
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as scratch:
@@ -386,56 +369,46 @@ def make_state_entry(
                 domain = Domain.from_dict(model.card["domain"])
                 candidate = model_candidate(m.label, model, domain.stop_radius_mm)
                 timed = race([candidate], domain, rounds=10).timing(m.label)
-            name = f"{entry.state}.{settings.label}.onnx"
-            rows.append(
-                {
-                    "file": name,
-                    "sha256": sha256_of(file),
-                    "lens": space.lens.name,
-                    "configuration": entry.lens.configuration,
-                    "efl_mm": None,
-                    "model": settings.label,
-                    "axes": [axis.to_dict() for axis in space.axes],
-                    "wavelength_nm": list(domain.wavelength_nm),
-                    **{key: record.get(key) for key in kept},
-                    "rms_um_at_21_6": record.get("rms_um_at_21_6"),
-                    "broken": broken,
-                    "ns_per_ray": timed,
-                    "exact_compiled_ns_per_ray": None,
-                    "speedup_over_compiled": None,
-                    "promised_speedup": None,
-                }
-            )
-            with atomic_path(out / name) as temporary:
-                temporary.write_bytes(file.read_bytes())
+            row = {
+                "file": f"{entry.state}.{settings.label}.onnx",
+                "sha256": sha256_of(file),
+                "lens": space.lens.name,
+                "configuration": entry.lens.configuration,
+                "efl_mm": None,
+                "model": settings.label,
+                "axes": [axis.to_dict() for axis in space.axes],
+                "wavelength_nm": list(domain.wavelength_nm),
+                **{key: record.get(key) for key in _KEPT},
+                "rms_um_at_21_6": record.get("rms_um_at_21_6"),
+                "broken": broken,
+                "ns_per_ray": timed,
+                **dict.fromkeys(("exact_compiled_ns_per_ray", "speedup_over_compiled", "promised_speedup")),
+            }
+            rows.append(_shipped(row, file, out))
     return rows
 
 
-ABOUT = """\
-Fit, check on fresh rays and time the models that experiments/models.toml lists, and write them with
-index.json and README.md. Existing models of the same settings and version are kept: an
-interrupted run resumes where it stopped.
-Exit code 1 where a lens could not be done or a card does not hold."""
+def _shipped(row: Row, file: Path, out: Path) -> Row:
+    """The row of a model whose file has been copied to its place."""
+    with atomic_path(out / row["file"]) as temporary:
+        temporary.write_bytes(file.read_bytes())
+    return row
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m experiments models`."""
-    parser.add_argument("lenses", metavar="LENS", nargs="*", help="entries whose name starts so (default: all)")
-    parser.add_argument(
-        "--list", metavar="FILE", type=Path, default=lab.ROOT / "experiments" / "models.toml",
-        help="list (default: experiments/models.toml)",
-    )  # fmt: skip
-    parser.add_argument("--again", action="store_true", help="make the chosen entries again")
-    lab.add_out(parser, lab.MODELS, "folder")
+OPTIONS = (
+    lab.option("lenses", metavar="LENS", nargs="*", help="entries whose name starts so (default: all)"),
+    lab.option("--list", metavar="FILE", type=Path, default=_LIST, help="list (default: experiments/models.toml)"),
+    lab.option("--again", action="store_true", help="make the chosen entries again"),
+    lab.out(lab.MODELS, "folder"),
+)
 
 
 def run(args: argparse.Namespace) -> int:
     """Make what is missing; 1 where something failed."""
     library = read_list(args.list)
     args.out.mkdir(parents=True, exist_ok=True)
-    failed = make_models(
-        library, chosen(library, args.lenses), args.out, Progress(quiet=args.quiet), again=args.again
-    )  # fmt: skip
+    entries = chosen(library, args.lenses)
+    failed = make_models(library, entries, args.out, Progress(quiet=args.quiet), again=args.again)
     print((args.out / "README.md").read_text(encoding="utf-8"))
     for line in failed:
         print(f"experiments: {line}", file=sys.stderr)

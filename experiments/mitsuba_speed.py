@@ -1,7 +1,9 @@
-"""Speed of the renderer beside Mitsuba 3: the same Cornell box, picture, samples, depth and roulette, in one run.
+"""Paths per second of the renderer beside the scalar and LLVM variants of Mitsuba 3, on Mitsuba's own Cornell box.
 
-The scene is Mitsuba's own, unmodified but for the depth at which Russian roulette begins, which is ours. Each renderer
-makes a picture in turn, repeat after repeat, so that a busy machine slows all alike; compiling is not counted.
+With its pinhole and through a lens model: the same picture, samples, depth and roulette, in one run. Each renderer
+makes a picture in turn, so that a busy machine slows all alike; compiling is not counted. Then our scenes, where their
+time goes, and the memory that a render takes by picture size. Without the extra "mitsuba", our side alone.
+Writes render_speed.md and render_speed.json.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ import numpy as np
 
 import neurolens
 from experiments import lab
+from experiments.lab import Report
 from experiments.mitsuba_scenes import our_scene, with_our_spectra
 from experiments.renderer_speed import thin_camera
 from neurolens import mitsuba
@@ -31,7 +34,6 @@ from neurolens.base.errors import NeurolensError
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.commands.arguments import whole
 from neurolens.evaluate.records import plain
 from neurolens.mitsuba import require_mitsuba
 from neurolens.mitsuba.library import libraries
@@ -104,6 +106,9 @@ def film_mm(box: dict[str, Any]) -> tuple[float, float]:
     return side, side
 
 
+_NO_WHITE = np.ones((1, 1, 1), np.float32)
+
+
 def rows(model: Path, settings: Settings) -> list[Row]:
     """Every renderer that this machine can run; a variant without its compiler is left out.
 
@@ -124,7 +129,10 @@ def rows(model: Path, settings: Settings) -> list[Row]:
         _ours(meshes, pinhole, "hero", settings, _TRIANGLES),
         _ours(our_scene(box, lens.film_mm), lens, "one", settings),
     ]
-    cos4 = _cos4(settings.size, pinhole)
+    # Natural vignetting of the pinhole, [size, size, 1], which Mitsuba's has not.
+    place = (np.arange(settings.size) + 0.5) / settings.size - 0.5
+    tangent2 = (place[:, None] ** 2 + place[None, :] ** 2) * (pinhole.film_mm[0] / pinhole.focal_mm) ** 2
+    cos4 = ((1 + tangent2) ** -2.0).astype(np.float32)[..., None]
     for variant in VARIANTS:
         try:
             require_mitsuba(variant)
@@ -132,7 +140,7 @@ def rows(model: Path, settings: Settings) -> list[Row]:
             continue
         found.append(_theirs(variant, None, settings, np.reciprocal(cos4)))
         if variant.startswith("llvm"):
-            found.append(_theirs(variant, lens, settings, np.ones((1, 1, 1), np.float32)))
+            found.append(_theirs(variant, lens, settings, _NO_WHITE))
     mi.set_variant("scalar_rgb")
     return found
 
@@ -141,25 +149,18 @@ def _ours(scene: Scene, chosen: Camera, wavelengths: Any, settings: Settings, ho
     film = FilmSettings(wavelengths=wavelengths)
 
     def draw(seed: int) -> FloatArray:
-        done = render(
-            scene, chosen, samples=settings.samples, threads=settings.threads, seed=seed, film=film
-        )  # fmt: skip
-        return done.rgb
+        return render(scene, chosen, samples=settings.samples, threads=settings.threads, seed=seed, film=film).rgb
 
     carries = {"hero": "4 wavelengths", "one": "1 wavelength"}[wavelengths]
-    return Row(f"neurolens, {how}", carries, _word(chosen), draw, np.ones((1, 1, 1), np.float32))
+    return Row(f"neurolens, {how}", carries, _word(chosen), draw, _NO_WHITE)
 
 
 def _theirs(variant: str, chosen: Camera | None, settings: Settings, white: FloatArray) -> Row:
     """Mitsuba in a variant, through its own pinhole or a camera of ours."""
     spectral = variant.endswith("spectral")
-
-    def prepared() -> Any:
-        mi = require_mitsuba(variant)
-        box = cornell_box(settings.size)
-        return mi, mitsuba.load_scene(with_our_spectra(box) if spectral else box)
-
-    scene = prepared()[1]
+    require_mitsuba(variant)
+    box = cornell_box(settings.size)
+    scene = mitsuba.load_scene(with_our_spectra(box) if spectral else box)
 
     def draw(seed: int) -> FloatArray:
         mi = require_mitsuba(variant)
@@ -173,22 +174,6 @@ def _theirs(variant: str, chosen: Camera | None, settings: Settings, white: Floa
 
 def _word(chosen: Camera | None) -> str:
     return "pinhole" if chosen is None or chosen.name == "pinhole" else "lens model"
-
-
-def _cos4(size: int, pinhole: Pinhole) -> FloatArray:
-    """Natural vignetting of the pinhole, [size, size, 1], which Mitsuba's has not."""
-    place = (np.arange(size) + 0.5) / size - 0.5
-    tangent2 = (place[:, None] ** 2 + place[None, :] ** 2) * (pinhole.film_mm[0] / pinhole.focal_mm) ** 2
-    return ((1 + tangent2) ** -2.0).astype(np.float32)[..., None]
-
-
-def measure(found: list[Row], settings: Settings, report: Callable[[float], None]) -> None:
-    """Run every renderer once to warm up, then in turn `repeats` times."""
-    total = len(found) * (settings.repeats + 1)
-    for repeat in range(settings.repeats + 1):
-        for k, row in enumerate(found):
-            row.run(seed=repeat)
-            report((repeat * len(found) + k + 1) / total)
 
 
 def record(row: Row, settings: Settings, base: Row) -> dict[str, Any]:
@@ -294,7 +279,7 @@ def _stage_of(function: Function) -> str | None:
     return _FUNCTIONS.get(module, {}).get(name) or _STAGE.get(module, STAGES[-1])
 
 
-def memory_of(scene_file: str, width: int, samples: int) -> dict[str, Any]:
+def memory_of(scene_file: str, width: int, samples: int) -> lab.Row:
     """Render a scene, in a fresh process.
 
     Returns: width, height, samples, growth_mb (highest resident memory while rendering, less that before).
@@ -303,10 +288,9 @@ def memory_of(scene_file: str, width: int, samples: int) -> dict[str, Any]:
     camera = thin_camera(scene)
     height = round(width * camera.film_mm[1] / camera.film_mm[0])
     render(scene, camera, width=64, height=36, samples=1, threads=1)  # what numpy sets up once
-    grown = lab.memory_growth(
-        lambda: render(scene, camera, width=width, height=height, samples=samples, threads=1)
-    )[1]  # fmt: skip
-    return {"width": width, "height": height, "samples": samples, "growth_mb": grown / 1e6}
+    size: dict[str, int] = {"width": width, "height": height, "samples": samples}
+    grown = lab.memory_growth(lambda: render(scene, camera, **size, threads=1))[1]  # type: ignore[arg-type]
+    return {**size, "growth_mb": grown / 1e6}
 
 
 @dataclass
@@ -321,80 +305,56 @@ class Found:
     missing: list[str] = field(default_factory=list)
 
 
+_BESIDE = """\
+Its own Cornell box, {size} x {size} pixels, {samples} samples, at most seven surfaces, roulette after two in all; \
+{repeats} repeats in turn, compiling and warming up left out. Time: median, over that of our first row. Mean: of the \
+picture's R, G and B; the lens sees another part of the box than the pinhole, and RGB paths mix colours otherwise than \
+spectra. Noise: variance of a pixel's luminance over its square at these samples; our samples are low-discrepancy, \
+those of Mitsuba's scene independent. A lens that disperses leaves a path one wavelength, in Mitsuba four times the \
+same."""
+_SPEEDS = lab.columns(
+    ("renderer", "name"),
+    ("a path carries", "carries"),
+    ("camera", "camera"),
+    ("Mpath/s, fastest", "mpaths_per_s", ".3g"),
+    ("median", "mpaths_per_s_median", ".3g"),
+    ("time", "time_over_ours", ".2f"),
+    ("mean R G B", lambda r: " ".join(f"{v:.4f}" for v in r["mean_rgb"])),
+    ("noise", "noise", ".2g"),
+)
+_WHERE = """\
+Paths per second through a thin lens, four wavelengths per path, the scene's own depth; beside it the share of the \
+time by what the code is for (profile of one worker)."""
+_SCENES = lab.columns(
+    ("scene", "scene"),
+    ("surfaces a path", "max_depth"),
+    ("Mpath/s, fastest", "mpaths_per_s", ".3g"),
+    ("median", "mpaths_per_s_median", ".3g"),
+    *((f"{stage} %", f"shares.{stage}", ".0f", 100) for stage in STAGES),
+)
+_MEMORY = lab.columns(("picture", "{width} x {height}".format_map), ("samples", "samples"), ("MB", "growth_mb", ".0f"))
+
+
 def page(found: Found) -> str:
     """The tables as Markdown."""
     s = found.settings
     versions = ", ".join(f"{name} {version}" for name, version in found.versions.items())
-    parts = [
-        "# Speed of the renderer",
-        f"One run of `python -m experiments mitsuba` ({versions}); {s.threads} threads.",
-    ]
+    parts = [f"One run of `python -m experiments mitsuba` ({versions}); {s.threads} threads."]
     if found.rows:
-        parts += [
-            "## Beside Mitsuba 3",
-            f"Its own Cornell box, {s.size} x {s.size} pixels, {s.samples} samples, at most seven surfaces, roulette "
-            f"after two in all; {s.repeats} repeats in turn, compiling and warming up left out. Time: median, over "
-            "that of our first row. Mean: of the picture's R, G and B; the lens sees another part of the box than the "
-            "pinhole, and RGB paths mix colours otherwise than spectra. Noise: variance of a pixel's luminance over "
-            "its square at these samples; our samples are low-discrepancy, those of Mitsuba's scene independent. A "
-            "lens that disperses leaves a path one wavelength, in Mitsuba four times the same.",
-            _speed_table(found.rows),
-        ]
+        parts += ["## Beside Mitsuba 3", _BESIDE.format(**vars(s)), lab.table(_SPEEDS, found.rows, "–")]
     if found.scenes:
-        parts += [
-            "## Scenes, and where the time goes",
-            "Paths per second through a thin lens, four wavelengths per path, the scene's own depth; beside it the "
-            "share of the time by what the code is for (profile of one worker).",
-            _scene_table(found.scenes),
-        ]
+        parts += ["## Scenes, and where the time goes", _WHERE, lab.table(_SCENES, found.scenes)]
     if found.memory:
-        parts += ["## Memory", _memory_text(found.memory), _memory_table(found.memory)]
-    parts += [f"Not measured: {reason}" for reason in found.missing]
-    return "\n\n".join(parts) + "\n"
+        parts += ["## Memory", _memory_text(found.memory), lab.table(_MEMORY, found.memory)]
+    return lab.page("# Speed of the renderer", *parts, *(f"Not measured: {reason}" for reason in found.missing))
 
 
-def _speed_table(rows: list[dict[str, Any]]) -> str:
-    header = ("renderer", "a path carries", "camera", "Mpath/s, fastest", "median", "time", "mean R G B", "noise")
-    return lab.table(
-        header,
-        [
-            (
-                row["name"],
-                row["carries"],
-                row["camera"],
-                f"{row['mpaths_per_s']:.3g}",
-                f"{row['mpaths_per_s_median']:.3g}",
-                f"{row['time_over_ours']:.2f}",
-                " ".join(f"{v:.4f}" for v in row["mean_rgb"]),
-                "–" if row["noise"] is None else f"{row['noise']:.2g}",
-            )
-            for row in rows
-        ],
-    )
-
-
-def _scene_table(rows: list[dict[str, Any]]) -> str:
-    header = ("scene", "surfaces a path", "Mpath/s, fastest", "median", *(f"{stage} %" for stage in STAGES))
-    return lab.table(
-        header,
-        [
-            (
-                row["scene"],
-                str(row["max_depth"]),
-                f"{row['mpaths_per_s']:.3g}",
-                f"{row['mpaths_per_s_median']:.3g}",
-                *(f"{100 * row['shares'][stage]:.0f}" for stage in STAGES),
-            )
-            for row in rows
-        ],
-    )
-
-
-def _memory_text(rows: list[dict[str, Any]]) -> str:
+def _memory_text(rows: list[lab.Row]) -> str:
     """What grows with the picture, from the two largest at equal samples, and what does not."""
-    small, large = sorted((r for r in rows if r["samples"] == rows[0]["samples"]), key=_pixels)[-2:]
-    each = (large["growth_mb"] - small["growth_mb"]) * 1e6 / (_pixels(large) - _pixels(small))
-    rest = large["growth_mb"] - each * _pixels(large) * 1e-6
+    sizes = sorted((r["width"] * r["height"], r["growth_mb"]) for r in rows if r["samples"] == rows[0]["samples"])
+    (small, small_mb), (large, large_mb) = sizes[-2:]
+    each = (large_mb - small_mb) * 1e6 / (large - small)
+    rest = large_mb - each * large * 1e-6
     return (
         "Highest resident memory of one worker while it renders, less that before. It grows by "
         f"{each:.0f} bytes per pixel, the film; the paths under way take {rest:.0f} MB whatever the picture's size and "
@@ -402,58 +362,35 @@ def _memory_text(rows: list[dict[str, Any]]) -> str:
     )
 
 
-def _pixels(row: dict[str, Any]) -> int:
-    return int(row["width"] * row["height"])
-
-
-def _memory_table(rows: list[dict[str, Any]]) -> str:
-    cells = [(f"{r['width']} x {r['height']}", str(r["samples"]), f"{r['growth_mb']:.0f}") for r in rows]
-    return lab.table(("picture", "samples", "MB"), cells)
-
-
-def write(found: Found, out: Path) -> str:
-    """Write render_speed.md and .json into `out`; returns the page."""
-    text = page(found)
-    data = {k: getattr(found, k) for k in ("versions", "rows", "scenes", "memory", "missing")}
-    lab.write_results(out, "render_speed", text, plain(data | {"settings": vars(found.settings)}))
-    return text
-
-
-ABOUT = """\
-Paths per second of the renderer beside the scalar and LLVM variants of Mitsuba 3, on Mitsuba's own
-Cornell box, with its pinhole and through a lens model; then of our scenes, where their time goes, and
-the memory that a render takes by picture size. Without the extra "mitsuba", our side alone.
-Writes render_speed.md and render_speed.json."""
 SCENES = ("cornell", "room", "lights", "grid")
 MODEL = "laikin_double_gauss_50.ols-60.onnx"
 SCENE_SAMPLES, SCENE_WIDTH = 16, 240
 WIDTHS, MANY_SAMPLES = (256, 512, 1024, 2048), 64
+OPTIONS = (
+    lab.count("size", 256, "side in pixels (default: 256)", 16, 2048),
+    lab.count("samples", 16, "a pixel (default: 16)", 1, 4096),
+    lab.count("repeats", 5, "default: 5", 1, 100),
+    lab.count("threads", 2, "of all (default: 2)", 1, 256),
+    lab.out(),
+)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m experiments mitsuba`."""
-    parser.add_argument("--size", metavar="PIXELS", type=whole(16, 2048), default=256, help="side (default: 256)")
-    parser.add_argument("--samples", metavar="N", type=whole(1, 4096), default=16, help="a pixel (default: 16)")
-    parser.add_argument("--repeats", metavar="N", type=whole(1, 100), default=5, help="default: 5")
-    parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=2, help="of all (default: 2)")
-    lab.add_out(parser)
-
-
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Measure, writing the page after each part."""
-    settings = Settings(args.size, args.samples, args.threads, args.repeats)
-    found = Found(settings, _versions())
+    found = Found(Settings(args.size, args.samples, args.threads, args.repeats), _versions())
     parts = {"beside Mitsuba": _beside, "scenes": _scenes, "memory": _memory}
     progress = Progress(dict(zip(parts, (120.0, 60.0, 40.0), strict=True)), quiet=args.quiet)
+    text = ""
     for name, part in parts.items():
         with progress.stage(name) as report:
             try:
                 part(found, report)
             except NeurolensError as error:
                 found.missing.append(f"{name} ({error})")
-        write(found, args.out)
-    print(page(found))
-    return 0
+        data = {k: getattr(found, k) for k in ("versions", "rows", "scenes", "memory", "missing")}
+        data["settings"] = vars(found.settings)
+        text = lab.write_results(args.out, "render_speed", page(found), plain(data))
+    print(text)
 
 
 def _versions() -> dict[str, str]:
@@ -466,31 +403,32 @@ def _versions() -> dict[str, str]:
     return known
 
 
-def _beside(found: Found, report: Callable[[float], None]) -> None:
+def _beside(found: Found, report: Report) -> None:
+    """Run every renderer once to warm up, then in turn `repeats` times."""
     made = rows(lab.MODELS / MODEL, found.settings)
-    measure(made, found.settings, report)
+    total = len(made) * (found.settings.repeats + 1)
+    for k in range(total):
+        made[k % len(made)].run(seed=k // len(made))
+        report((k + 1) / total)
     found.rows = [record(row, found.settings, made[0]) for row in made]
 
 
-def _scenes(found: Found, report: Callable[[float], None]) -> None:
+def _scenes(found: Found, report: Report) -> None:
     """Each scene: timed with all threads, then profiled with one."""
-    files = [file for name in SCENES if (file := lab.SCENES / f"{name}.toml").is_file()]
-    repeats = min(found.settings.repeats, 5)
-    for k, file in enumerate(files):
-        scene = load_scene(file)
+    threads, repeats = found.settings.threads, min(found.settings.repeats, 5)
+    for k, name in enumerate(SCENES):
+        scene = load_scene(lab.SCENES / f"{name}.toml")
         camera = thin_camera(scene)
         height = round(SCENE_WIDTH * camera.film_mm[1] / camera.film_mm[0])
+        size: dict[str, Any] = {"width": SCENE_WIDTH, "height": height, "samples": SCENE_SAMPLES}
         speeds = []
         for seed in range(repeats):
-            done = render(
-                scene, camera, width=SCENE_WIDTH, height=height, samples=SCENE_SAMPLES,
-                threads=found.settings.threads, seed=seed,
-            )  # fmt: skip
+            done = render(scene, camera, **size, threads=threads, seed=seed)
             speeds.append(float(done.stats["mpaths_per_s"]))
-            report((k + (seed + 1) / (repeats + 1)) / len(files))
+            report((k + (seed + 1) / (repeats + 1)) / len(SCENES))
         found.scenes.append(
             {
-                "scene": file.stem,
+                "scene": name,
                 "max_depth": scene.settings.camera.max_depth,
                 "mpaths_per_s": max(speeds),
                 "mpaths_per_s_median": sorted(speeds)[len(speeds) // 2],
@@ -499,7 +437,7 @@ def _scenes(found: Found, report: Callable[[float], None]) -> None:
         )
 
 
-def _memory(found: Found, report: Callable[[float], None]) -> None:
+def _memory(found: Found, report: Report) -> None:
     cases = [*((width, 1) for width in WIDTHS), (WIDTHS[0], MANY_SAMPLES)]
     for k, (width, samples) in enumerate(cases):
         found.memory.append(lab.in_child(memory_of, str(lab.SCENES / "room.toml"), width, samples))

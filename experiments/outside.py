@@ -1,4 +1,8 @@
-"""Random inputs to an exported model: outside its domain the status must say so, and what passes must be a ray."""
+"""Random numbers of every kind (any bits, NaN, infinities, denormals, rays just outside the domain) through a model.
+
+A ray outside the domain never passes; one that passes is finite, and its direction is of unit length. Exit code 1 where
+that is broken.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments import lab
 from neurolens.base import status as st
 from neurolens.base.progress import Progress
 from neurolens.cameras.onnxlens import OnnxLens, load_model
-from neurolens.commands.arguments import whole
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.surrogates.model import ANY_WAVELENGTH_NM
 
@@ -168,18 +172,12 @@ def _place(
     return ~sides[0], sides[1] & (stop >= 1e-6 * d["stop_radius_mm"])
 
 
-ABOUT = """\
-Random numbers of every kind (any bit pattern, NaN, infinities, denormals, huge and negative ones,
-rays just outside the domain) through an exported model. A ray outside the domain never passes; one
-that passes is finite, and its direction is of unit length. Exit code 1 where that is broken."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m experiments outside`."""
-    parser.add_argument("models", metavar="MODEL", type=Path, nargs="+", help="exported models (.onnx)")
-    parser.add_argument("--rays", metavar="N", type=whole(1000), default=10_000_000, help="a model (default 10000000)")
-    parser.add_argument("--seed", metavar="N", type=whole(0), default=1, help="of the numbers (default 1)")
-    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+OPTIONS = (
+    lab.option("models", metavar="MODEL", type=Path, nargs="+", help="exported models (.onnx)"),
+    lab.count("rays", 10_000_000, "a model (default 10000000)", 1000),
+    lab.count("seed", 1, "of the numbers (default 1)", 0),
+    lab.QUIET,
+)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,9 +1,8 @@
-"""Speed against the promises: `python -m experiments promises` (`make bench`).
+"""Race each model of which models/index.json promises a speed-up against the exact tracer of its lens (`make bench`).
 
-Races each model of which models/index.json promises a speed-up against the exact tracer of its lens, the thin lens and
-the pinhole, all in one run, writes the table to experiments/results/, and fails when a model is slower, relative to the
-compiled exact tracer, than promised, or when tracer or renderer fall below their floors (`floors`). `python -m
-experiments trace` times the exact tracer alone.
+Beside the thin lens and the pinhole, all in one run; then the floors of the tracer and the renderer. Exit code 1 where
+a model is slower, relative to the compiled exact tracer, than promised, or where a floor is missed.
+Writes bench.md and bench.json. `python -m experiments trace` times the exact tracer alone.
 """
 
 from __future__ import annotations
@@ -22,14 +21,31 @@ from typing import Any
 import torch
 
 from experiments import lab
+from experiments.lab import Row
 from experiments.renderer_speed import measure
 from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
-from neurolens.commands.arguments import whole
 from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
 from neurolens.evaluate.speed import Race, race
 from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.domain import Domain, domain_of
+
+
+@dataclass(frozen=True)
+class Floor:
+    """One speed against its floor; `measured` is None, with a `reason`, where it could not be taken."""
+
+    name: str
+    floor: float
+    measured: float | None
+    unit: str
+    reason: str = ""
+
+    @property
+    def verdict(self) -> str:
+        if self.measured is None:
+            return "UNCHECKED"
+        return "pass" if self.measured >= self.floor else "FAIL"
 
 
 @dataclass
@@ -43,14 +59,11 @@ class Outcome:
         floors: of the tracer and the renderer.
     """
 
-    rows: list[dict[str, Any]] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
     missed: list[str] = field(default_factory=list)
     checked: int = 0
     unchecked: list[str] = field(default_factory=list)
     floors: list[Floor] = field(default_factory=list)
-
-
-Save = Callable[[Outcome], None]
 
 
 def read_index(folder: Path) -> list[dict[str, Any]]:
@@ -77,12 +90,12 @@ def read_index(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def bench_models(root: Path, folder: Path, only: str, threads: int, rounds: int, save: Save) -> Outcome:
-    """Race the models of an index, lens by lens, their lens files below `root`; `save` what there is after each.
+def bench_models(folder: Path, only: str, threads: int, rounds: int, save: Callable[[Outcome], str]) -> Outcome:
+    """Race the models of an index, lens by lens; `save` what there is after each.
 
     Without `only`, those of which the index promises a speed-up.
     """
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in read_index(folder):
         if only in row["file"] and (only or row.get("promised_speedup") is not None):
             groups.setdefault((row["lens_file"], row.get("configuration"), row.get("efl_mm")), []).append(row)
@@ -92,14 +105,12 @@ def bench_models(root: Path, folder: Path, only: str, threads: int, rounds: int,
     for (lens_file, configuration, efl_mm), rows in groups.items():
         state = " ".join([Path(lens_file).stem, *([str(configuration)] if configuration else [])])
         _say(f"{state}: compiling and timing, {len(rows)} models ...")
-        lens = read_lens(root / lens_file).at(zoom=configuration, focal_length_mm=efl_mm)
+        lens = read_lens(lab.ROOT / lens_file).at(zoom=configuration, focal_length_mm=efl_mm)
         models = {row["file"]: load_model(folder / row["file"], lens.sha256) for row in rows}
         domain = Domain.from_dict(next(iter(models.values())).card["domain"])
         lens = lens.with_stop_radius(domain.stop_radius_mm)
-        candidates = exact_candidates(lens, domain)
-        for name, model in models.items():
-            candidates.append(model_candidate(name, model, domain.stop_radius_mm))
-        candidates += ideal_cameras(lens, domain)
+        made = [model_candidate(name, model, domain.stop_radius_mm) for name, model in models.items()]
+        candidates = [*exact_candidates(lens, domain), *made, *ideal_cameras(lens, domain)]
         timed = race(candidates, domain, threads=threads, rounds=rounds)
         outcome.rows += table_rows(state, timed)
         hold_to_promises(rows, timed, outcome)
@@ -147,72 +158,37 @@ def report_outcome(outcome: Outcome) -> int:
     return 1 if outcome.missed or below else 0
 
 
-LENS, SCENE = "lenses/laikin_double_gauss_50.toml", "experiments/scenes/room.toml"
+LENS, SCENE = lab.LENSES / "laikin_double_gauss_50.toml", lab.SCENES / "room.toml"
 TRACER_MRAY_S = {"eager": 6.0, "compiled": 20.0}  # one core, float32, 12 refractions, stop, rims and dispersion
 RENDER_MPATH_S = 1.0  # the room, depth 3, two cores
 
 
-@dataclass(frozen=True)
-class Floor:
-    """One speed against its floor; `measured` is None, with a `reason`, where it could not be taken."""
-
-    name: str
-    floor: float
-    measured: float | None
-    unit: str
-    reason: str = ""
-
-    @property
-    def verdict(self) -> str:
-        if self.measured is None:
-            return "UNCHECKED"
-        return "pass" if self.measured >= self.floor else "FAIL"
-
-
-def check_floors(root: Path, rounds: int = 20) -> list[Floor]:
-    """Measure all of them; the best of the rounds counts, as a busy machine only ever slows.
-
-    Args:
-        root: the project's folder.
-
-    Raises:
-        InputError: the lens or the scene is not there.
-    """
-    lens = read_lens(root / LENS).at()
+def check_floors(rounds: int = 20) -> list[Floor]:
+    """Measure all of them; the best of the rounds counts, as a busy machine only ever slows."""
+    lens = read_lens(LENS).at()
     domain = domain_of(lens)
     candidates = exact_candidates(lens, domain, transmittance=False, build_rays=False, label="trace")
     timed = race(candidates, domain, rounds=rounds)
     found = []
     for kind, floor in TRACER_MRAY_S.items():
-        timing = timed.timing(f"trace {kind}")
+        timing, reason = timed.timing(f"trace {kind}"), timed.unavailable.get(f"trace {kind}", "")
         speed = None if timing is None else 1000 / timing["min"]
-        reason = timed.unavailable.get(f"trace {kind}", "")
         found.append(Floor(f"exact tracer, {kind}, one core, float32", floor, speed, "Mray/s", reason))
-    room = measure(root / SCENE, threads=2, depth=3)
-    found.append(Floor("render of the room, two cores, depth 3", RENDER_MPATH_S, room["mpaths_per_s"], "Mpath/s"))
-    return found
-
-
-def floor_table(floors: Sequence[Floor]) -> str:
-    """The floors as a table in Markdown."""
-    rows = []
-    for f in floors:
-        shown = f"({f.reason})" if f.measured is None else f"{f.measured:.3g}"
-        rows.append([f.name, shown, f"{f.floor:g}", f.unit, f.verdict])
-    return lab.table("what|measured|floor|unit|verdict", rows) + "\n"
+    speed = measure(SCENE, threads=2, depth=3)["mpaths_per_s"]
+    return [*found, Floor("render of the room, two cores, depth 3", RENDER_MPATH_S, speed, "Mpath/s")]
 
 
 COMPILED, EAGER = "exact compiled", "exact eager"
 
 
-def table_rows(state: str, timed: Race) -> list[dict[str, Any]]:
+def table_rows(state: str, timed: Race) -> list[Row]:
     """One row per candidate of a race.
 
     Returns: tables of lens (`state`), name, ns_per_ray, speedup_over_compiled and speedup_over_eager ({"min", "median"}
         as of `Race.speedup`; None where that tracer did not run), reason where unavailable, load of the machine.
         Where several exact tracers raced, each is held against those of its own kind.
     """
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for name in (*timed.ns, *timed.unavailable):
         own = name.rsplit(" ", 1)[0]
         compiled, eager = (n if n in timed.ns else f"{own} {n.split()[-1]}" for n in (COMPILED, EAGER))
@@ -230,77 +206,71 @@ def table_rows(state: str, timed: Race) -> list[dict[str, Any]]:
     return rows
 
 
-def markdown(title: str, conditions: str, rows: Sequence[dict[str, Any]]) -> str:
-    """A page with the rows as a table."""
-    lines: list[list[Any]] = []
-    for row in rows:
-        t = row["ns_per_ray"]
-        if t is None:
-            lines.append([row["lens"], row["name"], f"unavailable: {row['reason']}", *[""] * 6])
-            continue
-        figures = [f"{v:.1f}" for v in (t["min"], t["median"], 1000 / t["min"])]
-        ratios = [_ratio(row[key]) for key in ("speedup_over_compiled", "speedup_over_eager")]
-        lines.append([row["lens"], row["name"], *figures, t["batch"], t["threads"], *ratios])
-    loads = [v for row in rows for v in row["load"] if v is not None]
-    if loads:
-        conditions += f" Load average of the machine meanwhile: up to {max(loads):.1f} on {os.cpu_count()} cores."
-    head = "lens|candidate|ns per ray, best|median|Mray/s|batch|threads|over compiled|over eager"
-    return f"# {title}\n\n{conditions}\n\n{lab.table(head, lines)}\n"
+def _ratio(found: dict[str, float] | None) -> str | None:
+    return None if found is None else lab.best_median(found["min"], found["median"])
 
 
-def _ratio(found: dict[str, float] | None) -> str:
-    return "" if found is None else f"{found['min']:.2f} ({found['median']:.2f})"
+_COLUMNS = lab.columns(
+    ("lens", "lens"),
+    ("candidate", "name"),
+    (
+        "ns per ray, best",
+        lambda r: f"{t['min']:.1f}" if (t := r["ns_per_ray"]) else f"unavailable: {r['reason']}",
+    ),
+    ("median", "ns_per_ray.median", ".1f"),
+    ("Mray/s", lambda r: 1000 / t["min"] if (t := r["ns_per_ray"]) else None, ".1f"),
+    ("batch", "ns_per_ray.batch"),
+    ("threads", "ns_per_ray.threads"),
+    ("over compiled", lambda r: _ratio(r["speedup_over_compiled"])),
+    ("over eager", lambda r: _ratio(r["speedup_over_eager"])),
+)
+_FLOORS = lab.columns(
+    ("what", "name"),
+    ("measured", lambda f: f"({f.reason})" if f.measured is None else f"{f.measured:.3g}"),
+    ("floor", "floor", "g"),
+    ("unit", "unit"),
+    ("verdict", "verdict"),
+)
+_NOTES = """\
+Rays uniform over film and pupil disc of each domain, blocked ones included; {threads}, {rounds} rounds in turn, each \
+the best of a few short samples; float32 unless told. Exact tracer and models do the same work: film and pupil points \
+in; scene ray, transmittance and status out, with stop, rims and dispersion; models add the crossing with the stop. \
+Thin lens and pinhole give ray and weight. Ratios: by the best times (median within rounds), above 1 is faster. \
+Python {python}, torch {torch}, {processor}."""
 
 
-def notes(threads: str, rounds: int) -> str:
-    """What a reader must know of the conditions."""
-    return (
-        f"Rays uniform over film and pupil disc of each domain, blocked ones included; {threads}, {rounds} rounds in "
-        "turn, each the best of a few short samples; float32 unless told. Exact tracer and models do the same work: "
-        "film and pupil points in; scene ray, transmittance and status out, with stop, rims and dispersion; "
-        "models add the crossing with the stop. Thin lens and pinhole give ray and weight. Ratios: by the best times "
-        "(median within rounds), above 1 is faster. "
-        f"Python {platform.python_version()}, torch {torch.__version__}, {platform.machine()}."
-    )
+def page(rows: Sequence[Row], floors: Sequence[Floor], threads: int, rounds: int) -> str:
+    """The rows and the floors, with what a reader must know of the conditions."""
+    versions = {"python": platform.python_version(), "torch": torch.__version__, "processor": platform.machine()}
+    notes = _NOTES.format(threads=f"{threads} thread" + "s" * (threads > 1), rounds=rounds, **versions)
+    load = lab.most_load(rows)
+    if load is not None:
+        notes += f" Load average of the machine meanwhile: up to {load:.1f} on {os.cpu_count()} cores."
+    parts = ["## Floors", lab.table(_FLOORS, floors)] if floors else []
+    return lab.page("# Models against the exact tracer", notes, lab.table(_COLUMNS, rows), *parts)
 
 
-ABOUT = """\
-Race each model of which models/index.json promises a speed-up against the exact tracer of its lens, the
-thin lens and the pinhole, all in one run; then the floors of the tracer and the renderer.
-Exit code 1 where a model is slower than promised or a floor is missed. Writes bench.md and bench.json."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m experiments promises`."""
-    parser.add_argument(
-        "--models", metavar="DIR", type=Path, default=lab.MODELS, help="folder with index.json (default: models)"
-    )
-    parser.add_argument(
-        "--only", metavar="TEXT", default="",
-        help="models whose names hold this text, promised or not; no floors then",
-    )  # fmt: skip
-    parser.add_argument("--threads", metavar="N", type=whole(1), default=1, help="that share out batches (default 1)")
-    parser.add_argument("--rounds", metavar="N", type=whole(1), default=20, help="of each candidate (default 20)")
-    lab.add_out(parser)
+OPTIONS = (
+    lab.option("--models", metavar="DIR", type=Path, default=lab.MODELS, help="with index.json (default: models)"),
+    lab.option("--only", metavar="TEXT", default="", help="models whose names hold this, promised or not; no floors"),
+    lab.count("threads", 1, "that share out batches (default 1)"),
+    lab.count("rounds", 20, "of each candidate (default 20)"),
+    lab.out(),
+)
 
 
 def run(args: argparse.Namespace) -> int:
     """0 where all that could be checked is kept, 1 where something is not."""
     warnings.simplefilter("ignore")
-    threads = f"{args.threads} thread" + "s" * (args.threads > 1)
 
-    def page(outcome: Outcome) -> str:
-        floors = f"\n## Floors\n\n{floor_table(outcome.floors)}" if outcome.floors else ""
-        return markdown("Models against the exact tracer", notes(threads, args.rounds), outcome.rows) + floors
+    def save(outcome: Outcome) -> str:
+        text = page(outcome.rows, outcome.floors, args.threads, args.rounds)
+        floors = [{**asdict(f), "verdict": f.verdict} for f in outcome.floors]
+        return lab.write_results(args.out, "bench", text, {"rows": outcome.rows, "floors": floors})
 
-    def save(outcome: Outcome) -> None:
-        data = {"rows": outcome.rows, "floors": [{**asdict(f), "verdict": f.verdict} for f in outcome.floors]}
-        lab.write_results(args.out, "bench", page(outcome), data)
-
-    outcome = bench_models(lab.ROOT, args.models, args.only, args.threads, args.rounds, save)
+    outcome = bench_models(args.models, args.only, args.threads, args.rounds, save)
     if not args.only:
         _say("floors of the tracer and the renderer ...")
-        outcome.floors = check_floors(lab.ROOT, args.rounds)
-        save(outcome)
-    print(page(outcome))
+        outcome.floors = check_floors(args.rounds)
+    print(save(outcome))
     return report_outcome(outcome)

@@ -1,4 +1,7 @@
-"""Share of the rays from a pupil that pass the lens, by method, beside the figures of the theses."""
+"""What share of the rays that a pupil sends pass the lens: pupils of the literature, and the outlines of our cameras.
+
+On the lenses of the theses, beside their figures (half a minute). Writes passage.md, passage.json and passage.png.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +19,11 @@ from numpy.typing import NDArray
 from torch.quasirandom import SobolEngine
 
 from experiments import lab
-from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, new_figure, save, style
+from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, drawing
 from neurolens.base.progress import Progress
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.commands.arguments import whole
 from neurolens.optics import pupil_methods as known
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
@@ -42,70 +45,40 @@ class Case:
     theirs: dict[str, float] = field(default_factory=dict)
     source: str = ""
 
+    @property
+    def name(self) -> str:
+        return f"{self.lens.rsplit('_', 1)[0].replace('_', ' ')} {self.focal_length_mm:g} mm"
+
 
 def _steinert(lens: str, mm: float, figures: dict[float, tuple[float, float]], name: str = "") -> list[Case]:
     source = f"Steinert 2009, Table 5.2{f', {name}' if name else ''}"
     return [Case(lens, mm, n, {"rear rim": a, "pixel disc": b}, source) for n, (a, b) in figures.items()]
 
 
+KIMURA, KINGSLAKE = "Kimura wide angle 36 mm", "Kingslake telephoto 250 mm"
+WILLI = "Willi 2021, Table 3.1"
+GAUSS = {"rear rim": 36.9, "Wu, two steps": 92.2, "radial ellipses": 99.8}
+FISHEYE = {"rear rim": 0.5, "Wu, two steps": 74.4, "pixel disc": 79.7, "radial ellipses": 88.7}
 # Lit pixels only for the fisheye's global pupil, as the table gives them too.
 CASES = (
     *_steinert("muller_fisheye_100", 14.0, {4.0: (43.2, 64.4), 5.6: (29.7, 76.2), 8.0: (16.9, 79.7)}),
-    *_steinert(
-        "angenieux_retrofocus_35",
-        35.0,
-        {2.8: (25.4, 84.5), 4.0: (13.1, 85.4), 5.6: (7.7, 85.7)},
-        "Kimura wide angle 36 mm",
-    ),
+    *_steinert("angenieux_retrofocus_35", 35.0, {2.8: (25.4, 84.5), 4.0: (13.1, 85.4), 5.6: (7.7, 85.7)}, KIMURA),
     *_steinert("brendel_tessar_100", 50.0, {2.8: (60.7, 81.6), 4.0: (34.2, 83.7), 5.6: (18.0, 83.7)}),
-    *_steinert(
-        "sigler_telephoto_100",
-        250.0,
-        {5.6: (22.4, 86.7), 8.0: (15.8, 86.2), 11.0: (10.7, 86.2)},
-        "Kingslake telephoto 250 mm",
-    ),
-    Case(
-        "tronnier_double_gauss_100",
-        100.0,
-        4.0,
-        {"rear rim": 36.9, "Wu, two steps": 92.2, "radial ellipses": 99.8},
-        "Willi 2021, Table 3.1, double Gauss 100 mm",
-    ),
-    Case(
-        "mizuguchi_fisheye_10",
-        10.5,
-        8.0,
-        {"rear rim": 0.5, "Wu, two steps": 74.4, "pixel disc": 79.7, "radial ellipses": 88.7},
-        "Willi 2021, Table 3.1",
-    ),
+    *_steinert("sigler_telephoto_100", 250.0, {5.6: (22.4, 86.7), 8.0: (15.8, 86.2), 11.0: (10.7, 86.2)}, KINGSLAKE),
+    Case("tronnier_double_gauss_100", 100.0, 4.0, GAUSS, f"{WILLI}, double Gauss 100 mm"),
+    Case("mizuguchi_fisheye_10", 10.5, 8.0, FISHEYE, WILLI),
     Case("laikin_double_gauss_50", 50.0, 1.8),
     Case("laikin_double_gauss_50", 50.0, 8.0),
 )
 # Those of the picture.
-DRAWN = tuple(
-    case
-    for case in CASES
-    if (case.lens, case.f_number)
-    in (("laikin_double_gauss_50", 1.8), ("muller_fisheye_100", 4.0), ("mizuguchi_fisheye_10", 8.0))
-)
+_IN_PICTURE = (("laikin_double_gauss_50", 1.8), ("muller_fisheye_100", 4.0), ("mizuguchi_fisheye_10", 8.0))
+DRAWN = tuple(case for case in CASES if (case.lens, case.f_number) in _IN_PICTURE)
 
 # Steinert 2009, Table 5.3: percent of rays through the global pupil that pass, pixel (128, 96) of 512 x 384.
 TABLE_5_3 = {2.8: 64.31, 4.0: 35.8, 5.6: 18.1, 8.0: 9.0, 11.0: 5.1, 16.0: 3.0, 22.0: 1.7, 32.0: 0.8, 45.0: 0.4}
 
-
 FILM_MM = (36.0, 24.0)
 OURS = "outlines (ours)"
-METHODS = (
-    "rear rim",
-    "exit pupil",
-    "Wu, two steps",
-    "pixel disc",
-    "pixel ellipse",
-    "radial boxes",
-    "radial ellipses",
-    "interpolated boxes",
-    OURS,
-)
 SAMPLES = 2**17
 
 # Film and pupil samples [2, N] and wavelengths [N] to pupil points [2, N] and areas [N] (float32 or float64).
@@ -135,28 +108,28 @@ class Passage:
     by_radius: dict[str, NDArray[np.float64]]
 
 
-def camera_of(case: Case, folder: Path) -> ExactCamera:
-    """The lens of a case, read from `folder`, on `FILM_MM`, focused at infinity."""
-    lens = read_lens(folder / f"{case.lens}.toml").at(focal_length_mm=case.focal_length_mm, f_number=case.f_number)
+def camera_of(case: Case) -> ExactCamera:
+    """The lens of a case on `FILM_MM`, focused at infinity."""
+    lens = read_lens(lab.LENSES / f"{case.lens}.toml").at(focal_length_mm=case.focal_length_mm, f_number=case.f_number)
     return ExactCamera(lens, film_mm=FILM_MM, focus_m=math.inf)
 
 
-def measure(case: Case, folder: Path, samples: int = SAMPLES) -> Passage:
+def measure(case: Case, samples: int = SAMPLES) -> Passage:
     """Rates of every method for a case, in light of 400 to 700 nm."""
     start = time.perf_counter()
-    camera = camera_of(case, folder)
-    lens = camera.lens
+    camera = camera_of(case)
     found = time.perf_counter() - start
     outline = camera.film.outline
     film, square, wavelength = _samples(samples, 1, outline.film_radius_mm)
     rates, by_radius = {}, {}
     true = true_irradiance(camera, samples)
-    for name, make in _pupils(lens, outline).items():
+    for name, make in METHODS.items():
         start = time.perf_counter()
-        plane, sample = make()
+        pupil = make(camera.lens, outline)
         search_s = found if name == OURS else time.perf_counter() - start
-        passed, light = _irradiance(camera, _Pupil(plane, sample), film, square, wavelength)
-        rates[name] = Rate(float(passed.mean()), light / true, search_s, _nanoseconds(sample, film, square, wavelength))
+        passed, light = _irradiance(camera, pupil, film, square, wavelength)
+        sample_ns = _nanoseconds(pupil.sample, film, square, wavelength)
+        rates[name] = Rate(float(passed.mean()), light / true, search_s, sample_ns)
         by_radius[name] = _profile(np.hypot(*film), passed, outline.film_radius_mm)
     lost = lost_light(camera, film, square, wavelength)
     return Passage(case, rates, outline.film_radius_mm, 1 - film.shape[1] / samples, lost, by_radius)
@@ -195,40 +168,36 @@ def lost_light(camera: ExactCamera, film: Any, square: Any, wavelength: Any, wid
 
 
 @dataclass(frozen=True)
-class _Pupil:
+class Pupil:
+    """A plane, and points on it."""
+
     pupil_z_mm: float
     sample: SampleFunction
 
 
-def _pupils(lens: Lens, outline: PupilOutline) -> dict[str, Callable[[], tuple[float, SampleFunction]]]:
-    """How to make the pupil of each of `METHODS`: its plane and its samples."""
-    end, film_z = outline.film_radius_mm, lens.film_z_mm
-    assert film_z is not None
+def _searched(make: Callable[..., Any], *args: Any) -> Callable[[Lens, PupilOutline], Any]:
+    return lambda lens, outline: make(lens, outline.film_radius_mm, *args)
 
-    def of(make: Callable[..., known.RadialPupil], *args: Any) -> Callable[[], tuple[float, SampleFunction]]:
-        def made() -> tuple[float, SampleFunction]:
-            pupil = make(lens, end, *args)
-            return pupil.pupil_z_mm, pupil.sample
 
-        return made
+def _boxes(lens: Lens, outline: PupilOutline) -> Pupil:
+    assert lens.film_z_mm is not None
+    bounds = pupil_bounds(lens, outline.film_radius_mm, (lens.film_z_mm, lens.film_z_mm), (400.0, 700.0))
+    table = PupilTable.of(vars(bounds))
+    return Pupil(bounds.pupil_z_mm, lambda film, square, wavelength: table.sample(film, square))
 
-    def boxes() -> tuple[float, SampleFunction]:
-        bounds = pupil_bounds(lens, end, (film_z, film_z), (400.0, 700.0))
-        table = PupilTable.of(vars(bounds))
-        return bounds.pupil_z_mm, lambda film, square, wavelength: table.sample(film, square)
 
-    makers = (
-        of(known.rear_rim),
-        of(known.global_exit_pupil),
-        of(known.wu_exit_pupil),
-        of(known.pixel_pupils, "disc"),
-        of(known.pixel_pupils, "ellipse"),
-        of(known.radial_bounds, "box"),
-        of(known.radial_bounds, "ellipse"),
-        boxes,
-        lambda: (outline.pupil_z_mm, outline.sample),
-    )
-    return dict(zip(METHODS, makers, strict=True))
+# How the pupil of a lens on the axis is made; `OURS` is the outline that the camera has found.
+METHODS: dict[str, Callable[[Lens, PupilOutline], Any]] = {
+    "rear rim": _searched(known.rear_rim),
+    "exit pupil": _searched(known.global_exit_pupil),
+    "Wu, two steps": _searched(known.wu_exit_pupil),
+    "pixel disc": _searched(known.pixel_pupils, "disc"),
+    "pixel ellipse": _searched(known.pixel_pupils, "ellipse"),
+    "radial boxes": _searched(known.radial_bounds, "box"),
+    "radial ellipses": _searched(known.radial_bounds, "ellipse"),
+    "interpolated boxes": _boxes,
+    OURS: lambda lens, outline: outline,
+}
 
 
 def _irradiance(camera: ExactCamera, pupil: Any, film: Any, square: Any, wavelength: Any) -> tuple[Any, float]:
@@ -261,13 +230,13 @@ def _profile(radius: Any, passed: Any, end: float, bins: int = 24) -> NDArray[np
     return np.bincount(place, weights=passed, minlength=bins) / np.maximum(count, 1)
 
 
-def pixel_rates(folder: Path, samples: int = SAMPLES) -> Iterator[tuple[float, float, float]]:
+def pixel_rates(samples: int = SAMPLES) -> Iterator[tuple[float, float, float]]:
     """f-number, percent that passes from the pixel of Table 5.3 through the rear rim, and theirs; 36 x 27 mm film."""
     radius = math.hypot(128, 96) * 36 / 512
     r, angle = SobolEngine(2, scramble=True, seed=1).draw(samples).double().numpy().T
     r, angle = np.sqrt(r), 2 * math.pi * angle
     for f_number, theirs in TABLE_5_3.items():
-        lens = read_lens(folder / "brendel_tessar_100.toml").at(focal_length_mm=50.0, f_number=f_number)
+        lens = read_lens(lab.LENSES / "brendel_tessar_100.toml").at(focal_length_mm=50.0, f_number=f_number)
         rim = known.rear_rim(lens, radius)
         points = rim.along[0] * np.stack([r * np.cos(angle), r * np.sin(angle)])
         passed = known.passes_through(lens, rim.pupil_z_mm)(np.full(samples, radius), points)
@@ -285,6 +254,8 @@ In brackets what the theses say of their lens. *Light* is the irradiance found t
 through a disc that is surely wide enough, in percent: below 100 the pupil is too small (its noise is about 0.2).
 *Lost* is the share of the light that passes outside our outlines. *Search*: seconds, once a camera; *ns*: a sample.
 """
+
+
 _METHODS = """\
 rear rim: its disc, Steinert's and Willi's global pupil. exit pupil: the paraxial one at this stop. Wu: one disc by a
 search in two steps. pixel disc, ellipse: about 128 probe rays per pixel (Steinert). radial boxes: pbrt's bounds, 50
@@ -293,67 +264,38 @@ this project before, between 33 film radii. outlines (ours): `neurolens.cameras.
 """
 
 
-def page(passages: Sequence[Passage], pixel: Sequence[tuple[float, float, float]], samples: int) -> str:
-    """The whole page in Markdown."""
+def _rate(method: str, p: Passage) -> str:
+    theirs = p.case.theirs.get(method)
+    return f"{100 * p.rates[method].passed:.1f}" + (f" [{theirs:g}]" if theirs is not None else "")
+
+
+_LENS = (("lens", "case.name"), ("f/", "case.f_number", "g"))
+_RATES = lab.columns(
+    *_LENS,
+    ("dark %", "dark", ".1f", 100),
+    *((method, partial(_rate, method)) for method in METHODS),
+    ("lost", "lost", ".0e"),
+    ("search s", f"rates.{OURS}.search_s", ".2f"),
+    ("ns", f"rates.{OURS}.sample_ns", ".0f"),
+)
+_LIGHT = lab.columns(*_LENS, *((method, f"rates.{method}.light", ".1f", 100) for method in METHODS))
+
+
+def page(passages: Sequence[Passage], pixel: Sequence[Sequence[float]], samples: int) -> str:
+    """The whole page in Markdown; `pixel`: of `pixel_rates`."""
     width, height = FILM_MM
-    parts = [_INTRO.format(width=width, height=height, samples=samples)]
-    head = ["lens", "f/", "dark %", *METHODS, "lost", "search s", "ns"]
-    rows = [_row(p) for p in passages]
-    parts += [lab.table(head, rows) + "\n", _METHODS]
-    light = [[_name(p), f"{p.case.f_number:g}", *(f"{100 * p.rates[m].light:.1f}" for m in METHODS)] for p in passages]
-    parts += ["## Light found, percent\n", lab.table(["lens", "f/", *METHODS], light) + "\n"]
-    sources = dict.fromkeys(f"- {_name(p)}: {p.case.source}." for p in passages if p.case.source)
-    parts += ["Figures in brackets:\n", "\n".join(sources) + "\n"]
+    sources = dict.fromkeys(f"- {p.case.name}: {p.case.source}." for p in passages if p.case.source)
+    parts = [_INTRO.format(width=width, height=height, samples=samples), lab.table(_RATES, passages), _METHODS]
+    parts += ["## Light found, percent", lab.table(_LIGHT, passages), "Figures in brackets:", "\n".join(sources)]
     if pixel:
+        head = ["f/", *(f"{n:g}" for n, _, _ in pixel)]
+        rows = [["ours", *(f"{a:.2f}" for _, a, _ in pixel)], ["theirs", *(f"{b:g}" for _, _, b in pixel)]]
         parts += [
-            "## Closing the stop: Tessar 50 mm, one pixel, rear rim\n",
-            "Pixel (128, 96) of 512 x 384 on 36 x 27 mm, d line; Steinert 2009, Table 5.3, in the second row.\n",
-            lab.table(
-                ["f/", *(f"{n:g}" for n, _, _ in pixel)],
-                [["ours", *(f"{a:.2f}" for _, a, _ in pixel)], ["theirs", *(f"{b:g}" for _, _, b in pixel)]],
-            )
-            + "\n",
+            "## Closing the stop: Tessar 50 mm, one pixel, rear rim",
+            "Pixel (128, 96) of 512 x 384 on 36 x 27 mm, d line; Steinert 2009, Table 5.3, in the second row.",
+            lab.table(head, rows),
         ]
-    return "\n".join(parts)
-
-
-def _name(p: Passage) -> str:
-    return f"{p.case.lens.rsplit('_', 1)[0].replace('_', ' ')} {p.case.focal_length_mm:g} mm"
-
-
-def _row(p: Passage) -> list[str]:
-    rates = []
-    for method in METHODS:
-        theirs = p.case.theirs.get(method)
-        rates.append(f"{100 * p.rates[method].passed:.1f}" + (f" [{theirs:g}]" if theirs is not None else ""))
-    ours = p.rates[OURS]
-    lost = f"{p.lost:.0e}"
-    return [
-        _name(p),
-        f"{p.case.f_number:g}",
-        f"{100 * p.dark:.1f}",
-        *rates,
-        lost,
-        f"{ours.search_s:.2f}",
-        f"{ours.sample_ns:.0f}",
-    ]
-
-
-def write(
-    passages: Sequence[Passage],
-    pixel: Sequence[tuple[float, float, float]],
-    shown: Sequence[Passage],
-    cameras: Sequence[ExactCamera],
-    samples: int,
-    folder: Path,
-) -> str:
-    """Write passage.md, passage.json and passage.png (the cases shown, with their cameras); returns the page."""
-    text = page(passages, pixel, samples)
-    data = {"film_mm": FILM_MM, "samples": samples, "cases": [_json(p) for p in passages], "tessar_pixel": list(pixel)}
-    lab.write_results(folder, "passage", text, data)
-    with style():
-        save(picture(shown, cameras), folder / "passage.png")
-    return text
+    return lab.page(*parts)
 
 
 def _json(p: Passage) -> dict[str, Any]:
@@ -373,97 +315,71 @@ def _json(p: Passage) -> dict[str, Any]:
 _SHOWN = (OURS, "radial ellipses", "pixel ellipse", "pixel disc", "Wu, two steps", "rear rim")
 
 
-def picture(passages: Sequence[Passage], cameras: Sequence[ExactCamera]) -> Any:
+def draw(passages: Sequence[Passage], path: Path) -> None:
     """Above: rates against the film radius of some cases; below: what passes their pupil planes, and our outlines."""
-    figure = new_figure(3.6 * len(passages), 5.2)
-    axes = figure.subplots(2, len(passages), squeeze=False, height_ratios=(1.7, 1))
-    for column, (p, camera) in enumerate(zip(passages, cameras, strict=True)):
-        above, below = axes[:, column]
-        for method, colour in zip(_SHOWN, (INK, *FIELD_COLOURS), strict=False):
-            values = 100 * p.by_radius[method]
-            radius = (np.arange(values.size) + 0.5) * p.lit_radius_mm / values.size
-            above.plot(radius, values, color=colour, lw=2.2 if method == OURS else 1.3, label=method)
-        above.set(ylim=(0, 103), xlim=(0, p.lit_radius_mm), xlabel="film radius (mm)")
-        above.set_title(f"{_name(p)}, f/{p.case.f_number:g}", loc="left")
-        above.grid(axis="y")
-        if column == 0:
-            above.set_ylabel("rays that pass (%)")
-            above.legend(loc="lower left")
-        _draw_outlines(below, camera)
-        if column == 0:
-            below.set_ylabel("y on the pupil plane (mm)")
-    return figure
+    with drawing(path, 3.6 * len(passages), 5.2) as figure:
+        axes = figure.subplots(2, len(passages), squeeze=False, height_ratios=(1.7, 1))
+        for column, p in enumerate(passages):
+            above, below = axes[:, column]
+            for method, colour in zip(_SHOWN, (INK, *FIELD_COLOURS), strict=False):
+                values = 100 * p.by_radius[method]
+                radius = (np.arange(values.size) + 0.5) * p.lit_radius_mm / values.size
+                above.plot(radius, values, color=colour, lw=2.2 if method == OURS else 1.3, label=method)
+            above.set(ylim=(0, 103), xlim=(0, p.lit_radius_mm), xlabel="film radius (mm)")
+            above.set_title(f"{p.case.name}, f/{p.case.f_number:g}", loc="left")
+            above.grid(axis="y")
+            _draw_outlines(below, camera_of(p.case))
+        axes[0, 0].set_ylabel("rays that pass (%)")
+        axes[0, 0].legend(loc="lower left")
+        axes[1, 0].set_ylabel("y on the pupil plane (mm)")
 
 
 def _draw_outlines(axes: Any, camera: ExactCamera) -> None:
-    """What passes at 550 nm (dots) and our outlines, from the axis (left) to the end of the light."""
-    outline = camera.film.outline
-    end = outline.film_radius_mm
+    """What passes at 550 nm (dots, on a grid a quarter wider) and our outlines, from the axis to the end of light."""
     axes.set_aspect("equal", "box")
     left, ticks = 0.0, []
     square = np.stack([a.ravel() for a in np.meshgrid(*[(np.arange(36) + 0.5) / 36] * 2)]).astype(np.float32)
     wavelength = np.full(square.shape[1], 550, np.float32)
     for share in (0.0, 0.6, 0.85, 0.97):
         film = np.zeros_like(square)
-        film[0] = share * end
-        points, passed = _around(camera, film, square, wavelength)
-        x, y = _polygon(camera, share * end)
+        film[0] = radius = share * camera.film.outline.film_radius_mm
+        x, y = _polygon(camera.film.outline, radius)
         middle, half = (x.min() + x.max()) / 2, (x.max() - x.min()) / 2
+        across, up = middle + 2.5 * half * (square[0] - 0.5), 2.5 * y.max() * (square[1] - 0.5)
+        points = np.stack([across, up]).astype(np.float32)
+        passed = camera.film.scene(film, points, wavelength).status == 0
         left += 1.25 * half
         axes.plot(points[0] - middle + left, points[1], ".", ms=1.1, color=FAINT, rasterized=True)
         axes.plot(points[0][passed] - middle + left, points[1][passed], ".", ms=1.6, color=FIELD_COLOURS[0])
         axes.plot(x - middle + left, y, color=INK, lw=1.2)
-        ticks.append((left, f"{share * end:.1f}"))
+        ticks.append((left, f"{radius:.1f}"))
         left += 1.25 * half
     axes.set_xticks([t for t, _ in ticks], [t for _, t in ticks])
     axes.set_xlabel("pupils at film radius (mm), one scale")
 
 
-def _around(camera: ExactCamera, film: Any, square: Any, wavelength: Any) -> tuple[Any, Any]:
-    """Points on a grid a quarter wider than the outline, and which pass."""
-    x, y = _polygon(camera, float(film[0, 0]))
-    points = np.stack(
-        [
-            (x.min() + x.max()) / 2 + 1.25 * (x.max() - x.min()) * (square[0] - 0.5),
-            1.25 * 2 * y.max() * (square[1] - 0.5),
-        ]
-    ).astype(np.float32)
-    return points, camera.film.scene(film, points, wavelength).status == 0
-
-
-def _polygon(camera: ExactCamera, radius: float) -> tuple[Any, Any]:
+def _polygon(outline: PupilOutline, radius: float) -> tuple[Any, Any]:
     """The closed outline of a film radius at 550 nm, on the pupil plane, mm."""
     way = np.linspace(0, 4, 513)[:, None] - np.array([3.5, 0.5])  # round the edge of the unit square
     square = np.clip(np.abs((way + 2) % 4 - 2) - 0.5, 0, 1).T.astype(np.float32)
     film = np.repeat(np.array([[radius], [0]], np.float32), square.shape[1], 1)
-    x, y = camera.film.outline.sample(film, square, np.full(square.shape[1], 550, np.float32))[0]
+    x, y = outline.sample(film, square, np.full(square.shape[1], 550, np.float32))[0]
     return x, y
 
 
-ABOUT = """\
-What share of the rays that a pupil sends pass the lens: the pupils of the literature and the outlines
-of this project's cameras, on the lenses of the theses, beside their figures (half a minute).
-Writes passage.md, passage.json and passage.png."""
+OPTIONS = (lab.count("rays", SAMPLES, "rays per method (default 131072)", 1000), lab.ONLY, lab.out())
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m experiments pupils`."""
-    parser.add_argument("--rays", metavar="N", type=whole(1000), default=2**17, help="rays per method (default 131072)")
-    lab.add_only(parser)
-    lab.add_out(parser)
-
-
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Measure every case of the theses and draw three."""
     lab.quiet_glasses()
     cases = lab.chosen(CASES, lambda case: case.lens, args.only, "pupils")
     with Progress(quiet=args.quiet).stage("pupils") as report:
         done = []
         for case in cases:
-            done.append(measure(case, lab.LENSES, args.rays))
+            done.append(measure(case, args.rays))
             report(len(done) / (len(cases) + 1))
-        pixel = [] if args.only else list(pixel_rates(lab.LENSES, args.rays))
-        shown = [p for p in done if p.case in DRAWN] or done[:1]
-        cameras = [camera_of(p.case, lab.LENSES) for p in shown]
-    print(write(done, pixel, shown, cameras, args.rays, args.out))
-    return 0
+        pixel = [] if args.only else list(pixel_rates(args.rays))
+    data = {"film_mm": FILM_MM, "samples": args.rays, "cases": [_json(p) for p in done], "tessar_pixel": pixel}
+    print(lab.write_results(args.out, "passage", page(done, pixel, args.rays), data))
+    draw([p for p in done if p.case in DRAWN] or done[:1], args.out / "passage.png")

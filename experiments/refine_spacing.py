@@ -1,16 +1,14 @@
 """Refine one spacing of a lens with gradients through the exact tracer, so that its spots shrink.
 
-    python experiments/refine_spacing.py            # writes experiments/results/refine_spacing.{json,png}
-
 The lens is a textbook Cooke triplet whose rear air space was made 0.6 mm too long, as if a spacer were wrong. Free are
 that space and the film's place; the loss is the mean square distance of rays from their field's centroid, over three
 fields and three wavelengths. Rays start in front of the lens and fill the stop of the lens as it stands.
+Writes refine_spacing.json and refine_spacing.png.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import time
 from dataclasses import replace
@@ -20,17 +18,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from experiments import lab
 from neurolens import __version__
 from neurolens.analysis.bundles import bundle
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.plot_style import heading, new_figure, save, style, wavelength_colour
-from neurolens.base.files import atomic_write_text
+from neurolens.analysis.plot_style import drawing, wavelength_colour
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
-ROOT = Path(__file__).parents[1]
 LENS = "lenses/cooke_triplet_50.toml"
 SPACE = 3  # the space after this surface
 WRONG_MM = 0.6
@@ -69,14 +66,12 @@ class Spots:
         return total
 
 
-def main() -> None:
+OPTIONS = (lab.out(),)
+
+
+def run(args: argparse.Namespace) -> None:
     """Refine, check the gradient, write figures and picture."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument(
-        "-o", "--output", type=Path, default=ROOT / "experiments" / "results", help="folder to write to"
-    )
-    folder: Path = parser.parse_args().output
-    file_lens = read_lens(ROOT / LENS)
+    file_lens = read_lens(lab.ROOT / LENS)
     right_mm = float(file_lens.surfaces[SPACE].thickness_mm)
     rows = list(file_lens.surfaces)
     rows[SPACE] = replace(rows[SPACE], thickness_mm=right_mm + WRONG_MM)
@@ -102,10 +97,9 @@ def main() -> None:
         "wavelengths_nm": WAVELENGTHS_NM,
         "versions": {"neurolens": __version__, "torch": torch.__version__},
     }
-    folder.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(folder / "refine_spacing.json", json.dumps(record, indent=1) + "\n")
-    draw(spots, refocused, refined, history, record, folder / "refine_spacing.png")
-    print(json.dumps(record, indent=1))
+    lab.write_json(args.out / "refine_spacing.json", record)
+    draw(spots, refocused, refined, history, record, args.out / "refine_spacing.png")
+    print((args.out / "refine_spacing.json").read_text())
 
 
 def refine(spots: Spots, start: Tensor, free: tuple[bool, bool]) -> tuple[Tensor, list[float]]:
@@ -146,8 +140,8 @@ def rms_um(spots: Spots, at: Tensor) -> float:
 
 def draw(spots: Spots, before: Tensor, after: Tensor, history: list[float], record: dict[str, Any], path: Path) -> None:
     """Spots before and after, and the loss at every evaluation."""
-    with style():
-        figure = new_figure(11.5, 6.2)
+    title, below = "One spacing refined by gradients", f"{spots.lens.name}; the space after surface {SPACE}"
+    with drawing(path, 11.5, 6.2, title, below) as figure:
         axes = figure.subplots(2, len(FIELDS_DEG) + 1, width_ratios=[*([1.0] * len(FIELDS_DEG)), 1.5])
         for row, (values, name) in enumerate(((before, "0.6 mm too long, refocused"), (after, "refined"))):
             x, y = (1000 * c for c in spots.land(values))
@@ -169,9 +163,3 @@ def draw(spots: Spots, before: Tensor, after: Tensor, history: list[float], reco
         spaces, sizes = record["space_mm"], record["rms_spot_um"]
         lines = [f"{k}: {v:.4f} mm" for k, v in spaces.items()] + [f"RMS {k}: {v:.2f} um" for k, v in sizes.items()]
         axes[1, -1].text(0, 0.95, "air space\n" + "\n".join(lines), va="top", fontsize=9)
-        heading(figure, "One spacing refined by gradients", f"{spots.lens.name}; the space after surface {SPACE}")
-        save(figure, path)
-
-
-if __name__ == "__main__":
-    main()

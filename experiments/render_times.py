@@ -1,9 +1,7 @@
 """Render time by camera and scene: Willi's Tables 6.2 and 6.3, with surrogates beside the lenses.
 
 All cameras see the same 20 degrees at f/4, focused at 5 m: the film grows with the focal length. One wavelength per
-path for all, for ideal cameras could share a path between four. Renders run in turn, camera after camera, in one
-process on one thread, and the whole round again; a figure is the best of the rounds, ratios are of one run.
-
+path for all, for ideal cameras could share a path between four. Renders run in turn, in one process on one thread.
 Source of the tables: Willi 2021 (multi-lens cameras in appleseed).
 """
 
@@ -12,11 +10,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from experiments import lab
+from experiments.lab import Report
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import FUSED, Shot, make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
@@ -101,18 +100,18 @@ class Timed:
     paths: int = 0
 
 
-def make_subjects(root: Path, quick: bool, report: Callable[[float], None]) -> list[Subject]:
+def make_subjects(quick: bool, report: Report) -> list[Subject]:
     """All cameras; one that this machine cannot make says why."""
     specs: list[tuple[Subject, str, float]] = [
         (Subject(PINHOLE, None, PINHOLE), "pinhole", 50.0),
         (Subject(THIN, None, THIN), "thin", 50.0),
-        (Subject(STOP, 0, STOP), str(root / "experiments" / "lenses" / "stop_only_50.toml"), 50.0),
+        (Subject(STOP, 0, STOP), str(lab.ROOT / "experiments" / "lenses" / "stop_only_50.toml"), 50.0),
     ]
     for count, lens, stem, efl in LENSES:
         for kind in KINDS if not quick or count in _QUICK else ():
-            folder, name = ("models", f"{stem}.{_FILES[kind]}.onnx") if kind in _FILES else ("lenses", f"{stem}.toml")
+            file = lab.MODELS / f"{stem}.{_FILES[kind]}.onnx" if kind in _FILES else lab.LENSES / f"{stem}.toml"
             compiled = FUSED if kind in (EXACT_C, *FUSED_MODELS) else ""
-            specs.append((Subject(lens, count, kind), f"{compiled}{root / folder / name}", efl))
+            specs.append((Subject(lens, count, kind), f"{compiled}{file}", efl))
     for k, (subject, spec, efl) in enumerate(specs):
         began = time.perf_counter()
         try:
@@ -120,7 +119,7 @@ def make_subjects(root: Path, quick: bool, report: Callable[[float], None]) -> l
             _differentials(subject.camera, 1)
             subject.moves_error = getattr(subject.camera, "differentials_error", None)
         except InputError as error:
-            subject.reason = str(error).replace(f"{root}/", "")
+            subject.reason = str(error).replace(f"{lab.ROOT}/", "")
         subject.made_s = time.perf_counter() - began
         report((k + 1) / len(specs))
     return [subject for subject, _, _ in specs]
@@ -152,7 +151,7 @@ def _inputs(camera: Camera, count: int) -> tuple[np.ndarray, np.ndarray, np.ndar
     return film.astype(np.float32), rng.random((2, count), np.float32), wavelength.astype(np.float32)
 
 
-def time_alone(subjects: Sequence[Subject], report: Callable[[float], None]) -> None:
+def time_alone(subjects: Sequence[Subject], report: Report) -> None:
     """Nanoseconds a ray of every camera by itself, with and without differentials, in turn."""
     calls: list[tuple[Subject, str, int, Callable[[], object]]] = []
     for s in subjects:
@@ -176,15 +175,13 @@ def time_alone(subjects: Sequence[Subject], report: Callable[[float], None]) -> 
         report((k + 1) / _ALONE_ROUNDS)
 
 
-def load_scenes(root: Path, quick: bool) -> dict[str, Scene]:
+def load_scenes(quick: bool) -> dict[str, Scene]:
     """The scenes by what they cost."""
     chosen = list(SCENES.items())[: 1 if quick else 3]
-    return {cost: load_scene(root / "experiments" / "scenes" / f"{name}.toml") for cost, name in chosen}
+    return {cost: load_scene(lab.SCENES / f"{name}.toml") for cost, name in chosen}
 
 
-def time_renders(
-    subjects: Sequence[Subject], scenes: dict[str, Scene], size: Size, report: Callable[[float], None]
-) -> list[Timed]:
+def time_renders(subjects: Sequence[Subject], scenes: dict[str, Scene], size: Size, report: Report) -> list[Timed]:
     """Every camera in every scene; in the cheap one also with differentials, where they take no minute."""
     rows = []
     for cost in scenes:
@@ -264,10 +261,10 @@ def shapes() -> list[Shape]:
     return found
 
 
-def time_shapes(root: Path, scene: Scene, size: Size, report: Callable[[float], None]) -> list[Shape]:
+def time_shapes(scene: Scene, size: Size, report: Report) -> list[Shape]:
     """The biconvex lens, compiled, with every shape of its stop."""
     _, _, stem, efl = LENSES[0]
-    spec = f"{FUSED}{root / 'lenses' / f'{stem}.toml'}"
+    spec = f"{FUSED}{lab.LENSES / stem}.toml"
     found = shapes()
     try:
         cameras = [make_camera(spec, shot(efl, spec, shape.aperture)) for shape in found]

@@ -1,4 +1,7 @@
-"""How fast the renderer is on one scene, and how fast rays meet its meshes, by the tree in numpy and by Embree."""
+"""Paths per second of the renderer through a thin lens with the scene's focus and aperture, fastest and median.
+
+With --meshes, instead, nanoseconds per ray of each mesh of the scene, by the tree in numpy and by Embree.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments import lab
 from neurolens.base.errors import InputError
 from neurolens.cameras.ideal import ThinLens
-from neurolens.commands.arguments import whole
 from neurolens.render.mesh import EmbreeMesh, Mesh
 from neurolens.render.primitives import Primitive, Rays
 from neurolens.render.renderer import render
@@ -34,34 +37,26 @@ def measure(
     """Speed of a scene file at its own picture size, through a thin lens with the scene's focus and aperture.
 
     Returns:
-        mpaths_per_s of the fastest and of the median render, their seconds, threads, depth, lanes (wavelengths per
-        path) and paths a render.
-
-    Raises:
-        InputError: a scene that cannot be read, a count below 1.
+        mpaths_per_s of the fastest and of the median render, their seconds, paths a render, lanes (wavelengths per
+        path).
     """
-    if repeats < 1:
-        raise InputError("bench", "repeats", repeats, "an integer above 0")
     loaded = load_scene(scene)
-    camera = thin_camera(loaded)
-    stats = [
-        render(loaded, camera, samples=samples, threads=threads, max_depth=depth, seed=k).stats for k in range(repeats)
-    ]
-    seconds = [s["seconds"] for s in stats]
-    paths = stats[0]["paths"]
+    camera, size = thin_camera(loaded), {"samples": samples, "threads": threads, "max_depth": depth}
+    stats = [render(loaded, camera, seed=k, **size).stats for k in range(repeats)]  # type: ignore[arg-type]
+    seconds, paths = [s["seconds"] for s in stats], stats[0]["paths"]
     return {
         "mpaths_per_s": paths / min(seconds) * 1e-6,
         "mpaths_per_s_median": paths / statistics.median(seconds) * 1e-6,
         "seconds_min": min(seconds),
         "seconds_median": statistics.median(seconds),
         "paths": paths,
-        "threads": threads,
-        "max_depth": depth,
         "lanes": LANES if stats[0]["wavelengths"] == "hero" else 1,
     }
 
 
 _BATCH = 32768
+
+
 _MAKERS: dict[str, Callable[..., Primitive]] = {"tree": Mesh, "embree": EmbreeMesh}
 
 
@@ -69,10 +64,8 @@ def measure_meshes(scene: str | Path, repeats: int = 5) -> list[dict[str, float]
     """Nanoseconds a ray for each mesh of a scene: triangles, share of rays that hit, tree, embree (if installed).
 
     Raises:
-        InputError: a scene that cannot be read or has no mesh, a count below 1.
+        InputError: a scene that cannot be read or has no mesh.
     """
-    if repeats < 1:
-        raise InputError("bench", "repeats", repeats, "an integer above 0")
     triangles = load_scene(scene).triangles
     if not triangles:
         raise InputError(scene, "meshes", "(none)", "a scene with a mesh")
@@ -109,32 +102,25 @@ def _rays_around(vertices: NDArray[np.float64]) -> Rays:
     return Rays.of(origin.astype(np.float32), direction.astype(np.float32))
 
 
-ABOUT = """\
-Paths per second of the renderer through a thin lens with the scene's focus and aperture, fastest and
-median of the repeats; with --meshes, instead, nanoseconds per ray of each mesh of the scene."""
+OPTIONS = (
+    lab.option("scene", metavar="SCENE.toml", type=Path, help="scene file"),
+    *(lab.count(n, k, f"default {k}") for n, k in (("threads", 2), ("depth", 3), ("samples", 16), ("repeats", 5))),
+    lab.option("--meshes", action="store_true", help="the scene's meshes, in numpy and in Embree"),
+)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m experiments renderer`."""
-    parser.add_argument("scene", metavar="SCENE.toml", type=Path, help="scene file")
-    for name, default in (("threads", 2), ("depth", 3), ("samples", 16), ("repeats", 5)):
-        parser.add_argument(f"--{name}", metavar="N", type=whole(1), default=default, help=f"default {default}")
-    parser.add_argument("--meshes", action="store_true", help="the scene's meshes, in numpy and in Embree")
-
-
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Print the speeds."""
-    if args.meshes:
-        for row in measure_meshes(args.scene, args.repeats):
-            line = f"{row['triangles']} triangles, {row['hit']:.0%} of rays hit: tree {row['tree']:.0f} ns per ray"
-            if "embree" in row:
-                line += f", Embree {row['embree']:.0f} ns, {row['tree'] / row['embree']:.1f} times as fast"
-            print(line if "embree" in row else f"{line} (Embree is not installed: pip install neurolens[embree])")
-        return 0
-    found = measure(args.scene, args.threads, args.depth, args.samples, args.repeats)
-    print(
-        f"{found['mpaths_per_s']:.2f} Mpath/s fastest, {found['mpaths_per_s_median']:.2f} median "
-        f"({found['paths']} paths of depth {found['max_depth']}, wavelengths each: {found['lanes']}, "
-        f"{found['threads']} threads, {found['seconds_min']:.2f} s fastest, {found['seconds_median']:.2f} s median)"
-    )
-    return 0
+    for row in measure_meshes(args.scene, args.repeats) if args.meshes else ():
+        line = f"{row['triangles']} triangles, {row['hit']:.0%} of rays hit: tree {row['tree']:.0f} ns per ray"
+        more = " (Embree is not installed: pip install neurolens[embree])"
+        if "embree" in row:
+            more = f", Embree {row['embree']:.0f} ns, {row['tree'] / row['embree']:.1f} times as fast"
+        print(line + more)
+    if not args.meshes:
+        found = measure(args.scene, args.threads, args.depth, args.samples, args.repeats)
+        print(
+            f"{found['mpaths_per_s']:.2f} Mpath/s fastest, {found['mpaths_per_s_median']:.2f} median ({found['paths']} "
+            f"paths of depth {args.depth}, wavelengths each: {found['lanes']}, {args.threads} threads, "
+            f"{found['seconds_min']:.2f} s fastest, {found['seconds_median']:.2f} s median)"
+        )

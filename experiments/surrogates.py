@@ -1,4 +1,8 @@
-"""Every method on a set of lenses, or on the whole library: `neurolens bench surrogates` with lenses chosen here."""
+"""Every method on a set of lenses, or on the whole library: `neurolens bench surrogates` with lenses chosen here.
+
+Without LENS: laikin_double_gauss_50 (a standard lens), ogawa_zoom_70_200 (a long zoom), schaefter_primoplan_100 (hard
+for its aperture), horimoto_fisheye_16 and phone_lens_6 (steep aspheres).
+"""
 
 from __future__ import annotations
 
@@ -9,20 +13,13 @@ from neurolens.base.errors import InputError
 from neurolens.commands import bench
 from neurolens.evaluate.describe import lens_files
 
-# A standard lens, a long zoom, one that is hard for its aperture, a fisheye, and one of steep aspheres.
 DEFAULT_LENSES = (
     "laikin_double_gauss_50", "ogawa_zoom_70_200", "schaefter_primoplan_100", "horimoto_fisheye_16", "phone_lens_6"
 )  # fmt: skip
-ABOUT = f"""\\
-{bench.SURROGATES}
-
-Without LENS: {", ".join(DEFAULT_LENSES)}."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m experiments surrogates`: those of `neurolens bench surrogates`, and --library."""
-    bench.add_surrogate_arguments(parser, "*")
-    parser.add_argument("--library", action="store_true", help="every lens file of lenses/")
+OPTIONS = (
+    lambda parser: bench.add_surrogate_arguments(parser, "*"),
+    lab.option("--library", action="store_true", help="every lens file of lenses/"),
+)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,22 +1,21 @@
-"""Speed of the exact tracer alone: eager and compiled, both precisions, by the number of surfaces and of threads.
+"""Rays per second of the exact tracer: eager and compiled, float32 and float64, by number of surfaces and threads.
 
-Rays are made beforehand: film points over the image circle, aimed at the rear rim, wavelengths of their own, blocked
-ones included; tracing tests the stop and every rim and follows dispersion, without transmittance. Candidates run in
-turn, round after round (`speed.race`), so that ratios within a race are fair.
+With two aspheres too, and the memory that it takes. Rays are made beforehand; candidates run in turn, so that ratios
+are fair on a busy machine; absolute figures want a quiet one. Writes trace_speed.md and trace_speed.json.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from experiments import lab
+from experiments.lab import Report, Row
 from neurolens.base import status as st
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import whole
@@ -28,33 +27,25 @@ from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import Rays, compile_trace, trace
 from neurolens.surrogates.domain import FilmRays
 
-# Lens files by number of refractions; the first that is there is taken.
+# Lens files by number of refractions.
 LENSES = {
-    2: "thorlabs_lb1471*",
-    7: "brendel_tessar*",
-    10: "tronnier_double_gauss*",
+    2: "thorlabs_lb1471_biconvex_50",
+    7: "brendel_tessar_100",
+    10: "tronnier_double_gauss_100",
     12: "laikin_double_gauss_50",
-    18: "itoh*",
-    25: "ikemori*",
-    33: "ogawa*",
-    57: "panavision*",
+    18: "itoh_zoom_100_146",
+    25: "ikemori_retrofocus_14",
+    33: "ogawa_zoom_70_200",
+    57: "panavision_anamorphic_zoom_21",
 }
 MAIN = 12  # the double Gauss on which the goals stand, with and without aspheres
 ASPHERIC_SURFACES = (0, 12)  # of that double Gauss: first and last, where aspheres are used
 DTYPES = (torch.float32, torch.float64)
 
 
-def chosen_lenses(folder: Path) -> tuple[dict[int, Lens], list[str]]:
-    """The lenses of the table that have a file, by nominal number of refractions, and what is missing."""
-    found: dict[int, Lens] = {}
-    missing = []
-    for count, pattern in LENSES.items():
-        paths = sorted(folder.glob(f"{pattern}.toml"))
-        if paths:
-            found[count] = read_lens(paths[0]).at()
-        else:
-            missing.append(f"{count} refractions ({pattern}.toml)")
-    return found, missing
+def lens_of(count: int) -> Lens:
+    """The lens of so many refractions."""
+    return read_lens(lab.LENSES / f"{LENSES[count]}.toml").at()
 
 
 def with_aspheres(lens: Lens) -> Lens:
@@ -88,58 +79,40 @@ def launched(lens: Lens, rays: FilmRays, dtype: torch.dtype) -> tuple[Rays, torc
     return Rays(*(c.to(dtype).contiguous() for c in start)), rays.wavelength_nm.to(dtype).contiguous()
 
 
-def candidates(lens: Lens, dtypes: Sequence[torch.dtype] = DTYPES, label: str = "") -> list[Candidate]:
+def candidates(lens: Lens, label: str = "") -> list[Candidate]:
     """The tracer eager and compiled in each precision, named "{label}eager float32" and so on."""
+    fast = compile_trace(lens)
     found = []
-    for dtype in dtypes:
+    for dtype in DTYPES:
+
+        def eager(rays: FilmRays, dtype: torch.dtype = dtype) -> Call:
+            given = launched(lens, rays, dtype)
+            return lambda: trace(lens, *given)
+
+        def compiled(rays: FilmRays, dtype: torch.dtype = dtype) -> Call:
+            given = launched(lens, rays, dtype)
+            try:
+                fast(*given)
+            except Exception as error:  # torch raises its own kinds: no compiler, or one that fails
+                raise Unavailable(f"torch cannot compile here: {type(error).__name__}") from error
+            return lambda: fast(*given)
+
         name = str(dtype).removeprefix("torch.")
-        found.append(Candidate(f"{label}eager {name}", _eager(lens, dtype), EAGER_BATCHES))
-        found.append(Candidate(f"{label}compiled {name}", _compiled(lens, dtype), COMPILED_BATCHES))
+        found.append(Candidate(f"{label}eager {name}", eager, EAGER_BATCHES))
+        found.append(Candidate(f"{label}compiled {name}", compiled, COMPILED_BATCHES))
     return found
 
 
-def _eager(lens: Lens, dtype: torch.dtype) -> Callable[[FilmRays], Call]:
-    def prepare(rays: FilmRays) -> Call:
-        given = launched(lens, rays, dtype)
-        return lambda: trace(lens, *given)
-
-    return prepare
+ASPHERES = "aspheres, "
 
 
-def _compiled(lens: Lens, dtype: torch.dtype) -> Callable[[FilmRays], Call]:
-    fast = compile_trace(lens)
-
-    def prepare(rays: FilmRays) -> Call:
-        given = launched(lens, rays, dtype)
-        try:
-            fast(*given)
-        except Exception as error:  # torch raises its own kinds: no compiler, or one that fails
-            raise Unavailable(f"torch cannot compile here: {type(error).__name__}") from error
-        return lambda: fast(*given)
-
-    return prepare
-
-
-def time_lens(
-    lens: Lens,
-    threads: Sequence[int],
-    rounds: int,
-    *,
-    aspheric: Lens | None = None,
-    dtypes: Sequence[torch.dtype] = DTYPES,
-    report: Callable[[float], None] = lambda share: None,
-) -> list[dict[str, Any]]:
+def time_lens(lens: Lens, threads: Sequence[int], rounds: int, report: Report, aspheric: Lens | None) -> list[Row]:
     """Race the tracer on one lens, and beside it on one with aspheres, a race per thread count, compiled once.
 
     Returns: rows with units in their keys.
-
-    Raises:
-        InputError: as of `race`.
     """
     rays = film_rays(lens)
-    field = candidates(lens, dtypes)
-    if aspheric is not None:
-        field += candidates(aspheric, dtypes, "aspheres, ")
+    field = candidates(lens) + (candidates(aspheric, ASPHERES) if aspheric is not None else [])
     share = float((trace(lens, *launched(lens, rays, torch.float32)).status == st.PASSED).double().mean())
     rows = []
     for i, count in enumerate(threads):
@@ -152,14 +125,14 @@ def time_lens(
     return rows
 
 
-def _row(name: str, lens: Lens, timed: Race, passing: float) -> dict[str, Any]:
-    aspheres = len(ASPHERIC_SURFACES) if name.startswith("aspheres, ") else sum(bool(s.asphere) for s in lens.surfaces)
-    kind, dtype = name.removeprefix("aspheres, ").split()
-    row: dict[str, Any] = {
+def _row(name: str, lens: Lens, timed: Race, passing: float) -> Row:
+    aspheric = name.startswith(ASPHERES)
+    kind, dtype = name.removeprefix(ASPHERES).split()
+    row: Row = {
         "lens": Path(lens.path).stem,
         "refractions": lens.refractions,
         "surfaces": len(lens.surfaces),
-        "aspheres": aspheres,
+        "aspheres": len(ASPHERIC_SURFACES) if aspheric else sum(bool(s.asphere) for s in lens.surfaces),
         "cylinders": sum(s.cylinder is not None for s in lens.surfaces),
         "kind": kind,
         "dtype": dtype,
@@ -171,13 +144,12 @@ def _row(name: str, lens: Lens, timed: Race, passing: float) -> dict[str, Any]:
     timing = timed.timing(name)
     if timing is not None:
         row |= {"ns_min": timing["min"], "ns_median": timing["median"], "batch": timing["batch"]}
-    if name.startswith("aspheres, "):
-        slower = timed.speedup(name.removeprefix("aspheres, "), name)
-        row["over_spheres"] = slower  # times as long as the spherical lens, in the same race
+    if aspheric:  # times as long as the spherical lens, in the same race
+        row["over_spheres"] = timed.speedup(name.removeprefix(ASPHERES), name)
     return row
 
 
-def goals(rows: Sequence[dict[str, Any]]) -> list[lab.Goal]:
+def goals(rows: Sequence[Row]) -> list[lab.Goal]:
     """Goals of the tracer, for the main lens on one thread in float32."""
     main = [r for r in rows if r["threads"] == 1 and r["refractions"] == MAIN and r["dtype"] == "float32"]
     found = []
@@ -191,10 +163,12 @@ def goals(rows: Sequence[dict[str, Any]]) -> list[lab.Goal]:
 
 
 SIZES = (100_000, 1_000_000, 10_000_000)
+
+
 _PART = 65536
 
 
-def memory_of(lens_file: str, count: int) -> dict[str, Any]:
+def memory_of(lens_file: str, count: int) -> Row:
     """Trace `count` float32 rays, in a fresh process.
 
     Returns: rays, results_mb (the tensors that come out), growth_mb (highest resident memory while tracing, less that
@@ -211,7 +185,7 @@ def memory_of(lens_file: str, count: int) -> dict[str, Any]:
     return {"rays": count, "results_mb": results, "growth_mb": grown, "working_mb": grown - results}
 
 
-def _rays(lens: Any, count: int) -> tuple[Rays, torch.Tensor]:
+def _rays(lens: Lens, count: int) -> tuple[Rays, torch.Tensor]:
     """Float32 rays, the same few again and again, made without temporaries of their size."""
     start, wavelength = launched(lens, film_rays(lens, _PART), torch.float32)
     columns = [torch.empty(count) for _ in range(7)]
@@ -221,11 +195,18 @@ def _rays(lens: Any, count: int) -> tuple[Rays, torch.Tensor]:
     return Rays(*columns[:6]), columns[6]
 
 
-NOTES = """\
+_NOTES = """\
 Rays made beforehand: film points over the image circle, aimed at the rear rim, 400 to 700 nm, a wavelength each;
 blocked rays are traced like the others. Stop, every rim, total reflection and dispersion; no transmittance. Best and
 median of {rounds} rounds in turn (A B .. B A), each the best of a few short samples; more threads than one share out
 batches. A refraction is a surface at which the medium changes."""
+_MEMORY = "Memory of one call of `trace` (12 refractions, float32, one thread), each size in a process of its own:"
+_MEMORY_COLUMNS = lab.columns(
+    ("rays", "rays", ","),
+    ("results, MB", "results_mb", ".1f"),
+    ("growth of resident memory, MB", "growth_mb", ".1f"),
+    ("tracing itself, MB", "working_mb", ".1f"),
+)
 
 
 @dataclass
@@ -234,112 +215,83 @@ class Found:
 
     Attributes:
         rows: of `time_lens`. memory: of `memory_of`.
-        missing: lenses without a file, and what could not be measured, as sentences.
+        missing: what could not be measured, as sentences.
     """
 
     rounds: int
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    memory: list[dict[str, Any]] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
+    memory: list[Row] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
 
-
-def write(found: Found, folder: Path) -> None:
-    """Write trace_speed.md and trace_speed.json, each whole or not at all."""
-    data = {
-        "machine": lab.machine(),
-        "rounds": found.rounds,
-        "rows": found.rows,
-        "memory": found.memory,
-        "goals": [g.to_dict() for g in goals(found.rows)],
-        "missing": found.missing,
-    }
-    lab.write_results(folder, "trace_speed", page(found), data)
+    def write(self, folder: Path) -> str:
+        """Write trace_speed.md and trace_speed.json, each whole or not at all; returns the page."""
+        told = {"machine": lab.machine(), "rounds": self.rounds, "rows": self.rows, "memory": self.memory}
+        told |= {"goals": [g.to_dict() for g in goals(self.rows)], "missing": self.missing}
+        return lab.write_results(folder, "trace_speed", page(self), told)
 
 
 def page(found: Found) -> str:
     """The whole page."""
-    parts = ["# The exact tracer", "`python -m experiments trace`", _conditions(found)]
-    parts += [lab.goal_table("goal (12 refractions, float32, one thread)", goals(found.rows)), speed_table(found.rows)]
-    if found.memory:
-        parts.append(memory_table(found.memory))
-    if found.missing:
-        parts.append("Not measured: " + "; ".join(found.missing) + ".")
-    return "\n\n".join(parts) + "\n"
-
-
-def _conditions(found: Found) -> str:
-    m = lab.machine()
-    loads = [v for row in found.rows for v in row["load"] if v is not None]
-    busy = f" Load average meanwhile up to {max(loads):.1f}." if loads else ""
-    return f"{NOTES.format(rounds=found.rounds)}\n\n{lab.machine_line(', ' + m['vectors'])}{busy}"
-
-
-def speed_table(rows: Sequence[dict[str, Any]]) -> str:
-    """One line per lens and thread count; Mray/s by the best time (by the median)."""
-    kinds = [(kind, dtype) for dtype in ("float32", "float64") for kind in ("eager", "compiled")]
-    kinds = [k for k in kinds if any((r["kind"], r["dtype"]) == k for r in rows)]
-    columns = ["lens", "refractions", "aspheres", "cylinders", "threads", *(f"{k} {d}, Mray/s" for k, d in kinds), ""]
-    lines = []
-    groups: dict[tuple[Any, ...], dict[tuple[str, str], dict[str, Any]]] = {}
-    for r in rows:
-        key = (r["lens"], r["refractions"], r["aspheres"], r["cylinders"], r["threads"])
-        groups.setdefault(key, {})[r["kind"], r["dtype"]] = r
-    for key, cells in groups.items():
-        aspheric = [(k, c) for k, d in kinds if (c := cells.get((k, d))) and c.get("over_spheres")]
-        ratios = [f"{k} {c['over_spheres']['min']:.2f}" for k, c in aspheric]
-        note = f"times as long as spheres: {', '.join(ratios)}" if ratios else ""
-        lines.append([*key, *(_speed(cells.get(k)) for k in kinds), note])
-    return lab.table(columns, lines)
-
-
-def _speed(row: dict[str, Any] | None) -> str:
-    if row is None or "ns_min" not in row:
-        return row["reason"] or "" if row is not None else ""
-    return f"{1000 / row['ns_min']:.2f} ({1000 / row['ns_median']:.2f})"
-
-
-def memory_table(memory: Sequence[dict[str, Any]]) -> str:
-    """Memory beyond rays and results."""
-    note = "Memory of one call of `trace` (12 refractions, float32, one thread), each size in a process of its own:"
-    rows = [[f"{m['rays']:,}", *(f"{m[key]:.1f}" for key in ("results_mb", "growth_mb", "working_mb"))] for m in memory]
-    return f"{note}\n\n{lab.table('rays|results, MB|growth of resident memory, MB|tracing itself, MB', rows)}"
-
-
-ABOUT = """\
-Rays per second of the exact tracer: eager and compiled, float32 and float64, by number of
-surfaces and threads, with two aspheres, and the memory that it takes. Candidates run in turn,
-so that ratios are fair on a busy machine; absolute figures want a quiet one.
-Writes trace_speed.md and trace_speed.json."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m experiments trace`."""
-    parser.add_argument("--quick", action="store_true", help="12 refractions on one thread, few rounds (a minute)")
-    lab.add_only(parser)
-    parser.add_argument(
-        "--threads", metavar="N", type=whole(1), nargs="+", default=[1, 2], help="thread counts (default: 1 2)"
+    load = lab.most_load(found.rows)
+    machine = lab.machine_line(f", {lab.machine()['vectors']}")
+    return lab.page(
+        "# The exact tracer",
+        "`python -m experiments trace`",
+        _NOTES.format(rounds=found.rounds),
+        machine + ("" if load is None else f" Load average meanwhile up to {load:.1f}."),
+        lab.goal_table("goal (12 refractions, float32, one thread)", goals(found.rows)),
+        speed_table(found.rows),
+        f"{_MEMORY}\n\n{lab.table(_MEMORY_COLUMNS, found.memory)}" if found.memory else "",
+        f"Not measured: {'; '.join(found.missing)}." if found.missing else "",
     )
-    parser.add_argument("--rounds", metavar="N", type=whole(1), help="rounds (default 20; quick 5)")
-    lab.add_out(parser)
 
 
-def run(args: argparse.Namespace) -> int:
+def speed_table(rows: Sequence[Row]) -> str:
+    """One line per lens and thread count; Mray/s by the best time (by the median)."""
+    keys = ("lens", "refractions", "aspheres", "cylinders", "threads")
+    kinds = [f"{kind} {dtype}" for dtype in ("float32", "float64") for kind in ("eager", "compiled")]
+    lines: dict[tuple[object, ...], Row] = {}
+    for r in rows:
+        lines.setdefault(tuple(r[k] for k in keys), {})[f"{r['kind']} {r['dtype']}"] = r
+
+    def speed(cells: Row, kind: str) -> str:
+        row = cells.get(kind, {})
+        if "ns_min" in row:
+            return lab.best_median(1000 / row["ns_min"], 1000 / row["ns_median"])
+        return row.get("reason") or ""
+
+    def note(cells: Row) -> str:
+        aspheric = [cells[k] for k in kinds if cells.get(k, {}).get("over_spheres")]
+        ratios = [f"{r['kind']} {r['over_spheres']['min']:.2f}" for r in aspheric]
+        return f"times as long as spheres: {', '.join(ratios)}" if ratios else ""
+
+    kinds = [kind for kind in kinds if any(kind in cells for cells in lines.values())]
+    cells = [[*key, *(speed(found, kind) for kind in kinds), note(found)] for key, found in lines.items()]
+    return lab.table([*keys, *(f"{kind}, Mray/s" for kind in kinds), ""], cells)
+
+
+OPTIONS = (
+    lab.option("--quick", action="store_true", help="12 refractions on one thread, few rounds (a minute)"),
+    lab.ONLY,
+    lab.option("--threads", metavar="N", type=whole(1), nargs="+", default=[1, 2], help="counts (default: 1 2)"),
+    lab.ROUNDS,
+    lab.out(),
+)
+
+
+def run(args: argparse.Namespace) -> None:
     """Time the tracer, lens by lens; the table is written after each."""
     lab.quiet_glasses()
-    lenses, missing = chosen_lenses(lab.LENSES)
-    lenses = {MAIN: lenses[MAIN]} if args.quick else lenses
-    lenses = {n: lenses[n] for n in lab.chosen(list(lenses), lambda n: Path(lenses[n].path).stem, args.only, "trace")}
-    rounds = args.rounds or (5 if args.quick else 20)
-    found = Found(rounds, missing=[] if args.quick or args.only else missing)
+    counts = lab.chosen([MAIN] if args.quick else list(LENSES), lambda n: LENSES[n], args.only, "trace")
+    lenses, found = {n: lens_of(n) for n in counts}, Found(lab.rounds_of(args))
     threads = args.threads[:1] if args.quick else args.threads
-    stages = {n: f"{n} refractions" for n in lenses}
-    plan = {stages[n]: (2.0 if n == MAIN else 1.0) * (8 + n + n * len(threads)) for n in lenses} | {"memory": 10.0}
-    progress = Progress(plan, quiet=args.quiet)
+    plan = {f"{n} refractions": (2.0 if n == MAIN else 1.0) * (8 + n + n * len(threads)) for n in lenses}
+    progress = Progress(plan | {"memory": 10.0}, quiet=args.quiet)
     for n, lens in lenses.items():
-        with progress.stage(stages[n]) as report:
+        with progress.stage(f"{n} refractions") as report:
             aspheric = with_aspheres(lens) if n == MAIN else None
-            found.rows += time_lens(lens, threads, rounds, aspheric=aspheric, report=report)
-        write(found, args.out)
+            found.rows += time_lens(lens, threads, found.rounds, report, aspheric)
+        text = found.write(args.out)
     if MAIN in lenses:
         with progress.stage("memory") as report:
             try:
@@ -348,6 +300,5 @@ def run(args: argparse.Namespace) -> int:
                     report((i + 1) / len(SIZES))
             except lab.Unmeasured as reason:
                 found.missing.append(str(reason))
-        write(found, args.out)
-    print(page(found))
-    return 0
+        text = found.write(args.out)
+    print(text)

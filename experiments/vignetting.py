@@ -1,21 +1,23 @@
-"""Vignetting of the library's surrogates: false passes and blocks at several openings, and relative illumination.
+"""False passes and false blocks of one surrogate a lens, and how far its illumination is from the exact lens's.
 
-One fit per lens and domain serves every opening. The exact lens closed by some stops, or with blades, passes what it
-passes open and what crosses the stop within the smaller opening; so does the model, by its own stop crossing, as
-cameras test it outside the graph.
+Open, closed by two and four stops, and with blades, over every lens that is round about its axis (some minutes of one
+core); rows of an earlier run stay where a lens is not chosen. One fit per lens and domain serves every opening: the
+exact lens closed by some stops passes what it passes open and what crosses the stop within the smaller opening; so does
+the model, by its own stop crossing, as cameras test it outside the graph.
+Writes vignetting.md, vignetting.json and vignetting.png (cat's eyes, exact and of the model).
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import statistics
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -23,11 +25,11 @@ import torch
 from torch import Tensor
 
 from experiments import lab
+from experiments.lab import Row
 from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import whole
 from neurolens.evaluate.describe import lens_files, read_quietly
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
 from neurolens.evaluate.vignetting import SEED, false_shares, relative_illumination
@@ -63,20 +65,28 @@ def model_of(file: Path, choice: DomainChoice) -> tuple[LensModel, float, float]
     return model, len(pairs.train) / pairs.tested, time.perf_counter() - start
 
 
-def opening_errors(lens: Lens, model: LensModel, count: int, seed: int = SEED) -> dict[str, dict[str, float | None]]:
+def opening_errors(lens: Lens, model: LensModel, count: int, seed: int = SEED) -> dict[str, Row]:
     """false_pass, false_block and the rays that pass the exact lens, by name of `OPENINGS`; one fit, one trace."""
-    right: dict[str, list[Tensor]] = {name: [] for name in OPENINGS}
-    said: dict[str, list[Tensor]] = {name: [] for name in OPENINGS}
-    stop = lens.stop_index
+    found: dict[str, list[tuple[Tensor, Tensor]]] = {name: [] for name in OPENINGS}
     for start in range(0, count, _BATCH):
         rays = sample_domain(model.domain, min(_BATCH, count - start), seed, start)
-        exact, found = trace_pairs(lens, rays, model.domain.pupil_z_mm), model.predict(rays)
-        for name in OPENINGS:
-            open_ = _within(exact.cross_x[stop], exact.cross_y[stop], model.domain, name)
-            right[name].append((exact.status == st.PASSED) & open_)
-            said[name].append((found.status == st.PASSED) & _within(found.stop_x, found.stop_y, model.domain, name))
-    joined = {name: (torch.cat(right[name]), torch.cat(said[name])) for name in OPENINGS}
+        for name, both in passing(lens, model, rays).items():
+            found[name].append(both)
+    joined = {name: [torch.cat(parts) for parts in zip(*both, strict=True)] for name, both in found.items()}
     return {name: {**false_shares(a, b), "passing": int(a.sum())} for name, (a, b) in joined.items()}
+
+
+def passing(lens: Lens, model: LensModel, rays: FilmRays) -> dict[str, tuple[Tensor, Tensor]]:
+    """Which rays pass the exact lens, and which the model says do, by name of `OPENINGS`."""
+    exact, said = trace_pairs(lens, rays, model.domain.pupil_z_mm), model.predict(rays)
+    x, y = exact.cross_x[lens.stop_index], exact.cross_y[lens.stop_index]
+    return {
+        name: (
+            (exact.status == st.PASSED) & _within(x, y, model.domain, name),
+            (said.status == st.PASSED) & _within(said.stop_x, said.stop_y, model.domain, name),
+        )
+        for name in OPENINGS
+    }
 
 
 def _within(x: Tensor, y: Tensor, domain: Domain, name: str) -> Tensor:
@@ -108,32 +118,6 @@ def measure(file: Path, domain: str, rays: int) -> dict[str, Any]:
     return row
 
 
-def measure_all(
-    files: Sequence[Path], domains: Sequence[str], rays: int, folder: Path, report: Callable[[float], None]
-) -> list[dict[str, Any]]:
-    """Measure and write after every lens; rows of other lenses in the folder's vignetting.json stay.
-
-    Returns all rows.
-
-    Raises:
-        InputError: a vignetting.json that holds something else.
-    """
-    target = folder / "vignetting.json"
-    try:
-        known = json.loads(target.read_text(encoding="utf-8")) if target.exists() else []
-        rows = {(r["lens"], r["domain"]): r for r in known}
-    except (ValueError, KeyError, TypeError) as error:
-        expected = "rows of experiments vignetting"
-        raise InputError(target, "file", f"({type(error).__name__})", expected) from error
-    jobs = [(file, domain) for file in files for domain in domains]
-    for i, (file, domain) in enumerate(jobs):
-        rows[file.stem, domain] = measure(file, domain, rays)
-        done = sorted(rows.values(), key=lambda r: (r["domain"], r["lens"]))
-        lab.write_results(folder, "vignetting", page(done), done)
-        report((i + 1) / len(jobs))
-    return sorted(rows.values(), key=lambda r: (r["domain"], r["lens"]))
-
-
 _INTRO = """\
 # Vignetting of surrogates
 
@@ -144,49 +128,52 @@ by two with six straight blades. *Light*: largest difference of the relative ill
 percent of the exact value on the axis. *Passing*: share of the disc's rays that pass. *Terms*: monomials computed for
 all outputs.
 """
-_ABOUT = {
+_TITLES = {
     "infinity": "Focused at infinity, 400-700 nm",
     "default": "Focused from infinity to the near limit, 380-780 nm or as far as the glasses are stated (the default)",
 }
 
 
-def page(rows: Sequence[dict[str, Any]]) -> str:
+Choose = Callable[[list[float]], float]
+
+
+def _percent(values: Iterable[float | None], choose: Choose) -> str:
+    known = [v for v in values if v is not None]  # None where no ray counts
+    return f"{100 * choose(known):.3f}" if known else "-"
+
+
+def _errors(opening: str, rows: Sequence[Row], choose: Choose) -> str:
+    """Both shares of an opening, chosen from the rows'."""
+    return " / ".join(
+        _percent((r["openings"][opening][k] for r in rows), choose) for k in ("false_pass", "false_block")
+    )
+
+
+_CHOSEN: dict[str, Callable[[Sequence[Row], Choose], str]] = {n: partial(_errors, n) for n in OPENINGS}
+_CHOSEN["light"] = lambda rows, choose: _percent((r["illumination"]["max_difference"] for r in rows), choose)
+_COLUMNS = lab.columns(
+    ("lens", "lens"),
+    *((title, lambda r, cell=cell: cell([r], max)) for title, cell in _CHOSEN.items()),
+    ("passing", lambda r: f"{100 * r['passing_share']:.0f}%"),
+    ("gates", "gates"),
+    ("terms", "monomials"),
+    ("s", "seconds", ".1f"),
+)
+
+
+def page(rows: Sequence[Row]) -> str:
     """The tables in Markdown, with the median and the worst of each column."""
     parts = [_INTRO]
-    for domain, title in _ABOUT.items():
+    for domain, title in _TITLES.items():
         mine = [r for r in rows if r["domain"] == domain]
         good = [r for r in mine if "failed" not in r]
-        if not mine:
-            continue
-        head = ["lens", *OPENINGS, "light", "passing", "gates", "terms", "s"]
-        lines = [_line(r) for r in good]
-        for name, choose in (("**median**", statistics.median), ("**worst**", max)):
-            if good:
-                lines.append(_summary(name, choose, good))
+        lines = [[c.cell(r) for c in _COLUMNS] for r in good]
+        for name, choose in (("**median**", median), ("**worst**", max)) if good else ():
+            lines.append([name, *(cell(good, choose) for cell in _CHOSEN.values()), *[""] * 4])
         failed = [f"- {r['lens']}: {r['failed']}" for r in mine if "failed" in r]
-        parts.append("\n".join([f"## {title}\n", lab.table(head, lines), *failed]) + "\n")
-    return "\n".join(parts)
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.3f}"
-
-
-def _line(row: dict[str, Any]) -> list[str]:
-    pairs = [f"{_percent(o['false_pass'])} / {_percent(o['false_block'])}" for o in row["openings"].values()]
-    light = _percent(row["illumination"]["max_difference"])
-    rest = [f"{100 * row['passing_share']:.0f}%", str(row["gates"]), str(row["monomials"]), f"{row['seconds']:.1f}"]
-    return [row["lens"], *pairs, light, *rest]
-
-
-def _summary(name: str, choose: Callable[[list[float]], float], rows: Sequence[dict[str, Any]]) -> list[str]:
-    cells = []
-    for opening in OPENINGS:
-        both = ([r["openings"][opening][k] for r in rows] for k in ("false_pass", "false_block"))
-        known = ([v for v in values if v is not None] for values in both)  # None where no ray counts
-        cells.append(" / ".join(_percent(choose(values) if values else None) for values in known))
-    cells.append(_percent(choose([r["illumination"]["max_difference"] for r in rows])))
-    return [name, *cells, "", "", "", ""]
+        made = lab.table([c.title for c in _COLUMNS], lines)
+        parts += [f"## {title}", "\n".join([made, *failed])] if mine else []
+    return lab.page(*parts)
 
 
 _RADII = (0.0, 0.4, 0.7, 0.9, 1.0)  # shares of the film radius
@@ -211,20 +198,22 @@ def cats_eyes(models: Sequence[LensModel], path: Path) -> Path:
 
 
 def _draw(axes: Any, model: LensModel, share: float) -> None:
-    u, v, exact, said = pupil_masks(model, share)
+    u, v, masks = pupil_masks(model, share)
     for k, name in enumerate(_SHOWN):
-        if exact[name].any():
+        exact, said = masks[name]
+        if exact.any():
             fill = _EXACT if k == 0 else FIELD_COLOURS[0]
-            axes.contourf(u, v, exact[name].astype(float), levels=[0.5, 2.0], colors=[fill], alpha=1.0 - 0.55 * k)
-        if said[name].any():
-            axes.contour(u, v, said[name].astype(float), levels=[0.5], colors=[_MODEL], linewidths=0.9)
+            axes.contourf(u, v, exact.astype(float), levels=[0.5, 2.0], colors=[fill], alpha=1.0 - 0.55 * k)
+        if said.any():
+            axes.contour(u, v, said.astype(float), levels=[0.5], colors=[_MODEL], linewidths=0.9)
     axes.set_aspect("equal")
     axes.tick_params(labelsize=6, colors=INK)
 
 
-def pupil_masks(
-    model: LensModel, share: float, points: int = _POINTS
-) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
+Masks = dict[str, tuple[np.ndarray, np.ndarray]]
+
+
+def pupil_masks(model: LensModel, share: float, points: int = _POINTS) -> tuple[np.ndarray, np.ndarray, Masks]:
     """Grids u and v [points, points] of the pupil plane, mm, and what passes there, exact and by the model.
 
     From a film point at `share` of the film radius along +x, on the first film plane, at the middle wavelength; masks
@@ -241,48 +230,40 @@ def pupil_masks(
     film_x = torch.full_like(u, share * d.film_radius_mm)
     wavelength = torch.full_like(u, sum(d.wavelength_nm) / 2)
     rays = FilmRays(film_x, torch.zeros_like(u), torch.full_like(u, d.film_z_mm[0]), u, v, wavelength)
-    traced, found, stop = trace_pairs(model.lens, rays, d.pupil_z_mm), model.predict(rays), model.lens.stop_index
-    exact: dict[str, np.ndarray] = {}
-    said: dict[str, np.ndarray] = {}
-    for name, (closed, blades) in OPENINGS.items():
-        radius = d.stop_radius_mm / math.sqrt(2) ** closed
-        both = (
-            (exact, traced.status, traced.cross_x[stop], traced.cross_y[stop]),
-            (said, found.status, found.stop_x, found.stop_y),
-        )
-        for masks, status, x, y in both:
-            within = x * x + y * y <= radius**2 if blades is None else torch.as_tensor(blades.inside(x, y, radius))
-            masks[name] = ((status == st.PASSED) & within).reshape(points, points).numpy()
-    return u.reshape(points, points).numpy(), v.reshape(points, points).numpy(), exact, said
+
+    def shaped(values: Tensor) -> np.ndarray:
+        return values.reshape(points, points).numpy()
+
+    masks = {k: (shaped(exact), shaped(said)) for k, (exact, said) in passing(model.lens, model, rays).items()}
+    return shaped(u), shaped(v), masks
 
 
-ABOUT = """\
-False passes and false blocks of one surrogate a lens: open, closed by two and four stops, and with
-blades; and how far its relative illumination is from the exact lens's. Over every lens that is round
-about its axis (some minutes of one core). Rows of an earlier run stay where a lens is not chosen.
-Writes vignetting.md, vignetting.json and vignetting.png (cat's eyes, exact and of the model)."""
 _DRAWN = ("laikin_double_gauss_50", "tajima_retrofocus_24", "isshiki_fisheye_10", "shimizu_fisheye_220")
+OPTIONS = (
+    lab.count("rays", 100_000, "a lens (default 100000)", 1000),
+    lab.ONLY,
+    lab.option("--domain", choices=("infinity", "default"), help="one of the two domains (default: both)"),
+    lab.option("--lenses", metavar="DIR", type=Path, default=lab.LENSES, help="lens files (default: lenses)"),
+    lab.out(),
+)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m experiments vignetting`."""
-    parser.add_argument("--rays", metavar="N", type=whole(1000), default=100_000, help="a lens (default 100000)")
-    lab.add_only(parser)
-    parser.add_argument("--domain", choices=("infinity", "default"), help="one of the two domains (default: both)")
-    parser.add_argument("--lenses", metavar="DIR", type=Path, default=lab.LENSES, help="lens files (default: lenses)")
-    lab.add_out(parser)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Measure the lenses, draw four of them."""
+def run(args: argparse.Namespace) -> None:
+    """Measure the lenses, draw four of them; the table is written after each."""
     files = [f for f in lens_files(args.lenses) if args.only in f.stem and not read_quietly(f).anamorphic]
     if not files:
         raise InputError("experiments vignetting", "--only", args.only, f"part of a lens's name in {args.lenses}")
-    domains = [args.domain] if args.domain else list(DOMAINS)
+    jobs = [(file, domain) for file in files for domain in ([args.domain] if args.domain else DOMAINS)]
+    target = args.out / "vignetting.json"
+    rows = lab.kept_rows(target, "experiments vignetting", lambda r: (r["domain"], r["lens"]))
+    text = ""
     with Progress(quiet=args.quiet).stage("vignetting") as report:
-        rows = measure_all(files, domains, args.rays, args.out, lambda share: report(0.9 * share))
+        for i, (file, domain) in enumerate(jobs):
+            rows[domain, file.stem] = measure(file, domain, args.rays)
+            done = [rows[key] for key in sorted(rows)]
+            text = lab.write_results(args.out, "vignetting", page(done), done)
+            report(0.9 * (i + 1) / len(jobs))
         drawn = [f for f in files if f.stem in _DRAWN] or files[:1]
         if not args.only or not (args.out / "vignetting.png").exists():
             cats_eyes([model_of(f, DOMAINS["infinity"])[0] for f in drawn], args.out / "vignetting.png")
-    print(page(rows))
-    return 0
+    print(text)

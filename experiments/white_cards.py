@@ -1,71 +1,156 @@
-r"""White surroundings through the 14 mm fisheye at f/4, rendered four ways: flat, cos^4, effective aperture, both.
+"""Light on the film: its factors for four lenses, and a white card through the 14 mm fisheye four ways.
 
-    python experiments/white_cards.py [--samples 64] [--threads 2]
+The four ways are flat, cos^4, effective aperture, and both. From the integral over the pupil that knows nothing of
+cameras (`neurolens.optics.radiometry`), and as rendered, by this, X being none, natural, optical or both:
 
-Each card is what this renders, X being none, natural, optical or both:
+    neurolens render experiments/scenes/white.toml --camera lenses/muller_fisheye_100.toml --efl 14 --vignetting X
 
-    neurolens render experiments/scenes/white.toml --camera lenses/muller_fisheye_100.toml --efl 14 \
-        --vignetting X -o X.exr
-
-Means over rings of the pictures stand beside the integral over the pupil that knows nothing of cameras
-(`neurolens.optics.radiometry`). Writes white_cards.md and white_cards.png to experiments/results/.
+Writes film_light.json, film_light.png and white_card.png; white_cards.md and white_cards.png, where means over rings of
+the pictures stand beside the integral.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
-import time
-import warnings
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from neurolens.base.errors import NeurolensWarning
+from experiments import lab
+from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing
 from neurolens.base.files import atomic_write_text
+from neurolens.base.progress import Progress
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.optics.lensfile import read_lens
-from neurolens.optics.radiometry import film_light, white_card
+from neurolens.optics.radiometry import FilmLight, film_light, white_card
 from neurolens.render.pictures import write_png
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
 
-ROOT = Path(__file__).parents[1]
-OUT = ROOT / "experiments" / "results"
-LENS, EFL_MM, F_NUMBER = ROOT / "lenses" / "muller_fisheye_100.toml", 14.0, 4.0
-CARDS = {"none": "flat", "natural": "cos4", "optical": "aperture", "both": "both"}
-LIT_MM = 18.83  # where the light of this lens ends
+LENSES = {
+    "Double Gauss 50 mm f/1.8": ("laikin_double_gauss_50", 50.0, None),
+    "Tessar 50 mm f/4": ("brendel_tessar_100", 50.0, 4.0),
+    "Müller fisheye 14 mm f/4": ("muller_fisheye_100", 14.0, 4.0),
+    "Takahashi retrofocus 18 mm f/2.8": ("takahashi_retrofocus_100", 18.0, 2.8),
+}
+CARD = "Müller fisheye 14 mm f/4"
+FACTORS = ("relative", "natural", "aperture", "optical", "mechanical", "transmittance", "area_mm2")
+WAYS = {"none": "flat", "natural": "cos4", "optical": "aperture", "both": "both"}  # --vignetting to `white_card`'s
+LIT_MM = 18.83  # where the light of the card's lens ends
 PLACES = {"centre": 0.0, "half the lit radius": 0.5, "nine tenths": 0.9, "98%": 0.98}
 
 
-def main() -> None:
-    """Render, compare and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--samples", type=int, default=64)
-    parser.add_argument("--threads", type=int, default=2)
-    args = parser.parse_args()
-    warnings.simplefilter("ignore", NeurolensWarning)
-    scene = load_scene(ROOT / "experiments" / "scenes" / "white.toml")
-    shot = scene.settings.camera
+def light_of(name: str, radius_mm: Any) -> FilmLight:
+    """Of one of `LENSES`."""
+    stem, mm, f_number = LENSES[name]
+    return film_light(read_lens(lab.LENSES / f"{stem}.toml").at(focal_length_mm=mm, f_number=f_number), radius_mm)
+
+
+_FACTORS = {
+    "natural": "natural: mean cos⁴",
+    "aperture": "area left by the stop",
+    "optical": "left by the rims of glass",
+    "mechanical": "left by hoods and rings",
+    "transmittance": "transmittance",
+}
+_WAYS = {
+    "flat": "every ray counts the same",
+    "cos4": "cos⁴ only",
+    "aperture": "effective aperture only",
+    "both": "both: what the film sees",
+}
+_PIXELS = 360  # across the white card
+
+
+def film_light_picture(lights: Mapping[str, FilmLight], path: Path) -> Path:
+    """Relative illumination and its factors, each over its value on the axis, a column for every lens named."""
+    with drawing(path, 3.3 * len(lights), 3.5) as figure:
+        columns = figure.subplots(1, len(lights), sharey=True, squeeze=False)[0]
+        for axes, (name, light) in zip(columns, lights.items(), strict=True):
+            lit = light.irradiance > 0
+            for (factor, label), colour in zip(_FACTORS.items(), FIELD_COLOURS, strict=False):
+                values = getattr(light, factor)
+                axes.plot(light.radius_mm[lit], values[lit] / values[0], color=colour, lw=1.4, label=label)
+            axes.plot(light.radius_mm[lit], light.relative[lit], color=INK, lw=2.4, label="relative illumination")
+            axes.set(xlabel="film radius (mm)", ylim=(0, 1.18), xlim=(0, light.radius_mm.max()))
+            axes.set_title(name, loc="left")
+            axes.grid(axis="y")
+        columns[0].set_ylabel("over the axis")
+        columns[0].legend(loc="lower left", fontsize=7.8)
+    return Path(path)
+
+
+def white_card_picture(light: FilmLight, film_mm: tuple[float, float], title: str, path: Path) -> Path:
+    """A white card seen in four ways (`white_card`), grey linear in the light, with its fall along +x drawn over it."""
+    width, height = film_mm
+    y, x = np.mgrid[0 : round(_PIXELS * height / width), 0:_PIXELS]
+    radius = np.hypot((x + 0.5) / _PIXELS * width - width / 2, (y + 0.5) / _PIXELS * width - height / 2)
+    with drawing(path, 8.4, 6.6) as figure:
+        for axes, (way, values) in zip(figure.subplots(2, 2).flat, white_card(light).items(), strict=True):
+            picture = np.interp(radius, light.radius_mm, values, right=0)
+            shown = axes.imshow(
+                picture,
+                cmap="gray",
+                vmin=0,
+                vmax=1.1,
+                extent=(-width / 2, width / 2, -height / 2, height / 2),
+                interpolation="nearest",
+            )
+            axes.set_title(_WAYS[way], loc="left")
+            axes.set(xlabel="film x (mm)", ylabel="film y (mm)")
+            for spine in axes.spines.values():
+                spine.set_visible(False)
+            _profile_on(axes, light.radius_mm, values, film_mm)
+        bar = figure.colorbar(shown, ax=figure.axes, shrink=0.7)
+        bar.set_label("irradiance over the axis")
+        figure.suptitle(f"{title}\n", x=0.01, ha="left", fontweight="bold", fontsize=12)
+        curve = "curve: irradiance along +x, 0 at the film's lower edge, 1 at its upper edge"
+        figure.text(0.01, 0.945, curve, ha="left", fontsize=9, color=FIELD_COLOURS[3])
+    return Path(path)
+
+
+def _profile_on(axes: Any, radius: Any, values: Any, film_mm: tuple[float, float]) -> None:
+    """The fall along the film's +x, drawn over the picture: its foot is the lower edge, 1 its upper edge."""
+    width, height = film_mm
+    inside = radius <= width / 2
+    axes.plot(radius[inside], (values[inside] - 0.5) * height, color=FIELD_COLOURS[3], lw=1.6)
+    axes.set(xlim=(-width / 2, width / 2), ylim=(-height / 2, height / 2 * 1.12))
+
+
+def rendered(samples: int, threads: int, out: Path, report: lab.Report) -> str:
+    """Render the card in all ways, write white_cards.md and white_cards.png; returns the page."""
+    scene = load_scene(lab.SCENES / "white.toml")
+    shot, (stem, efl_mm, f_number) = scene.settings.camera, LENSES[CARD]
     film_mm = (shot.film_width_mm, shot.film_height_mm)
     radius = np.array(list(PLACES.values())) * LIT_MM
-    light = film_light(read_lens(LENS).at(focal_length_mm=EFL_MM, f_number=F_NUMBER), radius)
+    light = light_of(CARD, radius)
     # As `white_card`, but through glass with its losses, which the effective aperture takes along.
     true = white_card(light) | {"aperture": light.relative / light.natural, "both": light.relative}
     cards, rows = [], []
-    for vignetting, name in CARDS.items():
-        start = time.perf_counter()
-        camera = make_camera(LENS, Shot(film_mm, math.inf, F_NUMBER, EFL_MM, vignetting=vignetting))
-        rgb = render(scene, camera, samples=args.samples, threads=args.threads).rgb
-        found = rings(rgb.mean(2), film_mm, radius)
-        cells = (f"{a:.3f} ({b:.3f})" for a, b in zip(found, true[name], strict=True))
-        rows.append(f"| {name} | {vignetting} | {' | '.join(cells)} |")
-        print(f"{rows[-1]}  {time.perf_counter() - start:.1f} s", flush=True)
-        cards.append(rgb)
-    OUT.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(OUT / "white_cards.md", page(rows))
+    for vignetting, name in WAYS.items():
+        set_ = Shot(film_mm, math.inf, f_number, efl_mm, vignetting=vignetting)
+        camera = make_camera(lab.LENSES / f"{stem}.toml", set_)
+        cards.append(render(scene, camera, samples=samples, threads=threads).rgb)
+        found = rings(cards[-1].mean(2), film_mm, radius)
+        pairs = zip(found, true[name], strict=True)
+        rows.append([name, vignetting, *(lab.best_median(a, b, ".3f") for a, b in pairs)])
+        report(len(rows) / len(WAYS))
     top, bottom = (np.concatenate(cards[i : i + 2], axis=1) for i in (0, 2))
-    write_png(OUT / "white_cards.png", np.concatenate([top, bottom]).astype(np.float32), 0.0)
+    write_png(out / "white_cards.png", np.concatenate([top, bottom]).astype(np.float32), 0.0)
+    text = lab.page(
+        "# White cards: vignetting switched off, in part or as a whole",
+        f"`python -m experiments white-cards`: Müller fisheye at {efl_mm:g} mm, f/{f_number:g}, 36 x 24 mm film, lit\n"
+        f"to {LIT_MM:g} mm; film value over rings of the rendered pictures. In brackets the integral over the pupil "
+        "at\nthe d line. Both is the product of cos4 and aperture, which takes the losses of the glass along.",
+        lab.table(["card", "--vignetting", *PLACES], rows),
+        "![Flat, cos4; aperture, both](white_cards.png)",
+    )
+    atomic_write_text(out / "white_cards.md", text)
+    return text
 
 
 def rings(picture: np.ndarray, film_mm: tuple[float, float], radius_mm: np.ndarray) -> list[float]:
@@ -77,20 +162,22 @@ def rings(picture: np.ndarray, film_mm: tuple[float, float], radius_mm: np.ndarr
     return [float(picture[np.abs(place - r) < (0.75 * pixel if r else 1.0)].mean()) for r in radius_mm]
 
 
-def page(rows: list[str]) -> str:
-    """The table as a page."""
-    head = [
-        "# White cards: vignetting switched off, in part or as a whole",
-        "",
-        f"`python experiments/white_cards.py`: Müller fisheye at {EFL_MM:g} mm, f/{F_NUMBER:g}, 36 x 24 mm film, lit",
-        f"to {LIT_MM:g} mm; film value over rings of the rendered pictures. In brackets the integral over the pupil at",
-        "the d line. Both is the product of cos4 and aperture, which takes the losses of the glass along.",
-        "",
-        f"| card | --vignetting | {' | '.join(PLACES)} |",
-        f"|---|---|{'---|' * len(PLACES)}",
-    ]
-    return "\n".join([*head, *rows, "", "![Flat, cos4; aperture, both](white_cards.png)"]) + "\n"
+OPTIONS = (
+    lab.count("samples", 64, "a pixel of the cards (default 64)"),
+    lab.count("threads", 2, "default 2"),
+    lab.out(),
+)
 
 
-if __name__ == "__main__":
-    main()
+def run(args: argparse.Namespace) -> None:
+    """Measure, render, write and draw."""
+    lab.quiet_glasses()
+    radius, out = np.linspace(0, 21.63, 64), args.out
+    lights = {name: light_of(name, radius) for name in LENSES}
+    table = {n: {f: np.round(getattr(light, f), 6).tolist() for f in FACTORS} for n, light in lights.items()}
+    out.mkdir(parents=True, exist_ok=True)
+    atomic_write_text(out / "film_light.json", json.dumps({"film_radius_mm": radius.tolist(), "lenses": table}) + "\n")
+    film_light_picture(lights, out / "film_light.png")
+    white_card_picture(lights[CARD], (36.0, 24.0), f"White card, {CARD}", out / "white_card.png")
+    with Progress(quiet=args.quiet).stage("white cards") as report:
+        print(rendered(args.samples, args.threads, out, report))

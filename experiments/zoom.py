@@ -1,6 +1,7 @@
-"""The benchmark of models of many states: every zoom of the library over its whole range, and internal focus.
+"""Fit one model for the whole range of each zoom of the library, for internal focus, and for both.
 
-One model per case, measured at random states against the exact lens, beside models that were each fitted to one state.
+Each is measured at random states against the exact lens, beside models fitted to one state each. A minute or two for
+each of the eight, ten for the last; those that are in the table are kept. Writes zoom.md, zoom.json and zoom.png.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median_high
 from typing import Any
 
 from experiments import lab
@@ -17,7 +19,6 @@ from neurolens import __version__
 from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress, Report
-from neurolens.commands.arguments import whole
 from neurolens.evaluate.experiment import near_limit_m, wavelengths_nm
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.train_states import AXIS_LABELS, error_axes, error_line, fit_and_measure_states
@@ -50,9 +51,9 @@ class Case:
         focus = "-focus" if self.internal else ""
         return f"{self.lens}{focus}{'' if self.position is None else '-' + self.position}"
 
-    def space(self, lenses: Path) -> StateSpace:
+    def space(self) -> StateSpace:
         """The states, with the domain that `neurolens train` takes where nothing is stated."""
-        lens = read_lens(lenses / f"{self.lens}.toml").with_aperture(None)
+        lens = read_lens(lab.LENSES / f"{self.lens}.toml").with_aperture(None)
         return StateSpace(
             lens,
             axes_of(lens, zoom=self.zoom, internal=self.internal, state=self.position),
@@ -74,14 +75,14 @@ CASES = (
 )
 
 
-def measure_case(case: Case, lenses: Path, folder: Path, states: int, report: Report) -> dict[str, Any]:
+def measure_case(case: Case, folder: Path, states: int, report: Report) -> dict[str, Any]:
     """Fit and measure one case.
 
     Args:
         folder: for the model, which is kept; see `train_states.fit_and_measure_states`.
         states: random states of the measurement.
     """
-    space = case.space(lenses)
+    space = case.space()
     settings = StateSettings(terms=TERMS, rays=RAYS, name=case.name)
     record = fit_and_measure_states(space, settings, folder, states=states, report=lambda done: report(0.8 * done))
     fixed = []
@@ -109,17 +110,6 @@ def _fixed(space: StateSpace, place: float) -> dict[str, float]:
     return {axis.name: value, "rms_um": errors.rms_um, "direction_rms_deg": errors.direction_rms_deg}
 
 
-def write_records(records: Mapping[str, Mapping[str, Any]], out: Path) -> str:
-    """Write zoom.json, zoom.md and zoom.png; returns the page."""
-    order = [c.name for c in CASES]
-    rows = sorted(records.values(), key=lambda r: order.index(r["case"]) if r["case"] in order else len(order))
-    out.mkdir(parents=True, exist_ok=True)
-    panels_plot([(r["case"], Axis.from_dict(r["axes"][0]), r["states"], r["fixed"]) for r in rows], out / "zoom.png")
-    text = page(rows)
-    lab.write_results(out, "zoom", text, {"cases": rows})
-    return text
-
-
 _HEAD = """\
 # Models of many states
 
@@ -128,113 +118,87 @@ length in mm, 1 / distance in 1/m). {terms} coefficients per vector at every nod
 and where the film focuses, focus from infinity to the near limit (14 focal lengths or more) in every state. Worst and
 median of {states} random states, rays that no fit saw, micrometres on the film; the goal is 3 um RMS anywhere.
 *One state*: median of models of as many coefficients that were each fitted to one state.
-Made by `python -m experiments zoom`.
-
-"""
-_COLUMNS = (
-    "model|state|nodes|RMS um, median|worst|at 21.6 mm|p99 worst|direction deg, worst|position um, worst|"
-    "transmittance, worst|false pass %, worst|false block %, worst|one state, RMS um|kB|fit s"
+Made by `python -m experiments zoom`."""
+_COLUMNS = lab.columns(
+    ("model", "case"),
+    (
+        "state",
+        lambda r: ", ".join("{name} {range[0]:.4g}–{range[1]:.4g} {unit}".format(**axis) for axis in r["axes"]),
+    ),
+    ("nodes", "nodes"),
+    ("RMS um, median", "median.rms_um", ".2g"),
+    ("worst", "rms_um", ".2g"),
+    ("at 21.6 mm", "rms_um_at_21_6", ".2g"),
+    ("p99 worst", "p99_um", ".2g"),
+    ("direction deg, worst", "direction_rms_deg", ".2g"),
+    ("position um, worst", "position_rms_um", ".2g"),
+    ("transmittance, worst", "transmittance_rms", ".2g"),
+    ("false pass %, worst", "false_pass", ".2g", 100),
+    ("false block %, worst", "false_block", ".2g", 100),
+    ("one state, RMS um", lambda r: median_high(f["rms_um"] for f in r["fixed"]) if r["fixed"] else None, ".2g"),
+    ("kB", "bytes", ".0f", 1e-3),
+    ("fit s", "fit_s", ".0f"),
 )
 
 
 def page(rows: Sequence[Mapping[str, Any]]) -> str:
     """The table."""
-
-    def number(value: float | None, scale: float = 1.0) -> str:
-        return "–" if value is None else f"{scale * value:.2g}"
-
-    lines = []
-    for r in rows:
-        ranges = ", ".join(f"{a['name']} {a['range'][0]:.4g}–{a['range'][1]:.4g} {a['unit']}" for a in r["axes"])
-        single = sorted(f["rms_um"] for f in r["fixed"])
-        cells = [
-            r["case"],
-            ranges,
-            str(r["nodes"]),
-            number(r["median"]["rms_um"]),
-            number(r["rms_um"]),
-            number(r["rms_um_at_21_6"]),
-            number(r["p99_um"]),
-            number(r["direction_rms_deg"]),
-            number(r["position_rms_um"]),
-            number(r["transmittance_rms"]),
-            number(r["false_pass"], 100),
-            number(r["false_block"], 100),
-            number(single[len(single) // 2]) if single else "–",
-            f"{r['bytes'] / 1000:.0f}",
-            f"{r['fit_s']:.0f}",
-        ]
-        lines.append(cells)
-    states = max((len(r["states"]) for r in rows), default=0)
-    return (
-        _HEAD.format(terms=TERMS, states=states)
-        + lab.table(_COLUMNS, lines)
-        + "\n\n![error over the state](zoom.png)\n"
-    )
+    head = _HEAD.format(terms=TERMS, states=max((len(r["states"]) for r in rows), default=0))
+    return lab.page(head, lab.table(_COLUMNS, rows, "–"), "![error over the state](zoom.png)")
 
 
-Panel = tuple[str, Axis, Sequence[Mapping[str, Any]], Sequence[Mapping[str, Any]]]
+def write_records(records: Mapping[str, Mapping[str, Any]], out: Path) -> str:
+    """Write zoom.json, zoom.md and zoom.png; returns the page."""
+    order = [c.name for c in CASES]
+    rows = sorted(records.values(), key=lambda r: order.index(r["case"]) if r["case"] in order else len(order))
+    out.mkdir(parents=True, exist_ok=True)
+    draw(rows, out / "zoom.png")
+    return lab.write_results(out, "zoom", page(rows), {"cases": rows})
 
 
-def panels_plot(panels: Sequence[Panel], path: str | Path) -> Path:
-    """A panel for each model: its error over the first state axis, and those of models fitted to one state each.
-
-    Args:
-        panels: title, first axis, rows of the model, rows of the others.
-        path: PNG, PDF or SVG to write.
-    """
-    columns = 2 if len(panels) > 1 else 1
-    rows = -(-len(panels) // columns)
-    with drawing(path, 5.2 * columns, 3.0 * rows) as figure:
-        places = figure.subplots(rows, columns, squeeze=False).ravel()
-        for place, (title, axis, states, fixed) in zip(places, panels, strict=False):
+def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """A panel for each model: its error over the first state axis, and those of models fitted to one state each."""
+    columns = 2 if len(rows) > 1 else 1
+    lines = -(-len(rows) // columns)
+    with drawing(path, 5.2 * columns, 3.0 * lines) as figure:
+        places = figure.subplots(lines, columns, squeeze=False).ravel()
+        for place, row in zip(places, rows, strict=False):
+            axis, states, fixed = Axis.from_dict(row["axes"][0]), row["states"], row["fixed"]
             error_line(place, axis, states, FIELD_COLOURS[0], "one model of all states")
             if fixed:
                 x = [r[axis.name] for r in fixed]
                 place.plot(x, [r["rms_um"] for r in fixed], "s", ms=5, mfc="none", color=INK, label="one state each")
             error_axes(place, axis, [r["rms_um"] for r in (*states, *fixed)])
-            place.set_title(title, loc="left", fontsize="medium")
-            place.set_xlabel(AXIS_LABELS.get(axis.name, f"{axis.name} ({axis.unit})"))
-            place.set_ylabel("RMS (um)")
+            place.set_title(row["case"], loc="left", fontsize="medium")
+            place.set(xlabel=AXIS_LABELS.get(axis.name, f"{axis.name} ({axis.unit})"), ylabel="RMS (um)")
             place.legend(loc="best", fontsize="small")
-        for place in places[len(panels) :]:
+        for place in places[len(rows) :]:
             place.set_visible(False)
-    return Path(path)
 
 
-ABOUT = """\
-Fit one model for the whole range of each zoom of the library, for internal focus, and for both, and
-measure it at random states against the exact lens, beside models fitted to one state each. A minute
-or two for each of the eight, ten for the last; those that are in the table are kept.
-Writes zoom.md, zoom.json and zoom.png."""
+OPTIONS = (
+    lab.option("cases", metavar="CASE", nargs="*", help="cases by name, as in the table (default: all)"),
+    lab.count("states", 25, "random states (default: 25)", 2, 1000),
+    lab.option("--again", action="store_true", help="measure the chosen cases again"),
+    lab.option("--models", metavar="DIR", type=Path, default=Path("runs/zoom"), help="for them (default: runs/zoom)"),
+    lab.out(),
+)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m experiments zoom`."""
-    parser.add_argument("cases", metavar="CASE", nargs="*", help="cases by name, as in the table (default: all)")
-    parser.add_argument("--states", metavar="N", type=whole(2, 1000), default=25, help="random states (default: 25)")
-    parser.add_argument("--again", action="store_true", help="measure the chosen cases again")
-    parser.add_argument(
-        "--models", metavar="DIR", type=Path, default=Path("runs/zoom"), help="for the models (default: runs/zoom)"
-    )
-    lab.add_out(parser)
-
-
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Measure what is missing, and write the table after each case."""
     known = {c.name: c for c in CASES}
     unknown = [name for name in args.cases if name not in known]
     if unknown:
         raise InputError("experiments zoom", "CASE", unknown[0], f"one of: {', '.join(known)}")
     args.models.mkdir(parents=True, exist_ok=True)
-    records = lab.kept_rows(args.out / "zoom.json", "cases", "case", "experiments zoom")
+    records = lab.kept_rows(args.out / "zoom.json", "experiments zoom", lambda r: r["case"], "cases")
     missing = [known[n] for n in args.cases or known if args.again or n not in records]
     progress = Progress(dict.fromkeys((c.name for c in missing), 60.0), quiet=args.quiet)
     text = page(list(records.values()))
     with pinned_threads():
         for case in missing:
             with progress.stage(case.name) as report:
-                records[case.name] = measure_case(case, lab.LENSES, args.models, args.states, report)
+                records[case.name] = measure_case(case, args.models, args.states, report)
             text = write_records(records, args.out)
     print(text)
-    return 0

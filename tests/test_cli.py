@@ -285,7 +285,7 @@ def python(code: str, *args: object) -> subprocess.CompletedProcess[str]:
 
 
 WITHOUT_TORCH = (
-    "import sys; sys.modules.update(dict.fromkeys(['torch', 'matplotlib', 'onnx', 'sklearn']))\n"
+    "import sys; sys.modules.update(dict.fromkeys(['torch', 'matplotlib', 'sklearn']))\n"
     "from neurolens.cli import main; sys.exit(main(sys.argv[1:]))"
 )
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.gallery.cameras import View
+from experiments.gallery.cameras import View, pupil_rays
 from neurolens.cameras.contract import Camera
 
 _SIDE = 64  # pupil points per side
@@ -106,11 +106,7 @@ def _jacobian(camera: Camera, film: Floats, depth_m: float, wavelength_nm: float
 
 def _crossings(camera: Camera, film: Floats, depth_m: float, wavelength_nm: float) -> tuple[Floats, Floats]:
     """Where rays from one film point (lens frame, mm) meet the plane z = -depth_m: [2, N] m, and weights [N]."""
-    middle = (np.arange(_SIDE, dtype=np.float32) + np.float32(0.5)) / _SIDE
-    pupil = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
-    count = pupil.shape[1]
-    points = np.repeat(film[:, None], count, axis=1).astype(np.float32)
-    rays = camera.sample(points, pupil.astype(np.float32), np.full(count, wavelength_nm, np.float32))
+    rays = pupil_rays(camera, film[:, None], _SIDE, wavelength_nm)
     weight = rays.weight.astype(np.float64)
     origin, direction = rays.origin_m.astype(np.float64), rays.direction.astype(np.float64)
     ahead = (weight > 0) & (direction[2] < 0)

@@ -12,12 +12,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.gallery.cameras import View
+from experiments.gallery.cameras import View, pupil_rays
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera
+from neurolens.optics.glass import LINE_D_NM
 
 Array = NDArray[np.float64]
 
@@ -282,9 +283,7 @@ def squeeze_of(camera: Camera, distance_m: float) -> float:
 
 def passage(camera: Camera) -> float:
     """Share of the rays sampled from the film's centre that pass the stop's shape."""
-    middle = ((np.arange(_SQUARE) + 0.5) / _SQUARE).astype(np.float32)
-    square = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
-    rays = camera.sample(np.zeros_like(square), square, np.full(square.shape[1], 587.5618, np.float32))
+    rays = pupil_rays(camera, np.zeros((2, 1)), _SQUARE, LINE_D_NM)
     return float((rays.status == st.PASSED).mean())
 
 

@@ -180,17 +180,29 @@ NEAR_CORNER = 0.95  # of the way to the film's corner, where falloff is matched 
 _SQUARE = 64  # pupil samples per side
 
 
-def illumination(camera: Camera, radii_mm: Array, azimuth_deg: float = 33.7) -> Array:
-    """Mean weight of the rays of film points [N] mm from the centre at 550 nm: a white card without noise."""
-    middle = ((np.arange(_SQUARE) + 0.5) / _SQUARE).astype(np.float32)
+def pupil_rays(camera: Camera, film_mm: Array, side: int, wavelength_nm: float = 550.0) -> CameraRays:
+    """Rays of film points [2, N] mm through side x side pupil samples each, film point after film point."""
+    middle = ((np.arange(side) + 0.5) / side).astype(np.float32)
     square = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
-    where = np.array([math.cos(math.radians(azimuth_deg)), math.sin(math.radians(azimuth_deg))])
-    wavelength, found = np.full(square.shape[1], 550.0, np.float32), []
-    for radius in radii_mm:
-        film = np.repeat((where * radius)[:, None], square.shape[1], axis=1).astype(np.float32)
-        rays = camera.sample(film, square, wavelength)
-        found.append(np.where(rays.status == st.PASSED, rays.weight, 0).mean(dtype=np.float64))
-    return np.array(found)
+    films = np.repeat(film_mm, side**2, axis=1).astype(np.float32)
+    wavelength = np.full(films.shape[1], wavelength_nm, np.float32)
+    return camera.sample(films, np.tile(square, film_mm.shape[1]), wavelength)
+
+
+def passing_weight(rays: CameraRays, points: int) -> Array:
+    """Weights of so many film points' rays, [points, rays each]; 0 where a ray is stopped."""
+    return np.where(rays.status == st.PASSED, rays.weight, 0).astype(np.float64).reshape(points, -1)
+
+
+def outward(radii_mm: Array) -> Array:
+    """Film points [2, N] at radii [N] mm, at an angle that is no symmetry of the film."""
+    angle = math.radians(33.7)
+    return np.array([[math.cos(angle)], [math.sin(angle)]]) * radii_mm
+
+
+def illumination(camera: Camera, radii_mm: Array) -> Array:
+    """Mean weight of the rays of film points [N] mm from the centre at 550 nm: a white card without noise."""
+    return passing_weight(pupil_rays(camera, outward(radii_mm), _SQUARE), len(radii_mm)).mean(axis=1)
 
 
 def post_process(radius_mm: Any, k: float) -> Any:
@@ -295,23 +307,13 @@ def thin_camera(shot: Shot, surrogate: Surrogate | None) -> Camera:
     )
 
 
-def pinhole_camera(shot: Shot, surrogate: Surrogate | None) -> Camera:
-    """A pinhole at the focal length."""
-    return Pinhole(float(first_order(shot.lens).efl_mm), shot.film_mm, shot.f_number)
-
-
-def post_processed(shot: Shot, surrogate: Surrogate | None) -> Camera:
-    """A thin lens without vignetting, darkened afterwards to the exact lens's centre and corner."""
-    return PostProcessed(thin_camera(shot, surrogate), exact_camera(shot, surrogate))
-
-
 # Columns that an effect may ask for. A camera is made of the shot and of the surrogate, None where no column needs one.
 CAMERAS: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
     "exact": exact_camera,
     "surrogate": surrogate_camera,
     "thin": thin_camera,
-    "pinhole": pinhole_camera,
-    "post": post_processed,
+    "pinhole": lambda shot, _: Pinhole(float(first_order(shot.lens).efl_mm), shot.film_mm, shot.f_number),
+    "post": lambda shot, surrogate: PostProcessed(thin_camera(shot, surrogate), exact_camera(shot, surrogate)),
 }
 # The same as compiled code: many times as fast, but not for every lens, nor on every machine.
 _COMPILED: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {

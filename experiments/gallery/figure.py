@@ -73,32 +73,26 @@ def draw(title: str, rows: Sequence[Row], path: Path) -> None:
                 if column == "difference" and row.difference is None:
                     continue
                 axes = figure.add_axes(place)
-                extent = _extent(row.window_mm)
+                x, y, width, height = row.window_mm
+                extent = (x - width / 2, x + width / 2, y - height / 2, y + height / 2)
+                look: dict[str, Any] = {"extent": extent, "interpolation": "nearest"}
                 if column == "difference":
-                    shown = axes.imshow(
-                        row.difference, cmap="magma", vmin=0, vmax=scale, extent=extent, interpolation="nearest"
-                    )
+                    shown = axes.imshow(row.difference, cmap="magma", vmin=0, vmax=scale, **look)
                 else:
-                    picture = to_srgb(row.pictures[column], row.exposure)
-                    axes.imshow(picture, extent=extent, interpolation="nearest")
+                    axes.imshow(to_srgb(row.pictures[column], row.exposure), **look)
                 _axes(axes, first=k == 0)
                 if k == 0:
                     axes.set_title(row.label, loc="left", fontsize=8.6, pad=3)
                 if index == 0:
                     name = TITLES.get(column, "|surrogate - exact|" if column == "difference" else column)
-                    height = places[0][1] + places[0][3] + _LABEL / figure.get_figheight()
-                    figure.text(place[0], height, name, fontsize=9.5, fontweight="bold", va="bottom")
+                    top = places[0][1] + places[0][3] + _LABEL / figure.get_figheight()
+                    figure.text(place[0], top, name, fontsize=9.5, fontweight="bold", va="bottom")
         if shown is not None:
             colours = figure.colorbar(shown, cax=figure.add_axes(bar), format="%.1e")
             colours.set_label("share of white", fontsize=8)
             colours.ax.tick_params(labelsize=7)
             colours.outline.set_visible(False)
         _save_small(figure, path)
-
-
-def _extent(window_mm: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    x, y, width, height = window_mm
-    return x - width / 2, x + width / 2, y - height / 2, y + height / 2
 
 
 def _axes(axes: Any, first: bool) -> None:

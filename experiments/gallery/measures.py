@@ -11,15 +11,22 @@ from numpy.typing import NDArray
 
 from experiments.gallery import aberrations, bokeh
 from experiments.gallery.bokeh import light_disc
-from experiments.gallery.cameras import NEAR_CORNER, View, illumination, post_process, strength_for
-from neurolens.base import status as st
+from experiments.gallery.cameras import (
+    NEAR_CORNER,
+    View,
+    illumination,
+    outward,
+    passing_weight,
+    post_process,
+    pupil_rays,
+    strength_for,
+)
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
+from neurolens.optics.glass import LINE_D_NM
 
 _RADII = 13
 
@@ -79,15 +86,10 @@ def panorama(view: View) -> dict[str, float]:
     return found
 
 
-def field_angles(camera: Camera, radii_mm: Array, azimuth_deg: float = 33.7, wavelength_nm: float = 587.5618) -> Array:
+def field_angles(camera: Camera, radii_mm: Array) -> Array:
     """Angle to the axis, radians, of the mean ray of film points [N] mm from the centre; NaN where none passes."""
-    middle = ((np.arange(_SQUARE) + 0.5) / _SQUARE).astype(np.float32)
-    square = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
-    where = np.array([math.cos(math.radians(azimuth_deg)), math.sin(math.radians(azimuth_deg))])
-    film = np.repeat(where[:, None] * radii_mm, square.shape[1], axis=1).astype(np.float32)
-    pupil = np.tile(square, len(radii_mm))
-    rays = camera.sample(film, pupil, np.full(film.shape[1], wavelength_nm, np.float32))
-    weight = np.where(rays.status == st.PASSED, rays.weight, 0).astype(np.float64).reshape(len(radii_mm), -1)
+    rays = pupil_rays(camera, outward(radii_mm), _SQUARE, LINE_D_NM)
+    weight = passing_weight(rays, len(radii_mm))
     mean = (rays.direction.reshape(3, len(radii_mm), -1) * weight).sum(axis=2)
     angle = np.arctan2(np.hypot(mean[0], mean[1]), -mean[2])
     return np.asarray(np.where(weight.sum(axis=1) > 0, angle, np.nan))
@@ -147,26 +149,6 @@ def exposure(camera: Camera) -> float:
     if isinstance(camera, ThinLens):
         return camera.radius_mm**2 / (camera.radius_mm**2 + camera.image_distance_mm**2)
     raise InputError("exposure", "camera", camera.name, "a lens, a model or a thin lens")
-
-
-def paraxial_blur_mm(lens: Lens, distance_m: float, wavelength_nm: float = 550.0) -> float:
-    """First-order diameter of the disc of a light on the axis: D m |d - s| / d.
-
-    D is the diameter of the entrance pupil, d and s the distances from it of the light and of what is in focus, m the
-    magnification there: the pupil's cone cut by the plane in focus, and that plane's picture.
-
-    Args:
-        lens: focused, its film in place. distance_m: from film to light.
-    """
-    data: Any = first_order(lens, wavelength_nm)
-    assert lens.film_z_mm is not None
-    light_z = lens.film_z_mm - 1e3 * distance_m
-    behind = lens.film_z_mm - float(data.rear_principal_z_mm)
-    efl = float(data.efl_mm)
-    focus_z = float(data.front_principal_z_mm) - 1 / (1 / efl - 1 / behind)
-    to_light, to_focus = (float(data.entrance_pupil_z_mm) - z for z in (light_z, focus_z))
-    magnification = (behind - efl) / efl
-    return float(data.entrance_pupil_diameter_mm) * magnification * abs(to_light - to_focus) / to_light
 
 
 # A measure takes what one camera saw and gives numbers; their names carry the unit.

@@ -1,4 +1,8 @@
-"""Renders and measures the effects of the gallery, and writes their page; what an earlier run finished is kept."""
+"""Render small scenes that show what real lenses do, each through the exact lens, a surrogate and a thin lens.
+
+And measure the effect in each. An effect is a file of experiments/gallery; its figure, its numbers and a page of all
+are written to experiments/results/gallery. Finished effects are kept, fitted models in runs/gallery.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ import argparse
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -26,12 +30,13 @@ from experiments.gallery.cameras import (
 )
 from experiments.gallery.figure import Row, difference_of, draw, exposure_of
 from experiments.gallery.measures import MEASURES
-from experiments.gallery.settings import Effect, Panel, find_effects, read_effect
+from experiments.gallery.settings import Effect, find_effects, read_effect
+from experiments.lab import Row as Record
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress, Report
-from neurolens.commands.arguments import add_json, whole
-from neurolens.commands.output import print_json, table
+from neurolens.commands.arguments import add_json
+from neurolens.commands.output import number, print_json, table
 from neurolens.evaluate.train import versions
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
@@ -41,7 +46,7 @@ SCHEMA = 1
 
 def run_effect(
     effect: Effect, out: Path, cache: Path, *, samples: int | None = None, threads: int = 2, progress: Progress
-) -> dict[str, Any]:
+) -> Record:
     """Render and measure an effect: NAME.png and NAME.json in `out`, fitted models in `cache`.
 
     Args:
@@ -64,7 +69,11 @@ def run_effect(
     rows, panels = [], []
     with progress.stage(f"{effect.name}: render") as report:
         for k, (shot, surrogate) in enumerate(zip(shots, surrogates, strict=True)):
-            views = _views(effect, shot, surrogate, samples, threads, _part(report, k, len(shots)))
+
+            def part(fraction: float, seconds_left: float | None = None, before: int = k) -> None:
+                report((before + fraction) / len(shots))
+
+            views = _views(effect, shot, surrogate, samples, threads, part)
             row = _row(shot, views)
             rows.append(row)
             panels.append(_record(effect, shot, surrogate, views, row))
@@ -81,7 +90,7 @@ def run_effect(
         "fingerprint": fingerprint,
     }
     draw(effect.title, rows, out / f"{effect.name}.png")
-    atomic_write_text(out / f"{effect.name}.json", json.dumps(_plain(record), indent=1, allow_nan=False) + "\n")
+    lab.write_json(out / f"{effect.name}.json", _plain(record))
     return record
 
 
@@ -108,18 +117,13 @@ def fingerprint_of(effect: Effect, samples: int | None) -> str:
     return found.hexdigest()[:16]
 
 
-def finished(effect: Effect, out: Path) -> dict[str, Any] | None:
+def finished(effect: Effect, out: Path) -> Record | None:
     """The record that an earlier run left, with its figure."""
     try:
         record = json.loads((out / f"{effect.name}.json").read_text(encoding="utf-8"))
         return record if record["schema"] == SCHEMA and (out / f"{effect.name}.png").is_file() else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
-
-
-def _part(report: Report, k: int, count: int) -> Report:
-    """Progress of the k-th of so many equal parts."""
-    return lambda fraction, _left=None: report((k + fraction) / count)
 
 
 def _surrogates(effect: Effect, shots: Sequence[Shot], cache: Path, progress: Progress) -> list[Surrogate | None]:
@@ -136,7 +140,7 @@ def _surrogates(effect: Effect, shots: Sequence[Shot], cache: Path, progress: Pr
     return [next(s for other, s in made if same_state(shot, other)) for shot in shots]
 
 
-def _error(record: dict[str, Any]) -> str:
+def _error(record: Record) -> str:
     if record.get("rms_um") is not None:
         return f"RMS {record['rms_um']:.3g} um on the film"
     return f"RMS {record.get('direction_rms_deg') or math.nan:.3g} degrees"
@@ -156,7 +160,7 @@ def _views(
             shot.scene,
             Window(camera_of(column, shot, surrogate, compiled=True), window),
             width=panel.width,
-            height=height_of(panel, window),
+            height=max(1, round(panel.width * window[3] / window[2])),
             samples=samples or panel.samples,
             threads=threads,
             film=film,
@@ -164,11 +168,6 @@ def _views(
         views[column] = View(shot, camera, column, done.rgb)
         report((k + 1) / len(effect.columns))
     return views
-
-
-def height_of(panel: Panel, window_mm: tuple[float, float, float, float]) -> int:
-    """Of the picture, in pixels."""
-    return max(1, round(panel.width * window_mm[3] / window_mm[2]))
 
 
 def _row(shot: Shot, views: dict[str, View]) -> Row:
@@ -180,9 +179,7 @@ def _row(shot: Shot, views: dict[str, View]) -> Row:
     return Row(shot.panel.label, first.window_mm, {c: v.rgb for c, v in views.items()}, exposure, difference)
 
 
-def _record(
-    effect: Effect, shot: Shot, surrogate: Surrogate | None, views: dict[str, View], row: Row
-) -> dict[str, Any]:
+def _record(effect: Effect, shot: Shot, surrogate: Surrogate | None, views: dict[str, View], row: Row) -> Record:
     measured = {column: MEASURES[effect.measure](view) for column, view in views.items()}
     names = list(dict.fromkeys(name for found in measured.values() for name in found))
     return {
@@ -221,38 +218,37 @@ millimetres of film, pictures upright. Made by `python -m experiments gallery`; 
 """
 
 
-def write_page(records: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write README.md of the records (see `run.run_effect`), whose figures lie beside it."""
-    atomic_write_text(path, "\n".join([_HEAD, *(section(record) for record in records)]))
+def page(records: Sequence[Record]) -> str:
+    """All effects (records of `run_effect`), whose figures lie beside the page."""
+    return lab.page(_HEAD, *(section(record) for record in records))
 
 
-def section(record: Mapping[str, Any]) -> str:
+def section(record: Record) -> str:
     """One effect, in Markdown."""
     name = record["name"]
-    return "\n".join(
-        [
-            f"## {record['title']}\n",
-            f"{record['text'].strip()}\n",
-            f"![{record['title']}]({name}.png)\n",
-            effect_table(record),
-            f"\nAfter {record['source'].strip()} [experiments/gallery/{name}.toml]"
-            f"(../../gallery/{name}.toml), `{record['command']}`.\n",
-        ]
+    toml = f"[experiments/gallery/{name}.toml](../../gallery/{name}.toml)"
+    return lab.page(
+        f"## {record['title']}",
+        record["text"].strip(),
+        f"![{record['title']}]({name}.png)",
+        effect_table(record),
+        f"After {record['source'].strip()} {toml}, `{record['command']}`.",
     )
 
 
-def effect_table(record: Mapping[str, Any]) -> str:
+def effect_table(record: Record) -> str:
     """The measured numbers: a row a panel and quantity, a column per camera, and the surrogate's error."""
     panels = record["panels"]
-    columns = list(dict.fromkeys(c for p in panels for found in p["measured"].values() for c in found))
-    head = ["panel", "measured", *(TITLES.get(c, c) for c in columns)]
-    lines = [f"| {' | '.join(head)} | RMS of the surrogate |", f"|{'---|' * (len(head) + 1)}"]
-    for panel in panels:
-        for k, (quantity, found) in enumerate(panel["measured"].items()):
-            cells = [panel["label"] if k == 0 else "", quantity_name(quantity)]
-            cells += [_number(found.get(c)) for c in columns] + [_page_error(panel["surrogate"]) if k == 0 else ""]
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    cameras = list(dict.fromkeys(c for p in panels for found in p["measured"].values() for c in found))
+    rows = [
+        [p["label"] if k == 0 else "", quantity_name(quantity)]
+        + [None if found.get(c) is None else f"{found[c]:.3g}" for c in cameras]
+        + [_surrogate_error(p["surrogate"]) if k == 0 else ""]
+        for p in panels
+        for k, (quantity, found) in enumerate(p["measured"].items())
+    ]
+    head = ["panel", "measured", *(TITLES.get(c, c) for c in cameras), "RMS of the surrogate"]
+    return lab.table(head, rows, "–")
 
 
 def quantity_name(key: str) -> str:
@@ -263,43 +259,30 @@ def quantity_name(key: str) -> str:
     return key.replace("_", " ")
 
 
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3g}"
-
-
-def _page_error(surrogate: Mapping[str, Any] | None) -> str:
+def _surrogate_error(surrogate: Record | None) -> str | None:
     if surrogate is None:
-        return "–"
+        return None
     if surrogate["rms_um"] is not None:
         return f"{surrogate['rms_um']:.2g} um ({surrogate['name'].rpartition('.')[2]})"
     degrees = surrogate.get("direction_rms_deg")
-    return "–" if degrees is None else f"{degrees:.2g} deg"
+    return None if degrees is None else f"{degrees:.2g} deg"
 
 
-ABOUT = """\
-Render small scenes that show what real lenses do, each through the exact lens, a surrogate and a
-thin lens, and measure the effect in each. An effect is a file of experiments/gallery; its figure,
-its numbers and a page of all are written to experiments/results/gallery. Finished
-effects are kept, fitted models in runs/gallery."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m experiments gallery`."""
-    parser.add_argument("effects", metavar="EFFECT", nargs="*", help="names of effects (default: all)")
-    parser.add_argument("--list", action="store_true", help="list the effects and stop")
-    parser.add_argument(
-        "--effects-in", metavar="DIR", type=Path, default=lab.ROOT / "experiments" / "gallery",
+OPTIONS = (
+    lab.option("effects", metavar="EFFECT", nargs="*", help="names of effects (default: all)"),
+    lab.option("--list", action="store_true", help="list the effects and stop"),
+    lab.option(
+        "--effects-in", metavar="DIR", type=Path, default=Path(__file__).parent,
         help="effect files (default: experiments/gallery)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--samples", metavar="N", type=whole(1, 1 << 16), help="samples per pixel (default: the effect's own)"
-    )
-    parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=2, help="workers (default: 2)")
-    lab.add_out(parser, lab.RESULTS / "gallery", "folder")
-    add_json(parser)
+    ),
+    lab.count("samples", None, "samples per pixel (default: the effect's own)", 1, 1 << 16),
+    lab.count("threads", 2, "workers (default: 2)", 1, 256),
+    lab.out(lab.RESULTS / "gallery", "folder"),
+    add_json,
+)  # fmt: skip
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Render and measure the effects asked for, then write the page of all that are there."""
     folder, out = args.effects_in, args.out
     effects = [read_effect(path) for path in find_effects(folder, args.effects)]
@@ -307,29 +290,23 @@ def run(args: argparse.Namespace) -> int:
         check(effect)
     if args.list:
         print(table(("effect", "title"), [(effect.name, effect.title) for effect in effects], left=2))
-        return 0
+        return
     out.mkdir(parents=True, exist_ok=True)
     progress, records = Progress(quiet=args.quiet), []
     for effect in effects:
         cache = lab.ROOT / "runs" / "gallery"
         records.append(run_effect(effect, out, cache, samples=args.samples, threads=args.threads, progress=progress))
         everything = [finished(read_effect(path), out) for path in find_effects(folder)]
-        write_page([record for record in everything if record is not None], out / "README.md")
+        atomic_write_text(out / "README.md", page([record for record in everything if record is not None]))
     if args.json:
         print_json({"effects": records})
-        return 0
+        return
     columns = ("exact", "surrogate", "thin")
     rows = [
-        (
-            record["name"],
-            panel["label"],
-            quantity_name(name),
-            *("-" if found.get(c) is None else f"{found[c]:.4g}" for c in columns),
-        )
+        (record["name"], panel["label"], quantity_name(name), *(number(found.get(c)) for c in columns))
         for record in records
         for panel in record["panels"]
         for name, found in panel["measured"].items()
     ]
     print(table(("effect", "panel", "measured", *columns), rows, left=3))
     print(out / "README.md")
-    return 0

@@ -125,7 +125,7 @@ def _lookup(space: _Space, node: Node, given: list[Rows]) -> Rows:
     whole = index.long() if space.torch else index.astype(np.intp)
     found = table[:, space.clip(whole, 0, table.shape[1] - 1)] if space.torch else table.take(whole, 1, mode="clip")
     weights = given[2]
-    groups = found.reshape(len(weights), -1, found.shape[1])[:, list(node.static)]
+    groups = found.reshape(len(weights), len(table) // len(weights), found.shape[1])[:, list(node.static)]
     return functools.reduce(operator.add, (w * group for w, group in zip(weights, groups, strict=True)))
 
 

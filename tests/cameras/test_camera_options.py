@@ -69,12 +69,12 @@ def test_directions_of_another_length_pass_nothing() -> None:
             return out._replace(scene_ray=ray)
 
     film, square, wavelength = film_rays(lens, 900)
-    before = lens.sample(film, square, wavelength)
+    before = lens.film.sample(film, square, wavelength)
     lens.film = copy(lens.film)
     scene = copy(lens.film.scene)
     object.__setattr__(scene, "model", Poor)
     lens.film.scene = scene
-    after = lens.sample(film, square, wavelength)
+    after = lens.film.sample(film, square, wavelength)
     bad = np.zeros(900, bool)
     bad[::3] = bad[1::9] = True
     bad &= before.status == st.PASSED

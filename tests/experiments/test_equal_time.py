@@ -25,6 +25,7 @@ from experiments.equal_time_errors import (
     weights,
 )
 from neurolens.base.errors import InputError
+from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.render.film import FilmSettings
@@ -228,17 +229,15 @@ def scene_file(tmp_path: Path) -> Path:
     return file
 
 
-def shelf(file: Path, camera: object = None) -> equal_time.Shelf:
-    camera = camera or Pinhole(50.0, (36.0, 18.0))
-    return equal_time.shelf(
-        file.parent / "run", file, load_scene(file), "a camera", camera, FilmSettings(wavelengths="one"), (8, 4)
-    )  # type: ignore[arg-type]
+def shelf(file: Path, camera: Camera | None = None) -> equal_time.Shelf:
+    shown, film = camera or Pinhole(50.0, (36.0, 18.0)), FilmSettings(wavelengths="one")
+    return equal_time.Shelf(file.parent / "run", file, load_scene(file), "a camera", shown, film, (8, 4))
 
 
 def test_a_finished_render_is_not_repeated(scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = shelf(scene_file).take(2, 7, 1)
     again = shelf(scene_file)
-    monkeypatch.setattr(equal_time, "render", None)
+    monkeypatch.setattr(again, "render", None)
     kept = again.take(2, 7, 1)
     assert np.array_equal(first[0], kept[0]) and first[1] == kept[1]
     for samples, seed, threads in ((4, 7, 1), (2, 8, 1), (2, 7, 2)):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 
 import mpmath
@@ -20,17 +21,7 @@ from neurolens.optics.trace import trace
 
 LENSES = Path(__file__).parents[2] / "lenses"
 COUNT = 300
-ALL = [
-    *cases.apertures(LENSES, COUNT),
-    *cases.wide_fields(LENSES, COUNT),
-    *cases.radii(COUNT),
-    *cases.grazing(COUNT),
-    *cases.total_reflection(COUNT),
-    *cases.near_equal_indices(COUNT),
-    *cases.wavelengths(LENSES, COUNT),
-    *cases.object_distances(LENSES, COUNT),
-    *cases.shapes(COUNT),
-]
+ALL = list(takewhile(lambda case: case.group != "library", cases.all_cases(COUNT)))
 
 
 @pytest.mark.parametrize("case", ALL, ids=lambda c: f"{c.group}: {c.name}")
@@ -44,7 +35,7 @@ def test_no_nan_and_no_status_that_depends_on_the_precision(case: cases.Case) ->
 
 
 def test_the_whole_library_once() -> None:
-    rows = [measure(c, exact_rays=2) for c in cases.library(LENSES, 60)]
+    rows = [measure(c, exact_rays=2) for c in cases.library(60)]
     assert len(rows) >= 2 * len(list(LENSES.glob("*.toml")))
     assert failures(rows) == []
     assert max(r.relative for r in rows) < 1e-5
@@ -143,7 +134,7 @@ def test_reference_names_what_ends_a_ray() -> None:
 def test_the_table_of_extremes_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cases, "library", lambda lenses, count: cases.wavelengths(lenses, count))
+    monkeypatch.setattr(cases, "library", cases.wavelengths)
     assert main(["extremes", "--rays", "100", "--out", str(tmp_path), "--quiet"]) == 0
     text = (tmp_path / "extremes.md").read_text()
     assert capsys.readouterr().out.strip() == text.strip()

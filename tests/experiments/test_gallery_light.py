@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from experiments.gallery.cameras import CAMERAS, PostProcessed, View, illumination, post_process, shot_of, strength_for
-from experiments.gallery.measures import MEASURES, PROJECTIONS, blur_mm, exposure, field_angles, paraxial_blur_mm, scale
+from experiments.gallery.measures import MEASURES, PROJECTIONS, blur_mm, exposure, field_angles, scale
 from experiments.gallery.run import check
 from experiments.gallery.settings import read_effect
 from neurolens.base.errors import InputError
@@ -21,6 +21,8 @@ from neurolens.cameras.model import load_model
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.vignetting import Vignetted
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
 from neurolens.render.scene import load_scene
 
 ROOT = Path(__file__).parents[2]
@@ -104,6 +106,26 @@ def test_a_white_card_four_ways() -> None:
     assert both[-1] < 0.5 and ways["natural"][-1] > ways["optical"][-1]
     thin = camera("thin", 4.0, (36.0, 24.0), 10.0, 14.0)
     assert relative(Vignetted(thin, "optical"), 16.0) == pytest.approx(np.ones(5), abs=4e-3)
+
+
+def paraxial_blur_mm(lens: Lens, distance_m: float, wavelength_nm: float = 550.0) -> float:
+    """First-order diameter of the disc of a light on the axis: D m |d - s| / d.
+
+    D is the diameter of the entrance pupil, d and s the distances from it of the light and of what is in focus, m the
+    magnification there: the pupil's cone cut by the plane in focus, and that plane's picture.
+
+    Args:
+        lens: focused, its film in place. distance_m: from film to light.
+    """
+    data: Any = first_order(lens, wavelength_nm)
+    assert lens.film_z_mm is not None
+    light_z = lens.film_z_mm - 1e3 * distance_m
+    behind = lens.film_z_mm - float(data.rear_principal_z_mm)
+    efl = float(data.efl_mm)
+    focus_z = float(data.front_principal_z_mm) - 1 / (1 / efl - 1 / behind)
+    to_light, to_focus = (float(data.entrance_pupil_z_mm) - z for z in (light_z, focus_z))
+    magnification = (behind - efl) / efl
+    return float(data.entrance_pupil_diameter_mm) * magnification * abs(to_light - to_focus) / to_light
 
 
 def test_blur_of_near_and_far_signs_is_first_order_when_stopped_down() -> None:

@@ -19,9 +19,9 @@ from experiments.trace_speed import (
     ASPHERIC_SURFACES,
     LENSES,
     MAIN,
-    chosen_lenses,
     film_rays,
     launched,
+    lens_of,
     memory_of,
     with_aspheres,
 )
@@ -35,7 +35,6 @@ from neurolens.evaluate.speed import Unavailable, race
 from neurolens.graph.compiler import find_compiler
 from neurolens.graph.program import SCENE_RAY
 from neurolens.graph.scalars import lower
-from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
 from neurolens.optics.tracegraph import exact_graph
 from neurolens.render.scene import scene_from_tables
@@ -99,9 +98,7 @@ FOLDER = Path(__file__).parents[2] / "lenses"
 
 
 def test_lenses_have_the_refractions_that_the_table_says() -> None:
-    lenses, missing = chosen_lenses(FOLDER)
-    assert missing == []
-    assert set(lenses) == set(LENSES)
+    lenses = {count: lens_of(count) for count in LENSES}
     for count, lens in lenses.items():
         # The anamorphic zoom's table leaves its last plane to the reader.
         assert lens.refractions in (count, count - 1)
@@ -110,7 +107,7 @@ def test_lenses_have_the_refractions_that_the_table_says() -> None:
 
 
 def test_two_aspheres_change_the_rays_and_little_else() -> None:
-    plain = chosen_lenses(FOLDER)[0][MAIN]
+    plain = lens_of(MAIN)
     aspheric = with_aspheres(plain)
     changed = [k for k, s in enumerate(aspheric.surfaces) if s.asphere]
     assert changed == list(ASPHERIC_SURFACES)
@@ -124,7 +121,7 @@ def test_two_aspheres_change_the_rays_and_little_else() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_rays_have_wavelengths_of_their_own(dtype: torch.dtype) -> None:
-    lens = chosen_lenses(FOLDER)[0][MAIN]
+    lens = lens_of(MAIN)
     rays, wavelength = launched(lens, film_rays(lens, 1000), dtype)
     assert {c.dtype for c in (*rays, wavelength)} == {dtype}
     assert all(c.is_contiguous() for c in rays)
@@ -139,10 +136,9 @@ def test_memory_is_measured_in_a_child() -> None:
     assert found["results_mb"] == pytest.approx(2.8)
 
 
-@pytest.mark.slow
 def test_a_child_that_fails_says_why() -> None:
-    with pytest.raises(lab.Unmeasured, match="none.toml"):
-        lab.in_child(memory_of, str(FOLDER / "none.toml"), 10)
+    with pytest.raises(lab.Unmeasured, match="missing 1 required positional argument"):
+        lab.in_child(lab.look_up, "alone")
 
 
 def test_a_lens_that_is_not_there_is_one_clear_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -152,25 +148,20 @@ def test_a_lens_that_is_not_there_is_one_clear_error(capsys: pytest.CaptureFixtu
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_exact_graph_is_the_exact_trace() -> None:
+def test_the_exact_graph_of_rays_alone_gives_the_rays_of_the_whole() -> None:
+    """The whole against the tracer: tests/optics/test_tracegraph.py."""
     lens, domain = lens_models.lens(), lens_models.domain()
     s = sample_domain(domain, 20_000, 3)
-    s = replace(s, film_z=torch.full_like(s.film_z, domain.film_z_mm[0]))
-    rays = camera_rays(s.film_x, s.film_y, s.film_z, s.pupil_x, s.pupil_y, domain.pupil_z_mm)
-    exact = trace(lens, rays, s.wavelength_nm, transmittance=True)
-    columns = {"film_x_mm": s.film_x, "film_y_mm": s.film_y, "pupil_x_mm": s.pupil_x, "pupil_y_mm": s.pupil_y}
-    inputs = {k: v.numpy() for k, v in columns.items()} | {"wavelength_nm": s.wavelength_nm.numpy()}
-    inputs |= {"film_z_mm": domain.film_z_mm[0], "stop_radius_mm": lens.stop_radius_mm}
-    found = lower(exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm)).evaluate(inputs)
-    status = exact.status.numpy()
-    assert np.mean(found["status"] != status) < 1e-4 and len(np.unique(status)) > 3
-    passed = (status == st.PASSED) & (found["status"] == st.PASSED)
-    for name, column in zip(SCENE_RAY, exact.rays, strict=True):
-        assert np.abs(found[name] - column.numpy())[passed].max() < 1e-4
-    assert exact.transmittance is not None
-    assert np.abs(found["transmittance"] - exact.transmittance.numpy())[passed].max() < 1e-5
-    alone = lower(exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=False)).evaluate(inputs)
-    assert np.array_equal(alone["dx"][passed], found["dx"][passed]) and "transmittance" not in alone
+    inputs = {f"{k}_mm": getattr(s, k).numpy() for k in ("film_x", "film_y", "pupil_x", "pupil_y")}
+    inputs |= {"wavelength_nm": s.wavelength_nm.numpy(), "film_z_mm": domain.film_z_mm[0]}
+    inputs |= {"stop_radius_mm": lens.stop_radius_mm}
+    found, alone = (
+        lower(exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=whole)).evaluate(inputs)
+        for whole in (True, False)
+    )
+    passed = found["status"] == st.PASSED
+    assert passed.mean() > 0.1 and len(np.unique(found["status"])) > 3 and "transmittance" not in alone
+    assert all(np.array_equal(alone[name][passed], found[name][passed]) for name in SCENE_RAY)
 
 
 def test_candidates_time_models_and_files() -> None:
