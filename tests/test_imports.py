@@ -55,10 +55,10 @@ PACKAGES = {
     "render": {"numpy", "OpenEXR", "PIL", "trimesh"},
 }
 # Besides those: the writer of ONNX; the one camera that traces rays exactly, the maker of cameras, which imports it
-# when one is asked for; the shapes of the stop, which are tested on torch's tensors where a tracer hands them in.
+# when one is asked for; the shapes of the stop, which are parts of graphs.
 EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
     "neurolens.graph.onnx": (set(), {"onnx"}),
-    "neurolens.optics.apertures": (set(), {"torch"}),
+    "neurolens.optics.apertures": ({"graph"}, set()),
     "neurolens.optics.sag": ({"optics"}, set()),  # for a type
     "neurolens.cameras.exact": ({"optics"}, {"torch"}),
     "neurolens.cameras.build": ({"optics"}, set()),

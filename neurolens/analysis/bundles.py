@@ -20,7 +20,6 @@ from neurolens.analysis.fields import DEFAULT_NM, ChiefRays, Scene, on_plane
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.optics.aiming import without_rims
-from neurolens.optics.apertures import inside_on_tensors
 from neurolens.optics.passing import media
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
@@ -345,4 +344,5 @@ def _inside_stop(scene: Scene, pattern: Pattern) -> Tensor:
     if scene.lens.aperture is None:
         return torch.ones_like(t, dtype=torch.bool)
     x, y = (-t, s) if scene.axis == "x" else (s, -t)
-    return inside_on_tensors(scene.lens.aperture, x, y, 1.0)
+    opened: Tensor = scene.lens.aperture.inside(x, y, 1.0)
+    return opened

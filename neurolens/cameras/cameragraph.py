@@ -13,6 +13,7 @@ from neurolens.cameras.pupil_outline import pupil_graph
 from neurolens.graph.derive import derivative
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import FILM_X_Y
+from neurolens.optics.apertures import Aperture
 
 # How far the squared length of a direction may be from 1: where a poor network decodes none, the ray is no ray.
 UNIT_SLACK = 1e-3
@@ -23,14 +24,17 @@ D_FILM = tuple(derivative("scene_ray", by) for by in FILM_X_Y)
 _METRES = [1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0]
 
 
-def camera_graph(lens: Graph, segments: int, wavelengths: int) -> Graph:
+def camera_graph(
+    lens: Graph, segments: int, wavelengths: int, aperture: Aperture | None = None, stopped: int = 0
+) -> Graph:
     """The graph of a camera with the graph of its lens inside.
 
     Args:
         lens: inputs `rays` [5] (film and pupil point, wavelength), `film_z_mm` and `stop_radius_mm`; outputs
-            `scene_ray` [6], `transmittance`, `status`, and any others, which the camera has, too: derivatives of
-            `scene_ray` are taken for those by the film point.
+            `scene_ray` [6], `transmittance`, `status`, `stop_xy_mm` [2] for an aperture, else to be handed on, and
+            derivatives of `scene_ray`, which the camera has, too.
         segments, wavelengths: of the outline; see `pupil_point`.
+        aperture, stopped: see `weight_graph`.
 
     Inputs: those of `pupil_graph` and `weight_graph`. Outputs: those of `weight_graph`.
     """
@@ -39,20 +43,24 @@ def camera_graph(lens: Graph, segments: int, wavelengths: int) -> Graph:
     film, wavelength = g.input("film_mm", 2), g.input("wavelength_nm")
     found = g.inline(lens, {"rays": g.concat(film, pupil["pupil_mm"], wavelength)})
     derivatives = tuple(name for name in found if "_by_" in name)
-    g.outputs = {
-        **found,
-        **g.inline(weight_graph(derivatives), {"film_mm": film, **pupil, **found, "lens_status": found["status"]}),
-    }
-    del g.outputs["scene_ray"], g.outputs["transmittance"]
+    given = {"film_mm": film, **pupil, **found, "lens_status": found["status"]}
+    g.outputs = g.inline(weight_graph(derivatives, aperture, stopped), given)
+    if aperture is None and "stop_xy_mm" in found:
+        g.outputs["stop_xy_mm"] = found["stop_xy_mm"]
     return g
 
 
 @cache
-def weight_graph(derivatives: tuple[str, ...] = ()) -> Graph:
+def weight_graph(derivatives: tuple[str, ...] = (), aperture: Aperture | None = None, stopped: int = 0) -> Graph:
     """Weighted rays in the camera's frame, of rays of a lens.
 
     w = T A cos^4 / Z^2 over the exposure on the axis; see `cameras.contract`. Film points that nothing reaches (area 0
     or NaN) are outside the domain; what does not pass weighs nothing, and is no ray.
+
+    Args:
+        derivatives: names of derivatives of `scene_ray`, inputs and outputs, too.
+        aperture: shape of the stop's opening, tested on the crossing `stop_xy_mm`; None: the round one of the lens.
+        stopped: status of rays that the shape stops.
 
     Inputs: `film_mm`, `pupil_mm` [2], `area_mm2`, `scene_ray` [6] (mm, lens frame), `transmittance`, `lens_status`, and
     derivatives [6] of the ray; of the call `film_z_mm`, `per_distance` (1 / Z), `scale` (1 / (Z^2 exposure)).
@@ -63,6 +71,10 @@ def weight_graph(derivatives: tuple[str, ...] = ()) -> Graph:
     through, status = g.input("transmittance"), g.input("lens_status")
     per_distance, scale, film_z = (g.input(name, per_call=True) for name in ("per_distance", "scale", "film_z_mm"))
     unit = g.square(ray[3:]).between(1 - UNIT_SLACK, 1 + UNIT_SLACK)
+    if aperture is not None:
+        opened = aperture.opening(g, g.input("stop_xy_mm", 2), g.input("stop_radius_mm", per_call=True))
+        shut = g.select(status <= float(st.PASSED), float(stopped), status)
+        status = g.select(opened, status, shut)
     lit, outside = g.constant(_NO_AREA) <= area, float(st.OUTSIDE_DOMAIN)
     passed = (status <= float(st.PASSED)) & unit & lit
     cos2 = 1.0 / (1.0 + g.square((pupil - film) * per_distance))

@@ -65,8 +65,10 @@ class FusedFilm:
         if film.pupil is not film.outline:
             raise InputError("camera", "pupil", "(another)", "outline: the only one that fused cameras sample")
         self._film, self._graph, self._film_mm = film, graph, film_mm
-        self._aperture, self._stop_radius_mm = aperture, stop_radius_mm
-        self._stopped = np.int32(st.blocked(stop_surface, st.RIM))
+        # A mask is tested on rays that come back: its table is too large for the loops.
+        self._mask = aperture if aperture is not None and aperture.mask is not None else None
+        self._blades = aperture if self._mask is None else None
+        self._stop_radius_mm, self._stopped = stop_radius_mm, st.blocked(stop_surface, st.RIM)
         self._rays = self._compiled(graph)
         self._rays_and_moves: _Compiled | None = None
         self.moves_error: float | None = None
@@ -83,19 +85,21 @@ class FusedFilm:
             self._rays_and_moves = self._compiled(self._with_differentials())
         run = self._rays_and_moves if differentials and self._rays_and_moves is not None else self._rays
         found = run({"film_mm": film, "square": square, "wavelength_nm": wavelength[None]})
-        if self._aperture is not None:
-            inside = self._aperture.inside(found["stop_xy_mm"][0], found["stop_xy_mm"][1], self._stop_radius_mm)
+        if self._mask is not None:
+            inside = self._mask.inside(found["stop_xy_mm"][0], found["stop_xy_mm"][1], self._stop_radius_mm)
             shut = ~inside & (found["status"][0] == st.PASSED)
             found["weight"][0, shut], found["status"][0, shut] = 0, self._stopped
         return camera_rays(found)
 
     def _compiled(self, lens: Graph) -> _Compiled:
-        outputs = {k: v for k, v in lens.outputs.items() if k != "stop_xy_mm" or self._aperture is not None}
         outline = self._film.outline
         numbers = outline.numbers | self._film.numbers | {"stop_radius_mm": self._stop_radius_mm}
         groups = outline.table.reshape(len(outline.table), -1, 5)
         table = np.pad(groups, ((0, 0), (0, 0), (0, padded_columns(5) - 5)))
-        return _Compiled(camera_graph(pruned(lens, outputs), outline.x.shape[2] - 1, len(outline.x)), numbers, table)
+        round_stop = self._mask is None and self._blades is None
+        needed = {name: value for name, value in lens.outputs.items() if not (round_stop and name == "stop_xy_mm")}
+        shape = outline.x.shape[2] - 1, len(outline.x)
+        return _Compiled(camera_graph(pruned(lens, needed), *shape, self._blades, self._stopped), numbers, table)
 
     def _with_differentials(self) -> Graph:
         """The lens with differentials."""

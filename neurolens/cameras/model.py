@@ -37,7 +37,6 @@ _NOT_KEPT = ("reference", "units", "frame", "status_codes", "states")
 _INPUTS = {"film_mm": ("tensor(float)", 2, None), "square": ("tensor(float)", 2, None)}
 _INPUTS |= {"wavelength_nm": ("tensor(float)", 1, None)}
 _OUTPUTS = {"ray": ("tensor(float)", 6, None), "weight": ("tensor(float)", None), "status": ("tensor(int32)", None)}
-_OUTPUTS |= {"stop_xy_mm": ("tensor(float)", 2, None)}
 _NOMINAL = 1.02  # f-numbers are engraved rounded: up to this much wider than the widest stop means the widest stop
 
 
@@ -187,46 +186,41 @@ class OnnxFilm:
 
         scene, outline = film.scene, film.outline
         assert isinstance(scene, ModelScene) and film.pupil is outline
-        self._path, self._scene = model.path, scene
+        self._path, aperture = model.path, scene.aperture
         before = Graph()
         found = before.inline(pupil_graph(outline.x.shape[2] - 1, len(outline.x)), {})
         rays = before.concat(before.input("film_mm", 2), found["pupil_mm"], before.input("wavelength_nm"))
         before.outputs = {"rays": rays, **found}
         numbers: dict[str, Any] = outline.numbers | film.numbers | {"stop_radius_mm": scene.stop_radius_mm}
-        constants = (
-            {STATE: model.state} | {name: [value] for name, value in numbers.items()} | {"outline": outline.table}
+        tables = {"outline": outline.table} | (
+            {} if aperture is None or aperture.mask is None else {"mask": aperture.table}
         )
-        self._outputs = {name: _OUTPUTS[name] for name in _OUTPUTS if scene.aperture or name != "stop_xy_mm"}
-        parts = [write_onnx(before, {}), model.data, write_onnx(weight_graph(), {})]
-        whole = joined(parts, constants, tuple(self._outputs), {"status": "lens_status"})
-        self._session = open_session(model.path, whole, model.threads, _INPUTS, self._outputs)
+        constants = {STATE: model.state, **tables} | {name: [value] for name, value in numbers.items()}
+        after = weight_graph((), aperture, scene.stop_status)
+        parts = [write_onnx(before, {}), model.data, write_onnx(after, {})]
+        whole = joined(parts, constants, tuple(_OUTPUTS), {"status": "lens_status"})
+        self._session = open_session(model.path, whole, model.threads, _INPUTS, _OUTPUTS)
 
     def sample(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `LensFilm.sample`."""
         count = film_mm.shape[1]
-        rows = {"ray": 6, "stop_xy_mm": 2}
         found: dict[str, NDArray[Any]] = {
-            name: np.empty((rows.get(name, 1), count), np.int32 if name == "status" else np.float32)
-            for name in self._outputs
+            name: np.empty((6 if name == "ray" else 1, count), np.int32 if name == "status" else np.float32)
+            for name in _OUTPUTS
         }
         for start in range(0, count, RAYS_A_CALL):
             part = slice(start, start + RAYS_A_CALL)
             given = {"film_mm": film_mm[:, part], "square": square[:, part], "wavelength_nm": wavelength_nm[None, part]}
-            done = run_session(
-                self._path, self._session, tuple(self._outputs), {k: padded(v) for k, v in given.items()}
-            )
+            feeds = {name: padded(values) for name, values in given.items()}
+            done = run_session(self._path, self._session, tuple(_OUTPUTS), feeds)
             for whole, piece in zip(found.values(), done, strict=True):
                 whole[:, part] = piece[..., : min(RAYS_A_CALL, count - start)]
-        if self._scene.aperture is not None:
-            stopped = self._scene.stopped(found["status"][0], found["stop_xy_mm"])
-            found["weight"][:, stopped != found["status"][0]] = 0
-            found["status"][0] = stopped
         return camera_rays(found)
 
 
 @dataclass(frozen=True)
 class ModelScene:
-    """A model at one focus and stop. The graph knows a round stop; blades and masks are tested on its crossing."""
+    """A model at one focus and stop. It knows a round stop; blades and masks are tested on its crossing."""
 
     model: OnnxLens
     film_z_mm: float
@@ -246,8 +240,12 @@ class ModelScene:
         if self.aperture is None:
             return status
         inside = self.aperture.inside(stop_xy_mm[0], stop_xy_mm[1], self.stop_radius_mm)
-        stopped = np.int32(st.blocked(int(self.model.card["lens"].get("stop_surface", 0)), st.RIM))
-        return np.where(inside | (status != st.PASSED), status, stopped)
+        return np.where(inside | (status != st.PASSED), status, np.int32(self.stop_status))
+
+    @property
+    def stop_status(self) -> int:
+        """Status of rays that the stop's shape blocks."""
+        return st.blocked(int(self.model.card["lens"].get("stop_surface", 0)), st.RIM)
 
     def with_differentials(
         self, derivatives: OnnxDerivatives, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray

@@ -127,8 +127,7 @@ def pupil_point(
     place = (1.0 - inner.maximum(0.0).sqrt()) * last_row
     row = place.floor()
     step = place - row
-    # a, b from -1 to 1, and the sign of b: a clamped multiple.
-    a, b, large = g.split(g.affine([[2.0, 0.0], [0.0, 2.0], [0.0, 2e30]], square, [-1.0, -1.0, -1e30]), (1, 1, 1))
+    a, b = g.split(square * 2.0 - 1.0, (1, 1))
     height = b.abs()
     size = a.abs().maximum(height)
     # Along the upper half of a concentric square, from 0 at +x over 2 at +y to 4 at -x; the centre has no place.
@@ -143,10 +142,11 @@ def pupil_point(
     vertex, side, centre = g.split(g.lookup(g.table("outline", 10 * wavelengths), cell, weights), (2, 2, 1))
     products = vertex * g.affine([[0.0, 1.0], [1.0, 0.0]], side)
     area = g.affine([[float(segments), -float(segments)]], products).minimum(inner * 1e30)  # none beyond the end
-    point = (vertex + side * (along - edge)) * g.concat(size, size * large.clip(-1.0, 1.0))
+    sign = (b * 1e30).clip(-1.0, 1.0)
+    point = (vertex + side * (along - edge)) * g.concat(size, size * sign)
     x, y = g.split(point, (1, 1))
     # Turned to the azimuth of the film point; on the axis (a hair beside it, far below rounding) that is 0.
-    turn = (film + [_HAIR, 0.0]) / (radius + _HAIR)
+    turn = (film + [_HAIR, 0.0]) * (1.0 / (radius + _HAIR))
     return turn * (x + centre) + g.affine([[0.0, -1.0], [1.0, 0.0]], turn) * y, area
 
 

@@ -9,15 +9,15 @@ import hashlib
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError
-
-if TYPE_CHECKING:
-    from torch import Tensor
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph, Value
 
 MIN_BLADES, MAX_BLADES = 3, 100
 MAX_MASK = 4096
@@ -96,76 +96,66 @@ class Aperture:
     def inside(self, x: Any, y: Any, radius_mm: float) -> Any:
         """Whether points of the stop lie in the opening: booleans of the shape of x and y; False for NaN.
 
-        Numpy arrays x, y and the stop's radius in mm; for torch tensors see `inside_on_tensors`.
+        Numpy arrays or torch tensors x, y and the stop's radius in mm.
         """
-        open_ = x * x + y * y <= radius_mm * radius_mm
-        if self.blades is not None:
-            return open_ & self.between_blades(x, y, radius_mm)
-        assert self.mask is not None
-        row, column = self.places(x, y, radius_mm)
-        open_ = open_ & self.on_mask(row, column)
-        row, column = (np.where(open_, v, 0).astype(np.intp) for v in (row, column))
-        return open_ & self.mask[row, column]
+        tensors = not isinstance(x, np.ndarray)
+        library: Any = import_module("torch") if tensors else np
+        points = library.stack([x.reshape(-1), y.reshape(-1)])
+        given = {"stop_xy_mm": points, "stop_radius_mm": library.ones_like(points[:1, :1]) * radius_mm}
+        if self.mask is not None:
+            given["mask"] = _mask_on(self, str(x.device)) if tensors else self.table.astype(x.dtype)
+        return (evaluate(self._graph, given)["open"] > 0).reshape(x.shape)
 
-    def between_blades(self, x: Any, y: Any, radius_mm: float) -> Any:
-        """Whether points lie within every blade's edge: half planes, or discs through two corners each.
+    def opening(self, g: Graph, xy: Value, radius: Value) -> Value:
+        """Whether points [2] of the stop of a radius (mm) lie in the opening, as a truth; a mask is the table `mask`.
 
-        A disc of curvature k that touches the edge's middle line at distance e holds what has
+        Within every blade's edge: half planes, or discs through two corners each. In units of the radius, a disc of
+        curvature k that touches the edge's middle line at distance e holds what has
         u (1 - k e) <= e - k (e^2 + x^2 + y^2) / 2, with u the distance along that line; k = 0 is the half plane.
         """
+        point = xy / radius
+        squared, turn = g.square(point), math.radians(self.rotation_deg)
+        within = squared <= 1.0
+        if self.mask is not None:
+            height, width = self.mask.shape
+            scale = max(height, width) / 2
+            cos, sin = math.cos(turn) * scale, math.sin(turn) * scale
+            place = g.affine([[sin, -cos], [cos, sin]], point, [height / 2, width / 2]).floor()
+            cell = g.affine([[float(width), 1.0]], place)
+            seen = g.constant(THRESHOLD) <= g.lookup(g.table("mask", 1), cell, g.constant(1.0))
+            on_mask = place.between([0.0, 0.0], [height - 1.0, width - 1.0])
+            return within & on_mask[0] & on_mask[1] & seen
         assert self.blades is not None
-        half = math.pi / self.blades
-        rise = self.curvature * radius_mm * (1 - math.cos(half))
-        curvature = 2 * rise / ((radius_mm * math.sin(half)) ** 2 + rise * rise)
-        edge = radius_mm * math.cos(half) + rise
-        bound = edge - curvature / 2 * (x * x + y * y + edge * edge)
-        scale = 1 - curvature * edge
-        within = x * scale == x * scale  # False for NaN
         if self.curvature == 1:
-            return within & (x * x + y * y <= radius_mm * radius_mm)
-        for k in range(self.blades):
-            angle = math.radians(self.rotation_deg) + (2 * k + 1) * half
-            within = within & (x * (scale * math.cos(angle)) + y * (scale * math.sin(angle)) <= bound)
-        return within
+            return within
+        half = math.pi / self.blades
+        rise = self.curvature * (1 - math.cos(half))
+        curvature = 2 * rise / (math.sin(half) ** 2 + rise * rise)
+        edge = math.cos(half) + rise
+        scale, angles = 1 - curvature * edge, turn + (2 * np.arange(self.blades) + 1) * half
+        along = g.affine(scale * np.stack([np.cos(angles), np.sin(angles)], 1), point)
+        while along.rows > 1:  # the largest of all
+            part = (along.rows + 1) // 2
+            along = along[:part].maximum(along[along.rows - part :])
+        return within & (along <= (edge - curvature / 2 * edge * edge) - squared * (curvature / 2))
 
-    def places(self, x: Any, y: Any, radius_mm: float) -> tuple[Any, Any]:
-        """Row and column of points on the mask, as numbers with a fraction."""
+    @cached_property
+    def _graph(self) -> Graph:
+        g = Graph()
+        opened = self.opening(g, g.input("stop_xy_mm", 2), g.input("stop_radius_mm", per_call=True))
+        g.outputs["open"] = g.select(opened, 1.0, 0.0)
+        return g
+
+    @cached_property
+    def table(self) -> NDArray[np.float32]:
+        """The mask as the table of `opening`, [H W, 1], row after row."""
         assert self.mask is not None
-        height, width = self.mask.shape
-        scale = max(height, width) / (2 * radius_mm) if radius_mm > 0 else 0.0
-        cos, sin = (f(math.radians(self.rotation_deg)) * scale for f in (math.cos, math.sin))
-        return height / 2 - (y * cos - x * sin), width / 2 + (x * cos + y * sin)
-
-    def on_mask(self, row: Any, column: Any) -> Any:
-        """Whether such places lie on the mask."""
-        assert self.mask is not None
-        height, width = self.mask.shape
-        return (row >= 0) & (row < height) & (column >= 0) & (column < width)
-
-
-def inside_on_tensors(aperture: Aperture, x: Tensor, y: Tensor, radius_mm: float) -> Tensor:
-    """Whether points [N] (mm, in the stop's plane) lie between the blades or on the mask; False for NaN.
-
-    The circle round the opening is the stop's own rim, which the tracer tests beside this.
-    """
-    if aperture.blades is not None:
-        opened: Tensor = aperture.between_blades(x, y, radius_mm)
-        return opened
-    import torch
-
-    row, column = aperture.places(x, y, radius_mm)
-    on_mask: Tensor = aperture.on_mask(row, column)
-    row, column = (torch.where(on_mask, v, 0.0).to(torch.int64) for v in (row, column))
-    mask = _mask_on(aperture, str(x.device))
-    return on_mask & mask[row, column]
+        return self.mask.reshape(-1, 1).astype(np.float32)
 
 
 @lru_cache(maxsize=8)
-def _mask_on(aperture: Aperture, device: str) -> Tensor:
-    import torch
-
-    assert aperture.mask is not None
-    return torch.tensor(aperture.mask, device=device)
+def _mask_on(aperture: Aperture, device: str) -> Any:
+    return import_module("torch").as_tensor(aperture.table, device=device)
 
 
 def _real(value: object) -> bool:

@@ -11,7 +11,6 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.optics import glass
-from neurolens.optics.apertures import inside_on_tensors
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.shapes import intersect_shape, is_plain
@@ -150,7 +149,7 @@ def meet(lens: Lens, k: int, r: Rays, before: Medium, entering: bool, mode: Mode
             tests.end(distance2 < math.inf)
         tests.require(at_most(distance2, surface.semi_diameter_mm**2, spend=mode.spend), k, st.RIM)
     if lens.aperture is not None and surface.stop:
-        tests.require(inside_on_tensors(lens.aperture, hit.x, hit.y, lens.stop_radius_mm), k, st.RIM)
+        tests.require(lens.aperture.inside(hit.x, hit.y, lens.stop_radius_mm), k, st.RIM)
     return hit
 
 
