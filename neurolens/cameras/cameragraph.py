@@ -33,7 +33,7 @@ def camera_graph(
         lens: inputs `rays` [5] (film and pupil point, wavelength), `film_z_mm` and `stop_radius_mm`; outputs
             `scene_ray` [6], `transmittance`, `status`, `stop_xy_mm` [2] for an aperture, else to be handed on, and
             derivatives of `scene_ray`, which the camera has, too.
-        segments, wavelengths: of the outline; see `pupil_point`.
+        segments, wavelengths: of the outline; see `pupil_graph`.
         aperture, stopped: see `weight_graph`.
 
     Inputs: those of `pupil_graph` and `weight_graph`. Outputs: those of `weight_graph`.

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.pupil_outline import turned
 from neurolens.modelfile.cardcheck import pupil_rows
 
 # Lattice on a row's box when the bounds are tightened; along and across (one half).
@@ -50,40 +48,6 @@ class PupilTable:
     def of(bounds: Mapping[str, Any]) -> PupilTable:
         """From the fields of `optics.pupils.PupilBounds`, as a model's card holds them."""
         return PupilTable(float(bounds["pupil_z_mm"]), float(bounds["film_radius_mm"]), pupil_rows(bounds))
-
-    def sample(self, film_mm: FloatArray, square: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Uniform points in the boxes of film points.
-
-        Args:
-            film_mm: [2, N].
-            square: [2, N] in [0, 1).
-
-        Returns the points [2, N] in mm and the areas [N] of their boxes in mm^2, 0 where nothing passes.
-        """
-        count = self.rows.shape[1]
-        radius = np.sqrt(np.einsum("in,in->n", film_mm, film_mm))
-        # Beyond the last row, and for NaN, the place is that of the dark row at the end.
-        place = np.fmin(radius * np.float32((count - 1) / self.film_radius_mm), np.float32(count - 1))
-        row = place.astype(np.intp)
-        step = place - row
-        low, low_step, width, width_step, half, half_step = self._between.take(row, axis=1)
-        width += width_step * step
-        half += half_step * step
-        along = low + low_step * step + width * square[0]
-        across = half * (square[1] * np.float32(2) - np.float32(1))
-        return turned(along, across, film_mm, radius), width * half * np.float32(2)
-
-    @cached_property
-    def _between(self) -> FloatArray:
-        """[6, R] low, width and half width at each row, each with its step to the next; a dark row at the end.
-
-        Rows hold the boxes of their neighbours, so what passes between two rows lies in the mean of their boxes.
-        """
-        low, high, half = self.rows
-        lit = np.append((low <= high)[:-1] & (low <= high)[1:], False)
-        columns = np.stack([low, high - low, half])
-        steps = np.diff(columns, axis=1, append=columns[:, -1:])
-        return np.where(lit, np.stack([columns, steps], axis=1).reshape(6, -1), np.float32(0))
 
 
 def tightened(table: PupilTable, passes: Passes, wavelength_nm: Sequence[float]) -> PupilTable:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph, Value
+from neurolens.graph.ir import Graph
 
 _HAIR = 1e-18  # mm
 
@@ -48,7 +48,7 @@ class PupilOutline:
     def sample(
         self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Points that fill the polygons of film points evenly; see `pupil_point`.
+        """Points that fill the polygons of film points evenly; see `pupil_graph`.
 
         Args:
             film_mm: [2, N].
@@ -71,7 +71,7 @@ class PupilOutline:
 
     @cached_property
     def numbers(self) -> dict[str, float]:
-        """The inputs of the call of `pupil_point`."""
+        """The inputs of the call of `pupil_graph`."""
         waves = [w**-2 for w in self.wavelength_nm]
         numbers = {"per_radius": 1 / self.film_radius_mm, "last_row": float(self.centre.size - 1)}
         if len(self.x) > 1:
@@ -80,7 +80,7 @@ class PupilOutline:
 
     @cached_property
     def table(self) -> FloatArray:
-        """The table of `pupil_point`, [R * (K + 1), 10 W]; each column is contiguous.
+        """The table of `pupil_graph`, [R * (K + 1), 10 W]; each column is contiguous.
 
         Groups of columns (weights 1, step, share, share step): first vertex and edge (x, y, dx, dy) at a row, and
         centre; their steps to the next row; and of two wavelengths the change of both from the first to the second.
@@ -96,19 +96,7 @@ class PupilOutline:
 
 @cache
 def pupil_graph(segments: int, wavelengths: int) -> Graph:
-    """`pupil_mm` [2] and `area_mm2` of `film_mm` [2], `square` [2] and `wavelength_nm`; see `pupil_point`."""
-    g = Graph()
-    point, area = pupil_point(
-        g, g.input("film_mm", 2), g.input("square", 2), g.input("wavelength_nm"), segments, wavelengths
-    )
-    g.outputs = {"pupil_mm": point, "area_mm2": area}
-    return g
-
-
-def pupil_point(
-    g: Graph, film: Value, square: Value, wavelength: Value, segments: int, wavelengths: int
-) -> tuple[Value, Value]:
-    """The pupil point [2] of a film point [2], of a point of the unit square and a wavelength, and its area.
+    """The pupil point of a film point, of a point of the unit square and a wavelength, and its area, as a graph.
 
     The square's concentric squares become concentric copies of the polygon, as for Shirley and Chiu's disk (1997):
     neighbours stay neighbours, and inside each triangle between centre and edge areas stay in proportion.
@@ -116,11 +104,14 @@ def pupil_point(
     Args:
         segments: K, of the upper half of a polygon. wavelengths: of the outline, 1 or 2.
 
-    Of the call: the table `outline` (`PupilOutline.table`), `per_radius` (1 / the last film radius), `last_row`, and
-    of two wavelengths `wave_first`, `wave_scale`: the share of the second is (1 / wavelength^2 - first) scale.
-
-    The area is that of `PupilOutline.sample`, but negative or NaN where nothing passes; points mean nothing there.
+    Inputs: `film_mm`, `square` [2], `wavelength_nm`; of the call the table `outline` (`PupilOutline.table`),
+    `per_radius` (1 / the last film radius), `last_row`, and of two wavelengths `wave_first`, `wave_scale`: the share of
+    the second is (1 / wavelength^2 - first) scale.
+    Outputs: `pupil_mm` [2], and `area_mm2`, that of `PupilOutline.sample`, but negative or NaN where nothing passes;
+    points mean nothing there.
     """
+    g = Graph()
+    film, square, wavelength = g.input("film_mm", 2), g.input("square", 2), g.input("wavelength_nm")
     per_radius, last_row = (g.input(name, per_call=True) for name in ("per_radius", "last_row"))
     radius = g.square(film).sqrt()
     inner = 1.0 - radius * per_radius
@@ -147,7 +138,9 @@ def pupil_point(
     x, y = g.split(point, (1, 1))
     # Turned to the azimuth of the film point; on the axis (a hair beside it, far below rounding) that is 0.
     turn = (film + [_HAIR, 0.0]) * (1.0 / (radius + _HAIR))
-    return turn * (x + centre) + g.affine([[0.0, -1.0], [1.0, 0.0]], turn) * y, area
+    pupil = turn * (x + centre) + g.affine([[0.0, -1.0], [1.0, 0.0]], turn) * y
+    g.outputs = {"pupil_mm": pupil, "area_mm2": area}
+    return g
 
 
 def wavelength_between(wavelength_nm: tuple[float, ...], share: float) -> float:
@@ -156,12 +149,3 @@ def wavelength_between(wavelength_nm: tuple[float, ...], share: float) -> float:
     if share in (0, 1):  # no rounding may leave the range
         return last if share else first
     return first if first == last else float((first**-2 + share * (last**-2 - first**-2)) ** -0.5)
-
-
-def turned(along: FloatArray, across: FloatArray, film_mm: FloatArray, radius: FloatArray) -> FloatArray:
-    """Points [2, N] of film points on +x, turned to the azimuth of the film points [2, N] at the radii given."""
-    on_axis = radius == 0
-    scale = np.float32(1) / np.where(on_axis, np.float32(1), radius)
-    with np.errstate(invalid="ignore"):  # infinite film points, which carry no area
-        cos, sin = film_mm[0] * scale + on_axis, film_mm[1] * scale
-    return np.stack([along * cos - across * sin, along * sin + across * cos])

@@ -16,6 +16,7 @@ from neurolens.graph import derive
 from neurolens.graph.c import write_blocks, write_c
 from neurolens.graph.compiler import compile_c
 from neurolens.graph.derive import derivative, with_derivatives
+from neurolens.graph.glsl import write_glsl
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
 from neurolens.graph.onnx import write_onnx
@@ -213,6 +214,7 @@ def test_lookups_of_any_float_stay_inside_the_table(tmp_path: Path) -> None:
             getattr(library, name)(count, given_, None, table_, len(cells), found_, status_)
             assert np.array_equal(status, y <= 0.5)
             found.append(out)
+    assert write_glsl(program, "h", []).count("texelFetch(t, ivec2(") == 4
     for values in found:
         np.testing.assert_allclose(values[:, known], wanted[:, known], rtol=0, atol=1e-6)
         assert values.shape == (2, x.size)
