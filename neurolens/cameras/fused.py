@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.cameragraph import camera_graph
+from neurolens.cameras.cameragraph import D_FILM, camera_graph
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FloatArray
 from neurolens.cameras.lens_film import LensFilm, camera_rays
 from neurolens.cameras.model import ModelScene, OnnxCamera
@@ -173,13 +173,17 @@ class _Compiled:
         self._call.restype = None
 
     def __call__(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
-        """Outputs [R, N] of the graph for inputs [R, N]."""
+        """What `lens_film.camera_rays` takes, for inputs [R, N]."""
         count = rays["film_mm"].shape[1]
         found: dict[str, NDArray[Any]] = {
-            name: np.empty((rows, count), kind) for name, (rows, kind) in self._rows.items()
+            name: np.empty((rows, count), kind) for name, (rows, kind) in self._rows.items() if name not in D_FILM
         }
+        arrays = rays | found
+        if D_FILM[0] in self._rows:
+            found["d_film"] = np.empty((6, 2, count), np.float32)
+            arrays |= {name: found["d_film"][:, k] for k, name in enumerate(D_FILM)}
         places: dict[str, int] = {}
-        for name, array in (rays | found).items():
+        for name, array in arrays.items():
             address, step = array.ctypes.data, array.strides[0]
             places |= {row: address + k * step for k, row in enumerate(row_names(name, len(array)))}
         given, out = (

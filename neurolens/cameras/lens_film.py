@@ -105,22 +105,24 @@ class LensFilm:
         # A film point that nothing reaches is dark: no ray is traced.
         some = np.flatnonzero(lit)
         found = self._weighted(scene, film_mm[:, some], pupil[:, some], area[some], wavelength_nm[some])
-        whole = {name: np.zeros((len(part), lit.size), part.dtype) for name, part in found.items()}
+        whole = {name: np.zeros((*part.shape[:-1], lit.size), part.dtype) for name, part in found.items()}
         whole["status"][:] = st.OUTSIDE_DOMAIN
         for name, part in found.items():
-            whole[name][:, some] = part
+            whole[name][..., some] = part
         return camera_rays(whole)
 
     def _weighted(
         self, scene: SceneFunction, film: FloatArray, pupil: FloatArray, area: FloatArray, wavelength_nm: FloatArray
     ) -> dict[str, NDArray[Any]]:
-        """Outputs of `weight_graph` for lit film points [2, N] through pupil points [2, N], densities 1 / area [N]."""
+        """What `camera_rays` takes, for lit film points [2, N] through pupil points [2, N], densities 1 / area [N]."""
         out = scene(film, pupil, wavelength_nm)
         given = {"film_mm": film, "pupil_mm": pupil, "area_mm2": area[None], "scene_ray": out.scene_ray}
         given |= {"transmittance": out.transmittance[None], "lens_status": out.status[None].astype(np.float32)}
         given |= {} if out.d_film is None else dict(zip(D_FILM, np.moveaxis(out.d_film, 1, 0), strict=True))
         given |= {name: np.array([[value]], np.float32) for name, value in self.numbers.items()}
-        return evaluate(weight_graph(() if out.d_film is None else D_FILM), given)
+        found = evaluate(weight_graph(() if out.d_film is None else D_FILM), given)
+        moves = [found.pop(name) for name in D_FILM if name in found]
+        return found | ({"d_film": np.stack(moves, 1)} if moves else {})
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -149,14 +151,15 @@ class LensFilm:
 
 
 def camera_rays(found: Mapping[str, NDArray[Any]]) -> CameraRays:
-    """Rays of the outputs of `cameragraph.weight_graph`, [R, N] each; those that do not pass look ahead."""
-    ray, moves = found["ray"], None
+    """Rays of the outputs of `cameragraph.weight_graph`, [R, N] each; those that do not pass look ahead.
+
+    Derivatives by the film point stand together, `d_film` [6, 2, N].
+    """
+    ray, moves = found["ray"], found.get("d_film")
     lost = np.flatnonzero(found["status"][0] != st.PASSED)
     if lost.size:
         ray[:, lost] = _AHEAD
-        for name in D_FILM if D_FILM[0] in found else ():
-            found[name][:, lost] = 0
-    if D_FILM[0] in found:
-        both = np.stack([found[name] for name in D_FILM], 1)
-        moves = RayDifferentials(both[:3], both[3:])
-    return CameraRays(ray[:3], ray[3:], found["weight"][0], found["status"][0], moves)
+        if moves is not None:
+            moves[..., lost] = 0
+    differentials = None if moves is None else RayDifferentials(moves[:3], moves[3:])
+    return CameraRays(ray[:3], ray[3:], found["weight"][0], found["status"][0], differentials)
