@@ -198,7 +198,10 @@ class OnnxFilm:
         constants = {STATE: model.state, **tables} | {name: [value] for name, value in numbers.items()}
         after = weight_graph((), aperture, scene.stop_status)
         parts = [write_onnx(before, {}), model.data, write_onnx(after, {})]
-        whole = joined(parts, constants, tuple(_OUTPUTS), {"status": "lens_status"})
+        try:
+            whole = joined(parts, constants, tuple(_OUTPUTS), {"status": "lens_status"})
+        except ModelError as error:
+            raise ModelError(f"{model.path}: {error}") from error
         self._session = open_session(model.path, whole, model.threads, _INPUTS, _OUTPUTS)
 
     def sample(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:

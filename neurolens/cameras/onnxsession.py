@@ -46,11 +46,16 @@ def joined(
         models: of the package onnx, or their bytes.
         constants: inputs that become numbers. outputs: wanted of all that the models give.
         renamed: what models give, where a later one takes it under another name.
+
+    Raises:
+        ModelError: models of several operator sets.
     """
     import onnx  # takes a quarter of a second
     from onnx import helper, numpy_helper
 
     parts = [onnx.load_from_string(m) if isinstance(m, bytes) else m for m in models]
+    if len(versions := {tuple((o.domain, o.version) for o in part.opset_import) for part in parts}) > 1:
+        raise ModelError(f"operator sets {sorted(versions)}: a camera needs a model of the one that neurolens writes")
     graph, known = onnx.GraphProto(name="camera"), dict[str, Any]()  # what is given: a name here, and its description
     for k, part in enumerate(parts):
         names = {"": ""}  # of the part: names here

@@ -22,6 +22,7 @@ from neurolens.graph.ir import Graph, Value
 MIN_BLADES, MAX_BLADES = 3, 100
 MAX_MASK = 4096
 THRESHOLD = 0.5
+_AT_ONCE = 1 << 16  # points: each takes a number a blade
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,10 +102,12 @@ class Aperture:
         tensors = not isinstance(x, np.ndarray)
         library: Any = import_module("torch") if tensors else np
         points = library.stack([x.reshape(-1), y.reshape(-1)])
-        given = {"stop_xy_mm": points, "stop_radius_mm": library.ones_like(points[:1, :1]) * radius_mm}
+        call = {"stop_radius_mm": library.ones_like(points[:1, :1]) * radius_mm}
         if self.mask is not None:
-            given["mask"] = _mask_on(self, str(x.device)) if tensors else self.table.astype(x.dtype)
-        return (evaluate(self._graph, given)["open"] > 0).reshape(x.shape)
+            call["mask"] = _mask_on(self, str(x.device)) if tensors else self.table
+        parts = [points[:, k : k + _AT_ONCE] for k in range(0, max(points.shape[1], 1), _AT_ONCE)]
+        opened = [evaluate(self._graph, {"stop_xy_mm": part, **call})["open"][0] > 0 for part in parts]
+        return library.concatenate(opened).reshape(x.shape)
 
     def opening(self, g: Graph, xy: Value, radius: Value) -> Value:
         """Whether points [2] of the stop of a radius (mm) lie in the opening, as a truth; a mask is the table `mask`.

@@ -353,3 +353,12 @@ def test_models_need_no_torch(path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_model_of_another_operator_set_is_refused_as_a_camera(path: Path, tmp_path: Path) -> None:
+    proto, other = onnx.load(path), tmp_path / "other.onnx"
+    proto.opset_import[0].version += 1
+    onnx.save(proto, other)
+    camera = OnnxCamera(load_model(other), film_mm=(36.0, 24.0), focus_m=2.0)
+    with pytest.raises(ModelError, match=r"other\.onnx: operator sets"):
+        camera.sample(np.zeros((2, 1), np.float32), np.full((2, 1), 0.5, np.float32), np.full(1, 550, np.float32))
