@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,11 @@ def test_a_signal_in_mid_render_loses_nothing(
     out, part = tmp_path / "a.exr", tmp_path / "a.exr.part"
     arguments = ["render", scene.name, "--camera", "thin", "-o", out.name, "--quiet", "--checkpoint-every", "0.05"]
     command = [sys.executable, "-m", "neurolens", *arguments, "--samples", "100000"]
-    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    # Tests in the background of a shell ignore SIGINT, and would hand that on.
+    default = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(
+        command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=default
+    )
     wait(lambda: part.exists() or process.poll() is not None)
     workers = children(process)
     assert len(workers) == 2
