@@ -211,13 +211,15 @@ class OnnxFilm:
             name: np.empty((6 if name == "ray" else 1, count), np.int32 if name == "status" else np.float32)
             for name in _OUTPUTS
         }
-        for start in range(0, count, RAYS_A_CALL):
-            part = slice(start, start + RAYS_A_CALL)
+        # Calls of about the same size: few rays cost nearly as much as many.
+        ends = np.linspace(0, count, max(1, round(count / RAYS_A_CALL)) + 1).astype(int)
+        for start, end in zip(ends[:-1], ends[1:], strict=True):
+            part = slice(start, end)
             given = {"film_mm": film_mm[:, part], "square": square[:, part], "wavelength_nm": wavelength_nm[None, part]}
             feeds = {name: padded(values) for name, values in given.items()}
             done = run_session(self._path, self._session, tuple(_OUTPUTS), feeds)
             for whole, piece in zip(found.values(), done, strict=True):
-                whole[:, part] = piece[..., : min(RAYS_A_CALL, count - start)]
+                whole[:, part] = piece[..., : end - start]
         return camera_rays(found)
 
 
