@@ -6,7 +6,7 @@ together with the graph of their lens; cameras whose lens is a function (a trace
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 
 from neurolens.base import status as st
 from neurolens.cameras.pupil_outline import pupil_graph
@@ -50,7 +50,7 @@ def camera_graph(
     return g
 
 
-@cache
+@lru_cache(maxsize=16)
 def weight_graph(derivatives: tuple[str, ...] = (), aperture: Aperture | None = None, stopped: int = 0) -> Graph:
     """Weighted rays in the camera's frame, of rays of a lens.
 

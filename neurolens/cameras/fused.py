@@ -105,8 +105,7 @@ class FusedFilm:
         """The lens with differentials."""
         fitted = with_low_order_derivatives(self._graph, self._samples())
         self.moves_error = None if fitted is None else fitted.error
-        graph = with_film_derivatives(self._graph) if fitted is None else fitted.graph
-        return graph
+        return with_film_derivatives(self._graph) if fitted is None else fitted.graph
 
     def _samples(self) -> dict[str, FloatArray]:
         """Inputs of the graph for rays all over film, pupil and wavelengths."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -201,8 +202,7 @@ def test_lookups_of_any_float_stay_inside_the_table(tmp_path: Path) -> None:
     try:
         compile_c(write_blocks(program, "f") + write_c(program, "g", []) + _LOOKUP_CALL, tmp_path / "f.so")
     except InputError as reason:
-        found.append(found[0])
-        assert "compiler" in str(reason)
+        assert not shutil.which("cc"), reason
     else:
         library, padded = ctypes.CDLL(str(tmp_path / "f.so")), np.zeros((7, 2, 8), np.float32)
         padded[..., :5] = table.reshape(7, 2, 5)
