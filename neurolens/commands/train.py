@@ -10,7 +10,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_json, check_run_folder, positive, whole
+from neurolens.commands.arguments import add_json, check_run_folder, lens_path, positive, whole
 from neurolens.commands.output import answer, number, table
 
 _DESCRIPTION = """\
@@ -46,7 +46,9 @@ def add_parser(subparsers: Any) -> None:
         "train", help="fit, measure and render the models of an experiment", description=_DESCRIPTION, epilog=_EPILOG
     )
     parser.add_argument("experiment", metavar="EXPERIMENT.toml", nargs="?", type=Path, help="experiment file")
-    parser.add_argument("--lens", metavar="FILE", type=Path, help="lens file, instead of an experiment")
+    parser.add_argument(
+        "--lens", metavar="FILE", type=Path, help="lens file or name of lenses/, instead of an experiment"
+    )
     parser.add_argument(
         "--out", metavar="DIR", type=Path,
         help="run folder, made if needed (default: runs/NAME of the experiment or lens file)",
@@ -98,6 +100,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("neurolens train", given, "(without --lens)", "--lens FILE")
     args.overrides = [*states, *asked, *["evaluation.rounds=0"] * args.no_race, *args.overrides]
     if args.lens is not None:
+        args.lens = lens_path(args.lens, "train")
         experiment = default_experiment(_own_format(args.lens, folder), args.overrides)
     else:
         experiment = read_experiment(args.experiment, args.overrides)
