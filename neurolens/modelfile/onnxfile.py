@@ -135,6 +135,8 @@ def _node(node: Fields) -> Node:
     attributes = [fields_of(attribute, _FLOATS["attribute"]) for attribute in node.get(5, [])]
     if any(set(a) & {5, 6, 10, 11, 22, 23} for a in attributes):  # tensors, graphs, sparse tensors
         raise ModelError(f"operator {kind}: an attribute holds a tensor or a graph, expected numbers only")
+    if kind == "Transpose" and attributes:
+        raise ModelError("operator Transpose: attributes, expected none: axes in reverse order")
     numbers = {text(a, 1): _signed(one(a, 3)) for a in attributes if 3 in a}
     inputs, outputs = ([as_text(name) for name in node.get(number, [])] for number in (1, 2))
     return Node(kind, numbers, inputs, outputs)

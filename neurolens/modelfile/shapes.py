@@ -19,7 +19,7 @@ RAYS = 16_400  # of a call: `onnxlens.BATCH` with its padding
 MAX_NUMBERS = 20_000 * RAYS  # of any tensor; the largest polynomials known have a thousand terms
 MAX_ALIVE = 2 * MAX_NUMBERS  # of all computed tensors that a later node still needs
 
-ELEMENTWISE = frozenset("Abs Cast Clip Cos DequantizeLinear Identity Neg Reciprocal Relu Sin Sqrt Tanh".split())
+ELEMENTWISE = frozenset("Abs Cast Clip Cos DequantizeLinear Floor Identity Neg Reciprocal Relu Sin Sqrt Tanh".split())
 BROADCAST = frozenset("Add And Div Equal Greater GreaterOrEqual LessOrEqual Max Min Mul Sub Where".split())
 
 
@@ -136,6 +136,10 @@ def _reshape(_: Node, given: list[Shape], constants: list[Any]) -> list[Shape]:
     return [tuple(shape)]
 
 
+def _transpose(_: Node, given: list[Shape], __: list[Any]) -> list[Shape]:
+    return [given[0][::-1]]
+
+
 SHAPED: dict[str, Callable[[Node, list[Shape], list[Any]], list[Shape]]] = {
     "MatMul": _product,
     "Gemm": _product,
@@ -144,6 +148,7 @@ SHAPED: dict[str, Callable[[Node, list[Shape], list[Any]], list[Shape]]] = {
     "Split": _split,
     "ReduceSum": _reduce,
     "Reshape": _reshape,
+    "Transpose": _transpose,
 }
 
 

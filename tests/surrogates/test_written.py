@@ -185,6 +185,8 @@ def test_fixed_values_outside_the_domain_are_refused() -> None:
             fixed_models(model, fix)
     with pytest.raises(InputError, match="film_z"):
         fused_program([model], ALL, Fix(film_z_mm=1.0))
+    with pytest.raises(InputError, match="published method"):
+        fixed_models(lens_models.model("rtf"), Fix(wavelengths_nm=(500.0,)))
 
 
 def test_literals_keep_every_bit() -> None:
