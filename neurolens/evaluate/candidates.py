@@ -251,6 +251,6 @@ def fused_candidate(
         found = load_fitted(model) if isinstance(model, Path) else model
         models = [found] if isinstance(found, LensModel) else found
         program = fused_program(models, parts, fix)
-    except ModelError:
+    except (ModelError, InputError):
         return None
     return program_candidate(name, program, domain, fix.stop_radius_mm)

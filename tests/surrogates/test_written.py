@@ -191,6 +191,12 @@ def test_fixed_values_outside_the_domain_are_refused() -> None:
         fixed_models(lens_models.model("rtf"), Fix(wavelengths_nm=(500.0,)))
 
 
+def test_networks_that_a_compiler_would_not_end_with_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.surrogates.source.MOST_WEIGHTS", 100)
+    with pytest.raises(InputError, match="onnxruntime"):
+        fused_program([lens_models.model("network")])
+
+
 def test_literals_keep_every_bit() -> None:
     numbers = np.random.default_rng(1).integers(0, 2**32, 20_000, dtype=np.uint32).view(np.float32)
     numbers = numbers[np.isfinite(numbers)]
