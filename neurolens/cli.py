@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_
     args = argparse.Namespace(kept="nothing was done")
     try:
         args = build().parse_args(argv)
-        with _plain_warnings():
+        with _plain_warnings(quiet=getattr(args, "quiet", False)):
             code: int = args.run(args)
         sys.stdout.flush()
         return code
@@ -88,19 +88,22 @@ def _fail(message: str) -> int:
 
 
 @contextmanager
-def _plain_warnings() -> Iterator[None]:
-    """Show the project's own warnings as one line each, without the place in the code."""
+def _plain_warnings(quiet: bool) -> Iterator[None]:
+    """Show each of the project's own warnings once, as one line without the place in the code; none if `quiet`."""
     with warnings.catch_warnings():
-        usual = warnings.showwarning
+        usual, said = warnings.showwarning, set[str]()
 
         def show(message: Any, category: type[Warning], *place: Any, **more: Any) -> None:
             if issubclass(category, NeurolensWarning):
-                print(f"neurolens: warning: {message}", file=sys.stderr)
+                text = " ".join(str(message).split())
+                if not quiet and text not in said:
+                    print(f"neurolens: warning: {text}", file=sys.stderr)
+                said.add(text)
             else:
                 usual(message, category, *place, **more)
 
         warnings.showwarning = show
-        warnings.simplefilter("default", NeurolensWarning)
+        warnings.simplefilter("always", NeurolensWarning)
         yield
 
 

@@ -128,8 +128,8 @@ def test_samples_that_are_not_finite_are_one_warning(
 
     monkeypatch.setattr(ThinLens, "sample", sample)
     out = tmp_path / "a.exr"
-    assert main(["render", str(scene), "--camera", "thin", "--quiet", "-o", str(out)]) == 0
-    lines = capsys.readouterr().err.splitlines()
+    assert main(["render", str(scene), "--camera", "thin", "-o", str(out)]) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
     half = 64 * 36 * 16 // 2
     assert lines == [f"neurolens: warning: {half} of {2 * half} samples were not finite and count as black"]
     picture, told = read_exr(out)

@@ -171,7 +171,7 @@ def run(args: argparse.Namespace) -> int:
     width, height = picture_size(settings, args.width, args.height)
     PixelGrid(width, height, (settings.film_width_mm, settings.film_height_mm))  # before the slow make_camera
     camera = make_camera(args.camera, shot_of(settings, args, scene.aperture))
-    for note in camera.settings.get("notes", ()):
+    for note in (*camera.settings.get("notes", ()), *_pixel_notes(camera, width)):
         warn(note)
     with Stopping() as stopping, Progress(quiet=args.quiet).stage(f"render {scene.name}, {camera.name}") as report:
         result = render(
@@ -182,6 +182,13 @@ def run(args: argparse.Namespace) -> int:
         if not result.stats["complete"]:
             raise Unfinished
     return _deliver(args, files, result, camera, film, stopping)
+
+
+def _pixel_notes(camera: Camera, width: int) -> list[str]:
+    """A sentence on a model whose error is larger than the pixels of a picture so many wide."""
+    error = (camera.settings.get("card") or {}).get("errors", {}).get("rms_um") or 0.0
+    pixel = 1e3 * camera.film_mm[0] / width
+    return [f"the model's RMS error of {error:.3g} um is more than a pixel, {pixel:.3g} um"] if error > pixel else []
 
 
 def _deliver(

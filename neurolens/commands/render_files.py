@@ -7,13 +7,14 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import check_writable
 from neurolens.base.progress import duration
 from neurolens.commands.arguments import check_folder, check_suffix, positive
@@ -124,8 +125,8 @@ class Unfinished(Exception):
 
 
 def warn(text: str) -> None:
-    """Print a warning to stderr."""
-    print(f"neurolens: warning: {text}", file=sys.stderr)
+    """A warning, which the command line prints to stderr."""
+    warnings.warn(text, NeurolensWarning, stacklevel=2)
 
 
 def watch_of(args: argparse.Namespace, files: Files, stop: Callable[[], bool]) -> Watch:

@@ -10,7 +10,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_json, check_run_folder
+from neurolens.commands.arguments import add_json, check_run_folder, lens_path
 from neurolens.commands.output import answer, number, table
 
 _DESCRIPTION = """\
@@ -44,7 +44,9 @@ def add_parser(subparsers: Any) -> None:
         "train", help="fit, measure and render the models of an experiment", description=_DESCRIPTION, epilog=_EPILOG
     )
     parser.add_argument("experiment", metavar="EXPERIMENT.toml", nargs="?", type=Path, help="experiment file")
-    parser.add_argument("--lens", metavar="FILE", type=Path, help="lens file, instead of an experiment")
+    parser.add_argument(
+        "--lens", metavar="FILE", type=Path, help="lens file or name of lenses/, instead of an experiment"
+    )
     parser.add_argument(
         "--out", metavar="DIR", type=Path,
         help="run folder, made if needed (default: runs/NAME of the experiment or lens file)",
@@ -75,6 +77,7 @@ def run(args: argparse.Namespace) -> int:
     if states and args.lens is None:
         raise InputError("neurolens train", "--zoom-range, --internal-focus", "(without --lens)", "--lens FILE")
     if args.lens is not None:
+        args.lens = lens_path(args.lens, "train")
         args.overrides = [*states, *args.overrides]
         experiment = default_experiment(_own_format(args.lens, folder), args.overrides)
     else:

@@ -23,6 +23,7 @@ MAX_BYTES = 64 * 2**20
 OPERATORS = ELEMENTWISE | BROADCAST | frozenset(SHAPED)
 # TensorProto.DataType: what models hold, and the numpy type of their raw bytes.
 _TYPES: dict[int, str] = {1: "<f4", 3: "<i1", 6: "<i4", 7: "<i8", 10: "<f2"}
+_CASTS = {1: "float32", 6: "int32", 7: "int64", 9: "bool"}  # never text, of 32 bytes a number
 _EXTERNAL = 1  # TensorProto.DataLocation
 _FLOATS = {"attribute": frozenset({2, 7}), "tensor": frozenset({4, 10})}  # fields of numbers of fixed width
 
@@ -120,10 +121,10 @@ def _check_graph(graph: Fields, opsets: list[str], functions: bool) -> None:
     for tensor in tensors:
         _check_tensor(tensor)
     nodes = [_node(fields_of(node)) for node in graph.get(1, [])]
-    known = [_shape_of_input(fields_of(value)) for value in graph.get(11, [])]
-    known += [(text(t, 8), tuple(integers(t.get(1, [])))) for t in tensors]
+    inputs = [_shape_of_input(fields_of(value)) for value in graph.get(11, [])]
+    constants = [(text(t, 8), tuple(integers(t.get(1, [])))) for t in tensors]
     try:
-        check_shapes(nodes, known, {text(t, 8): _values(t).tolist() for t in tensors if t.get(2) == [7]})
+        check_shapes(nodes, inputs, constants, {text(t, 8): _values(t).tolist() for t in tensors if t.get(2) == [7]})
     except ValueError as error:
         raise ModelError(str(error)) from error
 
@@ -138,6 +139,8 @@ def _node(node: Fields) -> Node:
     if kind == "Transpose" and attributes:
         raise ModelError("operator Transpose: attributes, expected none: axes in reverse order")
     numbers = {text(a, 1): _signed(one(a, 3)) for a in attributes if 3 in a}
+    if kind == "Cast" and numbers.get("to") not in _CASTS:
+        raise ModelError(f"operator Cast: to type {numbers.get('to')}, expected {', '.join(_CASTS.values())}")
     inputs, outputs = ([as_text(name) for name in node.get(number, [])] for number in (1, 2))
     return Node(kind, numbers, inputs, outputs)
 

@@ -59,7 +59,7 @@ PUBLISHED: dict[str, PublishedMethod] = {
     ),
     "neurolens2017": PublishedMethod(
         'Zheng and Zheng 2017, "NeuroLens: Data-Driven Camera Lens Simulation Using Neural Networks", Computer '
-        "Graphics Forum 36(8)",
+        "Graphics Forum 36(8); here 24,000 steps of 128 rays a network",
         (
             ModelSettings(
                 "neurolens2017",
@@ -68,7 +68,7 @@ PUBLISHED: dict[str, PublishedMethod] = {
                 partitions=2,
                 units=128,
                 layers=3,
-                steps=6000,
+                steps=24_000,
             ),
         ),
     ),
