@@ -23,7 +23,7 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.rays import frame_width_mm
 from neurolens.evaluate.records import ExactRecord, Timing
 from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, race
-from neurolens.graph.c import Signature, write_c
+from neurolens.graph.c import Signature, write_blocks, write_c
 from neurolens.graph.compiler import FLAGS, compile_c, find_compiler
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
@@ -160,7 +160,9 @@ class CompiledSource:
         self.signature = Signature.of(program, "lens")
         self._folder = tempfile.TemporaryDirectory(prefix="neurolens-source-")
         library = Path(self._folder.name) / "lens.so"
-        text = write_c(program, "lens", ["A timed model."]) + self._wrapper()
+        blocks = bool(program.own_tables)  # lookups: loops of arrays have them apart
+        text = write_blocks(program, "lens") if blocks else write_c(program, "lens", ["A timed model."])
+        text += self._wrapper(blocks)
         try:
             self.warnings = compile_c(text, library, flags)
         except InputError as error:
@@ -168,9 +170,15 @@ class CompiledSource:
         self._run = ctypes.CDLL(str(library)).neurolens_run
         self._run.argtypes, self._run.restype = [ctypes.c_size_t, ctypes.c_void_p], None
 
-    def _wrapper(self) -> str:
+    def _wrapper(self, blocks: bool) -> str:
         """All arguments as one array of pointers: ctypes is slow per argument."""
         s = self.signature
+        if blocks:
+            first = len(s.per_ray)
+            call, out = ", ".join(f"*(const float *)a[{k}]" for k in range(first, len(s.inputs))), len(s.inputs)
+            given = f"(const float *const *)a, call, lens_table, lens_table_cells, (float *const *)(a + {out})"
+            body = f"const float call[] = {{{call}}}; lens(n, {given}, (int *)a[{out + len(s.outputs)}]);"
+            return f"void neurolens_run(size_t n, void **a) {{ {body} }}\n"
         kinds = ["(const float *)a[{}]"] * len(s.per_ray) + ["*(const float *)a[{}]"] * len(s.per_call)
         kinds += ["*(const int *)a[{}]"] * (s.bands > 1) + ["(float *)a[{}]"] * len(s.outputs) + ["(int *)a[{}]"]
         given = ", ".join(kind.format(i) for i, kind in enumerate(kinds))
@@ -252,6 +260,6 @@ def fused_candidate(
         found = load_fitted(model) if isinstance(model, Path) else model
         models = [found] if isinstance(found, LensModel) else found
         program = fused_program(models, parts, fix)
-    except (ModelError, TypeError):
+    except (ModelError, InputError):
         return None
     return program_candidate(name, program, domain, fix.stop_radius_mm)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from neurolens.base.errors import InputError
 from neurolens.surrogates.cores import Basis
 
-PublishedName = Literal["taylor", "hanika", "schrade", "zheng-adaptive", "neurolens2017", "rtf"]
+PublishedName = Literal["taylor", "hanika", "schrade", "zheng-adaptive", "neurolens2017", "rtf", "ray-lut"]
 Method = Literal["thin", "thick", "dense", "omp", "ols", "adaptive", "mlp", "ols+mlp", PublishedName]
 POLYNOMIALS = ("dense", "omp", "ols", "adaptive")
 NETWORKS = ("mlp", "ols+mlp")
