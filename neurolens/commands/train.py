@@ -10,7 +10,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_json, check_run_folder, lens_path
+from neurolens.commands.arguments import add_glass, add_json, check_run_folder, lens_path
 from neurolens.commands.output import answer, number, table
 
 _DESCRIPTION = """\
@@ -63,6 +63,7 @@ def add_parser(subparsers: Any) -> None:
         "--internal-focus", action="store_true",
         help="of --lens: one model of internal focus, infinity to the near limit (input \"state\", in 1/m)",
     )  # fmt: skip
+    add_glass(parser)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="fitted models are kept in the run folder; the same command resumes")
 
