@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from neurolens.base.errors import NeurolensError
+from neurolens.base.signals import ASKING
 from neurolens.render.film import CONTEXT, FORKS
 from neurolens.render.job import Job
 
@@ -145,7 +146,7 @@ def _signals_held() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ASKING)
     try:
         yield
     finally:
