@@ -33,7 +33,7 @@ examples:
   neurolens export models/NAME.onnx --to c -o lens.h
   neurolens render experiments/scenes/room.toml --camera models/NAME.onnx -o room.exr
 
-exit codes: 0 done, 1 a promise of a model does not hold, 2 bad input, 130 interrupted.
+exit codes: 0 done, 1 a model breaks a promise or none has the error asked for, 2 bad input, 130 interrupted.
 Help of a command: neurolens COMMAND --help"""
 
 

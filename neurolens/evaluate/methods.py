@@ -34,7 +34,7 @@ from neurolens.surrogates.settings import NETWORK_ABLATIONS, POLYNOMIAL_ABLATION
 
 GROUPS = {
     "paraxial": "what renderers use today",
-    "published": "published methods, as their papers have them",
+    "published": "published methods, our implementations of their papers",
     "ours": "this project's",
     "ablations": "ours with one thing changed",
 }

@@ -138,6 +138,8 @@ def _node(node: Fields) -> Node:
     attributes = [fields_of(attribute, _FLOATS["attribute"]) for attribute in node.get(5, [])]
     if any(set(a) & {5, 6, 10, 11, 22, 23} for a in attributes):  # tensors, graphs, sparse tensors
         raise ModelError(f"operator {kind}: an attribute holds a tensor or a graph, expected numbers only")
+    if kind == "Transpose" and attributes:
+        raise ModelError("operator Transpose: attributes, expected none: axes in reverse order")
     numbers = {text(a, 1): _signed(one(a, 3)) for a in attributes if 3 in a}
     if kind == "Cast" and numbers.get("to") not in _CASTS:
         raise ModelError(f"operator Cast: to type {numbers.get('to')}, expected {', '.join(_CASTS.values())}")

@@ -26,7 +26,7 @@ _A_NUMBER = 10
 MAX_RANK = 8
 MAX_NODES = 10_000  # 136 in the largest model that ships
 
-ELEMENTWISE = frozenset("Abs Cast Clip Cos DequantizeLinear Identity Neg Reciprocal Relu Sin Sqrt Tanh".split())
+ELEMENTWISE = frozenset("Abs Cast Clip Cos DequantizeLinear Floor Identity Neg Reciprocal Relu Sin Sqrt Tanh".split())
 BROADCAST = frozenset("Add And Div Equal Greater GreaterOrEqual LessOrEqual Max Min Mul Sub Where".split())
 
 
@@ -167,6 +167,10 @@ def _reshape(_: Node, given: list[Shape], constants: list[Any]) -> list[Shape]:
     return [tuple(shape)]
 
 
+def _transpose(_: Node, given: list[Shape], __: list[Any]) -> list[Shape]:
+    return [given[0][::-1]]
+
+
 SHAPED: dict[str, Callable[[Node, list[Shape], list[Any]], list[Shape]]] = {
     "MatMul": _product,
     "Gemm": _product,
@@ -175,6 +179,7 @@ SHAPED: dict[str, Callable[[Node, list[Shape], list[Any]], list[Shape]]] = {
     "Split": _split,
     "ReduceSum": _reduce,
     "Reshape": _reshape,
+    "Transpose": _transpose,
 }
 
 

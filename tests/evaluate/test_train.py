@@ -15,6 +15,7 @@ from experiments.zoom import CASES, page
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
+from neurolens.cli import main
 from neurolens.evaluate import measure
 from neurolens.evaluate.experiment import default_experiment, read_experiment
 from neurolens.evaluate.measure import fit_and_measure
@@ -156,6 +157,34 @@ def test_bad_settings_name_the_field(tmp_path: Path, override: str, field: str) 
     (tmp_path / "small.toml").write_text(SMALL.replace("ROOT", str(ROOT)))
     with pytest.raises(InputError, match=field):
         run_experiment(read_experiment(tmp_path / "small.toml", [override]), tmp_path / "out")
+
+
+SINGLET = str(lens_models.LENSES / "thorlabs_lb1471_biconvex_50.toml")
+QUICK = """--no-race --quiet --set pairs.train=1000 --set pairs.held_out=500 --set pairs.rim=500 --set lens.f_number=8
+--set evaluation.vignetting_rays=2000 --set domain.film_radius_mm=15""".split()
+RUNGS = "model=[{terms=3,planes=false},{terms=12,planes=false},{terms=20,planes=false}]"
+
+
+@pytest.mark.parametrize(("asked", "within_um", "tried"), [("um=2", 2.0, 2), ("px=1e-6", 1e-6 * 6.24, 3)])
+def test_models_are_fitted_until_one_has_the_error_asked_for(tmp_path, capsys, asked, within_um, tried) -> None:
+    kind, _, value = asked.partition("=")
+    code = main(["train", "--lens", SINGLET, "--out", str(tmp_path), f"--target-{kind}", value, *QUICK, "--set", RUNGS])
+    found, said = json.loads((tmp_path / "results.json").read_text()), capsys.readouterr().out
+    errors = [m["rms_um"] for m in found["models"]]
+    assert found["target"]["within_um"] == pytest.approx(within_um, rel=1e-3)  # 15 mm: a frame of 24.96 mm
+    assert len(errors) == tried and (errors[-1] <= within_um) == (code == 0) == found["target"]["met"]
+    assert all(e > within_um for e in errors[:-1])
+    assert ("no model tried reaches it" in said) == (code == 1)
+    assert not found["exact"] and "ns_per_ray" not in found["models"][0] and (tmp_path / "report.html").exists()
+
+
+def test_an_error_asked_for_is_one_positive_number_of_a_lens() -> None:
+    asked = default_experiment(SINGLET, ["target.um=1.5"])
+    assert asked.target and asked.target.within_um(20.0) == 1.5 and len(asked.model) > 5
+    for bad in ("target.um=-1", "target.px=inf", "target={um=1.0,px=1.0}", "target={}"):
+        with pytest.raises(InputError, match="target"):
+            default_experiment(SINGLET, [bad])
+    assert main(["train", "any.toml", "--target-um", "1"]) == 2
 
 
 ZOOM = lens_models.LENSES / "nikon_zoom_70_200.toml"
