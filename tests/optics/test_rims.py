@@ -53,9 +53,7 @@ def test_rims_clip_as_the_rule_says(name: str, vignetting: float) -> None:
 def test_a_lens_file_without_diameters_passes_and_blocks_what_the_printed_one_does(name: str, tmp_path: Path) -> None:
     """Wherever rims are not what limits: at the stop, and within the share of the pupil that the rule keeps."""
     text = (LENSES / f"{name}.toml").read_text(encoding="utf-8")
-    bare = re.sub(
-        r", diameter_mm = *[0-9.]+", "", re.sub(r"^rims = .*$", 'rims = "derived"', text, flags=re.MULTILINE)
-    )
+    bare = re.sub(r", diameter_mm = *[0-9.]+", "", re.sub(r"^rims = .*$", 'rims = "derived"', text, flags=re.MULTILINE))
     (tmp_path / f"{name}.toml").write_text(bare, encoding="utf-8")
     lens, printed = read_lens(tmp_path / f"{name}.toml"), tabled(name)
     assert lens.rims == "derived" and lens.stop_radius_mm == pytest.approx(
