@@ -19,7 +19,7 @@ from torch import Tensor
 
 from neurolens import __version__
 from neurolens.base import status as st
-from neurolens.base.files import atomic_write_text, fingerprint_of, sha256_of
+from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of, sha256_of
 from neurolens.base.progress import Report
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.evaluate.rays import PIXELS_ACROSS, EachRay, Predict, RayErrors, each_ray
@@ -280,10 +280,11 @@ def fit_and_measure(
         return Measured(settings, file, known)
     training = folder / f"{settings.label}.training.npz"  # left by a killed run
     model = fit_model(prepared, settings, report, checkpoint=training)
-    export_onnx(model, file, errors={})
     on = rays() if rays else shared_rays(prepared, vignetting_rays)
-    errors = measure_on(on, load_model(file))
-    export_onnx(model, file, errors=errors)
+    with atomic_path(file) as measured:  # a file without its errors never has the final name
+        export_onnx(model, measured, errors={})
+        errors = measure_on(on, load_model(measured))
+        export_onnx(model, measured, errors=errors)
     record: dict[str, Any] = {
         "name": settings.label,
         "family": settings.family,

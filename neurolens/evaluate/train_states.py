@@ -14,7 +14,7 @@ from typing import Any
 from neurolens import __version__
 from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing, plain_log_ticks
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_write_text, fingerprint_of
+from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.evaluate import pages
@@ -63,13 +63,14 @@ def fit_and_measure_states(
     if known is not None:
         return known
     model = fit_states(space, settings, lambda done: report(0.6 * done))
-    export_states(model, file)
-    loaded, rows = load_model(file), []
-    for state in random_states(space.axes, states, settings.seed + FRESH):
-        rows.append(errors_at(loaded, space, state, RAYS, settings.seed + FRESH))
-        report(0.6 + 0.4 * len(rows) / states)
-    errors = card_errors(rows, RAYS)
-    export_states(model, file, errors)
+    with atomic_path(file) as measured:  # a file without its errors never has the final name
+        export_states(model, measured)
+        loaded, rows = load_model(measured), []
+        for state in random_states(space.axes, states, settings.seed + FRESH):
+            rows.append(errors_at(loaded, space, state, RAYS, settings.seed + FRESH))
+            report(0.6 + 0.4 * len(rows) / states)
+        errors = card_errors(rows, RAYS)
+        export_states(model, measured, errors)
     core = model.nodes[0].core
     record = {
         "name": settings.label,
