@@ -57,7 +57,7 @@ format: $(INSTALLED)
 clean:
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache build *.egg-info
 
-# torch goes first, by itself: it brings setuptools, which then builds the project without fetching anything unpinned.
+# torch goes first, by itself, at the tested version: it brings setuptools, which then builds the project without fetching anything unpinned.
 $(INSTALLED): pyproject.toml constraints.txt
 	@set -e; found=; \
 	for candidate in "$(PYTHON)" python3 python3.14 python3.13 python3.12 python3.11; do \
@@ -69,6 +69,6 @@ $(INSTALLED): pyproject.toml constraints.txt
 	fi; \
 	echo "Setting up $(VENV) with $$found (once; torch is large)"; \
 	"$$found" -m venv $(VENV) || { echo "'$$found -m venv' failed: is the venv module installed (Debian: python3-venv)?" >&2; exit 1; }
-	$(BIN)/python -m pip install --quiet -c constraints.txt torch==2.13.0
+	$(BIN)/python -m pip install --quiet -c constraints.txt torch
 	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[train,dev]'
 	@touch $@

@@ -40,7 +40,7 @@ from neurolens.evaluate.image import DEFAULT, flip, flip_map
 from neurolens.evaluate.records import plain
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
-from neurolens.render.film import FilmSettings
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import CameraSettings, Scene, load_scene
 from neurolens.surrogates.domain import Domain

@@ -37,7 +37,7 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.records import plain
 from neurolens.mitsuba import require_mitsuba
 from neurolens.mitsuba.library import libraries
-from neurolens.render.film import FilmSettings
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene, load_scene
 

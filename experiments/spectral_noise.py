@@ -17,7 +17,7 @@ from experiments import lab
 from neurolens.base.progress import Progress
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.render.colour import SRGB
-from neurolens.render.film import FilmSettings
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import RenderResult, render
 from neurolens.render.scene import load_scene
 

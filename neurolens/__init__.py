@@ -1,3 +1,9 @@
 """neurolens: any lens prescription as a fast camera model with a measured error."""
 
+import os
+
 __version__ = "0.1.0"
+
+# onnxruntime reads this when it is imported. Otherwise 1.31 writes a device id and events into the user's cache folder
+# and looks for a server to send them to; its own call to stop that comes too late.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

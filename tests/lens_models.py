@@ -48,9 +48,7 @@ _FITS = {
     "rtf": ModelSettings("rtf", basis="raw", degree=4),
     "taylor": ModelSettings("taylor", basis="raw", degree=3),
     "cells": ModelSettings("zheng-adaptive", basis="raw", terms=6, partitions=2),
-    "neurolens2017": ModelSettings(
-        "neurolens2017", basis="raw", units=16, layers=2, steps=60, seconds=600.0, partitions=2
-    ),
+    "neurolens2017": ModelSettings("neurolens2017", basis="raw", units=16, layers=2, steps=60, partitions=2),
 }
 
 

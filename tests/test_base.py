@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import math
+import os
+import time
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,7 +34,7 @@ def test_files_are_whole_or_as_before(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="stopped"), atomic_path(target) as temporary:
         temporary.write_bytes(b"half")
         raise RuntimeError("stopped")
-    with pytest.raises(FileNotFoundError), atomic_path(tmp_path / "empty.png"):
+    with pytest.raises(OSError, match="nothing was written"), atomic_path(tmp_path / "empty.png"):
         pass
     assert target.read_text(encoding="utf-8") == text and list(tmp_path.iterdir()) == [target]
 
@@ -49,6 +51,33 @@ def test_errors_name_the_target_not_the_temporary_file(tmp_path: Path) -> None:
         check_writable(tmp_path)
     check_writable(tmp_path / "fine.exr")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_runs_that_share_a_folder_do_not_share_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target, other = tmp_path / "film.exr", tmp_path / "other"
+    monkeypatch.setattr("os.getpid", lambda: 7)  # as in two containers
+    with atomic_path(target) as first, atomic_path(target) as second:
+        assert first != second
+        first.write_bytes(b"first")
+        second.write_bytes(b"second")
+    assert target.read_bytes() == b"first"
+    monkeypatch.setattr("secrets.token_hex", lambda n: "0" * 2 * n)
+    other.write_bytes(b"kept")
+    first.with_name(f".neurolens-{'0' * 16}.tmp.exr").symlink_to(other)  # a trap with the name to come
+    with pytest.raises(FileExistsError), atomic_path(target) as temporary:
+        temporary.write_bytes(b"bad")
+    assert other.read_bytes() == b"kept"
+
+
+def test_what_killed_runs_left_is_removed_after_a_day(tmp_path: Path) -> None:
+    names = (f".neurolens-{k:016x}.tmp{suffix}" for k, suffix in enumerate((".exr", "", ".so")))
+    left, fresh, users = tmp_path / next(names), tmp_path / next(names), tmp_path / ".mine.tmp.so"
+    for file in (left, fresh, users):
+        file.touch()
+    for file in (left, users):
+        os.utime(file, (time.time() - 2 * 86400,) * 2)
+    atomic_write_text(tmp_path / "a.txt", "a")
+    assert sorted(tmp_path.iterdir()) == sorted([fresh, users, tmp_path / "a.txt"])
 
 
 @dataclass(frozen=True)

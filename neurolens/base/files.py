@@ -1,4 +1,4 @@
-"""Atomic writing of files (to a temporary name, then renamed), and hashes of files and settings."""
+"""Files: written whole or not at all, read only where they are regular and of bounded size; caches; hashes."""
 
 from __future__ import annotations
 
@@ -6,25 +6,44 @@ import errno
 import hashlib
 import json
 import os
+import re
+import secrets
+import stat
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import cache
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
+
+from neurolens.base.errors import InputError
+
+_LEFT_OVER = re.compile(r"\.neurolens-[0-9a-f]{16}\.tmp(\.\w{1,16})?")  # a temporary file of ours
+_ABANDONED_S = 24 * 3600.0  # nothing is written for a day
+_DIGEST = 32  # bytes of SHA-256
+# Opened without waiting for a writer of a FIFO; what a system lacks it does not need.
+_READ = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; rename it to `path` on success, remove it on any failure.
+    """Yield the path of a new empty file beside `path`; rename it to `path` on success, remove it on any failure.
 
-    The temporary name keeps the suffix, because writers such as OpenEXR and Pillow choose the format by it.
+    Its name is random, so that processes that share a folder never share it; its content is on the disk before it has
+    the final name. It keeps the suffix, because writers such as OpenEXR and Pillow choose the format by it. What killed
+    runs have left in the folder is removed after a day.
 
     Raises:
-        OSError: it cannot be written; the error names `path`, not the temporary file.
+        OSError: it cannot be written, or nothing was; the error names `path`, not the temporary file.
     """
     target = Path(path)
     temporary = _temporary(target)
     try:
+        _remove_abandoned(temporary)
         yield temporary
+        _flush(temporary)
         os.replace(temporary, target)
     except OSError as error:
         # An error of a full disk names no file, other errors name the temporary one.
@@ -46,21 +65,139 @@ def check_writable(path: str | Path) -> None:
     if target.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(target))
     # Permission bits are not enough: for a superuser every folder looks writable.
-    temporary = _temporary(target)
-    try:
-        temporary.touch()
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(target)) from None
-    temporary.unlink()
+    _temporary(target).unlink()
 
 
 def _temporary(target: Path) -> Path:
-    return target.with_name(f".{target.stem}.{os.getpid()}.tmp{target.suffix}")
+    """A new empty file in the folder of `target`, which only this call has opened."""
+    suffix = target.suffix if re.fullmatch(r"\.\w{1,16}", target.suffix) else ""
+    temporary = target.with_name(f".neurolens-{secrets.token_hex(8)}.tmp{suffix}")
+    try:
+        os.close(os.open(temporary, _NEW, 0o666))
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(target)) from None
+    except ValueError:
+        raise OSError(errno.EINVAL, "no name of a file", repr(str(target))) from None
+    return temporary
+
+
+def _flush(temporary: Path) -> None:
+    with temporary.open("rb+") as file:
+        if not os.fstat(file.fileno()).st_size:
+            raise OSError(errno.ENODATA, "nothing was written", str(temporary))
+        os.fsync(file.fileno())
+
+
+def _remove_abandoned(new: Path) -> None:
+    """Remove temporary files beside `new` that are much older, by the clock of that disk."""
+    with suppress(OSError):
+        now = new.stat().st_mtime
+        for entry in os.scandir(new.parent):
+            if _LEFT_OVER.fullmatch(entry.name) and now - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED_S:
+                with suppress(OSError):  # another run was faster, or it is not ours
+                    os.unlink(entry.path)
+
+
+def open_regular(path: str | Path) -> BufferedReader:
+    """A regular file opened for reading; a FIFO or a device is refused, not waited for.
+
+    Raises:
+        OSError: missing, not regular, not readable, or a name that no file can have.
+    """
+    try:
+        descriptor = os.open(path, _READ)
+    except ValueError:  # a zero byte or half a surrogate pair
+        raise OSError(errno.EINVAL, "no name of a file", repr(str(path))) from None
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    raise OSError(errno.EINVAL, "not a regular file", str(path))
+
+
+def read_bytes(
+    path: str | Path, most: int, expected: str = "a file", place: tuple[str | Path, str] | None = None
+) -> bytes:
+    """The content of a user's file: regular, of at most `most` bytes.
+
+    Args:
+        expected: what it should be, for messages: "a lens file". place: file and field that name it, if not itself.
+
+    Raises:
+        InputError: missing, not regular, unreadable or larger.
+    """
+    file, field = place or (path, "file")
+    found = f"{str(path)!r}: " if place else ""
+    try:
+        with open_regular(path) as stream:
+            data = stream.read(most + 1)
+    except FileNotFoundError:
+        raise InputError(file, field, f"({found}missing)", f"{expected} that exists") from None
+    except OSError as error:
+        raise InputError(file, field, f"({found}{error.strerror})", f"{expected} that can be read") from None
+    if len(data) > most:
+        raise InputError(file, field, f"({found}more than {most} bytes)", f"{expected} of at most {most} bytes")
+    return data
+
+
+def cache_folder() -> Path:
+    """`neurolens` in $XDG_CACHE_HOME or ~/.cache; where that is not this user's alone, a folder of this process."""
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    folder = Path(home) / "neurolens"
+    with suppress(OSError):
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.lstat()
+        if stat.S_ISDIR(found.st_mode) and _mine(found) and os.access(folder, os.W_OK | os.X_OK):
+            return folder
+    return Path(_folder_of_process().name)
+
+
+@cache
+def _folder_of_process() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix="neurolens-")
+
+
+def _mine(found: os.stat_result) -> bool:
+    """What others can write to, others can put code into."""
+    return hasattr(os, "getuid") and found.st_uid == os.getuid() and not found.st_mode & 0o022
+
+
+def seal(temporary: Path, mode: int = 0o600) -> None:
+    """Write the SHA-256 of a file of a cache behind its content, before it has its final name (`atomic_path`)."""
+    data = temporary.read_bytes()
+    with temporary.open("ab") as file:
+        file.write(hashlib.sha256(data).digest())
+    temporary.chmod(mode)
+
+
+def sealed_bytes(path: Path) -> bytes | None:
+    """The content of a file of a cache; None where there is none, a damaged one, or one that others could write."""
+    try:
+        if not _mine(path.lstat()):  # nor a link, which everybody could write
+            return None
+        with open_regular(path) as file:
+            data = file.read()
+    except OSError:
+        return None
+    content, digest = data[:-_DIGEST], data[-_DIGEST:]
+    return content if hashlib.sha256(content).digest() == digest else None
+
+
+def keep_newest(new: Path, most: int) -> None:
+    """Of the files of a cache with the suffix of `new`, which was written last, keep `new` and the nearest in time.
+
+    A clock that went back leaves files of the future: they go as the oldest do.
+    """
+    with suppress(OSError):
+        now = new.stat().st_mtime
+        others = [(abs(now - file.stat().st_mtime), file) for file in new.parent.glob(f"*{new.suffix}") if file != new]
+        for _, file in sorted(others)[most - 1 :]:
+            file.unlink()
 
 
 def sha256_of(path: str | Path) -> str:
     """Hexadecimal SHA-256 of a file."""
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    with open_regular(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def fingerprint_of(values: Sequence[Any]) -> str:

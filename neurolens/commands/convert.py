@@ -7,6 +7,7 @@ import math
 import warnings
 from contextlib import suppress
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -24,7 +25,8 @@ Read a lens file of another program and write it as a lens file of neurolens (.t
 Formats: Zemax (.zmx), CODE V (.seq), OSLO (.len, the simple ones), plain tables of four
 columns as in pbrt and appleseed (.dat, .txt), and JSON (our own, DeepLens, ISET). The content decides.
 Unsupported content is an error that names the line; what was left out, computed, assumed or
-doubtful is printed as a warning. Needs the extra "train" (torch)."""
+doubtful is printed as a warning. Rims that a file does not give, and the check of the lens against its own
+statements, are traced: they need the extra "train" (torch)."""
 _EPILOG = """\
 examples:
   neurolens convert double_gauss.zmx -o lenses/double_gauss.toml
@@ -85,6 +87,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _doubts(lens: Lens) -> list[str]:
     """Contradictions between the lens and statements of its file, as sentences."""
+    if find_spec("torch") is None:
+        return ["the lens is not checked against its file's statements: that needs torch (pip install '.[train]')"]
     from neurolens.optics.lenscheck import check_lens, doubts
 
     try:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +17,15 @@ from neurolens.commands.output import answer
 if TYPE_CHECKING:
     from neurolens.surrogates.model import LensModel
     from neurolens.surrogates.pairs import RayPairs
+    from neurolens.surrogates.source import Written
     from neurolens.surrogates.specialise import Fix
 
 _DESCRIPTION = """\
 Write an exported model in another form: a self-contained C99 header (one function for a ray, one for
 arrays that compilers vectorise), a GLSL function, or an ONNX file. Domain guard, stop, rims,
 transmittance and status codes are those of the model; the card is a comment at the top.
-Needs the extra "train" (torch)."""
+Needs the extra "train" (torch); without it C and GLSL are written from the graph in the file,
+whole and with nothing fixed."""
 _EPILOG = """\
 values fixed by a scene are folded into fewer operations (--fix, repeatable):
   wavelengths=450,550,650   one coefficient table per wavelength, chosen by the argument band (a single one:
@@ -80,6 +84,10 @@ def run(args: argparse.Namespace) -> int:
     if args.to != "onnx" and (args.derivatives or args.inverse):
         raise InputError("neurolens export", "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
     check_writable(args.out)
+    if args.to != "onnx" and set(parts) == set(_PARTS) and not given and find_spec("torch") is None:
+        from neurolens.surrogates.source import export_file
+
+        return _answer(args, _about(export_file(file, args.out, args.to, args.name)))
     from neurolens.cameras.model import load_model
     from neurolens.surrogates.source import Parts, export_source
     from neurolens.surrogates.specialise import fixed_models
@@ -95,10 +103,23 @@ def run(args: argparse.Namespace) -> int:
     else:
         asked = Parts(*(name in parts for name in _PARTS[1:]))
         written = export_source(models, args.out, args.to, card, parts=asked, fix=fix, name=args.name)
-        s = written.signature
-        bands = [m.domain.wavelength_nm[0] for m in models] if s.bands > 1 else []
-        about = {"function": s.name, "inputs": s.inputs, "outputs": [*s.outputs, "status"], "bands_nm": bands}
-        about["operations_per_ray"] = written.operations
+        about = _about(written, [m.domain.wavelength_nm[0] for m in models])
+    return _answer(args, about)
+
+
+def _about(written: Written, bands_nm: Sequence[float] = ()) -> dict[str, Any]:
+    """What --json tells of source code."""
+    s = written.signature
+    return {
+        "function": s.name,
+        "inputs": s.inputs,
+        "outputs": [*s.outputs, "status"],
+        "bands_nm": bands_nm if s.bands > 1 else [],
+        "operations_per_ray": written.operations,
+    }
+
+
+def _answer(args: argparse.Namespace, about: dict[str, Any]) -> int:
     data = {"file": str(args.out), "to": args.to, "bytes": args.out.stat().st_size, **about}
     maps = about.get("inverse", {}).values()
     said = [f"{m['file']}: finds {m['converged']:.3%} of the model's rays in three steps" for m in maps]

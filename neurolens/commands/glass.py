@@ -19,7 +19,7 @@ Look glasses up in the catalogue that ships with neurolens: index, Abbe number, 
 wavelengths that the maker states the index for, and what 10 mm transmit inside (without
 reflections). A name gives the glass of every maker that has one of that name, the one that a
 lens file gets first; a six-digit code (517642) the glasses nearest to it, up to 0.01 in
-n_d and 2 in V_d away. Needs the extra "train" (torch)."""
+n_d and 2 in V_d away."""
 _EPILOG = """\
 examples:
   neurolens glass N-BK7 "F2 (CDGM)" PMMA

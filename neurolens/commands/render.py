@@ -33,7 +33,7 @@ from neurolens.commands.render_files import (
     write_pictures,
 )
 from neurolens.evaluate.records import plain
-from neurolens.render.film import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS, FilmSettings
+from neurolens.render.film_settings import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS, FilmSettings
 
 if TYPE_CHECKING:
     from neurolens.cameras.build import Shot

@@ -20,7 +20,7 @@ from neurolens.commands.arguments import check_folder, check_suffix, positive
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
-    from neurolens.render.film import FilmSettings
+    from neurolens.render.film_settings import FilmSettings
     from neurolens.render.renderer import RenderResult, Watch
 
 _AT_ONCE_S = 1.0

@@ -274,6 +274,6 @@ def default_experiment(lens_file: str | Path, overrides: Sequence[str] = ()) -> 
     tables = {
         "title": f"Models of {Path(lens_file).stem}",
         "lens": {"file": str(lens_file)},
-        "model": [{"method": "ols", "terms": 64}, {"method": "mlp", "units": 32, "layers": 2}],
+        "model": [{"method": "ols", "terms": 64}, {"method": "mlp", "units": 16, "layers": 2}],
     }
     return from_dict(Experiment, apply_overrides(tables, overrides), "--set")

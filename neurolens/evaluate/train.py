@@ -128,7 +128,7 @@ def _plan(experiment: Experiment) -> dict[str, float]:
     """Expected seconds of each stage on two cores, for the time left."""
     plan: dict[str, float] = {"trace ray pairs": 3}
     for m in experiment.model:
-        plan[f"fit {m.label}"] = m.seconds if m.method in NETWORKS else 3
+        plan[f"fit {m.label}"] = 0.06 * m.steps * (m.units * m.layers / 32) ** 2.5 if m.method in NETWORKS else 3
     plan["race for speed"] = 45 if experiment.evaluation.compile_exact else 10
     if experiment.scene_domain is not None:
         plan["fit the scene's domain"] = 5

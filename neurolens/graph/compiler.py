@@ -8,15 +8,13 @@ import os
 import platform
 import shlex
 import shutil
-import stat
 import subprocess
-import tempfile
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path
+from neurolens.base.files import atomic_path, cache_folder, keep_newest, seal, sealed_bytes
 
 # -march=native takes what the machine has; the others let square roots and divisions become vectors, also where only
 # one side of a choice needs them. NaN and infinity stay what they are. A function put into its caller loses what is
@@ -62,7 +60,7 @@ def compile_c(source: str, library: Path, flags: tuple[str, ...] = FLAGS) -> str
     """
     compiler = find_compiler()
     done = _run([*_words(compiler), *flags, "-shared", "-fPIC", "-x", "c", "-", "-o", str(library), "-lm"], source)
-    if done.returncode or not library.is_file():
+    if done.returncode or not library.is_file() or not library.stat().st_size:
         said = " ".join(next((line for line in done.stderr.splitlines() if "error" in line), done.stderr).split())
         raise InputError(compiler, "compile", f"({said[:200] or 'no word'})", "a C compiler that knows C99")
     return done.stderr
@@ -81,25 +79,24 @@ def _run(command: list[str], text: str = "") -> subprocess.CompletedProcess[str]
 def load_compiled(source: str) -> ctypes.CDLL:
     """The library of a source: compiled once for this machine, then taken from the folder.
 
-    The folder is `neurolens` in $XDG_CACHE_HOME or ~/.cache; where that is not this user's alone, a temporary one that
-    goes with the process. A library of another user, or a damaged one, is made anew.
+    It is kept in `cache_folder`; a library of another user, or a damaged one, is made anew.
 
     Raises:
         InputError: as `compile_c`; a library that cannot be loaded.
     """
-    folder = _folder()
-    library = folder / f"{_key(source)}.so"
-    with suppress(OSError):  # not there, or damaged
-        if _mine(library.lstat()):
+    library = cache_folder() / f"{_key(source)}.so"
+    if sealed_bytes(library) is not None:
+        with suppress(OSError):  # another run has just removed it
             return ctypes.CDLL(str(library))
     with atomic_path(library) as temporary:
         compile_c(source, temporary, FLAGS)
-        temporary.chmod(0o700)
-    _forget_oldest(folder)
+        seal(temporary, 0o700)
     try:
-        return ctypes.CDLL(str(library))
+        loaded = ctypes.CDLL(str(library))
     except OSError as error:
         raise InputError(library, "load", f"({error})", "code for this machine, and a disk that may hold it") from error
+    keep_newest(library, _KEPT)  # one in use stays readable for those that have opened it
+    return loaded
 
 
 def _key(source: str) -> str:
@@ -117,34 +114,3 @@ def _compiler_and_processor(compiler: str) -> str:
         known = ("model name", "flags", "Features", "CPU part")
         processor += "".join(dict.fromkeys(line for line in lines if line.startswith(known)))
     return "\0".join((compiler, asked.stdout, platform.machine(), processor))
-
-
-def _folder() -> Path:
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    folder = Path(home) / "neurolens"
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.lstat()
-        if stat.S_ISDIR(found.st_mode) and _mine(found) and os.access(folder, os.W_OK | os.X_OK):
-            return folder
-    except OSError:
-        pass
-    return Path(_temporary().name)
-
-
-def _mine(found: os.stat_result) -> bool:
-    """What others can write to, others can put code into."""
-    return hasattr(os, "getuid") and found.st_uid == os.getuid() and not found.st_mode & 0o022
-
-
-@cache
-def _temporary() -> tempfile.TemporaryDirectory[str]:
-    return tempfile.TemporaryDirectory(prefix="neurolens-")
-
-
-def _forget_oldest(folder: Path) -> None:
-    """Keep the folder small; a library in use stays readable for those that have opened it."""
-    with suppress(OSError):
-        files = sorted(folder.glob("*.so"), key=lambda f: f.stat().st_mtime)
-        for old in files[:-_KEPT]:
-            old.unlink()

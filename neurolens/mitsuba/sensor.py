@@ -33,7 +33,8 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.mitsuba.library import libraries, matrix, number, require_mitsuba, rows, vector
-from neurolens.render.film import FilmSettings, PixelGrid
+from neurolens.render.film import PixelGrid
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.pictures import make_aperture
 from neurolens.render.sampler import hash32
 from neurolens.render.spectrum import SpectralRange

@@ -60,7 +60,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.tomlfile import read_toml, reject_unknown
-from neurolens.optics import catalogue, coatings
+from neurolens.optics import catalogue, designs
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.glass import check_against_table
 from neurolens.optics.prescription import Coating, Configuration, Lens, Surface
@@ -252,7 +252,7 @@ def _surface(row: Table, n_before: float, known: Mapping[str, Coating]) -> Surfa
     name = row.text("coating")
     if name in known:
         return replace(surface, coating=known[name])
-    design = coatings.design(name, n_before, surface.n_d, file=row.file, where=f"{row.where}coating")
+    design = designs.design(name, n_before, surface.n_d, file=row.file, where=f"{row.where}coating")
     return replace(surface, coating=design)
 
 

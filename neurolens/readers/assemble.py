@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.optics import catalogue, paraxial, rims
+from neurolens.optics import catalogue, paraxial
 from neurolens.optics.catalogue import Glass
 from neurolens.optics.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
 from neurolens.optics.paraxial import FirstOrder
@@ -87,6 +87,8 @@ def with_rims(lens: Lens) -> Lens:
     missing = [k for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm)]
     if not missing:
         return lens
+    from neurolens.optics import rims  # they are traced, which needs torch
+
     listed = ", ".join(map(str, missing))
     if lens.half_field_deg is None and lens.image_radius_mm is None:
         expected = "the clear diameter of every surface, or a field to derive rims for (--half-field)"

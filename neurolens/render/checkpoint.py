@@ -26,7 +26,8 @@ from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, fingerprint_of
 from neurolens.cameras.contract import Camera
-from neurolens.render.film import CHUNK_BYTES, Film, FilmSettings, Tiling
+from neurolens.render.film import CHUNK_BYTES, Film, Tiling
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.job import Job
 from neurolens.render.mesh import tracer
 

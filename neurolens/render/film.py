@@ -12,20 +12,13 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import FloatArray
-
-ColourSpaceName = Literal["sRGB", "ACEScg"]
-WavelengthMode = Literal["auto", "one", "hero", "lanes"]
-WavelengthSampling = Literal["importance", "uniform"]
-COLOUR_SPACE_NAMES: tuple[str, ...] = get_args(ColourSpaceName)
-WAVELENGTH_MODES: tuple[str, ...] = get_args(WavelengthMode)
-WAVELENGTH_SAMPLINGS: tuple[str, ...] = get_args(WavelengthSampling)
 
 FORKS = sys.platform.startswith("linux")
 CONTEXT: Any = multiprocessing.get_context("fork" if FORKS else None)
@@ -40,25 +33,6 @@ RGB, LUMINANCE2, DEPTH, HITS, PASSED, DROPPED, COLUMNS = slice(0, 3), 3, 4, 5, 6
 BYTES_A_PIXEL = 8 * COLUMNS + 100
 _LONGEST_WAIT_S = 5.0
 _ASPECT_TOLERANCE = 0.02  # larger deviations from square pixels are taken as mistakes
-
-
-@dataclass(frozen=True)
-class FilmSettings:
-    """The [film] table of a scene: spectral sampling and colour.
-
-    Attributes:
-        colour_space: of the EXR, linear: "sRGB" (Rec. 709 primaries, D65) or "ACEScg" (AP1, the white of ACES).
-        white_balance: illuminant that becomes neutral, named as those of lights are; None leaves D65 neutral.
-        wavelengths: of a path: "one"; "hero", four that share the path (Wilkie et al. 2014); "lanes", four paths one
-            after the other that share all random numbers, a quarter of the wavelengths apart; "auto", hero where the
-            camera's rays do not depend on the wavelength (by more than a twentieth of a pixel), else one.
-        wavelength_sampling: "importance", by the film's response times the light of the scene, or "uniform".
-    """
-
-    colour_space: ColourSpaceName = "sRGB"
-    white_balance: str | None = None
-    wavelengths: WavelengthMode = "auto"
-    wavelength_sampling: WavelengthSampling = "importance"
 
 
 @dataclass(frozen=True)

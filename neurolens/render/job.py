@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.render import film as columns
 from neurolens.render.colour import SRGB, balance
-from neurolens.render.film import Film, FilmSettings, PixelGrid, Tiling, shared
+from neurolens.render.film import Film, PixelGrid, Tiling, shared
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.integrator import lit, trace
 from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler
 from neurolens.render.scene import CameraSettings, Scene

@@ -14,7 +14,8 @@ import numpy as np
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.render.checkpoint import identity, read_checkpoint, write_checkpoint
-from neurolens.render.film import DROPPED, PASSED, FilmSettings, PixelGrid, check_memory
+from neurolens.render.film import DROPPED, PASSED, PixelGrid, check_memory
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.illuminants import check_name
 from neurolens.render.job import Job, Layers, develop
 from neurolens.render.scene import Scene

@@ -18,7 +18,7 @@ from neurolens.base.tomlfile import read_toml, suggestion
 from neurolens.cameras.contract import FloatArray
 from neurolens.optics.apertures import Aperture
 from neurolens.render import scenetables as tables
-from neurolens.render.film import FilmSettings
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.illuminants import Spectrum, check_name, check_spectrum, illuminant, read_spectrum
 from neurolens.render.meshfile import TriangleSet, encloses, read_mesh
 from neurolens.render.pictures import make_aperture, read_environment, read_picture

@@ -11,7 +11,8 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 from neurolens.render.directions import centres
 from neurolens.render.environment import sun_spectrum, total_spectrum
-from neurolens.render.film import FilmSettings, PixelGrid, WavelengthMode
+from neurolens.render.film import PixelGrid
+from neurolens.render.film_settings import FilmSettings, WavelengthMode
 from neurolens.render.illuminants import FloatArray64, Spectrum, illuminant
 from neurolens.render.scene import Scene
 from neurolens.render.scenetables import Vector

@@ -135,7 +135,7 @@ def _fit_core(
         raise InputError("fit", "method", settings.method, f"one of {', '.join(known)}")
     if mirror and settings.method != "mlp":
         return fit_mirror(prepared, settings.method, settings.terms, settings.degree)
-    zones = itertools.count()
+    zones, fits = itertools.count(), 2 * settings.partitions - 1
 
     def fit(data: Prepared) -> ZoneCore:
         base = None
@@ -146,8 +146,9 @@ def _fit_core(
             return base
         if isinstance(base, RawPolynomial):
             raise InputError("fit", "basis", settings.basis, "invariants, with a network beside the polynomial")
-        file = of_zone(checkpoint, next(zones))
-        network = fit_network(data, settings, base=base, checkpoint=file, progress=progress)
+        zone = next(zones)
+        share = None if progress is None else lambda part: progress((zone + part) / fits)
+        network = fit_network(data, settings, base=base, checkpoint=of_zone(checkpoint, zone), progress=share)
         return network if base is None else Residual((base, network))
 
     return fit_partitioned(prepared, settings.partitions, fit)

@@ -40,8 +40,10 @@ class ModelSettings:
         transmittance_terms: how many more terms the transmittance may have where it needs them.
         planes: whether `PLANES_SEARCHED` methods in the invariants search the planes of the light field.
         partitions: zones of the film with a fit of their own (polynomials and networks).
-        units, layers: of the network. steps, seconds: its training ends by either, or by convergence; results repeat
-            bit for bit where the time does not end it.
+        units, layers: of the network.
+        steps: most iterations of a network's training, which ends before where it has converged; never a time, so that
+            a machine gives the same bytes whatever its load. One on n times the fewest rays counts n (see
+            `fits.network`).
         seed: of the network's first weights.
         target_um: film-equivalent RMS asked for. Polynomials take the fewest terms of `TERMS_LADDER` that reach it; a
             fit that does not reach it warns and gives its best.
@@ -64,8 +66,7 @@ class ModelSettings:
     partitions: int = 1
     units: int = 16
     layers: int = 2
-    steps: int = 300
-    seconds: float = 60.0
+    steps: int = 400
     seed: int = 0
     target_um: float | None = None
 
@@ -84,8 +85,6 @@ class ModelSettings:
         for name, (least, most) in limits.items():
             if not least <= getattr(self, name) <= most:
                 raise InputError("settings", name, getattr(self, name), f"an integer from {least} to {most}")
-        if not 0 < self.seconds:
-            raise InputError("settings", "seconds", self.seconds, "a number above 0")
         if not 0 < self.position_weight < math.inf:
             raise InputError("settings", "position_weight", self.position_weight, "a number above 0")
         if self.target_um is not None and not 0 < self.target_um < math.inf:

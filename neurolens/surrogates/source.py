@@ -1,4 +1,7 @@
-"""Source code of exported models: a C99 header or a GLSL function, the card as a comment on top."""
+"""Source code of exported models: a C99 header or a GLSL function, the card as a comment on top.
+
+From a model's coefficients, or, without torch, from the graph in its file, which fixes nothing.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import neurolens
 from neurolens.base.errors import InputError
@@ -16,10 +19,13 @@ from neurolens.graph.c import Signature, write_c
 from neurolens.graph.glsl import write_glsl
 from neurolens.graph.program import FILM_Z, STOP_RADIUS, Program
 from neurolens.graph.scalars import lower
+from neurolens.modelfile.graph import graph_of
+from neurolens.modelfile.onnxfile import read_checked
 from neurolens.surrogates.assemble import ALL, SCALARS, Parts, model_graph
-from neurolens.surrogates.export import largest_angle
-from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.specialise import Fix
+
+if TYPE_CHECKING:
+    from neurolens.surrogates.model import LensModel
 
 # Nothing fixed. Wavelengths are fixed in the models themselves, one model a table; film plane and stop here too.
 FREE = Fix()
@@ -58,19 +64,46 @@ def export_source(
         InputError: another language, a name that is no identifier, numbers that float32 cannot hold, a card that lacks
             what the comment says.
     """
+    model = models[0]
+    own = _checked_name(language, model.lens.lens_id, name)
+    waves = [m.domain.wavelength_nm for m in models]
+    about = card, model.domain.to_dict(), waves, fix, [g.status for g in model.gates]
+    return _write(fused_program(models, parts, fix), Path(path), language, own, about)
+
+
+def export_file(file: str | Path, path: str | Path, language: str, name: str | None = None) -> Written:
+    """Write the graph of a model's file, with everything it gives: the same rays to rounding, without torch.
+
+    Arguments as of `export_source`; errors too, and a ModelError for a file that cannot be trusted.
+    """
+    data, card = read_checked(file)
+    try:
+        domain, codes = card["domain"], [gate["status"] for gate in card["gates"]]
+        own = _checked_name(language, str(card["lens"]["id"]), name)
+        about = card, domain, [domain["wavelength_nm"]], FREE, codes
+    except (KeyError, TypeError) as error:
+        raise _no_card(error) from error
+    return _write(lower(graph_of(file, data)), Path(path), language, own, about)
+
+
+def _checked_name(language: str, lens_id: str, name: str | None) -> str:
     if language not in WRITERS:
         raise InputError("export", "to", language, f"one of {', '.join(WRITERS)}")
-    own = identifier(models[0].lens.lens_id) if name is None else name
+    own = identifier(lens_id) if name is None else name
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,99}", own) or "__" in own:
         raise InputError("export", "name", own, "letters, digits and single underscores, a letter first")
-    program = fused_program(models, parts, fix)
+    return own
+
+
+def _no_card(error: Exception) -> InputError:
+    return InputError("export", "card", f"({type(error).__name__}: {error})", "a card of neurolens, whole")
+
+
+def _write(program: Program, target: Path, language: str, own: str, about: tuple[Any, ...]) -> Written:
     try:
-        comment = comment_of(models, card, fix)
+        comment = comment_of(*about)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(
-            "export", "card", f"({type(error).__name__}: {error})", "a card of neurolens, whole"
-        ) from error
-    target = Path(path)
+        raise _no_card(error) from error
     atomic_write_text(target, WRITERS[language](program, own, comment))
     return Written(target, Signature.of(program, own), sum(program.count().values()))
 
@@ -85,6 +118,8 @@ def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FR
     Raises:
         InputError: weights that float32 cannot hold; a fixed film position or stop outside the domain.
     """
+    from neurolens.surrogates.export import largest_angle  # needs torch
+
     fix.check(models[0].domain)
     angle = max(largest_angle(model) for model in models)
     fixed = {FILM_Z: fix.film_z_mm, STOP_RADIUS: fix.stop_radius_mm}
@@ -98,21 +133,21 @@ def identifier(text: str) -> str:
     return word if word[:1].isalpha() else f"lens_{word}"
 
 
-def comment_of(models: Sequence[LensModel], card: Mapping[str, Any], fix: Fix) -> list[str]:
-    """What the card says, in lines."""
-    model, lens, fit = models[0], card["lens"], card["fit"]
-    d = model.domain
-    waves = [m.domain.wavelength_nm for m in models]
+def comment_of(
+    card: Mapping[str, Any], domain: Mapping[str, Any], waves: Sequence[Sequence[float]], fix: Fix, codes: Sequence[int]
+) -> list[str]:
+    """What the card says, in lines: of this domain, its bands of wavelengths, the codes of the gates that are left."""
+    lens, fit, d = card["lens"], card["fit"], domain
     lines = [
         f"{lens['name']}: {fit['method']}, written by neurolens {neurolens.__version__}.",
         f"Lens data: figures published in {lens['source']} (sha256 {lens['sha256'][:16]}).",
         f"Focal length {lens['efl_mm']:.6g} mm, f/{lens['f_number']:.3g}, {lens['refractions']} refractions.",
         card["frame"],
-        f"Domain: film radius {d.film_radius_mm:.6g} mm; film plane z {_span(*d.film_z_mm)} mm; pupil radius "
-        f"{d.pupil_radius_mm:.6g} mm on the plane z = {d.pupil_z_mm:.6g} mm; stop radius up to "
-        f"{d.stop_radius_mm:.6g} mm; wavelength {', '.join(_span(*w) for w in waves)} nm.",
+        f"Domain: film radius {d['film_radius_mm']:.6g} mm; film plane z {_span(*d['film_z_mm'])} mm; pupil radius "
+        f"{d['pupil_radius_mm']:.6g} mm on the plane z = {d['pupil_z_mm']:.6g} mm; stop radius up to "
+        f"{d['stop_radius_mm']:.6g} mm; wavelength {', '.join(_span(*w) for w in waves)} nm.",
     ]
-    if len(models) > 1:
+    if len(waves) > 1:
         bands = ", ".join(f"{k}: {w[0]:g} nm" for k, w in enumerate(waves))
         lines.append(f"Argument band: {bands}.")
     for what, value in (("film plane z", fix.film_z_mm), ("stop radius", fix.stop_radius_mm)):
@@ -125,8 +160,7 @@ def comment_of(models: Sequence[LensModel], card: Mapping[str, Any], fix: Fix) -
     if errors.get("poor"):
         lines.append(f"Poor: {', '.join(errors['poor'])}.")
     lines.append("Units: mm, nm; directions are unit vectors, transmittance a share of the power.")
-    codes = {g.status for g in model.gates}
-    gone = {g["status"] for g in card["gates"]} - codes
+    gone = {g["status"] for g in card["gates"]} - set(codes)
     told = {c: w for c, w in card["status_codes"].items() if int(c) not in gone}
     lines.append(f"Status: {'; '.join(f'{c} {w}' for c, w in told.items())}.")
     flat = [" ".join(str(line).split()) for line in lines]

@@ -8,16 +8,18 @@ in white light take the whole model. A film position and a stop narrow the domai
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from neurolens.base.errors import InputError
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.optics.glass import inverse_square_um
 from neurolens.surrogates.cores import STOP
-from neurolens.surrogates.domain import Domain, sample_domain
-from neurolens.surrogates.model import LensModel
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from neurolens.surrogates.domain import Domain
+    from neurolens.surrogates.model import LensModel
 
 # A gate goes where at most this share of the domain's rays is blocked by it and by nothing else.
 IDLE_SHARE = 1e-5
@@ -96,6 +98,10 @@ def without_idle_gates(models: tuple[LensModel, ...]) -> tuple[LensModel, ...]:
 
 def _blocked(model: LensModel) -> Tensor:
     """[1 + G, N] bool: which of the stop and the gates block each ray of the domain."""
+    import torch
+
+    from neurolens.surrogates.domain import sample_domain
+
     with torch.no_grad():
         vectors, scalars = model.core(model.encoding(sample_domain(model.domain, _IDLE_RAYS, seed=17)))
     stop = ((vectors[STOP] * model.scales.stop_mm) ** 2).sum(0) > model.domain.stop_radius_mm**2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -341,7 +342,8 @@ def test_worker_camera_gives_the_same_rays(model: OnnxLens) -> None:
     assert json.loads(json.dumps(camera.settings, allow_nan=False))["f_number"] == pytest.approx(4.0)
 
 
-def test_models_need_no_torch(path: Path) -> None:
+def test_models_need_no_torch_and_write_nothing(path: Path, tmp_path: Path) -> None:
+    """Nothing in the home and cache folders either: onnxruntime records what it does unless told not to."""
     code = (
         "import sys\n"
         "sys.modules.update(dict.fromkeys(['torch', 'sklearn', 'matplotlib']))\n"
@@ -351,8 +353,11 @@ def test_models_need_no_torch(path: Path) -> None:
         "rays = camera.sample(np.zeros((2, 9), 'f4'), np.full((2, 9), .5, 'f4'), np.full(9, 550, 'f4'))\n"
         "assert (rays.status == 0).all() and (rays.direction[2] < -.9).all()\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+    env = {k: v for k, v in os.environ.items() if k != "ORT_DISABLE_TELEMETRY"}
+    env |= {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env=env, check=False)
     assert done.returncode == 0, done.stderr
+    assert list(tmp_path.rglob("*")) == []
 
 
 def test_a_model_of_another_operator_set_is_refused_as_a_camera(path: Path, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from neurolens.surrogates.cores import Network
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.stored import load_fitted
 
-SETTINGS = ModelSettings("mlp", units=10, layers=2, steps=40, seconds=1e6)
+SETTINGS = ModelSettings("mlp", units=10, layers=2, steps=40)
 RUN = """
 import sys
 from pathlib import Path

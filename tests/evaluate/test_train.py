@@ -46,7 +46,6 @@ terms = 24
 method = "mlp"
 units = 8
 steps = 20
-seconds = 60
 [evaluation]
 vignetting_rays = 20000
 rounds = 1

@@ -28,7 +28,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.render.film import FilmSettings
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.scene import CameraSettings, load_scene
 
 SHAPE = (12, 20, 3)

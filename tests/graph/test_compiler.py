@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from pathlib import Path
 
 import pytest
@@ -56,6 +58,20 @@ def test_libraries_that_are_damaged_or_of_others_are_made_anew(tmp_path: Path) -
     library.unlink()
     library.symlink_to(kept)
     assert compiler.load_compiled(SOURCE).answer() == 42 and not library.is_symlink()
+    library.unlink()
+    library.write_bytes(good[:-1000] + bytes(1000))  # would load, and crash
+    assert compiler.load_compiled(SOURCE).answer() == 42 and library.read_bytes() == good
+
+
+def test_few_are_kept_and_the_newest_also_when_the_clock_goes_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiler, "_KEPT", 2)
+    for answer in (1, 2, 3):
+        assert compiler.load_compiled(SOURCE.replace("42", str(answer))).answer() == answer
+        for library in compiler.cache_folder().glob("*.so"):
+            os.utime(library, (time.time() + 1e6 + answer,) * 2)  # made before the clock was set back
+    assert len(list(compiler.cache_folder().glob("*.so"))) == 2
+    newest = compiler.cache_folder() / f"{compiler._key(SOURCE.replace('42', '3'))}.so"
+    assert newest.is_file()
 
 
 @pytest.mark.parametrize("text", ["not a program", "#!/bin/sh\nexit 0\n", "#!/bin/sh\nprintf '\\377' >&2\nexit 1\n"])

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.optics import coatings
+from neurolens.optics import designs
 from neurolens.optics.coatings import Layers, power_amplitudes, powers, reflectance, transmittance
 
 LAM_NM = 550.0
@@ -226,7 +226,7 @@ def normal_reflectance(coating: Any, n_before: float, n_after: float, lam_nm: fl
 
 @pytest.mark.parametrize("glass", [1.46, 1.52, 1.7, 1.904, 2.0])
 def test_quarter_wave_closed_form(glass: float):
-    coating = coatings.quarter_wave(600.0)
+    coating = designs.quarter_wave(600.0)
     expected = ((glass - 1.38**2) / (glass + 1.38**2)) ** 2
     assert normal_reflectance(coating, 1.0, glass, 600.0) == pytest.approx(expected, abs=1e-15)
     assert normal_reflectance(coating, glass, 1.0, 600.0) == pytest.approx(expected, abs=1e-15)
@@ -237,21 +237,21 @@ def test_quarter_wave_closed_form(glass: float):
 @pytest.mark.parametrize("at_nm", [450.0, 550.0])
 def test_v_coat_reflects_nothing_at_its_wavelength_from_either_side(glass: float, at_nm: float):
     for media in ((1.0, glass), (glass, 1.0)):
-        coating = coatings.v_coat(*media, at_nm)
+        coating = designs.v_coat(*media, at_nm)
         assert normal_reflectance(coating, *media, at_nm) < 1e-28
         assert all(0 < thickness < at_nm / 2 for _, thickness in coating.layers)
         assert normal_reflectance(coating, *media, at_nm * 1.3) > 1e-3
 
 
 def test_v_coat_between_glasses():
-    assert normal_reflectance(coatings.v_coat(1.6, 1.7), 1.6, 1.7) < 1e-28
+    assert normal_reflectance(designs.v_coat(1.6, 1.7), 1.6, 1.7) < 1e-28
     with pytest.raises(InputError, match=r"v-coat: media: got \(1.5 to 1.52\).*1.38 over 2.1 or 1.38 over 1.63"):
-        coatings.v_coat(1.5, 1.52)
+        designs.v_coat(1.5, 1.52)
 
 
 @pytest.mark.parametrize("media", [(1.0, 1.52), (1.52, 1.0), (1.0, 1.75)])
 def test_broadband_stays_low_over_the_visible(media: tuple[float, float]):
-    broad, single = coatings.broadband(*media), coatings.quarter_wave()
+    broad, single = designs.broadband(*media), designs.quarter_wave()
     assert normal_reflectance(broad, *media, 510.0) < 1e-28
     lam_nm = torch.linspace(420, 670, 26, dtype=torch.float64)
     r_broad, r_single = (reflectance(torch.ones_like(lam_nm), *media, c.layers, lam_nm) for c in (broad, single))
@@ -262,19 +262,19 @@ def test_broadband_stays_low_over_the_visible(media: tuple[float, float]):
 
 def test_films_of_low_index_lie_towards_the_air():
     for name in ("v-coat", "broadband"):
-        there = coatings.design(name, 1.0, 1.52).layers
-        back = coatings.design(name, 1.52, 1.0).layers
+        there = designs.design(name, 1.0, 1.52).layers
+        back = designs.design(name, 1.52, 1.0).layers
         assert there[0][0] == 1.38 and back == there[::-1]
 
 
 def test_designs_by_name():
-    assert coatings.design("bare", 1.52, 1.52).layers == ()
-    assert coatings.design("quarter-wave", 1.0, 1.52).layers == coatings.quarter_wave().layers
-    assert coatings.design("quarter-wave 500", 1.0, 1.52).layers == coatings.quarter_wave(at_nm=500.0).layers
-    assert coatings.design("v-coat 500", 1.0, 1.52).layers == coatings.v_coat(1.0, 1.52, 500.0).layers
-    assert coatings.design("broadband 500", 1.0, 1.52).layers == coatings.broadband(1.0, 1.52, 500.0).layers
+    assert designs.design("bare", 1.52, 1.52).layers == ()
+    assert designs.design("quarter-wave", 1.0, 1.52).layers == designs.quarter_wave().layers
+    assert designs.design("quarter-wave 500", 1.0, 1.52).layers == designs.quarter_wave(at_nm=500.0).layers
+    assert designs.design("v-coat 500", 1.0, 1.52).layers == designs.v_coat(1.0, 1.52, 500.0).layers
+    assert designs.design("broadband 500", 1.0, 1.52).layers == designs.broadband(1.0, 1.52, 500.0).layers
     for name in ("bare", "quarter-wave", "quarter-wave 500", "v-coat 550", "broadband"):
-        assert coatings.design(name, 1.0, 1.6).name == name
+        assert designs.design(name, 1.0, 1.6).name == name
 
 
 @pytest.mark.parametrize(
@@ -282,11 +282,11 @@ def test_designs_by_name():
 )
 def test_unknown_designs_are_refused_with_those_known(name: str):
     with pytest.raises(InputError, match=r'a\.toml: surface 3, coating: got .*"bare", "quarter-wave", "v-coat"'):
-        coatings.design(name, 1.0, 1.52, file="a.toml", where="surface 3, coating")
+        designs.design(name, 1.0, 1.52, file="a.toml", where="surface 3, coating")
 
 
 def test_designs_that_the_media_do_not_allow():
     with pytest.raises(InputError, match=r"a\.toml: surface 3, coating: .*two different media"):
-        coatings.design("broadband", 1.5, 1.5, file="a.toml", where="surface 3, coating")
+        designs.design("broadband", 1.5, 1.5, file="a.toml", where="surface 3, coating")
     with pytest.raises(InputError, match=r"a\.toml: surface 3, coating: got 'v-coat 500', .*1.5 to 1.52"):
-        coatings.design("v-coat 500", 1.5, 1.52, file="a.toml", where="surface 3, coating")
+        designs.design("v-coat 500", 1.5, 1.52, file="a.toml", where="surface 3, coating")

@@ -13,7 +13,8 @@ from torch import Tensor
 from experiments.extreme_cases import from_film, from_scene, generator, unit
 from neurolens.base import status as st
 from neurolens.optics import glass
-from neurolens.optics.coatings import design, reflectance
+from neurolens.optics.coatings import reflectance
+from neurolens.optics.designs import design
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays, Towards, trace
 

@@ -20,7 +20,7 @@ from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.ideal import ThinLens
 from neurolens.render.checkpoint import digest
-from neurolens.render.film import FilmSettings
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import RenderResult, Watch, render
 
 PATHS_A_PASS = 16 * 64

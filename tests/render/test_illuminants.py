@@ -12,7 +12,7 @@ from render_helpers import FILM, WHITE, diffuse, scene
 from neurolens.base.errors import InputError
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.render.colour import SRGB
-from neurolens.render.film import FilmSettings
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.illuminants import illuminant, planck, table
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene

@@ -13,7 +13,8 @@ from render_helpers import FILM, SIZE, WHITE, diffuse, lit_scene, scene
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.render.film import BYTES_A_PIXEL, COLUMNS, FilmSettings, PixelGrid
+from neurolens.render.film import BYTES_A_PIXEL, COLUMNS, PixelGrid
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.job import Job, develop
 from neurolens.render.renderer import Watch, render
 

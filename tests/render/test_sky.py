@@ -19,7 +19,7 @@ from neurolens.render.environment import (
     sun_spectrum,
     zenith,
 )
-from neurolens.render.film import FilmSettings
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.illuminants import table
 from neurolens.render.renderer import render
 from neurolens.render.scenetables import Sky

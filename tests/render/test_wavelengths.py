@@ -15,7 +15,8 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.render.film import FilmSettings, PixelGrid
+from neurolens.render.film import PixelGrid
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.illuminants import table
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene

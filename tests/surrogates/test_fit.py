@@ -34,7 +34,6 @@ from neurolens.surrogates.targets import targets_of
         *(("units", v) for v in (0, 513)),
         *(("layers", v) for v in (0, 9)),
         *(("steps", v) for v in (0, 10**9)),
-        *(("seconds", v) for v in (0.0, -1.0, math.nan)),
         *(("target_um", v) for v in (0.0, -1.0, math.nan, math.inf)),
     ],
 )

@@ -28,13 +28,15 @@ from neurolens.evaluate.candidates import CompiledSource
 from neurolens.graph.c import literal
 from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.program import SCENE_RAY
+from neurolens.graph.scalars import lower
 from neurolens.modelfile import MODEL_KEY
+from neurolens.modelfile.graph import graph_of
 from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.assemble import ALL, RAY_ONLY, Parts
 from neurolens.surrogates.card import card_of, card_to_json
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.source import export_source, fused_program
+from neurolens.surrogates.source import export_file, export_source, fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 from neurolens.surrogates.stored import load_fitted
 
@@ -192,6 +194,22 @@ def test_literals_keep_every_bit() -> None:
     numbers = numbers[np.isfinite(numbers)]
     read = np.array([np.float32(literal(float(v)).strip("()").removesuffix("f")) for v in numbers])
     assert np.array_equal(read.view(np.uint32), numbers.view(np.uint32))
+
+
+def test_a_file_without_its_coefficients_is_written_as_the_same_function(tmp_path: Path) -> None:
+    """What is written without torch: rays of the file's graph, under the same comment and signature."""
+    file, model = lens_models.exported("invariants"), lens_models.model("invariants")
+    written = export_file(file, tmp_path / "file.h", "c")
+    whole = export_source([model], tmp_path / "model.h", "c", load_model(file).card)
+    assert written.signature == whole.signature
+    head, other = (f.read_text(encoding="utf-8").partition("#ifndef")[0] for f in (written.path, whole.path))
+    assert head == other
+    rays = {**rays_of(model, 2000, seed=3), "film_z_mm": model.domain.film_z_mm[0], "stop_radius_mm": 5.0}
+    found = compiled(lower(graph_of(file, file.read_bytes()))).rays(rays)
+    wanted = written_rays("onnx", "invariants", rays)
+    assert np.mean(found["status"] != wanted["status"]) < 1e-3
+    for name in SCENE_RAY:
+        np.testing.assert_allclose(found[name], wanted[name], rtol=0, atol=2e-5)
 
 
 def test_the_card_stands_on_top(tmp_path: Path) -> None:

@@ -2,13 +2,13 @@
 
 Several starts run on few rays, then the best, on as many rays as it takes not to overfit: a smooth lens is learnt from
 2000 rays as well as from 16,000, at an eighth of the cost of a step. Where the error on rays that the fit has not seen
-runs ahead of that on its own, it goes on with twice as many.
+runs ahead of that on its own, it goes on with twice as many. Steps are counted by their rays, so that their number
+bounds the work and tells the share done.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -73,7 +73,7 @@ def fit_network(
         raise InputError("mlp", "pairs.train", "(no rays)", "at least one passing ray")
     with pinned_threads():
         problem, shift, scale = _problem(data, base)
-        decisive = {name: getattr(settings, name) for name in ("units", "layers", "steps", "seconds", "seed")}
+        decisive = {name: getattr(settings, name) for name in ("units", "layers", "steps", "seed")}
         key = fingerprint(problem.tensors, {**decisive, "starts": STARTS, "rays": RAYS})
         enough = (_ENOUGH * 1000 * data.pairs.domain.film_radius_mm) ** 2
         best = Training(problem, settings, enough, Checkpoint(checkpoint, key), progress).run()
@@ -126,7 +126,8 @@ class _Place:
 
     Attributes:
         start: the start that runs, or their number once the best goes on.
-        taken: steps of the present start, or of the best.
+        taken: steps of the present start, or of the best; of twice the rays, twice.
+        bursts: of the best.
         level: how often the rays were doubled.
         champion: the best start so far, by its loss `least`.
         previous: loss after the last burst.
@@ -136,6 +137,7 @@ class _Place:
 
     start: int = 0
     taken: int = 0
+    bursts: int = 0
     level: int = 0
     champion: int = -1
     least: float = math.inf
@@ -152,7 +154,7 @@ class Training:
 
     Attributes:
         problem: all rays.
-        settings: units, layers, seed, steps and seconds are read.
+        settings: units, layers, seed and steps are read.
         enough: a loss so low that the rounding of float32 evaluation is larger.
         checkpoint: what earlier runs left.
         progress: called with the share done.
@@ -165,7 +167,6 @@ class Training:
     progress: Callable[[float], None] | None = None
     _place: _Place = field(default_factory=_Place)
     _champion: list[Tensor] = field(default_factory=list)
-    _highest: float = 0.0
 
     def run(self) -> Projection:
         """Train, from the start or from where the checkpoint was written; the last layer fits all rays."""
@@ -194,23 +195,21 @@ class Training:
         odd = self.problem.every(4, first=1) if self._levels[0] > 1 else None
         self._unseen = odd if self._place.level + 1 < len(self._levels) else None
 
-    def _burst(self, steps: int, until: float) -> Projection:
-        """At most `_BURST` steps, none after this share of the time."""
-        place = self._place
-        deadline = time.monotonic() + until * self.settings.seconds - self.checkpoint.elapsed_s
-        count = min(_BURST, steps - place.taken)
+    def _burst(self, steps: int) -> Projection:
+        """At most `_BURST` steps, each counted by its rays."""
+        place, each = self._place, self._levels[0] // self._levels[self._place.level]
+        count = min(_BURST, -(-(steps - place.taken) // each))
         best, self._stand = minimise(
-            self._rays, self._stand, count, deadline, lambda share: self._report(place.taken + share * count)
+            self._rays, self._stand, count, lambda share: self._report(place.taken + share * count * each)
         )
-        place.taken += count
+        place.taken += count * each
         return best
 
     def _try_start(self) -> None:
         """A burst of one of the starts; the end of its trial compares it with the best so far."""
         place, short = self._place, max(1, round(_TRIAL_STEPS * self.settings.steps))
-        until = 0.4 * (place.start + 1) / STARTS
-        best = self._burst(short, until)
-        if place.taken < short and self.checkpoint.elapsed_s < until * self.settings.seconds and not self._stand.stuck:
+        best = self._burst(short)
+        if place.taken < short and not self._stand.stuck:
             return
         if best.loss < place.least or not self._champion:
             place.least, place.champion, self._champion = best.loss, place.start, self._stand.hidden
@@ -220,29 +219,27 @@ class Training:
     def _go_on(self) -> None:
         """A burst of the best start; then more rays, or the end."""
         place, s = self._place, self.settings
-        best = self._burst(s.steps, 1.0)
+        best = self._burst(s.steps)
+        place.bursts += 1
         little = best.loss > (1 - _LITTLE) * place.previous
         place.idle = place.idle + 1 if little else 0
         place.previous = best.loss
         done = place.idle >= _IDLE or best.loss <= self.enough
-        if self._unseen is not None and (done or place.taken % (2 * _BURST) == 0):
+        if self._unseen is not None and (done or place.bursts % 2 == 0):
             outputs = activations(best.hidden, self._unseen.inputs)[-1] @ best.output.T
             if self._unseen.loss(outputs) > _GAP**2 * best.loss:
                 place.level, place.previous, place.idle, done = place.level + 1, math.inf, 0, False
                 self._stand = Stand(best.hidden, min(self._stand.damping, Stand.damping))
                 self._take_rays()
-        over = place.taken >= s.steps or self.checkpoint.elapsed_s >= s.seconds or self._stand.stuck
-        place.ended = over or done
+        place.ended = done or place.taken >= s.steps or self._stand.stuck
 
     def _report(self, taken: float) -> None:
-        """Tell the share done; it never goes back."""
+        """Tell the share of the iterations done."""
         if self.progress:
             s = self.settings
             short = max(1, round(_TRIAL_STEPS * s.steps)) if STARTS > 1 else 0
             done = min(self._place.start, STARTS) * short + taken
-            share = max(done / (STARTS * short + s.steps), self.checkpoint.elapsed_s / s.seconds)
-            self._highest = min(1.0, max(self._highest, share))
-            self.progress(self._highest)
+            self.progress(min(1.0, done / (STARTS * short + s.steps)))
 
     def _save(self, *, now: bool = False) -> None:
         self._place.damping, self._place.growth = self._stand.damping, self._stand.growth

@@ -11,7 +11,6 @@ matrix of sensitivities with the products of their inputs, so that the sum over 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -200,19 +199,16 @@ class Stand:
         return self.damping >= _DAMPING_END
 
 
-def minimise(
-    problem: Problem, start: Stand, steps: int, deadline: float, progress: Progress | None = None
-) -> tuple[Projection, Stand]:
+def minimise(problem: Problem, start: Stand, steps: int, progress: Progress | None = None) -> tuple[Projection, Stand]:
     """Levenberg-Marquardt on the hidden weights (damping after Nielsen 1999), scaled by the diagonal (Marquardt 1963).
 
     Args:
         steps: steps tried; fewer when the loss no longer falls.
-        deadline: time.monotonic() after which no step starts.
         progress: called with the share of the steps done.
     """
     best, damping, growth, taken = project(problem, start.hidden), start.damping, start.growth, 0
     system = None
-    while taken < steps and damping < _DAMPING_END and time.monotonic() < deadline:
+    while taken < steps and damping < _DAMPING_END:
         if system is None:
             system = normal_equations(problem, best)
         matrix, gradient, diagonal = system

@@ -67,7 +67,6 @@ PUBLISHED: dict[str, PublishedMethod] = {
                 units=128,
                 layers=3,
                 steps=6000,
-                seconds=90.0,
             ),
         ),
     ),

@@ -16,7 +16,6 @@ would need a new training.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -101,9 +100,9 @@ class _Rays:
 def fit_averaged(
     data: RawData, settings: ModelSettings, progress: Callable[[float], None] | None = None
 ) -> tuple[Averaged, tuple[Gate, ...]]:
-    """Train every network; the same seed gives the same weights where `steps` ends the training.
+    """Train every network; the same seed gives the same weights.
 
-    `partitions` are the rings; `seconds` are the processor's, of all networks, so that a busy machine trains no worse.
+    `partitions` are the rings, `steps` those of each network.
 
     Raises:
         InputError: more rings than the rays allow.
@@ -125,7 +124,7 @@ def fit_averaged(
         networks: list[Layers] = []
         for _ in range(NETWORKS):
             done = len(rings) * NETWORKS + len(networks)
-            networks.append(_train(ring, settings, settings.seed + done, settings.seconds / total))
+            networks.append(_train(ring, settings, settings.seed + done))
             if progress:
                 progress((done + 1) / total)
         rings.append(tuple(networks))
@@ -157,7 +156,7 @@ def _training_rays(data: RawData) -> _Rays:
     return _Rays(inputs.float(), outputs.float(), outputs[6].float())
 
 
-def _train(rays: _Rays, settings: ModelSettings, seed: int, seconds: float) -> Layers:
+def _train(rays: _Rays, settings: ModelSettings, seed: int) -> Layers:
     generator = torch.Generator().manual_seed(seed)
     widths = [5, *[settings.units] * settings.layers, 7]
     weights: list[Tensor] = []
@@ -175,16 +174,9 @@ def _train(rays: _Rays, settings: ModelSettings, seed: int, seconds: float) -> L
     for weight in weights:
         weight.requires_grad_(True)
     adam = torch.optim.Adam(weights, lr=RATE)
-    start = time.process_time()
     for step in range(settings.steps):
-        # The clock hastens the fall of the rate where it would end the training first, and only there, so that what the
-        # steps end repeats.
-        clock = (time.process_time() - start) / seconds
-        if clock >= 1:
-            break
-        spent = max(2 * clock - 1, step / settings.steps)
         for group in adam.param_groups:
-            group["lr"] = RATE * 0.5 * (1 + math.cos(math.pi * spent))
+            group["lr"] = RATE * 0.5 * (1 + math.cos(math.pi * step / settings.steps))
         batch = torch.randint(len(inputs), (BATCH,), generator=generator)
         h = inputs[batch]
         for k in range(0, len(weights) - 2, 2):

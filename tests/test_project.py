@@ -1,0 +1,36 @@
+"""What the project says of itself in several files agrees."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+from packaging.requirements import Requirement
+
+import neurolens
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def test_the_tested_versions_lie_in_the_ranges_that_are_declared() -> None:
+    text = (ROOT / "constraints.txt").read_text(encoding="utf-8")
+    tested = dict(re.findall(r"^([^\s=]+)==(\S+)", text, re.MULTILINE))
+    versions = {name.lower().replace("_", "-"): version for name, version in tested.items()}
+    extras = PROJECT["optional-dependencies"]
+    for line in [*PROJECT["dependencies"], *(line for extra in extras.values() for line in extra)]:
+        wanted = Requirement(line)
+        assert wanted.specifier.contains(versions[wanted.name.lower()]), line
+        assert not any(s.operator == "==" for s in wanted.specifier), (
+            f"{line}: a range, constraints.txt has the version"
+        )
+
+
+def test_licence_citation_and_changes_are_there_and_name_this_version() -> None:
+    assert PROJECT["license"] == "MIT" and (ROOT / "LICENSE").read_text(encoding="utf-8").startswith("MIT License")
+    assert "CC0" in (ROOT / "lenses" / "LICENSE").read_text(encoding="utf-8")
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {neurolens.__version__}\n" in citation and "\nlicense: MIT\n" in citation
+    assert f"\n## {neurolens.__version__}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert (ROOT / "neurolens" / "py.typed").exists()
