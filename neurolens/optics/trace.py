@@ -19,6 +19,7 @@ from neurolens.base.errors import InputError
 from neurolens.optics import glass
 from neurolens.optics.passing import Mode, along_axis, bend, check_rays, media, meet, sound_wavelength, start, unit
 from neurolens.optics.prescription import Lens
+from neurolens.optics.shapes import start_of
 from neurolens.optics.surfaces import Counts, Rays, times
 from neurolens.optics.transmission import passage
 
@@ -161,7 +162,17 @@ def compile_trace(
         # Read the catalogue now: compiled code cannot read files.
         glass.index_of(surface, glass.LINE_D_NM)
         glass.absorption_of(surface, glass.LINE_D_NM)
-    return torch.compile(run, dynamic=False)
+    return compile_tracing(run)
+
+
+def compile_tracing(run: Callable[..., Any], fullgraph: bool = False) -> Callable[..., Any]:
+    """`torch.compile` of a function that traces, for chunks of one length.
+
+    What it may take for constant is marked here only: that imports the compiler, which takes longer than a camera
+    needs to start.
+    """
+    torch.compiler.assume_constant_result(start_of)
+    return torch.compile(run, dynamic=False, fullgraph=fullgraph)
 
 
 @cache
