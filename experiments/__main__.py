@@ -36,7 +36,7 @@ NAMES = {
     "optiland": ("compare_optiland", "speed of the exact tracer beside Optiland"),
 }
 _DESCRIPTION = """\
-Measure on this machine what the README reports, and write tables to experiments/results.
+Measure on this machine what the README reports, and write tables to runs/results (--commit: experiments/results).
 Needs the extra "train"; run it from the project's folder."""
 
 

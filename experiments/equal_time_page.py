@@ -372,11 +372,10 @@ def _colour(name: str) -> str:
 
 OPTIONS = (
     lab.option("--scene", metavar="SCENE", action="append", help="grid, lights, room or a file (default: all)"),
-    lab.option("--quick", action="store_true", help="tiny pictures (a minute); results stay in the run folder"),
+    lab.option("--quick", action="store_true", help="tiny pictures (a minute)"),
     lab.count("threads", 1, "of the timed renders (default 1)", 1, 256),
     lab.option("--folder", metavar="DIR", type=Path, help="of the kept renders (default: runs/equal_time)"),
-    lab.option("--out", metavar="DIR", type=Path, help="default: experiments/results/equal_time"),
-    lab.QUIET,
+    lab.out(lab.RESULTS / "equal_time"),
 )
 
 
@@ -384,12 +383,11 @@ def run(args: argparse.Namespace) -> None:
     """Measure scene by scene; the page is written after each."""
     counts = QUICK if args.quick else Counts()
     folder = args.folder or lab.ROOT / "runs" / ("equal_time_quick" if args.quick else "equal_time")
-    out = args.out or (folder / "results" if args.quick else lab.RESULTS / "equal_time")
     files = [scene_file(name) for name in args.scene or SCENES]
     progress = Progress({file.stem: 1.0 for file in files}, quiet=args.quiet)
     done: list[SceneResult] = []
     for file in files:
         with progress.stage(file.stem) as report:
             done.append(measure_scene(file, folder, counts, args.threads, report))
-        text = write(done, out)
-    print(f"{text}\nWritten to {out}")
+        text = write(done, args.out)
+    print(f"{text}\nWritten to {args.out}")

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
-from neurolens.commands.arguments import whole
+from neurolens.commands.arguments import QUIET_HELP, whole
 from neurolens.evaluate.pages import markdown_table
 
 ROOT = Path(__file__).parents[1]
@@ -50,17 +50,21 @@ def count(name: str, default: int | None, text: str, least: int = 1, most: int |
 
 
 def out(folder: Path = RESULTS, what: str = "folder for the tables") -> Option:
-    """--out and --quiet."""
+    """--out, by default in runs/; --commit, for the folder that is kept in the repository; --quiet."""
+    place = ROOT / "runs" / folder.relative_to(ROOT / "experiments") if folder.is_relative_to(RESULTS) else folder
 
     def add(parser: argparse.ArgumentParser) -> None:
-        shown = folder.relative_to(ROOT)
-        parser.add_argument("--out", metavar="DIR", type=Path, default=folder, help=f"{what} (default: {shown})")
+        shown = place.relative_to(ROOT)
+        parser.add_argument("--out", metavar="DIR", type=Path, default=place, help=f"{what} (default: {shown})")
+        if place != folder:
+            text = f"the folder is {folder.relative_to(ROOT)}, which the README shows"
+            parser.add_argument("--commit", dest="out", action="store_const", const=folder, help=text)
         QUIET(parser)
 
     return add
 
 
-QUIET = option("--quiet", action="store_true", help="no progress on stderr")
+QUIET = option("--quiet", action="store_true", help=QUIET_HELP)
 ONLY = option("--only", metavar="TEXT", default="", help="lens files whose name holds this text")
 ROUNDS = count("rounds", None, "rounds (default 20; quick 5)")
 

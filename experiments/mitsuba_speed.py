@@ -15,6 +15,7 @@ import pstats
 import statistics
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -91,11 +92,16 @@ class Row:
         self.pictures.append(picture / self.white)
 
 
-def cornell_box(size: int) -> dict[str, Any]:
-    """Mitsuba's Cornell box at a picture size, box-filtered, with our beginning of roulette."""
+def cornell_box(settings: Settings) -> dict[str, Any]:
+    """Mitsuba's Cornell box at a picture size, box-filtered, with our beginning of roulette.
+
+    Sampled by `multijitter`: of Mitsuba's samplers the one of least noise at equal time (its scene has `independent`).
+    """
     mi, _ = libraries()
     box: dict[str, Any] = mi.cornell_box()
+    size = settings.size
     box["sensor"]["film"] |= {"width": size, "height": size, "rfilter": {"type": "box"}}
+    box["sensor"]["sampler"] = {"type": "multijitter", "sample_count": settings.samples}
     box["integrator"]["rr_depth"] = ROULETTE_FROM
     return box
 
@@ -117,7 +123,7 @@ def rows(model: Path, settings: Settings) -> list[Row]:
     """
     mi = require_mitsuba("scalar_rgb")
     libraries()[1].set_thread_count(settings.threads)
-    box = cornell_box(settings.size)
+    box = cornell_box(settings)
     pinhole = Pinhole(FOCAL_MM, film_mm(box))
     lens = mitsuba.camera(model, film_mm=(28.0, 28.0), focus_m=FOCUS_M, f_number=F_NUMBER)
     behind, meshes = (
@@ -159,7 +165,7 @@ def _theirs(variant: str, chosen: Camera | None, settings: Settings, white: Floa
     """Mitsuba in a variant, through its own pinhole or a camera of ours."""
     spectral = variant.endswith("spectral")
     require_mitsuba(variant)
-    box = cornell_box(settings.size)
+    box = cornell_box(settings)
     scene = mitsuba.load_scene(with_our_spectra(box) if spectral else box)
 
     def draw(seed: int) -> FloatArray:
@@ -180,12 +186,12 @@ def record(row: Row, settings: Settings, base: Row) -> dict[str, Any]:
     """Figures of a row: Mpath/s of the fastest and of the median repeat, time over that of `base`, and the picture.
 
     `mean_rgb`: of the picture. `noise`: variance of a pixel's luminance between the repeats over its square, both
-    means over the picture, at the settings' samples.
+    means over the picture, at the settings' samples. `equal_noise`: time to the noise that `base` has, over its time.
     """
     low, middle = min(row.seconds), statistics.median(row.seconds)
     pictures = np.stack(row.pictures)
-    grey = pictures @ np.array([0.2126, 0.7152, 0.0722], np.float32)
-    noise = float(np.mean(grey.var(axis=0, ddof=1)) / np.mean(grey**2)) if len(grey) > 1 else None
+    noise, base_noise = (_noise(r) for r in (row, base))
+    time_over_ours = middle / statistics.median(base.seconds)
     return {
         "name": row.name,
         "carries": row.carries,
@@ -195,10 +201,16 @@ def record(row: Row, settings: Settings, base: Row) -> dict[str, Any]:
         "seconds_min": low,
         "seconds_median": middle,
         "first_s": row.first_s,
-        "time_over_ours": middle / statistics.median(base.seconds),
+        "time_over_ours": time_over_ours,
         "mean_rgb": [float(v) for v in pictures.mean(axis=(0, 1, 2))],
         "noise": noise,
+        "equal_noise": time_over_ours * noise / base_noise if noise and base_noise else None,
     }
+
+
+def _noise(row: Row) -> float | None:
+    grey = np.stack(row.pictures) @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+    return float(np.mean(grey.var(axis=0, ddof=1)) / np.mean(grey**2)) if len(grey) > 1 else None
 
 
 STAGES = ("camera", "intersection", "lights", "shading", "random numbers", "integrator", "film, set-up")
@@ -307,11 +319,13 @@ class Found:
 
 _BESIDE = """\
 Its own Cornell box, {size} x {size} pixels, {samples} samples, at most seven surfaces, roulette after two in all; \
-{repeats} repeats in turn, compiling and warming up left out. Time: median, over that of our first row. Mean: of the \
-picture's R, G and B; the lens sees another part of the box than the pinhole, and RGB paths mix colours otherwise than \
-spectra. Noise: variance of a pixel's luminance over its square at these samples; our samples are low-discrepancy, \
-those of Mitsuba's scene independent. A lens that disperses leaves a path one wavelength, in Mitsuba four times the \
-same."""
+{repeats} repeats in turn; the first picture, with compiling, is beside. Time: median, over that of our first row. \
+Mean: of the picture's R, G and B; the lens sees another part of the box than the pinhole, and RGB paths mix colours \
+otherwise than spectra. Noise: variance of a pixel's luminance over its square at these samples, low-discrepancy in \
+all (Mitsuba's `multijitter`); beside it the time to the noise of our first row, over its time. A lens that disperses \
+leaves a path one wavelength, in Mitsuba four times the same. The llvm variants take the processor's widest vectors: \
+held to AVX2 they ran 1.6 to 1.9 times as long on a processor with AVX-512, with LLVM 15 as with LLVM 19 (LLVM 15 \
+cannot compile them for AVX-512)."""
 _SPEEDS = lab.columns(
     ("renderer", "name"),
     ("a path carries", "carries"),
@@ -321,6 +335,8 @@ _SPEEDS = lab.columns(
     ("time", "time_over_ours", ".2f"),
     ("mean R G B", lambda r: " ".join(f"{v:.4f}" for v in r["mean_rgb"])),
     ("noise", "noise", ".2g"),
+    ("time to equal noise", "equal_noise", ".2f"),
+    ("first picture s", "first_s", ".2g"),
 )
 _WHERE = """\
 Paths per second through a thin lens, four wavelengths per path, the scene's own depth; beside it the share of the \
@@ -400,6 +416,9 @@ def _versions() -> dict[str, str]:
             known[package] = version(package)
         except PackageNotFoundError:
             continue
+    with suppress(NeurolensError, AttributeError):  # no LLVM, or a Dr.Jit that does not tell
+        require_mitsuba("llvm_ad_rgb")
+        known["LLVM"] = ".".join(map(str, libraries()[1].detail.llvm_version()))
     return known
 
 

@@ -36,7 +36,7 @@ LENSES = Path(__file__).parents[1] / "lenses"
 GAUSS, FISHEYE = "laikin_double_gauss_50", "muller_fisheye_100"
 KINDS = ("invariants", "raw", "network", "thick", "fisheye")
 GATED = ("singlet", "hemisphere")  # lenses whose rays are lost at surfaces, too
-PUBLISHED = ("hanika", "schrade", "rtf", "taylor", "cells", "neurolens2017")
+PUBLISHED = ("hanika", "schrade", "rtf", "taylor", "cells", "neurolens2017", "ray-lut")
 _FITS = {
     "invariants": ModelSettings("dense", degree=4),
     "raw": ModelSettings("dense", basis="raw", degree=3),
@@ -47,6 +47,7 @@ _FITS = {
     "schrade": ModelSettings("schrade", basis="raw", degree=5, terms=12),
     "rtf": ModelSettings("rtf", basis="raw", degree=4),
     "taylor": ModelSettings("taylor", basis="raw", degree=3),
+    "ray-lut": ModelSettings("ray-lut", basis="raw", units=6),
     "cells": ModelSettings("zheng-adaptive", basis="raw", terms=6, partitions=2),
     "neurolens2017": ModelSettings("neurolens2017", basis="raw", units=16, layers=2, steps=60, partitions=2),
 }

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from command_line import described, failure, run_json
+from lens_models import edited
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.cli import main
+from neurolens.commands.arguments import Parser, lens_path
 from neurolens.render.pictures import read_exr, write_exr
 
 LENSES = Path(__file__).parents[1] / "lenses"
 SINGLET, PHONE = LENSES / "thorlabs_lb1471_biconvex_50.toml", LENSES / "phone_lens_6.toml"
 ANAMORPHIC, NIKON = LENSES / "cooke_anamorphic_42.toml", LENSES / "nikon_zoom_70_200.toml"
 TAJIMA, TRIPLET = LENSES / "tajima_retrofocus_24.toml", LENSES / "cooke_triplet_50.toml"
+MODEL = LENSES.parent / "models" / "laikin_double_gauss_50.ols-28.onnx"
 _NOWHERE = Path("/proc/q.exr")  # nobody, root neither, makes a file there
 
 
@@ -95,16 +100,58 @@ def test_doubts_are_said_and_kept(scene: Path, tmp_path: Path, capsys: pytest.Ca
     """A slip of the pen in the table, and a film five times as wide as the picture; a film that fits is no doubt."""
     slip, out = tmp_path / "slip.toml", tmp_path / "a.exr"
     slip.write_text(SINGLET.read_text().replace("radius_mm =  50.6", "radius_mm =  60.5"))
-    common = ("-o", str(out), "--quiet", "--samples", "1")
+    common = ("-o", str(out), "--samples", "1")
     assert main(["render", str(scene), "--camera", str(slip), *common]) == 0
-    assert "warning: the focal length is 54" in capsys.readouterr().err
+    assert capsys.readouterr().err.count("warning: the focal length is 54") == 1
     assert any("the focal length is 54" in note for note in read_exr(out)[1]["camera"]["notes"])
     small = ("--camera", str(TRIPLET), "--efl", "10")
     assert main(["render", str(scene), *small, *common]) == 0
     assert "times the image circle of 7.28 mm" in capsys.readouterr().err
     assert main(["render", str(scene), *small, *common, "--film", "6x3.375"]) == 0
-    assert capsys.readouterr().err == ""
+    assert "warning" not in capsys.readouterr().err
     assert read_exr(out)[1]["camera"]["film_mm"] == [6, 3.375]
+
+
+def test_a_model_says_where_it_is_poor_dark_or_coarser_than_the_picture(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def spoil(card: dict[str, Any]) -> None:
+        card["errors"] |= {"poor": ["false pass 2%"], "rms_um": 2000.0}
+        card["domain"]["focus_m"] = ["inf", "inf"]
+
+    model = edited(MODEL, tmp_path / "model.onnx", spoil)
+    render = ("render", str(scene), "--camera", str(model), "-o", str(tmp_path / "a.exr"), "--samples", "1")
+    assert main([*render, "--film", "60x40"]) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+    assert [("poor" in s, "its corners stay dark" in s, "more than a pixel" in s) for s in said] == [
+        (True, False, False), (False, True, False), (False, False, True),
+    ]  # fmt: skip
+    assert main([*render, "--film", "60x40", "--quiet"]) == 0
+    assert capsys.readouterr().err == ""
+    assert "within the model's domain, inf m" in failure(capsys, *render, "--focus", "0.2")
+
+
+def test_warnings_are_lines_once_and_none_when_quiet(capsys: pytest.CaptureFixture[str]) -> None:
+    def build() -> Parser:
+        def run(_: object) -> int:
+            for text in ("a\nb", "a\nb", "c"):
+                warnings.warn(text, NeurolensWarning, stacklevel=2)
+            return 0
+
+        parser = Parser(prog="x")
+        parser.add_argument("--quiet", action="store_true")
+        parser.set_defaults(run=run, kept="")
+        return parser
+
+    for quiet, lines in (([], ["neurolens: warning: a b", "neurolens: warning: c"]), (["--quiet"], [])):
+        assert main(quiet, build) == 0
+        assert capsys.readouterr().err.splitlines() == lines
+
+
+def test_a_lens_is_found_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
+    assert lens_path("cooke_triplet_50", "lens") == TRIPLET and lens_path(TRIPLET, "lens") == TRIPLET
+    for command in ("lens", "analyse"):
+        assert "a lens file, or a name in" in failure(capsys, command, "no_such_lens")
 
 
 def test_the_shape_of_the_picture_is_checked_before_the_camera(

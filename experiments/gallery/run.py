@@ -143,7 +143,8 @@ def _surrogates(effect: Effect, shots: Sequence[Shot], cache: Path, progress: Pr
 def _error(record: Record) -> str:
     if record.get("rms_um") is not None:
         return f"RMS {record['rms_um']:.3g} um on the film"
-    return f"RMS {record.get('direction_rms_deg') or math.nan:.3g} degrees"
+    degrees = record.get("direction_rms_deg")
+    return "no ray to measure" if degrees is None else f"RMS {degrees:.3g} degrees"
 
 
 def _views(

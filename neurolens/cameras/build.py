@@ -35,7 +35,7 @@ FISHEYES = tuple(f"fisheye-{name}" for name in PROJECTIONS)
 IDEAL = ("thin", "pinhole", *FISHEYES)
 THICK = "thick:"
 FUSED = "fused:"  # before a path: compiled by the system's C compiler
-_DARK_FILM = 1.25  # diagonal of the film over the image circle
+_BEYOND = 1.02  # diagonal of the film over the image circle: 36x24 over 43.2 mm is as lenses are engraved
 _EFL_MM, _FISHEYE_EFL_MM, _THIN_F_NUMBER, _PINHOLE_F_NUMBER = 50.0, 14.0, 4.0, 8.0
 
 
@@ -197,23 +197,25 @@ def _exact(path: Path, shot: Shot, fused: bool, progress: Progress | None) -> Ca
         film_offset_mm=shot.film_offset_mm,
         progress=progress,
     )
-    camera.settings |= {"zoom": shot.zoom, "notes": [*doubts(check_lens(tabled)), *_dark_film(lens, shot.film_mm)]}
+    camera.settings |= {"zoom": shot.zoom, "notes": [*doubts(check_lens(tabled)), *_film_notes(lens, shot.film_mm)]}
     return camera
 
 
-def _dark_film(lens: Lens, film_mm: tuple[float, float]) -> list[str]:
-    """A sentence on a film that is far larger than the picture of the lens, where the size of that is known."""
+def _film_notes(lens: Lens, film_mm: tuple[float, float]) -> list[str]:
+    """A sentence on a film that is larger than the picture of the lens, where the size of that is known."""
     from neurolens.optics.pupils import image_radius_mm
 
     if lens.image_radius_mm is None and (lens.half_field_deg is None or lens.half_field_deg >= 60):
         return []  # only a long search would tell
-    circle, diagonal = 2 * image_radius_mm(lens)[0], math.hypot(*film_mm)
-    if diagonal <= _DARK_FILM * circle:
+    return _beyond_circle(film_mm, image_radius_mm(lens)[0], "the image circle", "may stay dark")
+
+
+def _beyond_circle(film_mm: tuple[float, float], radius_mm: float, what: str, then: str) -> list[str]:
+    circle, diagonal = 2 * radius_mm, math.hypot(*film_mm)
+    if diagonal <= _BEYOND * circle:
         return []
-    return [
-        f"the film's diagonal of {diagonal:.3g} mm is {diagonal / circle:.2g} times the image circle "
-        f"of {circle:.3g} mm: its corners may stay dark"
-    ]
+    told = f"the film's diagonal of {diagonal:.3g} mm is {diagonal / circle:.3g} times {what} of {circle:.3g} mm"
+    return [f"{told}: its corners {then}"]
 
 
 def _model(path: Path, shot: Shot, fused: bool) -> Camera:
@@ -233,7 +235,7 @@ def _model(path: Path, shot: Shot, fused: bool) -> Camera:
         model = model.at(*state_for(path, model.axes, model.state, shot.zoom, shot.focus_m))
     lens, domain = model.card["lens"], model.card["domain"]
     widest = float(lens["f_number"] * lens["stop_radius_mm"] / domain["stop_radius_mm"])
-    return (FusedCamera if fused else OnnxCamera)(
+    camera = (FusedCamera if fused else OnnxCamera)(
         model,
         film_mm=shot.film_mm,
         focus_m=shot.focus_m,
@@ -242,6 +244,10 @@ def _model(path: Path, shot: Shot, fused: bool) -> Camera:
         wavelength_nm=shot.wavelength_nm,
         film_offset_mm=shot.film_offset_mm,
     )
+    notes = _beyond_circle(shot.film_mm, domain["film_radius_mm"], "the model's picture", "stay dark")
+    poor = ", ".join(model.card["errors"].get("poor") or ())
+    camera.settings["notes"] = [*([f"the model is poor, as its card says: {poor}"] if poor else []), *notes]
+    return camera
 
 
 def _refuse(camera: str, field: str, value: object, expected: str) -> None:

@@ -274,7 +274,7 @@ def _film_z(model: OnnxLens, focus_m: float, offset_mm: float) -> float:
         return float(near)  # its groups focus, on the one film position of the state
     z = film_z_mm(lens["efl_mm"], lens["front_principal_z_mm"], lens["rear_principal_z_mm"], focus_m) + offset_mm
     if not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
-        limits = " to ".join(f"{v} m" for v in reversed(model.card["domain"]["focus_m"]))
+        limits = " to ".join(dict.fromkeys(f"{v} m" for v in reversed(model.card["domain"]["focus_m"])))
         if offset_mm:
             expected = f"a film position within the model's domain, {near:.6g} to {far:.6g} mm (focus {limits})"
             raise InputError(model.path, "film_offset_mm", offset_mm, expected)

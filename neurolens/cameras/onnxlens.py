@@ -114,7 +114,7 @@ class OnnxLens:
         Args:
             film_xy_mm, pupil_xy_mm: [2, N], lens frame, on the film plane and on the plane domain.pupil_z_mm.
             wavelength_nm: [N], or one number.
-            film_z_mm: film plane; None takes the domain's nearest to the lens (its farthest focus). An array [N] costs
+            film_z_mm: film plane; None takes the paraxial image of the farthest focus. An array [N] costs
                 a call for each distinct value.
             stop_radius_mm: None takes the widest stop.
             state: of a model of many states, a number for every axis; None takes `self.state`, at first the first end
@@ -129,7 +129,9 @@ class OnnxLens:
         film, pupil, wavelength = _columns(film_xy_mm, pupil_xy_mm, wavelength_nm)
         domain = self.card["domain"]
         stop = np.array([domain["stop_radius_mm"] if stop_radius_mm is None else stop_radius_mm], np.float32)
-        plane = np.atleast_1d(np.asarray(domain["film_z_mm"][0] if film_z_mm is None else film_z_mm, np.float32))
+        plane = np.atleast_1d(
+            np.asarray(self.card["lens"]["film_z_mm"] if film_z_mm is None else film_z_mm, np.float32)
+        )
         count = film.shape[1]
         if plane.shape == (count,) and count > 1:
             return self._by_plane(film, pupil, wavelength, plane, stop)

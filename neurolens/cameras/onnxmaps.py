@@ -166,7 +166,7 @@ class OnnxInverse:
         session, card = self._map(name)
         domain = card["domain"]
         call = {
-            "film_z_mm": domain["film_z_mm"][0] if film_z_mm is None else film_z_mm,
+            "film_z_mm": card["lens"]["film_z_mm"] if film_z_mm is None else film_z_mm,
             "stop_radius_mm": domain["stop_radius_mm"] if stop_radius_mm is None else stop_radius_mm,
         }
         with np.errstate(over="ignore"):

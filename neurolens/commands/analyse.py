@@ -11,7 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.commands.arguments import add_json, add_lens_state, between, check_run_folder, focus_of, state_of
+from neurolens.commands.arguments import (
+    add_json,
+    add_lens_state,
+    between,
+    check_run_folder,
+    focus_of,
+    lens_path,
+    state_of,
+)
 from neurolens.commands.output import answer, number, table
 
 if TYPE_CHECKING:
@@ -61,7 +69,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "analyse", help="spots, MTF, distortion and more of a lens file", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument("file", metavar="LENS", type=Path, help="lens file (lenses/*.toml)")
+    parser.add_argument("file", metavar="LENS", type=Path, help="lens file, or name of lenses/")
     parser.add_argument("what", metavar="WHAT", nargs="*", help="what to show (default: all)")
     add_lens_state(parser, efl="as tabled", f_number="the tabled stop")
     parser.add_argument(
@@ -97,6 +105,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.analysis.layout import state_text
 
     began = time.perf_counter()
+    args.file = lens_path(args.file, "analyse")
     scene, doubts = _scene_of(args)
     scene.check()
     found, pictures, notes = {}, {}, [f"derived: {scene.lens.derived}"] if scene.lens.derived else []

@@ -73,6 +73,8 @@ def _number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) 
     return convert
 
 
+QUIET_HELP = "neither progress nor warnings on stderr"
+
 # Repeated here, so that help imports no camera; a test compares with `cameras.exact` and `cameras.vignetting`.
 PUPILS = ("outline", "rear-rim", "exit-pupil", "wu", "pixel-disc", "pixel-ellipse", "boxes", "ellipses")
 VIGNETTINGS = ("both", "natural", "optical", "none")
@@ -204,17 +206,40 @@ def add_exposure(parser: argparse._ActionsContainer) -> None:
     """Add --exposure."""
     parser.add_argument(
         "--exposure", metavar="STOPS", type=between(-40, 40, "stops"), default=0.0,
-        help="brightens the preview only (default: 0)",
+        help="stops by which the preview OUT.png is brighter; OUT.exr keeps the scene's light as it is (default: 0)",
     )  # fmt: skip
 
 
 def add_json(parser: argparse.ArgumentParser, quiet: bool = False) -> None:
     """Add --json, and --quiet before it where a command shows its progress."""
     if quiet:
-        parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+        parser.add_argument("--quiet", action="store_true", help=QUIET_HELP)
     parser.add_argument(
         "--json", action="store_true", help="print one JSON object on stdout instead of the text; keys carry their unit"
     )
+
+
+def project_root() -> Path:
+    """The project's folder: that of the source, or else, for a package installed away from it, the working folder.
+
+    Raises:
+        InputError: neither has the folder experiments/.
+    """
+    for root in (Path(__file__).parents[2], Path.cwd()):
+        if (root / "experiments").is_dir():
+            return root
+    raise InputError(Path.cwd(), "experiments/", "(missing)", "the project's folder as the working folder")
+
+
+def lens_path(name: str | Path, command: str) -> Path:
+    """The lens file of an argument: a path, or a name of lenses/ in the project; raises InputError for another word."""
+    path = Path(name)
+    if path.exists() or path.suffix:  # the reader says what is wrong with a path
+        return path
+    folder = project_root() / "lenses"
+    if (folder / f"{path}.toml").is_file():
+        return folder / f"{path}.toml"
+    raise InputError(f"neurolens {command}", "LENS", str(name), f"a lens file, or a name in {folder}")
 
 
 def check_folder(path: Path, option: str) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
-from neurolens.commands.arguments import Parser, check_run_folder, whole
+from neurolens.commands.arguments import QUIET_HELP, Parser, check_run_folder, lens_path, whole
 
 if TYPE_CHECKING:
     from neurolens.evaluate.methods import BenchSettings
@@ -63,7 +63,7 @@ def add_surrogate_arguments(parser: argparse.ArgumentParser, lenses: str) -> Non
     parser.add_argument(
         "--out", metavar="DIR", type=Path, default=Path("runs/surrogates"), help="folder (default: runs/surrogates)"
     )
-    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    parser.add_argument("--quiet", action="store_true", help=QUIET_HELP)
 
 
 def run_surrogates(args: argparse.Namespace) -> int:
@@ -124,17 +124,7 @@ def _lens_files(names: list[str]) -> list[Path]:
     Raises:
         InputError: no such file, or two of one name, whose records would be the same file.
     """
-    from neurolens.evaluate.describe import project_root
-
-    files = []
-    for name in names:
-        path = Path(name)
-        if not path.is_file():
-            folder = project_root() / "lenses"
-            path = folder / f"{name}.toml"
-            if not path.is_file():
-                raise InputError("neurolens bench surrogates", "LENS", name, f"a lens file, or a name in {folder}")
-        files.append(path)
+    files = [lens_path(name, "bench surrogates") for name in names]
     twice = sorted({f.stem for f in files if sum(g.stem == f.stem for g in files) > 1})
     if twice:
         raise InputError("neurolens bench surrogates", "LENS", twice, "files whose names differ")

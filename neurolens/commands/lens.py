@@ -19,6 +19,8 @@ from neurolens.commands.arguments import (
     check_suffix,
     focus_of,
     given_options,
+    lens_path,
+    project_root,
     state_of,
 )
 from neurolens.commands.output import answer, number, table
@@ -40,7 +42,7 @@ are from the axis in degrees; first-order data is for the d line (587.56 nm). Ne
 "train" (torch)."""
 _EPILOG = """\
 examples:
-  neurolens lens lenses/laikin_double_gauss_50.toml
+  neurolens lens laikin_double_gauss_50
   neurolens lens lenses/brendel_tessar_100.toml --efl 50 --focus 1.5 --layout tessar.png
   neurolens lens lenses/ogawa_zoom_70_200.toml --zoom 135mm --json
   neurolens lens list --layouts lenses.png
@@ -53,7 +55,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "lens", help="first-order data, field and layout of a lens file", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument("file", metavar="FILE", type=Path, help='lens file (lenses/*.toml), or the word "list"')
+    parser.add_argument("file", metavar="FILE", type=Path, help='lens file, name of lenses/, or the word "list"')
     parser.add_argument(
         "folder", metavar="FOLDER", type=Path, nargs="?", help='of lens files, after "list" (default: those that ship)'
     )
@@ -98,6 +100,7 @@ def run(args: argparse.Namespace) -> int:
     _check_mode(args, listing)
     if listing:
         return _run_list(args)
+    args.file = lens_path(args.file, "lens")
     if args.derive_rims:
         return _run_rims(args)
     for option, path in (("--layout", args.layout), ("--breathing", args.breathing)):
@@ -248,7 +251,7 @@ _LIST_HEADER = ("lens", "name", "EFL mm", "f/", "half field", "refr.", "asph.", 
 
 
 def _run_list(args: argparse.Namespace) -> int:
-    from neurolens.evaluate.describe import lens_files, library_row, project_root, section
+    from neurolens.evaluate.describe import lens_files, library_row, section
 
     if args.layouts is not None:
         check_folder(args.layouts, "--layouts")

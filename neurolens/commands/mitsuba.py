@@ -43,7 +43,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "-o", "--out", metavar="OUT.exr", type=Path, required=True, help="picture to write; the preview is OUT.png"
     )
-    parser.add_argument("--variant", metavar="NAME", help="of Mitsuba (default: llvm_ad_spectral)")
+    parser.add_argument(
+        "--variant", metavar="NAME", help="of Mitsuba (default: llvm_ad_spectral; scalar_spectral without LLVM)"
+    )
     parser.add_argument("--samples", metavar="N", type=whole(1, 1 << 20), help="a pixel (default: the scene's)")
     parser.add_argument(
         "--film", metavar="WxH", type=film_size, help="size in mm (default: 36 wide, the picture's shape)"

@@ -51,7 +51,7 @@ The same seed gives the same picture for any number of threads; all cameras shar
 random numbers. A model (.onnx), the thin lens and the points need no torch; a lens file
 (.toml) does (extra "train").
 
-The preview is updated during the render. Ctrl-C (and SIGTERM) writes the picture so far; the same
+The preview is updated during the render. Ctrl-C (SIGTERM, SIGHUP) writes the picture so far; the same
 command then resumes from OUT.exr.part and ends with the same picture, bit for bit."""
 _EPILOG = """\
 examples:
@@ -172,7 +172,7 @@ def run(args: argparse.Namespace) -> int:
     PixelGrid(width, height, (settings.film_width_mm, settings.film_height_mm))  # before the slow make_camera
     progress = Progress(quiet=args.quiet)
     camera = make_camera(args.camera, shot_of(settings, args, scene.aperture), progress)
-    for note in camera.settings.get("notes", ()):
+    for note in (*camera.settings.get("notes", ()), *_pixel_notes(camera, width)):
         warn(note)
     with Stopping() as stopping, progress.stage(f"render {scene.name}, {camera.name}") as report:
         result = render(
@@ -183,6 +183,13 @@ def run(args: argparse.Namespace) -> int:
         if not result.stats["complete"]:
             raise Unfinished
     return _deliver(args, files, result, camera, film, stopping)
+
+
+def _pixel_notes(camera: Camera, width: int) -> list[str]:
+    """A sentence on a model whose error is larger than the pixels of a picture so many wide."""
+    error = (camera.settings.get("card") or {}).get("errors", {}).get("rms_um") or 0.0
+    pixel = 1e3 * camera.film_mm[0] / width
+    return [f"the model's RMS error of {error:.3g} um is more than a pixel, {pixel:.3g} um"] if error > pixel else []
 
 
 def _deliver(

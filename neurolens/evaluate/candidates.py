@@ -23,13 +23,15 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.rays import frame_width_mm
 from neurolens.evaluate.records import ExactRecord, Timing
 from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, race
-from neurolens.graph.c import Signature, write_c
+from neurolens.graph.c import Signature, write_blocks, write_c
 from neurolens.graph.compiler import FLAGS, compile_c, find_compiler
 from neurolens.graph.program import Program
+from neurolens.graph.scalars import lower
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import Traced, compile_tracing, trace
+from neurolens.optics.tracegraph import exact_graph
 from neurolens.surrogates.assemble import ALL, Parts
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.model import LensModel
@@ -37,7 +39,8 @@ from neurolens.surrogates.source import FREE, fused_program
 from neurolens.surrogates.specialise import Fix
 from neurolens.surrogates.stored import load_fitted
 
-EXACT = ("exact eager", "exact compiled")  # names of `exact_candidates` of a whole camera
+# Names of `exact_candidates` of a whole camera, and of `exact_c_candidate`.
+EXACT = ("exact eager", "exact compiled", "exact C")
 EAGER_BATCHES = (8192, 16384, 32768)
 COMPILED_BATCHES = (16384,)  # each further size costs half a minute of compilation
 
@@ -85,6 +88,12 @@ def exact_candidates(
 
     found = [Candidate(f"{label} eager", lambda rays: partial(run, *arguments(rays)), EAGER_BATCHES)]
     return [*found, Candidate(f"{label} compiled", faster, COMPILED_BATCHES)] if compiled else found
+
+
+def exact_c_candidate(lens: Lens, domain: Domain) -> Candidate:
+    """The exact trace as C, by the same writer and flags as the models: what a model as C is to be held against."""
+    graph = exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm)
+    return program_candidate(EXACT[2], lower(graph), domain)
 
 
 def exact_records(timed: Race) -> list[ExactRecord]:
@@ -151,7 +160,9 @@ class CompiledSource:
         self.signature = Signature.of(program, "lens")
         self._folder = tempfile.TemporaryDirectory(prefix="neurolens-source-")
         library = Path(self._folder.name) / "lens.so"
-        text = write_c(program, "lens", ["A timed model."]) + self._wrapper()
+        blocks = bool(program.own_tables)  # lookups: loops of arrays have them apart
+        text = write_blocks(program, "lens") if blocks else write_c(program, "lens", ["A timed model."])
+        text += self._wrapper(blocks)
         try:
             self.warnings = compile_c(text, library, flags)
         except InputError as error:
@@ -159,9 +170,15 @@ class CompiledSource:
         self._run = ctypes.CDLL(str(library)).neurolens_run
         self._run.argtypes, self._run.restype = [ctypes.c_size_t, ctypes.c_void_p], None
 
-    def _wrapper(self) -> str:
+    def _wrapper(self, blocks: bool) -> str:
         """All arguments as one array of pointers: ctypes is slow per argument."""
         s = self.signature
+        if blocks:
+            first = len(s.per_ray)
+            call, out = ", ".join(f"*(const float *)a[{k}]" for k in range(first, len(s.inputs))), len(s.inputs)
+            given = f"(const float *const *)a, call, lens_table, lens_table_cells, (float *const *)(a + {out})"
+            body = f"const float call[] = {{{call}}}; lens(n, {given}, (int *)a[{out + len(s.outputs)}]);"
+            return f"void neurolens_run(size_t n, void **a) {{ {body} }}\n"
         kinds = ["(const float *)a[{}]"] * len(s.per_ray) + ["*(const float *)a[{}]"] * len(s.per_call)
         kinds += ["*(const int *)a[{}]"] * (s.bands > 1) + ["(float *)a[{}]"] * len(s.outputs) + ["(int *)a[{}]"]
         given = ", ".join(kind.format(i) for i, kind in enumerate(kinds))
@@ -243,6 +260,6 @@ def fused_candidate(
         found = load_fitted(model) if isinstance(model, Path) else model
         models = [found] if isinstance(found, LensModel) else found
         program = fused_program(models, parts, fix)
-    except (ModelError, TypeError):
+    except (ModelError, InputError):
         return None
     return program_candidate(name, program, domain, fix.stop_radius_mm)

@@ -270,7 +270,7 @@ def random_states(axes: Sequence[Axis], count: int, seed: int) -> list[State]:
 def errors_at(model: OnnxLens, space: StateSpace, state: State, rays: int, seed: int) -> dict[str, Any]:
     """Figures of one state: `RAY_KEYS` of `rays.RayErrors`, `SHARES` of four times as many rays, the state by axis.
 
-    What is not finite is None. `film_z_um`: how far the card's first film plane is from the exact lens's, um.
+    What is not finite is None. `film_z_um`: how far the card's paraxial image is from the exact lens's film, um.
     """
     here, lens = model.at(*state), space.lens_at(state)
     domain, predict = Domain.from_dict(here.card["domain"]), onnx_predictor(here)
@@ -285,7 +285,7 @@ def errors_at(model: OnnxLens, space: StateSpace, state: State, rays: int, seed:
     return {
         **dict(zip((a.name for a in model.axes), state, strict=True)),
         **{k: None if v is None or not math.isfinite(v) else v for k, v in figures.items()},
-        "film_z_um": 1000 * (domain.film_z_mm[0] - lens.film_z_mm),
+        "film_z_um": 1000 * (here.card["lens"]["film_z_mm"] - lens.film_z_mm),
         "passing_share": float(fresh.passes.double().mean()),
     }
 

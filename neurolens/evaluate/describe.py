@@ -310,15 +310,3 @@ def _caption(lens: Lens, efl_mm: float, f_number: float) -> str:
     if lens.anamorphic:
         text = f"{efl_mm:.3g} / {first_order(lens, meridian='x').efl_mm:.3g} mm f/{f_number:.2g}"
     return text + ("" if lens.half_field_deg is None else f", {lens.half_field_deg:.3g}°") + f", rims {lens.rims}"
-
-
-def project_root() -> Path:
-    """The project's folder: that of the source, or else, for a package installed away from it, the working folder.
-
-    Raises:
-        InputError: neither has the folder experiments/.
-    """
-    for root in (Path(__file__).parents[2], Path.cwd()):
-        if (root / "experiments").is_dir():
-            return root
-    raise InputError(Path.cwd(), "experiments/", "(missing)", "the project's folder as the working folder")

@@ -34,7 +34,7 @@ from neurolens.surrogates.settings import NETWORK_ABLATIONS, POLYNOMIAL_ABLATION
 
 GROUPS = {
     "paraxial": "what renderers use today",
-    "published": "published methods, as their papers have them",
+    "published": "published methods, our implementations of their papers",
     "ours": "this project's",
     "ablations": "ours with one thing changed",
 }
@@ -184,7 +184,7 @@ def run_bench(
     """Lens by lens, the records of its rows; existing ones are recomputed only `again`."""
     slow = (*NETWORKS, "neurolens2017")
     for bench in benches:
-        progress.plan({f"{bench.name}: {r.name}": 30.0 if r.settings.method in slow else 4.0 for r in rows})
+        progress.plan({f"{bench.name}: {r.name}": 40.0 if r.settings.method in slow else 4.0 for r in rows})
         progress.plan({f"{bench.name}: race": 60.0 if bench.settings.compile_exact else 15.0})
     for bench in benches:
         records = []

@@ -13,6 +13,7 @@ from neurolens.evaluate.methods import GROUPS
 from neurolens.evaluate.pages import DASH, Column, Record, markdown_table, number, show
 from neurolens.evaluate.plots import place_labels
 from neurolens.evaluate.records import pareto_front
+from neurolens.surrogates.source import MOST_WEIGHTS
 
 COLUMNS = (
     Column("RMS um", "rms_um_at_21_6"),
@@ -79,6 +80,13 @@ def lens_page(name: str, records: Sequence[Record], facts: str) -> str:
         rows.append([exact["name"], *cells])
     lines = markdown_table(["method", *(c.heading for c in COLUMNS)], rows)
     apart = [f"- {r['method']} has no graph: {r['not_exported']}" for r in records if r["not_exported"]]
+    for record in records:
+        time, weights = number(record, "ns_per_ray.min"), number(record, "parameters") or 0
+        if time and number(record, "fused_ns_per_ray.min") is None and weights > MOST_WEIGHTS:
+            apart.append(
+                f"- {record['method']} is not written as C: so many weights are products of matrices by blocks of "
+                f"rays, which onnxruntime does at {2 * weights / time:.0f} Gflop/s here."
+            )
     return "\n".join([f"# {name}", "", facts, "", *lines, *([""] if apart else []), *apart, ""])
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurolens.graph.program import Argument, Program, Step
 
@@ -113,7 +114,8 @@ class Signature:
         per_ray, per_call = (
             tuple(s.name for s in steps if s.kind == "input" and s.per_call is whole) for whole in (False, True)
         )
-        tables = tuple(dict.fromkeys(s.name for s in steps if s.kind == "lookup"))
+        looked = dict.fromkeys(s.name for s in steps if s.kind == "lookup")
+        tables = tuple(name for name in looked if name not in program.own_tables)
         outputs = tuple(o for o in program.outputs if o != "status")
         return Signature(name, per_ray, per_call, outputs, program.tables, tables, "status" in program.outputs)
 
@@ -141,10 +143,15 @@ def write_c(program: Program, name: str, comment: Sequence[str]) -> str:
         text += _CLAMP.format(name=name, macro=macro)
     if any(program.steps[k].kind == "floor" for k in live):
         text += "#include <math.h>\n"
-    if signature.tables:
+    if any(program.steps[k].kind == "lookup" for k in live):
         text += _CELL.format(name=name, macro=macro)
-    lookup = f"{{table}}[{name}_cell({{index}}, {{table}}_cells) * {{width}} + {{place}}]"
-    writer = Writer(program, f"{name}_sqrt", f"{macro}_FMA", clamp=f"{name}_clamp", floor="floorf", lookup=lookup)
+    for table in dict.fromkeys(program.steps[k].name for k in live if program.steps[k].kind == "lookup"):
+        if table in program.own_tables:
+            text += _numbers(f"{name}_{table}", program.own_tables[table])
+    lookup = f"{{table}}[{name}_cell({{index}}, {{cells}}) * {{width}} + {{place}}]"
+    writer = Writer(
+        program, f"{name}_sqrt", f"{macro}_FMA", clamp=f"{name}_clamp", floor="floorf", lookup=lookup, name=name
+    )
     body = [f"    const float t{k} = {writer.step(program.steps[k])};" for k in live if not _input(program, k)]
     results = [f"    ray.{o} = {writer.value(program.outputs[o].argument)};" for o in signature.outputs]
     if "status" in program.outputs:
@@ -154,6 +161,12 @@ def write_c(program: Program, name: str, comment: Sequence[str]) -> str:
         text += f"\nstatic const float {name}_table[{program.tables}][{len(writer.table)}] = {{\n{rows}}};\n"
         body.insert(0, f"    const float *const c = {name}_table[band];")
     return text + _functions(signature, macro, body, results)
+
+
+def _numbers(name: str, rows: NDArray[np.float64]) -> str:
+    """A table as one array."""
+    lines = ",\n".join(", ".join(literal(v) for v in row) for row in rows)
+    return f"\nstatic const float {name}[{rows.size}] = {{\n{lines}}};\n"
 
 
 def _input(program: Program, k: int) -> bool:
@@ -204,34 +217,47 @@ def write_blocks(program: Program, name: str) -> str:
 
     Compilers make vectors of the loops before and after the lookups; of lookups themselves they make none, or slow
     ones. NAME(count, per_ray, per_call, table, cells, outputs, status) takes pointers in the order of the signature;
-    groups of the table's columns are padded to `padded_columns`.
+    groups of the table's columns are padded to `padded_columns`. A table of the program's own is NAME_table, of
+    NAME_table_cells.
     """
     before, lookups, after = program.around_lookups()
     whole, first, last = (
         Signature.of(p, f"{name}{part}") for p, part in ((program, ""), (before, "_before"), (after, "_after"))
     )
-    columns, groups = lookups[0].columns, len(lookups[0].arguments) - 1
+    step = lookups[0]
+    columns, weights = step.columns, len(step.arguments) - step.indices
+    groups, own = weights // step.indices, program.own_tables.get(step.name)
     made = [*first.outputs, *(f"column_{c}" for c in range(columns))]
     places = {row: f"in[{k}] + at" for k, row in enumerate(whole.per_ray)}
     places |= {number: f"call[{k}]" for k, number in enumerate(whole.per_call)}
     places |= {row: f"made[{k}]" for k, row in enumerate(made)}
     width = padded_columns(columns)
-    terms = (f"made[{made.index(f'weight_{g}')}][i] * cell[{width * g} + c]" for g in range(groups))
+    row = width * groups
+    cells = [
+        f"const float *const cell_{k} = table + {row} * {name}_cell(made[{made.index(f'index_{k}')}][i], cells);"
+        for k in range(step.indices)
+    ]
+    terms = (
+        f"made[{made.index(f'weight_{g}')}][i] * cell_{g // groups}[{width * (g % groups)} + c]" for g in range(weights)
+    )
     loops = _BLOCKS.format(
         name=name,
         block=BLOCK,
         made=len(made),
         columns=columns,
         width=width,
-        row=width * groups,
+        cells="\n            ".join(cells),
         total=" + ".join(terms),
         first=", ".join(places[row] for row in (*first.inputs, *first.outputs)),
         last=", ".join(places[row] for row in last.inputs),
         out="".join(f", out[{k}] + at" for k in range(len(whole.outputs))),
-        index=made.index("index"),
         looked=made.index("column_0"),
     )
     text = write_c(before, first.name, ["Before the lookups."]) + write_c(after, last.name, ["After them."])
+    if own is not None:
+        padded = np.pad(own.reshape(len(own), groups, columns), ((0, 0), (0, 0), (0, width - columns)))
+        text += f"enum {{ {name}_table_cells = {len(own)} }};\n"
+        text += _numbers(f"{name}_table", padded.reshape(len(own), -1))
     return text + _CELL.format(name=name, macro=last.name.upper()) + loops
 
 
@@ -246,7 +272,7 @@ void {name}(
         const size_t n = count - at < {block} ? count - at : {block};
         {name}_before_rays(n, {first});
         for (size_t i = 0; i < n; i++) {{
-            const float *const cell = table + {row} * {name}_cell(made[{index}][i], cells);
+            {cells}
             for (int c = 0; c < {width}; c++)
                 sums[i][c] = {total};
         }}
@@ -264,7 +290,8 @@ class Writer:
 
     Args:
         sqrt, fma, clamp, floor: functions of those; without one its operations are written.
-        place: of the table's coefficient {}. lookup: of a column of a table of the caller.
+        place: of the table's coefficient {}. lookup: of a column of a table of the caller, or where own_lookup says
+            none, of the program, whose name starts with `name`.
 
     Attributes:
         table: coefficients that differ between tables, each a row of one value a table, in the order of their use.
@@ -279,9 +306,11 @@ class Writer:
         clamp: str = "",
         floor: str = "floor",
         lookup: str = "",
+        own_lookup: str = "",
+        name: str = "",
     ) -> None:
         self.program, self.sqrt, self.fma, self.place, self.clamp = program, sqrt, fma, place, clamp
-        self.floor, self.lookup = floor, lookup
+        self.floor, self.lookup, self.own_lookup, self.name = floor, lookup, own_lookup or lookup, name
         self.table: list[tuple[float, ...]] = []
 
     def value(self, argument: Argument) -> str:
@@ -310,11 +339,15 @@ class Writer:
         if step.kind == "neg":
             return f"-({given[0]})"
         if step.kind == "lookup":
-            width = step.columns * (len(given) - 1)
-            places = range(step.column, width, step.columns)
+            own = self.program.own_tables.get(step.name)
+            form, table, cells = self.lookup, step.name, f"{step.name}_cells"
+            if own is not None:
+                form, table, cells = self.own_lookup, f"{self.name}_{step.name}", str(len(own))
+            width = step.columns * (len(given) - step.indices) // step.indices
             return " + ".join(
-                f"{weight} * {self.lookup.format(table=step.name, index=given[0], width=width, place=place)}"
-                for weight, place in zip(given[1:], places, strict=True)
+                f"{weight} * {form.format(table=table, cells=cells, index=index, width=width, place=place)}"
+                for index, weights in step.at_indices(given)
+                for weight, place in zip(weights, range(step.column, width, step.columns), strict=True)
             )
         if step.kind in ("sqrt", "floor"):
             return f"{getattr(self, step.kind)}({given[0]})"

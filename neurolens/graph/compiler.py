@@ -8,6 +8,7 @@ import os
 import platform
 import shlex
 import shutil
+import signal
 import subprocess
 from contextlib import suppress
 from functools import cache
@@ -67,13 +68,27 @@ def compile_c(source: str, library: Path, flags: tuple[str, ...] = FLAGS) -> str
 
 
 def _run(command: list[str], text: str = "") -> subprocess.CompletedProcess[str]:
+    pipe = subprocess.PIPE
     try:
-        return subprocess.run(
-            command, input=text, capture_output=True, text=True, errors="replace", timeout=_SECONDS, check=False
-        )
+        # A group of its own: the driver's children, which do the work, are to end with it, at Ctrl-C too.
+        with subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, errors="replace", start_new_session=True
+        ) as child:
+            try:
+                out, err = child.communicate(text, timeout=_SECONDS)
+            except BaseException:
+                _end(child)
+                raise
     except (OSError, subprocess.TimeoutExpired) as error:
         said = f"no end after {_SECONDS} s" if isinstance(error, subprocess.TimeoutExpired) else error
         raise InputError(command[0], "compile", f"({said})", "a C compiler that works") from error
+    return subprocess.CompletedProcess(command, child.returncode, out, err)
+
+
+def _end(child: subprocess.Popen[str]) -> None:
+    """End a process and, where the system has groups of them, all that it has started."""
+    with suppress(OSError):
+        os.killpg(child.pid, signal.SIGKILL) if hasattr(os, "killpg") else child.kill()
 
 
 def load_compiled(source: str) -> ctypes.CDLL:

@@ -19,23 +19,28 @@ _HEAD = """\
 """
 # Tables of the caller are textures of one float a texel, a cell a line; NaN is less than nothing in no language.
 _LOOKUP = "texelFetch({table}, ivec2({place}, clamp(int({index}), 0, textureSize({table}, 0).y - 1)), 0).r"
+_OWN_LOOKUP = "{table}[{width} * clamp(int({index}), 0, {cells} - 1) + {place}]"
 
 
 def write_glsl(program: Program, name: str, comment: Sequence[str]) -> str:
     """The text of a function; arguments as of `c.write_c`."""
     signature = Signature.of(program, name)
     lines = "\n".join(f" * {line}".rstrip() for line in comment).replace("*/", "* /")
-    writer = Writer(program, "sqrt", place=f"{name}_table[band_first + {{}}]", lookup=_LOOKUP)
+    place = f"{name}_table[band_first + {{}}]"
+    writer = Writer(program, "sqrt", place=place, lookup=_LOOKUP, own_lookup=_OWN_LOOKUP, name=name)
     live = program.live()
     body = [f"    float t{k} = {writer.step(program.steps[k])};" for k in live if program.steps[k].kind != "input"]
     results = [f"    {o} = {writer.value(program.outputs[o].argument)};" for o in signature.outputs]
     results.append(f"    status = int({writer.value(program.outputs['status'].argument)});")
     text = _HEAD.format(comment=lines)
+    constants = {table: numbers.reshape(-1) for table, numbers in program.own_tables.items()}
     if writer.table:
-        numbers = [literal(v) for v in np.array(writer.table).T.reshape(-1)]
+        constants["table"] = np.array(writer.table).T.reshape(-1)
+    for table, values in constants.items():
+        numbers = [literal(v) for v in values]
         rows = ",\n    ".join(", ".join(numbers[i : i + 8]) for i in range(0, len(numbers), 8))
         size = len(numbers)
-        text += f"\nconst float {name}_table[{size}] = float[{size}](\n    {rows}\n);\n"
+        text += f"\nconst float {name}_{table}[{size}] = float[{size}](\n    {rows}\n);\n"
     band = []
     if signature.bands > 1:
         band = ["in int band"]

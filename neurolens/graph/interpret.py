@@ -121,12 +121,15 @@ def _series(space: _Space, node: Node, given: list[Rows]) -> Rows:
 
 
 def _lookup(space: _Space, node: Node, given: list[Rows]) -> Rows:
-    table, index = given[0].T, given[1][0]
-    whole = index.long() if space.torch else index.astype(np.intp)
-    found = table[:, space.clip(whole, 0, table.shape[1] - 1)] if space.torch else table.take(whole, 1, mode="clip")
-    weights = given[2]
-    groups = found.reshape(len(weights), len(table) // len(weights), found.shape[1])[:, list(node.static)]
-    return functools.reduce(operator.add, (w * group for w, group in zip(weights, groups, strict=True)))
+    table, indices, weights = given[0].T, given[1], given[2]
+    count = len(weights) // len(indices)
+    terms: list[Rows] = []
+    for k, index in enumerate(indices):
+        whole = index.long() if space.torch else index.astype(np.intp)
+        found = table[:, space.clip(whole, 0, table.shape[1] - 1)] if space.torch else table.take(whole, 1, mode="clip")
+        groups = found.reshape(count, len(table) // count, found.shape[1])[:, list(node.static)]
+        terms += (w * group for w, group in zip(weights[k * count :], groups, strict=False))
+    return functools.reduce(operator.add, terms)
 
 
 def _between(space: _Space, node: Node, given: list[Rows]) -> Rows:
@@ -161,6 +164,7 @@ _EACH: dict[str, Callable[..., Rows]] = {
 }
 _WHOLE: dict[str, Callable[[_Space, Node, list[Rows]], Rows]] = {
     "constant": lambda s, node, given: s.numbers(node.arrays[0][:, None]),
+    "table": lambda s, node, given: s.numbers(node.arrays[0]),
     "take": lambda s, node, given: given[0][list(node.static)],
     "concat": lambda s, node, given: s.concat(s.broadcast(given)),
     "clip": lambda s, node, given: s.clip(given[0], *(float(v) for v in node.arrays[0])),

@@ -4,7 +4,7 @@ A value has R rows and one column a ray, or one for the whole call (a film posit
 `polynomial`, `quadratic` and `series` stay whole and are lowered late: to matrix products and few passes over the rays
 for ONNX (`graph.onnx`), to fused multiply-adds for C and GLSL (`graph.scalars`). A new reader is one rule an operator:
 
-    input, table, constant      named rows of the caller; a table of numbers of the caller; numbers
+    input, table, constant      named rows of the caller; a table of numbers, of the caller or its own; numbers
     take, concat                rows of a value; rows of several values below each other
     affine                      W x + b; W may be W0 + s W1 with s of the call, and rows may be added
     quadratic                   sums of products of two rows of x, plus constants
@@ -12,7 +12,7 @@ for ONNX (`graph.onnx`), to fused multiply-adds for C and GLSL (`graph.scalars`)
     series                      a polynomial in one row, lowest coefficient first
     add sub mul div max min     row by row; one row meets any number of rows
     neg sqrt tanh abs floor clip (clip between two numbers)
-    lookup                      a weighted sum of parts of the row of a table at an index
+    lookup                      a weighted sum of parts of the rows of a table at some indices
     le between and select       truths: 1 where x <= y, and where low <= x <= high (0 for NaN); choice by a truth
     first_failure               the code of the first test that fails, 0 where none does
     whole                       a number as an integer
@@ -177,13 +177,19 @@ class Graph:
         """Numbers [cells, columns] of the caller, for `lookup` alone."""
         return self.add("table", (), columns, name=name, per_call=True)
 
+    def own_table(self, values: ArrayLike) -> Value:
+        """Numbers [cells, columns] of the graph itself, for `lookup` alone."""
+        array = np.asarray(values, np.float64)
+        return self.add("table", (), array.shape[1], arrays=(array,), per_call=True)
+
     def lookup(self, table: Value, index: Value, weights: Value) -> Value:
-        """The sum of weight g times group g of the columns of a table, in the cell of an index: interpolation.
+        """The sum of weight (i, g) times group g of the columns of a table, in the cell of index i: interpolation.
 
         The index's fraction is cut off. One beyond the table's ends, or NaN, takes some cell of the table: never
-        anything outside it. There are as many groups, of equally many columns, as weights.
+        anything outside it. There are as many groups, of equally many columns, as weights of each index; the weights
+        of the first index come first.
         """
-        rows = table.rows // weights.rows
+        rows = table.rows * index.rows // weights.rows
         return self.add("lookup", (table, index, weights), rows, static=tuple(range(rows)), per_call=False)
 
     def constant(self, value: ArrayLike) -> Value:

@@ -141,13 +141,12 @@ class _Writer:
         return self.op(_SIMPLE[node.kind], *(self.name(k) for k in node.inputs))
 
     def _result(self, name: str, value: str, node: Node, shape: Sequence[int] | None) -> None:
-        kind = INT32 if node.kind == "whole" else FLOAT
         axes: list[int | str] = [*(shape or ([node.rows] if node.rows > 1 else [])), "N"]
         if len(axes) == 2:
             self.op("Identity", value, out=name)
         else:
             self.op("Reshape", value, self.const([*axes[:-1], -1], np.int64), out=name)
-        self.results.append((name, kind, axes))
+        self.results.append((name, INT32 if node.kind == "whole" else FLOAT, axes))
 
     def name(self, number: int) -> str:
         """The tensor of a node's value."""
@@ -399,15 +398,13 @@ def _series(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
 
 def _divided(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
     above, below = node.inputs
-    if _is_constant(w, above, 1.0):
-        return w.op("Reciprocal", w.name(below))
-    return w.op("Div", w.name(above), w.name(below))
+    inverse = _is_constant(w, above, 1.0)
+    return w.op("Reciprocal", w.name(below)) if inverse else w.op("Div", w.name(above), w.name(below))
 
 
 def _larger(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
-    if _is_constant(w, node.inputs[1], 0.0):
-        return w.op("Relu", w.name(node.inputs[0]))
-    return w.op("Max", *(w.name(k) for k in node.inputs))
+    relu = _is_constant(w, node.inputs[1], 0.0)
+    return w.op("Relu", w.name(node.inputs[0])) if relu else w.op("Max", *(w.name(k) for k in node.inputs))
 
 
 def _is_constant(w: _Writer, number: int, value: float) -> bool:
@@ -446,29 +443,32 @@ def _first_failure(w: _Writer, number: int, node: Node, arrays: list[Array]) -> 
 
 def _lookup(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
     """Whole cells are copied, then turned so that rays are the last axis: columns one by one take five times that."""
-    table, index = (w.name(k) for k in node.inputs[:2])
+    table, index, weights = (w.name(k) for k in node.inputs)
+    nodes = [w.graphs[0].nodes[k] for k in node.inputs]
+    (columns, indices, count), own = (n.rows for n in nodes), nodes[0].arrays
+    groups, total = count // indices, ""
     # onnxruntime refuses an index beyond the table.
-    last = w.op("Sub", w.op("Gather", w.op("Shape", table), w.const(0, np.int64)), w.const(1, np.int64))
-    whole = w.op("Cast", w.op("Squeeze", index, w.const([0], np.int64)), to=INT32)
-    cell = w.op("Clip", whole, w.const(0, np.int32), w.op("Cast", last, to=INT32))
-    rows = w.op("Transpose", w.op("Gather", table, cell, axis=0), perm=[1, 0])
-    columns, groups = (w.graphs[0].nodes[k].rows for k in (node.inputs[0], node.inputs[2]))
-    parts = w.op("Reshape", rows, w.const([groups, columns // groups, -1], np.int64))
-    weights = w.op("Reshape", w.name(node.inputs[2]), w.const([groups, 1, -1], np.int64))
-    # Summed by a product with ones: ReduceSum takes seven times as long.
-    flat = w.op("Reshape", w.op("Mul", parts, weights), w.const([groups, -1], np.int64))
-    total = w.op("MatMul", w.const(np.ones((1, groups))), flat)
+    if own:
+        last = w.const(len(own[0]) - 1, np.int32)
+    else:
+        cells = w.op("Gather", w.op("Shape", table), w.const(0, np.int64))
+        last = w.op("Cast", w.op("Sub", cells, w.const(1, np.int64)), to=INT32)
+    for k, weight in zip(w.split(index, [1] * indices), w.split(weights, [groups] * indices), strict=True):
+        whole = w.op("Cast", w.op("Reshape", k, w.const([-1], np.int64)), to=INT32)
+        rows = w.op("Transpose", w.op("Gather", table, w.op("Clip", whole, w.const(0, np.int32), last), axis=0))
+        parts = w.op("Reshape", rows, w.const([groups, columns // groups, -1], np.int64))
+        product = w.op("Mul", parts, w.op("Reshape", weight, w.const([groups, 1, -1], np.int64)))
+        # Summed by a product with ones: ReduceSum takes seven times as long.
+        one = w.op("MatMul", w.const(np.ones((1, groups))), w.op("Reshape", product, w.const([groups, -1], np.int64)))
+        total = w.op("Add", total, one) if total else one
     total = w.op("Reshape", total, w.const([columns // groups, -1], np.int64))
-    wanted = list(node.static)
-    if wanted == list(range(columns // groups)):
-        return total
-    return w.op("Gather", total, w.const(wanted, np.int64), axis=0)
+    whole_row = node.static == tuple(range(columns // groups))
+    return total if whole_row else w.op("Gather", total, w.const(list(node.static), np.int64), axis=0)
 
 
 _SIMPLE = {
     "add": "Add", "sub": "Sub", "mul": "Mul", "min": "Min", "neg": "Neg", "sqrt": "Sqrt", "tanh": "Tanh", "abs": "Abs",
-    "floor": "Floor",
-    "le": "LessOrEqual", "and": "And", "select": "Where",
+    "floor": "Floor", "le": "LessOrEqual", "and": "And", "select": "Where",
 }  # fmt: skip
 _RULES: dict[str, Callable[[_Writer, int, Node, list[Array]], str | _Linear | _Longer]] = {
     "input": _input,
@@ -484,7 +484,7 @@ _RULES: dict[str, Callable[[_Writer, int, Node, list[Array]], str | _Linear | _L
     "clip": _clip,
     "between": _between,
     "first_failure": _first_failure,
-    "table": lambda w, number, node, arrays: node.name,
+    "table": lambda w, number, node, arrays: w.numbers(arrays[0]) if arrays else node.name,
     "lookup": _lookup,
     "whole": lambda w, number, node, arrays: w.op("Cast", w.name(node.inputs[0]), to=INT32),
 }

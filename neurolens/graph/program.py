@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.base.errors import InputError
 
 # select(a, b, x, y) is x where a <= b, else y; so NaN in a or b gives y. clamp(x, limit) is x within -limit and limit,
-# at the one on its side beyond; NaN becomes one of the two (not in GLSL). Its limit is a number above 0. lookup(index,
-# weights ...) is the sum of each weight times its group's column of a table, in the cell at the index (`Graph.lookup`).
+# at the one on its side beyond; NaN becomes one of the two (not in GLSL). Its limit is a number above 0. lookup(indices
+# ..., weights ...) is the sum of each weight times its group's column of a table, in the cells at the indices
+# (`Graph.lookup`).
 KINDS = {
     "neg": 1, "add": 2, "sub": 2, "mul": 2, "div": 2, "sqrt": 1, "floor": 1, "max": 2, "min": 2, "clamp": 2, "fma": 3,
     "select": 4,
@@ -37,6 +38,7 @@ TANH_LIMIT = 9.02
 TANH_NUMERATOR = (1.0, 0.13379719853401184, 0.0034940363839268684, 2.058350946754217e-05, 1.3319104930076264e-08)
 TANH_DENOMINATOR = (1.0, 0.4671303331851959, 0.02587108127772808, 0.0003283095720689744, 7.762034215375024e-07)
 
+T = TypeVar("T")
 Literal = tuple[float, ...]
 Argument = int | Literal  # the number of an earlier step, or a literal
 
@@ -57,7 +59,7 @@ class Step:
 
     Attributes:
         name: of an input, or of the table that a lookup reads. per_call: whether an input is one number for all rays.
-        column, columns: of each group of the table's columns, and how many these are.
+        column, columns: of each group of the table's columns, and how many these are. indices: how many.
     """
 
     kind: str
@@ -66,6 +68,13 @@ class Step:
     per_call: bool = False
     column: int = 0
     columns: int = 0
+    indices: int = 1
+
+    def at_indices(self, arguments: Sequence[T]) -> list[tuple[T, Sequence[T]]]:
+        """Of a lookup: each index with its weights, from its arguments or what stands for them."""
+        count = (len(arguments) - self.indices) // self.indices
+        starts = range(self.indices, len(arguments), count)
+        return [(index, arguments[k : k + count]) for index, k in zip(arguments, starts, strict=False)]
 
 
 @dataclass(frozen=True)
@@ -122,20 +131,22 @@ class Program:
 
     Attributes:
         tables: coefficient tables, the length of every literal.
+        own_tables: numbers [cells, columns] that lookups read and that no caller gives, by name.
     """
 
     tables: int = 1
     steps: list[Step] = field(default_factory=list)
     outputs: dict[str, Expr] = field(default_factory=dict)
+    own_tables: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     _known: dict[Step, int] = field(default_factory=dict)
 
     def input(self, name: str, per_call: bool = False) -> Expr:
         return self._append(Step("input", (), name, per_call))
 
-    def lookup(self, table: str, columns: int, column: int, index: Expr, weights: Sequence[Expr]) -> Expr:
-        """A column of groups of so many, in the cell of an index: the sum over the groups."""
-        arguments = (index.argument, *(w.argument for w in weights))
-        return self._append(Step("lookup", arguments, table, column=column, columns=columns))
+    def lookup(self, table: str, columns: int, column: int, indices: Sequence[Expr], weights: Sequence[Expr]) -> Expr:
+        """A column of groups of so many, in the cells of some indices: the sum over these and the groups."""
+        arguments = tuple(e.argument for e in (*indices, *weights))
+        return self._append(Step("lookup", arguments, table, column=column, columns=columns, indices=len(indices)))
 
     def literal(self, value: ArrayLike) -> Expr:
         """A number, or one for each table.
@@ -251,7 +262,7 @@ class Program:
         def moved(argument: Argument) -> Argument:
             return place[argument] if isinstance(argument, int) else argument
 
-        found = Program(self.tables)
+        found = Program(self.tables, own_tables=self.own_tables)
         for step in (self.steps[k] for k in order):
             found._append(replace(step, arguments=tuple(moved(a) for a in step.arguments)))
         found.outputs = {name: Expr(found, moved(e.argument)) for name, e in self.outputs.items()}
@@ -260,17 +271,19 @@ class Program:
     def around_lookups(self) -> tuple[Program, list[Step], Program]:
         """The steps that lookups need, the lookups, and the steps after them, which take what was made as inputs.
 
-        The first has outputs `index`, `weight_0` ..., and `step_K` that the last takes; of lookups it takes `column_C`.
+        The first has outputs `index_0` ..., `weight_0` ..., and `step_K` that the last takes; of lookups it takes
+        `column_C`.
 
         Raises:
-            ValueError: no lookups, or others than columns of one table at one index.
+            ValueError: no lookups, or others than columns of one table at the same indices.
         """
         live = self.live()
         lookups = [self.steps[k] for k in live if self.steps[k].kind == "lookup"]
         if len({(s.name, s.arguments) for s in lookups}) != 1:
-            raise ValueError("lookups: expected columns of one table at one index")
-        index, *weights = (Expr(self, a) for a in lookups[0].arguments)
-        before = replace(self, outputs={"index": index} | {f"weight_{g}": w for g, w in enumerate(weights)})
+            raise ValueError("lookups: expected columns of one table at the same indices")
+        given, count = [Expr(self, a) for a in lookups[0].arguments], lookups[0].indices
+        before = replace(self, outputs={f"index_{i}": index for i, index in enumerate(given[:count])})
+        before.outputs |= {f"weight_{g}": w for g, w in enumerate(given[count:])}
         early = set(before.live())
         late = [self.steps[k] for k in live if k not in early]
         taken = {a for step in late if step.kind != "lookup" for a in step.arguments}
@@ -315,10 +328,12 @@ class Program:
                     continue
                 given = [value(a) for a in step.arguments]
                 if step.kind == "lookup":
-                    groups = np.asarray(inputs[step.name], np.float32)[:, step.column :: step.columns].T
-                    cell = np.asarray(given[0]).astype(np.intp)
+                    cells = self.own_tables.get(step.name, inputs.get(step.name))
+                    groups = np.asarray(cells, np.float32)[:, step.column :: step.columns].T
                     found[k] = sum(
-                        w * group.take(cell, mode="clip") for w, group in zip(given[1:], groups, strict=True)
+                        w * group.take(np.asarray(index).astype(np.intp), mode="clip")
+                        for index, weights in step.at_indices(given)
+                        for w, group in zip(weights, groups, strict=True)
                     )
                     continue
                 if step.kind == "fma":  # the product is exact in float64

@@ -187,9 +187,15 @@ def _clip(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array
 
 
 def _lookup(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
-    table = at.graphs[0].nodes[node.inputs[0]]
-    columns, (index,), weights = table.rows // len(given[2]), *given[1:]
-    return [at.program.lookup(table.name, columns, column, index, weights) for column in node.static]
+    table, name = at.graphs[0].nodes[node.inputs[0]], f"table_{node.inputs[0]}"
+    if not table.arrays:
+        name = table.name
+    elif any((g.nodes[node.inputs[0]].arrays[0] != table.arrays[0]).any() for g in at.graphs):
+        raise InputError("export", "models", "(tables of numbers that differ)", "one wavelength, or none fixed")
+    else:
+        at.program.own_tables[name] = table.arrays[0]
+    columns = table.rows * len(given[1]) // len(given[2])
+    return [at.program.lookup(name, columns, column, given[1], given[2]) for column in node.static]
 
 
 def _first_failure(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:

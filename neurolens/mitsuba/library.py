@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import importlib
+import warnings
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.cameras.contract import FloatArray
 
-DEFAULT_VARIANT = "llvm_ad_spectral"
+DEFAULT_VARIANT, WITHOUT_LLVM = "llvm_ad_spectral", "scalar_spectral"
+# LLVM 15 and 16, which Dr.Jit takes, abort the process on Mitsuba's kernels (seen with AVX-512); 19 works.
+_OLDEST_LLVM = 17
 
 
 def libraries() -> tuple[Any, Any]:
@@ -31,12 +34,21 @@ def libraries() -> tuple[Any, Any]:
 def require_mitsuba(variant: str | None = None) -> Any:
     """The module mitsuba with a variant set: `variant`, else the current one, else llvm_ad_spectral.
 
+    Warns:
+        NeurolensWarning: no LLVM, or one so old that compiled variants may end the process; where no variant was asked
+            for, scalar_spectral is taken in its place.
+
     Raises:
         NeurolensError: Mitsuba is not installed, or the variant's compiler (LLVM, CUDA) is missing.
         InputError: a variant that this Mitsuba does not have, or one that carries neither RGB nor plain spectra.
     """
-    mi, _ = libraries()
+    mi, dr = libraries()
     wanted = variant or mi.variant() or DEFAULT_VARIANT
+    if wanted.startswith("llvm") and (doubt := _llvm_doubt(dr)):
+        asked = variant or mi.variant()
+        told = f"{doubt}; the variant {WITHOUT_LLVM} needs none{'' if asked else ' and is taken'}"
+        warnings.warn(told, NeurolensWarning, stacklevel=2)
+        wanted = asked or WITHOUT_LLVM
     known = [v for v in mi.variants() if v.endswith(("_rgb", "_spectral"))]
     if wanted not in known:
         raise InputError("mitsuba", "variant", wanted, f"one of: {', '.join(known)}")
@@ -50,6 +62,19 @@ def require_mitsuba(variant: str | None = None) -> Any:
         needed = "libLLVM" if wanted.startswith("llvm") else "CUDA"
         raise NeurolensError(f"mitsuba variant {wanted}: no {needed} ({reason}); a scalar variant needs none") from None
     return mi
+
+
+def _llvm_doubt(dr: Any) -> str:
+    """What is wrong with the LLVM that Dr.Jit found; empty if nothing is."""
+    version = dr.detail.llvm_version()
+    if version[0] >= _OLDEST_LLVM:
+        return ""
+    found = (
+        f"LLVM {'.'.join(map(str, version))} is too old for Mitsuba"
+        if version[0] > 0
+        else "Mitsuba found no LLVM that it takes"
+    )
+    return f"{found} (19 works; DRJIT_LIBLLVM_PATH names the library)"
 
 
 @cache

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import ModelError
-from neurolens.modelfile import CARD_KEY, CARD_KIND, CARD_SCHEMA
+from neurolens.modelfile import CARD_KEY, CARD_KIND, CARD_SCHEMA, MAX_CARD
 from neurolens.modelfile.protobuf import Fields, as_text, fields_of, integers, message, one, text, walk
 from neurolens.modelfile.shapes import BROADCAST, ELEMENTWISE, RAYS, SHAPED, Node, Shape, check_shapes
 
@@ -23,6 +23,7 @@ MAX_BYTES = 64 * 2**20
 OPERATORS = ELEMENTWISE | BROADCAST | frozenset(SHAPED)
 # TensorProto.DataType: what models hold, and the numpy type of their raw bytes.
 _TYPES: dict[int, str] = {1: "<f4", 3: "<i1", 6: "<i4", 7: "<i8", 10: "<f2"}
+_CASTS = {1: "float32", 6: "int32", 7: "int64", 9: "bool"}  # never text, of 32 bytes a number
 _EXTERNAL = 1  # TensorProto.DataLocation
 _FLOATS = {"attribute": frozenset({2, 7}), "tensor": frozenset({4, 10})}  # fields of numbers of fixed width
 
@@ -70,10 +71,12 @@ def card_in(file: Any, metadata: dict[str, str]) -> dict[str, Any]:
     """The card in a file's metadata.
 
     Raises:
-        ModelError: none, one that is not strict JSON, or of another kind or schema.
+        ModelError: none, one of more than `MAX_CARD` characters, that is not strict JSON, or of another kind or schema.
     """
     if CARD_KEY not in metadata:
         raise ModelError(f"{file}: no card: its metadata has no {CARD_KEY!r}, so this is no model made by neurolens")
+    if len(metadata[CARD_KEY]) > MAX_CARD:
+        raise ModelError(f"{file}: card: {len(metadata[CARD_KEY])} characters, expected at most {MAX_CARD}")
     try:
         card = json.loads(metadata[CARD_KEY], parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
@@ -120,10 +123,10 @@ def _check_graph(graph: Fields, opsets: list[str], functions: bool) -> None:
     for tensor in tensors:
         _check_tensor(tensor)
     nodes = [_node(fields_of(node)) for node in graph.get(1, [])]
-    known = [_shape_of_input(fields_of(value)) for value in graph.get(11, [])]
-    known += [(text(t, 8), tuple(integers(t.get(1, [])))) for t in tensors]
+    inputs = [_shape_of_input(fields_of(value)) for value in graph.get(11, [])]
+    constants = [(text(t, 8), tuple(integers(t.get(1, [])))) for t in tensors]
     try:
-        check_shapes(nodes, known, {text(t, 8): _values(t).tolist() for t in tensors if t.get(2) == [7]})
+        check_shapes(nodes, inputs, constants, {text(t, 8): _values(t).tolist() for t in tensors if t.get(2) == [7]})
     except ValueError as error:
         raise ModelError(str(error)) from error
 
@@ -135,7 +138,11 @@ def _node(node: Fields) -> Node:
     attributes = [fields_of(attribute, _FLOATS["attribute"]) for attribute in node.get(5, [])]
     if any(set(a) & {5, 6, 10, 11, 22, 23} for a in attributes):  # tensors, graphs, sparse tensors
         raise ModelError(f"operator {kind}: an attribute holds a tensor or a graph, expected numbers only")
+    if kind == "Transpose" and attributes:
+        raise ModelError("operator Transpose: attributes, expected none: axes in reverse order")
     numbers = {text(a, 1): _signed(one(a, 3)) for a in attributes if 3 in a}
+    if kind == "Cast" and numbers.get("to") not in _CASTS:
+        raise ModelError(f"operator Cast: to type {numbers.get('to')}, expected {', '.join(_CASTS.values())}")
     inputs, outputs = ([as_text(name) for name in node.get(number, [])] for number in (1, 2))
     return Node(kind, numbers, inputs, outputs)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 Fields = dict[int, list[Any]]
 
+MAX_FIELDS = 50_000  # of a message: a file of small ones would take a hundred times its size in memory
 _VARINT, _DOUBLE, _BYTES, _FLOAT = 0, 1, 2, 5  # wire types
 
 
@@ -22,7 +23,9 @@ def fields_of(data: memoryview, fixed: frozenset[int] = frozenset()) -> Fields:
     found: Fields = {}
     if isinstance(data, int):
         raise ValueError("a number where a message should be")
-    for number, wire, value in walk(data):
+    for count, (number, wire, value) in enumerate(walk(data)):
+        if count >= MAX_FIELDS:
+            raise ValueError(f"more than {MAX_FIELDS} fields in one message")
         if wire in (_DOUBLE, _FLOAT) and number not in fixed:
             raise ValueError(f"field {number}: a number of fixed width")
         found.setdefault(number, []).append(value)

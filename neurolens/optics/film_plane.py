@@ -1,11 +1,17 @@
-"""Where the film lies for an object distance: first-order focusing, shared by lenses and cameras."""
+"""Where the film lies for an object distance: to first order, and the colours of best focus; for lenses and cameras."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from neurolens.base.errors import InputError
+
+COLOURS = 7  # wavelengths that stand for a range
+_LEAST = 1e-3  # weight of a colour that the eye does not see: infrared light has a focus, too
 
 
 def film_z_mm(
@@ -34,3 +40,14 @@ def film_z_mm(
         nearest = (max(4 * efl_mm, 0.0) + separation) / 1000
         raise InputError(file, "focus_m", focus_m, f"at least {nearest:.4g} m, four focal lengths")
     return rear_principal_z_mm + 2 * d * efl_mm / (d + math.sqrt(d * (d - 4 * efl_mm)))
+
+
+def colours(range_nm: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Wavelengths (nm) in the middle of equal parts of a range and their weights in the spot of best focus.
+
+    A picture is judged by its luminance: weights are the eye's photopic sensitivity (CIE V, as a Gaussian of 559 nm).
+    """
+    low, high = range_nm
+    count = COLOURS if low < high else 1
+    nm = low + (high - low) * (np.arange(count) + 0.5) / count
+    return nm, np.exp(-285.4e-6 * (nm - 559.0) ** 2) + _LEAST

@@ -12,10 +12,13 @@ from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.optics import paraxial
+from neurolens.optics import film_plane, paraxial
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Configuration, Focus, Lens
 from neurolens.optics.pupils import image_radius_mm
@@ -236,40 +239,76 @@ def _solve(excess: Callable[[float], float], furthest: float) -> float:
 
 
 _RINGS, _SPOKES = 512, 24
+_RINGS_OF_SPOKES = 64  # where the opening is not round
 _WIDER = 1.1  # the disc of rays over the paraxial entrance pupil: aberrations of the pupil move its edge
-_ROUNDS = 4  # the object's distance counts from the film: each round reduces the step by a factor of 100
+_ROUNDS = 2  # the object's distance counts from the film: each round reduces the step by a factor of 100
+_SPARE = 0.05  # of a film range, added at both ends
+_NEAREST = 0.5  # of the way from the last surface to the paraxial image: no film of a range lies nearer
 
 
 def best_focus_z_mm(
-    lens: Lens, focus_m: float = math.inf, weights: Sequence[tuple[float, float]] = ((LINE_D_NM, 1.0),)
+    lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[float, float] = (400.0, 700.0), film_moves: bool = True
 ) -> float:
     """Film plane (lens frame, mm) of least RMS spot for the axial point `focus_m` metres from it.
 
-    Rays are spread evenly over the entrance pupil, those that stop and rims let through count, and the plane
-    follows in closed form: the spot's second moment is a parabola in z. With pure third-order spherical aberration it
-    lies two thirds of the way from the paraxial to the marginal focus. A pinhole's film stays in place.
+    Rays of the colours of `film_plane.colours` are spread evenly over the entrance pupil, and those that stop and rims
+    let through count: the focus of a lens with spherical aberration shifts as it is stopped down. The plane follows in
+    closed form: the spot's second moment is a parabola in z. With pure third-order spherical aberration it lies two
+    thirds of the way from the paraxial to the marginal focus; of a lens with cylinders it is that of the whole spot. A
+    pinhole's film stays in place.
 
     Args:
-        weights: (wavelength in nm, weight) pairs; the spot is that of all colours together.
+        wavelength_nm: range of the light.
+        film_moves: False: of a lens that was focused by moving its groups.
 
     Raises:
-        InputError: no ray passes, weights that are not positive, or focus nearer than four focal lengths.
+        InputError: no ray passes, or focus nearer than four focal lengths.
     """
-    if not weights or not all(w > 0 for pair in weights for w in pair):
-        raise InputError("best focus", "weights", tuple(weights), "(wavelength in nm, weight) pairs above 0")
-    film_z = paraxial.film_z_mm(lens, focus_m)
+    film_z = paraxial.film_z_mm(lens, focus_m) if film_moves or lens.film_z_mm is None else lens.film_z_mm
     if paraxial.is_pinhole(lens):
         return film_z
+    wavelengths, weights = film_plane.colours(wavelength_nm if lens.dispersive else (LINE_D_NM, LINE_D_NM))
     for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
-        film_z = _least_spot_z_mm(lens, film_z - 1000 * focus_m, weights)
+        along, across = _moments(lens, film_z - 1000 * focus_m, wavelengths)
+        w = torch.from_numpy(weights)[:, None, None]
+        if not float(across.sum()) > 0:
+            raise InputError(lens.path, "focus", "best", "a lens that axial light passes and bends")
+        film_z = -float((w * along).sum() / (w * across).sum())
     return film_z
 
 
+def film_range_mm(
+    lens: Lens, focus_m: float, wavelength_nm: tuple[float, float], film_moves: bool = True
+) -> tuple[float, float]:
+    """Film planes that hold the paraxial image of an axial point, and its least spot at every aperture and colour.
+
+    What is least for all rays lies between what is least for each colour and meridian by itself. Arguments are those
+    of `best_focus_z_mm`.
+    """
+    image = paraxial.film_z_mm(lens, focus_m) if film_moves or lens.film_z_mm is None else lens.film_z_mm
+    if paraxial.is_pinhole(lens):
+        return image, image
+    colours = np.linspace(*wavelength_nm, film_plane.COLOURS if lens.dispersive else 1)
+    low = high = image
+    for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
+        # The rays within each ring are those that a smaller stop lets through.
+        along, across = (m.cumsum(1) for m in _moments(lens, (low + high) / 2 - 1000 * focus_m, colours))
+        found = [image, *(-along / across)[across > 0].tolist()]
+        low, high = min(found), max(found)
+    spare, last = _SPARE * (high - low), float(lens.vertices_mm[len(lens.surfaces) - 1])
+    return max(low - spare, last + _NEAREST * (image - last)), high + spare
+
+
 def axial_rays(lens: Lens, object_z_mm: float) -> Rays:
-    """Rays towards the film from a point of the axis (-inf allowed), of equal areas of the entrance pupil."""
+    """Rays [rings * spokes] to the film from a point of the axis (-inf allowed), of equal areas of the entrance pupil.
+
+    One spoke stands for all where lens and opening are round.
+    """
     data = paraxial.first_order(lens)
-    ring = torch.sqrt((torch.arange(_RINGS, dtype=torch.float64) + 0.5) / _RINGS)
-    spoke = 2 * math.pi * (torch.arange(_SPOKES, dtype=torch.float64) + 0.5) / _SPOKES
+    round_ = not lens.anamorphic and lens.aperture is None
+    rings, spokes = (_RINGS, 1) if round_ else (_RINGS_OF_SPOKES, _SPOKES)
+    ring = torch.sqrt((torch.arange(rings, dtype=torch.float64) + 0.5) / rings)
+    spoke = 2 * math.pi * (torch.arange(spokes, dtype=torch.float64) + 0.5) / spokes
     radius = _WIDER / 2 * data.entrance_pupil_diameter_mm * ring[:, None]
     x, y = (radius * torch.cos(spoke)).reshape(-1), (radius * torch.sin(spoke)).reshape(-1)
     # Started well in front of every lens, so that a front surface bulging towards the scene is still ahead.
@@ -287,21 +326,21 @@ def axial_rays(lens: Lens, object_z_mm: float) -> Rays:
     return Rays(dx * t, dy * t, object_z_mm + dz * t, dx, dy, dz)
 
 
-def _least_spot_z_mm(lens: Lens, object_z_mm: float, weights: Sequence[tuple[float, float]]) -> float:
-    """Plane where sum w (x^2 + y^2) is least; x = x0 + z tx, so z = -sum w (x0 tx + y0 ty) / sum w (tx^2 + ty^2)."""
+def _moments(lens: Lens, object_z_mm: float, wavelength_nm: NDArray[np.float64]) -> tuple[Tensor, Tensor]:
+    """Of each ray [colours, rings, spokes] x0 tx + y0 ty and tx^2 + ty^2, with (x0, y0) where it meets the plane z = 0
+    and (tx, ty) its slopes; 0 of one that is blocked. The sum of (x0 + z tx)^2 is least where the first make up for z
+    times the second.
+    """
     rays = axial_rays(lens, object_z_mm)
-    along, across = 0.0, 0.0
-    for wavelength_nm, weight in weights:
-        with torch.no_grad():
-            out = trace(lens, rays, wavelength_nm, towards="film")
-        passed = out.status == 0
-        r = Rays(*(c[passed] for c in out.rays))
-        tx, ty = r.dx / r.dz, r.dy / r.dz
-        along += weight * float(((r.x - r.z * tx) * tx + (r.y - r.z * ty) * ty).sum())
-        across += weight * float((tx * tx + ty * ty).sum())
-    if not across > 0:
-        raise InputError(lens.path, "focus", "best", "a lens that axial light passes and bends")
-    return -along / across
+    count, colours = len(rays.x), len(wavelength_nm)
+    with torch.no_grad():
+        many = Rays(*(c.repeat(colours) for c in rays))
+        out = trace(lens, many, torch.from_numpy(wavelength_nm).repeat_interleave(count), towards="film")
+    r, passed = out.rays, out.status == 0
+    tx, ty = r.dx / r.dz, r.dy / r.dz
+    along, across = (r.x - r.z * tx) * tx + (r.y - r.z * ty) * ty, tx * tx + ty * ty
+    shape = (colours, _RINGS, 1) if count == _RINGS else (colours, _RINGS_OF_SPOKES, _SPOKES)
+    return along.where(passed, 0.0).reshape(shape), across.where(passed, 0.0).reshape(shape)
 
 
 @dataclass(frozen=True)

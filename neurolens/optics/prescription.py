@@ -208,8 +208,8 @@ class Lens:
                 image circle stays (by the traced chief ray, along x; distortion included).
             zoom: name of a state of the file, or a focal length in mm between those of its states, as a number or its
                 text (`neurolens.optics.states`; marked in `derived`).
-            focus: "film" moves the film as the paraxial image does; "best" to the least RMS spot of the axial point at
-                the d line; "internal" moves the groups as the file's focus states do, film fixed.
+            focus: "film" moves the film as the paraxial image does; "best" to the least RMS spot of the axial point
+                (`focusing.best_focus_z_mm`); "internal" moves the groups as the file's focus states do, film fixed.
 
         Raises:
             InputError: an unknown state, a focal length beyond the zoom's range, a value that is not positive, a focus

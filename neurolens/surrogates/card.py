@@ -15,10 +15,10 @@ from torch import Tensor
 import neurolens
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.modelfile import CARD_KIND, CARD_SCHEMA
+from neurolens.modelfile import CARD_KIND, CARD_SCHEMA, MAX_CARD
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
 from neurolens.surrogates.model import LensModel, Prediction
 
 UNITS = {
@@ -46,7 +46,7 @@ def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
     return {
         "kind": CARD_KIND,
         "schema": CARD_SCHEMA,
-        "lens": lens_facts(model.lens, model.domain.film_z_mm[0]),
+        "lens": lens_facts(model.lens, model.domain),
         "units": UNITS,
         "frame": FRAME.format(place="the front surface" if model.direction == "angle" else "the plane z = 0"),
         "domain": model.domain.to_dict(),
@@ -76,13 +76,17 @@ def card_to_json(card: dict[str, Any]) -> str:
     """Strict JSON: a number that is not finite is an error, never the word NaN.
 
     Raises:
-        InputError: a value that JSON cannot hold, with its place in the card.
+        InputError: a value that JSON cannot hold, with its place in the card; more than `MAX_CARD` characters, which no
+            reader takes.
     """
     try:
-        return json.dumps(card, allow_nan=False)
+        text = json.dumps(card, allow_nan=False)
     except (TypeError, ValueError) as error:
         field, value = _culprit(card, "")
         raise InputError("model card", field, value, "finite numbers, text, lists and dictionaries") from error
+    if len(text) > MAX_CARD:
+        raise InputError("model card", "length", f"({len(text)} characters)", f"at most {MAX_CARD}")
+    return text
 
 
 def _culprit(value: Any, place: str) -> tuple[str, Any]:
@@ -100,7 +104,9 @@ def _culprit(value: Any, place: str) -> tuple[str, Any]:
     return place, value
 
 
-def lens_facts(lens: Lens, nearest_film_z_mm: float) -> dict[str, Any]:
+def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
+    """The card's table of the lens; its film is that of the domain nearest to where the lens has it."""
+    near, far = domain.film_z_mm
     data = first_order(lens)
     curvature = float(lens.surfaces[0].curvature)
     return {
@@ -119,7 +125,7 @@ def lens_facts(lens: Lens, nearest_film_z_mm: float) -> dict[str, Any]:
         "front_principal_z_mm": float(data.front_principal_z_mm),
         "rear_principal_z_mm": float(data.rear_principal_z_mm),
         "exit_pupil_z_mm": float(data.exit_pupil_z_mm) if math.isfinite(data.exit_pupil_z_mm) else "inf",
-        "film_z_mm": float(nearest_film_z_mm),
+        "film_z_mm": near if lens.film_z_mm is None else min(max(float(lens.film_z_mm), near), far),
         "dispersive": lens.dispersive,
     }
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base.errors import InputError
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Exponents, Form, Graph, Value
 
@@ -119,11 +120,11 @@ class Core:
 
     def fixed(self, w: float) -> Self:
         """The same core for one value of w, which then is 0."""
-        raise TypeError(f"no fixed wavelength for a core of type {type(self).__name__}")
+        raise InputError("export", "fix", type(self).__name__, "nothing fixed: a published method is written whole")
 
     def keep(self, scalars: Sequence[int]) -> Self:
         """The same core with these of its scalars only."""
-        raise TypeError(f"no part of a core of type {type(self).__name__}")
+        raise InputError("export", "fix", type(self).__name__, "nothing fixed: a published method is written whole")
 
     @property
     def coefficients(self) -> int:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from neurolens.base.errors import InputError
-from neurolens.optics import paraxial
+from neurolens.optics.focusing import film_range_mm
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -41,8 +41,8 @@ class Domain:
 
     Attributes:
         film_radius_mm: film points lie within this distance of the axis.
-        film_z_mm: film planes, nearest to the lens first (infinity focus) to farthest (near limit).
-        focus_m: the object distances that those planes focus (far, near), from film to object.
+        film_z_mm: film planes, nearest to the lens first (best focus at infinity) to farthest (near limit).
+        focus_m: the object distances that those planes focus (far, near), from film to object, at every aperture.
         pupil_z_mm: plane of the pupil points.
         pupil_radius_mm: pupil points lie within this distance of the axis; 1.05 times the disc of passing rays.
         wavelength_nm: shortest and longest wavelength; equal for a lens whose dispersion is unknown.
@@ -113,7 +113,8 @@ def domain_of(
 
     Args:
         film_radius_mm: None takes the lit film (see `pupils.image_radius_mm`).
-        focus_m: two object distances from the film; the domain holds every film plane between theirs.
+        focus_m: two object distances from the film; the domain holds every film plane between theirs, the paraxial
+            images and those of least spot.
         wavelength_nm: replaced by the d line where no glass of the lens has a known dispersion.
         nearest_m: distance from the film of the nearest object in view; None takes the nearest focus.
         film_z_mm: film planes, of a lens that was focused otherwise; None follows from `focus_m`.
@@ -132,15 +133,15 @@ def domain_of(
         raise InputError("domain", "wavelength_nm", wavelength_nm, "shortest then longest, within 300 to 2500 nm")
     if not lens.dispersive:
         low = high = LINE_D_NM
-    planes = sorted(film_z_mm or (paraxial.film_z_mm(lens, f) for f in focus_m))
+    planes = sorted(film_z_mm or _film_planes_mm(lens, focus_m, (low, high)))
     radius = film_radius_mm if film_radius_mm is not None else image_radius_mm(lens)[0]
-    bounds = pupil_bounds(lens, radius, (planes[0], planes[1]), (low, high), pupil_z_mm=pupil_z_mm)
+    bounds = pupil_bounds(lens, radius, (planes[0], planes[-1]), (low, high), pupil_z_mm=pupil_z_mm)
     plane = _best_plane_z_mm(lens, bounds, planes[0]) if pupil_z_mm is None else pupil_z_mm
     if plane != bounds.pupil_z_mm:
-        bounds = pupil_bounds(lens, radius, (planes[0], planes[1]), (low, high), pupil_z_mm=plane)
+        bounds = pupil_bounds(lens, radius, (planes[0], planes[-1]), (low, high), pupil_z_mm=plane)
     return Domain(
         film_radius_mm=radius,
-        film_z_mm=(planes[0], planes[1]),
+        film_z_mm=(planes[0], planes[-1]),
         focus_m=(max(focus_m), min(focus_m)),
         pupil_z_mm=bounds.pupil_z_mm,
         pupil_radius_mm=PUPIL_MARGIN * bounds.disc_mm,
@@ -149,6 +150,12 @@ def domain_of(
         bounds=bounds,
         nearest_m=nearest_m,
     )
+
+
+def _film_planes_mm(lens: Lens, focus_m: tuple[float, float], wavelength_nm: tuple[float, float]) -> list[float]:
+    """Ends of the film's travel: at both distances the paraxial image and the best focus at every aperture."""
+    ends = (film_range_mm(lens, f, wavelength_nm) for f in focus_m)
+    return [z for end in ends for z in end]
 
 
 def _best_plane_z_mm(lens: Lens, bounds: PupilBounds, film_z_mm: float) -> float:

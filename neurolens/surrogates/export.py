@@ -206,7 +206,7 @@ def state_card(model: StateModel, errors: dict[str, Any]) -> dict[str, Any]:
 
 def _node_facts(node: LensModel) -> dict[str, Any]:
     """The card's table of a node's lens; the f-number is that at infinity focus, as photographers count."""
-    facts = lens_facts(node.lens, node.domain.film_z_mm[0])
+    facts = lens_facts(node.lens, node.domain)
     return {**facts, "f_number": float(first_order(at_infinity(node.lens)).f_number)}
 
 

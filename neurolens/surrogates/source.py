@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 # Nothing fixed. Wavelengths are fixed in the models themselves, one model a table; film plane and stop here too.
 FREE = Fix()
 WRITERS = {"c": write_c, "glsl": write_glsl}
+MOST_WEIGHTS = 20_000  # each is a step, and compilers take minutes; larger products of matrices go by blocks
 _WIDTH = 110
 _ERRORS = ("rms_um", "p99_um", "max_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
 
@@ -116,7 +117,8 @@ def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FR
     status, a float.
 
     Raises:
-        InputError: weights that float32 cannot hold; a fixed film position or stop outside the domain.
+        InputError: weights that float32 cannot hold, or more than `MOST_WEIGHTS`; a fixed film position or stop
+            outside the domain.
     """
     from neurolens.surrogates.export import largest_angle  # needs torch
 
@@ -124,7 +126,11 @@ def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FR
     angle = max(largest_angle(model) for model in models)
     fixed = {FILM_Z: fix.film_z_mm, STOP_RADIUS: fix.stop_radius_mm}
     known = {name: value for name, value in fixed.items() if value is not None}
-    return lower([model_graph(model, angle, SCALARS, parts) for model in models], known)
+    graphs = [model_graph(model, angle, SCALARS, parts) for model in models]
+    weights = sum(node.arrays[0].size for node in graphs[0].nodes if node.kind == "affine")
+    if weights > MOST_WEIGHTS:
+        raise InputError("export", "weights", weights, f"at most {MOST_WEIGHTS}: larger networks are for onnxruntime")
+    return lower(graphs, known)
 
 
 def identifier(text: str) -> str:

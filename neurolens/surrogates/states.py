@@ -19,7 +19,7 @@ import numpy as np
 from neurolens.base.errors import InputError
 from neurolens.modelfile.axes import Array, Axis, product, weights
 from neurolens.modelfile.states import mix_domain
-from neurolens.optics.focusing import infinity_states, nearest_focus_m
+from neurolens.optics.focusing import film_range_mm, infinity_states, nearest_focus_m
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
@@ -107,7 +107,8 @@ class StateSpace:
             if radius is None:
                 radius = image_radius_mm(self._lens(zoom, math.inf))[0]
             assert lens.film_z_mm is not None
-            film_z, focus = (lens.film_z_mm, lens.film_z_mm), (focus_m, focus_m)
+            film_z = film_range_mm(lens, focus_m, self.wavelength_nm, film_moves=False)
+            focus = (focus_m, focus_m)
         return domain_of(
             lens,
             film_radius_mm=radius,

@@ -36,6 +36,11 @@ from neurolens.surrogates.cores import (
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import Gate, LensModel, Scales
+from neurolens.surrogates.published.adaptive import Cells
+from neurolens.surrogates.published.data import OuterPupil
+from neurolens.surrogates.published.neural import Averaged
+from neurolens.surrogates.published.raylut import RayTable
+from neurolens.surrogates.published.rtf import Meridian
 
 SCHEMA = 1
 # Cores by the name that files carry. Their fields are tensors, integer arrays, numbers, tuples and other cores.
@@ -46,10 +51,15 @@ CORES: dict[str, type] = {
     "network": Network,
     "partitioned": Partitioned,
     "residual": Residual,
+    "outer-pupil": OuterPupil,
+    "cells": Cells,
+    "averaged": Averaged,
+    "meridian": Meridian,
+    "ray-table": RayTable,
 }
 _NAMES = {kind: name for name, kind in CORES.items()}
 _MAX_TEXT = 16 * 2**20  # of the JSON; the largest models known take 100 kB
-_MAX_DEPTH = 8
+_MAX_DEPTH = 16  # two a cut of cells
 _MAX_ROWS = 20_000  # of any array: terms, or units of a layer
 _MAX_DEGREE = 64  # of any term; settings allow half, and growth without limit stays far below
 _MAX_RAYS = 1000  # of the card's reference; `card.reference_rays` gives 4 a status
@@ -58,7 +68,8 @@ _LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "des
 
 def storable(core: Core) -> bool:
     """Whether a core, and every core in it, has a name in `CORES`."""
-    return type(core) in _NAMES and all(storable(part) for part in getattr(core, "parts", ()))
+    parts = [*getattr(core, "parts", ()), *(v for v in vars(core).values() if isinstance(v, Core))]
+    return type(core) in _NAMES and all(storable(part) for part in parts)
 
 
 def model_to_text(model: LensModel) -> str:
@@ -94,8 +105,8 @@ def load_fitted(path: str | Path) -> LensModel:
         raise ModelError(f"{file}: a model of many states (zoom, internal focus), expected one of one state")
     if MODEL_KEY not in metadata:
         raise ModelError(
-            f"{file}: it holds no coefficients beside its graph: a model of many states, a published method, or one "
-            "made by an earlier version, then export it again"
+            f"{file}: it holds no coefficients beside its graph: a model of many states, or one made by an "
+            "earlier version, then export it again"
         )
     try:
         data = json.loads(_inflated(metadata[MODEL_KEY]))

@@ -14,7 +14,7 @@ import lens_models
 import numpy as np
 import onnx
 import pytest
-from onnx import ModelProto, TensorProto, helper, numpy_helper
+from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
@@ -56,6 +56,13 @@ def change_card(change: Callable[[dict], object]) -> Callable[[ModelProto], None
         proto.metadata_props[0].value = json.dumps(card)
 
     return apply
+
+
+def grown(proto: ModelProto, rows: int, inner: int, columns: int) -> list[NodeProto]:
+    """A matrix "grown" of the product of two small ones."""
+    for name, shape in (("tall", (rows, inner)), ("wide", (inner, columns))):
+        proto.graph.initializer.append(numpy_helper.from_array(np.ones(shape, np.float32), name))
+    return [helper.make_node("MatMul", ["tall", "wide"], ["grown"])]
 
 
 def change_weights(factor: float) -> Callable[[ModelProto], None]:
@@ -111,6 +118,7 @@ DAMAGE: dict[str, tuple[Callable[[ModelProto], object], str]] = {
         lambda p: setattr(p.metadata_props[0], "value", '{"kind":' + "[" * 200_000 + "]" * 200_000 + "}"),
         "JSON",
     ),
+    "card too long": (change_card(lambda c: c.update(fit=c["fit"] | {"note": "x" * 2**20})), "card: .* characters"),
     "a section of text": (change_card(lambda c: c.update(lens="lens")), "lens: got 'lens'"),
     "no name of the lens": (change_card(lambda c: c["lens"].pop("id")), "lens.id"),
     "negative radius": (change_card(lambda c: c["domain"].update(film_radius_mm=-20)), "domain.film_radius_mm"),
@@ -163,7 +171,7 @@ DAMAGE: dict[str, tuple[Callable[[ModelProto], object], str]] = {
     ),
     "rows without end": (
         lambda p: p.graph.node.extend(
-            helper.make_node("Concat", [f"g{k}" if k else "film_z_mm"] * 16, [f"g{k + 1}"], axis=0) for k in range(12)
+            helper.make_node("Concat", [f"g{k}" if k else "rays"] * 16, [f"g{k + 1}"], axis=0) for k in range(12)
         ),
         "operator Concat has shape",
     ),
@@ -187,6 +195,38 @@ DAMAGE: dict[str, tuple[Callable[[ModelProto], object], str]] = {
             ]
         ),
         "numbers at a time",
+    ),
+    "products of constants": (  # folded on loading
+        lambda p: p.graph.node.extend(
+            [*grown(p, 8000, 1, 8000), *(helper.make_node("Mul", ["grown"] * 2, [f"g{k}"]) for k in range(30))]
+        ),
+        "100000000 multiply-adds without rays",
+    ),
+    "products of rays": (
+        lambda p: p.graph.node.extend(
+            [
+                *grown(p, 1000, 1, 1000),
+                helper.make_node("Concat", ["rays"] * 200, ["r0"], axis=0),
+                *(helper.make_node("MatMul", ["grown", f"r{k}"], [f"r{k + 1}"]) for k in range(3)),
+            ]
+        ),
+        "2000000 multiply-adds a ray",
+    ),
+    "numbers as text": (
+        lambda p: p.graph.node.append(helper.make_node("Cast", ["rays"], ["q"], to=TensorProto.STRING)),
+        "Cast: to type 8, expected float32",
+    ),
+    "many operators": (
+        lambda p: p.graph.node.extend(helper.make_node("Neg", ["rays"], [f"n{k}"]) for k in range(10_001)),
+        "operators, expected at most 10000",
+    ),
+    "many dimensions": (
+        lambda p: p.graph.initializer.append(helper.make_tensor("deep", TensorProto.FLOAT, [1] * 9, [1.0])),
+        "9 dimensions",
+    ),
+    "many parts of one message": (
+        lambda p: p.graph.value_info.extend(helper.make_empty_tensor_value_info("") for _ in range(50_001)),
+        "more than 50000 fields",
     ),
     "a shape that only running tells": (
         lambda p: p.graph.node.append(helper.make_node("Reshape", ["rays", "film_z_mm"], ["q"])),

@@ -82,12 +82,14 @@ def test_a_direction_error_at_infinity_is_f_times_the_angle() -> None:
 def test_a_shift_at_a_finite_plane_is_magnification_times_the_shift() -> None:
     lens, _ = lens_and_domain("laikin_double_gauss_50", None, 1.0)
     lens = lens.with_stop_radius(1.0)
-    domain = domain_of(lens, focus_m=(1.0, 1.0), film_radius_mm=0.01)
+    assert lens.film_z_mm is not None
+    film_z_mm = (lens.film_z_mm, lens.film_z_mm)
+    domain = domain_of(lens, focus_m=(1.0, 1.0), film_radius_mm=0.01, film_z_mm=film_z_mm)
     rays, shift = held_out(lens, domain), 1e-3
     moved = rays.scene._replace(x=rays.scene.x + shift)
     errors = ray_errors(lens, domain, rays, lambda _: says(moved, rays.transmittance))
     data = first_order(lens)
-    extension = domain.film_z_mm[0] - data.rear_focal_z_mm
+    extension = lens.film_z_mm - data.rear_focal_z_mm
     magnification = extension / data.efl_mm  # Newton
     assert errors.rms_um == pytest.approx(1000 * magnification * shift, rel=5e-3)
     assert errors.rms_infinity_um == 0
@@ -128,12 +130,13 @@ def test_the_jacobian_on_the_axis_is_paraxial() -> None:
     for focus_m in (math.inf, 0.7):
         lens, domain = lens_and_domain("laikin_double_gauss_50", None, focus_m)
         zero = torch.zeros(1, dtype=torch.float64)
-        rays = FilmRays(zero, zero, zero + domain.film_z_mm[0], zero, zero, zero + 587.5618)
+        assert lens.film_z_mm is not None
+        rays = FilmRays(zero, zero, zero + lens.film_z_mm, zero, zero, zero + 587.5618)
         vergence = focused_vergence(lens, rays.film_z)
         data = first_order(lens)
         expected = 1 / data.efl_mm
         if not math.isinf(focus_m):  # object size / distance
-            expected = data.efl_mm / (domain.film_z_mm[0] - data.rear_focal_z_mm) * float(vergence)
+            expected = data.efl_mm / (lens.film_z_mm - data.rear_focal_z_mm) * float(vergence)
         for value in local_jacobian(lens, domain, rays, vergence):
             assert float(value) == pytest.approx(expected, rel=1e-5)
 

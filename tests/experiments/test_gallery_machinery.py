@@ -14,7 +14,7 @@ from gallery_shots import GALLERY, ROOT, shipped, shot
 from experiments.__main__ import main
 from experiments.gallery.cameras import Window, exact_camera, fitted, surrogate_camera, widened
 from experiments.gallery.figure import MOST_BYTES
-from experiments.gallery.run import check, fingerprint_of
+from experiments.gallery.run import _error, check, fingerprint_of
 from experiments.gallery.settings import find_effects, read_effect
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
@@ -55,6 +55,11 @@ def written(folder: Path, old: str = "", new: str = "") -> Path:
     assert old in text
     path.write_text(text.replace(old, new) if old else text, encoding="utf-8")
     return path
+
+
+def test_a_surrogate_without_a_measured_ray_is_no_nan() -> None:
+    assert _error({"rms_um": None, "direction_rms_deg": None}) == "no ray to measure"
+    assert _error({"rms_um": 1.25}) == "RMS 1.25 um on the film"
 
 
 def test_every_effect_of_the_gallery_can_be_read() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import math
 from functools import cache, partial
 from itertools import pairwise
@@ -46,6 +47,14 @@ def test_a_measurement_knows_no_other_options(capsys: pytest.CaptureFixture[str]
         main(["nonsense"])
     assert main(["pupils", "--only", "nobody", "--quiet"]) == 2
     assert "--only" in capsys.readouterr().err
+
+
+def test_results_go_to_the_kept_folder_only_when_asked() -> None:
+    parser = argparse.ArgumentParser()
+    lab.out(lab.RESULTS / "gallery")(parser)
+    assert parser.parse_args([]).out == lab.ROOT / "runs" / "results" / "gallery"
+    assert parser.parse_args(["--commit"]).out == lab.RESULTS / "gallery"
+    assert parser.parse_args(["--out", "x"]).out == Path("x")
 
 
 LENSES = Path(__file__).parents[2] / "lenses"

@@ -58,6 +58,9 @@ def test_figures_of_known_times_and_pictures() -> None:
     assert found["time_over_ours"] == pytest.approx(0.6 / 0.3)
     assert found["mean_rgb"] == pytest.approx([2, 2, 2])
     assert found["noise"] == pytest.approx(1 / np.mean([1, 4, 9]))  # variance 1 over the mean square
+    # Twice the time: the variance decides the rest.
+    noisy = record(row([0.5, 0.6, 0.7], [2 * p - 2 for p in base.pictures]), SETTINGS, base)
+    assert noisy["equal_noise"] == pytest.approx(2 * noisy["noise"] / found["noise"])
 
 
 def test_the_first_picture_is_kept_apart_and_white_is_taken_out() -> None:
@@ -174,7 +177,8 @@ def test_candidates_time_models_and_files() -> None:
     assert candidate is not None
     timing = race([candidate], model.domain, rounds=1).timing("fused")
     assert timing is not None and 0 < timing["min"] < 1e4
-    assert fused_candidate("x", lens_models.exported("invariants"), model.domain) is not None
+    for kind in ("invariants", "rtf", "ray-lut"):
+        assert fused_candidate("x", lens_models.exported(kind), model.domain) is not None
 
 
 def test_the_part_of_a_graph_that_gives_rays_gives_the_same() -> None:

@@ -85,6 +85,21 @@ def test_what_is_no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, te
     assert not list((tmp_path / "neurolens").iterdir())
 
 
+def test_a_compiler_without_end_is_ended_with_its_children(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Compilers are drivers: what works is a child of theirs, which holds the pipes, too."""
+    endless, told = tmp_path / "endless", tmp_path / "child"
+    endless.write_text(f"#!/bin/sh\nsleep 600 & echo $! > {told}\nwait\n")
+    endless.chmod(0o700)
+    monkeypatch.setenv("CC", str(endless))
+    monkeypatch.setattr(compiler, "_SECONDS", 2)
+    with pytest.raises(InputError, match="no end after 2 s"):
+        compiler.compile_c(SOURCE, tmp_path / "a.so")
+    ended, child = time.monotonic() + 30, Path(f"/proc/{told.read_text().strip()}/stat")
+    while child.exists() and child.read_text().split()[2] != "Z":
+        assert time.monotonic() < ended
+        time.sleep(0.01)
+
+
 def test_no_compiler_and_one_that_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="error"):
         compiler.load_compiled("this is no C\n")

@@ -61,6 +61,8 @@ CASES: dict[str, Callable[[Graph, Value, Value, Value], Value]] = {
     "clip": lambda g, x, y, s: (x * y).clip(0.4, 0.9),
     "floor": lambda g, x, y, s: x.floor() * y + x,
     "lookup": lambda g, x, y, s: g.lookup(g.table("t", 6), x[0] * 3.0, g.concat(x[1], y[0] * s)) * x,
+    "lookup at two indices": lambda g, x, y, s: g.lookup(g.table("t", 6), x[[0, 2]] * 3.0, g.concat(x, y[0] * s)),
+    "lookup in the graph's own table": lambda g, x, y, s: g.lookup(g.own_table(W), y[1] * 2.0, x[1]) * y,
     "select": lambda g, x, y, s: g.select(x <= y, x * x, y * s),
     "select by several": lambda g, x, y, s: g.select((x <= y) & x.between(0.5, 1.2), x * y, 3.0),
     "constant": lambda g, x, y, s: g.constant([1.0, 2.0]) + s * 0.0,

@@ -71,19 +71,28 @@ def test_an_operator_without_a_fused_form(tmp_path: Path) -> None:
         graph_of(tmp_path / "model.onnx", proto.SerializeToString())
 
 
-def test_graphs_that_ask_for_too_much(tmp_path: Path) -> None:
-    """A few numbers that meet as rows and columns, and a shape that only fits as many rays as the check has."""
+ONES = {(5000, 1), (1, 5000), (100, 5), (100, 100)}
+
+
+@pytest.mark.parametrize(
+    "products",
+    [
+        [("Mul", "1x5000", "5000x1")],
+        [("MatMul", "5000x1", "1x5000")],
+        [("Reshape", "film_z_mm", "shape")],  # fits as many rays as the check has
+        [("MatMul", "100x5", "rays"), ("MatMul", "100x100", "x0")],  # gcc takes 94 s
+        [("Max", *["rays"] * 2000)],
+    ],
+)
+def test_graphs_that_ask_for_too_much(products: list[tuple[str, ...]], tmp_path: Path) -> None:
+    """Numbers that meet as rows and columns, and what a compiler would take minutes for."""
     helper, tensor = onnx.helper, onnx.numpy_helper.from_array
-    row, column = (tensor(np.ones(s, np.float32), n) for s, n in (((1, 5000), "row"), ((5000, 1), "column")))
-    shape = tensor(np.array([1, 16400]), "shape")
-    for node, constants in (
-        (helper.make_node("Mul", ["row", "column"], ["x"]), [row, column]),
-        (helper.make_node("MatMul", ["column", "row"], ["x"]), [row, column]),
-        (helper.make_node("Reshape", ["film_z_mm", "shape"], ["x"]), [shape]),
-    ):
-        graph = helper.make_graph([node], "g", [], [], constants)
-        with pytest.raises(InputError, match="graph"):
-            graph_of(tmp_path / "model.onnx", helper.make_model(graph).SerializeToString())
+    constants = [tensor(np.ones(shape, np.float32), "x".join(map(str, shape))) for shape in ONES]
+    constants.append(tensor(np.array([1, 16400]), "shape"))
+    nodes = [helper.make_node(p, given, [f"x{k}"]) for k, (p, *given) in enumerate(products)]
+    graph = helper.make_graph(nodes, "g", [], [], constants)
+    with pytest.raises(InputError, match="graph"):
+        graph_of(tmp_path / "model.onnx", helper.make_model(graph).SerializeToString())
 
 
 def test_a_number_where_bytes_belong_takes_no_memory(tmp_path: Path) -> None:

@@ -16,15 +16,17 @@ from neurolens.optics.focusing import (
     best_focus_z_mm,
     breathing,
     field_change,
+    film_range_mm,
     focus_states,
     infinity_states,
     monotone,
     nearest_focus_m,
 )
+from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.lenscheck import in_state
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import write_lens
-from neurolens.optics.paraxial import first_order
+from neurolens.optics.paraxial import film_z_mm, first_order
 from neurolens.optics.prescription import Coating, Lens, Surface
 from neurolens.optics.sag import check_clearance
 from neurolens.optics.trace import Rays, trace
@@ -273,8 +275,8 @@ def test_pure_third_order_aberration_focuses_best_two_thirds_of_the_way() -> Non
 @pytest.mark.parametrize("focus_m", [math.inf, 1.0])
 @pytest.mark.parametrize("name", ["laikin_double_gauss_50", "thorlabs_lb1471_biconvex_50", "phone_lens_6"])
 def test_no_plane_near_by_has_a_smaller_spot(name: str, focus_m: float) -> None:
-    lens = tabled(name).at(focus_m=focus_m, focus="best")
-    z = lens.film_z_mm
+    lens = tabled(name)
+    z = best_focus_z_mm(lens, focus_m, (LINE_D_NM, LINE_D_NM))
 
     def spot(film_z: float) -> float:
         source = -math.inf if math.isinf(focus_m) else z - 1000 * focus_m
@@ -287,14 +289,42 @@ def test_no_plane_near_by_has_a_smaller_spot(name: str, focus_m: float) -> None:
     assert spot(z) < min(spot(z - step), spot(z + step))
 
 
-def test_best_focus_weighs_colours() -> None:
+def test_best_focus_weighs_colours_as_the_eye_does() -> None:
     lens = tabled("thorlabs_lb1471_biconvex_50").at(f_number=16)
-    blue, red = (best_focus_z_mm(lens, weights=[(nm, 1.0)]) for nm in (450.0, 650.0))
-    both = best_focus_z_mm(lens, weights=[(450.0, 1.0), (650.0, 1.0)])
-    mostly_red = best_focus_z_mm(lens, weights=[(450.0, 1.0), (650.0, 9.0)])
-    assert blue < both < mostly_red < red
-    with pytest.raises(InputError, match="weights"):
-        best_focus_z_mm(lens, weights=[(450.0, 0.0)])
+    blue, green, red = (best_focus_z_mm(lens, wavelength_nm=(nm, nm)) for nm in (450.0, 555.0, 650.0))
+    assert blue < green < red
+    assert best_focus_z_mm(lens) == pytest.approx(green, abs=0.05 * (red - blue))
+    assert blue < best_focus_z_mm(lens, wavelength_nm=(400.0, 500.0)) < green
+    near, far = (best_focus_z_mm(lens, wavelength_nm=(nm, nm)) for nm in (800.0, 1000.0))
+    assert best_focus_z_mm(lens, wavelength_nm=(800.0, 1000.0)) == pytest.approx(
+        (near + far) / 2, abs=0.1 * (far - near)
+    )
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "laikin_double_gauss_50",
+        "schneider_anamorphic_31",
+        "edmund_asphere_30",
+        "nikon_zoom_70_200",
+        "takahashi_retrofocus_100",
+    ],
+)
+@pytest.mark.parametrize("focus_m", [math.inf, 1.5])
+def test_a_film_range_holds_best_focus_at_every_aperture_and_colour(name: str, focus_m: float) -> None:
+    lens = tabled(name)
+    internal = "nikon" in name
+    lens = lens.at(zoom=100.0, focus_m=focus_m, focus="internal") if internal else lens
+    low, high = film_range_mm(lens, focus_m, (400.0, 700.0), film_moves=not internal)
+    assert low < (lens.film_z_mm if internal else film_z_mm(lens, focus_m)) < high
+    found = [
+        best_focus_z_mm(lens.with_stop_radius(lens.stop_radius_mm * share), focus_m, light, film_moves=not internal)
+        for share in (1.0, 0.7, 0.1)
+        for light in ((400.0, 700.0), (400.0, 400.0), (475.0, 475.0), (700.0, 700.0))
+    ]
+    assert low < min(found) and max(found) < high
+    assert lens.anamorphic or high - low < 1.5 * (max(found) - min(found))  # and hardly more
 
 
 def test_a_shut_stop_has_no_best_focus() -> None:

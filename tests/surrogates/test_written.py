@@ -187,6 +187,14 @@ def test_fixed_values_outside_the_domain_are_refused() -> None:
             fixed_models(model, fix)
     with pytest.raises(InputError, match="film_z"):
         fused_program([model], ALL, Fix(film_z_mm=1.0))
+    with pytest.raises(InputError, match="published method"):
+        fixed_models(lens_models.model("rtf"), Fix(wavelengths_nm=(500.0,)))
+
+
+def test_networks_that_a_compiler_would_not_end_with_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.surrogates.source.MOST_WEIGHTS", 100)
+    with pytest.raises(InputError, match="onnxruntime"):
+        fused_program([lens_models.model("network")])
 
 
 def test_literals_keep_every_bit() -> None:

@@ -1,8 +1,9 @@
 """The published surrogates of lenses, as rows of the benchmark beside ours: who, and with which settings.
 
-Each method has its own module, whose docstring says what the paper does, what it leaves open and what was chosen.
-All are fitted on the same rays as ours (`fit_model`) and are measured by the same code; their tests of who passes are
-their own.
+All are our own implementations of the papers: none runs its authors' code. Each method has its own module, whose
+docstring says what the paper does, what it leaves open and what was chosen. All are fitted on the same rays as ours
+(`fit_model`), are written by the same writers (ONNX, C) and are measured by the same code; their tests of who passes
+are their own.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from neurolens.surrogates.published.adaptive import fit_adaptive
 from neurolens.surrogates.published.data import RawData, outer_pupil
 from neurolens.surrogates.published.neural import fit_averaged
 from neurolens.surrogates.published.polynomials import fit_dense, fit_sparse
+from neurolens.surrogates.published.raylut import fit_table
 from neurolens.surrogates.published.rtf import fit_rtf
 from neurolens.surrogates.published.taylor import fit_taylor
 from neurolens.surrogates.settings import ModelSettings
@@ -57,7 +59,7 @@ PUBLISHED: dict[str, PublishedMethod] = {
     ),
     "neurolens2017": PublishedMethod(
         'Zheng and Zheng 2017, "NeuroLens: Data-Driven Camera Lens Simulation Using Neural Networks", Computer '
-        "Graphics Forum 36(8)",
+        "Graphics Forum 36(8); here 24,000 steps of 128 rays a network",
         (
             ModelSettings(
                 "neurolens2017",
@@ -66,7 +68,7 @@ PUBLISHED: dict[str, PublishedMethod] = {
                 partitions=2,
                 units=128,
                 layers=3,
-                steps=6000,
+                steps=24_000,
             ),
         ),
     ),
@@ -74,6 +76,11 @@ PUBLISHED: dict[str, PublishedMethod] = {
         'Goossens et al. 2022, "Ray-transfer functions for camera simulation of 3D scenes with hidden lens design", '
         "Optics Express 30(13)",
         tuple(ModelSettings("rtf", f"rtf-d{degree}", "raw", degree=degree) for degree in (6, 4, 8)),
+    ),
+    "ray-lut": PublishedMethod(
+        'Honsbrok, Mostafawy, Herder, Huldtgren 2025, "Ray-LUT: A Lookup-Based Method for Camera Lens Simulation in '
+        'Real-Time Using Ray Tracing", GRAPP',
+        tuple(ModelSettings("ray-lut", f"ray-lut-{nodes}", "raw", units=nodes) for nodes in (8, 16, 32)),
     ),
 }
 
@@ -91,7 +98,7 @@ def fit_published(
     s, method = settings, settings.method
     if method not in PUBLISHED:
         raise InputError("fit", "method", method, f"one of {', '.join(PUBLISHED)}")
-    data = RawData.of(prepared, centred=method in ("taylor", "hanika"))
+    data = RawData.of(prepared, centred=method in ("taylor", "hanika", "ray-lut"))
     core: Core
     if method == "neurolens2017":
         core, gates = fit_averaged(data, s, progress)
@@ -99,6 +106,8 @@ def fit_published(
         core, gates = fit_rtf(data, s.degree)
     elif method == "taylor":
         core, gates = outer_pupil(data, fit_taylor(prepared.pairs.lens, data.encoding, s.degree), 0.0)
+    elif method == "ray-lut":
+        core, gates = outer_pupil(data, fit_table(data, s.units), 0.0)
     elif method == "hanika":
         core, gates = outer_pupil(data, fit_dense(data, s.degree))
     elif method == "schrade":

@@ -68,10 +68,7 @@ class Meridian(Core):
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
         p, u, unit = field.p, field.u, units.vectors[0]
-        rho = g.square(p)
-        radius, on_axis = rho.sqrt(), rho <= 0.0
-        safe = g.select(on_axis, 1.0, radius)
-        y = (p[0] / safe, g.select(on_axis, 1.0, p[1] / safe))  # on the axis: the y axis itself
+        radius, y = meridian_of(p)
         slope = u * self.slope
         along = 1.0 / (g.square(slope) + 1.0).sqrt()
         x = g.concat(radius, g.concat(*turn(slope, y)) * along)
@@ -83,11 +80,11 @@ class Meridian(Core):
             exponents, weight = exponents[used][:, :3], weight[:, used]
         position, direction, transmittance = g.split(g.polynomial(exponents, weight, x), [2, 3, 1])
         direction = direction * (1.0 / g.square(direction).sqrt())
-        position = _turned_back(position, y)
+        position = turned_back(position, y)
         crossing = turn(p * self.film + u * self.pupil, y)
         vectors = (position, position, position * 0.0)
         gate = (self._ellipse(radius, crossing) - 1.0) * units.gates
-        return CoreValues(vectors, transmittance, gate, g.concat(_turned_back(direction[0:2], y), -direction[2]))
+        return CoreValues(vectors, transmittance, gate, g.concat(turned_back(direction[0:2], y), -direction[2]))
 
     def _ellipse(self, radius: Value, crossing: tuple[Value, Value]) -> Value:
         """Squared place of a crossing in the ellipse at a radius: above 1 outside. Piecewise linear by hinges."""
@@ -109,7 +106,15 @@ class Meridian(Core):
         return int((self.outputs != 0).sum()) + self.ellipse.size
 
 
-def _turned_back(v: Value, y: tuple[Value, Value]) -> Value:
+def meridian_of(p: Value) -> tuple[Value, tuple[Value, Value]]:
+    """The length of p, and the components of the unit vector along it; on the axis the y axis itself."""
+    g, rho = p.graph, p.graph.square(p)
+    radius, on_axis = rho.sqrt(), rho <= 0.0
+    safe = g.select(on_axis, 1.0, radius)
+    return radius, (p[0] / safe, g.select(on_axis, 1.0, p[1] / safe))
+
+
+def turned_back(v: Value, y: tuple[Value, Value]) -> Value:
     """The inverse of `turn`."""
     a, b = v.graph.split(v, [1, 1])
     return v.graph.concat(a * y[1] + b * y[0], b * y[1] - a * y[0])
