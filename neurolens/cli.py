@@ -17,7 +17,7 @@ from typing import Any
 from neurolens import __version__
 from neurolens.base.errors import NeurolensError, NeurolensWarning
 from neurolens.base.signals import handled
-from neurolens.commands.arguments import Parser
+from neurolens.commands.arguments import Parser, more_glasses
 
 # Packages of the extra that a base install lacks.
 _TRAIN_PACKAGES = {"torch", "sklearn", "onnx", "matplotlib", "flip_evaluator", "mpmath"}
@@ -60,7 +60,7 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_
     args = argparse.Namespace(kept="nothing was done")
     try:
         args = build().parse_args(argv)
-        with handled(_interrupt), _plain_warnings(quiet=getattr(args, "quiet", False)):
+        with handled(_interrupt), _plain_warnings(quiet=getattr(args, "quiet", False)), more_glasses(args):
             code: int = args.run(args)
         sys.stdout.flush()
         return code

@@ -10,7 +10,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_json, check_run_folder, lens_path, positive, whole
+from neurolens.commands.arguments import add_glass, add_json, check_run_folder, lens_path, positive, whole
 from neurolens.commands.output import answer, number, table
 
 _DESCRIPTION = """\
@@ -81,6 +81,7 @@ def add_parser(subparsers: Any) -> None:
         help="width of the picture of --target-px (default: 4000)",
     )  # fmt: skip
     parser.add_argument("--no-race", action="store_true", help="time no model")
+    add_glass(parser)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="fitted models are kept in the run folder; the same command resumes")
 
