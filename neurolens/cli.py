@@ -42,12 +42,24 @@ def build_parser() -> Parser:
 
     Commands are imported here, so that `main` handles an interrupt of the imports.
     """
-    from neurolens.commands import analyse, bench, convert, evaluate, export, glass, lens, mitsuba, render, train
+    from neurolens.commands import (
+        analyse,
+        bench,
+        convert,
+        evaluate,
+        export,
+        glass,
+        lens,
+        mitsuba,
+        models,
+        render,
+        train,
+    )
 
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    for command in (lens, analyse, glass, convert, train, evaluate, export, render, mitsuba, bench):
+    for command in (lens, analyse, glass, convert, train, models, evaluate, export, render, mitsuba, bench):
         command.add_parser(subparsers)
     return parser
 

@@ -31,7 +31,7 @@ GAUSS, SINGLET, PHONE, ZOOM, TESSAR = (
         "brendel_tessar_100",
     )
 )
-COMMANDS = ("lens", "analyse", "glass", "convert", "train", "evaluate", "export", "render")
+COMMANDS = ("lens", "analyse", "glass", "convert", "train", "models", "evaluate", "export", "render")
 
 
 @pytest.mark.parametrize("command", [[], *([c] for c in COMMANDS)])
