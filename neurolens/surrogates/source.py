@@ -47,8 +47,8 @@ _WIDTH = 110
 _WORDS = """
     alignas alignof and and_eq asm auto bitand bitor bool break case catch char char8_t char16_t char32_t class co_await
     co_return co_yield compl concept const const_cast consteval constexpr constinit continue decltype default delete do
-    double dynamic_cast else enum explicit export extern false float for friend goto if inline int long mutable namespace
-    new noexcept not not_eq nullptr operator or or_eq private protected public register reinterpret_cast requires
+    double dynamic_cast else enum explicit export extern false float for friend goto if inline int long mutable
+    namespace new noexcept not not_eq nullptr operator or or_eq private protected public register reinterpret_cast requires
     restrict return short signed sizeof static static_assert static_cast struct switch template this thread_local throw
     true try typedef typeid typename typeof union unsigned using virtual void volatile wchar_t while xor xor_eq
     active attribute buffer cast centroid coherent common discard external filter fixed flat half highp in inout input
@@ -123,7 +123,9 @@ def _checked_name(language: str, lens_id: str, name: str | None) -> str:
         raise InputError("export", "to", language, f"one of {', '.join(WRITERS)}")
     own = identifier(lens_id) if name is None else name
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,99}", own) or "__" in own or _taken(own):
-        expected = "letters, digits and single underscores, a letter first, and no word of C, C++ or GLSL or of the code"
+        expected = (
+            "letters, digits and single underscores, a letter first, and no word of C, C++ or GLSL or of the code"
+        )
         raise InputError("export", "name", own, expected)
     return own
 
