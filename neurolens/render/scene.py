@@ -6,7 +6,7 @@ The tables of shapes, materials and lights are defined in `neurolens.render.scen
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -151,6 +151,20 @@ def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> 
         _spectra(path, "reflectances", settings.reflectances, settings.camera, most=1.0),
         None if around is None else read_environment(path, "environment.file", path.parent / around, scale),
     )
+
+
+def seen_from(scene: Scene, path: str | Path, position_m: Vector | None, look_at_m: Vector | None) -> Scene:
+    """The scene from another place, towards another point; None keeps its own. Errors as of `load_scene`."""
+    moved: dict[str, Any] = {"position_m": position_m, "look_at_m": look_at_m}
+    given = {name: value for name, value in moved.items() if value is not None}
+    if not given:
+        return scene
+    try:
+        settings = replace(scene.settings, camera=replace(scene.settings.camera, **given))
+    except InputError as error:
+        raise InputError(path, f"camera.{error.field}", error.value, error.expected) from None
+    _check_camera(Path(path), settings, scene.triangles)
+    return replace(scene, settings=settings)
 
 
 def _aperture(path: Path, camera: CameraSettings) -> Aperture | None:
