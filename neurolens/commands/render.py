@@ -184,10 +184,11 @@ def _run_one(args: argparse.Namespace) -> int:
             args.width = settings.width
     width, height = picture_size(settings, args.width, args.height)
     PixelGrid(width, height, (settings.film_width_mm, settings.film_height_mm))  # before the slow make_camera
-    camera = make_camera(args.camera, shot_of(settings, args, scene.aperture))
+    progress = Progress(quiet=args.quiet)
+    camera = make_camera(args.camera, shot_of(settings, args, scene.aperture), progress)
     for note in (*camera.settings.get("notes", ()), *_pixel_notes(camera, width)):
         warn(note)
-    with Stopping() as stopping, Progress(quiet=args.quiet).stage(f"render {scene.name}, {camera.name}") as report:
+    with Stopping() as stopping, progress.stage(f"render {scene.name}, {camera.name}") as report:
         result = render(
             scene, camera, width=width, height=height, samples=args.samples, seed=args.seed,
             threads=args.threads, max_depth=args.max_depth, film=film, progress=report,
