@@ -7,8 +7,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from neurolens.base.errors import InputError
 from neurolens.commands.render_files import Files
 
@@ -119,6 +117,8 @@ def _track(text: str) -> tuple[str, list[tuple[int, list[float]]]]:
 
 def _at(name: str, keys: Sequence[tuple[int, list[float]]], frame: int) -> float | tuple[float, ...]:
     """The value of a quantity at a frame."""
+    import numpy as np
+
     frames, measures = [k for k, _ in keys], np.transpose([m for _, m in keys])
     found = tuple(_QUANTITIES[name].back(float(np.interp(frame, frames, row))) for row in measures)
     return found if len(found) > 1 else found[0]
