@@ -49,8 +49,8 @@ class TriangleSet:
     normals: NDArray[np.float64] | None = None
 
 
-def read_mesh(scene: Path, field: str, settings: MeshSettings) -> TriangleSet:
-    """Triangles in scene coordinates, none degenerate.
+def read_mesh(scene: Path, field: str, settings: MeshSettings, part: TriangleSet | None = None) -> TriangleSet:
+    """Triangles in scene coordinates, none degenerate; `part`: those of a file that has been read.
 
     Warns:
         NeurolensWarning: triangles of a file without area, which are left out.
@@ -59,7 +59,9 @@ def read_mesh(scene: Path, field: str, settings: MeshSettings) -> TriangleSet:
         InputError: names the scene file, the field and what is wrong: a file that is missing, too large or broken,
             numbers that are not finite, a face with a vertex that does not exist or without an area.
     """
-    if settings.file is not None:
+    if part is not None:
+        mesh = part
+    elif settings.file is not None:
         mesh = read_file(scene, f"{field}.file", scene.parent / settings.file)
     else:
         vertices = np.array(settings.vertices_m, np.float64).reshape(-1, 3)

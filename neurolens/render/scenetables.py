@@ -203,13 +203,15 @@ class Room(Box):
 class MeshSettings(Checked):
     """Triangles: `vertices_m` and `faces` (counted from 0), or an OBJ or PLY `file` beside the scene file.
 
+    Without `material` an OBJ file has its own: diffuse, with the colours (linear) and pictures of its MTL files.
+
     Mapped by `matrix` (three rows of four: x, y, z and what is added in m), scaled (by one number, or along x, y, z),
     turned about y, then moved; triangles without area in a file are left out with a warning. `smooth` interpolates
     vertex normals, those of the file or else the mean of the triangles around; left out, those of the file where it has
     them; false leaves the triangles flat.
     """
 
-    material: str
+    material: str | None = None
     file: Path | None = None
     vertices_m: tuple[Vector, ...] | None = None
     faces: tuple[tuple[int, int, int], ...] | None = None
