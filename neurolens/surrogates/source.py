@@ -48,12 +48,12 @@ _WORDS = """
     alignas alignof and and_eq asm auto bitand bitor bool break case catch char char8_t char16_t char32_t class co_await
     co_return co_yield compl concept const const_cast consteval constexpr constinit continue decltype default delete do
     double dynamic_cast else enum explicit export extern false float for friend goto if inline int long mutable
-    namespace new noexcept not not_eq nullptr operator or or_eq private protected public register reinterpret_cast requires
-    restrict return short signed sizeof static static_assert static_cast struct switch template this thread_local throw
-    true try typedef typeid typename typeof union unsigned using virtual void volatile wchar_t while xor xor_eq
-    active attribute buffer cast centroid coherent common discard external filter fixed flat half highp in inout input
-    interface invariant layout lowp mediump noinline noperspective out output partition patch precise precision readonly
-    resource sample sampler shared smooth subroutine superp uniform varying writeonly
+    namespace new noexcept not not_eq nullptr operator or or_eq private protected public register reinterpret_cast
+    requires restrict return short signed sizeof static static_assert static_cast struct switch template this
+    thread_local throw true try typedef typeid typename typeof union unsigned using virtual void volatile wchar_t while
+    xor xor_eq active attribute buffer cast centroid coherent common discard external filter fixed flat half highp in
+    inout input interface invariant layout lowp mediump noinline noperspective out output partition patch precise
+    precision readonly resource sample sampler shared smooth subroutine superp uniform varying writeonly
     abs all any clamp cross distance div dot equal fract inverse length main max min mix mod normalize outer reflect
     refract round sign step texture transpose radians degrees isnan isinf
     size_t ptrdiff_t max_align_t offsetof linux unix errno signal
