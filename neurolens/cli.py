@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -15,11 +16,12 @@ from typing import Any
 
 from neurolens import __version__
 from neurolens.base.errors import NeurolensError, NeurolensWarning
-from neurolens.commands.arguments import Parser
+from neurolens.base.signals import handled
+from neurolens.commands.arguments import Parser, more_glasses
 
 # Packages of the extra that a base install lacks.
 _TRAIN_PACKAGES = {"torch", "sklearn", "onnx", "matplotlib", "flip_evaluator", "mpmath"}
-_INTERRUPTED, _BROKEN_PIPE = 130, 141  # 128 plus the signal's number, as shells report it
+_BROKEN_PIPE = 141  # 128 plus the signal's number, as shells report it
 
 _DESCRIPTION = "Any lens prescription as a fast camera model with a measured error."
 _EPILOG = """\
@@ -31,7 +33,7 @@ examples:
   neurolens export models/NAME.onnx --to c -o lens.h
   neurolens render experiments/scenes/room.toml --camera models/NAME.onnx -o room.exr
 
-exit codes: 0 done, 1 a promise of a model does not hold, 2 bad input, 130 interrupted.
+exit codes: 0 done, 1 a model breaks a promise or none has the error asked for, 2 bad input, 130 interrupted.
 Help of a command: neurolens COMMAND --help"""
 
 
@@ -58,7 +60,7 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_
     args = argparse.Namespace(kept="nothing was done")
     try:
         args = build().parse_args(argv)
-        with _plain_warnings(quiet=getattr(args, "quiet", False)):
+        with handled(_interrupt), _plain_warnings(quiet=getattr(args, "quiet", False)), more_glasses(args):
             code: int = args.run(args)
         sys.stdout.flush()
         return code
@@ -77,9 +79,13 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_
         # The error of a full disk names no file.
         place = "" if error.filename is None else f"{error.filename}: "
         return _fail(f"{place}{error.strerror or error}")
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         print(f"\nneurolens: interrupted; {args.kept}", file=sys.stderr)
-        return _INTERRUPTED
+        return 128 + (error.args[0] if error.args else signal.SIGINT)
+
+
+def _interrupt(number: int) -> None:
+    raise KeyboardInterrupt(number)
 
 
 def _fail(message: str) -> int:

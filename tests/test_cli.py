@@ -6,6 +6,7 @@ import errno
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -250,6 +251,44 @@ def test_an_interrupt_says_what_is_kept(
     assert main(["render", str(scene), "--camera", "thin", "-o", str(tmp_path / "a.exr"), "--quiet"]) == 130
     assert "no picture was written" in capsys.readouterr().err
     assert not list(tmp_path.glob("*.exr"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_what_ends_a_training_says_what_is_kept(
+    number: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a handler SIGTERM and SIGHUP would end this process."""
+    before = signal.signal(number, signal.SIG_DFL)
+    monkeypatch.setattr("neurolens.evaluate.train.run_experiment", lambda *_, **__: signal.raise_signal(number))
+    try:
+        code = main(["train", "--lens", str(GAUSS), "--out", str(tmp_path / "run"), "--quiet"])
+    finally:
+        signal.signal(number, before)
+    assert code == 128 + number
+    assert "interrupted; fitted models are kept in the run folder" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="no terminals here")
+def test_what_is_said_after_a_terminal_was_closed_goes_nowhere() -> None:
+    ours, theirs = os.openpty()
+    code = (
+        "import fcntl, sys, termios, time\n"
+        "from neurolens.base.signals import handled\n"
+        "asked = []\n"
+        "with handled(asked.append):\n"
+        "    fcntl.ioctl(1, termios.TIOCSCTTY, 0)\n"
+        "    print('ready', flush=True)\n"
+        "    while not asked: time.sleep(0.01)\n"
+        "print('saved', file=sys.stderr, flush=True)\n"
+        "sys.exit(128 + asked[0])\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True, cwd=ROOT
+    )
+    os.close(theirs)
+    assert os.read(ours, 100).startswith(b"ready")
+    os.close(ours)
+    assert process.wait(60) == 128 + signal.SIGHUP
 
 
 @pytest.mark.parametrize("begin", ["from neurolens.cli import main; main()", "import neurolens.__main__"])

@@ -60,7 +60,7 @@ def wait(condition: Any) -> None:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="workers are forked on Linux")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
 def test_a_signal_in_mid_render_loses_nothing(
     number: int, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -105,6 +105,24 @@ def test_a_signal_in_mid_render_loses_nothing(
     one, other = read_layers(out), read_layers(tmp_path / "b.exr")
     assert sorted(one) == ["blocked", "depth", "samples", "variance"]
     assert all(np.array_equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="workers are forked on Linux")
+def test_workers_end_with_a_killed_command_whatever_they_do(scene: Path, tmp_path: Path) -> None:
+    """A killed parent can ask nobody to stop, and these workers never come to the end of a tile."""
+    code = (
+        "import sys, time\n"
+        "from neurolens.cli import main\n"
+        "from neurolens.render.job import Job\n"
+        "Job.render_tile = lambda *_: time.sleep(600)\n"
+        "main(['render', sys.argv[1], '--camera', 'thin', '-o', 'a.exr', '--quiet'])\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code, str(scene)], cwd=tmp_path, start_new_session=True)
+    wait(lambda: len(children(process)) == 2 or process.poll() is not None)
+    workers = children(process)
+    process.kill()
+    process.wait()
+    wait(lambda: not any(map(alive, workers)))
 
 
 def test_layers_are_chosen_and_explained(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

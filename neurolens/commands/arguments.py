@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -114,6 +115,7 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
 
 def add_lens_state(parser: argparse.ArgumentParser, *, efl: str, f_number: str, focus: str = "inf") -> None:
     """Add --efl, --field, --zoom, --f-number, --focus, --focusing and the stop's shape; texts describe defaults."""
+    add_glass(parser)
     group = parser.add_argument_group("state of the lens")
     size = group.add_mutually_exclusive_group()
     size.add_argument(
@@ -240,6 +242,24 @@ def lens_path(name: str | Path, command: str) -> Path:
     if (folder / f"{path}.toml").is_file():
         return folder / f"{path}.toml"
     raise InputError(f"neurolens {command}", "LENS", str(name), f"a lens file, or a name in {folder}")
+
+
+def add_glass(parser: argparse._ActionsContainer) -> None:
+    """Add --glass, for `more_glasses`."""
+    parser.add_argument(
+        "--glass", metavar="FILE.agf", dest="glass_files", type=Path, action="append", default=[],
+        help="glass catalogue of Zemax, whose glasses come before those that ship (repeatable)",
+    )  # fmt: skip
+
+
+def more_glasses(args: argparse.Namespace) -> AbstractContextManager[None]:
+    """A block in which the catalogues of --glass are known; without any, nothing is imported."""
+    files = getattr(args, "glass_files", ())
+    if not files:
+        return nullcontext()
+    from neurolens.readers import agf
+
+    return agf.more_glasses(files)
 
 
 def check_folder(path: Path, option: str) -> None:

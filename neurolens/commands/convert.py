@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_path
-from neurolens.commands.arguments import add_json, between, check_folder, check_suffix, positive
+from neurolens.commands.arguments import add_glass, add_json, between, check_folder, check_suffix, positive
 from neurolens.commands.output import answer, number
 
 if TYPE_CHECKING:
@@ -58,6 +58,7 @@ def add_parser(subparsers: Any) -> None:
         "--gap-before", action="store_true", help="plain table: thickness is that in front of each surface (Kolb 1995)"
     )
     group.add_argument("--semi-diameters", action="store_true", help="plain table: the last column holds rim radii")
+    add_glass(parser)
     add_json(parser)
     parser.set_defaults(run=run, kept="only a finished lens file is written")
 

@@ -8,7 +8,7 @@ import re
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
-from neurolens.commands.arguments import add_json
+from neurolens.commands.arguments import add_glass, add_json
 from neurolens.commands.output import answer, number, table
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ def add_parser(subparsers: Any) -> None:
         "glass", help="look glasses up by name or code", description=_DESCRIPTION, epilog=_EPILOG
     )
     parser.add_argument("name", metavar="NAME", nargs="+", help='"N-BK7", "Schott:N-BK7", or a code such as 517642')
+    add_glass(parser)
     add_json(parser)
     parser.set_defaults(run=run, kept="nothing is written")
 

@@ -51,7 +51,7 @@ The same seed gives the same picture for any number of threads; all cameras shar
 random numbers. A model (.onnx), the thin lens and the points need no torch; a lens file
 (.toml) does (extra "train").
 
-The preview is updated during the render. Ctrl-C (and SIGTERM) writes the picture so far; the same
+The preview is updated during the render. Ctrl-C (SIGTERM, SIGHUP) writes the picture so far; the same
 command then resumes from OUT.exr.part and ends with the same picture, bit for bit."""
 _EPILOG = """\
 examples:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
-import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import check_writable
 from neurolens.base.progress import duration
+from neurolens.base.signals import handled
 from neurolens.commands.arguments import check_folder, check_suffix, positive
 from neurolens.evaluate.records import plain
 
@@ -79,35 +79,30 @@ class Files:
 
 
 class Stopping:
-    """Inside the block, Ctrl-C and SIGTERM first request a stop; a second signal takes its usual effect.
+    """Inside the block, Ctrl-C, SIGTERM and SIGHUP first request a stop; a second signal takes its usual effect.
 
     `timeout` and others send a signal twice at once, to the process and to its group: that counts as one.
     """
 
     def __init__(self) -> None:
+        self._handled = handled(self._asked)
         self._before: dict[int, Any] = {}
         self._number: int | None = None
         self._at = 0.0
 
     def __enter__(self) -> Stopping:
-        if threading.current_thread() is threading.main_thread():  # others cannot handle signals
-            for number in (signal.SIGINT, signal.SIGTERM):
-                before = signal.getsignal(number)
-                if before not in (signal.SIG_IGN, None):
-                    self._before[number] = before
-                    signal.signal(number, self._asked)
+        self._before = self._handled.__enter__()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> bool:
-        for number, before in self._before.items():
-            signal.signal(number, before)
+        self._handled.__exit__(None, None, None)
         return kind is Unfinished
 
     def __call__(self) -> bool:
         """Whether a stop was requested."""
         return self._number is not None
 
-    def _asked(self, number: int, _: object) -> None:
+    def _asked(self, number: int) -> None:
         if self._number is None:
             self._number, self._at = number, time.monotonic()
         elif time.monotonic() > self._at + _AT_ONCE_S:

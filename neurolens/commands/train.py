@@ -10,7 +10,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_json, check_run_folder, lens_path
+from neurolens.commands.arguments import add_glass, add_json, check_run_folder, lens_path, positive, whole
 from neurolens.commands.output import answer, number, table
 
 _DESCRIPTION = """\
@@ -21,8 +21,9 @@ Needs the extra "train" (torch).
 Without an experiment file, --lens fits a polynomial and a network to that lens in its default state:
 full aperture, its whole lit film, all wavelengths from 380 to 780 nm (less where its glasses are stated
 for less; one where no dispersion is known), focus from infinity to 14 focal lengths (further where the
-lens is too long for that). A file of another program (Zemax, CODE V, ...) is read as "neurolens convert"
-reads it; where that lacks something, convert first, with its options.
+lens is too long for that). It takes a minute; --target-um asks for an error instead. A file of another
+program (Zemax, CODE V, ...) is read as "neurolens convert" reads it; where that lacks something, convert
+first, with its options.
 
 An interrupted run resumes where it stopped: existing models of the same settings are kept."""
 _EPILOG = """\
@@ -30,6 +31,7 @@ examples:
   neurolens train experiments/quickstart.toml
   neurolens train experiments/quickstart.toml --out runs/try --set render.samples=4 --set pairs.seed=2
   neurolens train --lens lenses/cooke_triplet_50.toml
+  neurolens train --lens lenses/cooke_triplet_50.toml --target-px 0.1 --no-race
   neurolens train --lens lenses/nikon_zoom_70_200.toml --zoom-range --out runs/zoom
   neurolens train --lens lenses/brendel_tessar_100.toml --out runs/tessar \\
       --set lens.efl_mm=50
@@ -63,6 +65,23 @@ def add_parser(subparsers: Any) -> None:
         "--internal-focus", action="store_true",
         help="of --lens: one model of internal focus, infinity to the near limit (input \"state\", in 1/m)",
     )  # fmt: skip
+    asked = parser.add_mutually_exclusive_group()
+    asked.add_argument(
+        "--target-um", metavar="X", type=positive("micrometres"),
+        help="of --lens: the fastest model whose film-equivalent RMS on rays held out is within X micrometres: from 12 "
+        "coefficients to a network of 2 x 32 units models are fitted until one is; exit code 1 if none is",
+    )  # fmt: skip
+    asked.add_argument(
+        "--target-px", metavar="X", type=positive("pixels"),
+        help="the same in pixels, of which --pixels-across make the width of the 3:2 frame inscribed in the film "
+        "circle (36 mm for a radius of 21.6 mm: 1 pixel of 4000 is 9 um)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--pixels-across", metavar="N", type=whole(1, 10**6), default=4000,
+        help="width of the picture of --target-px (default: 4000)",
+    )  # fmt: skip
+    parser.add_argument("--no-race", action="store_true", help="time no model")
+    add_glass(parser)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="fitted models are kept in the run folder; the same command resumes")
 
@@ -74,18 +93,23 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.evaluate.train import run_experiment
 
     states = ['lens.zoom="range"'] * args.zoom_range + ['lens.focusing="internal"'] * args.internal_focus
-    if states and args.lens is None:
-        raise InputError("neurolens train", "--zoom-range, --internal-focus", "(without --lens)", "--lens FILE")
+    asked = [] if args.target_um is None else [f"target.um={args.target_um!r}"]
+    if args.target_px is not None:
+        asked = [f"target.px={args.target_px!r}", f"target.pixels_across={args.pixels_across}"]
+    if (states or asked) and args.lens is None:
+        given = "--target-um, --target-px" if asked else "--zoom-range, --internal-focus"
+        raise InputError("neurolens train", given, "(without --lens)", "--lens FILE")
+    args.overrides = [*states, *asked, *["evaluation.rounds=0"] * args.no_race, *args.overrides]
     if args.lens is not None:
         args.lens = lens_path(args.lens, "train")
-        args.overrides = [*states, *args.overrides]
         experiment = default_experiment(_own_format(args.lens, folder), args.overrides)
     else:
         experiment = read_experiment(args.experiment, args.overrides)
     progress = Progress(quiet=args.quiet)
     results = run_experiment(experiment, folder, progress=progress, command=_command(args))
     data = {"folder": str(folder), "report": str(folder / "report.html"), **results}
-    return answer(args, data, lambda: _text(results, folder))
+    answer(args, data, lambda: _text(results, folder))
+    return 0 if (results.get("target") or {"met": True})["met"] else 1
 
 
 def _run_folder(args: argparse.Namespace) -> Path:
@@ -125,9 +149,14 @@ def _command(args: argparse.Namespace) -> str:
 
 
 def _text(results: Mapping[str, Any], folder: Path) -> str:
-    header = ("model", "rms um", "p99 um", "angle rms deg", "false pass", "false block", "ns/ray", "x exact", "fit s")
+    header = ("model", "rms um", "p99 um", "angle rms deg", "false pass", "false block", "ns/ray", "C ns/ray", "fit s")
     rows = [_row(model) for model in results.get("models", ())]
     parts = [str(results.get("title") or folder.name), table(header, rows)]
+    target = results.get("target")
+    if target:
+        reached = "reached" if target["met"] else "no model tried reaches it, the closest is"
+        said = f"Asked for {target['within_um']:.3g} um RMS"
+        parts.append(f"{said}: {reached} {target['model']}, {number(target['rms_um'], 3)} um.")
     parts += [f"Warning: {text}" for text in results.get("warnings", ())]
     places = [f"  {folder / 'report.html'}  everything on one page", f"  {folder / 'models'}  the ONNX models"]
     if (folder / "pictures").is_dir():
@@ -139,6 +168,6 @@ def _text(results: Mapping[str, Any], folder: Path) -> str:
 def _row(model: Mapping[str, Any]) -> tuple[str, ...]:
     errors = (number(model.get(key), 3) for key in ("rms_um", "p99_um", "direction_rms_deg"))
     shares = (model.get(key) for key in ("false_pass", "false_block"))
-    times = ((model.get("ns_per_ray") or {}).get("min"), model.get("speedup_over_compiled"), model.get("fit_s"))
+    times = (*((model.get(key) or {}).get("min") for key in ("ns_per_ray", "fused_ns_per_ray")), model.get("fit_s"))
     percent = ("-" if share is None else f"{100 * share:.2f}%" for share in shares)
     return (str(model.get("name")), *errors, *percent, *(number(value, 3) for value in times))

@@ -26,10 +26,12 @@ from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, race
 from neurolens.graph.c import Signature, write_blocks, write_c
 from neurolens.graph.compiler import FLAGS, compile_c, find_compiler
 from neurolens.graph.program import Program
+from neurolens.graph.scalars import lower
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import Traced, trace
+from neurolens.optics.tracegraph import exact_graph
 from neurolens.surrogates.assemble import ALL, Parts
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.model import LensModel
@@ -37,7 +39,8 @@ from neurolens.surrogates.source import FREE, fused_program
 from neurolens.surrogates.specialise import Fix
 from neurolens.surrogates.stored import load_fitted
 
-EXACT = ("exact eager", "exact compiled")  # names of `exact_candidates` of a whole camera
+# Names of `exact_candidates` of a whole camera, and of `exact_c_candidate`.
+EXACT = ("exact eager", "exact compiled", "exact C")
 EAGER_BATCHES = (8192, 16384, 32768)
 COMPILED_BATCHES = (16384,)  # each further size costs half a minute of compilation
 
@@ -85,6 +88,12 @@ def exact_candidates(
 
     found = [Candidate(f"{label} eager", lambda rays: partial(run, *arguments(rays)), EAGER_BATCHES)]
     return [*found, Candidate(f"{label} compiled", faster, COMPILED_BATCHES)] if compiled else found
+
+
+def exact_c_candidate(lens: Lens, domain: Domain) -> Candidate:
+    """The exact trace as C, by the same writer and flags as the models: what a model as C is to be held against."""
+    graph = exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm)
+    return program_candidate(EXACT[2], lower(graph), domain)
 
 
 def exact_records(timed: Race) -> list[ExactRecord]:

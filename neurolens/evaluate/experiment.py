@@ -14,6 +14,7 @@ from typing import Any, Literal
 from neurolens.base.config import apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
+from neurolens.evaluate.rays import PIXELS_ACROSS, frame_width_mm
 from neurolens.optics.glass import glass_of
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
@@ -135,8 +136,38 @@ def wavelengths_nm(lens: Lens) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
+class TargetChoice:
+    """An error asked for, of which models are fitted in turn until one has it: film-equivalent RMS on rays held out.
+
+    Attributes:
+        um, px: the error in micrometres, or in pixels of a picture `pixels_across` wide on the 3:2 frame inscribed in
+            the film circle of the models' domain (36 mm for a radius of 21.6 mm). One of the two.
+    """
+
+    um: float | None = None
+    px: float | None = None
+    pixels_across: int = PIXELS_ACROSS
+
+    def __post_init__(self) -> None:
+        for name, value in (("um", self.um), ("px", self.px), ("pixels_across", self.pixels_across)):
+            if value is not None and not 0 < value < math.inf:
+                raise InputError("settings", f"target.{name}", value, "a number above 0")
+        if (self.um is None) == (self.px is None):
+            raise InputError("settings", "target", "(both or neither)", "um or px")
+
+    def within_um(self, film_radius_mm: float) -> float:
+        """The error in micrometres on a film of this radius."""
+        pitch_um = 1000 * frame_width_mm(film_radius_mm) / self.pixels_across
+        return self.um if self.um is not None else (self.px or 0.0) * pitch_um
+
+
+@dataclass(frozen=True)
 class EvaluationChoice:
-    """Rays for false passes and blocks; rounds and threads of the race for speed; whether the compiled tracer runs."""
+    """Rays for false passes and blocks; rounds (0: no race) and threads of the race for speed.
+
+    Attributes:
+        compile_exact: whether the exact tracer compiled by torch runs, too: half a minute of compiling.
+    """
 
     vignetting_rays: int = 200_000
     rounds: int = 15
@@ -179,7 +210,10 @@ class SceneDomainChoice:
 
 @dataclass(frozen=True)
 class Experiment:
-    """One resolved run: lens, domain, ray pairs, models, measurements and renders."""
+    """One resolved run: lens, domain, ray pairs, models, measurements and renders.
+
+    Models are fitted in their order, with a `target` only until one has its error.
+    """
 
     title: str
     lens: LensChoice
@@ -189,6 +223,7 @@ class Experiment:
     evaluation: EvaluationChoice = field(default_factory=EvaluationChoice)
     render: RenderChoice = field(default_factory=RenderChoice)
     scene_domain: SceneDomainChoice | None = None
+    target: TargetChoice | None = None
     save_pairs: bool = False
 
     def __post_init__(self) -> None:
@@ -269,11 +304,24 @@ def keep_inputs(experiment: Experiment, folder: Path) -> dict[str, Any]:
     return to_dict(resolved)
 
 
+# Models in order of their time as C, tried for an error asked for.
+_LADDER: tuple[dict[str, Any], ...] = (
+    *({"method": "ols", "terms": terms} for terms in (12, 20, 28, 40, 64, 100)),
+    {"method": "mlp", "units": 16},
+    {"method": "mlp", "units": 32, "steps": 150},
+)
+
+
 def default_experiment(lens_file: str | Path, overrides: Sequence[str] = ()) -> Experiment:
-    """The experiment of `neurolens train --lens FILE`: a polynomial and a network, no renders."""
+    """The experiment of `neurolens train --lens FILE`: a polynomial and a network, no renders, a minute in all.
+
+    With a target among the overrides: as many of a ladder of models, the fastest first, as it takes.
+    """
+    asked = any(text.partition("=")[0].strip().partition(".")[0] == "target" for text in overrides)
     tables = {
         "title": f"Models of {Path(lens_file).stem}",
         "lens": {"file": str(lens_file)},
-        "model": [{"method": "ols", "terms": 64}, {"method": "mlp", "units": 16, "layers": 2}],
+        "model": list(_LADDER) if asked else [{"method": "ols", "terms": 64}, {"method": "mlp", "units": 16}],
+        "evaluation": {"rounds": 8, "compile_exact": False},
     }
     return from_dict(Experiment, apply_overrides(tables, overrides), "--set")

@@ -19,10 +19,10 @@ from torch import Tensor
 
 from neurolens import __version__
 from neurolens.base import status as st
-from neurolens.base.files import atomic_write_text, fingerprint_of, sha256_of
+from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of, sha256_of
 from neurolens.base.progress import Report
 from neurolens.cameras.model import OnnxLens, load_model
-from neurolens.evaluate.rays import PIXELS_ACROSS, EachRay, Predict, RayErrors, each_ray, ray_errors
+from neurolens.evaluate.rays import PIXELS_ACROSS, EachRay, Predict, RayErrors, each_ray
 from neurolens.evaluate.vignetting import NEAR_RIM, ZONES, deciding_rim_ratio, false_shares
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
@@ -30,7 +30,7 @@ from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model
 from neurolens.surrogates.fits import checkpoint
-from neurolens.surrogates.model import LensModel, Prediction
+from neurolens.surrogates.model import Prediction
 from neurolens.surrogates.pairs import PairSet, PairSettings, join_pairs, make_pairs, trace_pairs
 
 # Whole stops closed, by the name of the state.
@@ -279,15 +279,12 @@ def fit_and_measure(
     if known is not None:
         return Measured(settings, file, known)
     training = folder / f"{settings.label}.training.npz"  # left by a killed run
-
-    def error_um(model: LensModel) -> float:
-        return ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict).rms_um
-
-    model = fit_model(prepared, settings, report, checkpoint=training, error_um=error_um)
-    export_onnx(model, file, errors={})
+    model = fit_model(prepared, settings, report, checkpoint=training)
     on = rays() if rays else shared_rays(prepared, vignetting_rays)
-    errors = measure_on(on, load_model(file))
-    export_onnx(model, file, errors=errors)
+    with atomic_path(file) as measured:  # a file without its errors never has the final name
+        export_onnx(model, measured, errors={})
+        errors = measure_on(on, load_model(measured))
+        export_onnx(model, measured, errors=errors)
     record: dict[str, Any] = {
         "name": settings.label,
         "family": settings.family,

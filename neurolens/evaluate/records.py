@@ -16,6 +16,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 
 SCHEMA_VERSION = 1
+CLOSE_UM = 2.0  # a model within this RMS error counts as close: a quarter of a pixel of 36 mm at 4000 across
 
 
 class Timing(TypedDict, total=False):
@@ -46,8 +47,10 @@ class Results:
         models: name, family (of `plots.FAMILIES`), variables (raw or invariants), file relative to the run folder,
             `measure.CARD_KEYS`, stopped_down and zones as of `measure.Findings`, poor (errors that are visible in a
             picture), coefficients_per_vector (A and B terms both count; of a raw basis all scalars of the vector),
-            parameters (of the whole model, rims included), bytes, fit_s, load_s, ns_per_ray (`Timing`),
-            speedup_over_compiled (minima of the same run), break_even_rays, note.
+            parameters (of the whole model, rims included), bytes, fit_s, load_s, ns_per_ray (`Timing`) in onnxruntime,
+            speedup_over_compiled (minima of the same run), fused_ns_per_ray as C, fused_speedup and break_even_rays
+            (of it, against the exact lens as C), note.
+        target: of `target_record`, where an error was asked for.
         settings: the resolved configuration.
         exact: exact tracers on the clock.
         cameras: renders of a scene through a camera: name, scene, render_s, camera_s (inside the camera) and its share,
@@ -67,6 +70,7 @@ class Results:
     domain: dict[str, Any] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
     models: Sequence[Mapping[str, Any]] = ()
+    target: dict[str, Any] | None = None
     exact: Sequence[ExactRecord] = ()
     cameras: Sequence[dict[str, Any]] = ()
     images: Sequence[dict[str, Any]] = ()
@@ -105,7 +109,7 @@ def plain(value: Any) -> Any:
 def break_even_rays(
     fit_s: float | None, load_s: float | None, ns_exact: float | None, ns_model: float | None
 ) -> float | None:
-    """Rays after which fitting and loading have paid for themselves against the compiled exact tracer.
+    """Rays after which fitting and loading have paid for themselves against an exact tracer.
 
     (fit_s + load_s) seconds / (ns_exact - ns_model) nanoseconds per ray, both timed in one run with the same threads.
 
@@ -121,6 +125,44 @@ def break_even_rays(
     if fit_s is None or load_s is None or ns_exact is None or ns_model is None or ns_model >= ns_exact:
         return None
     return (fit_s + load_s) * 1e9 / (ns_exact - ns_model)
+
+
+def reaches(record: Mapping[str, Any], within_um: float) -> bool:
+    """Whether a model's film-equivalent RMS is within an error."""
+    found = record.get("rms_um")
+    return found is not None and bool(found <= within_um)
+
+
+def target_record(models: Sequence[Mapping[str, Any]], within_um: float) -> dict[str, Any]:
+    """The error asked for, whether it was met, and the name and error of the closest model that was tried."""
+    best = min(models, key=_error)
+    return {
+        "within_um": within_um,
+        "met": reaches(best, within_um),
+        "model": best["name"],
+        "rms_um": best.get("rms_um"),
+    }
+
+
+def _error(record: Mapping[str, Any]) -> tuple[float, float]:
+    """Micrometres, where all rays lie beyond 60 degrees the angle."""
+    found = (record.get("rms_um"), record.get("direction_rms_deg"))
+    return tuple(math.inf if v is None else v for v in found)  # type: ignore[return-value]
+
+
+def to_use(models: Sequence[Mapping[str, Any]], within_um: float = CLOSE_UM) -> Mapping[str, Any] | None:
+    """The fastest of the models within an error and not poor, as C where that was timed; if none is, the closest.
+
+    Ideal lenses (thin, thick) are left out; None where nothing else is there.
+    """
+    fits = [m for m in models if m.get("family") != "paraxial"]
+    close = [m for m in fits if reaches(m, within_um) and not m.get("poor")]
+
+    def cost(m: Mapping[str, Any]) -> tuple[float, float]:
+        timing = m.get("fused_ns_per_ray") or m.get("ns_per_ray") or {}
+        return timing.get("min", math.inf), m.get("bytes") or math.inf
+
+    return min(close, key=cost) if close else min(fits, key=_error, default=None)
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:

@@ -18,7 +18,15 @@ from neurolens.analysis.layout import lens_layout
 from neurolens.base.errors import NeurolensWarning
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.candidates import EXACT, exact_candidates, exact_records, ideal_cameras, model_candidate
+from neurolens.evaluate.candidates import (
+    EXACT,
+    exact_c_candidate,
+    exact_candidates,
+    exact_records,
+    fused_candidate,
+    ideal_cameras,
+    model_candidate,
+)
 from neurolens.evaluate.describe import layout_profile
 from neurolens.evaluate.experiment import Experiment, keep_inputs
 from neurolens.evaluate.figures import illumination_plot
@@ -26,7 +34,7 @@ from neurolens.evaluate.image import DEFAULT
 from neurolens.evaluate.measure import FRESH, MORE, Measured, fit_and_measure, onnx_predictor, shared_rays, what_is_poor
 from neurolens.evaluate.plots import error_against_coefficients_plot, pareto_plot
 from neurolens.evaluate.rays import pixel_um, pupil_disc_share
-from neurolens.evaluate.records import Results, write_results
+from neurolens.evaluate.records import Results, reaches, target_record, write_results
 from neurolens.evaluate.report import write_report
 from neurolens.evaluate.scenes import Pictures, domain_facts, render_all, scene_gain
 from neurolens.evaluate.speed import Race, race
@@ -76,12 +84,16 @@ def run_experiment(
             if experiment.save_pairs:
                 save_pairs(pairs, folder / "pairs.npz")
             prepared = prepare(pairs)
-        measured, count = [], experiment.evaluation.vignetting_rays
+        count, asked = experiment.evaluation.vignetting_rays, experiment.target
+        within_um = asked.within_um(domain.film_radius_mm) if asked else None
         fresh = functools.cache(lambda: shared_rays(prepared, count))
+        measured = list[Measured]()
         for model in experiment.model:
             with progress.stage(f"fit {model.label}") as report:
                 measured.append(fit_and_measure(prepared, model, models, count, report, fresh))
             _say_what_is_poor(measured[-1])
+            if within_um and reaches(measured[-1].record, within_um):
+                break
         timed = _race(experiment, prepared, measured, progress)
         with progress.stage("illumination"):
             names = experiment.render.models or best_models(measured)
@@ -100,8 +112,9 @@ def run_experiment(
         domain=_describe_domain(lens, pairs),
         settings=settings,
         models=[m.record for m in measured],
+        target=target_record([m.record for m in measured], within_um) if within_um else None,
         exact=exact_records(timed),
-        cameras=[*({"name": n, "ns_per_ray": timed.timing(n)} for n in _IDEAL), *drawn.cameras],
+        cameras=[*({"name": n, "ns_per_ray": timed.timing(n)} for n in _IDEAL if n in timed.ns), *drawn.cameras],
         images=drawn.images,
         image_settings=asdict(DEFAULT) if drawn.images else None,
         domain_gain=gain,
@@ -129,7 +142,7 @@ def _plan(experiment: Experiment) -> dict[str, float]:
     plan: dict[str, float] = {"trace ray pairs": 3}
     for m in experiment.model:
         plan[f"fit {m.label}"] = 0.06 * m.steps * (m.units * m.layers / 32) ** 2.5 if m.method in NETWORKS else 3
-    plan["race for speed"] = 45 if experiment.evaluation.compile_exact else 10
+    plan["race for speed"] = (45 if experiment.evaluation.compile_exact else 5) + 2 * len(experiment.model)
     if experiment.scene_domain is not None:
         plan["fit the scene's domain"] = 5
     if experiment.render.scenes:
@@ -138,19 +151,33 @@ def _plan(experiment: Experiment) -> dict[str, float]:
 
 
 def _race(experiment: Experiment, prepared: Prepared, measured: Sequence[Measured], progress: Progress) -> Race:
-    """Time the exact tracers and all models in one run, and add times, speed-ups and break-even to the records."""
+    """Time the exact tracers and all models in one run, and add times, speed-ups and break-even to the records.
+
+    Models run in onnxruntime and, on one thread and with a compiler, as C; the exact lens eager, as C, and compiled by
+    torch where that is asked for.
+    """
     chosen, lens, domain = experiment.evaluation, prepared.pairs.lens, prepared.pairs.domain
-    candidates = exact_candidates(lens, domain, compiled=chosen.compile_exact)
+    if not chosen.rounds:
+        return Race({}, {}, chosen.threads, 0)
+    with progress.stage("race for speed") as report:
+        candidates = exact_candidates(lens, domain, compiled=chosen.compile_exact)
+        candidates += [exact_c_candidate(lens, domain)] if chosen.threads == 1 else []
+        for m in measured:
+            candidates.append(model_candidate(m.settings.label, load_model(m.file), domain.stop_radius_mm))
+            fused = fused_candidate(f"{m.settings.label} fused", m.file, domain) if chosen.threads == 1 else None
+            candidates += [fused] if fused else []
+        candidates += ideal_cameras(lens, domain)
+        timed = race(candidates, domain, threads=chosen.threads, rounds=chosen.rounds, report=report)
     for m in measured:
-        candidates.append(model_candidate(m.settings.label, load_model(m.file), domain.stop_radius_mm))
-    candidates += ideal_cameras(lens, domain)
-    with progress.stage("race for speed"):
-        timed = race(candidates, domain, threads=chosen.threads, rounds=chosen.rounds)
-    for m in measured:
-        gain = timed.gain(m.settings.label, EXACT[1], m.record["fit_s"], m.record["load_s"])
-        m.record.update(ns_per_ray=gain.ns_per_ray, speedup_over_compiled=gain.speedup)
-        if gain.speedup is not None:
-            m.record["break_even_rays"] = gain.break_even_rays
+        cost = m.record["fit_s"], m.record["load_s"]
+        plain, fused_gain = (
+            timed.gain(f"{m.settings.label}{kind}", exact, *cost)
+            for kind, exact in (("", EXACT[1]), (" fused", EXACT[2]))
+        )
+        m.record.update(ns_per_ray=plain.ns_per_ray, speedup_over_compiled=plain.speedup)
+        m.record.update(fused_ns_per_ray=fused_gain.ns_per_ray, fused_speedup=fused_gain.speedup)
+        if fused_gain.speedup is not None:
+            m.record["break_even_rays"] = fused_gain.break_even_rays
     return timed
 
 
@@ -182,11 +209,12 @@ def _draw(
     records = [m.record for m in measured]
     exact = [timed.record(n) for n in EXACT if n in timed.ns]
     error = "rms_um" if any(r.get("rms_um") for r in records) else "direction_rms_deg"
-    pareto_plot(records, folder / "pareto.png", exact=exact, error=error, title=f"{lens.name}: error against time")
+    if timed.ns:
+        pareto_plot(records, folder / "pareto.png", exact=exact, error=error, title=f"{lens.name}: error against time")
     error_against_coefficients_plot(records, folder / "coefficients.png", error, title=f"{lens.name}: error, size")
     lens_layout(layout_profile(lens, domain), folder / "layout.png")
     texts = [
-        ("pareto", "Error against speed", "Held-out rays, full aperture, with the Pareto front."),
+        *[("pareto", "Error against speed", "Held-out rays, full aperture, with the Pareto front.")] * bool(timed.ns),
         ("coefficients", "Error against coefficients", "Coefficients per vector output, A and B terms both counted."),
         ("layout", "The lens", "Rays of three fields, traced exactly."),
     ]

@@ -14,7 +14,7 @@ from typing import Any
 from neurolens import __version__
 from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing, plain_log_ticks
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_write_text, fingerprint_of
+from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.evaluate import pages
@@ -22,7 +22,7 @@ from neurolens.evaluate.candidates import time_model
 from neurolens.evaluate.check import card_errors, errors_at, random_states
 from neurolens.evaluate.experiment import Experiment, keep_inputs
 from neurolens.evaluate.measure import FRESH, known_record, note_record, seconds_to_load
-from neurolens.evaluate.records import plain
+from neurolens.evaluate.records import plain, reaches, target_record
 from neurolens.modelfile.axes import Axis
 from neurolens.surrogates.export import export_states
 from neurolens.surrogates.fit import ModelSettings
@@ -63,13 +63,14 @@ def fit_and_measure_states(
     if known is not None:
         return known
     model = fit_states(space, settings, lambda done: report(0.6 * done))
-    export_states(model, file)
-    loaded, rows = load_model(file), []
-    for state in random_states(space.axes, states, settings.seed + FRESH):
-        rows.append(errors_at(loaded, space, state, RAYS, settings.seed + FRESH))
-        report(0.6 + 0.4 * len(rows) / states)
-    errors = card_errors(rows, RAYS)
-    export_states(model, file, errors)
+    with atomic_path(file) as measured:  # a file without its errors never has the final name
+        export_states(model, measured)
+        loaded, rows = load_model(measured), []
+        for state in random_states(space.axes, states, settings.seed + FRESH):
+            rows.append(errors_at(loaded, space, state, RAYS, settings.seed + FRESH))
+            report(0.6 + 0.4 * len(rows) / states)
+        errors = card_errors(rows, RAYS)
+        export_states(model, measured, errors)
     core = model.nodes[0].core
     record = {
         "name": settings.label,
@@ -107,11 +108,15 @@ def run_states(experiment: Experiment, folder: Path, *, progress: Progress, comm
         wanted = [m for m in experiment.model if m.method == "ols"]
         if not wanted:
             raise InputError("settings", "model", [m.label for m in experiment.model], 'a model of method "ols"')
-        records = []
+        target, first = experiment.target, space.domain_at(tuple(a.range[0] for a in space.axes))
+        within_um = target.within_um(first.film_radius_mm) if target else None
+        records = list[dict[str, Any]]()
         for m in wanted:
             settings = state_settings(m, experiment.pairs.train, experiment.pairs.seed)
             with progress.stage(f"fit {settings.label}") as report:
                 records.append(fit_and_measure_states(space, settings, models, report=report))
+            if within_um and reaches(records[-1], within_um):
+                break
         left_out = [m.label for m in experiment.model if m not in wanted]
     for record in records:
         record["ns_per_ray"] = time_model(load_model(folder / record["file"]), record["name"], rounds=8)
@@ -123,6 +128,7 @@ def run_states(experiment: Experiment, folder: Path, *, progress: Progress, comm
         "axes": [a.to_dict() for a in space.axes],
         "settings": plain(given),
         "models": records,
+        "target": target_record(records, within_um) if within_um else None,
         "seed": experiment.pairs.seed,
         "started": started.isoformat(timespec="seconds"),
         "wall_s": time.perf_counter() - clock,

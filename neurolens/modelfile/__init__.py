@@ -5,6 +5,7 @@ from __future__ import annotations
 # The metadata entry that holds the card, and the card's own first words.
 CARD_KEY = "neurolens"
 CARD_KIND, CARD_SCHEMA = "neurolens.lens_model", 1
+MAX_CARD = 2**20  # characters; the longest that ships, of a zoom's range, has 64,000
 
 # The entry that holds the coefficients from which the graph was made (`surrogates.stored`).
 MODEL_KEY = "neurolens.coefficients"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import ModelError
-from neurolens.modelfile import CARD_KEY, CARD_KIND, CARD_SCHEMA
+from neurolens.modelfile import CARD_KEY, CARD_KIND, CARD_SCHEMA, MAX_CARD
 from neurolens.modelfile.protobuf import Fields, as_text, fields_of, integers, message, one, text, walk
 from neurolens.modelfile.shapes import BROADCAST, ELEMENTWISE, RAYS, SHAPED, Node, Shape, check_shapes
 
@@ -71,10 +71,12 @@ def card_in(file: Any, metadata: dict[str, str]) -> dict[str, Any]:
     """The card in a file's metadata.
 
     Raises:
-        ModelError: none, one that is not strict JSON, or of another kind or schema.
+        ModelError: none, one of more than `MAX_CARD` characters, that is not strict JSON, or of another kind or schema.
     """
     if CARD_KEY not in metadata:
         raise ModelError(f"{file}: no card: its metadata has no {CARD_KEY!r}, so this is no model made by neurolens")
+    if len(metadata[CARD_KEY]) > MAX_CARD:
+        raise ModelError(f"{file}: card: {len(metadata[CARD_KEY])} characters, expected at most {MAX_CARD}")
     try:
         card = json.loads(metadata[CARD_KEY], parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:

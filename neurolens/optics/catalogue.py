@@ -9,6 +9,7 @@ import difflib
 import json
 import math
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
@@ -125,6 +126,25 @@ ALIASES = {
 }
 
 
+# Glasses of catalogues that a command names (`readers.agf`) by every key that finds them, and what is not read of them.
+_ADDED: dict[str, list[Glass]] = {}
+_REFUSED: dict[str, str] = {}
+
+
+def add(glasses: Iterable[Glass], refused: Mapping[str, str]) -> None:
+    """Put glasses before those of the table until `remove_added`; `refused`: why others are not there, by name."""
+    for glass in glasses:
+        for key in (_key(glass.name), _key(str(glass))):
+            _ADDED.setdefault(key, []).insert(0, glass)
+    _REFUSED.update({_key(name): reason for name, reason in refused.items()})
+
+
+def remove_added() -> None:
+    """Forget what `add` has put in."""
+    _ADDED.clear()
+    _REFUSED.clear()
+
+
 def find(name: str, file: str | Path = "glass catalogue", where: str = "glass") -> Glass:
     """The glass of a name: "N-BK7", or with its maker "Schott:N-BK7", "schott N-BK7", "N-BK7 (SCHOTT)".
 
@@ -139,7 +159,8 @@ def find(name: str, file: str | Path = "glass catalogue", where: str = "glass") 
     """
     glasses = same_name(name)
     if not glasses:
-        raise InputError(file, where, name, f"a glass of the catalogue; {_suggestion(name)}")
+        reason = _REFUSED.get(_key(name)) or _suggestion(name)
+        raise InputError(file, where, name, f"a glass of the catalogue; {reason}")
     return glasses[0]
 
 
@@ -147,12 +168,15 @@ def same_name(name: str) -> tuple[Glass, ...]:
     """Every maker's glass of a name, in the order of `MAKERS`; of one maker only if the name says so; may be empty."""
     maker, key = _split(name)
     found = (_glass(row) for row in _rows_by_key().get(key, ()))
-    return tuple(g for g in found if maker in (None, g.maker))
+    added = dict.fromkeys((*_ADDED.get(_key(name), ()), *_ADDED.get(key, ())))
+    same = (g for g in added if maker is None or maker.upper() == g.maker.upper())
+    return (*same, *(g for g in found if maker in (None, g.maker)))
 
 
 def all_glasses() -> tuple[Glass, ...]:
-    """The whole catalogue, by maker in the order of `MAKERS`."""
-    return tuple(_glass(row) for row in range(len(_table()["glasses"])))
+    """The whole catalogue: what was added, then by maker in the order of `MAKERS`."""
+    added = dict.fromkeys(glass for glasses in _ADDED.values() for glass in glasses)
+    return (*added, *(_glass(row) for row in range(len(_table()["glasses"]))))
 
 
 def nearest(n_d: float, V_d: float, count: int = 3) -> list[Glass]:

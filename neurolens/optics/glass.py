@@ -49,6 +49,22 @@ def glass_of(name: str) -> Glass:
     return found
 
 
+def forget() -> None:
+    """Look every glass up again: the catalogue has changed."""
+    _FOUND.clear()
+
+
+def by_figures(name: str, n_d: float, V_d: float, place: str) -> dict[str, Any]:
+    """Fields of a surface whose glass the catalogue does not know, by its n_d and V_d; the name stays for people.
+
+    Warns:
+        NeurolensWarning: always, with the dispersion taken; `place` is the file and the field.
+    """
+    told = f"glass {name} is not in the catalogue: taken by n_d {n_d:g} and V_d {V_d:g}, n = A + B / lambda^2 (Cauchy)"
+    warnings.warn(f"{place}: {told}, without absorption", NeurolensWarning, stacklevel=3)
+    return {"n_d": n_d, "V_d": V_d, "material": name}
+
+
 def index_of(surface: Surface, wavelength_nm: Any) -> Any:
     """Refractive index of the medium after a surface at a wavelength in nm (number, or tensor of any shape).
 

@@ -16,10 +16,12 @@ The format, complete; keys marked optional may be left out:
 
     # From the scene to the film, one row per surface, numbered from 0.
     # radius_mm: positive when the centre of curvature lies towards the film, inf for a plane.
-    # thickness_mm: to the next surface; the last one to the film. diameter_mm: full clear diameter.
+    # thickness_mm: to the next surface; the last one to the film. diameter_mm: full clear diameter; with
+    # rims = "derived" it may be left out, and follows from f-number and field (see `rims`).
     # n_d, V_d: of the glass after the surface; without n_d it is air. V_d may be left out where unknown: the index
     # is then constant. glass: name in the catalogue, whose dispersion then rules over n_d and V_d (which may be left
-    # out). material: name of the glass in the source, for people only. stop = true: the aperture stop, one row.
+    # out; they are needed where the catalogue does not know the name). material: name of the glass in the source, for
+    # people only. stop = true: the aperture stop, one row.
     # Optional: conic (Schwarzschild's constant K, 0 a sphere, -1 a paraboloid), asphere (power = coefficient:
     # sag = conic + sum A_p r^p, mm), cylinder = "x" or "y" (the axis along which it is curved), absorption_per_mm
     # (Napierian, of the medium after the surface), coating (a design such as "quarter-wave 550", or the name of one of
@@ -62,7 +64,7 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.tomlfile import read_toml, reject_unknown
 from neurolens.optics import catalogue, designs
 from neurolens.optics.apertures import Aperture
-from neurolens.optics.glass import check_against_table
+from neurolens.optics.glass import by_figures, check_against_table
 from neurolens.optics.prescription import Coating, Configuration, Lens, Surface
 from neurolens.optics.sag import check_clearance
 
@@ -197,7 +199,8 @@ def read_lens(path: str | Path) -> Lens:
         stated_efl_mm=table.optional("efl_mm"),
         stated_efl_x_mm=table.optional("efl_x_mm"),
     )
-    check_clearance(surfaces, file)
+    lens = _with_rims(lens, table)
+    check_clearance(lens.surfaces, file)
     for c in lens.configurations:
         check_clearance(lens.with_gaps(dict(c.thickness_mm)).surfaces, file, f'configuration "{c.name}", ')
     unknown = ", ".join(str(k) for k, s in enumerate(surfaces) if s.n_d != 1 and s.V_d is None and s.glass is None)
@@ -208,6 +211,19 @@ def read_lens(path: str | Path) -> Lens:
     for name in (coating["name"] for coating in data.get("coating", []) if coating["name"] not in used):
         warnings.warn(f'{file}: coating "{name}": no surface has it', NeurolensWarning, stacklevel=2)
     return lens
+
+
+def _with_rims(lens: Lens, table: Table) -> Lens:
+    """The lens with the diameters that its file leaves out."""
+    missing = [k for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm)]
+    if not missing:
+        return lens
+    if lens.rims != "derived":
+        expected = 'the full clear diameter in mm, or rims = "derived" to have it computed'
+        raise table.error(f"surface {missing[0]}, diameter_mm", "(missing)", expected)
+    from neurolens.optics.rims import with_derived_rims  # rays are traced, which needs torch
+
+    return with_derived_rims(lens)
 
 
 def _surfaces(table: Table) -> tuple[Surface, ...]:
@@ -242,7 +258,7 @@ def _surface(row: Table, n_before: float, known: Mapping[str, Coating]) -> Surfa
         stop=row.flag("stop"),
         radius_mm=math.inf if math.isinf(radius_mm) else radius_mm,
         thickness_mm=row.number("thickness_mm", unit="mm"),
-        diameter_mm=row.number("diameter_mm", unit="mm", above=0),
+        diameter_mm=row.number("diameter_mm", unit="mm", above=0) if "diameter_mm" in row else math.nan,
         **_glass(row),
         **_shape(row),
     )
@@ -273,8 +289,11 @@ def _glass(row: Table) -> dict[str, Any]:
         if medium["absorption_per_mm"] < 0:
             raise row.error("absorption_per_mm", medium["absorption_per_mm"], "at least 0")
     if "glass" in row:
-        medium["glass"] = row.text("glass")
-        known = catalogue.find(medium["glass"], row.file, f"{row.where}glass")
+        name = row.text("glass")
+        if not catalogue.same_name(name) and "n_d" in row and "V_d" in row:
+            return medium | by_figures(name, medium["n_d"], medium["V_d"], f"{row.file}: {row.where}glass")
+        medium["glass"] = name
+        known = catalogue.find(name, row.file, f"{row.where}glass")
         medium = {"V_d": known.V_d, **medium, "n_d": medium["n_d"] if "n_d" in row else known.n_d}
     return medium
 

@@ -25,6 +25,7 @@ _FIELDS = 17  # from the axis to the edge; rims are usually widest at one of the
 _HEIGHTS = (-1.0, -0.75, -0.5, 0.0, 0.5, 0.75, 1.0)  # in the stop, as shares of what the rule lets through
 _STEP_MM = 1e-3  # diameters are given to a micrometre
 _STEPS = 64
+_ROUNDS = 12  # rims of aspheres settle in 2 to 4
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,41 @@ def derive_rims(lens: Lens, rule: RimRule | None = None) -> tuple[Lens, list[Rim
         for c in lens.configurations
     )
     return replace(lens, surfaces=surfaces, configurations=configurations, rims="derived"), rims
+
+
+def with_derived_rims(lens: Lens) -> Lens:
+    """The lens with a diameter wherever it has none (NaN), by the rule as it is; given ones stay.
+
+    Raises:
+        InputError: as `derive_rims`, and where no field is stated.
+    """
+    missing = ", ".join(str(k) for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm))
+    if lens.half_field_deg is None and lens.image_radius_mm is None:
+        expected = "the clear diameter of every surface, or a field to derive rims for (half_field_deg, --half-field)"
+        raise InputError(lens.path, "diameter", f"(not given for surface {missing})", expected)
+    if math.isnan(lens.stop_radius_mm):
+        lens = lens.with_stop_radius(stop_radius_mm(lens, lens.f_number))
+    if not any(s.asphere and math.isnan(s.diameter_mm) for s in lens.surfaces):
+        return replace(_filled(lens, derive_rims(lens)[0]), rims="derived")
+    # Aspheres are traced no farther than a little beyond a rim: from those of their vertex spheres, until they stay.
+    found = _filled(lens, derive_rims(_spherical(lens))[0])
+    for _ in range(_ROUNDS):
+        before, found = found, _filled(lens, derive_rims(found)[0])
+        if found == before:
+            break
+    return replace(found, rims="derived")
+
+
+def _filled(lens: Lens, other: Lens) -> Lens:
+    pairs = zip(lens.surfaces, other.surfaces, strict=True)
+    rows = (replace(s, diameter_mm=o.diameter_mm) if math.isnan(s.diameter_mm) else s for s, o in pairs)
+    return replace(lens, surfaces=tuple(rows))
+
+
+def _spherical(lens: Lens) -> Lens:
+    radii = (1 / c if (c := s.vertex_curvature("y")) else math.inf for s in lens.surfaces)
+    rows = (replace(s, radius_mm=r, conic=0.0, asphere=()) for s, r in zip(lens.surfaces, radii, strict=True))
+    return replace(lens, surfaces=tuple(rows))
 
 
 def half_field_deg(lens: Lens) -> float:

@@ -10,6 +10,7 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.optics import catalogue, paraxial
 from neurolens.optics.catalogue import Glass
+from neurolens.optics.glass import by_figures
 from neurolens.optics.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
 from neurolens.optics.paraxial import FirstOrder
 from neurolens.optics.prescription import Lens, Surface
@@ -81,36 +82,15 @@ def smaller_stop(file: str, asked: float, limit: float | None, state: str = "") 
 
 
 def with_rims(lens: Lens) -> Lens:
-    """The lens with the rims that its file does not give derived by rule (`neurolens.optics.rims`); refused where no
-    field is known to derive them for, or the lens has cylinders.
-    """
+    """The lens with the rims that its file does not give derived by rule (`neurolens.optics.rims`), with a warning."""
     missing = [k for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm)]
     if not missing:
         return lens
-    from neurolens.optics import rims  # they are traced, which needs torch
+    from neurolens.optics.rims import with_derived_rims  # rays are traced, which needs torch
 
-    listed = ", ".join(map(str, missing))
-    if lens.half_field_deg is None and lens.image_radius_mm is None:
-        expected = "the clear diameter of every surface, or a field to derive rims for (--half-field)"
-        raise InputError(lens.path, "diameter", f"(not given for surface {listed})", expected)
-    trial = lens
-    if any(lens.surfaces[k].asphere for k in missing):
-        # Aspheres need a rim before they can be traced: start with the rims of their vertex spheres.
-        trial = _filled(lens, rims.derive_rims(_spherical(lens))[0])
-    warn(lens.path, f"no rim is given for surface {listed}: derived from f-number and field")
-    return replace(_filled(lens, rims.derive_rims(trial)[0]), rims="derived")
-
-
-def _filled(lens: Lens, other: Lens) -> Lens:
-    pairs = zip(lens.surfaces, other.surfaces, strict=True)
-    rows = (replace(s, diameter_mm=o.diameter_mm) if math.isnan(s.diameter_mm) else s for s, o in pairs)
-    return replace(lens, surfaces=tuple(rows))
-
-
-def _spherical(lens: Lens) -> Lens:
-    radii = (1 / c if (c := s.vertex_curvature("y")) else math.inf for s in lens.surfaces)
-    rows = (replace(s, radius_mm=r, conic=0.0, asphere=()) for s, r in zip(lens.surfaces, radii, strict=True))
-    return replace(lens, surfaces=tuple(rows))
+    derived = with_derived_rims(lens)
+    warn(lens.path, f"no rim is given for surface {', '.join(map(str, missing))}: derived from f-number and field")
+    return derived
 
 
 def check_states(lens: Lens) -> None:
@@ -168,7 +148,13 @@ def _check_rows(rows: Sequence[Surface], file: str) -> None:
 
 
 def named_glass(
-    name: str, file: str, field: str, makers: Sequence[str] = (), *, said: str | None = None
+    name: str,
+    file: str,
+    field: str,
+    makers: Sequence[str] = (),
+    *,
+    said: str | None = None,
+    figures: tuple[float, float] | None = None,
 ) -> dict[str, Any]:
     """Fields of a surface whose glass the file gives by name alone; warns where it is ambiguous.
 
@@ -177,13 +163,16 @@ def named_glass(
     Args:
         makers: the makers' catalogues that the file names; the first that has the glass is meant.
         said: the file's text, if it names the maker.
+        figures: n_d and V_d that the file gives beside the name, for a glass that the catalogue does not know.
 
     Raises:
-        InputError: a name that the catalogue does not know; the message suggests the nearest.
+        InputError: such a name without figures; the message suggests the nearest.
     """
     same = catalogue.same_name(name)
     known = next((g for m in makers for g in same if g.maker.upper() == m), None)
     replacing = next((g for m in makers for g in catalogue.same_name(f"{m}:N-{name}") if m in _NAMES), None)
+    if figures and not (same or replacing):
+        return by_figures(name, *figures, f"{file}: {field}")
     taken = known or replacing or catalogue.find(name, file, field)
     if makers and taken.maker.upper() not in makers:
         why = f"no glass of that name in the catalogues that the file names ({', '.join(makers)})"

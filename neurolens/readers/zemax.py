@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError
+from neurolens.optics import catalogue
 from neurolens.optics.lensfile import MAX_SURFACES
 from neurolens.optics.prescription import Lens
 from neurolens.readers.assemble import named_glass
@@ -264,4 +265,7 @@ def _glass(line: Line, rest: list[str], makers: list[str]) -> dict[str, Any]:
         return {"n_d": n_d, "V_d": V_d if V_d > 0 else None, "material": None if name == "___BLANK" else name}
     if kind not in ("0", "2"):
         raise line.error("GLAS", f"{name} with solve {kind}", "a glass of the catalogue, or n_d and V_d")
-    return named_glass(name, line.file, f"line {line.number}, GLAS", makers)
+    figures = [] if catalogue.same_name(name) else [line.number_of("GLAS", word) for word in rest[3:5]]
+    # 1.5 and 40 is what the program writes in the place of both.
+    told = (figures[0], figures[1]) if len(figures) == 2 and min(figures) > 1 and figures != [1.5, 40.0] else None
+    return named_glass(name, line.file, f"line {line.number}, GLAS", makers, figures=told)

@@ -113,9 +113,13 @@ def write_checkpoint(path: Path, film: Film, identity: dict[str, Any], spent: di
 
     Raises:
         OSError: it cannot be written; an older checkpoint is still there.
+        InputError: an identity that no reader would take.
         NeurolensError: a worker was killed while it wrote to the film.
     """
     tiling = film.tiling
+    about = {"format": _FORMAT, "samples": tiling.samples, "tile": tiling.tile, "step": tiling.step}
+    settings = json.dumps(about | {"render": identity, "spent": spent})
+    _check_length(path, len(settings))
     done: list[NDArray[np.int64]] = []
     with atomic_path(path) as temporary:
         with open(temporary, "wb") as file:
@@ -127,8 +131,7 @@ def write_checkpoint(path: Path, film: Film, identity: dict[str, Any], spent: di
                         member.write(np.ascontiguousarray(sums).data)
                         done.append(passes)
                 archive.writestr(_DONE, _header(film.done) + np.concatenate(done).tobytes())
-                about = {"format": _FORMAT, "samples": tiling.samples, "tile": tiling.tile, "step": tiling.step}
-                archive.writestr(_ABOUT, json.dumps(about | {"render": identity, "spent": spent}, indent=1))
+                archive.writestr(_ABOUT, settings)
             file.flush()
             os.fsync(file.fileno())
 
@@ -148,8 +151,7 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
             stored = all(i.compress_type == zipfile.ZIP_STORED and not i.flag_bits & 1 for i in members.values())
             if sorted(members) != sorted((_ABOUT, _SUMS, _DONE)) or not stored:
                 raise ValueError("other contents")
-            if members[_ABOUT].file_size > _LARGEST_ABOUT:
-                raise ValueError("settings too long")
+            _check_length(path, members[_ABOUT].file_size)
             about = json.loads(archive.read(_ABOUT))
             _check_render(path, about, identity)
             _check_tiling(path, about, film.tiling)
@@ -167,6 +169,11 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
     except (zipfile.BadZipFile, ValueError, KeyError, TypeError, AttributeError, EOFError, RuntimeError) as error:
         why = str(error) or type(error).__name__
         raise InputError(path, "file", f"({why})", f"a whole checkpoint of a render, {_AGAIN}") from None
+
+
+def _check_length(path: Path, length: int) -> None:
+    if length > _LARGEST_ABOUT:
+        raise InputError(path, "settings", f"({length} characters)", f"at most {_LARGEST_ABOUT}, with the camera's")
 
 
 def _check_render(path: Path, about: dict[str, Any], identity: dict[str, Any]) -> None:

@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 
 from neurolens.base.errors import NeurolensError
+from neurolens.base.signals import ASKING
 from neurolens.render.film import CONTEXT, FORKS
 from neurolens.render.job import Job
 
-_POLL_S, _PATIENCE_S = 0.05, 5.0
+_POLL_S, _POLL_PARENT_S, _PATIENCE_S = 0.05, 0.5, 5.0
 
 
 def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None:
@@ -74,7 +75,7 @@ def _dismiss(job: Job, team: Sequence[Any]) -> None:
             worker.join()
 
 
-def _work(job: Job, claimed: Any, parent: int | None = None) -> None:
+def _work(job: Job, claimed: Any) -> None:
     """Take tiles, all of one pass before the next, until none is left; `claimed` counts them over all workers."""
     opener = getattr(job.camera, "for_worker", None)
     camera = opener() if opener else job.camera
@@ -89,8 +90,8 @@ def _work(job: Job, claimed: Any, parent: int | None = None) -> None:
         # Sums are added in the order of passes, so that rounding does not depend on the workers.
         while film.done[tile] < part and not job.stop[0]:
             time.sleep(1e-4)
-        if job.stop[0] or (parent is not None and os.getppid() != parent):
-            return  # stop requested, or parent gone
+        if job.stop[0]:
+            return
         if film.done[tile] > part:
             continue  # done before a checkpoint
         began = time.perf_counter()
@@ -104,12 +105,20 @@ def _quiet(job: Job, claimed: Any, number: int, workers: int, parent: int) -> No
     """One of several workers: its error goes to the shared message only."""
     try:
         if FORKS:
+            threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
             _pin(number, workers)
-        _work(job, claimed, parent if FORKS else None)
+        _work(job, claimed)
     except BaseException as error:
         text = _said(error).encode()[: len(job.message)]
         job.message[: len(text)] = np.frombuffer(text, np.uint8)
         job.stop[0] = 1
+
+
+def _end_with(parent: int) -> None:
+    """End this worker once its parent is gone, whatever it does: a killed parent can ask nobody to stop."""
+    while os.getppid() == parent:
+        time.sleep(_POLL_PARENT_S)
+    os._exit(1)
 
 
 def _said(error: BaseException) -> str:
@@ -133,11 +142,11 @@ def _pin(number: int, workers: int) -> None:
 
 @contextmanager
 def _signals_held() -> Iterator[None]:
-    """Block Ctrl-C and SIGTERM inside the block; processes and threads started there never receive them."""
+    """Block what asks a render to stop inside the block; processes and threads started there never receive them."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ASKING)
     try:
         yield
     finally:

@@ -15,7 +15,7 @@ from torch import Tensor
 import neurolens
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.modelfile import CARD_KIND, CARD_SCHEMA
+from neurolens.modelfile import CARD_KIND, CARD_SCHEMA, MAX_CARD
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
@@ -76,13 +76,17 @@ def card_to_json(card: dict[str, Any]) -> str:
     """Strict JSON: a number that is not finite is an error, never the word NaN.
 
     Raises:
-        InputError: a value that JSON cannot hold, with its place in the card.
+        InputError: a value that JSON cannot hold, with its place in the card; more than `MAX_CARD` characters, which no
+            reader takes.
     """
     try:
-        return json.dumps(card, allow_nan=False)
+        text = json.dumps(card, allow_nan=False)
     except (TypeError, ValueError) as error:
         field, value = _culprit(card, "")
         raise InputError("model card", field, value, "finite numbers, text, lists and dictionaries") from error
+    if len(text) > MAX_CARD:
+        raise InputError("model card", "length", f"({len(text)} characters)", f"at most {MAX_CARD}")
+    return text
 
 
 def _culprit(value: Any, place: str) -> tuple[str, Any]:

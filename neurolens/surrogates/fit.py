@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import math
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -30,12 +29,10 @@ from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import RayPairs, trace_pairs
 from neurolens.surrogates.published import fit_published
 from neurolens.surrogates.settings import NETWORKS, PLANES_SEARCHED, POLYNOMIALS, ModelSettings, PublishedName
-from neurolens.surrogates.targets import Prepared, film_equivalent, scales_of, squared_error, targets_of
+from neurolens.surrogates.targets import Prepared, scales_of, squared_error
 
 # Rays drawn over the domain to find what blocks anything: a share of 1e-4 is 20 of them.
 _GATE_RAYS = 200_000
-# Terms of polynomials tried for an error asked for, fewest first.
-TERMS_LADDER = (12, 16, 20, 28, 40, 64, 100)
 ZoneCore = InvariantPolynomial | RawPolynomial | Network | Residual
 # A zone's fit sees this share of rho beyond its edges, so that neighbours meet.
 OVERLAP = 0.03
@@ -73,36 +70,17 @@ def fit_model(
     progress: Callable[[float], None] | None = None,
     *,
     checkpoint: Path | None = None,
-    error_um: Callable[[LensModel], float] | None = None,
 ) -> LensModel:
     """Fit one surrogate.
 
     Args:
         checkpoint: file in which the training of networks keeps its state, to go on from there after a kill (see
             `fit_network`). It stays when the fit has ended; `checkpoint.clear` removes it.
-        error_um: film-equivalent RMS of a model, for `target_um`; None takes first order on rays held out.
 
     Raises:
         InputError: an unknown method, or settings that the method refuses.
-
-    Warns:
-        NeurolensWarning: the error asked for is not reached.
     """
     start = time.perf_counter()
-    rungs = [settings]
-    if settings.climbs:
-        rungs = [replace(settings, terms=t) for t in TERMS_LADDER if t < len(prepared.pairs.train)]
-    models = (_fit_once(prepared, rung, progress, checkpoint) for rung in rungs)
-    if settings.target_um is None:
-        best = next(models)
-    else:
-        best = reach(models, settings.target_um, error_um or first_order_um(prepared.pairs))
-    return replace(best, fit_s=max(time.perf_counter() - start, spent_s(checkpoint)))
-
-
-def _fit_once(
-    prepared: Prepared, settings: ModelSettings, progress: Callable[[float], None] | None, checkpoint: Path | None
-) -> LensModel:
     pairs, encoding, gates = prepared.pairs, prepared.encoding, prepared.gates
     with pinned_threads():
         if settings.method in get_args(PublishedName):
@@ -121,6 +99,7 @@ def _fit_once(
         method=settings.label,
         settings={**asdict(settings), "rays": len(pairs.train), "rays_seed": pairs.settings.seed},
         direction="slope" if settings.family == "paraxial" else "angle",
+        fit_s=max(time.perf_counter() - start, spent_s(checkpoint)),
     )
 
 
@@ -152,39 +131,6 @@ def _fit_core(
         return network if base is None else Residual((base, network))
 
     return fit_partitioned(prepared, settings.partitions, fit)
-
-
-def reach(models: Iterable[LensModel], target_um: float, error_um: Callable[[LensModel], float]) -> LensModel:
-    """The first model whose film-equivalent RMS is at most `target_um`, else the best, with a warning.
-
-    What it reached stands in its settings. Models are fitted as they are asked for: none after the first that serves.
-    """
-    found: list[tuple[float, LensModel]] = []
-    for model in models:
-        error = error_um(model)
-        found.append((error if math.isfinite(error) else math.inf, model))
-        if error <= target_um:
-            break
-    least, best = min(found, key=lambda pair: pair[0])
-    if not least <= target_um:
-        warnings.warn(
-            f"{best.lens.path}: {best.method}: asked for {target_um:g} um, reached {least:.3g} um; this is the best of "
-            "the fits tried",
-            NeurolensWarning,
-            stacklevel=3,
-        )
-    return replace(best, settings={**best.settings, "reached_um": least if math.isfinite(least) else None})
-
-
-def first_order_um(pairs: RayPairs) -> Callable[[LensModel], float]:
-    """Film-equivalent RMS of models to first order, in the nearest focused plane, over the rays held out."""
-
-    def error(model: LensModel) -> float:
-        targets = targets_of(pairs.lens, model.encoding, pairs.held_out)
-        off = model.core(targets.field)[0] - targets.vectors
-        return math.sqrt(float((film_equivalent(pairs.lens, pairs.domain, off)[0] ** 2).sum(0).mean()))
-
-    return error
 
 
 def fit_partitioned(prepared: Prepared, zones: int, fit: Callable[[Prepared], ZoneCore]) -> Partitioned | ZoneCore:

@@ -45,8 +45,6 @@ class ModelSettings:
             a machine gives the same bytes whatever its load. One on n times the fewest rays counts n (see
             `fits.network`).
         seed: of the network's first weights.
-        target_um: film-equivalent RMS asked for. Polynomials take the fewest terms of `TERMS_LADDER` that reach it; a
-            fit that does not reach it warns and gives its best.
 
     Raises:
         InputError: numbers that ask for more than a fit can hold, or for less than one.
@@ -68,7 +66,6 @@ class ModelSettings:
     layers: int = 2
     steps: int = 400
     seed: int = 0
-    target_um: float | None = None
 
     def __post_init__(self) -> None:
         most_degree = _MOST_DEGREE[self.basis] if self.basis in _MOST_DEGREE else min(_MOST_DEGREE.values())
@@ -87,8 +84,6 @@ class ModelSettings:
                 raise InputError("settings", name, getattr(self, name), f"an integer from {least} to {most}")
         if not 0 < self.position_weight < math.inf:
             raise InputError("settings", "position_weight", self.position_weight, "a number above 0")
-        if self.target_um is not None and not 0 < self.target_um < math.inf:
-            raise InputError("settings", "target_um", self.target_um, "micrometres above 0, or none")
 
     @property
     def label(self) -> str:
@@ -96,20 +91,13 @@ class ModelSettings:
         if self.name:
             return self.name
         zones = f"-{self.partitions}zones" if self.partitions > 1 else ""
-        if self.target_um is not None:
-            zones += f"-to-{self.target_um:g}um"
         if self.method in NETWORKS:
             before = f"ols-{self.terms}-" if self.method == "ols+mlp" else ""
             return f"{before}mlp-{self.units}x{self.layers}{zones}"
         if self.method in ("thin", "thick"):
             return self.method
         size = f"-d{self.degree}" if self.method == "dense" else f"-{self.terms}"
-        return f"{'raw-' if self.basis == 'raw' else ''}{self.method}{'' if self.climbs else size}{zones}"
-
-    @property
-    def climbs(self) -> bool:
-        """Whether the fit chooses the number of terms by the error asked for."""
-        return self.target_um is not None and self.method in ("omp", "ols", "adaptive")
+        return f"{'raw-' if self.basis == 'raw' else ''}{self.method}{size}{zones}"
 
     @property
     def family(self) -> str:

@@ -118,6 +118,7 @@ DAMAGE: dict[str, tuple[Callable[[ModelProto], object], str]] = {
         lambda p: setattr(p.metadata_props[0], "value", '{"kind":' + "[" * 200_000 + "]" * 200_000 + "}"),
         "JSON",
     ),
+    "card too long": (change_card(lambda c: c.update(fit=c["fit"] | {"note": "x" * 2**20})), "card: .* characters"),
     "a section of text": (change_card(lambda c: c.update(lens="lens")), "lens: got 'lens'"),
     "no name of the lens": (change_card(lambda c: c["lens"].pop("id")), "lens.id"),
     "negative radius": (change_card(lambda c: c["domain"].update(film_radius_mm=-20)), "domain.film_radius_mm"),

@@ -15,6 +15,8 @@ from experiments.zoom import CASES, page
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
+from neurolens.cli import main
+from neurolens.evaluate import measure
 from neurolens.evaluate.experiment import default_experiment, read_experiment
 from neurolens.evaluate.measure import fit_and_measure
 from neurolens.evaluate.train import run_experiment
@@ -107,7 +109,13 @@ def test_less_to_model_is_modelled_better(run: tuple[Path, dict]) -> None:
     assert half["coefficients_per_vector"] == shot["coefficients_per_vector"] / 2
 
 
-def test_a_model_file_that_was_changed_is_fitted_again(tmp_path: Path) -> None:
+def test_models_are_whole_and_fitted_again_where_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The final name comes when the errors are in the card."""
+    there: list[list[Path]] = []
+    usual = measure.measure_on
+    monkeypatch.setattr(
+        measure, "measure_on", lambda *a: (there.append(list(tmp_path.glob("[!.]*.onnx"))), usual(*a))[1]
+    )
     lens = f'lens.file="{ROOT}/lenses/thorlabs_lb1471_biconvex_50.toml"'
     small = ("pairs.train=1000", "pairs.held_out=500", "pairs.rim=500", "evaluation.vignetting_rays=2000")
     (tmp_path / "a.toml").write_text('title = "a"\n[lens]\nfile = "a"\n[[model]]\nterms = 6\nplanes = false\n')
@@ -119,7 +127,7 @@ def test_a_model_file_that_was_changed_is_fitted_again(tmp_path: Path) -> None:
     assert fit_and_measure(prepared, settings.model[0], tmp_path, 2000, lambda _: None).record == first.record
     first.file.write_bytes(whole[:-1000])
     again = fit_and_measure(prepared, settings.model[0], tmp_path, 2000, lambda _: None)
-    assert again.record["rms_um"] == first.record["rms_um"]
+    assert again.record["rms_um"] == first.record["rms_um"] and there == [[], [first.file]]
     assert load_model(again.file).card["errors"]["rms_um"] == pytest.approx(first.record["rms_um"])
 
 
@@ -149,6 +157,34 @@ def test_bad_settings_name_the_field(tmp_path: Path, override: str, field: str) 
     (tmp_path / "small.toml").write_text(SMALL.replace("ROOT", str(ROOT)))
     with pytest.raises(InputError, match=field):
         run_experiment(read_experiment(tmp_path / "small.toml", [override]), tmp_path / "out")
+
+
+SINGLET = str(lens_models.LENSES / "thorlabs_lb1471_biconvex_50.toml")
+QUICK = """--no-race --quiet --set pairs.train=1000 --set pairs.held_out=500 --set pairs.rim=500 --set lens.f_number=8
+--set evaluation.vignetting_rays=2000 --set domain.film_radius_mm=15""".split()
+RUNGS = "model=[{terms=3,planes=false},{terms=12,planes=false},{terms=20,planes=false}]"
+
+
+@pytest.mark.parametrize(("asked", "within_um", "tried"), [("um=2", 2.0, 2), ("px=1e-6", 1e-6 * 6.24, 3)])
+def test_models_are_fitted_until_one_has_the_error_asked_for(tmp_path, capsys, asked, within_um, tried) -> None:
+    kind, _, value = asked.partition("=")
+    code = main(["train", "--lens", SINGLET, "--out", str(tmp_path), f"--target-{kind}", value, *QUICK, "--set", RUNGS])
+    found, said = json.loads((tmp_path / "results.json").read_text()), capsys.readouterr().out
+    errors = [m["rms_um"] for m in found["models"]]
+    assert found["target"]["within_um"] == pytest.approx(within_um, rel=1e-3)  # 15 mm: a frame of 24.96 mm
+    assert len(errors) == tried and (errors[-1] <= within_um) == (code == 0) == found["target"]["met"]
+    assert all(e > within_um for e in errors[:-1])
+    assert ("no model tried reaches it" in said) == (code == 1)
+    assert not found["exact"] and "ns_per_ray" not in found["models"][0] and (tmp_path / "report.html").exists()
+
+
+def test_an_error_asked_for_is_one_positive_number_of_a_lens() -> None:
+    asked = default_experiment(SINGLET, ["target.um=1.5"])
+    assert asked.target and asked.target.within_um(20.0) == 1.5 and len(asked.model) > 5
+    for bad in ("target.um=-1", "target.px=inf", "target={um=1.0,px=1.0}", "target={}"):
+        with pytest.raises(InputError, match="target"):
+            default_experiment(SINGLET, [bad])
+    assert main(["train", "any.toml", "--target-um", "1"]) == 2
 
 
 ZOOM = lens_models.LENSES / "nikon_zoom_70_200.toml"

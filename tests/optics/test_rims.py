@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,13 +13,15 @@ from shipped import tabled
 
 from neurolens.base.errors import InputError
 from neurolens.optics.aiming import aim_at_stop
-from neurolens.optics.paraxial import first_order
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.paraxial import first_order, stop_radius_mm
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.rims import RimRule, derive_rims, half_field_deg
 from neurolens.optics.sag import check_clearance
 from neurolens.optics.trace import trace
 
 INF = math.inf
+LENSES = Path(__file__).parents[2] / "lenses"
 
 
 def passing(lens: Lens, field_deg: float, heights: list[float]) -> list[bool]:
@@ -43,6 +47,29 @@ def test_rims_clip_as_the_rule_says(name: str, vignetting: float) -> None:
     # Somewhere the clear edge ends: rays well outside the share are lost, at one side at least.
     beyond = min(0.99, vignetting + 0.25)
     assert not all(passing(derived, field, [-beyond, beyond]))
+
+
+@pytest.mark.parametrize("name", ["laikin_double_gauss_50", "phone_lens_6"])
+def test_a_lens_file_without_diameters_passes_and_blocks_what_the_printed_one_does(name: str, tmp_path: Path) -> None:
+    """Wherever rims are not what limits: at the stop, and within the share of the pupil that the rule keeps."""
+    text = (LENSES / f"{name}.toml").read_text(encoding="utf-8")
+    bare = re.sub(r", diameter_mm = *[0-9.]+", "", re.sub(r"^rims = .*$", 'rims = "derived"', text, flags=re.MULTILINE))
+    (tmp_path / f"{name}.toml").write_text(bare, encoding="utf-8")
+    lens, printed = read_lens(tmp_path / f"{name}.toml"), tabled(name)
+    assert lens.rims == "derived" and lens.stop_radius_mm == pytest.approx(
+        printed.with_stop_radius(stop_radius_mm(printed, printed.f_number)).stop_radius_mm, abs=1e-4
+    )
+    whole = printed.with_stop_radius(lens.stop_radius_mm)
+    for share in (0.0, 0.3, 0.6, 1.0):
+        field = share * half_field_deg(lens)
+        kept = 0.999 * (1 - 0.5 * share)
+        heights = [-1.01, *(kept * k / 8 for k in range(-8, 9)), 1.01]
+        real, found = passing(whole, field, heights), passing(lens, field, heights)
+        assert found[1:-1] == [True] * 17 and found[0] is found[-1] is False
+        assert share > 0.5 or real == found
+    (tmp_path / "bare.toml").write_text(bare.replace('rims = "derived"', 'rims = "source"'), encoding="utf-8")
+    with pytest.raises(InputError, match='surface 0, diameter_mm: got .missing., expected .*rims = "derived"'):
+        read_lens(tmp_path / "bare.toml")
 
 
 def test_rims_of_a_double_gauss_come_out_near_the_printed_ones() -> None:

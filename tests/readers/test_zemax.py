@@ -98,6 +98,18 @@ def test_singlet_by_the_lensmakers_formula(encoding: str, tmp_path: Path) -> Non
     assert lens.f_number == pytest.approx(efl_mm / 10)
 
 
+def test_a_glass_of_no_catalogue_is_taken_by_the_figures_beside_it(tmp_path: Path) -> None:
+    """But not by 1.5 and 40, which the program writes where it has none."""
+    named = "GLAS N-BK7 0 0 1.5 4.0E+1"
+    with pytest.warns(
+        NeurolensWarning, match="line 29, GLAS: glass XY-9 is not in the catalogue.*n_d 1.62 and V_d 36.4"
+    ):
+        front = read(swapped(named, "GLAS XY-9 0 0 1.62 36.4"), tmp_path).surfaces[0]
+    assert (front.n_d, front.V_d, front.glass, front.material) == (1.62, 36.4, None, "XY-9")
+    with pytest.raises(InputError, match="line 29, GLAS"):
+        read(swapped(named, "GLAS XY-9 0 0 1.5 4.0E+1"), tmp_path)
+
+
 @pytest.mark.parametrize(
     ("aperture", "diameter_mm"), [("ENPD 4", 4.0), ("FNUM 5 0", None), ("FLOA", 16.0), ("FNUM 5 1", None)]
 )

@@ -1,9 +1,7 @@
-"""Settings of a fit, what is refused before anything is computed, and an error asked for instead of a size."""
+"""Settings of a fit, what is refused before anything is computed, and what each part of a fit is worth."""
 
 from __future__ import annotations
 
-import math
-import warnings
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -12,13 +10,11 @@ from typing import Any
 import pytest
 from lens_models import LENSES, prepared
 
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import read_lens
-from neurolens.surrogates import fit
 from neurolens.surrogates.bases import invariant_exponents, raw_exponents
-from neurolens.surrogates.card import card_of
 from neurolens.surrogates.domain import domain_of
-from neurolens.surrogates.fit import TERMS_LADDER, ModelSettings, Prepared, fit_model, prepare
+from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.fits import checkpoint
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.settings import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
@@ -34,7 +30,6 @@ from neurolens.surrogates.targets import targets_of
         *(("units", v) for v in (0, 513)),
         *(("layers", v) for v in (0, 9)),
         *(("steps", v) for v in (0, 10**9)),
-        *(("target_um", v) for v in (0.0, -1.0, math.nan, math.inf)),
     ],
 )
 def test_numbers_without_bounds_are_refused(field: str, value: Any) -> None:
@@ -47,49 +42,6 @@ def test_raw_candidates_are_bounded_by_their_number() -> None:
         ModelSettings(basis="raw", degree=12)
     assert len(raw_exponents(ModelSettings(basis="raw", degree=11).degree)) <= 5000
     assert 2 * len(invariant_exponents(ModelSettings(degree=16).degree)) <= 5000
-
-
-# The plainest polynomial: what is tested here is the choice of its size.
-PLAIN = ModelSettings("omp", degree=4)
-
-
-@pytest.fixture(autouse=True)
-def short_ladder(monkeypatch) -> None:
-    monkeypatch.setattr(fit, "TERMS_LADDER", TERMS_LADDER[:4:3])
-
-
-def test_polynomials_take_the_fewest_terms_that_reach_it() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", NeurolensWarning)
-        loose, tight = (fit_model(prepared(), replace(PLAIN, target_um=um)) for um in (1e6, 12.0))
-    assert loose.settings["terms"] == TERMS_LADDER[0]
-    assert loose.settings["terms"] < tight.settings["terms"]
-    assert tight.settings["reached_um"] <= 12.0
-    with pytest.warns(NeurolensWarning, match="asked for 12 um"):
-        short = fit_model(prepared(), ModelSettings("dense", degree=1, target_um=12.0))
-    assert short.settings["reached_um"] > 12.0
-    assert tight.method == "omp-to-12um"
-
-
-@pytest.mark.parametrize("method", ["omp", "mlp"])
-def test_what_is_out_of_reach_is_said_and_the_best_is_given(method) -> None:
-    settings = replace(PLAIN, method=method, units=3, layers=1, steps=3, target_um=1e-9)
-    with pytest.warns(NeurolensWarning, match=r"asked for 1e-09 um, reached \d"):
-        model = fit_model(prepared(), settings)
-    reached = card_of(model, {})["fit"]["settings"]["reached_um"]
-    assert 1e-9 < reached < 1e3
-    if method == "omp":
-        assert reached < fit_model(prepared(), replace(PLAIN, target_um=1e6)).settings["reached_um"]
-
-
-def test_the_error_may_be_measured_by_the_caller() -> None:
-    asked: list[int] = []
-    model = fit_model(
-        prepared(),
-        replace(PLAIN, target_um=5.0),
-        error_um=lambda m: asked.append(m.settings["terms"]) or (9.0 if m.settings["terms"] < 20 else 4.0),
-    )
-    assert asked == [12, 28] and model.settings["reached_um"] == 4.0
 
 
 def test_checkpoints_of_zones_are_kept_apart_and_removed_together(tmp_path: Path) -> None:

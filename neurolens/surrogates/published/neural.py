@@ -9,8 +9,9 @@ Left open and chosen here: subspaces are rings of the film that hold equally man
 is above 1/2; on a known front surface two numbers give the position, and the third channel carries the transmittance,
 which they leave out; outputs are scaled to unit spread, blocked rays count for the flag alone and come in the
 proportion in which they fall on the domain (at most two for one that passes); the rate of Adam falls to nothing along a
-half cosine. The flag belongs to one stop: the model knows no stop crossing (its stop output is 0), and a smaller stop
-would need a new training.
+half cosine over 24,000 steps: on rays of the 50 mm double Gauss not fitted the loss of a network is 7.7e-3 after 6,000,
+6.8e-3 after 24,000 and 7.8e-3 after 60,000 (its direction alone 0.31, 0.17 and 0.09 degrees). The flag belongs to one
+stop: the model knows no stop crossing (its stop output is 0), and a smaller stop would need a new training.
 """
 
 from __future__ import annotations
