@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from neurolens import __version__
-from neurolens.base.errors import NeurolensError, NeurolensWarning
+from neurolens.base.errors import NeurolensError, NeurolensWarning, printable
 from neurolens.base.signals import handled
 from neurolens.commands.arguments import Parser, more_glasses
 
@@ -42,12 +42,24 @@ def build_parser() -> Parser:
 
     Commands are imported here, so that `main` handles an interrupt of the imports.
     """
-    from neurolens.commands import analyse, bench, convert, evaluate, export, glass, lens, mitsuba, render, train
+    from neurolens.commands import (
+        analyse,
+        bench,
+        convert,
+        evaluate,
+        export,
+        glass,
+        lens,
+        mitsuba,
+        models,
+        render,
+        train,
+    )
 
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    for command in (lens, analyse, glass, convert, train, evaluate, export, render, mitsuba, bench):
+    for command in (lens, analyse, glass, convert, train, models, evaluate, export, render, mitsuba, bench):
         command.add_parser(subparsers)
     return parser
 
@@ -80,7 +92,7 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_
         place = "" if error.filename is None else f"{error.filename}: "
         return _fail(f"{place}{error.strerror or error}")
     except KeyboardInterrupt as error:
-        print(f"\nneurolens: interrupted; {args.kept}", file=sys.stderr)
+        print(f"\nneurolens: interrupted; {printable(args.kept)}", file=sys.stderr)
         return 128 + (error.args[0] if error.args else signal.SIGINT)
 
 
@@ -89,7 +101,7 @@ def _interrupt(number: int) -> None:
 
 
 def _fail(message: str) -> int:
-    print(f"neurolens: {' '.join(message.split())}", file=sys.stderr)
+    print(f"neurolens: {printable(' '.join(message.split()))}", file=sys.stderr)
     return 2
 
 
@@ -103,7 +115,7 @@ def _plain_warnings(quiet: bool) -> Iterator[None]:
             if issubclass(category, NeurolensWarning):
                 text = " ".join(str(message).split())
                 if not quiet and text not in said:
-                    print(f"neurolens: warning: {text}", file=sys.stderr)
+                    print(f"neurolens: warning: {printable(text)}", file=sys.stderr)
                 said.add(text)
             else:
                 usual(message, category, *place, **more)

@@ -10,7 +10,9 @@ from typing import Any
 import pytest
 from vignetting_oracle import vignetting_errors
 
+import neurolens
 from neurolens.cameras.model import OnnxLens, load_model
+from neurolens.cli import main
 from neurolens.evaluate.check import check_states, promises_of, space_of_card
 from neurolens.evaluate.measure import FreshRays, fresh_rays, measure, onnx_predictor
 from neurolens.optics.lensfile import read_lens
@@ -20,6 +22,7 @@ from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.stored import load_fitted
 
 ROOT = Path(__file__).parents[1]
+MODELS = ROOT / "models"
 INDEX: dict[str, Any] = json.loads((ROOT / "models" / "index.json").read_text(encoding="utf-8"))
 ROWS: list[dict[str, Any]] = INDEX["models"]
 # What is promised: file, figure, limit. Coefficients count A and B terms of one vector output.
@@ -116,3 +119,31 @@ def test_the_folder_is_small_and_holds_what_the_index_says() -> None:
     assert files == {row["file"] for row in ROWS}
     assert sum(f.stat().st_size for f in (ROOT / "models").iterdir()) < 5e6
     assert not [row["file"] for row in ROWS if row.get("broken")]
+
+
+def test_models_are_listed_with_the_one_to_use(tmp_path, monkeypatch, capsys) -> None:
+    """Of a working folder with runs, where the package ships no models."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(neurolens, "__file__", str(tmp_path / "site" / "neurolens" / "__init__.py"))
+    assert main(["models"]) == 2
+    assert "models/, runs/*/models/" in capsys.readouterr().err
+    own = tmp_path / "runs" / "mine" / "models"
+    own.mkdir(parents=True)
+    sizes, times = ("ols-28", "ols-60", "mlp-16x2"), (3.0, 4.0, 9.0)
+    for size in sizes:
+        (own / f"{size}.onnx").write_bytes((MODELS / f"laikin_double_gauss_50.{size}.onnx").read_bytes())
+    (own / "cut.onnx").write_bytes((own / "ols-28.onnx").read_bytes()[:900])
+    timed = [{"file": f"models/{n}.onnx", "fused_ns_per_ray": {"min": t}} for n, t in zip(sizes, times, strict=True)]
+    (own.parent / "results.json").write_text(json.dumps({"models": timed}))
+    for within, use in ((None, "ols-28"), ("1um", "ols-60"), ("0.01px", "mlp-16x2")):
+        more = [] if within is None else ["--within", within]
+        assert main(["models", "double gauss", "--json", *more]) == 0
+        out = capsys.readouterr()
+        rows = json.loads(out.out)["models"]
+        assert [Path(r["file"]).stem for r in rows if r.get("use")] == [use], within
+        assert len(rows) == 3 - [None, "1um", "0.01px"].index(within) and "cut.onnx: left out" in out.err
+    assert main(["models"]) == 0
+    said = capsys.readouterr().out
+    assert "Use runs/mine/models/ols-28.onnx (" in said and "--camera fused:runs/mine/models/ols-28.onnx" in said
+    assert main(["models", "--within", "1e-4um"]) == 1
+    assert "closest is runs/mine/models/mlp-16x2.onnx" in capsys.readouterr().out

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, TypedDict, TypeVar
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 
 SCHEMA_VERSION = 1
+R = TypeVar("R", bound=Mapping[str, Any])
 CLOSE_UM = 2.0  # a model within this RMS error counts as close: a quarter of a pixel of 36 mm at 4000 across
 
 
@@ -127,10 +129,10 @@ def break_even_rays(
     return (fit_s + load_s) * 1e9 / (ns_exact - ns_model)
 
 
-def reaches(record: Mapping[str, Any], within_um: float) -> bool:
+def reaches(record: Mapping[str, Any], most: float, key: str = "rms_um") -> bool:
     """Whether a model's film-equivalent RMS is within an error."""
-    found = record.get("rms_um")
-    return found is not None and bool(found <= within_um)
+    found = record.get(key)
+    return found is not None and bool(found <= most)
 
 
 def target_record(models: Sequence[Mapping[str, Any]], within_um: float) -> dict[str, Any]:
@@ -150,19 +152,25 @@ def _error(record: Mapping[str, Any]) -> tuple[float, float]:
     return tuple(math.inf if v is None else v for v in found)  # type: ignore[return-value]
 
 
-def to_use(models: Sequence[Mapping[str, Any]], within_um: float = CLOSE_UM) -> Mapping[str, Any] | None:
+def to_use(models: Sequence[R], most: float = CLOSE_UM, key: str = "rms_um") -> R | None:
     """The fastest of the models within an error and not poor, as C where that was timed; if none is, the closest.
 
     Ideal lenses (thin, thick) are left out; None where nothing else is there.
     """
     fits = [m for m in models if m.get("family") != "paraxial"]
-    close = [m for m in fits if reaches(m, within_um) and not m.get("poor")]
+    close = [m for m in fits if reaches(m, most, key) and not m.get("poor")]
 
     def cost(m: Mapping[str, Any]) -> tuple[float, float]:
         timing = m.get("fused_ns_per_ray") or m.get("ns_per_ray") or {}
         return timing.get("min", math.inf), m.get("bytes") or math.inf
 
     return min(close, key=cost) if close else min(fits, key=_error, default=None)
+
+
+def use_command(file: str, fused: bool) -> str:
+    """The command that renders a scene through a model, as C where that runs here."""
+    camera = f"{'fused:' if fused else ''}{file}"
+    return f"neurolens render experiments/scenes/room.toml --camera {shlex.quote(camera)} -o room.exr"
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
