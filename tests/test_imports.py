@@ -61,10 +61,11 @@ EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
     "neurolens.optics.apertures": ({"graph"}, set()),
     "neurolens.optics.sag": ({"optics"}, set()),  # for a type
     "neurolens.cameras.exact": ({"optics"}, {"torch"}),
+    "neurolens.cameras.outline_cache": ({"optics"}, {"torch"}),
     "neurolens.cameras.build": ({"optics"}, set()),
 }
 # Modules that load torch or onnx; others load these when they are needed.
-SLOW = {"neurolens.cameras.exact", "neurolens.graph.onnx"}
+SLOW = {"neurolens.cameras.exact", "neurolens.cameras.outline_cache", "neurolens.graph.onnx"}
 # What loads in a base install: these parts, and what converts lens files, looks up glass and writes C.
 LEAN = ("graph", "modelfile", "cameras", "render", "mitsuba", "commands", "cli", "base", "readers")
 LEAN_MODULES = {
@@ -139,5 +140,12 @@ def test_help_of_the_command_line_loads_not_even_numpy() -> None:
     code = (
         "import sys; sys.modules['numpy'] = None; from neurolens.cli import build_parser; build_parser().format_help()"
     )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_exact_cameras_start_without_torchs_compiler() -> None:
+    """It takes longer to load than all the rest."""
+    code = "import sys, neurolens.cameras.exact; assert 'torch._dynamo' not in sys.modules"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from neurolens.base.errors import InputError
+from neurolens.base.progress import Progress
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import ThickLens, ThinLens
 from neurolens.cameras.pinhole import PROJECTIONS, Fisheye, Pinhole, check_field
@@ -81,22 +82,23 @@ class Shot:
         return None if too_wide else self.f_number
 
 
-def make_camera(spec: str | Path, shot: Shot) -> Camera:
+def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) -> Camera:
     """The camera that `spec` names, set for a shot.
 
     Args:
         spec: see the module.
+        progress: shows what takes long, see `ExactCamera`.
 
     Raises:
         InputError: an unknown kind of camera, a missing file, a setting that this kind does not have or cannot reach.
         ModelError: a model that cannot be trusted.
         ModuleNotFoundError: a lens file without torch.
     """
-    camera = _camera(str(spec), shot)
+    camera = _camera(str(spec), shot, progress)
     return camera if shot.vignetting == "both" else Vignetted(camera, shot.vignetting, shot.wavelength_nm)
 
 
-def _camera(spec: str, shot: Shot) -> Camera:
+def _camera(spec: str, shot: Shot, progress: Progress | None) -> Camera:
     thick, fused = spec.startswith(THICK), spec.startswith(FUSED)
     path = Path(spec.removeprefix(THICK if thick else FUSED))
     exact = path.suffix == ".toml" and not thick
@@ -111,7 +113,7 @@ def _camera(spec: str, shot: Shot) -> Camera:
         raise InputError(path, "file", "(missing)", "a lens file" if path.suffix == ".toml" else "an ONNX model")
     if thick:
         return _thick(path, shot)
-    return _exact(path, shot, fused) if exact else _model(path, shot, fused)
+    return _exact(path, shot, fused, progress) if exact else _model(path, shot, fused)
 
 
 def _ideal(kind: str, shot: Shot) -> Camera:
@@ -173,7 +175,7 @@ def _thick(path: Path, shot: Shot) -> Camera:
     return camera
 
 
-def _exact(path: Path, shot: Shot, fused: bool) -> Camera:
+def _exact(path: Path, shot: Shot, fused: bool, progress: Progress | None) -> Camera:
     from neurolens.cameras.exact import ExactCamera, FusedExactCamera
     from neurolens.optics.lenscheck import check_lens, doubts
     from neurolens.optics.lensfile import read_lens
@@ -193,6 +195,7 @@ def _exact(path: Path, shot: Shot, fused: bool) -> Camera:
         focus=shot.focus,
         pupil=shot.pupil,
         film_offset_mm=shot.film_offset_mm,
+        progress=progress,
     )
     camera.settings |= {"zoom": shot.zoom, "notes": [*doubts(check_lens(tabled)), *_film_notes(lens, shot.film_mm)]}
     return camera

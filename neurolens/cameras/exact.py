@@ -19,20 +19,28 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.base.progress import Progress
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
 from neurolens.cameras.fused import FusedFilm
 from neurolens.cameras.lens_film import LensFilm, SceneRays
+from neurolens.cameras.outline_cache import kept_outline, search_key
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.pupil_search import COARSE, FINE
+from neurolens.cameras.pupil_search import COARSE, FINE, Detail, outline_of
 from neurolens.cameras.sampling import arrived, check_film, positive
 from neurolens.optics import pupil_methods as known
 from neurolens.optics.glass import LINE_D_NM, absorption_of
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
 from neurolens.optics.pupil_methods import RadialPupil
-from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds
+from neurolens.optics.pupils import (
+    PupilBounds,
+    camera_rays,
+    passes_at_any_azimuth,
+    pupil_bounds,
+    pupil_plane_z_mm,
+)
 from neurolens.optics.trace import Rays, film_derivatives, trace, trace_differentials
 from neurolens.optics.tracegraph import exact_graph
 
@@ -68,6 +76,7 @@ class ExactCamera:
             the same random numbers. None searches for them, over the whole film.
         pupil: how the pupil is sampled, one of `PUPILS`. All give the same picture in expectation; fewer
             rays pass through any but the outline, by which the others are widened where they would lose light.
+        progress: shows the search for the outline, where it was not found before (`outline_cache`).
 
     Raises:
         InputError: a focus nearer than four focal lengths, a lens that no ray passes, an unknown pupil.
@@ -86,6 +95,7 @@ class ExactCamera:
         focus: Focus = "film",
         pupil: str = OUTLINE,
         film_offset_mm: float = 0.0,
+        progress: Progress | None = None,
     ) -> None:
         self._pid = os.getpid()
         self.film_mm = check_film(film_mm)
@@ -101,17 +111,13 @@ class ExactCamera:
             film_z += film_offset_mm
             self.lens = replace(self.lens, film_z_mm=film_z)
         # A lens with cylinders is searched at many azimuths for one outline: coarser, for it fits none of them closely.
-        round_ = not self.lens.anamorphic
-        detail = FINE if round_ else COARSE._replace(tighten=bounds is not None)
-        if bounds is None:
-            corner = math.hypot(*self.film_mm) / 2
-            rows, points = (17, 128) if round_ else (13, 48)
-            bounds = pupil_bounds(
-                self.lens, 1.0001 * corner, (film_z, film_z), used, rows=rows, points=points, film_mm=self.film_mm
-            )
-        self._film_z_mm, self._pupil_z_mm = film_z, bounds.pupil_z_mm
+        detail = FINE if not self.lens.anamorphic else COARSE._replace(tighten=bounds is not None)
+        self._film_z_mm, self._pupil_z_mm = film_z, pupil_plane_z_mm(self.lens) if bounds is None else bounds.pupil_z_mm
         self._dtype = torch.float32 if dtype == "float32" else torch.float64
-        self.film = LensFilm(PupilTable.of(asdict(bounds)), float(film_z), used, self._scene, self._passes, detail)
+        read = [dtype, self._pupil_z_mm, self.film_mm, detail, bounds and asdict(bounds)]
+        key = search_key(self.lens, used, detail.wavelengths, *read)
+        outline = kept_outline(key, lambda: self._outline(bounds, used, detail, progress))
+        self.film = LensFilm(outline, float(film_z), used, self._scene)
         if pupil != OUTLINE:
             self.film.pupil = pupil_named(pupil, self.lens, self.film.outline, float(film_z))
         self._light_nm = used
@@ -177,6 +183,20 @@ class ExactCamera:
         if os.getpid() != self._pid:
             torch.set_num_threads(1)
         return self
+
+    def _outline(
+        self, bounds: PupilBounds | None, wavelength_nm: tuple[float, float], detail: Detail, progress: Progress | None
+    ) -> PupilOutline | None:
+        progress = progress or Progress(quiet=True)
+        with progress.stage(f"search the pupil of {self.name}") as report:
+            if bounds is None:
+                planes, corner = (self._film_z_mm, self._film_z_mm), 1.0001 * math.hypot(*self.film_mm) / 2
+                rows, points = (13, 48) if self.lens.anamorphic else (17, 128)
+                bounds = pupil_bounds(
+                    self.lens, corner, planes, wavelength_nm, rows=rows, points=points, film_mm=self.film_mm
+                )
+            table = PupilTable.of(asdict(bounds))
+            return outline_of(table, self._passes, wavelength_nm, detail, lambda share: report(0.2 + 0.8 * share))
 
     def _scene(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SceneRays:
         fx, fy, px, py, wavelength = (

@@ -15,8 +15,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.cameragraph import D_FILM, weight_graph
 from neurolens.cameras.contract import CameraRays, FloatArray, RayDifferentials
-from neurolens.cameras.pupil_boxes import Passes, PupilTable
-from neurolens.cameras.pupil_search import FINE, Detail, outline_of
+from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.sampling import stratified
 from neurolens.graph.interpret import evaluate
 
@@ -55,16 +54,12 @@ class LensFilm:
     """Film and pupil of a lens at one focus and stop: from film points and random numbers to weighted rays.
 
     Args:
-        table: boxes that hold the passing rays, at least those of this focus and stop.
+        outline: the pupil of every film radius; None where no ray passes.
         film_z_mm: film plane, lens frame.
         wavelength_nm: range of the wavelengths used.
         scene: the lens.
-        passes: whether rays pass where a simpler answer than that of `scene` should rule the outline; it must be true
-            where `scene` passes.
-        detail: how closely the outline is sought.
 
     Attributes:
-        outline: the pupil of every film radius, searched for when this is made (0.1 to 0.5 s).
         pupil: the shape that is sampled: the outline, or one put in its place that holds it.
 
     Raises:
@@ -73,18 +68,15 @@ class LensFilm:
 
     def __init__(
         self,
-        table: PupilTable,
+        outline: PupilOutline | None,
         film_z_mm: float,
         wavelength_nm: tuple[float, float],
         scene: SceneFunction,
-        passes: Passes | None = None,
-        detail: Detail = FINE,
     ) -> None:
-        self.film_z_mm, self.scene = film_z_mm, scene
-        self.distance_mm = film_z_mm - table.pupil_z_mm
-        outline = outline_of(table, passes or self._passes, wavelength_nm, detail)
         if outline is None:
             raise InputError("camera", "f_number, focus_m", "(no ray passes)", "a lens that light can pass")
+        self.film_z_mm, self.scene = film_z_mm, scene
+        self.distance_mm = film_z_mm - outline.pupil_z_mm
         self.outline = outline
         self.pupil: Pupil = outline
         self.exposure = 1.0
@@ -144,10 +136,6 @@ class LensFilm:
         if not exposure > 0:
             raise InputError("camera", "f_number, focus_m", "(no ray passes on the axis)", "a lens that light can pass")
         return exposure
-
-    def _passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
-        """Whether rays of film points [2, N] through pupil points [2, N] pass at one wavelength."""
-        return self.scene(film, pupil, np.full(film.shape[1], wavelength_nm, np.float32)).status == st.PASSED
 
 
 def camera_rays(found: Mapping[str, NDArray[Any]]) -> CameraRays:

@@ -22,6 +22,7 @@ from neurolens.cameras.onnxmaps import OnnxDerivatives, OnnxInverse, load_invers
 from neurolens.cameras.onnxsession import joined, open_session, padded, run_session
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import pupil_graph
+from neurolens.cameras.pupil_search import outline_of
 from neurolens.cameras.sampling import arrived, check_film, positive
 from neurolens.graph.ir import Graph
 from neurolens.modelfile import DOMAIN_SLACK
@@ -94,7 +95,8 @@ class OnnxCamera:
         stop = _stop_radius(model, f_number)
         round_stop = ModelScene(model, film_z, stop)
         scene = replace(round_stop, aperture=aperture)
-        self.film = LensFilm(PupilTable.of(domain["bounds"]), film_z, used, scene, round_stop.passes)
+        outline = outline_of(PupilTable.of(domain["bounds"]), round_stop.passes, used)
+        self.film = LensFilm(outline, film_z, used, scene)
         self.settings: dict[str, Any] = {
             "camera": "model",
             "model": str(model.path),

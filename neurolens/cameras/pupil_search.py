@@ -7,6 +7,7 @@ All rows of the outline are searched at once, ray by ray from a centre outwards.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -71,6 +72,7 @@ def outline_of(
     passes: Passes,
     wavelength_nm: tuple[float, float],
     detail: Detail = FINE,
+    report: Callable[[float], object] = lambda share: None,
 ) -> PupilOutline | None:
     """The outline of what passes, or None where nothing does.
 
@@ -79,6 +81,7 @@ def outline_of(
         passes: the lens at one focus and stop.
         wavelength_nm: shortest and longest wavelength; equal ones give an outline for one.
         detail: how closely.
+        report: told the share of the search that is done.
 
     The polygons hold every point found to pass at the rows, between them and between vertices, even where the region
     is not convex or the outline bends: their vertices are pushed out until they do.
@@ -96,19 +99,23 @@ def outline_of(
     frame = frame_of(tight, outline.radii(np.arange(rows, dtype=np.float64)), ask)
     start = np.repeat(np.linspace(0, np.pi, _DIRECTIONS)[None], rows, axis=0)
     reach = np.repeat(frame.reach[:, None], _DIRECTIONS, axis=1)
+    report(0.1)
     rough = _boundary(ask, frame, start, reach, detail.steps, detail.coarse)
+    report(0.2)
     angles = _equal_areas(start, rough, detail.segments)
     if detail.reach < math.inf:
         reach = np.minimum(reach, np.maximum(detail.reach * rough, reach / detail.steps))
     reach = np.stack([np.interp(*row) for row in zip(angles, start, reach, strict=True)])
-    fine = np.stack(
-        [_boundary(asking(passes, (w,)), frame, angles, reach, detail.steps, detail.fine) for w in looked_at]
-    )
-    fine = _together(fine, detail.wavelengths)
+    found = []
+    for w in looked_at:
+        found.append(_boundary(asking(passes, (w,)), frame, angles, reach, detail.steps, detail.fine))
+        report(0.2 + 0.4 * len(found) / len(looked_at))
+    fine = _together(np.stack(found), detail.wavelengths)
     x, y = (fine * a[:, None] * f(angles) for a, f in zip(frame.stretch, (np.cos, np.sin), strict=True))
     y[..., [0, -1]] = 0
     centre, x, y = (a.astype(np.float32) for a in (frame.centre, x, y))
-    return _pushed_out(replace(outline, centre=centre, x=x, y=y), passes, detail.wavelengths)
+    pushed = replace(outline, centre=centre, x=x, y=y)
+    return _pushed_out(pushed, passes, detail.wavelengths, lambda share: report(0.6 + 0.4 * share))
 
 
 def _boundary(
@@ -183,11 +190,14 @@ def _together(distance: Float64Array, shares: tuple[float, ...]) -> Float64Array
     return np.where(apart[:, None], joined, distance[[0, -1]])
 
 
-def _pushed_out(outline: PupilOutline, passes: Passes, shares: tuple[float, ...]) -> PupilOutline:
+def _pushed_out(
+    outline: PupilOutline, passes: Passes, shares: tuple[float, ...], report: Callable[[float], object]
+) -> PupilOutline:
     """The outline with its vertices moved outwards until it holds what passes between them, in all three ways."""
     needed = np.ones(outline.x.shape)
     both = len(outline.wavelength_nm) > 1
-    for share in shares if both else (0.0,):
+    for done, share in enumerate(shares if both else (0.0,)):
+        report(done / len(shares))
         ask = asking(passes, (wavelength_between(outline.wavelength_nm, share),))
         ends = {0.0: slice(0, 1), 1.0: slice(-1, None)}.get(share, slice(None))
         x, y = ((1 - share) * c[0].astype(np.float64) + share * c[-1] for c in (outline.x, outline.y))

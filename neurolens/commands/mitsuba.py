@@ -73,11 +73,12 @@ def run(args: argparse.Namespace) -> int:
 
     scene = load_scene(args.scene, args.variant)
     width, height = (int(v) for v in scene.sensors()[0].film().size())
-    camera = make_camera(args.camera, _shot(args, height / width))
+    progress = Progress(quiet=args.quiet)
+    camera = make_camera(args.camera, _shot(args, height / width), progress)
     for note in camera.settings.get("notes", ()):
         warn(note)
     began = time.perf_counter()
-    with Progress(quiet=args.quiet).stage(f"render {args.scene}, {camera.name}") as report:
+    with progress.stage(f"render {args.scene}, {camera.name}") as report:
         given = {"spp": args.samples, "seed": args.seed, "units_per_m": args.units_per_m}
         picture = render(scene, camera, **given, progress=report)
     mi, _ = libraries()

@@ -30,7 +30,7 @@ from neurolens.graph.scalars import lower
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
-from neurolens.optics.trace import Traced, trace
+from neurolens.optics.trace import Traced, compile_tracing, trace
 from neurolens.optics.tracegraph import exact_graph
 from neurolens.surrogates.assemble import ALL, Parts
 from neurolens.surrogates.domain import Domain, FilmRays
@@ -76,7 +76,7 @@ def exact_candidates(
         return (*places, wavelength) if build_rays else (camera_rays(*places, domain.pupil_z_mm), wavelength)
 
     run: Callable[..., Traced] = whole if build_rays else tracing
-    fast = torch.compile(run, dynamic=False, fullgraph=True)
+    fast = compile_tracing(run, fullgraph=True)
 
     def faster(rays: FilmRays) -> Call:
         given = arguments(rays)

@@ -15,7 +15,7 @@ from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import end_mm, sag_mm
 from neurolens.optics.surfaces import Rays
-from neurolens.optics.trace import trace
+from neurolens.optics.trace import passing, trace
 
 # Azimuths at which lenses with cylinders are searched, 5 degrees apart: at 15, one of them lost 7% of its corners.
 # Their two planes of symmetry give the rest: what passes at -a is the mirror image of what passes at a. In groups,
@@ -87,7 +87,7 @@ def passes_at_any_azimuth(
         r, u, v = film_radius[left], pupil_x[left], pupil_y[left]
         c, s = torch.cos(azimuth[which, 0]), torch.sin(azimuth[which, 0])
         rays = camera_rays(c * r, s * r, planes[left], c * u - s * v, s * u + c * v, pupil_z)
-        passed[left[trace(lens, rays, wavelength_nm).status == 0]] = True
+        passed[left[passing(lens, rays, wavelength_nm)]] = True
     return passed
 
 

@@ -149,7 +149,6 @@ def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], 
     return Hit(x, y, z, q, q2, met, (nx * scale, ny * scale, scale))
 
 
-@torch.compiler.assume_constant_result
 def start_of(surface: Surface) -> tuple[tuple[float, float], int]:
     """The conic c h^2 + cz z^2 = 2 z nearest to an asphere inside its rim, as (c, cz), and the steps it needs."""
     asphere = tuple((p, _number(a)) for p, a in surface.asphere)

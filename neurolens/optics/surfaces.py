@@ -72,6 +72,10 @@ class Labels:
         """`value` [N] of the rays that go on, `otherwise` for the others, even where it is NaN."""
         return torch.where(self._goes_on, value, otherwise)
 
+    def passed(self) -> Tensor:
+        """Whether every test so far was passed, [N]: boolean (of `Counts` 1.0 and 0.0)."""
+        return self._status == 0
+
     def status(self) -> Tensor:
         """Status of every ray, [N] int32; see `neurolens.base.status`."""
         return self._status
@@ -108,6 +112,9 @@ class Counts:
         # All bits or none: unlike a product with 0, this removes NaN.
         kept = value.view(bits).bitwise_and(self._mask).view(value.dtype)
         return kept if otherwise == 0 else kept.add_(1 - self._goes_on, alpha=otherwise)
+
+    def passed(self) -> Tensor:
+        return self._alive
 
     def status(self) -> Tensor:
         return _table((*self._meanings, st.PASSED), self._count.device).index_select(0, self._count.int())
@@ -274,9 +281,14 @@ def refract(
     Returns the refracted rays (vertex frame), n' times the cosine of refraction [N], and the square of that before
     guarding, which is not positive where the ray is totally reflected.
     """
-    sense, q2 = mode.sense, hit.q2 + (after.n2 - before.n2)
+    step = after.n2 - before.n2
+    sense, q2 = mode.sense, hit.q2 + step
     q = root(q2, mode.guard)
-    bend = q - hit.q
+    if q.dtype == torch.float32:
+        # q - hit.q without the rounding of both roots, which was a third of all error. Lost rays may have hit.q < 0.
+        bend = step / (q + (hit.q.abs() if mode.guard else hit.q))
+    else:
+        bend = q - hit.q
     if hit.normal is not None:
         direction = (torch.addcmul(p, bend, n, value=sense) for p, n in zip(r[3:], hit.normal, strict=True))
         return Rays(hit.x, hit.y, hit.z, *direction), q, q2

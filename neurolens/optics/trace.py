@@ -19,7 +19,8 @@ from neurolens.base.errors import InputError
 from neurolens.optics import glass
 from neurolens.optics.passing import Mode, along_axis, bend, check_rays, media, meet, sound_wavelength, start, unit
 from neurolens.optics.prescription import Lens
-from neurolens.optics.surfaces import Rays, times
+from neurolens.optics.shapes import start_of
+from neurolens.optics.surfaces import Counts, Rays, times
 from neurolens.optics.transmission import passage
 
 Towards = Literal["scene", "film"]
@@ -27,6 +28,8 @@ Transmittance = bool | Literal["polarised"]
 
 # Rays per chunk: long enough to hide the cost of calling an operator, short enough for a core's second-level cache.
 CHUNK = 32768
+# Of the rays that `passing` follows, the share below which those that are left are put together.
+_FEWER = 0.8
 
 
 class Crossing(NamedTuple):
@@ -125,6 +128,24 @@ def trace(
     return whole
 
 
+def passing(lens: Lens, rays: Rays, wavelength_nm: float, *, towards: Towards = "scene") -> Tensor:
+    """Whether rays pass the whole lens, bool [N]: where the status of `trace` is 0, bit for bit.
+
+    Rays that are lost are left out of the work on later surfaces. For questions of which most are answered by no.
+
+    Args:
+        lens, rays, towards: as for `trace`. wavelength_nm: of all rays.
+
+    Raises:
+        InputError: as `trace`.
+    """
+    check_rays(rays, wavelength_nm)
+    _keep_memory()
+    chunks = zip(*(c.split(CHUNK) for c in rays), strict=True)
+    with torch.no_grad():
+        return torch.cat([_passing_chunk(lens, Rays(*chunk), wavelength_nm, towards) for chunk in chunks])
+
+
 def compile_trace(
     lens: Lens, *, towards: Towards = "scene", transmittance: Transmittance = False, record: Sequence[int] = ()
 ) -> Callable[[Rays, Tensor], Traced]:
@@ -141,7 +162,17 @@ def compile_trace(
         # Read the catalogue now: compiled code cannot read files.
         glass.index_of(surface, glass.LINE_D_NM)
         glass.absorption_of(surface, glass.LINE_D_NM)
-    return torch.compile(run, dynamic=False)
+    return compile_tracing(run)
+
+
+def compile_tracing(run: Callable[..., Any], fullgraph: bool = False) -> Callable[..., Any]:
+    """`torch.compile` of a function that traces, for chunks of one length.
+
+    What it may take for constant is marked here only: that imports the compiler, which takes longer than a camera
+    needs to start.
+    """
+    torch.compiler.assume_constant_result(start_of)
+    return torch.compile(run, dynamic=False, fullgraph=fullgraph)
 
 
 @cache
@@ -169,10 +200,16 @@ def _parameters(lens: Lens) -> list[Any]:
     return found
 
 
+def _way(lens: Lens, towards: Towards) -> tuple[int, range]:
+    """The sense of travel along z, and the surfaces in the order in which light meets them."""
+    last = len(lens.surfaces) - 1
+    return (1, range(last + 1)) if towards == "film" else (-1, range(last, -1, -1))
+
+
 def _trace_chunk(
     lens: Lens, rays: Rays, wavelength_nm: Tensor | float, towards: Towards, wanted: _Wanted, freeze: bool
 ) -> Traced:
-    sense, order = (1, range(len(lens.surfaces))) if towards == "film" else (-1, range(len(lens.surfaces) - 1, -1, -1))
+    sense, order = _way(lens, towards)
     vertices = lens.vertices_mm
     wavelength_nm, lit = sound_wavelength(lens, wavelength_nm, rays.x.dtype)
     glasses = media(lens, wavelength_nm)  # glasses[k] lies before surface k as light travels to the film
@@ -200,6 +237,26 @@ def _trace_chunk(
     r = along_axis(unit(r._replace(z=r.z + vertex), after), tests, sense, vertex)
     arrived = None if power is None else tests.only(power.arrived(), 0.0)
     return Traced(r, tests.status(), arrived, crossings, tuple(path))
+
+
+def _passing_chunk(lens: Lens, rays: Rays, wavelength_nm: float, towards: Towards) -> Tensor:
+    sense, order = _way(lens, towards)
+    vertices, glasses, mode = lens.vertices_mm, media(lens, wavelength_nm), Mode(sense, False, False)
+    r, tests = start(rays, glasses[0 if sense > 0 else -1], mode, st.blocked(order[0], st.MISSED))
+    left, vertex = torch.arange(len(rays.x)), 0.0
+    for position, k in enumerate(order):
+        r = r._replace(z=r.z + (vertex - vertices[k]))
+        vertex = vertices[k]
+        before, after = (glasses[k], glasses[k + 1]) if sense > 0 else (glasses[k + 1], glasses[k])
+        hit = meet(lens, k, r, before, position == 0, mode, tests)
+        r = bend(lens.surfaces[k], k, r, hit, before, after, mode, tests)[0]
+        if float(tests.passed().sum()) < _FEWER * len(left):
+            alive = torch.nonzero(tests.passed())[:, 0]
+            r, left = Rays(*(c.index_select(0, alive) for c in r)), left.index_select(0, alive)
+            tests = Counts(torch.ones_like(r.x), st.PASSED)
+    passed = torch.zeros(len(rays.x), dtype=torch.bool)
+    passed[left] = tests.passed() > 0
+    return passed
 
 
 def _room(part: Any, count: int) -> Any:

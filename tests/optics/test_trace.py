@@ -15,7 +15,7 @@ from neurolens.base import status as st
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.pupils import camera_rays, pupil_plane_z_mm
-from neurolens.optics.trace import CHUNK, Rays, compile_trace, trace
+from neurolens.optics.trace import CHUNK, Rays, Towards, compile_trace, passing, trace
 
 INF = math.inf
 WIDE = 1000.0
@@ -318,6 +318,25 @@ def test_recording_changes_no_status() -> None:
     passed = plain.status == 0
     for a, b in zip(plain.rays, watched.rays, strict=True):
         torch.testing.assert_close(a[passed], b[passed], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("towards", ["scene", "film"])
+@pytest.mark.parametrize("name", ["muller_fisheye_100", "canon_aspheric_50", "schneider_anamorphic_31"])
+def test_passing_is_status_0_without_the_lost_rays(name: str, towards: Towards) -> None:
+    """Bit for bit, over several chunks, of which most rays are lost; NaN and no ray at all, too."""
+    table = focused(name)
+    start = bundle(table, 2 * CHUNK + 5, film=1.5)
+    if towards == "film":
+        out = trace(table, start)
+        start = Rays(*(torch.where(torch.rand(c.shape) < 0.5, c, c.flip(0)) for c in out.rays))
+        start = Rays(*start[:3], *(-c for c in start[3:]))
+    start.x[7] = math.nan
+    for dtype in (torch.float32, torch.float64):
+        rays = Rays(*(c.to(dtype) for c in start))
+        found = passing(table, rays, 500.0, towards=towards)
+        assert torch.equal(found, trace(table, rays, 500.0, towards=towards).status == 0)
+        assert 0 < found.sum() < 0.8 * len(found)
+    assert passing(table, Rays(*(c[:0] for c in start)), 500.0).shape == (0,)
 
 
 @pytest.mark.slow

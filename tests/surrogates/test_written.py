@@ -36,9 +36,11 @@ from neurolens.surrogates.assemble import ALL, RAY_ONLY, Parts
 from neurolens.surrogates.card import card_of, card_to_json
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.source import export_file, export_source, fused_program
+from neurolens.surrogates.source import export_file, export_source, fused_program, identifier
 from neurolens.surrogates.specialise import Fix, fixed_models
 from neurolens.surrogates.stored import load_fitted
+
+MODELS = Path(__file__).parents[2] / "models"
 
 
 def test_card_is_strict_json_and_says_what_the_model_is(tmp_path: Path) -> None:
@@ -212,12 +214,26 @@ def test_a_file_without_its_coefficients_is_written_as_the_same_function(tmp_pat
     assert written.signature == whole.signature
     head, other = (f.read_text(encoding="utf-8").partition("#ifndef")[0] for f in (written.path, whole.path))
     assert head == other
+    with pytest.raises(ModelError, match="many states"):
+        export_file(MODELS / "nikon_zoom_70_200-range.states-64.onnx", tmp_path / "zoom.h", "c")
     rays = {**rays_of(model, 2000, seed=3), "film_z_mm": model.domain.film_z_mm[0], "stop_radius_mm": 5.0}
     found = compiled(lower(graph_of(file, file.read_bytes()))).rays(rays)
     wanted = written_rays("onnx", "invariants", rays)
     assert np.mean(found["status"] != wanted["status"]) < 1e-3
     for name in SCENE_RAY:
         np.testing.assert_allclose(found[name], wanted[name], rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    "word",
+    ["int", "class", "status", "ray", "t12", "vec3", "sampler2D", "sqrtf", "clamp", "size_t", "film_x_mm", "gl_a"],
+)
+def test_words_of_the_languages_and_of_the_code_are_no_names(word: str, tmp_path: Path) -> None:
+    """With most of these a file would not compile."""
+    for language in ("c", "glsl"):
+        with pytest.raises(InputError, match=f"name: got '{word}'"):
+            export_file(lens_models.exported("invariants"), tmp_path / "a", language, word)
+    assert identifier(f"{word}!") == f"lens_{word}" and identifier("half-lens 2") == "half_lens_2"
 
 
 def test_the_card_stands_on_top(tmp_path: Path) -> None:

@@ -1,0 +1,120 @@
+"""Outlines kept between runs: found again bit for bit, made anew when damaged, never taken for another lens's."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import lens_models
+import numpy as np
+import pytest
+
+from neurolens.base.files import atomic_path, cache_folder, seal
+from neurolens.base.progress import Progress
+from neurolens.cameras import exact
+from neurolens.cameras.contract import FloatArray
+from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.outline_cache import kept_outline, search_key
+from neurolens.cameras.pupil_outline import PupilOutline
+from neurolens.optics.prescription import Lens
+
+KEY = "0123456789abcdef" * 4
+
+
+@pytest.fixture(autouse=True)
+def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return cache_folder()
+
+
+def outline(size: float = 1.0) -> PupilOutline:
+    sides = np.float32(size) * np.arange(2 * 3 * 4, dtype=np.float32).reshape(2, 3, 4)
+    return PupilOutline(-50.0, 20.0, (400.0, 700.0), np.arange(3, dtype=np.float32), sides, sides + 1)
+
+
+def parts(found: PupilOutline | None) -> tuple[object, ...]:
+    assert found is not None
+    arrays: tuple[FloatArray, ...] = (found.centre, found.x, found.y)
+    return (found.pupil_z_mm, found.film_radius_mm, found.wavelength_nm, *(a.tobytes() for a in arrays))
+
+
+def never(*given: object) -> PupilOutline:
+    raise AssertionError("searched again")
+
+
+def test_a_camera_starts_from_the_outline_of_the_run_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    def camera(focus_m: float, shown: Progress | None = None) -> ExactCamera:
+        return ExactCamera(lens, film_mm=(36, 24), focus_m=focus_m, progress=shown)
+
+    lens, written = lens_models.lens("tronnier_double_gauss_100"), io.StringIO()
+    first = camera(2.0, Progress(stream=written))
+    assert written.getvalue().startswith(f"search the pupil of {lens.name}: ")
+    monkeypatch.setattr(exact, "outline_of", never)
+    assert parts(camera(2.0).film.outline) == parts(first.film.outline)
+    with pytest.raises(AssertionError, match="searched"):
+        camera(2.1)
+
+
+def test_whatever_the_search_reads_is_in_the_key() -> None:
+    lens = lens_models.lens().at(focus_m=2.0)
+
+    def key(lens: Lens, waves: tuple[float, float] = (400.0, 700.0), *settings: object) -> str:
+        return search_key(lens, waves, (0.0, 0.5, 1.0), *settings)
+
+    def changed(k: int, **fields: object) -> Lens:
+        rows = [replace(s, **fields) if i == k else s for i, s in enumerate(lens.surfaces)]
+        return replace(lens, surfaces=tuple(rows))
+
+    others = [
+        changed(0, radius_mm=float(lens.surfaces[0].radius_mm) * (1 + 1e-15)),
+        changed(3, thickness_mm=1.0), changed(2, diameter_mm=9.0), changed(0, conic=0.1), changed(1, cylinder="x"),
+        changed(0, asphere=((4, 1e-9),)), changed(0, n_d=1.7, glass=None), changed(0, V_d=30.0, glass=None),
+        changed(0, glass="N-BK7"), lens.at(f_number=4.0), replace(lens, film_z_mm=90.0),
+    ]  # fmt: skip
+    keys = [key(lens), *map(key, others), key(lens, (400.0, 650.0)), key(lens, (400.0, 700.0), "float64")]
+    assert len(set(keys)) == len(keys) and key(lens) == keys[0]
+
+
+def test_two_runs_that_search_at_once_agree(folder: Path) -> None:
+    def beaten() -> PupilOutline:
+        kept_outline(KEY, outline)  # another run is faster
+        return outline()
+
+    assert parts(kept_outline(KEY, beaten)) == parts(kept_outline(KEY, never)) == parts(outline())
+    assert [f.suffix for f in folder.iterdir()] == [".npz"]
+
+
+@pytest.mark.parametrize("harm", ["cut", "flipped", "empty", "link", "not an outline", "objects", "NaN", "other key"])
+def test_damaged_files_are_made_again(folder: Path, tmp_path: Path, harm: str) -> None:
+    kept_outline(KEY, outline)
+    (file,) = folder.iterdir()
+    data = bytearray(file.read_bytes())
+    forged = {"key": np.array(KEY), **vars(outline())} | {
+        "not an outline": {"x": np.zeros(3, np.float32)},
+        "objects": {"centre": np.array([{}, {}, {}], object)},
+        "NaN": {"centre": np.full(3, np.nan, np.float32)},
+        "other key": {"key": np.array("another")},
+    }.get(harm, {})
+    if harm == "link":
+        file.rename(tmp_path / "elsewhere")
+        file.symlink_to(tmp_path / "elsewhere")
+    elif harm in ("cut", "flipped", "empty"):
+        data[len(data) // 2] ^= 1
+        file.write_bytes({"cut": data[:-40], "flipped": data, "empty": b""}[harm])
+    else:
+        with atomic_path(file) as temporary:
+            np.savez(temporary, **forged)  # type: ignore[arg-type]
+            seal(temporary)
+    assert parts(kept_outline(KEY, lambda: outline(2.0))) == parts(outline(2.0))
+    assert parts(kept_outline(KEY, never)) == parts(outline(2.0))
+
+
+def test_a_disk_that_takes_nothing_costs_the_cache_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.cameras.outline_cache.atomic_path", full)
+    assert parts(kept_outline(KEY, outline)) == parts(outline())
+    assert kept_outline(KEY, lambda: None) is None
+
+
+def full(path: Path) -> object:
+    raise OSError(28, "No space left on device", str(path))
