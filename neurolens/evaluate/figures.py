@@ -72,9 +72,9 @@ def side_by_side(
 
 
 def image_caption(errors: ImageErrors) -> str:
-    """Two lines: FLIP and relative MSE, each beside its noise floor."""
+    """Two lines: FLIP with the same random numbers, and relative MSE with others, each beside its noise floor."""
     return (
-        f"FLIP {errors.flip:.3g} (noise {errors.noise_floor_flip:.3g})\n"
+        f"FLIP {errors.flip_paired:.3g} (noise {errors.noise_floor_flip:.3g})\n"
         f"relMSE {errors.rel_mse:.3g} (noise {errors.noise_floor_rel_mse:.3g})"
     )
 

@@ -135,14 +135,18 @@ class ImageErrors:
     """Errors of a camera's renders: means over `pairs` pairs, the noise floor over all pairs of exact renders.
 
     Attributes:
-        flip_ratio: FLIP over the noise floor of the same pairs; None where that is 0.
+        flip_paired: against the exact render of the same random numbers, where most noise cancels: what the camera
+            itself changes, and the one to judge it by.
+        flip, rel_mse: against an exact render of another seed, noise included.
+        paired_share: of the noise floor; None where that is 0.
     """
 
+    flip_paired: float
+    paired_share: float | None
     flip: float
     rel_mse: float
     noise_floor_flip: float
     noise_floor_rel_mse: float
-    flip_ratio: float | None
     pairs: int
 
 
@@ -151,10 +155,8 @@ def compare(
 ) -> ImageErrors:
     """Error of a surrogate's renders against exact ones, beside the noise floor.
 
-    Render i of the surrogate is compared with exact render j != i of `seed_pairs`, never with its own seed: noise
-    that both share would cancel and flatter the surrogate. The floor of the pair is exact i against the same exact j,
-    so a surrogate without error has a ratio of exactly 1 if it uses the same random numbers, else of 1 up to
-    noise.
+    Render i of the surrogate is compared with exact render i, whose random numbers it shares (paired), and with exact
+    render j != i of `seed_pairs`, as two independent renders differ. The floor is exact i against the same exact j.
 
     Args:
         renders: one or more [H, W, 3] linear renders; number i has the seed of exact render i.
@@ -171,13 +173,14 @@ def compare(
         """Of each pair (i, j): test i against exact render j."""
         return [measure(tests[i], exact_renders[j], settings) for i, j in ring[: len(tests)]]
 
-    flips, floor_flips = errors(renders, flip), errors(exact_renders, flip)
-    of_same_pairs = float(np.mean(floor_flips[: len(flips)]))
+    floor = float(np.mean(errors(exact_renders, flip)))
+    paired = float(np.mean([flip(a, b, settings) for a, b in zip(renders, exact_renders, strict=False)]))
     return ImageErrors(
-        flip=float(np.mean(flips)),
+        flip_paired=paired,
+        paired_share=paired / floor if floor > 0 else None,
+        flip=float(np.mean(errors(renders, flip))),
         rel_mse=float(np.mean(errors(renders, rel_mse))),
-        noise_floor_flip=float(np.mean(floor_flips)),
+        noise_floor_flip=floor,
         noise_floor_rel_mse=float(np.mean(errors(exact_renders, rel_mse))),
-        flip_ratio=float(np.mean(flips)) / of_same_pairs if of_same_pairs > 0 else None,
-        pairs=len(flips),
+        pairs=len(renders),
     )

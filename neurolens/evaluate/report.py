@@ -75,9 +75,10 @@ _CAMERA_COLUMNS = (
     Column("threads", "threads"),
 )
 _IMAGE_COLUMNS = (
-    Column("FLIP", "flip", about="difference that an eye sees between the render and an exact one, 0 to 1"),
-    Column("its noise floor", "noise_floor_flip", about="FLIP of two exact renders that differ by their noise alone"),
-    Column("FLIP over floor", "flip_ratio", digits=4, about="1: nothing but noise"),
+    Column("FLIP", "flip_paired", about="difference that an eye sees from the exact render of the same random numbers"),
+    Column("of noise (%)", "paired_share", 100, about="that FLIP over the noise floor"),
+    Column("noise floor", "noise_floor_flip", about="FLIP of two exact renders that differ by their noise alone"),
+    Column("FLIP with noise", "flip", about="from an exact render of other random numbers"),
     Column("relative MSE", "rel_mse", about="mean squared difference over the square of the brightness"),
     Column("noise floor of it", "noise_floor_rel_mse", about="the same of two exact renders"),
     Column("pairs", "pairs", about="of renders compared"),
@@ -148,7 +149,7 @@ def _headline(results: Results) -> str:
     close = [m for m in models if reaches(m, CLOSE_UM)]
     within = f"within {CLOSE_UM:g} µm"
     rims = [{"name": m["name"], "worse": max(_pair)} for m in models if len(_pair := _false(m)) == 2]
-    ratios = _worst_ratios(results.images)
+    shares = _worst_shares(results.images)
     cards = (
         _card("lowest error, RMS", models, "rms_um", 1, "µm", min),
         _card("lowest direction error, RMS", models, "direction_rms_deg", 1, "°", min),
@@ -156,7 +157,7 @@ def _headline(results: Results) -> str:
         _card(f"least time as C, {within}", close, "fused_ns_per_ray.min", 1, "ns/ray", min),
         _card(f"as C, over the exact lens as C, {within}", close, "fused_speedup", 1, "times", max),
         _card("vignetting: false pass or false block, the larger, at best", rims, "worse", 100, "%", min),
-        _card("pictures: FLIP above that of noise, best model in its worst scene", ratios, "beyond", 100, "%", min),
+        _card("pictures: FLIP from exact over that of noise, best in its worst scene", shares, "share", 100, "%", min),
     )
     return f"<div class='cards'>{''.join(cards)}</div>" if any(cards) else ""
 
@@ -165,14 +166,14 @@ def _false(model: Record) -> list[float]:
     return [v for v in (number(model, "false_pass"), number(model, "false_block")) if v is not None]
 
 
-def _worst_ratios(images: Sequence[Record]) -> list[dict[str, Any]]:
-    """By how much the FLIP of each camera's pictures exceeds that of noise alone, in its worst scene."""
+def _worst_shares(images: Sequence[Record]) -> list[dict[str, Any]]:
+    """FLIP of each camera's pictures from exact ones of the same random numbers, over that of noise; worst scene."""
     worst: dict[str, float] = {}
     for record in images:
-        ratio, camera = number(record, "flip_ratio"), str(record.get("camera", ""))
-        if ratio is not None and not camera.startswith("exact"):  # which is 1 by definition
-            worst[camera] = max(ratio - 1, worst.get(camera, 0.0))
-    return [{"name": camera, "beyond": beyond} for camera, beyond in worst.items()]
+        share, camera = number(record, "paired_share"), str(record.get("camera", ""))
+        if share is not None and not camera.startswith("exact"):  # which is 0 by definition
+            worst[camera] = max(share, worst.get(camera, 0.0))
+    return [{"name": camera, "share": share} for camera, share in worst.items()]
 
 
 def _card(label: str, records: Sequence[Record], key: str, factor: float, unit: str, best: Any) -> str:

@@ -128,8 +128,7 @@ def _compare_scene(
             errors = compare(pictures, exact)
             record |= asdict(errors)
             captions[name] = image_caption(errors)
-            # The second exact seed, so that what shows is the noise of two renders and not the shared random numbers.
-            maps[name] = flip_map(pictures[0], exact[1])
+            maps[name] = flip_map(np.mean(pictures, axis=0), np.mean(exact[: len(pictures)], axis=0))
         found.images.append(record)
     maps[EXACT] = flip_map(exact[0], exact[1])
     captions[EXACT] = "two seeds: the noise floor"
@@ -140,8 +139,8 @@ def _compare_scene(
         {
             "file": f"{folder.name}/{file.name}",
             "title": f"{scene.name}: every camera",
-            "caption": f"The mean of {choice.seeds} renders of {choice.samples} samples a pixel. Below each the FLIP "
-            "difference of one of them from one exact render with another seed.",
+            "caption": f"The mean of {choice.seeds} renders of {choice.samples} samples a pixel. Below each its FLIP "
+            "difference from the exact lens's with the same random numbers; below the exact lens that of two seeds.",
             "wide": True,
         }
     )

@@ -106,11 +106,11 @@ def test_pairs_never_join_a_seed_with_itself(count: int) -> None:
 def test_comparing_tells_a_true_camera_from_a_wrong_one(picture: np.ndarray) -> None:
     exact = [noisy(picture, 0.05, seed) for seed in range(4)]
     same = image.compare(exact, exact)
-    assert same.flip_ratio == 1.0
+    assert same.flip_paired == same.paired_share == 0.0 and same.flip == same.noise_floor_flip
     other_noise = image.compare([noisy(picture, 0.05, 10 + seed) for seed in range(4)], exact)
-    assert other_noise.flip_ratio == pytest.approx(1.0, abs=0.05)
+    assert other_noise.paired_share == pytest.approx(1.0, abs=0.05)
     wrong = image.compare([np.roll(render, 4, axis=1) for render in exact], exact)
-    assert wrong.flip_ratio > 1.3 and wrong.rel_mse > 2 * wrong.noise_floor_rel_mse
+    assert wrong.paired_share > 1.3 and wrong.rel_mse > 2 * wrong.noise_floor_rel_mse
 
 
 def test_comparing_fewer_renders_uses_the_floor_of_the_same_pairs_and_a_floor_of_zero_gives_no_ratio(
@@ -118,10 +118,10 @@ def test_comparing_fewer_renders_uses_the_floor_of_the_same_pairs_and_a_floor_of
 ) -> None:
     exact = [noisy(picture, 0.02 * (1 + seed), seed) for seed in range(4)]
     figures = image.compare(exact[:1], exact)
-    assert figures.pairs == 1 and figures.flip_ratio == 1.0
+    assert figures.pairs == 1 and figures.paired_share == 0.0
     assert figures.noise_floor_flip == image.compare(exact, exact).noise_floor_flip
     figures = image.compare([picture * 1.1] * 4, [picture] * 4)
-    assert figures.noise_floor_flip == 0.0 and figures.flip_ratio is None and figures.flip > 0
+    assert figures.noise_floor_flip == 0.0 and figures.paired_share is None and figures.flip_paired > 0
 
 
 @pytest.mark.parametrize(

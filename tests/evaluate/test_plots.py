@@ -120,7 +120,7 @@ def test_other_plots_are_whole_pictures(count: int, tmp_path: Path) -> None:
     draw = np.random.default_rng(0)
     images = {f"camera {i}": draw.uniform(0, 1, (18, 32, 3)) for i in range(count)}
     maps = {name: draw.uniform(0, 0.3, (18, 32)) for name in list(images)[1:]}
-    captions = dict.fromkeys(images, drawn.image_caption(ImageErrors(0.1, 0.02, 0.09, 0.019, 1.1, 4)))
+    captions = dict.fromkeys(images, drawn.image_caption(ImageErrors(0.01, 0.11, 0.1, 0.02, 0.09, 0.019, 4)))
     path = tmp_path / "a.png"
     assert pixels(drawn.side_by_side(images, maps, path, captions, title="Room")).std() > 5
     assert pixels(plots.error_against_coefficients_plot(MODELS, path)).std() > 5

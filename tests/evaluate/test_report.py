@@ -129,7 +129,8 @@ def full_results(name: str = "Tessar 50 mm") -> dict[str, Any]:
         "cameras": [{"name": name, "scene": "room", "render_s": 12.5, "camera_s": 3.0, "camera_share": 0.24}],
         "images": [{
             "scene": "room", "camera": name, "file_png": "room.png", "file_exr": "room & co.exr", "flip": 0.081,
-            "rel_mse": 0.0123, "noise_floor_flip": 0.08, "flip_ratio": 1.0125, "pairs": 4, "caption": name,
+            "rel_mse": 0.0123, "noise_floor_flip": 0.08, "flip_paired": 0.004,
+            "paired_share": 0.05, "pairs": 4, "caption": name,
         }],
         "image_settings": {"exposure": 1.0, "pixels_per_degree": 67.0},
         "domain_gain": {"scene": "room", "text": name, "rows": [{"domain": "scene", "name": "ols 40", "rms_um": 0.61}]},
@@ -170,7 +171,7 @@ def test_it_says_what_to_use_and_what_words_mean(run_dir: Path) -> None:
     head = page.text.partition("In short")[0]
     assert "Use ols-40" in head and "3.25 ns a ray as C" in head
     assert f"--camera fused:{run_dir}/models/ols-40.onnx" in head
-    assert "1.25 %" in page.text  # of FLIP above the noise, where a ratio would read as "1"
+    assert "5 %" in page.text  # FLIP with the same random numbers, as a share of noise
     table = source.partition("<section><h2>Models")[2].partition("</table>")[0]
     headings = re.findall(r"<th scope='col'(.*?)>", table)
     assert len(headings) > 5 and all("title='" in h for h in headings)
