@@ -22,7 +22,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
-from neurolens.cameras.fused import FusedFilm
+from neurolens.cameras.fused import FusedFilm, LensGraph
 from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.outline_cache import kept_outline, search_key
 from neurolens.cameras.pupil_boxes import PupilTable
@@ -178,6 +178,17 @@ class ExactCamera:
         status = np.where(aim.status == st.PASSED, done.status.numpy(), aim.status)
         return arrived(film, origin, point_m, weight, status)
 
+    def lens_graph(self) -> LensGraph:
+        """The lens as a graph.
+
+        Raises:
+            InputError: coatings or glass that absorbs.
+        """
+        check_bare(self.lens)
+        waves = self.wavelength_nm or (LINE_D_NM, LINE_D_NM)
+        graph = exact_graph(self.lens, self._pupil_z_mm, waves)
+        return LensGraph(graph, float(self.lens.stop_radius_mm), self.lens.aperture, self.lens.stop_index)
+
     def for_worker(self) -> ExactCamera:
         """This camera, in a render worker. A forked process must not enter torch's thread pool: it never returns."""
         if os.getpid() != self._pid:
@@ -240,12 +251,9 @@ class FusedExactCamera(ExactCamera):
     rays_a_call = MANY_RAYS_A_CALL
 
     def __init__(self, lens: Lens, **kwargs: Any) -> None:
-        _check_bare(lens)
+        check_bare(lens)
         super().__init__(lens, **kwargs)
-        waves = self.wavelength_nm or (LINE_D_NM, LINE_D_NM)
-        graph = exact_graph(self.lens, self._pupil_z_mm, waves)
-        stop, surface = float(self.lens.stop_radius_mm), self.lens.stop_index
-        self._fused = FusedFilm(self.film, graph, stop, self.film_mm, self.lens.aperture, surface)
+        self._fused = FusedFilm(self.film, self.lens_graph(), self.film_mm)
         self.settings |= {"runtime": "fused"}
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
@@ -262,7 +270,8 @@ class FusedExactCamera(ExactCamera):
         return self._fused.moves_error
 
 
-def _check_bare(lens: Lens) -> None:
+def check_bare(lens: Lens) -> None:
+    """Refuse, by an InputError, coatings and glass that absorbs: their graph follows neither."""
     for k, s in enumerate(lens.surfaces):
         coated = s.coating is not None and bool(s.coating.layers)
         absorbs = (s.glass is not None or s.absorption_per_mm) and absorption_of(s, LINE_D_NM) is not None
