@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from neurolens import __version__
-from neurolens.base.errors import NeurolensError, NeurolensWarning
+from neurolens.base.errors import NeurolensError, NeurolensWarning, printable
 from neurolens.base.signals import handled
 from neurolens.commands.arguments import Parser, more_glasses
 
@@ -92,7 +92,7 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_
         place = "" if error.filename is None else f"{error.filename}: "
         return _fail(f"{place}{error.strerror or error}")
     except KeyboardInterrupt as error:
-        print(f"\nneurolens: interrupted; {args.kept}", file=sys.stderr)
+        print(f"\nneurolens: interrupted; {printable(args.kept)}", file=sys.stderr)
         return 128 + (error.args[0] if error.args else signal.SIGINT)
 
 
@@ -101,7 +101,7 @@ def _interrupt(number: int) -> None:
 
 
 def _fail(message: str) -> int:
-    print(f"neurolens: {' '.join(message.split())}", file=sys.stderr)
+    print(f"neurolens: {printable(' '.join(message.split()))}", file=sys.stderr)
     return 2
 
 
@@ -115,7 +115,7 @@ def _plain_warnings(quiet: bool) -> Iterator[None]:
             if issubclass(category, NeurolensWarning):
                 text = " ".join(str(message).split())
                 if not quiet and text not in said:
-                    print(f"neurolens: warning: {text}", file=sys.stderr)
+                    print(f"neurolens: warning: {printable(text)}", file=sys.stderr)
                 said.add(text)
             else:
                 usual(message, category, *place, **more)

@@ -227,3 +227,43 @@ def test_a_texture_with_the_name_of_the_preview_is_not_written_over(
     said = failure(capsys, "render", scene, "--camera", "pinhole", "--quiet", "-o", tmp_path / "ball.exr")
     assert "--out" in said and "ball.png" in said and (tmp_path / "ball.png").read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.png", "ball.toml"]
+
+
+def test_frames_follow_their_keys_and_what_exists_is_kept(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Focus is linear in 1/m, the stop in stops, places in metres; held before the first key and after the last."""
+    keys = ("--key", "focus=2:1,4:inf", "--key", "f-number=1:2,3:8", "--key", "position=1:0/0.5/5,3:1/0.5/5")
+    command = ("render", str(scene), "--camera", "thin", "--frames", "1:5:2", *keys, "--quiet", "--samples", "1")
+    (tmp_path / "a.0003.exr").write_bytes(b"kept")
+    assert main([*command, "-o", str(tmp_path / "a.exr")]) == 0
+    assert sorted(p.name for p in tmp_path.glob("a.*.exr")) == ["a.0001.exr", "a.0003.exr", "a.0005.exr"]
+    assert (tmp_path / "a.0003.exr").read_bytes() == b"kept"
+    first, last = (read_exr(tmp_path / f"a.000{n}.exr") for n in (1, 5))
+    cameras = [found[1]["camera"] for found in (first, last)]
+    assert [(c["focus_m"], c["f_number"]) for c in cameras] == [(1.0, pytest.approx(2)), (None, pytest.approx(8))]
+    # The same picture as of a scene that stands there.
+    moved, out = tmp_path / "moved.toml", tmp_path / "moved.exr"
+    moved.write_text(re.sub("position_m = .*", "position_m = [1.0, 0.5, 5.0]", scene.read_text()))
+    state = ("--f-number", "8", "--focus", "inf", "--seed", "5", "--samples", "1")
+    assert main(["render", str(moved), "--camera", "thin", "-o", str(out), *state]) == 0
+    assert np.array_equal(read_exr(out)[0], last[0]) and not np.array_equal(first[0], last[0])
+    assert main([*command, "-o", str(tmp_path / "a.exr"), "--restart"]) == 0
+    middle = read_exr(tmp_path / "a.0003.exr")[1]["camera"]
+    assert (middle["focus_m"], middle["f_number"]) == (pytest.approx(2), pytest.approx(8))
+    # A frame that was interrupted goes on; one that fails ends the run.
+    (tmp_path / "a.0001.exr.part").write_bytes(b"")
+    asked: list[str] = []
+    monkeypatch.setattr("neurolens.commands.render._run_one", lambda args: asked.append(args.out.name) or 3)
+    assert main([*command, "-o", str(tmp_path / "a.exr")]) == 3 and asked == ["a.0001.exr"]
+    capsys.readouterr()
+    for wrong, words in (
+        (("--key", "focus=1:0"), "a number above 0"),
+        (("--key", "position=1:0/1"), "X/Y/Z"),
+        (("--key", "focus=3:1,2:1"), "frames increasing"),
+        (("--key", "iso=1:100"), "NAME of focus"),
+        (("--key", "focus=1:1", "--focus", "2"), "left out"),
+    ):
+        start = ("render", scene, "--camera", "thin", "-o", tmp_path / "b.exr", "--frames", "1:2")
+        assert words in failure(capsys, *start, *wrong)
+    assert "--frames" in failure(capsys, "render", scene, "--camera", "thin", "-o", tmp_path / "b.exr", "--key", "a=1")

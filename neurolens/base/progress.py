@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Protocol, TextIO
 
+from neurolens.base.errors import printable
+
 # A plan is trusted like one that held for so many seconds.
 _TRUST_S = 20.0
 
@@ -132,7 +134,7 @@ class Progress:
         stream = self._output()
         if stream is None:
             return
-        now = self._clock()
+        now, text = self._clock(), printable(text)
         if self._terminal():
             if not last and self._open_line and now - self._printed_at < 0.1:
                 return

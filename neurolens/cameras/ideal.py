@@ -138,7 +138,8 @@ class ThinLens(_IdealLens):
 
         weight = cos2 * cos2 * np.float32(self._exposure / self._part)
         status = self._stopped(lens, np.zeros(count, np.int32))
-        return sound(CameraRays(origin, direction, np.where(status == st.PASSED, weight, np.float32(0)), status), cos2)
+        weight = np.where(status == st.PASSED, weight, np.float32(0))
+        return sound(CameraRays(origin, direction, weight, status), cos2, pupil)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `sample`, with the differentials of the rays, which turn about their points on the lens."""
@@ -253,7 +254,8 @@ class ThickLens(_IdealLens):
             np.multiply(height, np.float32(1e-3), out=origin[:2])
         weight = cos2 * cos2 * np.float32(self._exposure / self._part)
         status = self._stopped(entrance, np.zeros(count, np.int32))
-        return sound(CameraRays(origin, direction, np.where(status == st.PASSED, weight, np.float32(0)), status), cos2)
+        weight = np.where(status == st.PASSED, weight, np.float32(0))
+        return sound(CameraRays(origin, direction, weight, status), cos2, pupil)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `sample`, with the differentials of the rays; their origins move on the front principal plane."""

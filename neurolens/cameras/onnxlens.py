@@ -100,6 +100,7 @@ class OnnxLens:
         other.state = self.state
         return other
 
+    @np.errstate(over="ignore")  # numbers that float32 does not hold are outside the domain
     def rays(
         self,
         film_xy_mm: ArrayLike,
@@ -248,6 +249,7 @@ def _tolerances(model: OnnxLens, rounding: dict[str, Any]) -> tuple[Any, ...]:
     return [[position]] * 3 + [[direction]] * 3, power, stop, 0
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused
 def _check_rays(model: OnnxLens, reference: Any) -> None:
     try:
         rays = np.asarray(reference["rays"], np.float32)

@@ -84,7 +84,8 @@ class Pinhole:
             direction *= np.sqrt(cos2)
         origin = np.zeros((3, count), np.float32)
         origin[2] = -1e-3 * self.focal_mm
-        return sound(CameraRays(origin, direction, (cos2 * cos2).astype(np.float32), np.zeros(count, np.int32)), cos2)
+        rays = CameraRays(origin, direction, (cos2 * cos2).astype(np.float32), np.zeros(count, np.int32))
+        return sound(rays, cos2, pupil)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `sample`, with the differentials of the rays, all of which start at the hole."""
@@ -203,7 +204,8 @@ class Fisheye:
         origin = np.zeros_like(direction)
         origin[2] = -1e-3 * self.focal_mm
         weight = (self.projection.falloff(theta) * lit).astype(np.float32)
-        return CameraRays(origin, direction, weight, np.where(lit, st.PASSED, st.OUTSIDE_DOMAIN).astype(np.int32))
+        status = np.where(lit, st.PASSED, st.OUTSIDE_DOMAIN).astype(np.int32)
+        return sound(CameraRays(origin, direction, weight, status), np.ones_like(rho), pupil)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `sample`, with the differentials of the rays, all of which start at the hole."""

@@ -11,6 +11,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 
+_LEAST_COS2 = 1e-30  # squares of tangents beyond come near the end of float32
 _AHEAD = np.array([[0], [0], [-1]], np.float32)
 
 
@@ -27,9 +28,10 @@ def concentric_disk(square: FloatArray) -> FloatArray:
     other = np.where(swap, a, b)
     angle = other * np.float32(math.pi / 4)
     # The centre, radius 0, has no direction: dividing by 1 there leaves the angle 0 and the point at the origin.
-    angle /= np.where(radius == 0, np.float32(1), radius)
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.stack([radius * np.where(swap, sin, cos), radius * np.where(swap, cos, sin)])
+    with np.errstate(over="ignore", invalid="ignore"):  # of points outside the square
+        angle /= np.where(radius == 0, np.float32(1), radius)
+        cos, sin = np.cos(angle), np.sin(angle)
+        return np.stack([radius * np.where(swap, sin, cos), radius * np.where(swap, cos, sin)])
 
 
 def stratified(side: int, wavelength_nm: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
@@ -45,14 +47,16 @@ def stratified(side: int, wavelength_nm: tuple[float, float]) -> tuple[FloatArra
     return square, (wavelength_nm[0] + (wavelength_nm[1] - wavelength_nm[0]) * share).astype(np.float32)
 
 
-def sound(rays: CameraRays, cos2: FloatArray) -> CameraRays:
-    """The rays, those of film points that are not finite (or beyond float32) dark and straight ahead.
+def sound(rays: CameraRays, cos2: FloatArray, square: FloatArray) -> CameraRays:
+    """The rays, those of no film point, or of one too far out for float32, or of no pupil point, dark, straight ahead.
 
-    `cos2` [N]: a squared cosine of each ray, which is above 0 for sound ones and NaN or 0 for others.
+    Args:
+        cos2: [N], a squared cosine of each ray, which is NaN or near 0 for film points that are not sound.
+        square: [2, N] the pupil samples, which belong to [0, 1].
     """
-    if cos2.min(initial=1) > 0:  # false for NaN
+    if cos2.min(initial=1) > _LEAST_COS2 and square.min(initial=0) >= 0 and square.max(initial=0) <= 1:  # not NaN
         return rays
-    good = cos2 > 0
+    good = (cos2 > _LEAST_COS2) & ((square >= 0) & (square <= 1)).all(0)
     return CameraRays(
         np.where(good, rays.origin_m, np.float32(0)),
         np.where(good, rays.direction, _AHEAD),

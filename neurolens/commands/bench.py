@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, printable
 from neurolens.commands.arguments import QUIET_HELP, Parser, check_run_folder, lens_path, whole
 
 if TYPE_CHECKING:
@@ -96,7 +96,8 @@ def run_surrogates(args: argparse.Namespace) -> int:
         found[bench.name] = records
         write_lens(bench.name, records, facts, out)
         atomic_write_text(out / "summary.md", summary_page(found, facts))
-    print(f"{summary_page(found, facts)}\nLook at\n  {out / 'summary.md'}\n  {out / (benches[0].name + '.md')}, ...")
+    pages = f"Look at\n  {out / 'summary.md'}\n  {out / (benches[0].name + '.md')}, ..."
+    print(printable(f"{summary_page(found, facts)}\n{pages}"))
     return 0
 
 

@@ -8,12 +8,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from neurolens.base.errors import printable
 from neurolens.evaluate.records import plain
 
 
 def print_json(data: Mapping[str, Any]) -> None:
     """Print one JSON object on stdout."""
-    print(json.dumps(plain(data), indent=1, allow_nan=False, ensure_ascii=False))
+    print(printable(json.dumps(plain(data), indent=1, allow_nan=False, ensure_ascii=False)))
 
 
 def answer(args: argparse.Namespace, data: Mapping[str, Any], text: Callable[[], str]) -> int:
@@ -21,7 +22,7 @@ def answer(args: argparse.Namespace, data: Mapping[str, Any], text: Callable[[],
     if args.json:
         print_json(data)
     else:
-        print(text())
+        print(printable(text()))
     return 0
 
 

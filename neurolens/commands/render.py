@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
-from neurolens.base.errors import NeurolensError
+from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import (
     CAMERAS_HELP,
@@ -32,6 +32,7 @@ from neurolens.commands.render_files import (
     watch_of,
     write_pictures,
 )
+from neurolens.commands.render_frames import add_frames, run_frames
 from neurolens.evaluate.records import plain
 from neurolens.render.film_settings import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS, FilmSettings
 
@@ -62,7 +63,9 @@ examples:
   neurolens render experiments/scenes/grid.toml --camera lenses/ogawa_zoom_70_200.toml \\
       --zoom 100 --blades 8 --blade-curvature 0.5 -o zoom.exr
   neurolens render experiments/scenes/room.toml --camera thin --samples 64 --keep-checkpoint -o room.exr
-  neurolens render experiments/scenes/room.toml --camera thin --samples 256 -o room.exr   # 192 more"""
+  neurolens render experiments/scenes/room.toml --camera thin --samples 256 -o room.exr   # 192 more
+  neurolens render experiments/scenes/room.toml --camera fused:models/NAME.onnx --frames 1:48 \\
+      --key focus=1:1.2,48:3 --key position=1:0/1.6/3,48:0.5/1.6/2.5 -o pull.exr"""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -99,6 +102,7 @@ def add_parser(subparsers: Any) -> None:
         "axis from the film) and blocked (share of camera rays that do not pass) (default: all)",
     )  # fmt: skip
     _add_colour(parser)
+    add_frames(parser)
     add_safety(parser)
     add_lens_state(
         parser,
@@ -111,6 +115,7 @@ def add_parser(subparsers: Any) -> None:
         help="workers, each pinned to a core if there are as many as cores (default: 2)",
     )  # fmt: skip
     add_json(parser, quiet=True)
+    parser.set_defaults(position_m=None, look_at_m=None)
     parser.set_defaults(run=run_kept, kept="no picture was written; older files of that name are untouched")
 
 
@@ -151,15 +156,24 @@ def run_kept(args: argparse.Namespace) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
+    """Render one picture, or one a frame."""
+    if args.frames is not None:
+        return run_frames(args, _run_one)
+    if args.key:
+        raise InputError("neurolens render", "--key", args.key[0], "--frames beside it")
+    return _run_one(args)
+
+
+def _run_one(args: argparse.Namespace) -> int:
     """Render, write both pictures, print a summary."""
     files = Files.of(args.out)
     from neurolens.cameras.build import make_camera
     from neurolens.render.film import PixelGrid
     from neurolens.render.illuminants import check_name
     from neurolens.render.renderer import render
-    from neurolens.render.scene import files_named, load_scene
+    from neurolens.render.scene import files_named, load_scene, seen_from
 
-    scene = load_scene(args.scene)
+    scene = seen_from(load_scene(args.scene), args.scene, args.position_m, args.look_at_m)
     files.spare(args.scene.parent / name for name in files_named(scene.settings))
     settings, film = scene.settings.camera, film_of(scene.settings.film, args)
     if args.white_balance is not None:

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, printable
 from neurolens.base.files import check_writable
 from neurolens.base.progress import duration
 from neurolens.base.signals import handled
@@ -111,7 +111,7 @@ class Stopping:
 
     def say(self, what: str) -> int:
         """Print what remains of an interrupted render to stderr; the exit code, 128 plus the signal's number."""
-        print(f"\nneurolens: interrupted; {what}", file=sys.stderr)
+        print(f"\nneurolens: interrupted; {printable(what)}", file=sys.stderr)
         return 128 + (self._number or signal.SIGINT)
 
 

@@ -118,6 +118,7 @@ def check_card(file: Any, card: Mapping[str, Any]) -> None:
         raise ModelError(f"{file}: card: states: {type(error).__name__}: {error}") from error
 
 
+@np.errstate(over="ignore")
 def pupil_rows(bounds: Mapping[str, Any]) -> NDArray[np.float32]:
     """[3, R] low, high, half of the boxes in a card's bounds.
 

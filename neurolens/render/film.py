@@ -32,7 +32,8 @@ RGB, LUMINANCE2, DEPTH, HITS, PASSED, DROPPED, COLUMNS = slice(0, 3), 3, 4, 5, 6
 # Of a render in the main process: the sums, and at the end picture and layers, in the writer's order too.
 BYTES_A_PIXEL = 8 * COLUMNS + 100
 _LONGEST_WAIT_S = 5.0
-_ASPECT_TOLERANCE = 0.02  # larger deviations from square pixels are taken as mistakes
+# Larger deviations from square pixels are taken as mistakes, unless no whole number comes nearer.
+_ASPECT_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,8 @@ class PixelGrid:
             if getattr(self, field) < 1:
                 raise InputError("picture", field, getattr(self, field), "an integer above 0")
         film = self.film_mm[0] / self.film_mm[1]
-        if abs(self.width / self.height / film - 1) > _ASPECT_TOLERANCE:
+        nearest = round(self.width / film) == self.height or round(self.height * film) == self.width
+        if not nearest and abs(self.width / self.height / film - 1) > _ASPECT_TOLERANCE:
             shape = f"{self.film_mm[0]:g} x {self.film_mm[1]:g} mm"
             raise InputError("picture", "width x height", (self.width, self.height), f"the shape of the film, {shape}")
 

@@ -195,7 +195,7 @@ def _turned(hue: FloatArray, by: FloatArray | np.float32) -> FloatArray:
 # Of the layers, for the metadata of a picture.
 MEANING = {
     "samples": "samples in the pixel",
-    "variance": "of the pixel's luminance (linear sRGB), from its samples as if they were independent",
+    "variance": "of the pixel's luminance (linear sRGB), from its samples as if they were independent; inf: below two",
     "depth": "channel Z: m along the optical axis from the film's plane to the first surface, mean; inf: none",
     "blocked": "share of the samples whose camera ray did not pass",
 }

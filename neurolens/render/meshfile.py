@@ -9,7 +9,8 @@ from __future__ import annotations
 import io
 import math
 import re
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.render.scenetables import FARTHEST_M, MeshSettings
 
 LARGEST_FILE = 500_000_000  # bytes
@@ -48,22 +49,29 @@ class TriangleSet:
     normals: NDArray[np.float64] | None = None
 
 
-def read_mesh(scene: Path, field: str, settings: MeshSettings) -> TriangleSet:
-    """Triangles in scene coordinates, none degenerate.
+def read_mesh(scene: Path, field: str, settings: MeshSettings, part: TriangleSet | None = None) -> TriangleSet:
+    """Triangles in scene coordinates, none degenerate; `part`: those of a file that has been read.
+
+    Warns:
+        NeurolensWarning: triangles of a file without area, which are left out.
 
     Raises:
         InputError: names the scene file, the field and what is wrong: a file that is missing, too large or broken,
             numbers that are not finite, a face with a vertex that does not exist or without an area.
     """
-    if settings.file is not None:
+    if part is not None:
+        mesh = part
+    elif settings.file is not None:
         mesh = read_file(scene, f"{field}.file", scene.parent / settings.file)
     else:
         vertices = np.array(settings.vertices_m, np.float64).reshape(-1, 3)
         mesh = TriangleSet(vertices, np.array(settings.faces, np.int64).reshape(-1, 3))
-    _check(scene, field, mesh)
+    if settings.matrix is not None:
+        mesh = _mapped(mesh, np.array(settings.matrix, np.float64))
+    mesh = _checked(scene, field, mesh, None if settings.file is None else scene.parent / settings.file)
     angle = math.radians(settings.rotate_y_deg)
     turn = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
-    placed = settings.scale * mesh.vertices @ turn.T + np.array(settings.translate_m)
+    placed = np.array(settings.scale) * mesh.vertices @ turn.T + np.array(settings.translate_m)
     if not np.all(np.abs(placed) <= FARTHEST_M):
         raise InputError(scene, f"{field}.vertices_m", "(too far)", f"points within {FARTHEST_M:g} m in the scene")
     normals = mesh.normals
@@ -71,8 +79,18 @@ def read_mesh(scene: Path, field: str, settings: MeshSettings) -> TriangleSet:
         normals = vertex_normals(mesh.vertices, mesh.faces)
     if settings.smooth is False or normals is None:
         return TriangleSet(placed, mesh.faces, mesh.uv)
+    if isinstance(settings.scale, tuple):
+        normals = normals / np.array(settings.scale)
     turned = normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-30) @ turn.T
     return TriangleSet(placed, mesh.faces, mesh.uv, turned)
+
+
+def _mapped(mesh: TriangleSet, matrix: NDArray[np.float64]) -> TriangleSet:
+    """A mesh mapped by [3, 4]; a mirroring one turns its triangles, so that their fronts stay outside."""
+    linear = matrix[:, :3]
+    normals = None if mesh.normals is None else mesh.normals @ np.linalg.inv(linear)
+    faces = mesh.faces if np.linalg.det(linear) > 0 else mesh.faces[:, ::-1]
+    return TriangleSet(mesh.vertices @ linear.T + matrix[:, 3], faces, mesh.uv, normals)
 
 
 def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -85,7 +103,8 @@ def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> N
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
 
 
-def _check(scene: Path, field: str, mesh: TriangleSet) -> None:
+def _checked(scene: Path, field: str, mesh: TriangleSet, file: Path | None) -> TriangleSet:
+    """The mesh, of a file without the triangles that have no area; a scene's own must have one."""
     vertices, faces = mesh.vertices, mesh.faces
     if not len(faces):
         raise InputError(scene, f"{field}.faces", "(none)", "at least one triangle")
@@ -98,9 +117,16 @@ def _check(scene: Path, field: str, mesh: TriangleSet) -> None:
     edges = corners[:, [1, 2, 0]] - corners
     area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     # Height over the longest side: a needle this thin has no normal in float32.
-    for k in np.flatnonzero(~(area > 1e-6 * np.max(np.sum(edges**2, axis=2), axis=1)))[:1]:
+    flat = ~(area > 1e-6 * np.max(np.sum(edges**2, axis=2), axis=1))
+    if not flat.any():
+        return mesh
+    if file is None or flat.all():
+        k = int(np.flatnonzero(flat)[0])
         expected = "a triangle with an area, not a degenerate one"
         raise InputError(scene, f"{field}.faces[{k}]", faces[k].tolist(), expected)
+    told = f"{file}: {flat.sum()} of {len(flat)} triangles have no area and are left out"
+    warnings.warn(told, NeurolensWarning, stacklevel=2)
+    return replace(mesh, faces=faces[~flat])
 
 
 def read_file(scene: Path, field: str, path: Path) -> TriangleSet:

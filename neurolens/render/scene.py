@@ -6,7 +6,7 @@ The tables of shapes, materials and lights are defined in `neurolens.render.scen
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ from neurolens.optics.apertures import Aperture
 from neurolens.render import scenetables as tables
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.illuminants import Spectrum, check_name, check_spectrum, illuminant, read_spectrum
-from neurolens.render.meshfile import TriangleSet, encloses, read_mesh
+from neurolens.render.meshfile import TriangleSet, encloses
+from neurolens.render.mtlfile import Parts
 from neurolens.render.pictures import make_aperture, read_environment, read_picture
 from neurolens.render.scenetables import BLACK, Checked, Material, MeasuredSpectrum, Texture, Vector, require
 
@@ -131,8 +132,7 @@ def load_scene(path: str | Path) -> Scene:
 def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> Scene:
     """As `load_scene`, for tables already in memory; `path` is for messages and for finding files."""
     path = Path(path)
-    settings = from_dict(SceneSettings, tables, path)
-    triangles = tuple(read_mesh(path, f"meshes[{k}]", mesh) for k, mesh in enumerate(settings.meshes))
+    settings, triangles = _with_meshes(path, from_dict(SceneSettings, tables, path))
     _check_references(path, settings, triangles)
     _check_camera(path, settings, triangles)
     images = {
@@ -151,6 +151,31 @@ def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> 
         _spectra(path, "reflectances", settings.reflectances, settings.camera, most=1.0),
         None if around is None else read_environment(path, "environment.file", path.parent / around, scale),
     )
+
+
+def _with_meshes(path: Path, settings: SceneSettings) -> tuple[SceneSettings, tuple[TriangleSet, ...]]:
+    """The meshes, one a material, and the tables with the materials that their files bring."""
+    parts, materials = Parts(), settings.materials or {}
+    for k, mesh in enumerate(settings.meshes):
+        parts.add(path, f"meshes[{k}]", mesh, materials)
+    more: dict[str, Any] = {"meshes": tuple(parts.meshes)}
+    if parts.materials:
+        more |= {"materials": parts.materials | materials, "textures": parts.textures | (settings.textures or {})}
+    return replace(settings, **more), tuple(parts.triangles)
+
+
+def seen_from(scene: Scene, path: str | Path, position_m: Vector | None, look_at_m: Vector | None) -> Scene:
+    """The scene from another place, towards another point; None keeps its own. Errors as of `load_scene`."""
+    moved: dict[str, Any] = {"position_m": position_m, "look_at_m": look_at_m}
+    given = {name: value for name, value in moved.items() if value is not None}
+    if not given:
+        return scene
+    try:
+        settings = replace(scene.settings, camera=replace(scene.settings.camera, **given))
+    except InputError as error:
+        raise InputError(path, f"camera.{error.field}", error.value, error.expected) from None
+    _check_camera(Path(path), settings, scene.triangles)
+    return replace(scene, settings=settings)
 
 
 def _aperture(path: Path, camera: CameraSettings) -> Aperture | None:

@@ -19,6 +19,7 @@ from typing import Any, Literal
 from neurolens.base.errors import InputError
 
 Vector = tuple[float, float, float]
+Row = tuple[float, float, float, float]
 Reflectance = Vector | str  # linear sRGB, or the name of a measured spectrum
 BLACK: Vector = (0.0, 0.0, 0.0)
 # Squares and products stay far from the limits of float32.
@@ -50,6 +51,15 @@ _EMISSION: Rule = (lambda v: all(0 <= x <= BRIGHTEST for x in v), f"three number
 _REFLECTANCE: Rule = (lambda v: isinstance(v, str) or all(0 <= x <= 1 for x in v), "three numbers from 0 to 1")
 
 
+def _is_regular(rows: tuple[Row, ...]) -> bool:
+    """Whether a matrix is finite and keeps the volume of a cube above 1e-9 of that of its longest edges."""
+    if not all(abs(x) <= FARTHEST_M for row in rows for x in row):
+        return False
+    (a, b, c), (d, e, f), (g, h, i) = (row[:3] for row in rows)
+    volume = abs(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
+    return volume > 1e-9 * length((a, d, g)) * length((b, e, h)) * length((c, f, i))
+
+
 def _count(most: int) -> Rule:
     return lambda v: 1 <= v <= most, f"an integer from 1 to {most}"
 
@@ -62,7 +72,9 @@ _RULES: dict[str, Rule] = {
     **dict.fromkeys(("reflectance", "specular"), _REFLECTANCE),
     **dict.fromkeys(("radius_m", "cell_m", "transmittance_depth_m"), _SIZE),
     **dict.fromkeys(("rotate_y_deg", "sun_azimuth_deg"), _ANGLE),
-    **dict.fromkeys(("f_number", "film_width_mm", "film_height_mm", "scale"), _POSITIVE),
+    **dict.fromkeys(("f_number", "film_width_mm", "film_height_mm"), _POSITIVE),
+    "scale": (lambda v: all(0 < x < math.inf for x in (v if isinstance(v, tuple) else (v,))), "finite numbers above 0"),
+    "matrix": (lambda v: _is_regular(v), f"three rows of four numbers within {FARTHEST_M:g}, which flatten nothing"),
     **dict.fromkeys(("width", "height"), _count(16384)),
     "samples": _count(1 << 20),
     "max_depth": _count(1000),
@@ -191,15 +203,20 @@ class Room(Box):
 class MeshSettings(Checked):
     """Triangles: `vertices_m` and `faces` (counted from 0), or an OBJ or PLY `file` beside the scene file.
 
-    Scaled, turned about y, then moved. `smooth` interpolates vertex normals, those of the file or else the mean of the
-    triangles around; left out, those of the file where it has them; false leaves the triangles flat.
+    Without `material` an OBJ file has its own: diffuse, with the colours (linear) and pictures of its MTL files.
+
+    Mapped by `matrix` (three rows of four: x, y, z and what is added in m), scaled (by one number, or along x, y, z),
+    turned about y, then moved; triangles without area in a file are left out with a warning. `smooth` interpolates
+    vertex normals, those of the file or else the mean of the triangles around; left out, those of the file where it has
+    them; false leaves the triangles flat.
     """
 
-    material: str
+    material: str | None = None
     file: Path | None = None
     vertices_m: tuple[Vector, ...] | None = None
     faces: tuple[tuple[int, int, int], ...] | None = None
-    scale: float = 1.0
+    matrix: tuple[Row, Row, Row] | None = None
+    scale: float | Vector = 1.0
     rotate_y_deg: float = 0.0
     translate_m: Vector = BLACK
     smooth: bool | None = None

@@ -5,6 +5,7 @@ From a model's coefficients, or, without torch, from the graph in its file, whic
 
 from __future__ import annotations
 
+import math
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -17,7 +18,17 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.graph.c import NOTHING, Extras, Signature, write_c
 from neurolens.graph.glsl import write_glsl
-from neurolens.graph.program import FILM_Z, STOP_RADIUS, Program
+from neurolens.graph.program import (
+    FILM_Z,
+    RAY,
+    SCENE_RAY,
+    STATUS,
+    STOP,
+    STOP_RADIUS,
+    TRANSMITTANCE,
+    WAVELENGTH,
+    Program,
+)
 from neurolens.graph.scalars import lower
 from neurolens.modelfile.graph import graph_of
 from neurolens.modelfile.onnxfile import read_checked
@@ -32,6 +43,26 @@ FREE = Fix()
 WRITERS = {"c": write_c, "glsl": write_glsl}
 MOST_WEIGHTS = 20_000  # each is a step, and compilers take minutes; larger products of matrices go by blocks
 _WIDTH = 110
+# Keywords of C11, C++20 and GLSL 4.60 and words reserved there, functions of GLSL, names of the code that is written.
+_WORDS = """
+    alignas alignof and and_eq asm auto bitand bitor bool break case catch char char8_t char16_t char32_t class co_await
+    co_return co_yield compl concept const const_cast consteval constexpr constinit continue decltype default delete do
+    double dynamic_cast else enum explicit export extern false float for friend goto if inline int long mutable
+    namespace new noexcept not not_eq nullptr operator or or_eq private protected public register reinterpret_cast
+    requires restrict return short signed sizeof static static_assert static_cast struct switch template this
+    thread_local throw true try typedef typeid typename typeof union unsigned using virtual void volatile wchar_t while
+    xor xor_eq active attribute buffer cast centroid coherent common discard external filter fixed flat half highp in
+    inout input interface invariant layout lowp mediump noinline noperspective out output partition patch precise
+    precision readonly resource sample sampler shared smooth subroutine superp uniform varying writeonly
+    abs all any clamp cross distance div dot equal fract inverse length main max min mix mod normalize outer reflect
+    refract round sign step texture transpose radians degrees isnan isinf
+    size_t ptrdiff_t max_align_t offsetof linux unix errno signal
+    ray rays i r c x y count band known band_first
+""".split()
+_PATTERNS = re.compile(
+    r"t\d+|gl_.*|[biud]?vec[234]|d?mat[234](x[234])?|[iu]?(sampler|image|texture|subpassInput)\w*|texel\w*|atomic\w*|hvec\d"
+    r"|dmat\w*|fvec\d|u?int(8|16|32|64)?_t|u?int|float_t|double_t"
+)
 _ERRORS = ("rms_um", "p99_um", "max_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
 
 
@@ -101,9 +132,18 @@ def checked_name(language: str, lens_id: str, name: str | None) -> str:
     if language not in WRITERS:
         raise InputError("export", "to", language, f"one of {', '.join(WRITERS)}")
     own = identifier(lens_id) if name is None else name
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,99}", own) or "__" in own:
-        raise InputError("export", "name", own, "letters, digits and single underscores, a letter first")
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,99}", own) or "__" in own or _taken(own):
+        expected = (
+            "letters, digits and single underscores, a letter first, and no word of C, C++ or GLSL or of the code"
+        )
+        raise InputError("export", "name", own, expected)
     return own
+
+
+def _taken(word: str) -> bool:
+    """Whether a word has a meaning in a language, or in the code that is written."""
+    known = {*_WORDS, *RAY, *SCENE_RAY, *STOP, WAVELENGTH, FILM_Z, STOP_RADIUS, TRANSMITTANCE, STATUS}
+    return word in known or word.removesuffix("f") in dir(math) or _PATTERNS.fullmatch(word) is not None
 
 
 def _no_card(error: Exception) -> InputError:
@@ -161,7 +201,7 @@ def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FR
 def identifier(text: str) -> str:
     """A name of a function made from any text."""
     word = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_")[:80]
-    return word if word[:1].isalpha() else f"lens_{word}"
+    return word if word[:1].isalpha() and not _taken(word) else f"lens_{word}"
 
 
 def comment_of(

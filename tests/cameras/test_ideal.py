@@ -14,6 +14,7 @@ from shipped import disc_irradiance
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import ThickLens, ThinLens
 from neurolens.cameras.pinhole import PROJECTIONS, Fisheye, Pinhole
 from neurolens.cameras.sampling import concentric_disk
@@ -240,7 +241,7 @@ def test_weight_is_that_of_etendue(name: str) -> None:
     radius, azimuth = edge * rng.random(400), 2 * math.pi * rng.random(400)
     film = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth)]).astype(np.float32)
     rays = sample(camera, film)
-    slopes = differences(camera, film, film, film[0], 0.02)[3:]
+    slopes = differences(camera, film, 0 * film, film[0], 0.02)[3:]
     solid = FOCAL**2 * np.linalg.norm(np.cross(slopes[:, 0].T, slopes[:, 1].T), axis=1)
     foreshortening = -rays.direction[2] if name == "orthographic" else 1
     assert rays.weight == pytest.approx(foreshortening * solid, abs=2e-3)
@@ -253,6 +254,28 @@ def test_laws_of_the_falloff() -> None:
     for name, law in laws.items():
         radius = FOCAL * PROJECTIONS[name].radius(theta)
         assert sample(Fisheye(name, FOCAL), np.stack([radius, 0 * radius])).weight == pytest.approx(law, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        Pinhole(FOCAL),
+        *(Fisheye(name, FOCAL) for name in PROJECTIONS),
+        ThinLens(FOCAL, 2.0, 2.0),
+        ThickLens(FOCAL, 2.0, 2.0, principal_z_mm=(10.0, 30.0), entrance_pupil_z_mm=20.0),
+    ],
+    ids=lambda camera: camera.name,
+)
+def test_film_and_pupil_points_that_are_none_give_dark_unit_rays(camera: Camera) -> None:
+    film = np.zeros((2, 8), np.float32)
+    square = np.full((2, 8), 0.3, np.float32)
+    film[:, :4], square[1, 4:] = [1e19, 1e21, 3e38, math.nan], [-0.01, 1.01, math.inf, math.nan]
+    with np.errstate(over="raise", invalid="raise", divide="raise"):
+        rays = camera.sample(film, square, np.full(8, 550, np.float32))
+    assert (rays.status[2:] == st.OUTSIDE_DOMAIN).all() and not rays.weight[2:].any()
+    assert np.linalg.norm(rays.direction, axis=0) == pytest.approx(1, abs=1e-6)
+    edge = camera.sample(np.zeros((2, 1), np.float32), np.ones((2, 1), np.float32), np.full(1, 550, np.float32))
+    assert edge.status == st.PASSED
 
 
 def test_film_beyond_the_projection_is_dark() -> None:
@@ -272,10 +295,10 @@ def test_differentials_of_a_fisheye_are_finite_differences(name: str) -> None:
     rng = np.random.default_rng(0)
     film = (rng.random((2, 300)) * 12 - 6).astype(np.float32)
     film[:, 0] = 0
-    moves = camera.sample_differentials(film, film, film[0]).differentials
+    moves = camera.sample_differentials(film, 0 * film, film[0]).differentials
     assert moves is not None
     found = np.concatenate([moves.origin_m, moves.direction])
-    np.testing.assert_allclose(found, differences(camera, film, film, film[0], 0.02), atol=2e-5)
+    np.testing.assert_allclose(found, differences(camera, film, 0 * film, film[0], 0.02), atol=2e-5)
 
 
 def test_field_sets_the_circle_within_the_film() -> None:

@@ -11,10 +11,12 @@ import pytest
 from PIL import Image
 from render_helpers import WHITE, diffuse, radiance, scene, world
 
-from neurolens.base.errors import InputError
+from neurolens.base.config import from_dict
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.render import meshfile
-from neurolens.render.meshfile import TriangleSet, read_file
+from neurolens.render.meshfile import TriangleSet, read_file, read_mesh
 from neurolens.render.primitives import Rays
+from neurolens.render.scenetables import MeshSettings
 
 HERE = Path("scene.toml")
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1.25]], float)
@@ -56,6 +58,48 @@ def test_every_format_gives_the_same_solid(form: str, tmp_path: Path) -> None:
     assert mesh.faces.shape == (6, 3) and mesh.uv is None and mesh.normals is None
     assert np.array_equal(np.unique(mesh.vertices, axis=0), np.unique(CORNERS, axis=0))
     assert enclosed(mesh) == pytest.approx(1.25 / 3)  # base times height over three: no face is lost or turned
+
+
+def test_triangles_without_area_are_left_out_with_one_warning(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_bytes(obj() + b"\nf 1 1 2\nf 3 4 3\nf 1 2 3\n")
+    settings = MeshSettings("m", file=Path("a.obj"))
+    with pytest.warns(NeurolensWarning, match=r"a\.obj: 2 of 9 triangles have no area and are left out") as told:
+        mesh = read_mesh(tmp_path / "scene.toml", "meshes[0]", settings)
+    assert len(told) == 1 and len(mesh.faces) == 7
+    (tmp_path / "a.obj").write_bytes(b"v 0 0 0\nv 1 0 0\nf 1 1 2\n")
+    with pytest.raises(InputError, match="a triangle with an area"):
+        read_mesh(tmp_path / "scene.toml", "meshes[0]", settings)
+
+
+SHEAR = ((1.0, 0.5, 0.0, 3.0), (0.0, 2.0, 0.0, 0.0), (0.0, 0.25, 1.0, -1.0))
+MIRROR = ((-1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+
+
+@pytest.mark.parametrize("given", [{"scale": [2, 0.5, 3]}, {"matrix": SHEAR}, {"matrix": MIRROR, "scale": [1, 2, 1]}])
+def test_a_mesh_may_be_sheared_mirrored_and_scaled_along_axes(given: dict[str, Any], tmp_path: Path) -> None:
+    """The volume goes with the determinant, fronts stay outside, normals square to their faces."""
+    (tmp_path / "a.obj").write_bytes(obj())
+    settings = from_dict(MeshSettings, {"material": "m", "file": "a.obj", "rotate_y_deg": 30} | given, HERE)
+    solid, plain = read_mesh(tmp_path / "s.toml", "m", settings), read_file(HERE, "m", tmp_path / "a.obj")
+    linear = np.array(given.get("matrix", np.eye(3, 4)))[:, :3]
+    volume = abs(np.linalg.det(linear)) * np.prod(given.get("scale", 1))
+    assert enclosed(solid) == pytest.approx(volume * enclosed(plain))
+    corners = plain.vertices[plain.faces]
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    rows = [*(f"v {x} {y} {z}" for x, y, z in corners.reshape(-1, 3)), *(f"vn {x} {y} {z}" for x, y, z in flat)]
+    rows += ["f " + " ".join(f"{3 * k + i}//{k + 1}" for i in (1, 2, 3)) for k in range(len(flat))]
+    (tmp_path / "a.obj").write_text("\n".join(rows))
+    mesh = read_mesh(tmp_path / "s.toml", "m", settings)
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    out = np.cross(b - a, c - a)
+    assert mesh.normals is not None
+    towards = np.einsum("tk,tk->t", mesh.normals[mesh.faces[:, 0]], out) / np.linalg.norm(out, axis=1)
+    assert towards == pytest.approx(np.ones(len(out)))
+
+
+def test_a_matrix_that_flattens_is_refused() -> None:
+    with pytest.raises(InputError, match="matrix.*flatten nothing"):
+        MeshSettings("m", file=Path("a.obj"), matrix=((1, 0, 0, 0), (0, 1, 0, 0), (1, 1, 0, 0)))
 
 
 def test_nothing_is_merged_or_mended(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ from neurolens.surrogates.assemble import ALL, RAY_ONLY, Parts
 from neurolens.surrogates.card import card_of, card_to_json
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.source import export_file, export_source, fused_program
+from neurolens.surrogates.source import export_file, export_source, fused_program, identifier
 from neurolens.surrogates.specialise import Fix, fixed_models
 from neurolens.surrogates.stored import load_fitted
 
@@ -218,6 +218,18 @@ def test_a_file_without_its_coefficients_is_written_as_the_same_function(tmp_pat
     assert np.mean(found["status"] != wanted["status"]) < 1e-3
     for name in SCENE_RAY:
         np.testing.assert_allclose(found[name], wanted[name], rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    "word",
+    ["int", "class", "status", "ray", "t12", "vec3", "sampler2D", "sqrtf", "clamp", "size_t", "film_x_mm", "gl_a"],
+)
+def test_words_of_the_languages_and_of_the_code_are_no_names(word: str, tmp_path: Path) -> None:
+    """With most of these a file would not compile."""
+    for language in ("c", "glsl"):
+        with pytest.raises(InputError, match=f"name: got '{word}'"):
+            export_file(lens_models.exported("invariants"), tmp_path / "a", language, word)
+    assert identifier(f"{word}!") == f"lens_{word}" and identifier("half-lens 2") == "half_lens_2"
 
 
 def test_the_card_stands_on_top(tmp_path: Path) -> None:

@@ -1,0 +1,124 @@
+"""`neurolens render --frames`: a picture a frame, focus, stop, zoom and place of the camera between keys."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from neurolens.base.errors import InputError
+from neurolens.commands.render_files import Files
+
+_COMMAND = "neurolens render"
+_MOST = 100_000
+
+
+@dataclass(frozen=True)
+class _Quantity:
+    """What keys may change: where it goes, its components, and the measure of it that is linear between keys."""
+
+    option: str
+    size: int
+    linear_in: str
+    to: Callable[[float], float]
+    back: Callable[[float], float]
+
+
+def _inverse(value: float) -> float:
+    return 1 / value if value else math.inf
+
+
+def _itself(value: float) -> float:
+    return value
+
+
+_QUANTITIES = {
+    "focus": _Quantity("focus", 1, "1/m", _inverse, _inverse),
+    "f-number": _Quantity("f_number", 1, "stops", math.log, math.exp),
+    "zoom": _Quantity("zoom", 1, "the logarithm of mm", math.log, math.exp),
+    "position": _Quantity("position_m", 3, "m", _itself, _itself),
+    "look-at": _Quantity("look_at_m", 3, "m", _itself, _itself),
+}
+
+
+def add_frames(parser: argparse.ArgumentParser) -> None:
+    """Add --frames and --key."""
+    group = parser.add_argument_group("frames")
+    group.add_argument(
+        "--frames", metavar="FIRST:LAST[:STEP]", type=_frames,
+        help="render these frames to OUT.0001.exr and so on; a frame that exists is kept (--restart: none is), an "
+        "interrupted one goes on; the seed grows by the frame's number; --json prints an object a frame",
+    )  # fmt: skip
+    measures = ", ".join(f"{name} (linear in {q.linear_in})" for name, q in _QUANTITIES.items())
+    group.add_argument(
+        "--key", metavar="NAME=FRAME:VALUE,...", action="append", default=[],
+        help=f"values at frames, repeatable: {measures}; position and look-at are X/Y/Z in m; before the first key and "
+        "after the last one they stay",
+    )  # fmt: skip
+
+
+def run_frames(args: argparse.Namespace, render: Callable[[argparse.Namespace], int]) -> int:
+    """Render the frames that are missing, by `render`, as the keys say; the exit code of the first that fails.
+
+    Raises:
+        InputError: a key that is none, or of a quantity that the command line sets too.
+    """
+    tracks = dict(_track(text) for text in args.key)
+    if len(tracks) < len(args.key):
+        raise InputError(_COMMAND, "--key", args.key, "each quantity once")
+    for name in tracks:
+        option = _QUANTITIES[name].option
+        if getattr(args, option, None) is not None:
+            raise InputError(_COMMAND, f"--{name}", getattr(args, option), f"left out: --key {name} sets it")
+    digits = max(4, len(str(args.frames[-1])))
+    for frame in args.frames:
+        values = {_QUANTITIES[name].option: _at(name, track, frame) for name, track in tracks.items()}
+        out = args.out.with_name(f"{args.out.stem}.{frame:0{digits}d}{args.out.suffix}")
+        if out.is_file() and not Files.of(out).checkpoint.exists() and not args.restart:
+            continue
+        code = render(argparse.Namespace(**vars(args) | values | {"out": out, "seed": args.seed + frame}))
+        if code:
+            return code
+    return 0
+
+
+def _frames(text: str) -> range:
+    """Type of --frames."""
+    words = text.split(":")
+    if 2 <= len(words) <= 3 and all(w.isascii() and w.isdecimal() and len(w) <= 7 for w in words):
+        first, last, step = (*map(int, words), 1)[:3]
+        if first <= last and step > 0 and (last - first) // step < _MOST:
+            return range(first, last + 1, step)
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected FIRST:LAST or FIRST:LAST:STEP, at most {_MOST} frames")
+
+
+def _track(text: str) -> tuple[str, list[tuple[int, list[float]]]]:
+    """Name and keys, (frame, measures), of one --key."""
+    name, _, rest = text.partition("=")
+    if name not in _QUANTITIES:
+        raise InputError(_COMMAND, "--key", text, f"NAME=FRAME:VALUE,... with NAME of {', '.join(_QUANTITIES)}")
+    quantity = _QUANTITIES[name]
+    keys: list[tuple[int, list[float]]] = []
+    for word in rest.split(","):
+        frame, _, value = word.partition(":")
+        try:
+            numbers = [float(v) for v in value.split("/")] if len(value) < 100 else []
+        except ValueError:
+            numbers = []
+        good = [math.isfinite(v) if quantity.size > 1 else 0 < v and (v < math.inf or name == "focus") for v in numbers]
+        later = frame.isascii() and frame.isdecimal() and len(frame) <= 7 and (not keys or int(frame) > keys[-1][0])
+        if not later or len(numbers) != quantity.size or not all(good):
+            form = "X/Y/Z in m" if quantity.size > 1 else "a number above 0"
+            raise InputError(_COMMAND, f"--key {name}", word, f"FRAME:VALUE, frames increasing, VALUE {form}")
+        keys.append((int(frame), [quantity.to(v) for v in numbers]))
+    return name, keys
+
+
+def _at(name: str, keys: Sequence[tuple[int, list[float]]], frame: int) -> float | tuple[float, ...]:
+    """The value of a quantity at a frame."""
+    import numpy as np
+
+    frames, measures = [k for k, _ in keys], np.transpose([m for _, m in keys])
+    found = tuple(_QUANTITIES[name].back(float(np.interp(frame, frames, row))) for row in measures)
+    return found if len(found) > 1 else found[0]
