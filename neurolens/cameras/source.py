@@ -25,20 +25,20 @@ from neurolens.optics.film_plane import film_z_mm
 _DEGREES = range(2, 13)
 _ENOUGH_MM = 1e-5  # error of the film's position: a twentieth of a wavelength
 _ACROSS = 400  # distances at which it is measured
-CAMERA_FRAME = (
-    "Camera frame: metres, origin at the film's centre, the camera looks along -z, y up, x right. Film points are mm in "
-    "the lens frame: the picture on the film stands on its head. u and v are random numbers in [0, 1). The film value "
-    "is the mean of weight times radiance over u, v: uniform surroundings of radiance 1 give 1 on the axis. Rays of "
-    "status other than 0 weigh 0. pupil_x_mm, pupil_y_mm: where the ray crosses the pupil plane; 1 / area_mm2 is the "
-    "density of that point. Derivatives by the film point are in metres (directions: 1) per mm."
-)
+CAMERA_FRAME = """\
+Camera frame: metres, origin at the film's centre, the camera looks along -z, y up, x right. Film points are mm in the
+lens frame: the picture on the film stands on its head. u and v are random numbers in [0, 1). The film value is the mean
+of weight times radiance over u, v: uniform surroundings of radiance 1 give 1 on the axis. Rays of status other than 0
+weigh 0. pupil_x_mm, pupil_y_mm: where the ray crosses the pupil plane; 1 / area_mm2 is the density of that point.
+Derivatives by the film point are in metres (directions: 1) per mm."""
 
 
-def camera_program(film: LensFilm, lens: LensGraph, derivatives: bool = False) -> Program:
+def camera_program(film: LensFilm, lens: LensGraph, derivatives: bool = False, own_table: bool = True) -> Program:
     """A camera as one program.
 
     Args:
         film, lens: of the same focus and stop. derivatives: of the ray by the film point, too: the graph's own.
+        own_table: whether the outline's table is part of it; else the caller gives `outline`.
 
     Inputs: film_x_mm, film_y_mm, u, v, wavelength_nm. Outputs: see `CAMERA_FRAME`.
 
@@ -53,12 +53,13 @@ def camera_program(film: LensFilm, lens: LensGraph, derivatives: bool = False) -
         lens = lens._replace(graph=with_film_derivatives(lens.graph))
     graph, numbers = whole_camera(film, lens, pupil_too=True)
     program = lower(graph, numbers)
-    program.own_tables["outline"] = film.outline.table.astype(np.float64)
+    if own_table:
+        program.own_tables["outline"] = film.outline.table.astype(np.float64)
     return program
 
 
-def model_extras(card: Mapping[str, Any]) -> tuple[Extras, list[str]]:
-    """Constants of a model's card and, where the film moves to focus, its position; lines that tell of them."""
+def model_extras(card: Mapping[str, Any], focusing: bool = True) -> tuple[Extras, list[str]]:
+    """Constants of a model's card and, if `focusing`, the film's position for a focus; see `extras_of`."""
     lens, d = card["lens"], card["domain"]
     low, high = d["film_z_mm"]
     constants = {
@@ -67,7 +68,7 @@ def model_extras(card: Mapping[str, Any]) -> tuple[Extras, list[str]]:
         "stop_radius_max_mm": d["stop_radius_mm"], "wavelength_min_nm": d["wavelength_nm"][0],
         "wavelength_max_nm": d["wavelength_nm"][1],
     }  # fmt: skip
-    near = float(d["focus_m"][1])
+    near = float(d["focus_m"][1]) if focusing else math.inf
     planes = lens["efl_mm"], lens["front_principal_z_mm"], lens["rear_principal_z_mm"]
     return extras_of(constants, near, lambda focus_m: film_z_mm(*planes, focus_m))
 
