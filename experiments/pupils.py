@@ -266,6 +266,11 @@ Rates are percent of the rays sent from lit film points; the dark share of the f
 In brackets what the theses say of their lens. *Light* is the irradiance found through the pupil over that found
 through a disc that is surely wide enough, in percent: below 100 the pupil is too small (its noise is about 0.2).
 *Lost* is the share of the light that passes outside our outlines. *Search*: seconds, once a camera; *ns*: a sample.
+
+What is counted: *radial boxes*, the samples of the whole box, as pbrt draws them; *radial ellipses*, those of the disc
+inside it. A disc fills 78.5% of its box (pi / 4), so no box about a round pupil passes more: Willi's 99.8% (double
+Gauss) and 88.7% (fisheye) for pbrt's bounds stand beside the ellipses, and 92.2 and 74.4% for Wu's pupil beside a disc.
+What both lose besides is the step by which bounds are widened: 4.5% of the searched radius at 2000 samples.
 """
 
 

@@ -68,7 +68,7 @@ def test_derivatives_and_inverse_maps(file: Path, tmp_path: Path, capsys: pytest
     found = load_inverse(out).through_stop(film, stop, 550.0)
     assert found.status.tolist() == [0, 0, 0] and np.abs(found.stop_xy_mm - stop).max() < 1e-3
     model, pupil, step = load_model(out), found.rays[2:4], 0.02
-    slope = OnnxDerivatives(model)(film, pupil, np.full(3, 550.0), model.card["domain"]["film_z_mm"][0], 4.0).d_film
+    slope = OnnxDerivatives(model)(film, pupil, np.full(3, 550.0), model.card["lens"]["film_z_mm"], 4.0).d_film
     ahead, behind = (model.rays(film + [[h], [0]], pupil, 550.0).scene_ray for h in (step, -step))
     assert np.abs((ahead - behind)[3:] / (2 * step) - slope[3:, 0]).max() < 2e-5
 

@@ -11,7 +11,7 @@ import pytest
 from command_line import described, failure, run_json
 from lens_models import edited
 
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import NeurolensWarning
 from neurolens.cli import main
 from neurolens.commands.arguments import Parser, lens_path
 from neurolens.render.pictures import read_exr, write_exr
@@ -80,7 +80,7 @@ def test_a_place_that_cannot_be_written_is_found_before_the_render(
     monkeypatch.setattr("neurolens.render.renderer.render", lambda *_, **__: pytest.fail("rendered for nothing"))
     line = failure(capsys, "render", scene, "--camera", "thin", "-o", _NOWHERE, "--quiet")
     assert str(_NOWHERE) in line and ".tmp" not in line
-    with pytest.raises(InputError, match=str(_NOWHERE)) as refused:
+    with pytest.raises(OSError, match=str(_NOWHERE)) as refused:
         write_exr(_NOWHERE, np.zeros((2, 2, 3)))
     assert ".tmp" not in str(refused.value)
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
+from neurolens.base.bounds import FILM_MM, said, within
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 
@@ -112,8 +113,11 @@ def check_film(film_mm: tuple[float, float]) -> tuple[float, float]:
     """Width and height of the film as two floats above 0.
 
     Raises:
-        InputError: it is not two such numbers.
+        InputError: it is not two such numbers, or no film's.
     """
     if len(film_mm) != 2:
         raise InputError("camera", "film_mm", film_mm, "a width and a height")
-    return positive("film_mm width", film_mm[0]), positive("film_mm height", film_mm[1])
+    found = positive("film_mm width", film_mm[0]), positive("film_mm height", film_mm[1])
+    if not all(within(FILM_MM, side) for side in found):
+        raise InputError("camera", "film_mm", film_mm, f"sides {said(FILM_MM)} mm")
+    return found

@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
+from neurolens.base.bounds import F_NUMBER, FOCAL_MM
 from neurolens.base.errors import InputError, printable
 
 if TYPE_CHECKING:
@@ -119,7 +120,7 @@ def add_lens_state(parser: argparse.ArgumentParser, *, efl: str, f_number: str, 
     group = parser.add_argument_group("state of the lens")
     size = group.add_mutually_exclusive_group()
     size.add_argument(
-        "--efl", metavar="MM", type=between(1e-3, 1e6, "a focal length in mm"),
+        "--efl", metavar="MM", type=between(*FOCAL_MM, "a focal length in mm"),
         help=f"scale the whole lens to this focal length in mm (default: {efl})",
     )  # fmt: skip
     size.add_argument(
@@ -132,7 +133,7 @@ def add_lens_state(parser: argparse.ArgumentParser, *, efl: str, f_number: str, 
         "interpolated gaps); default: the state of the table",
     )  # fmt: skip
     group.add_argument(
-        "--f-number", metavar="N", type=positive("an f-number"),
+        "--f-number", metavar="N", type=between(*F_NUMBER, "an f-number"),
         help=f"focal length over entrance-pupil diameter at infinity focus (default: {f_number})",
     )  # fmt: skip
     group.add_argument(

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError, printable
-from neurolens.commands.arguments import QUIET_HELP, Parser, check_run_folder, lens_path, whole
+from neurolens.commands.arguments import QUIET_HELP, Parser, add_glass, check_run_folder, lens_path, whole
 
 if TYPE_CHECKING:
     from neurolens.evaluate.methods import BenchSettings
@@ -63,6 +63,7 @@ def add_surrogate_arguments(parser: argparse.ArgumentParser, lenses: str) -> Non
     parser.add_argument(
         "--out", metavar="DIR", type=Path, default=Path("runs/surrogates"), help="folder (default: runs/surrogates)"
     )
+    add_glass(parser)
     parser.add_argument("--quiet", action="store_true", help=QUIET_HELP)
 
 

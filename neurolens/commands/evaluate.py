@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_json, whole
+from neurolens.commands.arguments import add_glass, add_json, whole
 from neurolens.commands.output import answer, number, table
 
 if TYPE_CHECKING:
@@ -63,6 +63,7 @@ def add_parser(subparsers: Any) -> None:
         "--seed", metavar="N", type=whole(0), help="of the rays (default: one that differs from the fit's)"
     )
     parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=1, help="for the timing (default: 1)")
+    add_glass(parser)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="nothing is written")
 

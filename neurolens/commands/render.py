@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
+from neurolens.base.bounds import FILM_MM
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import (
@@ -261,7 +262,7 @@ def picture_size(settings: CameraSettings, width: int | None, height: int | None
 def film_size(text: str) -> tuple[float, float]:
     """Type of --film: width x height in mm, as in 36x24."""
     width, _, height = text.lower().partition("x")
-    side = between(1e-3, 1e4, "the film's width x height in mm, as in 36x24, each")
+    side = between(*FILM_MM, "the film's width x height in mm, as in 36x24, each")
     try:
         return side(width), side(height)
     except argparse.ArgumentTypeError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import hashlib
 import os
 import platform
@@ -22,6 +23,7 @@ from neurolens.base.files import atomic_path, cache_folder, keep_newest, seal, s
 # known of its arguments, that arrays do not overlap; functions of single rays are marked to be put into theirs still.
 FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-inline")
 _SECONDS = 300  # the largest models known compile in ten
+_ROOM = 2**20
 _KEPT = 64  # libraries of 50 to 200 kB
 
 
@@ -58,22 +60,27 @@ def compile_c(source: str, library: Path, flags: tuple[str, ...] = FLAGS) -> str
 
     Raises:
         InputError: there is no compiler, or it fails; the message says how.
+        OSError: the disk is full, where the library goes or where compilers have their temporary files.
     """
     compiler = find_compiler()
     done = _run([*_words(compiler), *flags, "-shared", "-fPIC", "-x", "c", "-", "-o", str(library), "-lm"], source)
     if done.returncode or not library.is_file() or not library.stat().st_size:
+        # Linkers that write to mapped memory say nothing, but end by a signal.
+        if "No space left" in done.stderr or shutil.disk_usage(library.parent).free < _ROOM:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(library.parent))
         said = " ".join(next((line for line in done.stderr.splitlines() if "error" in line), done.stderr).split())
         raise InputError(compiler, "compile", f"({said[:200] or 'no word'})", "a C compiler that knows C99")
     return done.stderr
 
 
 def _run(command: list[str], text: str = "") -> subprocess.CompletedProcess[str]:
-    pipe = subprocess.PIPE
+    pipe, english = subprocess.PIPE, {**os.environ, "LC_ALL": "C"}
     try:
         # A group of its own: the driver's children, which do the work, are to end with it, at Ctrl-C too.
         with subprocess.Popen(
-            command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, errors="replace", start_new_session=True
-        ) as child:
+            command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, errors="replace", start_new_session=True,
+            env=english,
+        ) as child:  # fmt: skip
             try:
                 out, err = child.communicate(text, timeout=_SECONDS)
             except BaseException:

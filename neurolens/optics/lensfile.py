@@ -70,6 +70,7 @@ from neurolens.optics.sag import check_clearance
 
 SCHEMA = 1
 MAX_SURFACES = 500
+MAX_TERMS = 1000  # aspheric coefficients of all surfaces: each costs every ray a step, and lenses have at most 400
 MAX_LAYERS = 200
 MAX_POWER = 40
 MAX_INDEX = 4.5  # germanium, the densest lens material there is, has 4.0
@@ -244,6 +245,8 @@ def _surfaces(table: Table) -> tuple[Surface, ...]:
     if len(stops) != 1:
         found = f"(stop = true on surfaces {', '.join(map(str, stops))})" if stops else "(no stop)"
         raise table.error("surfaces", found, "exactly one row with stop = true")
+    if (terms := sum(len(s.asphere) for s in surfaces)) > MAX_TERMS:
+        raise table.error("surfaces", f"({terms} aspheric coefficients)", f"at most {MAX_TERMS}")
     if surfaces[-1].n_d != 1:
         raise table.error(f"surface {len(rows) - 1}, n_d", surfaces[-1].n_d, "air between last surface and film")
     return tuple(surfaces)

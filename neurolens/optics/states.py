@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from neurolens.base.bounds import F_NUMBER, FOCAL_MM, said, within
 from neurolens.base.errors import InputError
 from neurolens.optics import paraxial
 from neurolens.optics.aiming import aim_at_stop
@@ -117,10 +118,11 @@ def _check(
     field_deg: float | None,
     focus: Focus,
 ) -> None:
-    finite = {"f_number": f_number, "focal_length_mm": focal_length_mm}
-    for field, value in (*finite.items(), ("focus_m", focus_m)):
-        if value is not None and not (value > 0 and (field == "focus_m" or math.isfinite(value))):
-            raise InputError(lens.path, field, value, "a positive number")
+    for field, value, bounds in (("f_number", f_number, F_NUMBER), ("focal_length_mm", focal_length_mm, FOCAL_MM)):
+        if value is not None and not within(bounds, value):
+            raise InputError(lens.path, field, value, f"a number {said(bounds)}")
+    if focus_m is not None and not focus_m > 0:
+        raise InputError(lens.path, "focus_m", focus_m, "a positive number")
     if field_deg is not None and not 0 < field_deg < 360:
         raise InputError(lens.path, "field_deg", field_deg, "a full field of view in degrees, above 0 and below 360")
     if field_deg is not None and focal_length_mm is not None:

@@ -281,9 +281,14 @@ def refract(
     Returns the refracted rays (vertex frame), n' times the cosine of refraction [N], and the square of that before
     guarding, which is not positive where the ray is totally reflected.
     """
-    sense, q2 = mode.sense, hit.q2 + (after.n2 - before.n2)
+    step = after.n2 - before.n2
+    sense, q2 = mode.sense, hit.q2 + step
     q = root(q2, mode.guard)
-    bend = q - hit.q
+    if q.dtype == torch.float32:
+        # q - hit.q without the rounding of both roots, which was a third of all error. Lost rays may have hit.q < 0.
+        bend = step / (q + (hit.q.abs() if mode.guard else hit.q))
+    else:
+        bend = q - hit.q
     if hit.normal is not None:
         direction = (torch.addcmul(p, bend, n, value=sense) for p, n in zip(r[3:], hit.normal, strict=True))
         return Rays(hit.x, hit.y, hit.z, *direction), q, q2

@@ -173,7 +173,7 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
 
 def _check_length(path: Path, length: int) -> None:
     if length > _LARGEST_ABOUT:
-        raise InputError(path, "settings", f"({length} characters)", f"at most {_LARGEST_ABOUT}, with the camera's")
+        raise InputError(path, "settings", f"({length} characters)", f"at most {_LARGEST_ABOUT}, {_AGAIN}")
 
 
 def _check_render(path: Path, about: dict[str, Any], identity: dict[str, Any]) -> None:

@@ -236,14 +236,14 @@ def develop(job: Job) -> tuple[FloatArray, Layers]:
     return rgb.reshape(*shape, 3), Layers(*(plane.reshape(shape) for plane in planes))
 
 
-def _layers(job: Job, sums: NDArray[np.float64], samples: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Samples, variance, depth and blocked share [4, n]."""
+def _layers(job: Job, sums: NDArray[np.float64], samples: NDArray[np.int64]) -> FloatArray:
+    """Samples, variance, depth and blocked share [4, n]; what float32 does not hold is infinite."""
     total = sums[:, columns.RGB] @ job.luminance_row
     groups = -(-samples // job.paths_a_sample)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # Of the sum over independent samples, then of the mean over paths.
         spread = np.maximum(sums[:, columns.LUMINANCE2] - total**2 / groups, 0) * groups / (groups - 1)
         variance = np.where(groups > 1, spread / samples.astype(np.float64) ** 2, np.inf)
         depth = np.where(sums[:, columns.HITS] > 0, sums[:, columns.DEPTH] / sums[:, columns.HITS], np.inf)
         blocked = np.where(samples > 0, 1 - sums[:, columns.PASSED] / samples, 0.0)
-    return np.stack([samples, variance, depth, blocked])
+        return np.stack([samples, variance, depth, blocked]).astype(np.float32)

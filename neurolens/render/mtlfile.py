@@ -5,6 +5,7 @@ A material of the scene with the name that `usemtl` says comes before the one of
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -98,7 +99,7 @@ def _library(scene: Path, mesh: Path, libraries: list[str]) -> dict[str, tuple[V
     found: dict[str, tuple[Vector, Path | None]] = {}
     for listed in libraries:
         whole = (scene.parent / mesh).parent / PurePosixPath(listed)
-        for name in [listed] if whole.is_file() else listed.split():  # several names, or one with blanks
+        for name in [listed] if os.path.isfile(whole) else listed.split():  # several names, or one with blanks
             file = mesh.parent / PurePosixPath(name.replace("\\", "/"))
             found |= _read_mtl(scene.parent / file, file.parent)
             if len(found) > _MOST:

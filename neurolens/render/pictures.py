@@ -54,7 +54,8 @@ def write_exr(
 
     Raises:
         InputError: another shape, no pixels, complex or text, not finite, a layer with NaN or of a colour's name,
-            metadata that is not JSON, no such folder, a place that cannot be written.
+            metadata that is not JSON, no such folder, a file that the library cannot write.
+        OSError: a place that cannot be written; it names `path`.
     """
     path = Path(path)
     picture = _shaped(path, np.asarray(rgb))

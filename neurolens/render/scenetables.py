@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from neurolens.base.bounds import F_NUMBER, FILM_MM, said, within
 from neurolens.base.errors import InputError
 
 Vector = tuple[float, float, float]
@@ -40,7 +41,6 @@ def require(ok: bool, field: str, value: object, expected: str) -> None:
 
 Rule = tuple[Callable[[Any], bool], str]  # test of a value, and text of what is expected
 _SIZE: Rule = (lambda v: SMALLEST_M <= v <= FARTHEST_M, f"a length from {SMALLEST_M:g} to {FARTHEST_M:g} m")
-_POSITIVE: Rule = (lambda v: 0 < v < math.inf, "a finite number above 0")
 _ANGLE: Rule = (lambda v: abs(v) <= _MOST_DEG, f"degrees, at most {_MOST_DEG:g} either way")
 _PLACE: Rule = (lambda v: all(abs(x) <= FARTHEST_M for x in v), f"three numbers within {FARTHEST_M:g} m")
 _DIRECTION: Rule = (
@@ -72,7 +72,8 @@ _RULES: dict[str, Rule] = {
     **dict.fromkeys(("reflectance", "specular"), _REFLECTANCE),
     **dict.fromkeys(("radius_m", "cell_m", "transmittance_depth_m"), _SIZE),
     **dict.fromkeys(("rotate_y_deg", "sun_azimuth_deg"), _ANGLE),
-    **dict.fromkeys(("f_number", "film_width_mm", "film_height_mm"), _POSITIVE),
+    "f_number": (lambda v: within(F_NUMBER, v), f"an f-number {said(F_NUMBER)}"),
+    **dict.fromkeys(("film_width_mm", "film_height_mm"), (lambda v: within(FILM_MM, v), f"mm {said(FILM_MM)}")),
     "scale": (lambda v: all(0 < x < math.inf for x in (v if isinstance(v, tuple) else (v,))), "finite numbers above 0"),
     "matrix": (lambda v: _is_regular(v), f"three rows of four numbers within {FARTHEST_M:g}, which flatten nothing"),
     **dict.fromkeys(("width", "height"), _count(16384)),

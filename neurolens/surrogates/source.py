@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import neurolens
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, ModelError
 from neurolens.base.files import atomic_write_text
 from neurolens.graph.c import NOTHING, Extras, Signature, write_c
 from neurolens.graph.glsl import write_glsl
@@ -119,6 +119,8 @@ def export_file(
     Arguments as of `export_source`; errors too, and a ModelError for a file that cannot be trusted.
     """
     data, card = read_checked(file)
+    if card.get("states"):
+        raise ModelError(f"{file}: a model of many states (zoom, internal focus), expected one of one state")
     try:
         domain, codes = card["domain"], [gate["status"] for gate in card["gates"]]
         own = checked_name(language, str(card["lens"]["id"]), name)

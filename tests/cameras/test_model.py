@@ -7,6 +7,7 @@ import math
 import os
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
+from neurolens.cameras.pupil_boxes import PupilTable, tightened
 from neurolens.modelfile import onnxfile
 
 ROOT = Path(__file__).parents[2]
@@ -325,6 +327,27 @@ def test_rays_do_not_depend_on_batches(model: OnnxLens) -> None:
             assert np.allclose(a[..., part], b, rtol=0, atol=2e-5)
     nothing = model.rays(np.empty((2, 0)), np.empty((2, 0)), np.empty(0))
     assert nothing.scene_ray.shape == (6, 0) and nothing.status.shape == (0,)
+
+
+def test_numbers_beyond_float32_are_outside_or_refused_without_a_warning(
+    path: Path, model: OnnxLens, tmp_path: Path
+) -> None:
+    def bounds(card: dict) -> None:
+        card["domain"]["bounds"]["low_mm"][0] = -1e300
+
+    def reference(card: dict) -> None:
+        card["reference"]["scene_ray"][0] = [1e300] * len(card["reference"]["scene_ray"][0])
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        for film, plane in ((1e300, None), (1.0, 1e300)):
+            rays = model.rays(np.full((2, 1), film), np.zeros((2, 1)), 550.0, plane)
+            assert rays.status == st.OUTSIDE_DOMAIN
+        for change in (bounds, reference):
+            with pytest.raises(ModelError):
+                load_model(damaged(path, tmp_path, change_card(change)))
+        wide = PupilTable(0.0, 20.0, np.array([[-3e38] * 3, [3e38] * 3, [3e38] * 3], np.float32))
+        assert (tightened(wide, lambda film, pupil, nm: np.zeros(film.shape[1], bool), [550.0]).rows[0] == 1).all()
 
 
 def test_film_position_of_every_ray(model: OnnxLens) -> None:

@@ -100,6 +100,16 @@ def test_a_compiler_without_end_is_ended_with_its_children(monkeypatch: pytest.M
         time.sleep(0.01)
 
 
+def test_a_full_disk_is_no_missing_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    odd = tmp_path / "odd"
+    odd.write_text("#!/bin/sh\necho 'ld: final link failed: No space left on device' >&2\nexit 1\n")
+    odd.chmod(0o700)
+    monkeypatch.setenv("CC", str(odd))
+    with pytest.raises(OSError, match="No space left") as error:
+        compiler.load_compiled(SOURCE)
+    assert error.value.filename == str(tmp_path / "neurolens")
+
+
 def test_no_compiler_and_one_that_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="error"):
         compiler.load_compiled("this is no C\n")

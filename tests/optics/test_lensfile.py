@@ -67,6 +67,8 @@ def test_reads_what_is_there(tmp_path: Path) -> None:
 
 
 ROW_3 = "{ radius_mm = inf, thickness_mm = 2.0, diameter_mm = 12.0, stop = true }"
+POWERS = ", ".join(f"{power} = 0.0" for power in range(3, 41))
+ASPHERE = f"{{ radius_mm = inf, thickness_mm = 2.0, diameter_mm = 12.0, asphere = {{ {POWERS} }} }}, "
 ROW_5 = "radius_mm = 60.0, thickness_mm = 70.0, diameter_mm = 18.0"
 BAD_ROWS = [
     # keys
@@ -173,6 +175,7 @@ BAD_FILES = [
     (GOOD[: GOOD.index("surfaces")], ["surfaces", "(missing)"]),
     (GOOD[: GOOD.index("surfaces")] + "surfaces = []", ["surfaces", "got []"]),
     (GOOD[: GOOD.index("surfaces")] + "surfaces = 6", ["surfaces", "got 6"]),
+    (GOOD.replace("surfaces = [", f"surfaces = [{27 * ASPHERE}"), ["surfaces", "1026 aspheric", "at most 1000"]),
     (GOOD[: GOOD.index("surfaces")] + f"surfaces = [{501 * (ROW_3 + ', ')}]", ["surfaces", "501", "at most 500"]),
     (GOOD + GOOD[GOOD.index("[[") :], ["configuration 1, name", "'near'", "no other"]),
 ]

@@ -19,7 +19,8 @@ from render_helpers import FILM, PINHOLE, SIZE, THIN, WHITE, diffuse, files_of_a
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.ideal import ThinLens
-from neurolens.render.checkpoint import digest
+from neurolens.render.checkpoint import SPENT, digest, write_checkpoint
+from neurolens.render.film import Film, Tiling
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import RenderResult, Watch, render
 
@@ -245,6 +246,7 @@ WRONG: dict[str, Callable[[Path], Any]] = {
     "fewer than no passes": lambda p: rewritten(p, array("done.npy", np.array([-1]))),
     "no JSON": lambda p: rewritten(p, lambda m: m.update({"about.json": b"{"})),
     "deep JSON": lambda p: rewritten(p, lambda m: m.update({"about.json": b"[" * 100_000})),
+    "long settings": lambda p: rewritten(p, about(more="x" * (8 << 20))),
     "a list": lambda p: rewritten(p, lambda m: m.update({"about.json": b"[1]"})),
     "another format": lambda p: rewritten(p, about(format=2)),
     "huge number of samples": lambda p: rewritten(p, about(samples=10**30)),
@@ -275,6 +277,14 @@ def test_a_checkpoint_that_is_not_whole_is_one_error(wrong: str, whole: bytes, t
         kept_render(part)
     assert str(refused.value).startswith(f"{part}: ") and "--restart" in str(refused.value)
     assert len(str(refused.value)) < 400
+
+
+def test_settings_that_no_reader_takes_are_not_written(tmp_path: Path) -> None:
+    part = tmp_path / "a.exr.part"
+    spent = dict.fromkeys(SPENT, 0.0)
+    with pytest.raises(InputError, match=r"settings: got \(\d+ characters\), expected at most"):
+        write_checkpoint(part, Film(Tiling.of(4, 1)), {"camera": "x" * (8 << 20)}, spent)
+    assert not part.exists()
 
 
 def test_a_checkpoint_that_does_not_fit_the_disk_leaves_the_older_one_and_the_render_goes_on(tmp_path: Path) -> None:

@@ -85,6 +85,7 @@ def test_a_mesh_with_a_material_of_the_scene_keeps_it(tmp_path: Path) -> None:
         ),
         (OBJ.replace("usemtl red one\n", ""), MTL, "none before a face"),
         (OBJ.replace("my colours", "other"), MTL, r"other\.mtl: file: got .missing."),
+        (OBJ.replace("my colours", "9" * 400), MTL, r"9\.mtl: file"),
         (OBJ, MTL.replace("0.6 0.1 0.05", "0.6 2 0"), "line 4, Kd: got '0.6 2 0'"),
         (OBJ, MTL.replace("map_Kd ", "map_Kd -s 2 2 2 "), "without options"),
         (OBJ, MTL.replace("wall.png", "gone.png"), r"textures\.room:wall\.file"),

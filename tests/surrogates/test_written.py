@@ -40,6 +40,8 @@ from neurolens.surrogates.source import export_file, export_source, fused_progra
 from neurolens.surrogates.specialise import Fix, fixed_models
 from neurolens.surrogates.stored import load_fitted
 
+MODELS = Path(__file__).parents[2] / "models"
+
 
 def test_card_is_strict_json_and_says_what_the_model_is(tmp_path: Path) -> None:
     model = lens_models.model("invariants")
@@ -212,6 +214,8 @@ def test_a_file_without_its_coefficients_is_written_as_the_same_function(tmp_pat
     assert written.signature == whole.signature
     head, other = (f.read_text(encoding="utf-8").partition("#ifndef")[0] for f in (written.path, whole.path))
     assert head == other
+    with pytest.raises(ModelError, match="many states"):
+        export_file(MODELS / "nikon_zoom_70_200-range.states-64.onnx", tmp_path / "zoom.h", "c")
     rays = {**rays_of(model, 2000, seed=3), "film_z_mm": model.domain.film_z_mm[0], "stop_radius_mm": 5.0}
     found = compiled(lower(graph_of(file, file.read_bytes()))).rays(rays)
     wanted = written_rays("onnx", "invariants", rays)
