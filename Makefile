@@ -1,6 +1,6 @@
 # On a fresh machine with Python 3.11 or newer and make, each target does its own set-up in .venv; a second run starts at once.
 #
-#   make demo     train, evaluate and render the quickstart (minutes), then print where to look
+#   make demo     train, evaluate and render the quickstart (4 CPU minutes after installing)
 #   make test     tests, then lint, format and types
 #   make bench    the tracer's speed, then models against it; fails when a promised ratio is lost
 #   make models   fit again every model of models/

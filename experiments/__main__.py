@@ -33,6 +33,7 @@ NAMES = {
     "spectral-noise": ("spectral_noise", "noise of the ways to sample wavelengths"),
     "refine-spacing": ("refine_spacing", "a spacing refined by gradients through the tracer"),
     "gallery": ("gallery.run", "what real lenses do: figures and numbers"),
+    "fuzz": ("fuzz", "hostile files and command lines: one clear line each, in bounded time and memory"),
     "optiland": ("compare_optiland", "speed of the exact tracer beside Optiland"),
 }
 _DESCRIPTION = """\

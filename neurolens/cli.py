@@ -1,6 +1,6 @@
 """The command line: `neurolens COMMAND`, one module of `neurolens.commands` each.
 
-Errors are one line and exit code 2.
+Errors are one line and exit code 2, or 70 where neurolens itself is at fault.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from contextlib import contextmanager
 from typing import Any
 
 from neurolens import __version__
-from neurolens.base.errors import NeurolensError, NeurolensWarning, printable
+from neurolens.base.errors import NeurolensError, NeurolensWarning, one_line, printable
 from neurolens.base.signals import handled
 from neurolens.commands.arguments import Parser, more_glasses
 
 # Packages of the extra that a base install lacks.
 _TRAIN_PACKAGES = {"torch", "sklearn", "onnx", "matplotlib", "flip_evaluator", "mpmath"}
 _BROKEN_PIPE = 141  # 128 plus the signal's number, as shells report it
+_FAULT, _TRACEBACK = 70, "NEUROLENS_TRACEBACK"  # EX_SOFTWARE of sysexits.h; the variable that asks for tracebacks
 
 _DESCRIPTION = "Any lens prescription as a fast camera model with a measured error."
 _EPILOG = """\
@@ -33,7 +34,8 @@ examples:
   neurolens export models/NAME.onnx --to c -o lens.h
   neurolens render experiments/scenes/room.toml --camera models/NAME.onnx -o room.exr
 
-exit codes: 0 done, 1 a model breaks a promise or none has the error asked for, 2 bad input, 130 interrupted.
+exit codes: 0 done, 1 a model breaks a promise or none has the error asked for, 2 bad input, 130 interrupted,
+70 a fault of neurolens itself, or no memory.
 Help of a command: neurolens COMMAND --help"""
 
 
@@ -78,11 +80,6 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_
         return code
     except NeurolensError as error:
         return _fail(str(error))
-    except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
-        if package not in _TRAIN_PACKAGES:
-            raise
-        return _fail(f"this needs {package}, which is not installed: pip install '.[train]' in the project's folder")
     except BrokenPipeError:
         # The reader (head, less) has exited; avoid a second error when the interpreter flushes stdout.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -94,15 +91,33 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_
     except KeyboardInterrupt as error:
         print(f"\nneurolens: interrupted; {printable(args.kept)}", file=sys.stderr)
         return 128 + (error.args[0] if error.args else signal.SIGINT)
+    except Exception as error:
+        return _fault(error)
 
 
 def _interrupt(number: int) -> None:
     raise KeyboardInterrupt(number)
 
 
-def _fail(message: str) -> int:
-    print(f"neurolens: {printable(' '.join(message.split()))}", file=sys.stderr)
-    return 2
+def _fault(error: Exception) -> int:
+    """Report what no command expects: a package or memory that is missing, or a fault of neurolens itself."""
+    package = (getattr(error, "name", None) or "").partition(".")[0]
+    if isinstance(error, ModuleNotFoundError) and package in _TRAIN_PACKAGES:
+        return _fail(f"this needs {package}, which is not installed: pip install '.[train]' in the project's folder")
+    if os.environ.get(_TRACEBACK):
+        import traceback
+
+        traceback.print_exception(error)
+    if isinstance(error, MemoryError):
+        return _fail(f"not enough memory ({error})", _FAULT)
+    found = f"{type(error).__name__}: {error}" if not isinstance(error, RecursionError) else "RecursionError"
+    asked = f"please report this line, the command and its files, with {_TRACEBACK}=1 for details"
+    return _fail(f"a fault of neurolens: {one_line(found, 300)}; {asked}", _FAULT)
+
+
+def _fail(message: str, code: int = 2) -> int:
+    print(f"neurolens: {one_line(message, 3000)}", file=sys.stderr)
+    return code
 
 
 @contextmanager
@@ -113,9 +128,9 @@ def _plain_warnings(quiet: bool) -> Iterator[None]:
 
         def show(message: Any, category: type[Warning], *place: Any, **more: Any) -> None:
             if issubclass(category, NeurolensWarning):
-                text = " ".join(str(message).split())
+                text = one_line(str(message), 3000)
                 if not quiet and text not in said:
-                    print(f"neurolens: warning: {printable(text)}", file=sys.stderr)
+                    print(f"neurolens: warning: {text}", file=sys.stderr)
                 said.add(text)
             else:
                 usual(message, category, *place, **more)

@@ -93,7 +93,7 @@ def test_bad_input_is_one_line(file: Path, tmp_path: Path, capsys: pytest.Captur
         (["export", file, "--to", "onnx", "-o", out, "--only", "ray"], ["--only"]),
         ([*base, "--inverse"], ["--inverse", "--to onnx"]),
         (["export", file, "--to", "onnx", "-o", out, "--fix", "wavelengths=450,550"], ["one wavelength"]),
-        (["export", tmp_path / "no.onnx", "--to", "c", "-o", out], ["no.onnx", "no such file"]),
+        (["export", tmp_path / "no.onnx", "--to", "c", "-o", out], ["no.onnx", "missing"]),
         (["export", old, "--to", "c", "-o", out], ["old.onnx", "export it again"]),
         (["export", bare, "--to", "c", "-o", out], ["card", "refractions"]),
         (["export", tmp_path / "empty", "--to", "c", "-o", out], ["empty", "name its file"]),

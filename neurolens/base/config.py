@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import tomllib
 import types
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -18,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from neurolens.base.errors import InputError
-from neurolens.base.tomlfile import format_toml, read_toml, reject_unknown
+from neurolens.base.tomlfile import format_toml, parse_toml, read_toml, reject_unknown
 
 T = TypeVar("T")
 _NAMES = {
@@ -69,7 +68,9 @@ def apply_overrides(data: Mapping[str, Any], overrides: Sequence[str]) -> dict[s
 
 def _override_value(dotted: str, text: str) -> Any:
     try:
-        parsed = tomllib.loads(f"value = {text}\n")
+        parsed = parse_toml(f"value = {text}\n", "--set")
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:
         if text and text[0] not in "[{\"'" and "\n" not in text:
             return text

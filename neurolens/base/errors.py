@@ -6,11 +6,25 @@ import re
 from pathlib import Path
 
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+_LONGEST = 400  # characters of a value or field in a message
 
 
 def printable(text: str) -> str:
     """Text for a terminal: what could command it, or turn the writing round, as \\u and four digits."""
     return _CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def one_line(text: str, most: int) -> str:
+    """A text on one line, cut to `most` characters, for a terminal."""
+    shown = printable(" ".join(text[: 4 * most].split()))
+    return shown if len(shown) <= most else f"{shown[: most - 3]}..."
+
+
+def _shown(value: object) -> str:
+    try:
+        return value if isinstance(value, str) and value.startswith("(") else repr(value)
+    except (ValueError, RecursionError):  # an integer of 5000 digits, lists in lists
+        return f"({type(value).__name__} that is too long to show)"
 
 
 class NeurolensError(Exception):
@@ -28,8 +42,8 @@ class InputError(NeurolensError, ValueError):
     """
 
     def __init__(self, file: str | Path, field: str, value: object, expected: str) -> None:
-        shown = value if isinstance(value, str) and value.startswith("(") else repr(value)
-        super().__init__(f"{file}: {field}: got {shown}, expected {expected}")
+        found, where = one_line(_shown(value), _LONGEST), one_line(field, _LONGEST)
+        super().__init__(f"{file}: {where}: got {found}, expected {expected}")
         self.file, self.field, self.value, self.expected = str(file), field, value, expected
 
 

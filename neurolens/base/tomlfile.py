@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError
+from neurolens.base.files import read_bytes
 
 MAX_BYTES = 1_000_000
+_DEEPEST = 100  # tables in each other, or parts of a key
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -20,29 +22,59 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     """The tables of a TOML file.
 
     Raises:
-        InputError: no regular file, unreadable, larger than `MAX_BYTES`, not UTF-8, broken TOML, or empty.
+        InputError: no regular file, unreadable, larger than `MAX_BYTES`, not UTF-8, broken TOML, empty, or refused by
+            `check_tree`.
     """
     path = Path(path)
-    if not path.exists():
-        raise InputError(path, "file", "(missing)", "a TOML file")
-    if not path.is_file():
-        raise InputError(path, "file", "(not a regular file)", "a TOML file")
     try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(path, "file", f"({error.strerror})", "a readable TOML file") from None
-    if len(raw) > MAX_BYTES:
-        raise InputError(path, "file", f"(more than {MAX_BYTES} bytes)", f"at most {MAX_BYTES} bytes")
-    try:
-        data = tomllib.loads(raw.decode("utf-8-sig"))
+        data = parse_toml(read_bytes(path, MAX_BYTES, "a TOML file").decode("utf-8-sig"), path)
     except UnicodeDecodeError as error:
         raise InputError(path, "file", f"(byte {error.start} is not UTF-8)", "UTF-8 text") from None
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:  # a number of 5000 digits is a plain ValueError
         raise InputError(path, "file", f"({error})", "valid TOML") from None
     if not data:
         raise InputError(path, "file", "(no keys)", "a TOML file with content")
     return data
+
+
+def parse_toml(text: str, file: str | Path) -> dict[str, Any]:
+    """The tables of a text; ValueError or RecursionError: no TOML; InputError: refused by `check_tree`."""
+    # The parser's time grows with the square of the parts of a dotted key.
+    if any(piece.count(".") > _DEEPEST for piece in re.split(r"[=,{}\[\]\n]", text)):
+        raise ValueError(f"a key of more than {_DEEPEST} parts")
+    data = tomllib.loads(text)
+    check_tree(data, file)
+    return data
+
+
+def check_tree(data: Any, file: str | Path) -> None:
+    """Refuse what no file of ours holds, in data of TOML or JSON: it would fail where it is used, without its place.
+
+    Raises:
+        InputError: tables and lists more than 100 deep, integers of more than 64 bits, texts with zero bytes or halves
+            of surrogate pairs.
+    """
+    level: list[tuple[str, Any]] = [("", data)]
+    for _ in range(_DEEPEST):
+        inner: list[tuple[str, Any]] = []
+        for place, value in level:
+            if isinstance(value, dict):
+                inner += [(f"{place}.{key}"[-200:] if place else key[:200], item) for key, item in value.items()]
+                texts = list(value)
+            elif isinstance(value, list):
+                inner += [(f"{place}[{k}]"[-200:], item) for k, item in enumerate(value)]
+                continue
+            else:
+                texts = [value] if isinstance(value, str) else []
+            if isinstance(value, int) and not -(2**63) <= value < 2**64:
+                raise InputError(file, place, "(an integer of more than 64 bits)", "a number of at most 64")
+            if any("\0" in t or not t.isascii() and any("\ud800" <= c <= "\udfff" for c in t) for t in texts):
+                raise InputError(file, place or "file", "(a zero byte or half a letter)", "text")
+        level = inner
+    if level:
+        raise InputError(file, level[0][0].partition(".")[0], "(nested too deep)", f"at most {_DEEPEST} tables")
 
 
 def suggestion(word: str, known: Sequence[str]) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from neurolens.base.bounds import F_NUMBER, FOCAL_MM
-from neurolens.base.errors import InputError, printable
+from neurolens.base.errors import InputError, one_line
 
 if TYPE_CHECKING:
     from neurolens.optics.apertures import Aperture
@@ -42,7 +42,7 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {printable(message)} (see {self.prog} --help)\n")
+        self.exit(2, f"{self.prog}: {one_line(message, 1000)} (see {self.prog} --help)\n")
 
 
 def positive(unit: str, *, infinite: bool = False) -> Callable[[str], float]:

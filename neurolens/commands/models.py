@@ -14,7 +14,7 @@ import neurolens
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import answer, number, table
-from neurolens.evaluate.records import reaches, to_use, use_command
+from neurolens.evaluate.records import CLOSE_UM, reaches, to_use, use_command
 
 _DESCRIPTION = """\
 List exported models by lens: film circle, focus, film-equivalent RMS error on rays held out, and
@@ -29,7 +29,6 @@ examples:
   neurolens models
   neurolens models double_gauss --within 0.5um
   neurolens models lenses/cooke_triplet_50.toml --within 0.1px --json"""
-_DEFAULT_UM = 2.0
 
 
 def add_parser(subparsers: Any) -> None:
@@ -67,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         known = ", ".join(sorted({m["lens"] for m in found})) or "a model in one of these folders"
         looked = ", ".join(map(str, places)) or "models/, runs/*/models/"
         raise InputError("neurolens models", "LENS", asked, f"one of: {known} (looked in {looked})")
-    key, most = args.within or ("rms_um", _DEFAULT_UM)
+    key, most = args.within or ("rms_um", CLOSE_UM)
     listed = sorted(of_lens, key=lambda m: (m["lens"], m["film_radius_mm"], m["rms_um"] or 0.0))
     kept = [m for m in listed if args.within is None or reaches(m, most, key)]
     for state in {_state(m) for m in listed}:

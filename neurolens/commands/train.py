@@ -12,6 +12,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_glass, add_json, check_run_folder, lens_path, positive, whole
 from neurolens.commands.output import answer, number, table
+from neurolens.evaluate.records import CLOSE_UM, to_use, use_command
 
 _DESCRIPTION = """\
 Run an experiment: trace ray pairs of the lens, fit the surrogates, export them as ONNX,
@@ -157,6 +158,10 @@ def _text(results: Mapping[str, Any], folder: Path) -> str:
         reached = "reached" if target["met"] else "no model tried reaches it, the closest is"
         said = f"Asked for {target['within_um']:.3g} um RMS"
         parts.append(f"{said}: {reached} {target['model']}, {number(target['rms_um'], 3)} um.")
+    best = to_use(results.get("models", ()), target["within_um"] if target else CLOSE_UM)
+    if best and best.get("file"):
+        command = use_command(str(folder / best["file"]), fused=best.get("fused_ns_per_ray") is not None)
+        parts.append(f"Use {best['name']}:\n  {command}")
     parts += [f"Warning: {text}" for text in results.get("warnings", ())]
     places = [f"  {folder / 'report.html'}  everything on one page", f"  {folder / 'models'}  the ONNX models"]
     if (folder / "pictures").is_dir():

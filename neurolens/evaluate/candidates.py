@@ -24,7 +24,7 @@ from neurolens.evaluate.rays import frame_width_mm
 from neurolens.evaluate.records import ExactRecord, Timing
 from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, race
 from neurolens.graph.c import Signature, write_blocks, write_c
-from neurolens.graph.compiler import FLAGS, compile_c, find_compiler
+from neurolens.graph.compiler import FLAGS, compile_c, has_compiler
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
 from neurolens.optics.paraxial import first_order
@@ -258,9 +258,7 @@ def fused_candidate(
 
     Of a model for each fixed wavelength the first is timed.
     """
-    try:
-        find_compiler()
-    except InputError:
+    if not has_compiler():
         return None
     try:
         found = load_fitted(model) if isinstance(model, Path) else model

@@ -183,7 +183,8 @@ class RenderChoice:
         scenes: scene files.
         models: names of the models that render; empty: the best polynomial and the best network.
         width, height, samples: of each picture, whose shape must be that of the scenes' film.
-        seeds: renders of each camera, so that errors have a noise floor; at least 4.
+        seeds: renders of each camera, so that errors have a noise floor; at least 4. Pictures are their mean.
+        fused: lens and models as C, where a compiler is there; no other pictures, several times sooner.
         threads: workers.
     """
 
@@ -193,6 +194,7 @@ class RenderChoice:
     height: int = 180
     samples: int = 16
     seeds: int = 4
+    fused: bool = True
     threads: int = 2
 
     def __post_init__(self) -> None:

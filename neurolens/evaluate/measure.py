@@ -320,5 +320,5 @@ def known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
         data = json.loads(file.with_suffix(".json").read_text(encoding="utf-8"))
         same = data["fingerprint"] == fingerprint and data["sha256"] == sha256_of(file)
         return data["record"] if same else None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None

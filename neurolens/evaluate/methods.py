@@ -287,7 +287,7 @@ def _known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
     try:
         record = json.loads(file.read_text(encoding="utf-8"))
         good = isinstance(record, dict) and {"lens", "method", "failed", "not_exported"} <= record.keys()
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return record if good and record.get("fingerprint") == fingerprint else None
 

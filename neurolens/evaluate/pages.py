@@ -26,12 +26,16 @@ def number(record: Mapping[str, Any], key: str) -> float | None:
 
 @dataclass(frozen=True)
 class Column:
-    """A figure of a record: its heading, its key (dots go into nested tables), a factor and significant digits."""
+    """A figure of a record: its heading, its key (dots go into nested tables), a factor and significant digits.
+
+    `about` says what it means, on hover and in the legend.
+    """
 
     heading: str
     key: str
     factor: float = 1.0
     digits: int = 3
+    about: str = ""
 
     def cell(self, record: Record, thousands: str = "") -> str:
         """The figure as text, a dash for None; the word "never" stays."""
@@ -69,13 +73,23 @@ def table(names: Sequence[str], records: Sequence[Record], columns: Iterable[Col
     columns = [c for c in columns if any(number(r, c.key) is not None for r in records)]
     if not records:
         return ""
-    head = "".join(f"<th scope='col'>{text(c.heading)}</th>" for c in columns)
+    head = "".join(f"<th scope='col'{_hover(c.about)}>{text(c.heading)}</th>" for c in columns)
     rows = []
     for name, record in zip(names, records, strict=True):
         cells = "".join(f"<td>{c.cell(record, ',')}</td>" for c in columns)
         rows.append(f"<tr><th scope='row'>{text(name)}</th>{cells}</tr>")
     body = f"<thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
-    return f"<div class='scroll'><table>{body}</table></div>"
+    return f"<div class='scroll' tabindex='0'><table>{body}</table></div>"
+
+
+def _hover(about: str) -> str:
+    return f" title='{text(about)}'" if about else ""
+
+
+def legend(columns: Iterable[Column]) -> str:
+    """What the headings of tables mean, folded."""
+    meant = {c.heading: c.about for c in columns if c.about}
+    return f"<details><summary>What the words mean</summary>{facts(meant)}</details>" if meant else ""
 
 
 def facts(values: Mapping[str, Any]) -> str:
@@ -143,9 +157,9 @@ def page(title: str, body: str) -> str:
 
 _CSS = """
 :root { color-scheme: light dark; --ink: #1b1f24; --dim: #5d6670; --line: #dfe3e8; --back: #fff; --card: #f5f7f9;
-  --accent: #0062a3; --warn: #fff6e0; --warnline: #e0a800; }
+  --accent: #0062a3; --shade: #0004; --warn: #fff6e0; --warnline: #e0a800; }
 @media (prefers-color-scheme: dark) { :root { --ink: #e4e8ec; --dim: #98a2ad; --line: #333a42; --back: #15181c;
-  --card: #1e2329; --accent: #6cb8f0; --warn: #2b2414; --warnline: #a07c10; } }
+  --card: #1e2329; --accent: #6cb8f0; --shade: #fff3; --warn: #2b2414; --warnline: #a07c10; } }
 * { box-sizing: border-box; }
 body { margin: 0 auto; max-width: 1320px; padding: 2rem 1.25rem 4rem; background: var(--back); color: var(--ink);
   font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; }
@@ -165,7 +179,18 @@ a { color: var(--accent); }
 dl { display: grid; grid-template-columns: auto 1fr; gap: .1rem .9rem; margin: 0; font-size: .88rem; }
 dt { color: var(--dim); } dd { margin: 0; overflow-wrap: anywhere; font-variant-numeric: tabular-nums; }
 details { margin-top: 1rem; } summary { cursor: pointer; color: var(--accent); margin-bottom: .5rem; }
-.scroll { overflow-x: auto; }
+.scroll { overflow-x: auto; scrollbar-width: auto; scrollbar-color: var(--dim) var(--card); padding-bottom: .2rem;
+  background: linear-gradient(to right, var(--back), transparent 2rem) 0 0 / 3rem 100% no-repeat local,
+    linear-gradient(to left, var(--back), transparent 2rem) 100% 0 / 3rem 100% no-repeat local,
+    linear-gradient(to right, var(--shade), transparent) 0 0 / 1rem 100% no-repeat scroll,
+    linear-gradient(to left, var(--shade), transparent) 100% 0 / 1rem 100% no-repeat scroll; }
+.scroll::-webkit-scrollbar { height: 12px; } .scroll::-webkit-scrollbar-track { background: var(--card); }
+.scroll::-webkit-scrollbar-thumb { background: var(--dim); border-radius: 6px; }
+th[title] { text-decoration: underline dotted; text-underline-offset: 3px; cursor: help; }
+.use { background: var(--card); border-left: 4px solid var(--accent); border-radius: 4px; padding: .6rem 1rem 1rem;
+  margin-top: 1.4rem; } .use h2 { border: 0; margin: 0 0 .3rem; } .use p { margin: .3rem 0; }
+pre { margin: .5rem 0 0; padding: .6rem .8rem; overflow-x: auto; background: var(--back); border-radius: 4px;
+  border: 1px solid var(--line); font-size: .85rem; }
 table { border-collapse: collapse; font-size: .84rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .32rem .6rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
 thead th { white-space: normal; vertical-align: bottom; color: var(--dim); font-weight: 600; min-width: 4.6rem; }

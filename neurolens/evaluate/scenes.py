@@ -13,7 +13,8 @@ import numpy as np
 
 from neurolens.base.progress import Progress, Report
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.exact import ExactCamera, FusedExactCamera
+from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
@@ -23,6 +24,7 @@ from neurolens.evaluate.figures import image_caption, side_by_side
 from neurolens.evaluate.image import compare, flip_map
 from neurolens.evaluate.measure import fit_and_measure
 from neurolens.evaluate.speed import Candidate, race
+from neurolens.graph.compiler import has_compiler
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.render.job import camera_axes
@@ -48,17 +50,23 @@ class Pictures:
     figures: list[dict[str, Any]] = field(default_factory=list)
 
 
-def scene_cameras(lens: Lens, domain: Domain, models: Mapping[str, Path], shot: CameraSettings) -> dict[str, Camera]:
-    """Exact lens, each model, thin lens and pinhole, set as a scene's [camera] asks; no wider than the lens opens."""
+def scene_cameras(
+    lens: Lens, domain: Domain, models: Mapping[str, Path], shot: CameraSettings, fused: bool = False
+) -> dict[str, Camera]:
+    """Exact lens, each model, thin lens and pinhole, set as a scene's [camera] asks; no wider than the lens opens.
+
+    Lens and models as C if `fused`.
+    """
     film = (shot.film_width_mm, shot.film_height_mm)
     data = first_order(lens)
     f_number = max(shot.f_number or data.f_number, data.f_number)
     # The same light for all cameras.
     real: dict[str, Any] = {"film_mm": film, "focus_m": shot.focus_m, "f_number": f_number}
     real["wavelength_nm"] = shot.wavelengths_nm
-    cameras: dict[str, Camera] = {EXACT: ExactCamera(lens, bounds=domain.bounds, **real)}
+    exact, model = (FusedExactCamera, FusedCamera) if fused else (ExactCamera, OnnxCamera)
+    cameras: dict[str, Camera] = {EXACT: exact(lens, bounds=domain.bounds, **real)}
     for name, file in models.items():
-        cameras[name] = OnnxCamera(load_model(file), **real)
+        cameras[name] = model(load_model(file), **real)
     cameras["thin lens"] = ThinLens(data.efl_mm, f_number, shot.focus_m, film)
     cameras["pinhole"] = Pinhole(data.efl_mm, film, f_number)
     return cameras
@@ -67,29 +75,27 @@ def scene_cameras(lens: Lens, domain: Domain, models: Mapping[str, Path], shot: 
 def render_all(
     choice: RenderChoice, lens: Lens, domain: Domain, models: Mapping[str, Path], folder: Path, report: Report
 ) -> Pictures:
-    """Every scene through every camera; the exact lens and the models with several seeds, for the noise floor."""
-    found = Pictures()
+    """Every scene through every camera with several seeds: for the noise floor, and their mean as the picture."""
+    found, fused = Pictures(), choice.fused and has_compiler()
     scenes = [load_scene(path) for path in choice.scenes]
-    done, total = 0, len(scenes) * ((1 + len(models)) * choice.seeds + 2)
+    done, total = 0, len(scenes) * (3 + len(models)) * choice.seeds
     for scene in scenes:
         film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
         renders: dict[str, list[FloatArray]] = {}
-        for name, camera in scene_cameras(lens, domain, models, scene.settings.camera).items():
-            seeds = choice.seeds if name == EXACT or name in models else 1
-            for seed in range(seeds):
+        for name, camera in scene_cameras(lens, domain, models, scene.settings.camera, fused).items():
+            for seed in range(choice.seeds):
                 result = render(
                     scene, camera, width=choice.width, height=choice.height, samples=choice.samples, seed=seed,
                     threads=choice.threads, film=film,
                 )  # fmt: skip
                 renders.setdefault(name, []).append(result.rgb)
-                if seed == 0:
-                    found.cameras.append(_camera_record(scene, name, result.stats))
-                    metadata = {"render": result.stats, "camera": camera.settings}
-                    file = folder / f"{_stem(scene, name)}.exr"
-                    write_exr(file, result.rgb, half=True, metadata=metadata)
-                    write_png(file.with_suffix(".png"), result.rgb)
                 done += 1
                 report(done / total)
+            found.cameras.append(_camera_record(scene, name, result.stats))
+            metadata = {"render": result.stats, "camera": camera.settings, "mean_of_renders": choice.seeds}
+            file, mean = folder / f"{_stem(scene, name)}.exr", np.mean(renders[name], axis=0, dtype=np.float32)
+            write_exr(file, mean, half=True, metadata=metadata)
+            write_png(file.with_suffix(".png"), mean)
         _compare_scene(found, scene, choice, renders, folder)
     return found
 
@@ -116,7 +122,7 @@ def _compare_scene(
             "camera": name,
             "file_png": f"{folder.name}/{_stem(scene, name)}.png",
             "file_exr": f"{folder.name}/{_stem(scene, name)}.exr",
-            "samples": choice.samples,
+            "samples": choice.samples * choice.seeds,
         }
         if name != EXACT:
             errors = compare(pictures, exact)
@@ -128,13 +134,14 @@ def _compare_scene(
     maps[EXACT] = flip_map(exact[0], exact[1])
     captions[EXACT] = "two seeds: the noise floor"
     file = folder / f"{scene.name}-side-by-side.png"
-    first = {name: pictures[0] for name, pictures in renders.items()}
-    side_by_side(first, maps, file, captions, title=f"{scene.name}, error against exact")
+    shown = {name: np.mean(pictures, axis=0) for name, pictures in renders.items()}
+    side_by_side(shown, maps, file, captions, title=f"{scene.name}, error against exact")
     found.figures.append(
         {
             "file": f"{folder.name}/{file.name}",
             "title": f"{scene.name}: every camera",
-            "caption": "Below each render its FLIP difference from an exact render with another seed.",
+            "caption": f"The mean of {choice.seeds} renders of {choice.samples} samples a pixel. Below each the FLIP "
+            "difference of one of them from one exact render with another seed.",
             "wide": True,
         }
     )

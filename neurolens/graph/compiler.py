@@ -45,6 +45,14 @@ def find_compiler() -> str:
     raise InputError("compiler", "CC", "(none found)", "a C compiler: $CC, cc, gcc or clang")
 
 
+def has_compiler() -> bool:
+    """Whether `find_compiler` finds one."""
+    try:
+        return bool(find_compiler())
+    except InputError:
+        return False
+
+
 def _words(compiler: str) -> list[str]:
     """The command of a compiler; a path with spaces that is there is one word."""
     if shutil.which(compiler):

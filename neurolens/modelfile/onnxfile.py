@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import ModelError
+from neurolens.base.errors import InputError, ModelError
+from neurolens.base.files import read_bytes
+from neurolens.base.tomlfile import check_tree
 from neurolens.modelfile import CARD_KEY, CARD_KIND, CARD_SCHEMA, MAX_CARD
 from neurolens.modelfile.protobuf import Fields, as_text, fields_of, integers, message, one, text, walk
 from neurolens.modelfile.shapes import BROADCAST, ELEMENTWISE, RAYS, SHAPED, Node, Shape, check_shapes
@@ -52,12 +54,10 @@ def read_metadata(path: str | Path) -> tuple[bytes, Fields, dict[str, str]]:
         ModelError: a file that is missing, too large, truncated, or no ONNX model.
     """
     file = Path(path)
-    if not file.is_file():
-        raise ModelError(f"{file}: no such file, expected an exported lens model (.onnx)")
-    size = file.stat().st_size
-    if size > MAX_BYTES:
-        raise ModelError(f"{file}: {size} bytes, expected at most {MAX_BYTES}")
-    data = file.read_bytes()
+    try:
+        data = read_bytes(file, MAX_BYTES, "an exported lens model (.onnx)")
+    except InputError as error:
+        raise ModelError(str(error)) from None
     try:
         model = fields_of(memoryview(data))
         one(model, 7)  # the graph
@@ -79,6 +79,7 @@ def card_in(file: Any, metadata: dict[str, str]) -> dict[str, Any]:
         raise ModelError(f"{file}: card: {len(metadata[CARD_KEY])} characters, expected at most {MAX_CARD}")
     try:
         card = json.loads(metadata[CARD_KEY], parse_constant=_refuse_constant)
+        check_tree(card, "card")
     except (ValueError, RecursionError) as error:
         raise ModelError(f"{file}: the card is not strict JSON ({error})") from error
     kind = card.get("kind") if isinstance(card, dict) else None

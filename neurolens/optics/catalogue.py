@@ -117,6 +117,9 @@ def _root(square: Any) -> Any:
 # A name that several makers use is that of the first one here.
 MAKERS = ("Schott", "Ohara", "Hoya", "Hikari", "CDGM", "Sumita", "LZOS", "generic")
 
+_BY_LETTERS = {maker.upper(): maker for maker in MAKERS}
+_LONGEST = 100  # characters of a name that count
+
 # Other names for the same dispersion. Schott published one set of coefficients for BK7 and N-BK7.
 ALIASES = {
     **{"BK7": "Schott:N-BK7", "silica": "generic:fused silica", "SiO2": "generic:fused silica"},
@@ -211,14 +214,16 @@ def _key(name: str) -> str:
 
 def _split(name: str) -> tuple[str | None, str]:
     """Maker (None where the name does not say) and key of a name as people write it."""
-    names = "|".join(MAKERS)
-    match = re.fullmatch(rf"\s*({names})\s*[: /_]\s*(.+)|(.+?)\s*\(({names})\)\s*", name, re.IGNORECASE)
-    if match is None:
-        alias = _alias_keys().get(_key(name))
-        return _split(alias) if alias else (None, _key(name))
-    said, bare = match[1] or match[4], match[2] or match[3]
-    maker = next(m for m in MAKERS if m.lower() == said.lower())
-    return maker, _key(bare)
+    text = " ".join(name[:_LONGEST].split())
+    bare, bracket, said = text.rpartition("(") if text.endswith(")") else ("", "", "")
+    if bracket and (maker := _BY_LETTERS.get(said[:-1].strip().upper())) and bare.strip():
+        return maker, _key(bare)
+    for letters, maker in _BY_LETTERS.items():
+        rest = text[len(letters) :]
+        if text.upper().startswith(letters) and rest[:1] in (" ", ":", "/", "_") and rest[1:].strip():
+            return maker, _key(rest[1:])
+    alias = _alias_keys().get(_key(text))
+    return _split(alias) if alias else (None, _key(text))
 
 
 @lru_cache(maxsize=1)

@@ -73,6 +73,7 @@ MAX_SURFACES = 500
 MAX_TERMS = 1000  # aspheric coefficients of all surfaces: each costs every ray a step, and lenses have at most 400
 MAX_LAYERS = 200
 MAX_POWER = 40
+LARGEST = 1e15  # of any figure but a radius
 MAX_INDEX = 4.5  # germanium, the densest lens material there is, has 4.0
 RIMS = ("source", "estimated", "derived")
 LENS_KEYS = (
@@ -119,7 +120,8 @@ class Table:
             found = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else float(value)
         except OverflowError:
             found = math.nan
-        if math.isnan(found) or (finite and math.isinf(found)) or (above is not None and not found > above):
+        expected += f", at most {LARGEST:g}" if finite and LARGEST < abs(found) < math.inf else ""
+        if math.isnan(found) or (finite and not abs(found) <= LARGEST) or (above is not None and not found > above):
             raise self.error(key, value, expected)
         return found
 

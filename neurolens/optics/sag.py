@@ -122,8 +122,34 @@ def end_mm(surface: Surface) -> float:
     return abs(float(surface.radius_mm)) / math.sqrt(stretch) if stretch > 0 else math.inf
 
 
+def check_figures(surfaces: Sequence[Surface], file: str, state: str = "") -> None:
+    """Raise for figures that no lens has, whose squares and inverses would overflow; a NaN is not yet known.
+
+    Args:
+        state: prefix of the surface in messages, for a zoom state of the file.
+
+    Raises:
+        InputError: names the file, the surface and the figure.
+    """
+    for k, s in enumerate(surfaces):
+        rim = min(s.semi_diameter_mm, 1e6)
+        figures: tuple[tuple[str, Any, float, float], ...] = (
+            ("radius_mm", abs(s.radius_mm), 1e-6, math.inf),
+            ("thickness_mm", abs(s.thickness_mm), 0.0, 1e6),
+            ("diameter_mm", s.diameter_mm, 1e-6, 1e6),
+            ("V_d", 100.0 if s.V_d is None else s.V_d, 1.0, 1e4),
+            ("conic", abs(s.conic), 0.0, 1e9),
+            ("asphere", sum(abs(float(a)) * rim**p for p, a in s.asphere), 0.0, 1e6),
+            ("absorption_per_mm", s.absorption_per_mm, 0.0, 1e6),
+        )
+        for name, value, low, high in figures:
+            if value < low or value > high:
+                expected = f"a size from {low:g} to {high:g}" + (" mm of sag at the rim" if name == "asphere" else "")
+                raise InputError(file, f"{state}surface {k}, {name}", float(value), expected)
+
+
 def check_clearance(surfaces: Sequence[Surface], file: str, state: str = "") -> None:
-    """Raise for a rim larger than its radius of curvature and for neighbours that overlap inside their rims.
+    """Raise as `check_figures`, for rims beyond the radius of curvature, and for neighbours that overlap inside theirs.
 
     The gap between two spheres is monotone from the axis outwards, so that axis and the smaller of the two rims
     decide; other shapes are also tested in between. A stop that bends nothing may lie inside an element beside which
@@ -135,6 +161,7 @@ def check_clearance(surfaces: Sequence[Surface], file: str, state: str = "") -> 
     Raises:
         InputError: names the file, the surface and by how much.
     """
+    check_figures(surfaces, file, state)
     for k, s in enumerate(surfaces):
         if s.semi_diameter_mm > end_mm(s):
             limit = f"at most {2 * end_mm(s):g} mm, where its {'conic' if s.conic else 'sphere'} ends"

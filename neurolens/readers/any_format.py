@@ -13,7 +13,7 @@ from neurolens.readers.codev import looks_like_seq, read_seq
 from neurolens.readers.draft import Given
 from neurolens.readers.json_lens import looks_like_json, read_json_lens
 from neurolens.readers.oslo import looks_like_len, read_len
-from neurolens.readers.source import decode, read_bytes
+from neurolens.readers.source import read_text
 from neurolens.readers.tables import looks_like_table, read_table
 from neurolens.readers.zemax import looks_like_zmx, read_zmx
 
@@ -70,7 +70,7 @@ def format_of(path: str | Path) -> Format:
     Raises:
         InputError: neither tells.
     """
-    head = decode(read_bytes(path), path)[:_HEAD]
+    head = read_text(path)[:_HEAD]
     suffix = Path(path).suffix.lower()
     by_content = next((f for f in FORMATS if f.looks_like(head)), None)
     by_suffix = next((f for f in FORMATS if suffix in f.suffixes), None)

@@ -14,7 +14,7 @@ from neurolens.optics.glass import by_figures
 from neurolens.optics.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
 from neurolens.optics.paraxial import FirstOrder
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.sag import check_clearance
+from neurolens.optics.sag import check_clearance, check_figures
 from neurolens.readers.source import warn
 
 # A diameter that the file does not give, until `finish` has found it.
@@ -139,6 +139,7 @@ def _check_rows(rows: Sequence[Surface], file: str) -> None:
         for power, _ in s.asphere:
             if not 2 <= power <= MAX_POWER:
                 raise InputError(file, f"{where}asphere, power", power, f"a power from 2 to {MAX_POWER}")
+    check_figures(rows, file)
     stops = [k for k, s in enumerate(rows) if s.stop]
     if len(stops) != 1:
         found = f"(on surfaces {', '.join(map(str, stops))})" if stops else "(none)"

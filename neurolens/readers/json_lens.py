@@ -11,19 +11,21 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 from neurolens.base.errors import InputError
+from neurolens.base.tomlfile import check_tree
 from neurolens.optics import paraxial
 from neurolens.optics.lensfile import MAX_SURFACES, Table
 from neurolens.optics.prescription import Configuration, Lens, Surface
 from neurolens.readers.assemble import UNKNOWN, check_states, finish, first_order, same_glass
 from neurolens.readers.draft import Given
 from neurolens.readers.json_others import read_others
-from neurolens.readers.source import decode, read_bytes, warn
+from neurolens.readers.source import read_text, warn
 
 KEYS = (
     *("name", "designer", "source", "efl_mm", "f_number", "field_or_image_circle", "notes", "computed_at_nd"),
@@ -35,9 +37,7 @@ SURFACE_KEYS = (
 )
 SHAPES = {"sphere": None, "asphere": None, "cyl-x": "x", "cyl-y": "y"}
 # Words in the notes that indicate diameters not from the source, independent of `diameters_estimated`.
-_NOT_THE_SOURCE_S = re.compile(
-    r"diameters?[^.;]*\b(trimmed|enlarged|chosen|estimated|inferred|computed|reduced)\b", re.IGNORECASE
-)
+_NOT_THE_SOURCE_S = frozenset("trimmed enlarged chosen estimated inferred computed reduced".split())
 STATE_KEYS = (
     *("name", "efl_mm", "efl_y_mm", "efl_x_mm", "f_number", "object_distance_mm", "magnification"),
     *("thickness_overrides", "stop_diameter_mm", "interpolated_by_transcriber", "note"),
@@ -45,7 +45,7 @@ STATE_KEYS = (
 MAX_STATES = 200
 DOUBTFUL = 0.05  # relative difference of a stated object distance from the paraxial one that is worth a warning
 AGREES = 1e-4  # relative: more than rounding of the printed figures, less than any wrong digit
-_NUMBER = r"([0-9]+(?:\.[0-9]+)?)"
+_NUMBER = r"(?<![0-9.])([0-9]{1,9}(?:\.[0-9]{1,9})?)"  # bounded: a search tries every place
 
 
 def read_json_lens(path: str | Path, given: Given | None = None, *, catalogue: bool = True) -> Lens:
@@ -79,7 +79,7 @@ def read_json_lens(path: str | Path, given: Given | None = None, *, catalogue: b
     last = len(rows) - 1
     surfaces = tuple(_surface(row, k, file, k == last, catalogue) for k, row in enumerate(rows))
     notes, estimated = table.text("notes", required=False), table.flag("diameters_estimated")
-    if not estimated and _NOT_THE_SOURCE_S.search(notes):
+    if not estimated and _tells_of_other_diameters(notes):
         warn(file, "the notes tell of diameters that are not the source's; rims are taken as estimated")
         estimated = True
     stated = table.optional("f_number")
@@ -102,6 +102,12 @@ def read_json_lens(path: str | Path, given: Given | None = None, *, catalogue: b
     return read_states(lens, data)
 
 
+def _tells_of_other_diameters(notes: str) -> bool:
+    """Whether a clause has "diameter" and after it one of the words."""
+    clauses = (clause.partition("diameter")[2] for clause in re.split("[.;]", notes.lower()))
+    return any(not _NOT_THE_SOURCE_S.isdisjoint(re.findall(r"\w+", rest)) for rest in clauses)
+
+
 def looks_like_json(head: str) -> bool:
     """Whether the beginning of a text is that of a JSON object."""
     return head.lstrip().startswith("{")
@@ -113,8 +119,8 @@ def _load(path: str | Path) -> dict[str, Any]:
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         found = dict(pairs)
         if len(found) < len(pairs):
-            keys = [key for key, _ in pairs]
-            twice = next(key for key in keys if keys.count(key) > 1)
+            counts = Counter(key for key, _ in pairs)
+            twice = next(key for key, count in counts.items() if count > 1)
             raise InputError(path, twice, "(given twice)", "each key once")
         return found
 
@@ -122,11 +128,12 @@ def _load(path: str | Path) -> dict[str, Any]:
         raise InputError(path, "file", word, "finite numbers")
 
     try:
-        data = json.loads(decode(read_bytes(path), path), object_pairs_hook=once, parse_constant=refuse)
+        data = json.loads(read_text(path), object_pairs_hook=once, parse_constant=refuse)
     except InputError:
         raise
     except (ValueError, RecursionError) as error:
         raise InputError(path, "file", f"({error})", "valid JSON") from None
+    check_tree(data, path)
     if not isinstance(data, dict):
         raise InputError(path, "file", f"(a {type(data).__name__})", "a JSON object with the key surfaces")
     return data

@@ -71,7 +71,7 @@ def read_len(path: str | Path, given: Given | None = None) -> Lens:
 
 def looks_like_len(head: str) -> bool:
     """Whether the beginning of a text is that of an OSLO file."""
-    return re.search(r"^\s*LEN\s+NEW\b", head, re.IGNORECASE | re.MULTILINE) is not None
+    return any(line.upper().split(maxsplit=2)[:2] == ["LEN", "NEW"] for line in head.splitlines())
 
 
 def _parts(text: str) -> list[str]:

@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.files import read_bytes
 from neurolens.base.tomlfile import suggestion
 
 MAX_BYTES = 4_000_000  # the longest real lens files, with tolerances and merit function, stay below 1 MB
 MAX_LINES = 100_000
 MAX_LINE = 10_000
+MAX_WORD, LARGEST = 60, 1e30  # characters of a number; its size, more than any program writes for infinity
 
 # Units of length in mm.
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "in": 25.4, "m": 1000.0}
@@ -43,10 +45,10 @@ class Line:
     def number_of(self, keyword: str, word: str, expected: str = "a finite number") -> float:
         """A finite number from one word of this line."""
         try:
-            value = float(word) if "_" not in word else math.nan
+            value = float(word) if "_" not in word and len(word) <= MAX_WORD else math.nan
         except ValueError:
             value = math.nan
-        if not math.isfinite(value):
+        if not abs(value) <= LARGEST:
             raise self.error(keyword, word, expected)
         return value
 
@@ -65,26 +67,16 @@ class Line:
         return [self.number_of(keyword, word) for word in words]
 
 
-def read_bytes(path: str | Path, max_bytes: int = MAX_BYTES) -> bytes:
-    """The content of a regular file of bounded size.
+def read_text(path: str | Path) -> str:
+    """The text of a lens file of bounded size.
 
     Raises:
-        InputError: no such file, not a regular one, unreadable, empty, or larger than `max_bytes`.
+        InputError: as `files.read_bytes` and `decode`; an empty file.
     """
-    path = Path(path)
-    if not path.is_file():
-        found = "(not a regular file)" if path.exists() else "(missing)"
-        raise InputError(path, "file", found, "a lens file")
-    try:
-        with path.open("rb") as file:
-            raw = file.read(max_bytes + 1)
-    except OSError as error:
-        raise InputError(path, "file", f"({error.strerror})", "a readable lens file") from None
-    if len(raw) > max_bytes:
-        raise InputError(path, "file", f"(more than {max_bytes} bytes)", f"at most {max_bytes} bytes")
+    raw = read_bytes(path, MAX_BYTES, "a lens file")
     if not raw.strip():
         raise InputError(path, "file", "(empty)", "a lens file with content")
-    return raw
+    return decode(raw, path)
 
 
 def decode(raw: bytes, path: str | Path) -> str:
@@ -114,7 +106,7 @@ def decode(raw: bytes, path: str | Path) -> str:
 def read_lines(path: str | Path) -> list[Line]:
     """The lines of a text file, those without content left out; refuses too many, or one too long."""
     file = str(path)
-    rows = decode(read_bytes(path), path).splitlines()
+    rows = read_text(path).splitlines()
     if len(rows) > MAX_LINES:
         raise InputError(file, "file", f"({len(rows)} lines)", f"at most {MAX_LINES} lines")
     lines = [Line(file, k, row.rstrip()) for k, row in enumerate(rows, start=1) if row.strip()]

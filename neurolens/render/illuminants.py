@@ -19,13 +19,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError
+from neurolens.base.files import read_bytes
 from neurolens.base.tomlfile import suggestion
 
 FloatArray64 = NDArray[np.float64]
 Spectrum = tuple[FloatArray64, FloatArray64]  # wavelengths in nm, increasing, and values there
 
 CIE_NAMES = ("D65", "D50", "A", "E")
-_KELVIN = re.compile(r"(\d+(?:\.\d*)?) ?K")
+_KELVIN = re.compile(r"([0-9]{1,9}(?:\.[0-9]{0,9})?) ?K")
 COLDEST_K, HOTTEST_K = 500.0, 1e5
 _SECOND_RADIATION_CONSTANT = 1.438776877e-2  # h c / k, m K
 _MOST_ROWS, _LARGEST_FILE = 10_000, 1_000_000
@@ -96,10 +97,8 @@ def read_spectrum(scene: Path, field: str, path: Path, most: float | None = None
         InputError: missing, too large, not numbers, or refused by `check_spectrum`.
     """
     try:
-        if path.stat().st_size > _LARGEST_FILE:
-            raise InputError(scene, field, str(path), f"a file of at most {_LARGEST_FILE} bytes")
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        lines = read_bytes(path, _LARGEST_FILE, "a CSV file", (scene, field)).decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
         raise InputError(scene, field, str(path), f"a readable CSV file ({error})") from None
     rows: list[tuple[float, float]] = []
     for number, line in enumerate(lines, 1):

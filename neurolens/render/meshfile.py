@@ -19,19 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.files import read_bytes
 from neurolens.render.scenetables import FARTHEST_M, MeshSettings
 
 LARGEST_FILE = 500_000_000  # bytes
 _LARGEST_HEADER = 100_000
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_INDEX = r"-?[1-9]\d*"
-_CORNER = rf"{_INDEX}(?:/(?:{_INDEX})?(?:/{_INDEX})?)?"
-_OBJ_LINES = {
-    "v": (re.compile(rf"v(?: {_NUMBER}){{3,7}}"), "v X Y Z"),
-    "vt": (re.compile(rf"vt(?: {_NUMBER}){{2,3}}"), "vt U V"),
-    "vn": (re.compile(rf"vn(?: {_NUMBER}){{3}}"), "vn X Y Z"),
-    "f": (re.compile(rf"f(?: {_CORNER}){{3,}}"), "f I J K, counted from 1, or back from -1"),
-}
+_LONGEST = 60  # characters of a number or a corner
+_INDEX = r"-?[1-9][0-9]{0,9}"
+_CORNER = re.compile(rf"{_INDEX}(?:/(?:{_INDEX})?(?:/{_INDEX})?)?")
+# Of each kind of line: the fewest and most words after it, how many are used, what is expected.
+_OBJ_LINES = {"v": (3, 7, 3, "v X Y Z"), "vt": (2, 3, 2, "vt U V"), "vn": (3, 3, 3, "vn X Y Z")}
+_FACE = "f I J K, counted from 1, or back from -1"
 
 
 @dataclass(frozen=True)
@@ -138,16 +136,10 @@ def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
     try:
         if kind not in (".obj", ".ply"):
             raise InputError(scene, field, str(path), "a mesh file that ends in .obj or .ply")
-        if not path.is_file():
-            raise InputError(scene, field, str(path), "a mesh file that exists")
-        if path.stat().st_size > LARGEST_FILE:
-            raise InputError(scene, field, str(path), f"a file of at most {LARGEST_FILE} bytes")
-        content = path.read_bytes()
+        content = read_bytes(path, LARGEST_FILE, "a mesh file", (scene, field))
         return (_read_obj if kind == ".obj" else _read_ply)(scene, field, path, content)
     except (InputError, MemoryError):
         raise
-    except OSError as error:
-        raise InputError(scene, field, str(path), f"a mesh file that can be read ({error.strerror})") from None
     except Exception as error:  # trimesh raises exceptions of many types
         raise InputError(scene, field, str(path), f"a mesh file that trimesh can read ({error})") from None
 
@@ -163,17 +155,19 @@ def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> TriangleSe
     faces = []
     for number, line in enumerate(text.splitlines(), 1):
         kind, *words = line.partition("#")[0].split() or [""]
-        if kind not in _OBJ_LINES:
+        if kind not in ("f", *_OBJ_LINES):
             continue
-        pattern, form = _OBJ_LINES[kind]
         place = f"{field} {path.name}, line {number}"
-        if not pattern.fullmatch(" ".join([kind, *words])):
-            raise InputError(scene, place, line[:60], form)
         if kind == "f":
+            if len(words) < 3 or not all(len(word) <= _LONGEST and _CORNER.fullmatch(word) for word in words):
+                raise InputError(scene, place, line[:60], _FACE)
             first, *rest = (corners.setdefault(c, len(corners)) for c in _corners(scene, place, words, values))
             faces += [(first, *edge) for edge in pairwise(rest)]
-        else:
-            values[kind].append([float(word) for word in words[: 2 if kind == "vt" else 3]])
+            continue
+        least, most, used, form = _OBJ_LINES[kind]
+        if not least <= len(words) <= most or not all(map(_is_number, words)):
+            raise InputError(scene, place, line[:60], form)
+        values[kind].append([float(word) for word in words[:used]])
     rows = np.array(list(corners), np.intp).reshape(-1, 3).T
     vertices, uv, normals = (
         None if (row < 0).any() else np.array(values[kind], np.float64).reshape(-1, 2 if kind == "vt" else 3)[row]
@@ -181,6 +175,14 @@ def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> TriangleSe
     )
     assert vertices is not None  # every corner has one
     return TriangleSet(vertices, np.array(faces, np.int64).reshape(-1, 3), uv, normals)
+
+
+def _is_number(word: str) -> bool:
+    """Whether a word is a decimal number; infinity, NaN and what only Python takes for one are not."""
+    try:
+        return len(word) <= _LONGEST and not word.strip("0123456789+-.eE") and math.isfinite(float(word))
+    except ValueError:
+        return False
 
 
 def _corners(scene: Path, field: str, words: list[str], values: dict[str, list[list[float]]]) -> list[tuple[int, ...]]:

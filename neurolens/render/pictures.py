@@ -6,7 +6,10 @@ float64 and int32; `write_exr` handles all three. The size of pictures named by 
 
 from __future__ import annotations
 
+import io
 import json
+import os
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path
+from neurolens.base.files import atomic_path, open_regular, read_bytes
 from neurolens.cameras.contract import FloatArray
 from neurolens.optics.apertures import MAX_MASK, THRESHOLD, Aperture
 from neurolens.render.colour import SRGB, ColourSpace, conversion, linear_to_srgb, srgb_to_linear
@@ -27,7 +30,10 @@ from neurolens.render.scenetables import BRIGHTEST
 METADATA_KEY = "neurolens"
 _HALF_MAX = 65504.0
 _COLOURS = "RGB"
-LARGEST_PICTURE, LARGEST_ENVIRONMENT = 8192, 4096  # pixels per side
+LARGEST_PICTURE, LARGEST_ENVIRONMENT, LARGEST_FILM = 8192, 4096, 1 << 16  # pixels per side
+MOST_PIXELS = 1 << 26  # of all textures of a scene: 0.8 GB
+_MOST_VALUES, _LARGEST_FILE = 1 << 28, 1 << 28  # of an OpenEXR file; bytes of any other
+FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "TGA", "WEBP")  # of Pillow's, which would ask other programs for some
 _DEPTH = "Z"  # the name of depth in other programs
 
 
@@ -135,30 +141,54 @@ def _colours(planes: Mapping[str, FloatArray], file: str | Path, field: str) -> 
 
 
 def _read_channels(
-    path: Path, place: tuple[str | Path, str] | None = None, most: int | None = None
+    path: Path, place: tuple[str | Path, str] | None = None, most: int = LARGEST_FILM
 ) -> tuple[dict[str, FloatArray], str]:
     """All channels as float32, and the text of our metadata.
+
+    The library reads every channel, so that a file is refused where they are too large together.
 
     Args:
         place: file and field that name the picture, if there are others than the picture itself. most: pixels per side.
     """
     file, field = place or (path, "file")
     name = str(path) if place else "(missing)"
-    if not path.is_file():
-        raise InputError(file, field, name, "an OpenEXR file that exists")
     try:
-        with OpenEXR.File(str(path), header_only=True) as header:
-            low, high = header.header()["dataWindow"]
-        if most is not None and max(high[k] - low[k] + 1 for k in range(2)) > most:
-            raise InputError(file, field, name, f"a picture of at most {most} pixels per side")
-        with OpenEXR.File(str(path), separate_channels=True) as whole:
+        open_regular(path).close()
+        values = 0
+        with _silent(), OpenEXR.File(str(path), header_only=True) as header:
+            for part in header.parts:
+                low, high = part.header["dataWindow"]
+                size = [int(high[k]) - int(low[k]) + 1 for k in range(2)]
+                if max(size) > most:
+                    raise InputError(file, field, name, f"a picture of at most {most} pixels per side")
+                values += size[0] * size[1] * len(part.header["channels"])
+        if values > _MOST_VALUES:
+            raise InputError(file, field, f"({values} values in all channels)", f"at most {_MOST_VALUES}")
+        with _silent(), OpenEXR.File(str(path), separate_channels=True) as whole:
             part = whole.parts[0]
             planes = {name: np.array(channel.pixels, np.float32) for name, channel in part.channels.items()}
             return planes, part.header.get(METADATA_KEY, "{}")
-    except InputError:
+    except (InputError, MemoryError):
         raise
+    except OSError as error:
+        raise InputError(file, field, name, f"an OpenEXR file that exists ({error.strerror})") from None
     except Exception as error:  # the library raises bare RuntimeError, ValueError and its own
         raise InputError(file, field, name if place else f"({error})", f"a whole OpenEXR file ({error})") from None
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Without stderr, on which the library prints what it also raises."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def write_png(path: str | Path, rgb: ArrayLike, exposure: float = 0.0) -> None:
@@ -176,31 +206,46 @@ def write_png(path: str | Path, rgb: ArrayLike, exposure: float = 0.0) -> None:
 def _opened(file: str | Path, field: str, path: Path, most: int) -> Iterator[Image.Image]:
     """A picture of at most `most` pixels per side; mistakes name file and field."""
     try:
-        with Image.open(path) as picture:
+        data = io.BytesIO(read_bytes(path, _LARGEST_FILE, "a picture", (file, field)))
+        with Image.open(data, formats=FORMATS) as picture:
             if max(picture.size) > most:
                 raise InputError(file, field, str(path), f"a picture of at most {most} pixels per side")
             yield picture
-    except FileNotFoundError:
-        raise InputError(file, field, str(path), "a picture that exists") from None
-    except InputError:
+    except (InputError, MemoryError):
         raise
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(file, field, str(path), f"a readable picture ({error})") from None
+    except Exception as error:  # decoders of damaged files raise errors of many types
+        kinds = ", ".join(FORMATS)
+        raise InputError(file, field, str(path), f"a readable picture, one of {kinds} ({error})") from None
 
 
-def read_picture(scene: Path, field: str, path: Path, most: int = LARGEST_PICTURE) -> FloatArray:
+def read_pictures(scene: Path, files: Mapping[str, Path]) -> dict[str, FloatArray]:
+    """The pictures of a scene by their fields, as `read_picture` reads them; together of at most `MOST_PIXELS`."""
+    found: dict[str, FloatArray] = {}
+    left = MOST_PIXELS
+    for field, path in files.items():
+        found[field] = read_picture(scene, field, path, pixels=left)
+        left -= found[field][..., 0].size
+    return found
+
+
+def read_picture(
+    scene: Path, field: str, path: Path, most: int = LARGEST_PICTURE, pixels: int = MOST_PIXELS
+) -> FloatArray:
     """Linear RGB [H, W, 3] of an sRGB picture: of 8 bits, or a grey one of 16 bits, which Pillow would clip to 8.
 
     Raises:
         InputError: names scene file, field and picture, which is missing, too large or broken.
     """
     with _opened(scene, field, path, most) as picture:
+        if picture.width * picture.height > pixels:
+            raise InputError(scene, field, str(path), f"{MOST_PIXELS} pixels at most in all pictures of a scene")
         if picture.mode.startswith("I;16"):
-            grey: FloatArray = np.asarray(picture, np.float32) / np.float32(65535)
-            return srgb_to_linear(np.stack([grey] * 3, axis=-1))
+            grey = srgb_to_linear(np.asarray(picture, np.float32) / np.float32(65535))
+            return np.stack([grey] * 3, axis=-1)
         if picture.mode in ("I", "F"):
             raise InputError(scene, field, str(path), "a picture of 8 or 16 bits a channel")
-        return srgb_to_linear(np.asarray(picture.convert("RGB"), np.float32) / np.float32(255))
+        # By a table: a picture takes 12 bytes a pixel, without temporary ones of 36 more.
+        return srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255))[np.asarray(picture.convert("RGB"))]
 
 
 def read_environment(scene: Path, field: str, path: Path, scale: float = 1.0) -> FloatArray:

@@ -22,7 +22,7 @@ from neurolens.render.film_settings import FilmSettings
 from neurolens.render.illuminants import Spectrum, check_name, check_spectrum, illuminant, read_spectrum
 from neurolens.render.meshfile import TriangleSet, encloses
 from neurolens.render.mtlfile import Parts
-from neurolens.render.pictures import make_aperture, read_environment, read_picture
+from neurolens.render.pictures import make_aperture, read_environment, read_pictures
 from neurolens.render.scenetables import BLACK, Checked, Material, MeasuredSpectrum, Texture, Vector, require
 
 _SHAPES = ("planes", "quads", "discs", "spheres", "boxes", "rooms", "meshes")
@@ -135,11 +135,9 @@ def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> 
     settings, triangles = _with_meshes(path, from_dict(SceneSettings, tables, path))
     _check_references(path, settings, triangles)
     _check_camera(path, settings, triangles)
-    images = {
-        name: read_picture(path, f"textures.{name}.file", path.parent / texture.file)
-        for name, texture in (settings.textures or {}).items()
-        if texture.file is not None
-    }
+    textures = {name: t.file for name, t in (settings.textures or {}).items() if t.file is not None}
+    pictures = read_pictures(path, {f"textures.{name}.file": path.parent / file for name, file in textures.items()})
+    images = dict(zip(textures, pictures.values(), strict=True))
     around, scale = settings.environment.file, settings.environment.scale
     return Scene(
         path.stem,

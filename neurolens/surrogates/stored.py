@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError, ModelError
+from neurolens.base.tomlfile import check_tree
 from neurolens.modelfile import MODEL_KEY
 from neurolens.modelfile.onnxfile import card_in, read_metadata
 from neurolens.optics.prescription import Coating, Lens, Surface
@@ -110,6 +111,7 @@ def load_fitted(path: str | Path) -> LensModel:
         )
     try:
         data = json.loads(_inflated(metadata[MODEL_KEY]))
+        check_tree(data, "coefficients")
         if data["schema"] != SCHEMA:
             raise ModelError(f"{file}: coefficients: schema: got {data['schema']!r}, expected {SCHEMA}")
         model = LensModel(
@@ -125,7 +127,7 @@ def load_fitted(path: str | Path) -> LensModel:
             direction="slope" if data["direction"] == "slope" else "angle",
         )
         _check(file, model, card)
-    except (ValueError, TypeError, KeyError, IndexError, RuntimeError, RecursionError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, IndexError, RuntimeError, ArithmeticError, AttributeError) as error:
         if isinstance(error, ModelError):
             raise
         raise ModelError(f"{file}: its coefficients are damaged ({type(error).__name__}: {error})") from error

@@ -149,7 +149,7 @@ DAMAGE: dict[str, tuple[Callable[[ModelProto], object], str]] = {
         "errors: got",
     ),
     "a number for words": (change_card(lambda c: c["errors"].update(poor=5)), "errors.poor"),
-    "an error beyond floats": (change_card(lambda c: c["errors"].update(rms_um=10**400)), "errors: got"),
+    "an error beyond floats": (change_card(lambda c: c["errors"].update(rms_um=10**400)), "errors.rms_um: got"),
     "reference beyond floats": (change_card(lambda c: c["reference"].update(stop_radius_mm=10**400)), "reference"),
     "no bounds": (change_card(lambda c: c["domain"].pop("bounds")), "domain.bounds"),
     "no reference rays": (change_card(lambda c: c.pop("reference")), "reference"),
@@ -249,9 +249,9 @@ def test_damaged_models_are_refused(name: str, path: Path, tmp_path: Path) -> No
 def test_files_that_are_no_models(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = path.read_bytes()
     file = tmp_path / "x.onnx"
-    with pytest.raises(ModelError, match="no such file"):
+    with pytest.raises(ModelError, match="missing"):
         load_model(file)
-    with pytest.raises(ModelError, match="no such file"):
+    with pytest.raises(ModelError, match="not a regular file"):
         load_model(tmp_path)
     for content in (b"", b"hello world\n" * 9, bytes(1000), np.random.default_rng(0).bytes(5000)):
         file.write_bytes(content)

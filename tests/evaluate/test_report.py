@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import random
+import re
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -112,7 +113,7 @@ def full_results(name: str = "Tessar 50 mm") -> dict[str, Any]:
         "direction_rms_deg": 0.00042, "position_rms_um": 3.3, "transmittance_rms": 0.0002, "false_pass": 0.0011,
         "false_block": 0.0013, "coefficients_per_vector": 40, "bytes": 18400, "fit_s": 7.2, "load_s": 0.1,
         "ns_per_ray": {"min": 13.1, "median": 14.0, "threads": 1}, "speedup_over_compiled": 3.66,
-        "break_even_rays": 2.1e8, "note": name,
+        "fused_ns_per_ray": {"min": 3.25}, "file": f"models/{name}.onnx", "break_even_rays": 2.1e8, "note": name,
     }  # fmt: skip
     return {
         "title": name,
@@ -157,6 +158,26 @@ def test_every_picture_and_link_exists_and_nothing_needs_the_network(run_dir: Pa
         assert (run_dir / unquote(target)).is_file(), target
     assert "script" not in page.tags and "link" not in page.tags
     assert "http" not in path.read_text(encoding="utf-8")
+
+
+def test_it_says_what_to_use_and_what_words_mean(run_dir: Path) -> None:
+    results = full_results("ols-40")
+    slow = {**results["models"][0], "name": "close", "rms_um": 0.01, "fused_ns_per_ray": {"min": 9.0}}
+    thin = {"name": "thin", "family": "paraxial", "rms_um": 1.0, "fused_ns_per_ray": {"min": 0.9}}
+    poor = {**results["models"][0], "name": "fast", "fused_ns_per_ray": {"min": 1.0}, "poor": ["false pass 3%"]}
+    source = write_report(run_dir, Results(**{**results, "models": [slow, thin, poor, *results["models"]]})).read_text()
+    page = Page(source)
+    head = page.text.partition("In short")[0]
+    assert "Use ols-40" in head and "3.25 ns a ray as C" in head
+    assert f"--camera fused:{run_dir}/models/ols-40.onnx" in head
+    assert "1.25 %" in page.text  # of FLIP above the noise, where a ratio would read as "1"
+    table = source.partition("<section><h2>Models")[2].partition("</table>")[0]
+    headings = re.findall(r"<th scope='col'(.*?)>", table)
+    assert len(headings) > 5 and all("title='" in h for h in headings)
+    assert "C (ns/ray)" in table and "onnxruntime (ns/ray)" in table and "What the words mean" in page.text
+    target = {"within_um": 0.001, "met": False, "model": "close", "rms_um": 0.01}
+    page = Page(write_report(run_dir, Results(**{**results, "models": [slow], "target": target})).read_text())
+    assert "the closest, as none is within 0.001 µm" in page.text
 
 
 def test_hostile_names_are_only_text(run_dir: Path) -> None:

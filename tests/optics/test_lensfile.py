@@ -95,7 +95,7 @@ BAD_ROWS = [
     ("radius_mm = 40.0", "radius_mm = nan", ["surface 4, radius_mm", "got nan", "a number"]),
     ("thickness_mm = 6.0", "thickness_mm = inf", ["surface 0, thickness_mm", "got inf", "finite"]),
     ("thickness_mm = 6.0", "thickness_mm = nan", ["surface 0, thickness_mm", "got nan", "finite"]),
-    ("thickness_mm = 6.0", "thickness_mm = 1" + 400 * "0", ["surface 0, thickness_mm", "finite"]),
+    ("thickness_mm = 6.0", "thickness_mm = 1" + 400 * "0", ["surfaces[0].thickness_mm", "64 bits"]),
     ("n_d = 1.6,", "n_d = 0.99,", ["surface 4, n_d", "got 0.99", "from 1"]),
     ("n_d = 1.6,", "n_d = 16.0,", ["surface 4, n_d", "got 16.0"]),
     ("n_d = 1.6,", "n_d = nan,", ["surface 4, n_d", "got nan"]),
@@ -329,7 +329,7 @@ def test_whatever_bends_or_weakens_rays_is_in_the_hash(change: dict[str, Any]) -
     assert Lens("n", "s", surfaces, 2.0).sha256 != Lens("n", "s", changed, 2.0).sha256
 
 
-texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=300)
+texts = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=300)
 
 
 @given(name=texts, notes=texts | st.text(" \\\"'\n\tab", max_size=400), material=texts.filter(str.strip))
@@ -344,7 +344,9 @@ def test_any_text_comes_back(tmp_path_factory: pytest.TempPathFactory, name: str
 positive = st.floats(1e-3, 1e6)
 
 
-@given(radius=positive, thickness=positive, diameter=st.floats(1e-6, 1e-3), n_d=st.floats(1.0001, 4), V_d=positive)
+@given(
+    radius=positive, thickness=positive, diameter=st.floats(1e-6, 1e-3), n_d=st.floats(1.0001, 4), V_d=st.floats(1, 1e4)
+)
 def test_any_figure_comes_back_bit_for_bit(
     tmp_path_factory: pytest.TempPathFactory, radius: float, thickness: float, diameter: float, n_d: float, V_d: float
 ) -> None:

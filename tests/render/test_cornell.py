@@ -29,7 +29,7 @@ def test_cornell_box_agrees_with_mitsuba(nm: float) -> None:
     pixel, sample = np.divmod(np.arange(count), SAMPLES)
     keys = sampler.keys(pixel, sample)
     points = PixelGrid(PIXELS, PIXELS, (25.0, 25.0)).film_points(pixel, sampler.draw2(keys, FILM))
-    rays = Pinhole(35.0, (25.0, 25.0)).sample(points, points, np.full(count, nm, np.float32))
+    rays = Pinhole(35.0, (25.0, 25.0)).sample(points, np.zeros_like(points), np.full(count, nm, np.float32))
     axes = np.diag(np.float32([-1, 1, -1]))  # the camera looks along +z, up is +y
     assert settings.up == (0, 1, 0) and settings.look_at_m[:2] == settings.position_m[:2]
     origin = axes @ rays.origin_m + np.float32(settings.position_m)[:, None]

@@ -125,7 +125,7 @@ def test_more_reference_rays_than_any_card_has_are_refused(tmp_path: Path) -> No
 def test_files_that_hold_none(tmp_path: Path) -> None:
     good = lens_models.exported("invariants").read_bytes()
     for name, data, words in (
-        ("missing.onnx", None, "no such file"),
+        ("missing.onnx", None, "missing"),
         ("short.onnx", good[: len(good) // 2], "truncated"),
         ("text.onnx", b"not a model at all", "truncated|no card"),
     ):

@@ -1,0 +1,230 @@
+"""Files and command lines of an attacker: one clear line each, in bounded time and memory (experiments/fuzz.py)."""
+
+from __future__ import annotations
+
+import os
+import struct
+import time
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import failure
+
+from experiments import fuzz
+from neurolens import cli
+from neurolens.base.config import apply_overrides
+from neurolens.base.errors import InputError
+from neurolens.base.files import open_regular
+from neurolens.base.tomlfile import read_toml
+from neurolens.optics import catalogue
+from neurolens.readers.any_format import read_any
+from neurolens.readers.json_lens import image_and_field, read_json_lens
+from neurolens.render import pictures
+from neurolens.render.illuminants import illuminant, read_spectrum
+from neurolens.render.meshfile import read_file
+
+SECONDS = 10  # each takes less than one, and took from ten to more than a hundred
+TWICE = "{" + ",".join(f'"{k % 89_999}": 1' for k in range(90_000)) + "}"
+LENS_JSON = '{"name": "a", "source": "b", "notes": %s, "surfaces": [{}]}'
+
+
+@pytest.mark.slow
+def test_200_hostile_cases_end_as_they_should() -> None:
+    found = fuzz.run_cases(0, 200, seed=13)
+    assert {v.kind for v in found} == set(fuzz.KINDS) and {v.code for v in found} == {0, 2}
+    assert not [v for v in found if v.faults]
+
+
+def mesh(text: bytes) -> Callable[[Path], object]:
+    def read(folder: Path) -> object:
+        (folder / "a.obj").write_bytes(text)
+        return read_file(folder / "scene.toml", "file", folder / "a.obj")
+
+    return read
+
+
+def lens(text: str, suffix: str) -> Callable[[Path], object]:
+    def read(folder: Path) -> object:
+        (folder / f"a{suffix}").write_text(text)
+        return (read_toml if suffix == ".toml" else read_any)(folder / f"a{suffix}")
+
+    return read
+
+
+@pytest.mark.parametrize(
+    "read",
+    {
+        "vertex of digits": mesh(b"v " + b"1" * 60_000 + b"x 0 0\n"),
+        "face of digits": mesh(b"f " + b"1" * 60_000 + b"x 2 3\n"),
+        "glass of spaces": lambda _: catalogue.same_name("Schott" + " " * 60_000 + "\n"),
+        "glass in spaces": lambda _: catalogue.same_name("x" + " " * 60_000 + "(Schott"),
+        "diameters": lens(LENS_JSON % ('"' + "diameter " * 100_000 + '"'), ".json"),
+        "field of digits": lambda _: image_and_field({"field_or_image_circle": "1" * 900_000}, "a.json"),
+        "many keys, one twice": lens(LENS_JSON % TWICE, ".json"),
+        "key of many parts": lens("a" + ".a" * 400_000 + " = 1", ".toml"),
+        "value of many parts": lambda _: apply_overrides({}, ["x={a" + ".a" * 60_000 + "=1}"]),
+        "blank lines before OSLO": lens("\n" * 900_000 + "x", ".abc"),
+        "kelvin of digits": lambda _: illuminant("1" * 900_000),
+    }.values(),
+)  # fmt: skip
+def test_a_file_of_one_megabyte_is_read_or_refused_soon(read: Callable[[Path], object], tmp_path: Path) -> None:
+    start = time.perf_counter()
+    with suppress(InputError):
+        read(tmp_path)
+    assert time.perf_counter() - start < SECONDS
+
+
+def fifo(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def zero(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+@pytest.mark.parametrize("special", [fifo, zero, Path.mkdir])
+@pytest.mark.parametrize(
+    "name", ["tile.png", "mask.png", "sky.exr", "lamp.csv", "tetra.obj", "tetra.ply", "scene.toml"]
+)
+def test_special_files_are_refused_not_waited_for(
+    name: str, special: Callable[[Path], None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for file in fuzz.SEEDS.iterdir():
+        if file.name != name:
+            (tmp_path / file.name).write_bytes(file.read_bytes())
+    special(tmp_path / name)
+    scene = tmp_path / "scene.toml"
+    line = failure(capsys, "render", scene, "--camera", "thin", "-o", tmp_path / "a.exr", "--quiet")
+    assert name in line and "not a regular file" in line
+
+
+@pytest.mark.parametrize("special", [fifo, zero])
+def test_special_models_and_lenses_are_refused(
+    special: Callable[[Path], None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, command in (
+        ("a.onnx", "export --to c -o a.h"),
+        ("a.zmx", "convert -o a.toml"),
+        ("a.json", "convert -o a.toml"),
+    ):
+        special(tmp_path / name)
+        assert "not a regular file" in failure(capsys, *command.split()[:1], tmp_path / name, *command.split()[1:])
+
+
+def picture(kind: str, size: tuple[int, int] = (4, 4)) -> bytes:
+    from PIL import Image
+
+    out = BytesIO()
+    Image.new("RGB", size).save(out, kind)
+    return out.getvalue()
+
+
+def test_pictures_are_of_few_formats_whatever_their_name(tmp_path: Path) -> None:
+    """Of an EPS file Pillow would have Ghostscript make a picture."""
+    for kind in ("EPS", "PDF", "GIF"):
+        (tmp_path / "a.png").write_bytes(picture(kind))
+        with pytest.raises(InputError, match="a readable picture, one of PNG, JPEG"):
+            pictures.read_picture(tmp_path / "scene.toml", "file", tmp_path / "a.png")
+
+
+def test_pictures_have_a_budget_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.png").write_bytes(picture("PNG", (40, 30)))
+    files = {field: tmp_path / "a.png" for field in ("first", "second")}
+    monkeypatch.setattr(pictures, "MOST_PIXELS", 2400)
+    assert len(pictures.read_pictures(tmp_path / "scene.toml", files)) == 2
+    monkeypatch.setattr(pictures, "MOST_PIXELS", 2399)
+    with pytest.raises(InputError, match="second: .*2399 pixels at most"):
+        pictures.read_pictures(tmp_path / "scene.toml", files)
+    layers = {f"layer{k}": np.zeros((8, 8)) for k in range(153)}
+    pictures.write_exr(tmp_path / "a.exr", np.zeros((8, 8, 3)), layers=layers)
+    assert len(pictures.read_layers(tmp_path / "a.exr")) == 153
+    monkeypatch.setattr(pictures, "_MOST_VALUES", 64 * 156 - 1)
+    with pytest.raises(InputError, match="9984 values in all channels"):
+        pictures.read_exr(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize(
+    "chunk", [b"iCCP", b"tRNS", b"PLTE", b"pHYs", b"gAMA", b"cHRM", b"acTL", b"fcTL", b"zTXt", b"iTXt"]
+)
+@pytest.mark.parametrize("content", [b"", b"\0", b"\xff" * 4, b"x" * 40])
+def test_damaged_chunks_of_a_png(chunk: bytes, content: bytes, tmp_path: Path) -> None:
+    """Read or refused, whatever the decoder raises."""
+    whole, said = picture("PNG"), chunk + content
+    bad = struct.pack(">I", len(content)) + said + struct.pack(">I", zlib.crc32(said))
+    (tmp_path / "a.png").write_bytes(whole[:33] + bad + whole[33:])
+    with suppress(InputError):
+        pictures.read_picture(tmp_path / "scene.toml", "file", tmp_path / "a.png")
+    with suppress(InputError):
+        pictures.read_mask(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("name", ["a\0b", "\udfff\ud800", "a" * 300])
+def test_names_that_no_file_can_have(name: str, tmp_path: Path) -> None:
+    with pytest.raises(OSError):
+        open_regular(tmp_path / name)
+    for read in (read_toml, read_any, pictures.read_mask, pictures.read_exr, read_json_lens):
+        with pytest.raises(InputError):
+            read(tmp_path / name)
+    with pytest.raises(InputError):
+        read_spectrum(tmp_path / "scene.toml", "file", tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a = " + "[" * 3000 + "]" * 3000, "valid TOML"),
+        ("a = " + "[" * 150 + "]" * 150, "nested too deep"),
+        ("a = 1" + "0" * 30, "64 bits"),
+        ("a = 1" + "0" * 5000, "valid TOML"),
+        ('a = "\\u0000"', "zero byte"),
+        ('"\\u0000" = 1', "zero byte"),
+    ],
+)
+def test_trees_that_no_file_of_ours_has(text: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_toml(tmp_path / "a.toml")
+
+
+def test_messages_are_one_line_whatever_the_value() -> None:
+    deep: list[object] = []
+    for _ in range(100_000):
+        deep = [deep]
+    for value in (deep, 10**5000, "\x1b[31m\n" * 100_000, ["x" * 100_000]):
+        said = str(InputError("a.toml", "field" * 1000, value, "less"))
+        assert len(said) < 2000 and said.isprintable() and "expected less" in said
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (
+            ZeroDivisionError("float\ndivision"),
+            "a fault of neurolens: ZeroDivisionError: float division; please report",
+        ),
+        (RecursionError("deep"), "a fault of neurolens: RecursionError; please report"),
+        (MemoryError("Unable to allocate 1 TiB"), "not enough memory (Unable to allocate 1 TiB)"),
+        (ModuleNotFoundError("No module named 'numpy'", name="numpy"), "a fault of neurolens: ModuleNotFoundError"),
+    ],
+)
+def test_the_last_net(
+    error: Exception, words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(args: object) -> int:
+        raise error
+
+    def build() -> cli.Parser:
+        parser = cli.Parser()
+        parser.set_defaults(run=run, kept="")
+        return parser
+
+    assert cli.main([], build) == 70
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line
+    monkeypatch.setenv("NEUROLENS_TRACEBACK", "1")
+    assert cli.main([], build) == 70 and "Traceback" in capsys.readouterr().err
