@@ -30,6 +30,7 @@ from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import COARSE, FINE, Detail, outline_of
 from neurolens.cameras.sampling import arrived, check_film, positive
 from neurolens.optics import pupil_methods as known
+from neurolens.optics.focusing import best_focused
 from neurolens.optics.glass import LINE_D_NM, absorption_of
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
@@ -70,7 +71,7 @@ class ExactCamera:
         f_number: None keeps the lens's stop.
         wavelength_nm: range of the wavelengths; the d line stands in for a lens without known dispersion.
         dtype: precision of the trace.
-        focus: how the lens is focused; see `Lens.at`.
+        focus: how the lens is focused; see `Lens.at`. After "internal" the film, too, moves to the least spot.
         film_offset_mm: moves the film away from the lens (negative: towards it) after focusing.
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
@@ -92,7 +93,7 @@ class ExactCamera:
         wavelength_nm: tuple[float, float] = (400.0, 700.0),
         dtype: Literal["float32", "float64"] = "float32",
         bounds: PupilBounds | None = None,
-        focus: Focus = "film",
+        focus: Focus = "best",
         pupil: str = OUTLINE,
         film_offset_mm: float = 0.0,
         progress: Progress | None = None,
@@ -100,11 +101,13 @@ class ExactCamera:
         self._pid = os.getpid()
         self.film_mm = check_film(film_mm)
         self.focus_m = positive("focus_m", focus_m, infinite=True)
-        self.lens = lens.at(f_number=f_number, focus_m=self.focus_m, focus=focus)
         self.name = lens.name
         self.dispersive = lens.dispersive
         self.wavelength_nm = wavelength_nm if self.dispersive else None
         used = wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
+        self.lens = lens.at(f_number=f_number, focus_m=self.focus_m, focus=focus, wavelength_nm=used)
+        if focus == "internal":
+            self.lens = best_focused(self.lens, self.focus_m, used)
         film_z = self.lens.film_z_mm
         assert film_z is not None  # `at` places the film
         if film_offset_mm:

@@ -286,15 +286,19 @@ def _given(texts: list[str]) -> dict[str, list[float]]:
 
 
 def _fix(given: dict[str, list[float]], model: LensModel) -> Fix:
+    from neurolens.optics.focusing import best_focus_z_mm
     from neurolens.optics.paraxial import film_z_mm
     from neurolens.surrogates.specialise import Fix
 
     film_z = given.get("film_z", [None])[0]
     stop = given.get("stop", [None])[0]
-    if "focus" in given:
-        film_z = film_z_mm(model.lens, given["focus"][0])
     if "f_number" in given:
         stop = model.lens.at(f_number=given["f_number"][0]).stop_radius_mm
+    if "focus" in given:
+        focus_m, lens = given["focus"][0], model.lens if stop is None else model.lens.with_stop_radius(stop)
+        Fix(film_z_mm=film_z_mm(lens, focus_m)).check(model.domain)
+        near, far = model.domain.film_z_mm
+        film_z = min(max(best_focus_z_mm(lens, focus_m), near), far)
     return Fix(tuple(given.get("wavelengths", ())), film_z, stop)
 
 
