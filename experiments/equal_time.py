@@ -78,7 +78,7 @@ def scene_cameras(shot: CameraSettings) -> tuple[dict[str, Camera], ExactCamera]
     for name, model in MODELS.items():
         cameras[name] = make_camera(f"{FUSED if name.startswith('fused') else ''}{lab.MODELS / model}", set_)
     cameras[FUSED_EXACT] = FusedExactCamera(lens, **same)
-    cameras[THIN] = make_camera("thin", replace(set_, efl_mm=data.efl_mm, f_number=f_number))
+    cameras[THIN] = make_camera(f"thin:{lab.LENSES / LENS}.toml", set_)
     return cameras, ExactCamera(lens, dtype="float64", **same)
 
 

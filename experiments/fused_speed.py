@@ -49,6 +49,11 @@ from neurolens.surrogates.source import fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
 
 WITHIN_UM = 1.0
+# Other ways to compile, of what is not fixed: one ray at a time, as an integrator calls it; without AVX-512.
+OTHERWISE = {
+    "one ray at a time, -O2": ("-std=c99", "-O2", "-march=native", "-fno-math-errno", "-fno-tree-vectorize"),
+    "AVX2": (*FLAGS, "-mno-avx512f"),
+}
 
 
 POLYNOMIALS = tuple(ModelSettings("ols", terms=n) for n in (8, 12, 16, 20, 24, 28, 32, 36, 40, 48, 56, 64, 80, 100))
@@ -148,6 +153,8 @@ def measure(case: Case, *, rounds: int, torch_compiled: bool, report: Report) ->
     for work in ("ray", "whole"):
         program = lower(exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm, whole=work == "whole"))
         add("exact C", work, program_candidate("", program, domain), program)
+        for words, flags in OTHERWISE.items():
+            add(f"exact C, {words}", work, program_candidate("", program, domain, flags=flags), program)
         if torch_compiled:
             add("exact torch", work, exact_candidates(lens, domain, transmittance=work == "whole")[1])
     for model, error in fitted:
@@ -155,7 +162,11 @@ def measure(case: Case, *, rounds: int, torch_compiled: bool, report: Report) ->
         for name, models, fixed in _forms(model):
             for work, parts in (("ray", RAY_ONLY), ("whole", ALL)):
                 candidate = fused_candidate(name, models, domain, parts=parts, fix=fixed)
-                add(name, work, candidate, fused_program(models, parts, fixed) if candidate else None, **known)
+                program = fused_program(models, parts, fixed)
+                add(name, work, candidate, program if candidate else None, **known)
+                for words, flags in OTHERWISE.items() if name.endswith(_FUSED) and candidate else ():
+                    other = program_candidate("", program, domain, flags=flags)
+                    add(f"{name}, {words}", work, other, program, **known)
     with tempfile.TemporaryDirectory(prefix="neurolens-fused-") as scratch:
         for model, error in fitted:
             file, name = export_onnx(model, Path(scratch) / f"{model.method}.onnx", {}), f"{model.method}, onnxruntime"
@@ -213,6 +224,7 @@ the front surface, direction and domain guard out. "whole": with stop, rims and 
   surface waits for the one before it (a division and two roots in a row), which costs more than its operations.
 - exact torch: the project's own tracer compiled by torch, rims tested in both kinds of work.
 - onnxruntime, "ray": the part of the exported graph that gives position and direction, without the domain guard.
+- One ray at a time: the same function without vectors ({scalar}), as an integrator calls it. AVX2: without AVX-512.
 - Operations: float operations per ray, a fused multiply-add is one; in brackets, how many are divisions and square
 roots.
   A core with two 512-bit pipes does 32 a cycle. Bytes: what a ray reads and writes.
@@ -287,7 +299,12 @@ def page(rows: Sequence[Row], rounds: int) -> str:
     return lab.page(
         "# Fused models against the exact lens",
         "`python -m experiments fused`",
-        _NOTES.format(rounds=rounds, flags=" ".join(FLAGS), wavelength=WAVELENGTH_NM),
+        _NOTES.format(
+            rounds=rounds,
+            flags=" ".join(FLAGS),
+            wavelength=WAVELENGTH_NM,
+            scalar=" ".join(OTHERWISE["one ray at a time, -O2"]),
+        ),
         lab.machine_line() + (_BUSY.format(most) if most > (os.cpu_count() or 1) else ""),
         lab.goal_table("goal", goals(rows)),
         lab.table(_COLUMNS, rows),

@@ -309,14 +309,15 @@ def _build() -> Parser:
 
 
 def seeds(folder: Path) -> Path:
-    """A folder with one good file of each kind."""
+    """A folder with one good file of each kind; RuntimeError where one is refused."""
     shutil.copytree(SEEDS, folder)
     shutil.copy(lab.LENSES / "cooke_triplet_50.toml", folder / "lens.toml")
     shutil.copy(lab.MODELS / "cooke_triplet_50.ols-64.onnx", folder / "model.onnx")
     os.mkfifo(folder / "fifo")
-    code, said, _ = _run(folder, _render("thin", "--keep-checkpoint", "--samples", "16"))
-    if code:
-        raise RuntimeError(said)
+    for argv in (["read", "experiment.toml"], _render("thin", "--keep-checkpoint", "--samples", "16")):
+        code, said, _ = _run(folder, argv)
+        if code:  # then every case would be refused
+            raise RuntimeError(said)
     for made in ("out.exr", "out.png"):
         (folder / made).unlink()
     (folder / "out.exr.part").rename(folder / "kept.part")

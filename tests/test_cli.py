@@ -71,7 +71,7 @@ def test_every_command_has_help(command: list[str], capsys: pytest.CaptureFixtur
         (["lens", GAUSS, "--derive-rims", "--layout", "a.png"], ["--layout"]),
         (["lens", GAUSS, "lenses"], ["FOLDER"]),
         (["lens", "list", "--focus", "2", "--blades", "5", "--efl", "20"], ["--efl"]),
-        (["lens", "list", "--focusing", "best"], ["--focusing"]),
+        (["lens", "list", "--focusing", "paraxial"], ["--focusing"]),
         (["lens", "list", "--breathing", "a.png"], ["--breathing"]),
         (["lens", "list", GAUSS], ["(a file)"]),
         (["lens", PHONE, "--vignetting", "0.4"], ["--vignetting"]),
@@ -140,7 +140,8 @@ def test_lens_describes_a_lens(name: str) -> None:
     data = described(ROOT / "lenses" / f"{name}.toml")
     assert data["efl_mm"] > 0 and data["film_z_mm"] > 0 and data["image_radius_mm"] > 0
     assert data["f_number"] == pytest.approx(data["efl_mm"] / data["entrance_pupil_diameter_mm"])
-    assert data["rear_focal_z_mm"] == pytest.approx(data["film_z_mm"])  # infinity focus
+    assert data["focusing"] == "best"  # at infinity, near the rear focal point
+    assert data["film_z_mm"] == pytest.approx(data["rear_focal_z_mm"], abs=0.1 * data["efl_mm"])
     assert 0.2 < data["passing_share"] < 1
     blocked = sum(part["share"] for part in data["ended"])
     assert data["passing_share"] + blocked == pytest.approx(1, abs=3e-3)

@@ -277,6 +277,7 @@ def exact_camera(shot: Shot, surrogate: Surrogate | None, kind: type[ExactCamera
         focus_m=shot.focus_m,
         wavelength_nm=shot.wavelength_nm,
         bounds=None if surrogate is None else surrogate.domain.bounds,
+        focus="paraxial",
         film_offset_mm=shot.offset_mm,
     )
 
@@ -291,6 +292,7 @@ def surrogate_camera(shot: Shot, surrogate: Surrogate | None, kind: type[OnnxCam
         f_number=float(first_order(shot.lens).f_number),
         aperture=shot.lens.aperture,
         wavelength_nm=shot.wavelength_nm,
+        focus="paraxial",
         film_offset_mm=shot.offset_mm,
     )
 

@@ -44,7 +44,7 @@ class Panel:
     efl_mm: float | None = None
     field_deg: float | None = None
     zoom: str | float | None = None
-    focusing: Literal["film", "best", "internal"] = "film"
+    focusing: Literal["best", "paraxial", "internal"] = "paraxial"
     widen: float = 1.0
     f_number: float | None = None
     focus_m: float | None = None

@@ -4,6 +4,7 @@
     fisheye-equidistant, -equisolid,    points with a fisheye projection
       -stereographic, -orthographic
     thick:LENS.toml                     principal planes and pupils of a lens file
+    thin:LENS.toml, pinhole:LENS.toml   thin lens and point that show the plane in focus at that lens's size
     LENS.toml                           the lens, traced exactly
     MODEL.onnx                          an exported model of one
     fused:LENS.toml, fused:MODEL.onnx   the same, compiled by the system's C compiler
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 FISHEYES = tuple(f"fisheye-{name}" for name in PROJECTIONS)
 IDEAL = ("thin", "pinhole", *FISHEYES)
-THICK = "thick:"
+IDEAL_OF = ("thick:", "thin:", "pinhole:")  # before a lens file: ideal cameras framed as that lens is
 FUSED = "fused:"  # before a path: compiled by the system's C compiler
 _BEYOND = 1.02  # diagonal of the film over the image circle: 36x24 over 43.2 mm is as lenses are engraved
 _EFL_MM, _FISHEYE_EFL_MM, _THIN_F_NUMBER, _PINHOLE_F_NUMBER = 50.0, 14.0, 4.0, 8.0
@@ -52,7 +53,7 @@ class Shot:
         zoom: state of a lens file by name, or a focal length in mm between its states; also of a model of a whole zoom.
         field_deg: full field of view that the film's image circle shall see; sets the size of a lens file. Of a fisheye
             projection, what the circle within the film shall see: sets its focal length, and what lies beyond is dark.
-        focus: how a lens file is focused: "film", "best" or "internal"; see `Lens.at`.
+        focus: how a lens is focused: "best", "paraxial" or "internal"; see `ExactCamera` and `OnnxCamera`.
         aperture: shape of the stop's opening; None is that of the lens file, else round.
         film_offset_mm: moves the film away from the lens after focusing; not of a pinhole.
         clamp_f_number: an f-number wider than the lens opens becomes its widest; else it is an error of a model, and
@@ -68,7 +69,7 @@ class Shot:
     efl_mm: float | None = None
     zoom: str | float | None = None
     field_deg: float | None = None
-    focus: Literal["film", "best", "internal"] = "film"
+    focus: Literal["best", "paraxial", "internal"] = "best"
     aperture: Aperture | None = None
     wavelength_nm: tuple[float, float] = (400.0, 700.0)
     film_offset_mm: float = 0.0
@@ -99,26 +100,28 @@ def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) 
 
 
 def _camera(spec: str, shot: Shot, progress: Progress | None) -> Camera:
-    thick, fused = spec.startswith(THICK), spec.startswith(FUSED)
-    path = Path(spec.removeprefix(THICK if thick else FUSED))
-    exact = path.suffix == ".toml" and not thick
+    kind = next((k for k in IDEAL_OF if spec.startswith(k)), "")
+    fused = spec.startswith(FUSED)
+    path = Path(spec.removeprefix(kind or FUSED))
+    exact = path.suffix == ".toml" and not kind
     only = "left out: only a lens file that is traced as it is has it"
     _refuse(spec, "pupil", None if (exact and not fused) or shot.pupil == "outline" else shot.pupil, only)
     if spec in IDEAL:
         return _ideal(spec, shot)
-    if path.suffix not in (".toml", ".onnx") or (thick and path.suffix != ".toml"):
-        expected = f"a lens file (.toml), {THICK}FILE.toml, a model (.onnx), {FUSED}FILE, {' or '.join(IDEAL)}"
+    if path.suffix not in (".toml", ".onnx") or (kind and path.suffix != ".toml"):
+        framed = ", ".join(f"{k}FILE.toml" for k in IDEAL_OF)
+        expected = f"a lens file (.toml), {framed}, a model (.onnx), {FUSED}FILE, {' or '.join(IDEAL)}"
         raise InputError("camera", "--camera", spec, expected)
     if not path.is_file():
         raise InputError(path, "file", "(missing)", "a lens file" if path.suffix == ".toml" else "an ONNX model")
-    if thick:
-        return _thick(path, shot)
+    if kind:
+        return _ideal_of(kind, path, shot)
     return _exact(path, shot, fused, progress) if exact else _model(path, shot, fused)
 
 
 def _ideal(kind: str, shot: Shot) -> Camera:
     _refuse(kind, "zoom", shot.zoom, "left out: only a lens file has zoom states")
-    _refuse(kind, "focus", None if shot.focus == "film" else shot.focus, "film: the others are for lens files")
+    _refuse(kind, "focus", "internal" if shot.focus == "internal" else None, "left out: only lens files have groups")
     if kind in FISHEYES:
         return _fisheye(kind, shot)
     _refuse(kind, "field_deg", shot.field_deg, "left out: set efl_mm")
@@ -145,34 +148,70 @@ def _fisheye(kind: str, shot: Shot) -> Camera:
     return Fisheye(projection, focal, shot.film_mm, field_deg=shot.field_deg, f_number=f_number)
 
 
-def _thick(path: Path, shot: Shot) -> Camera:
-    _refuse(f"{THICK}{path}", "film_offset_mm", shot.film_offset_mm or None, "left out: set focus_m")
+def _ideal_of(kind: str, path: Path, shot: Shot) -> Camera:
     from neurolens.optics.lensfile import read_lens
-    from neurolens.optics.paraxial import first_order
 
-    lens = read_lens(path).at(focal_length_mm=shot.efl_mm, field_deg=shot.field_deg, zoom=shot.zoom)
-    f_number = shot.f_number_for(first_order(lens).f_number)
-    lens = lens.at(f_number=f_number, focus_m=shot.focus_m, focus=shot.focus)
-    if lens.anamorphic:
-        raise InputError(
-            path, "surfaces", "(cylinders)", "a lens that is round about its axis: it has two focal lengths"
-        )
-    data = first_order(lens)
-    assert lens.film_z_mm is not None  # `at` places the film
-    camera = ThickLens(
-        data.efl_mm,
-        data.f_number,
-        shot.focus_m,
-        shot.film_mm,
-        principal_z_mm=(data.front_principal_z_mm, data.rear_principal_z_mm),
-        entrance_pupil_z_mm=data.entrance_pupil_z_mm,
-        film_at_mm=lens.film_z_mm,
-        aperture=shot.aperture or lens.aperture,
-        name=f"{lens.name}, thick",
-    )
+    if kind != "thin:":
+        _refuse(f"{kind}{path}", "film_offset_mm", shot.film_offset_mm or None, "left out: set focus_m")
+    lens = _placed(read_lens(path), shot)
+    camera = ideal_as(kind, lens, shot)
     lens_facts = {"id": lens.lens_id, "name": lens.name, "sha256": lens.sha256}
     camera.settings |= {"lens": lens_facts, "zoom": shot.zoom, "focusing": shot.focus, "derived": lens.derived}
     return camera
+
+
+def _placed(lens: Lens, shot: Shot) -> Lens:
+    """The lens as a shot asks for it."""
+    from neurolens.optics.focusing import best_focused
+    from neurolens.optics.paraxial import first_order
+
+    lens = lens.at(focal_length_mm=shot.efl_mm, field_deg=shot.field_deg, zoom=shot.zoom)
+    f_number = shot.f_number_for(first_order(lens).f_number)
+    light = shot.wavelength_nm
+    lens = lens.at(f_number=f_number, focus_m=shot.focus_m, focus=shot.focus, wavelength_nm=light)
+    return best_focused(lens, shot.focus_m, light) if shot.focus == "internal" else lens
+
+
+def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
+    """One of `IDEAL_OF`, framed as a lens that stands ready for the shot, with its entrance pupil.
+
+    Chief rays of a film point meet the plane in focus where the lens's do, to first order. A film in best focus is not
+    in the paraxial image: then the ideal lenses' focal lengths differ from the lens's by a few thousandths. Of
+    a lens with cylinders, thin lens and hole are those of the y-z plane.
+
+    Raises:
+        InputError: a thick lens of one with cylinders, which has two focal lengths; as the cameras.
+    """
+    from neurolens.optics.paraxial import first_order, framing_mm
+
+    if lens.anamorphic and kind == "thick:":
+        raise InputError(
+            lens.path, "surfaces", "(cylinders)", "a lens that is round about its axis: it has two focal lengths"
+        )
+    data, film_z, far = first_order(lens), float(lens.film_z_mm or 0.0), 1000 * shot.focus_m
+    thin, thick = framing_mm(lens, shot.focus_m)
+    if kind == "pinhole:":
+        return Pinhole(thin, shot.film_mm, data.f_number)
+    front = data.front_principal_z_mm
+    if kind == "thin:":
+        focal = thin / (1 + thin / (far - thin))
+    else:
+        focal = thick / (1 + thick / (front - film_z + far))
+    f_number, shape = focal / data.entrance_pupil_diameter_mm, shot.aperture or lens.aperture
+    if kind == "thin:":
+        offset = shot.film_offset_mm
+        return ThinLens(focal, f_number, shot.focus_m, shot.film_mm, aperture=shape, film_offset_mm=offset)
+    return ThickLens(
+        focal,
+        f_number,
+        shot.focus_m,
+        shot.film_mm,
+        principal_z_mm=(front, film_z - thick),
+        entrance_pupil_z_mm=data.entrance_pupil_z_mm,
+        film_at_mm=film_z,
+        aperture=shape,
+        name=f"{lens.name}, thick",
+    )
 
 
 def _exact(path: Path, shot: Shot, fused: bool, progress: Progress | None) -> Camera:
@@ -229,8 +268,8 @@ def _model(path: Path, shot: Shot, fused: bool) -> Camera:
     axes = [a.name for a in model.axes]
     if "zoom" not in axes:
         _refuse(str(path), "zoom", shot.zoom, "left out: the model is of one zoom position")
-    if shot.focus not in ("film", "internal" if "focus" in axes else "film"):
-        _refuse(str(path), "focus", shot.focus, "left out: a model focuses as it was fitted")
+    if "focus" not in axes and shot.focus == "internal":
+        _refuse(str(path), "focus", shot.focus, "left out: the model knows no moving groups")
     if model.axes:
         model = model.at(*state_for(path, model.axes, model.state, shot.zoom, shot.focus_m))
     lens, domain = model.card["lens"], model.card["domain"]
@@ -242,6 +281,7 @@ def _model(path: Path, shot: Shot, fused: bool) -> Camera:
         f_number=shot.f_number_for(widest),
         aperture=shot.aperture,
         wavelength_nm=shot.wavelength_nm,
+        focus=shot.focus,
         film_offset_mm=shot.film_offset_mm,
     )
     notes = _beyond_circle(shot.film_mm, domain["film_radius_mm"], "the model's picture", "stay dark")

@@ -25,7 +25,12 @@ _METRES = [1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0]
 
 
 def camera_graph(
-    lens: Graph, segments: int, wavelengths: int, aperture: Aperture | None = None, stopped: int = 0
+    lens: Graph,
+    segments: int,
+    wavelengths: int,
+    aperture: Aperture | None = None,
+    stopped: int = 0,
+    pupil_too: bool = False,
 ) -> Graph:
     """The graph of a camera with the graph of its lens inside.
 
@@ -35,6 +40,7 @@ def camera_graph(
             derivatives of `scene_ray`, which the camera has, too.
         segments, wavelengths: of the outline; see `pupil_graph`.
         aperture, stopped: see `weight_graph`.
+        pupil_too: whether the outputs of `pupil_graph` are outputs, too.
 
     Inputs: those of `pupil_graph` and `weight_graph`. Outputs: those of `weight_graph`.
     """
@@ -47,6 +53,8 @@ def camera_graph(
     g.outputs = g.inline(weight_graph(derivatives, aperture, stopped), given)
     if aperture is None and "stop_xy_mm" in found:
         g.outputs["stop_xy_mm"] = found["stop_xy_mm"]
+    if pupil_too:
+        g.outputs |= pupil
     return g
 
 

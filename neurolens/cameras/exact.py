@@ -22,7 +22,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
-from neurolens.cameras.fused import FusedFilm
+from neurolens.cameras.fused import FusedFilm, LensGraph
 from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.outline_cache import kept_outline, search_key
 from neurolens.cameras.pupil_boxes import PupilTable
@@ -30,6 +30,7 @@ from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import COARSE, FINE, Detail, outline_of
 from neurolens.cameras.sampling import arrived, check_film, positive
 from neurolens.optics import pupil_methods as known
+from neurolens.optics.focusing import best_focused
 from neurolens.optics.glass import LINE_D_NM, absorption_of
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
@@ -70,7 +71,7 @@ class ExactCamera:
         f_number: None keeps the lens's stop.
         wavelength_nm: range of the wavelengths; the d line stands in for a lens without known dispersion.
         dtype: precision of the trace.
-        focus: how the lens is focused; see `Lens.at`.
+        focus: how the lens is focused; see `Lens.at`. After "internal" the film, too, moves to the least spot.
         film_offset_mm: moves the film away from the lens (negative: towards it) after focusing.
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
@@ -92,7 +93,7 @@ class ExactCamera:
         wavelength_nm: tuple[float, float] = (400.0, 700.0),
         dtype: Literal["float32", "float64"] = "float32",
         bounds: PupilBounds | None = None,
-        focus: Focus = "film",
+        focus: Focus = "best",
         pupil: str = OUTLINE,
         film_offset_mm: float = 0.0,
         progress: Progress | None = None,
@@ -100,11 +101,13 @@ class ExactCamera:
         self._pid = os.getpid()
         self.film_mm = check_film(film_mm)
         self.focus_m = positive("focus_m", focus_m, infinite=True)
-        self.lens = lens.at(f_number=f_number, focus_m=self.focus_m, focus=focus)
         self.name = lens.name
         self.dispersive = lens.dispersive
         self.wavelength_nm = wavelength_nm if self.dispersive else None
         used = wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
+        self.lens = lens.at(f_number=f_number, focus_m=self.focus_m, focus=focus, wavelength_nm=used)
+        if focus == "internal":
+            self.lens = best_focused(self.lens, self.focus_m, used)
         film_z = self.lens.film_z_mm
         assert film_z is not None  # `at` places the film
         if film_offset_mm:
@@ -178,6 +181,17 @@ class ExactCamera:
         status = np.where(aim.status == st.PASSED, done.status.numpy(), aim.status)
         return arrived(film, origin, point_m, weight, status)
 
+    def lens_graph(self) -> LensGraph:
+        """The lens as a graph.
+
+        Raises:
+            InputError: coatings or glass that absorbs.
+        """
+        check_bare(self.lens)
+        waves = self.wavelength_nm or (LINE_D_NM, LINE_D_NM)
+        graph = exact_graph(self.lens, self._pupil_z_mm, waves)
+        return LensGraph(graph, float(self.lens.stop_radius_mm), self.lens.aperture, self.lens.stop_index)
+
     def for_worker(self) -> ExactCamera:
         """This camera, in a render worker. A forked process must not enter torch's thread pool: it never returns."""
         if os.getpid() != self._pid:
@@ -240,12 +254,9 @@ class FusedExactCamera(ExactCamera):
     rays_a_call = MANY_RAYS_A_CALL
 
     def __init__(self, lens: Lens, **kwargs: Any) -> None:
-        _check_bare(lens)
+        check_bare(lens)
         super().__init__(lens, **kwargs)
-        waves = self.wavelength_nm or (LINE_D_NM, LINE_D_NM)
-        graph = exact_graph(self.lens, self._pupil_z_mm, waves)
-        stop, surface = float(self.lens.stop_radius_mm), self.lens.stop_index
-        self._fused = FusedFilm(self.film, graph, stop, self.film_mm, self.lens.aperture, surface)
+        self._fused = FusedFilm(self.film, self.lens_graph(), self.film_mm)
         self.settings |= {"runtime": "fused"}
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
@@ -262,7 +273,8 @@ class FusedExactCamera(ExactCamera):
         return self._fused.moves_error
 
 
-def _check_bare(lens: Lens) -> None:
+def check_bare(lens: Lens) -> None:
+    """Refuse, by an InputError, coatings and glass that absorbs: their graph follows neither."""
     for k, s in enumerate(lens.surfaces):
         coated = s.coating is not None and bool(s.coating.layers)
         absorbs = (s.glass is not None or s.absorption_per_mm) and absorption_of(s, LINE_D_NM) is not None

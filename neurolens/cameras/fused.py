@@ -7,7 +7,7 @@ The system's C compiler makes the code when the camera is made (1 to 10 s, kept 
 from __future__ import annotations
 
 import ctypes
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,40 @@ MAX_STEPS = 12_000
 _SAMPLES = 4096  # rays that low-order derivatives are fitted to
 
 
+class LensGraph(NamedTuple):
+    """The graph of a lens with what its camera's graph takes from it.
+
+    Attributes:
+        graph: of the lens. stop_radius_mm: of its round stop.
+        aperture: the shape of the opening, tested on the rays' crossings with the stop; None is round.
+        stop_surface: of the lens, for the status of rays that the shape blocks.
+    """
+
+    graph: Graph
+    stop_radius_mm: float
+    aperture: Aperture | None = None
+    stop_surface: int = 0
+
+    @property
+    def blades(self) -> Aperture | None:
+        """The opening where it is no mask: a mask's table is too large for compiled loops."""
+        return None if self.aperture is None or self.aperture.mask is not None else self.aperture
+
+    @property
+    def stopped(self) -> int:
+        """Status of rays that the shape blocks."""
+        return st.blocked(self.stop_surface, st.RIM)
+
+
+def whole_camera(film: LensFilm, lens: LensGraph, pupil_too: bool = False) -> tuple[Graph, dict[str, float]]:
+    """The graph of a camera and its numbers of the call; see `cameragraph.camera_graph`."""
+    outline, graph = film.outline, lens.graph
+    needed = {name: value for name, value in graph.outputs.items() if name != "stop_xy_mm" or lens.aperture is not None}
+    shape = outline.x.shape[2] - 1, len(outline.x)
+    numbers = outline.numbers | film.numbers | {"stop_radius_mm": lens.stop_radius_mm}
+    return camera_graph(pruned(graph, needed), *shape, lens.blades, lens.stopped, pupil_too), numbers
+
+
 class FusedFilm:
     """A lens's film and pupil, and the lens itself as a graph, as one compiled function.
 
@@ -41,11 +75,8 @@ class FusedFilm:
 
     Args:
         film: of the same lens, focus and stop.
-        graph: of the lens.
-        stop_radius_mm: of its round stop.
+        lens: its graph.
         film_mm: width and height of the film whose rays differentials are fitted to.
-        aperture: the shape of the opening, tested on the rays' crossings with the stop; None is round.
-        stop_surface: of the lens, for the status of rays that the shape blocks.
 
     Attributes:
         moves_error: RMS error of fitted differentials over their size; None where they are the graph's own, or were
@@ -55,23 +86,13 @@ class FusedFilm:
         InputError: no C compiler, or one that fails; a pupil that is not sampled by its outline.
     """
 
-    def __init__(
-        self,
-        film: LensFilm,
-        graph: Graph,
-        stop_radius_mm: float,
-        film_mm: tuple[float, float],
-        aperture: Aperture | None = None,
-        stop_surface: int = 0,
-    ) -> None:
+    def __init__(self, film: LensFilm, lens: LensGraph, film_mm: tuple[float, float]) -> None:
         if film.pupil is not film.outline:
             raise InputError("camera", "pupil", "(another)", "outline: the only one that fused cameras sample")
-        self._film, self._graph, self._film_mm = film, graph, film_mm
-        # A mask is tested on rays that come back: its table is too large for the loops.
-        self._mask = aperture if aperture is not None and aperture.mask is not None else None
-        self._blades = aperture if self._mask is None else None
-        self._stop_radius_mm, self._stopped = stop_radius_mm, st.blocked(stop_surface, st.RIM)
-        self._rays = self._compiled(graph)
+        self._film, self._lens, self._film_mm = film, lens, film_mm
+        # A mask is tested on rays that come back.
+        self._mask = lens.aperture if lens.blades is None else None
+        self._rays = self._compiled(lens)
         self._rays_and_moves: _Compiled | None = None
         self.moves_error: float | None = None
 
@@ -88,26 +109,23 @@ class FusedFilm:
         run = self._rays_and_moves if differentials and self._rays_and_moves is not None else self._rays
         found = run({"film_mm": film, "square": square, "wavelength_nm": wavelength[None]})
         if self._mask is not None:
-            inside = self._mask.inside(found["stop_xy_mm"][0], found["stop_xy_mm"][1], self._stop_radius_mm)
+            inside = self._mask.inside(found["stop_xy_mm"][0], found["stop_xy_mm"][1], self._lens.stop_radius_mm)
             shut = ~inside & (found["status"][0] == st.PASSED)
-            found["weight"][0, shut], found["status"][0, shut] = 0, self._stopped
+            found["weight"][0, shut], found["status"][0, shut] = 0, self._lens.stopped
         return camera_rays(found)
 
-    def _compiled(self, lens: Graph) -> _Compiled:
-        outline = self._film.outline
-        numbers = outline.numbers | self._film.numbers | {"stop_radius_mm": self._stop_radius_mm}
-        groups = outline.table.reshape(len(outline.table), -1, 5)
-        table = np.pad(groups, ((0, 0), (0, 0), (0, padded_columns(5) - 5)))
-        round_stop = self._mask is None and self._blades is None
-        needed = {name: value for name, value in lens.outputs.items() if not (round_stop and name == "stop_xy_mm")}
-        shape = outline.x.shape[2] - 1, len(outline.x)
-        return _Compiled(camera_graph(pruned(lens, needed), *shape, self._blades, self._stopped), numbers, table)
+    def _compiled(self, lens: LensGraph) -> _Compiled:
+        table = self._film.outline.table
+        groups = table.reshape(len(table), -1, 5)
+        padded = np.pad(groups, ((0, 0), (0, 0), (0, padded_columns(5) - 5)))
+        return _Compiled(*whole_camera(self._film, lens), padded)
 
-    def _with_differentials(self) -> Graph:
+    def _with_differentials(self) -> LensGraph:
         """The lens with differentials."""
-        fitted = with_low_order_derivatives(self._graph, self._samples())
+        graph = self._lens.graph
+        fitted = with_low_order_derivatives(graph, self._samples())
         self.moves_error = None if fitted is None else fitted.error
-        return with_film_derivatives(self._graph) if fitted is None else fitted.graph
+        return self._lens._replace(graph=with_film_derivatives(graph) if fitted is None else fitted.graph)
 
     def _samples(self) -> dict[str, FloatArray]:
         """Inputs of the graph for rays all over film, pupil and wavelengths."""
@@ -117,8 +135,20 @@ class FusedFilm:
         wavelength = rng.uniform(outline.wavelength_nm[0], outline.wavelength_nm[-1], _SAMPLES).astype(np.float32)
         film, square = film.astype(np.float32), rng.random((2, _SAMPLES), np.float32)
         rays = np.stack([*film, *outline.sample(film, square, wavelength)[0], wavelength])
-        per_call = {"film_z_mm": self._film.film_z_mm, "stop_radius_mm": self._stop_radius_mm}
+        per_call = {"film_z_mm": self._film.film_z_mm, "stop_radius_mm": self._lens.stop_radius_mm}
         return {"rays": rays} | {name: np.array([[value]], np.float32) for name, value in per_call.items()}
+
+
+def lens_graph(camera: OnnxCamera) -> LensGraph:
+    """The graph of a model, in the state and with the stop of its camera.
+
+    Raises:
+        InputError: a model of operators that have no such form.
+    """
+    model, scene = camera.model, camera.film.scene
+    assert isinstance(scene, ModelScene)
+    graph = graph_of(model.path, model.data, model.state if model.axes else ())
+    return LensGraph(graph, scene.stop_radius_mm, scene.aperture, int(model.card["lens"].get("stop_surface", 0)))
 
 
 class FusedCamera(OnnxCamera):
@@ -135,11 +165,7 @@ class FusedCamera(OnnxCamera):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        graph = graph_of(self.model.path, self.model.data, self.model.state if self.model.axes else ())
-        scene = self.film.scene
-        assert isinstance(scene, ModelScene)
-        surface = int(self.model.card["lens"].get("stop_surface", 0))
-        self._fused = FusedFilm(self.film, graph, scene.stop_radius_mm, self.film_mm, scene.aperture, surface)
+        self._fused = FusedFilm(self.film, lens_graph(self), self.film_mm)
         self.settings |= {"runtime": "fused"}
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+import warnings
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
-from neurolens.base.errors import InputError, ModelError
+from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.cameras.cameragraph import UNIT_SLACK, weight_graph
 from neurolens.cameras.contract import RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
@@ -27,10 +28,12 @@ from neurolens.cameras.sampling import arrived, check_film, positive
 from neurolens.graph.ir import Graph
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.modelfile.states import STATE, state_for
+from neurolens.optics import film_plane
 from neurolens.optics.apertures import Aperture
-from neurolens.optics.film_plane import film_z_mm
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
+
+Focus = Literal["best", "paraxial", "internal"]
 
 # Parts of the card that the metadata of pictures leave out.
 _NOT_KEPT = ("reference", "units", "frame", "status_codes", "states")
@@ -53,11 +56,16 @@ class OnnxCamera:
         aperture: shape of the stop's opening; None is round.
         zoom: of a model of a zoom's whole range: a focal length in mm, or the name of a state of the source; None
             leaves it at `model.state`.
-        wavelength_nm: range of the light, which sets the exposure; None takes the model's own.
+        wavelength_nm: range of the light, which sets the exposure and the best focus; None takes the model's own.
+        focus: "best" places the film where the model's rays from the axis make the least spot, as `Lens.at` does for
+            the lens; "paraxial" in the paraxial image. "internal" is as "best": groups move where a model knows them.
         film_offset_mm: moves the film away from the lens (negative: towards it) after focusing.
 
     Raises:
         InputError: a focus, stop or zoom position outside the model's domain.
+
+    Warns:
+        NeurolensWarning: best focus lies beyond the film positions of a model, which has its film at their end then.
     """
 
     def __init__(
@@ -70,6 +78,7 @@ class OnnxCamera:
         aperture: Aperture | None = None,
         zoom: str | float | None = None,
         wavelength_nm: tuple[float, float] | None = None,
+        focus: Focus = "best",
         film_offset_mm: float = 0.0,
     ) -> None:
         self.focus_m = positive("focus_m", focus_m, infinite=True)
@@ -91,10 +100,12 @@ class OnnxCamera:
         light = (low, high) if wavelength_nm is None else wavelength_nm
         used = (min(max(low, light[0]), high), max(min(high, light[1]), low))
         self._light_nm = used
-        film_z = _film_z(model, self.focus_m, film_offset_mm)
         stop = _stop_radius(model, f_number)
-        round_stop = ModelScene(model, film_z, stop)
-        scene = replace(round_stop, aperture=aperture)
+        start = ModelScene(model, _paraxial_film_z(model, self.focus_m), stop, aperture)
+        best = start.film_z_mm if focus == "paraxial" else best_focus_z_mm(start, self.focus_m, used)
+        film_z = _film_z(model, best, film_offset_mm, lens["f_number"] * lens["stop_radius_mm"] / stop)
+        scene = replace(start, film_z_mm=film_z)
+        round_stop = replace(scene, aperture=None)
         outline = outline_of(PupilTable.of(domain["bounds"]), round_stop.passes, used)
         self.film = LensFilm(outline, film_z, used, scene)
         self.settings: dict[str, Any] = {
@@ -106,6 +117,7 @@ class OnnxCamera:
             "film_mm": list(self.film_mm),
             "film_z_mm": film_z,
             "film_offset_mm": film_offset_mm,
+            "focusing": focus,
             "stop_radius_mm": stop,
             "aperture": aperture and aperture.settings(),
             "state": dict(zip((a.name for a in model.axes), model.state, strict=True)),
@@ -266,20 +278,104 @@ class ModelScene:
         return self(film, pupil, np.full(film.shape[1], wavelength_nm, np.float32)).status == st.PASSED
 
 
-def _film_z(model: OnnxLens, focus_m: float, offset_mm: float) -> float:
+_RINGS, _SPOKES = 96, 24  # rays of the best focus
+_WIDER = 1.3  # their disc over the axial pupil at the stop in use
+_STEPS = 4  # towards the film points from which rays go to the object
+_SHIFT = 1e-3  # of the film radius, for differences
+_BLUR_MM = 0.002  # growth of a spot that is worth a warning
+
+
+def best_focus_z_mm(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float]) -> float:
+    """Film plane of least RMS spot for the axial point `focus_m` metres from it, by the model's own rays.
+
+    Spot and colours are those of `focusing.best_focus_z_mm`, whose rays come from the object. Here the film point of
+    each pupil point is searched from which a ray goes to the object, by Newton's method. The plane may lie outside the
+    domain.
+
+    Args:
+        scene: its film in the paraxial image, or near it.
+
+    Raises:
+        InputError: no ray passes.
+    """
+    domain = scene.model.card["domain"]
+    colours, weights = film_plane.colours(wavelength_nm)
+    shape = len(colours), _RINGS, _SPOKES
+    pupil = np.tile(_axial_pupil(domain, scene.stop_radius_mm), len(colours))
+    nanometres = np.repeat(colours, _RINGS * _SPOKES).astype(np.float32)
+    film, best, shift = np.zeros_like(pupil), scene.film_z_mm, _SHIFT * domain["film_radius_mm"]
+
+    def miss(film: FloatArray, object_z_mm: float) -> tuple[FloatArray, FloatArray, NDArray[np.int32]]:
+        """By how much rays miss the object, where it sees them in the entrance pupil, and their status."""
+        out = scene(film.astype(np.float32), pupil.astype(np.float32), nanometres)
+        place, way = out.scene_ray[:3].astype(np.float64), out.scene_ray[3:].astype(np.float64)
+        with np.errstate(all="ignore"):
+            slope = way[:2] / way[2]
+            at_lens = place[:2] - place[2] * slope
+        if math.isinf(object_z_mm):
+            return slope, at_lens, out.status
+        return slope + at_lens / object_z_mm, slope, out.status
+
+    start = miss(film, best - 1000 * focus_m)[0]
+    dx, dy = ((miss(film + shift * axis, best - 1000 * focus_m)[0] - start) / shift for axis in np.eye(2)[:, :, None])
+    for _ in range(_STEPS):
+        wrong, seen, status = miss(film, best - 1000 * focus_m)
+        with np.errstate(all="ignore"):
+            step = np.stack([wrong[0] * dy[1] - wrong[1] * dy[0], wrong[1] * dx[0] - wrong[0] * dx[1]])
+            film = film - step / (dx[0] * dy[1] - dx[1] * dy[0])
+            slope = (pupil - film) / (domain["pupil_z_mm"] - scene.film_z_mm)
+            # Equal areas of the entrance pupil count alike: a cell's area there.
+            cell = seen.reshape(2, *shape)
+            out, turn = np.gradient(cell, axis=2), np.roll(cell, -1, 3) - np.roll(cell, 1, 3)
+            weight = weights[:, None, None] * np.abs(out[0] * turn[1] - out[1] * turn[0])
+            moments = weight.reshape(-1) * np.stack([(film * slope).sum(0), (slope**2).sum(0)])
+        passed = (status == st.PASSED) & np.isfinite(moments).all(0)
+        along, across = np.where(passed, moments, 0.0).sum(1)
+        if not across > 0:
+            raise InputError(scene.model.path, "focus", "best", "a model that lets axial light pass")
+        best = scene.film_z_mm - float(along / across)
+        film = np.where(np.isfinite(film), film, 0.0)
+    return best
+
+
+def _axial_pupil(domain: dict[str, Any], stop_radius_mm: float) -> FloatArray:
+    """Pupil points [2, rings * spokes] about all that pass from the film's centre through a stop."""
+    ring, spoke = (np.arange(_RINGS) + 0.5) / _RINGS, 2 * np.pi * (np.arange(_SPOKES) + 0.5) / _SPOKES
+    low, high, half = (abs(domain["bounds"][name][0]) for name in ("low_mm", "high_mm", "half_mm"))
+    reach = _WIDER * max(low, high, half) * min(1.0, stop_radius_mm / domain["stop_radius_mm"])
+    return (reach * ring[:, None] * np.stack([np.cos(spoke), np.sin(spoke)])[:, None]).reshape(2, -1)
+
+
+def _paraxial_film_z(model: OnnxLens, focus_m: float) -> float:
+    """The film in the paraxial image, within the model's domain."""
     lens, (near, far) = model.card["lens"], model.card["domain"]["film_z_mm"]
     if any(a.name == "focus" for a in model.axes):
-        if offset_mm:
-            raise InputError(model.path, "film_offset_mm", offset_mm, "0: the model knows one film position a state")
-        return float(near)  # its groups focus, on the one film position of the state
-    z = film_z_mm(lens["efl_mm"], lens["front_principal_z_mm"], lens["rear_principal_z_mm"], focus_m) + offset_mm
+        return float(lens["film_z_mm"])  # its groups have moved
+    planes = lens["front_principal_z_mm"], lens["rear_principal_z_mm"]
+    z = film_plane.film_z_mm(lens["efl_mm"], *planes, focus_m)
     if not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
-        limits = " to ".join(dict.fromkeys(f"{v} m" for v in reversed(model.card["domain"]["focus_m"])))
-        if offset_mm:
-            expected = f"a film position within the model's domain, {near:.6g} to {far:.6g} mm (focus {limits})"
-            raise InputError(model.path, "film_offset_mm", offset_mm, expected)
-        raise InputError(model.path, "focus_m", focus_m, f"a focus within the model's domain, {limits}")
+        raise InputError(model.path, "focus_m", focus_m, f"a focus within the model's domain, {_limits(model)}")
     return min(max(z, near), far)
+
+
+def _film_z(model: OnnxLens, best_mm: float, offset_mm: float, f_number: float) -> float:
+    """The film position wanted, or the end of the model's domain that is nearest to it."""
+    near, far = model.card["domain"]["film_z_mm"]
+    z = best_mm + offset_mm
+    if offset_mm and not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
+        expected = f"a film position within the model's domain, {near:.6g} to {far:.6g} mm (focus {_limits(model)})"
+        raise InputError(model.path, "film_offset_mm", offset_mm, expected)
+    used = min(max(z, near), far)
+    if abs(used - z) > _BLUR_MM * f_number:
+        said = (
+            f"best focus needs its film at {z:.6g} mm; its domain ends at {used:.6g} mm, which is used: train it anew"
+        )
+        warnings.warn(f"{model.path}: {said}", NeurolensWarning, stacklevel=4)
+    return float(used)
+
+
+def _limits(model: OnnxLens) -> str:
+    return " to ".join(f"{v} m" for v in reversed(model.card["domain"]["focus_m"]))
 
 
 def _stop_radius(model: OnnxLens, f_number: float | None) -> float:

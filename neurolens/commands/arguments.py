@@ -87,7 +87,9 @@ cameras:
   fused:LENS.toml, fused:MODEL.onnx
                                the same, compiled by the system's C compiler: many times faster
   thick:LENS.toml              its principal planes and pupils: ideal imaging, no rims
-  thin, pinhole                a thin lens; a point
+  thin:LENS.toml, pinhole:LENS.toml
+                               a thin lens, a point: the plane in focus has the lens's size
+  thin, pinhole                the same of any focal length (--efl)
   fisheye-equidistant, fisheye-equisolid, fisheye-stereographic, fisheye-orthographic
                                points with these projections; --field sets the picture's circle"""
 
@@ -141,9 +143,9 @@ def add_lens_state(parser: argparse.ArgumentParser, *, efl: str, f_number: str, 
         help=f"distance from the film to the object in focus in metres, or inf (default: {focus})",
     )  # fmt: skip
     group.add_argument(
-        "--focusing", choices=("film", "best", "internal"), default="film",
-        help="by moving the film to the paraxial image, to the smallest spot on the axis, or by moving the groups as "
-        "the focus states of the lens file do (default: film)",
+        "--focusing", choices=("best", "paraxial", "internal"), default="best",
+        help="the film where the spot on the axis is smallest at this aperture, in the paraxial image, or first the "
+        "groups moved as the focus states of the lens file do (default: best)",
     )  # fmt: skip
     shape = parser.add_argument_group("shape of the stop")
     shape.add_argument(
@@ -177,10 +179,13 @@ def aperture_of(args: argparse.Namespace) -> Aperture | None:
 
 def state_of(args: argparse.Namespace, tabled: Lens) -> Lens:
     """The lens of a file in the state of the arguments of `add_lens_state`; raises InputError as `Lens.at`."""
-    return tabled.at(
+    from neurolens.optics.focusing import best_focused
+
+    lens = tabled.with_aperture(aperture_of(args) or tabled.aperture).at(
         zoom=args.zoom, focal_length_mm=args.efl, field_deg=args.field, f_number=args.f_number,
         focus_m=args.focus, focus=args.focusing,
-    ).with_aperture(aperture_of(args) or tabled.aperture)  # fmt: skip
+    )  # fmt: skip
+    return best_focused(lens, focus_of(args, tabled, lens)) if args.focusing == "internal" else lens
 
 
 def focus_of(args: argparse.Namespace, tabled: Lens, lens: Lens) -> float:
@@ -202,7 +207,7 @@ def given_options(args: argparse.Namespace) -> list[str]:
     """The options of `add_lens_state` that were given, for modes without a lens state."""
     names = ("efl", "field", "zoom", "f_number", "focus", "blades", "blade_rotation", "blade_curvature")
     given = [f"--{n.replace('_', '-')}" for n in (*names, "aperture_mask") if getattr(args, n) is not None]
-    return given + (["--focusing"] if args.focusing != "film" else [])
+    return given + (["--focusing"] if args.focusing != "best" else [])
 
 
 def add_exposure(parser: argparse._ActionsContainer) -> None:

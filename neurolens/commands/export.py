@@ -1,4 +1,4 @@
-"""`neurolens export MODEL`: source code of an exported model, or the same model for what a scene fixes."""
+"""`neurolens export`: source code of a model, a lens or a whole camera, or a model for what a scene fixes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neurolens import __version__
+from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, check_writable
-from neurolens.commands.arguments import add_json
+from neurolens.commands.arguments import add_json, positive
 from neurolens.commands.output import answer
+from neurolens.commands.render import film_size
 
 if TYPE_CHECKING:
     from neurolens.surrogates.model import LensModel
@@ -23,7 +26,10 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 Write an exported model in another form: a self-contained C99 header (one function for a ray, one for
 arrays that compilers vectorise), a GLSL function, or an ONNX file. Domain guard, stop, rims,
-transmittance and status codes are those of the model; the card is a comment at the top.
+transmittance and status codes are those of the model; the card is a comment at the top. Constants
+(planes, ranges) and the film's position for a focus stand beside it. A lens file gives the exact lens.
+With --camera, the whole camera for one focus and stop: film point and two random numbers in, weighted
+ray out, its pupil's outline as a table in the file (of GLSL, the data of a texture beside it).
 Needs the extra "train" (torch); without it C and GLSL are written from the graph in the file,
 whole and with nothing fixed."""
 _EPILOG = """\
@@ -37,6 +43,8 @@ examples:
   neurolens export models/laikin_double_gauss_50.ols-60.onnx --to c -o gauss.h
   neurolens export models/NAME.onnx --to glsl -o lens.glsl --fix wavelengths=450,550,650 --fix focus=2
   neurolens export runs/quickstart --to c -o ray.h --only ray
+  neurolens export lenses/NAME.toml --to c -o exact.h                     # every surface; no coatings
+  neurolens export models/NAME.onnx --to c -o cam.h --camera --focus 2 --f-number 2.8 --derivatives
   neurolens export models/NAME.onnx --to onnx -o laser.onnx --fix wavelengths=633
   neurolens export models/NAME.onnx --to onnx -o lens.onnx --derivatives  # for ray differentials
   neurolens export models/NAME.onnx --to onnx -o a.onnx --inverse         # and a.stop.onnx, a.scene.onnx"""
@@ -44,6 +52,8 @@ _PARTS = ("ray", "transmittance", "stop", "vignetting")
 _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
 # Rays for the errors of an ONNX file with fixed inputs; rays to fit inverse maps.
 _HELD_OUT, _VIGNETTING, _TRAIN = 20_000, 100_000, 15_000
+# Of an exact lens: its wavelengths; the nearest focus of its function of that, in focal lengths.
+_LIGHT_NM, _NEAR_EFL = (400.0, 700.0), 10.0
 
 
 def add_parser(subparsers: Any) -> None:
@@ -53,8 +63,9 @@ def add_parser(subparsers: Any) -> None:
         epilog=_EPILOG,
     )  # fmt: skip
     parser.add_argument(
-        "model", metavar="MODEL", type=Path, help="exported model (.onnx), or a run folder with one model"
-    )
+        "model", metavar="MODEL", type=Path,
+        help="exported model (.onnx), or a run folder with one model; of C and GLSL, a lens file (.toml), too",
+    )  # fmt: skip
     parser.add_argument("--to", choices=("c", "glsl", "onnx"), required=True, help="form to write")
     parser.add_argument("-o", "--out", metavar="FILE", type=Path, required=True, help="file to write")
     parser.add_argument(
@@ -65,29 +76,56 @@ def add_parser(subparsers: Any) -> None:
         help=f"comma-separated: {', '.join(_PARTS)} (default: all; the domain guard is always there)",
     )  # fmt: skip
     parser.add_argument("--name", metavar="WORD", help="of the function (default: the lens's id)")
-    parser.add_argument("--derivatives", action="store_true", help="of ONNX: additional outputs for ray differentials")
+    parser.add_argument(
+        "--derivatives", action="store_true",
+        help="of ONNX and with --camera: additional outputs for ray differentials",
+    )  # fmt: skip
     parser.add_argument(
         "--inverse", action="store_true",
         help="of ONNX: the inverse maps too (film and stop point to ray; scene ray to film), fitted and checked",
     )  # fmt: skip
+    group = parser.add_argument_group("camera", "what a whole camera is set to")
+    group.add_argument("--camera", action="store_true", help="the whole camera, of C and GLSL")
+    group.add_argument(
+        "--film", metavar="WxH", type=film_size, default=(36.0, 24.0), help="film in mm (default: 36x24)"
+    )
+    group.add_argument(
+        "--focus", metavar="M", type=positive("a distance in metres", infinite=True), default=math.inf,
+        help="distance from the film to the object in focus in metres (default: inf)",
+    )  # fmt: skip
+    group.add_argument("--f-number", metavar="N", type=positive("an f-number"), help="default: the widest")
+    group.add_argument(
+        "--zoom", metavar="STATE", help="state of a zoom by name or focal length; of a lens file, always"
+    )
     add_json(parser)
     parser.set_defaults(run=run, kept="nothing is written")
 
 
 def run(args: argparse.Namespace) -> int:
     """Load, fix, write."""
+    from neurolens.cameras.source import model_extras
+
     file = model_file(args.model)
     parts = _parts(args.only)
     given = _given(args.fix)
     if args.to == "onnx" and (args.name is not None or set(parts) != set(_PARTS)):
         raise InputError("neurolens export", "--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")
-    if args.to != "onnx" and (args.derivatives or args.inverse):
+    if args.to != "onnx" and ((args.derivatives and not args.camera) or args.inverse):
         raise InputError("neurolens export", "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
+    exact = file.suffix == ".toml"
+    if args.camera or exact:
+        if args.to == "onnx" or given or set(parts) != set(_PARTS):
+            what = "a camera" if args.camera else "a lens file"
+            raise InputError("neurolens export", str(file), f"({what})", "--to c or glsl, without --fix and --only")
+        check_writable(args.out)
+        return _answer(args, _about(_write_camera(file, args) if args.camera else _write_exact(file, args)))
     check_writable(args.out)
     if args.to != "onnx" and set(parts) == set(_PARTS) and not given and find_spec("torch") is None:
+        from neurolens.modelfile.onnxfile import read_checked
         from neurolens.surrogates.source import export_file
 
-        return _answer(args, _about(export_file(file, args.out, args.to, args.name)))
+        extras, notes = model_extras(read_checked(file)[1])
+        return _answer(args, _about(export_file(file, args.out, args.to, args.name, extras, notes)))
     from neurolens.cameras.model import load_model
     from neurolens.surrogates.source import Parts, export_source
     from neurolens.surrogates.specialise import fixed_models
@@ -102,9 +140,85 @@ def run(args: argparse.Namespace) -> int:
         about: dict[str, Any] = _write_inverse(models[0], args.out) if args.inverse else {}
     else:
         asked = Parts(*(name in parts for name in _PARTS[1:]))
-        written = export_source(models, args.out, args.to, card, parts=asked, fix=fix, name=args.name)
+        extras, notes = model_extras(card, focusing=fix.film_z_mm is None)
+        written = export_source(
+            models, args.out, args.to, card, parts=asked, fix=fix, name=args.name, extras=extras, notes=notes
+        )
         about = _about(written, [m.domain.wavelength_nm[0] for m in models])
     return _answer(args, about)
+
+
+def _write_camera(file: Path, args: argparse.Namespace) -> Written:
+    """A whole camera, of a model or a lens file."""
+    from neurolens.base.progress import Progress
+    from neurolens.cameras.build import Shot, make_camera
+    from neurolens.cameras.fused import lens_graph
+    from neurolens.cameras.model import OnnxCamera
+    from neurolens.cameras.source import CAMERA_FRAME, camera_program
+    from neurolens.graph.c import Extras
+    from neurolens.surrogates.source import checked_name, lines_of, write_program
+
+    shot = Shot(args.film, args.focus, args.f_number, zoom=args.zoom)
+    camera: Any = make_camera(file, shot, Progress(quiet=args.json))
+    facts = camera.settings
+    lens = facts["lens"] if "lens" in facts else facts["card"]["lens"]
+    name = checked_name(args.to, f"{lens['id']}_camera", args.name)
+    graph = lens_graph(camera) if isinstance(camera, OnnxCamera) else camera.lens_graph()
+    # Compilers of GLSL take minutes for an array of 43,000 constants: there the table is a texture of the caller.
+    program = camera_program(camera.film, graph, args.derivatives, own_table=args.to == "c")
+    numbers = {key: facts[key] for key in ("efl_mm", "f_number", "film_z_mm", "stop_radius_mm")}
+    constants = {"film_width_mm": args.film[0], "film_height_mm": args.film[1], **numbers}
+    constants |= {"pupil_z_mm": camera.film.outline.pupil_z_mm, "exposure": camera.film.exposure}
+    told = ", ".join(f"{key} {value:.6g}" for key, value in constants.items())
+    comment = [
+        f"{lens['name']}: a whole camera, written by neurolens {__version__} from {file.name}.",
+        f"Lens data: sha256 {str(lens.get('sha256'))[:16]}. Focus {args.focus:g} m; {told}.",
+        CAMERA_FRAME,
+    ]
+    if args.to == "glsl":
+        table, beside = camera.film.outline.table, args.out.with_name(f"{args.out.name}.outline.f32")
+        with atomic_path(beside) as temporary:
+            temporary.write_bytes(table.astype("<f4").tobytes())
+        size = f"{table.shape[1]} wide, {len(table)} high"
+        comment.append(f"outline: texture of one float a texel, {size}: {beside.name}, little-endian, line by line.")
+    return write_program(program, args.out, args.to, name, lines_of(comment), Extras(constants))
+
+
+def _write_exact(file: Path, args: argparse.Namespace) -> Written:
+    """The exact lens of a file as a function of film and pupil point, wavelength, film position and stop radius."""
+    from neurolens.cameras.exact import check_bare
+    from neurolens.cameras.source import extras_of
+    from neurolens.graph.scalars import lower
+    from neurolens.optics.lensfile import read_lens
+    from neurolens.optics.paraxial import film_z_mm, first_order
+    from neurolens.optics.pupils import image_radius_mm, pupil_bounds, pupil_plane_z_mm
+    from neurolens.optics.tracegraph import exact_graph
+    from neurolens.surrogates.source import checked_name, lines_of, write_program
+
+    lens = read_lens(file).at(zoom=args.zoom)
+    check_bare(lens)
+    name, plane, data = checked_name(args.to, lens.lens_id, args.name), pupil_plane_z_mm(lens), first_order(lens)
+    infinity, (radius, _) = film_z_mm(lens, math.inf), image_radius_mm(lens)
+    disc = pupil_bounds(lens, radius, (infinity, infinity), _LIGHT_NM, rows=9).disc_mm
+    constants = {
+        "efl_mm": float(data.efl_mm), "film_radius_mm": radius, "film_z_infinity_mm": infinity, "pupil_z_mm": plane,
+        "pupil_radius_mm": disc, "stop_radius_max_mm": float(lens.stop_radius_mm),
+        "wavelength_min_nm": _LIGHT_NM[0], "wavelength_max_nm": _LIGHT_NM[1],
+    }  # fmt: skip
+    near = _NEAR_EFL * abs(float(data.efl_mm)) / 1000
+    extras, notes = extras_of(constants, near, lambda focus_m: film_z_mm(lens, focus_m))
+    comment = [
+        f"{lens.name}: every surface traced, written by neurolens {__version__}. Surfaces are bare.",
+        f"Lens data: {lens.source} (sha256 {str(lens.sha256)[:16]}).",
+        "Lens frame: mm, front vertex at z = 0, film at z > 0. Rays go from the film point through the pupil point on "
+        f"the plane z = {plane:.6g} mm; the ray that comes out is a point on the front surface and a unit direction.",
+        f"Wavelengths from {_LIGHT_NM[0]:g} to {_LIGHT_NM[1]:g} nm. Status: 0 passed; at surface k, counted from 0 at "
+        f"the front, {st.blocked(0, st.MISSED)} + 4 k missed, {st.blocked(0, st.RIM)} + 4 k beyond its rim, "
+        f"{st.blocked(0, st.TOTAL_REFLECTION)} + 4 k totally reflected.",
+        *notes,
+    ]
+    program = lower(exact_graph(lens, plane, _LIGHT_NM))
+    return write_program(program, args.out, args.to, name, lines_of(comment), extras)
 
 
 def _about(written: Written, bands_nm: Sequence[float] = ()) -> dict[str, Any]:
@@ -172,15 +286,19 @@ def _given(texts: list[str]) -> dict[str, list[float]]:
 
 
 def _fix(given: dict[str, list[float]], model: LensModel) -> Fix:
+    from neurolens.optics.focusing import best_focus_z_mm
     from neurolens.optics.paraxial import film_z_mm
     from neurolens.surrogates.specialise import Fix
 
     film_z = given.get("film_z", [None])[0]
     stop = given.get("stop", [None])[0]
-    if "focus" in given:
-        film_z = film_z_mm(model.lens, given["focus"][0])
     if "f_number" in given:
         stop = model.lens.at(f_number=given["f_number"][0]).stop_radius_mm
+    if "focus" in given:
+        focus_m, lens = given["focus"][0], model.lens if stop is None else model.lens.with_stop_radius(stop)
+        Fix(film_z_mm=film_z_mm(lens, focus_m)).check(model.domain)
+        near, far = model.domain.film_z_mm
+        film_z = min(max(best_focus_z_mm(lens, focus_m), near), far)
     return Fix(tuple(given.get("wavelengths", ())), film_z, stop)
 
 

@@ -217,9 +217,15 @@ class CompiledSource:
 FUSED_BATCHES = (2048, 4096, 8192, 16384)
 
 
-def program_candidate(name: str, program: Program, domain: Domain, stop_radius_mm: float | None = None) -> Candidate:
+def program_candidate(
+    name: str,
+    program: Program,
+    domain: Domain,
+    stop_radius_mm: float | None = None,
+    flags: tuple[str, ...] = FLAGS,
+) -> Candidate:
     """A program of `surrogates.source`, compiled when the race prepares it; no stop radius: the domain's."""
-    compiled = cache(lambda: CompiledSource(program))
+    compiled = cache(lambda: CompiledSource(program, flags))
     room: dict[tuple[int, int], dict[str, NDArray[Any]]] = {}
 
     def prepare(rays: FilmRays) -> Call:

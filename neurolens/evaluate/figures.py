@@ -222,7 +222,7 @@ def draw_breathing(lens: Lens, path: str | Path, count: int = 48) -> dict[str, l
     """
     data = first_order(lens.at())
     nearest = 1.05 * (4 * abs(data.efl_mm) + data.rear_principal_z_mm - data.front_principal_z_mm) / 1000
-    ways: dict[str, Focus] = {"film moves": "film"}
+    ways: dict[str, Focus] = {"film moves": "paraxial"}
     if focus_states(lens):
         ways["groups move"] = "internal"
         nearest = max(nearest, 1.0001 * nearest_focus_m(lens))

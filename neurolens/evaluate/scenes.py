@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from neurolens.base.progress import Progress, Report
+from neurolens.cameras.build import Shot, ideal_as
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.exact import ExactCamera, FusedExactCamera
 from neurolens.cameras.fused import FusedCamera
-from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.candidates import model_candidate
@@ -55,7 +55,7 @@ def scene_cameras(
 ) -> dict[str, Camera]:
     """Exact lens, each model, thin lens and pinhole, set as a scene's [camera] asks; no wider than the lens opens.
 
-    Lens and models as C if `fused`.
+    All are in best focus, and show the plane in focus at one size. Lens and models as C if `fused`.
     """
     film = (shot.film_width_mm, shot.film_height_mm)
     data = first_order(lens)
@@ -63,12 +63,14 @@ def scene_cameras(
     # The same light for all cameras.
     real: dict[str, Any] = {"film_mm": film, "focus_m": shot.focus_m, "f_number": f_number}
     real["wavelength_nm"] = shot.wavelengths_nm
-    exact, model = (FusedExactCamera, FusedCamera) if fused else (ExactCamera, OnnxCamera)
-    cameras: dict[str, Camera] = {EXACT: exact(lens, bounds=domain.bounds, **real)}
+    exact_kind, model = (FusedExactCamera, FusedCamera) if fused else (ExactCamera, OnnxCamera)
+    exact = exact_kind(lens, bounds=domain.bounds, **real)
+    cameras: dict[str, Camera] = {EXACT: exact}
     for name, file in models.items():
         cameras[name] = model(load_model(file), **real)
-    cameras["thin lens"] = ThinLens(data.efl_mm, f_number, shot.focus_m, film)
-    cameras["pinhole"] = Pinhole(data.efl_mm, film, f_number)
+    cameras["thin lens"], cameras["pinhole"] = (
+        ideal_as(kind, exact.lens, Shot(film, shot.focus_m)) for kind in ("thin:", "pinhole:")
+    )
     return cameras
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,12 +125,28 @@ class Signature:
         return self.per_ray + self.per_call
 
 
-def write_c(program: Program, name: str, comment: Sequence[str]) -> str:
+@dataclass(frozen=True)
+class Extras:
+    """What stands beside the function of a file, under names that begin with the function's.
+
+    Attributes:
+        constants: numbers, by name. functions: of numbers that give one, by name: programs of one output.
+    """
+
+    constants: Mapping[str, float] = field(default_factory=dict)
+    functions: Mapping[str, Program] = field(default_factory=dict)
+
+
+NOTHING = Extras()
+
+
+def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras = NOTHING) -> str:
     """The text of a header.
 
     Args:
         name: of the function, an identifier.
         comment: lines on the model, for its head.
+        extras: what else the header holds.
     """
     signature = Signature.of(program, name)
     macro = name.upper()
@@ -148,6 +164,11 @@ def write_c(program: Program, name: str, comment: Sequence[str]) -> str:
     for table in dict.fromkeys(program.steps[k].name for k in live if program.steps[k].kind == "lookup"):
         if table in program.own_tables:
             text += _numbers(f"{name}_{table}", program.own_tables[table])
+    text += "\n" * bool(extras.constants)
+    text += "".join(f"#define {macro}_{key.upper()} {literal(v)}\n" for key, v in extras.constants.items())
+    for key, function in extras.functions.items():
+        own = Writer(function, "sqrtf", f"{macro}_FMA")
+        text += f"\n{macro}_INLINE {one_number(own, f'{name}_{key}', 'const float')}"
     lookup = f"{{table}}[{name}_cell({{index}}, {{cells}}) * {{width}} + {{place}}]"
     writer = Writer(
         program, f"{name}_sqrt", f"{macro}_FMA", clamp=f"{name}_clamp", floor="floorf", lookup=lookup, name=name
@@ -167,6 +188,16 @@ def _numbers(name: str, rows: NDArray[np.float64]) -> str:
     """A table as one array."""
     lines = ",\n".join(", ".join(literal(v) for v in row) for row in rows)
     return f"\nstatic const float {name}[{rows.size}] = {{\n{lines}}};\n"
+
+
+def one_number(writer: Writer, name: str, local: str) -> str:
+    """A function of the inputs of a program that gives its one output; `local` declares its variables."""
+    program = writer.program
+    arguments = ", ".join(f"float {program.steps[k].name}" for k in program.live() if _input(program, k))
+    steps = [(k, program.steps[k]) for k in program.live() if not _input(program, k)]
+    lines = [f"    {local} t{k} = {writer.step(step)};" for k, step in steps]
+    (found,) = program.outputs.values()
+    return "\n".join([f"float {name}({arguments})", "{", *lines, f"    return {writer.value(found.argument)};", "}\n"])
 
 
 def _input(program: Program, k: int) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from neurolens.graph.c import Signature, Writer, literal
+from neurolens.graph.c import NOTHING, Extras, Signature, Writer, literal, one_number
 from neurolens.graph.program import Program
 
 _HEAD = """\
@@ -22,7 +22,7 @@ _LOOKUP = "texelFetch({table}, ivec2({place}, clamp(int({index}), 0, textureSize
 _OWN_LOOKUP = "{table}[{width} * clamp(int({index}), 0, {cells} - 1) + {place}]"
 
 
-def write_glsl(program: Program, name: str, comment: Sequence[str]) -> str:
+def write_glsl(program: Program, name: str, comment: Sequence[str], extras: Extras = NOTHING) -> str:
     """The text of a function; arguments as of `c.write_c`."""
     signature = Signature.of(program, name)
     lines = "\n".join(f" * {line}".rstrip() for line in comment).replace("*/", "* /")
@@ -32,7 +32,10 @@ def write_glsl(program: Program, name: str, comment: Sequence[str]) -> str:
     body = [f"    float t{k} = {writer.step(program.steps[k])};" for k in live if program.steps[k].kind != "input"]
     results = [f"    {o} = {writer.value(program.outputs[o].argument)};" for o in signature.outputs]
     results.append(f"    status = int({writer.value(program.outputs['status'].argument)});")
-    text = _HEAD.format(comment=lines)
+    text = _HEAD.format(comment=lines) + "\n" * bool(extras.constants)
+    text += "".join(f"const float {name.upper()}_{k.upper()} = {literal(v)};\n" for k, v in extras.constants.items())
+    for key, function in extras.functions.items():
+        text += f"\n{one_number(Writer(function, 'sqrt'), f'{name}_{key}', 'float')}"
     constants = {table: numbers.reshape(-1) for table, numbers in program.own_tables.items()}
     if writer.table:
         constants["table"] = np.array(writer.table).T.reshape(-1)

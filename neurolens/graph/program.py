@@ -31,6 +31,8 @@ FILM_Z, STOP_RADIUS = "film_z_mm", "stop_radius_mm"  # for a whole call
 SCENE_RAY = ("x_mm", "y_mm", "z_mm", "dx", "dy", "dz")
 TRANSMITTANCE, STOP, STATUS = "transmittance", ("stop_x_mm", "stop_y_mm"), "status"
 _ROWS = {"rays": (*RAY, WAVELENGTH), "film_mm": FILM_X_Y, "scene_ray": SCENE_RAY, "stop_xy_mm": STOP}
+# Of what a camera is given and gives: points of the unit square, and rays in metres.
+_ROWS |= {"square": ("u", "v"), "pupil_mm": RAY[2:], "ray": ("x_m", "y_m", "z_m", "dx", "dy", "dz")}
 
 # tanh x = x P(x^2) / Q(x^2) on [-9.02, 9.02], beyond which float32 has 1: the rational function of these degrees of
 # least relative error (2.1e-8), by reweighted least squares. Evaluated in float32 the error is at most 3.1e-7.

@@ -140,7 +140,7 @@ def focus_path(lens: Lens) -> FocusPath:
         InputError: a file without focus states.
     """
     if not focus_states(lens):
-        raise InputError(lens.path, "focus", "internal", '"film" or "best": the file has no focus states')
+        raise InputError(lens.path, "focus", "internal", '"best" or "paraxial": the file has no focus states')
     film = len(lens.surfaces) - 1
     moved = sorted({film, *(k for c in focus_states(lens) for k, _ in c.thickness_mm)})
     by_zoom: dict[Configuration | None, list[Configuration]] = {}
@@ -247,7 +247,7 @@ _NEAREST = 0.5  # of the way from the last surface to the paraxial image: no fil
 
 
 def best_focus_z_mm(
-    lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[float, float] = (400.0, 700.0), film_moves: bool = True
+    lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[float, float] = (400.0, 700.0)
 ) -> float:
     """Film plane (lens frame, mm) of least RMS spot for the axial point `focus_m` metres from it.
 
@@ -259,12 +259,11 @@ def best_focus_z_mm(
 
     Args:
         wavelength_nm: range of the light.
-        film_moves: False: of a lens that was focused by moving its groups.
 
     Raises:
         InputError: no ray passes, or focus nearer than four focal lengths.
     """
-    film_z = paraxial.film_z_mm(lens, focus_m) if film_moves or lens.film_z_mm is None else lens.film_z_mm
+    film_z = _paraxial_film_z_mm(lens, focus_m)
     if paraxial.is_pinhole(lens):
         return film_z
     wavelengths, weights = film_plane.colours(wavelength_nm if lens.dispersive else (LINE_D_NM, LINE_D_NM))
@@ -277,15 +276,25 @@ def best_focus_z_mm(
     return film_z
 
 
-def film_range_mm(
-    lens: Lens, focus_m: float, wavelength_nm: tuple[float, float], film_moves: bool = True
-) -> tuple[float, float]:
+def best_focused(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float] = (400.0, 700.0)) -> Lens:
+    """A lens that `Lens.at` has placed, by film or groups, with its film where `best_focus_z_mm` says."""
+    return replace(lens, film_z_mm=best_focus_z_mm(lens, focus_m, wavelength_nm))
+
+
+def _paraxial_film_z_mm(lens: Lens, focus_m: float) -> float:
+    """Film in the paraxial image; where it stands, of a lens whose groups have moved to focus."""
+    if lens.infinity_mm and lens.film_z_mm is not None:
+        return float(lens.film_z_mm)
+    return paraxial.film_z_mm(lens, focus_m)
+
+
+def film_range_mm(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float]) -> tuple[float, float]:
     """Film planes that hold the paraxial image of an axial point, and its least spot at every aperture and colour.
 
     What is least for all rays lies between what is least for each colour and meridian by itself. Arguments are those
     of `best_focus_z_mm`.
     """
-    image = paraxial.film_z_mm(lens, focus_m) if film_moves or lens.film_z_mm is None else lens.film_z_mm
+    image = _paraxial_film_z_mm(lens, focus_m)
     if paraxial.is_pinhole(lens):
         return image, image
     colours = np.linspace(*wavelength_nm, film_plane.COLOURS if lens.dispersive else 1)
@@ -309,7 +318,8 @@ def axial_rays(lens: Lens, object_z_mm: float) -> Rays:
     rings, spokes = (_RINGS, 1) if round_ else (_RINGS_OF_SPOKES, _SPOKES)
     ring = torch.sqrt((torch.arange(rings, dtype=torch.float64) + 0.5) / rings)
     spoke = 2 * math.pi * (torch.arange(spokes, dtype=torch.float64) + 0.5) / spokes
-    radius = _WIDER / 2 * data.entrance_pupil_diameter_mm * ring[:, None]
+    widest = max(data.entrance_pupil_diameter_mm, paraxial.first_order(lens, meridian="x").entrance_pupil_diameter_mm)
+    radius = _WIDER / 2 * widest * ring[:, None]
     x, y = (radius * torch.cos(spoke)).reshape(-1), (radius * torch.sin(spoke)).reshape(-1)
     # Started well in front of every lens, so that a front surface bulging towards the scene is still ahead.
     front_mm = lens.surfaces[0].diameter_mm
@@ -364,12 +374,12 @@ class Breath:
     working_f_number: float
 
 
-def breathing(lens: Lens, focus_m: Sequence[float], focus: Focus = "film") -> list[Breath]:
+def breathing(lens: Lens, focus_m: Sequence[float], focus: Focus = "paraxial") -> list[Breath]:
     """The lens at several focus distances.
 
-    With h the radius of the image circle at infinity focus (the film does not grow), x' the film's distance behind the
-    rear focal point and e that of the entrance pupil behind the front one: the magnification is -x'/f, and the chief
-    ray of the film's edge leaves at atan(h / (f + x' e / f)).
+    With h the radius of the image circle at infinity focus (the film does not grow) and x' the film's distance behind
+    the rear focal point: the magnification is -x'/f, and the chief ray of the film's edge leaves at
+    atan(h / `paraxial.chief_reach_mm`).
 
     Args:
         lens: in the zoom position wanted.
@@ -387,8 +397,7 @@ def breathing(lens: Lens, focus_m: Sequence[float], focus: Focus = "film") -> li
         data = paraxial.first_order(state)
         assert state.film_z_mm is not None
         extension = state.film_z_mm - data.rear_focal_z_mm
-        pupil = data.entrance_pupil_z_mm - data.front_focal_z_mm
-        reach = data.efl_mm + extension * pupil / data.efl_mm
+        reach = paraxial.chief_reach_mm(state)
         found.append(
             Breath(
                 focus_m=float(distance),

@@ -157,6 +157,37 @@ def _pinhole(lens: Lens, indices: list[Any]) -> FirstOrder:
     )
 
 
+def chief_reach_mm(lens: Lens) -> float:
+    """Film height (mm) over the slope of the paraxial chief ray in the scene, which passes the entrance pupil's centre.
+
+    f + x' e / f, with x' the film's distance behind the rear focal point and e the pupil's behind the front one.
+    """
+    data = first_order(lens)
+    assert lens.film_z_mm is not None
+    film, pupil = lens.film_z_mm - data.rear_focal_z_mm, data.entrance_pupil_z_mm - data.front_focal_z_mm
+    return float(data.efl_mm + film * pupil / data.efl_mm)
+
+
+def framing_mm(lens: Lens, focus_m: float) -> tuple[float, float]:
+    """Image distances (mm) of two ideal lenses that show the plane `focus_m` metres from the film at the lens's size.
+
+    Chief rays of a film point then meet that plane in one point, also where the film is not in the paraxial image.
+
+    Args:
+        lens: placed by `Lens.at`.
+
+    Returns:
+        That of a thin lens or a hole so far before the film, and of a lens in this one's front principal plane.
+    """
+    data, reach = first_order(lens), chief_reach_mm(lens)
+    if math.isinf(focus_m):
+        return reach, reach
+    assert lens.film_z_mm is not None
+    plane = lens.film_z_mm - 1000 * focus_m
+    size = (data.entrance_pupil_z_mm - plane) / reach  # of the plane in focus over that on the film
+    return 1000 * focus_m / (1 + size), (data.front_principal_z_mm - plane) / size
+
+
 def stop_radius_mm(lens: Lens, f_number: float) -> float:
     """Radius of the stop for f-number N = EFL / paraxial entrance-pupil diameter at infinity focus."""
     # From an opening of 1 mm: a closed stop has no f-number to scale.

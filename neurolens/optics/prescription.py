@@ -14,7 +14,7 @@ from typing import Any, Literal
 from neurolens.base.errors import InputError
 from neurolens.optics.apertures import Aperture
 
-Focus = Literal["film", "best", "internal"]
+Focus = Literal["best", "paraxial", "internal"]
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,8 @@ class Lens:
         focal_length_mm: float | None = None,
         field_deg: float | None = None,
         zoom: str | float | None = None,
-        focus: Focus = "film",
+        focus: Focus = "paraxial",
+        wavelength_nm: tuple[float, float] = (400.0, 700.0),
     ) -> Lens:
         """The same lens in another state; `neurolens.optics.states` does the work.
 
@@ -208,8 +209,10 @@ class Lens:
                 image circle stays (by the traced chief ray, along x; distortion included).
             zoom: name of a state of the file, or a focal length in mm between those of its states, as a number or its
                 text (`neurolens.optics.states`; marked in `derived`).
-            focus: "film" moves the film as the paraxial image does; "best" to the least RMS spot of the axial point
-                (`focusing.best_focus_z_mm`); "internal" moves the groups as the file's focus states do, film fixed.
+            focus: "paraxial" moves the film as the paraxial image does; "best", which cameras and commands take, to the
+                least RMS spot of the axial point (`focusing.best_focus_z_mm`); "internal" moves the groups as
+                the file's focus states do, film fixed.
+            wavelength_nm: range of the light that "best" focuses.
 
         Raises:
             InputError: an unknown state, a focal length beyond the zoom's range, a value that is not positive, a focus
@@ -217,7 +220,7 @@ class Lens:
         """
         from neurolens.optics import states  # states need this module's types
 
-        return states.at(self, focus_m, f_number, focal_length_mm, field_deg, zoom, focus)
+        return states.at(self, focus_m, f_number, focal_length_mm, field_deg, zoom, focus, wavelength_nm)
 
     def scaled(self, factor: float) -> Lens:
         """All lengths times `factor`; angles, indices and f-number stay.

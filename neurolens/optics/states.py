@@ -21,7 +21,7 @@ from neurolens.optics import paraxial
 from neurolens.optics.aiming import aim_at_stop
 from neurolens.optics.focusing import (
     at_infinity,
-    best_focus_z_mm,
+    best_focused,
     focused_inside,
     gaps_mm,
     infinity_states,
@@ -42,6 +42,7 @@ def at(
     field_deg: float | None,
     zoom: str | float | None,
     focus: Focus,
+    wavelength_nm: tuple[float, float],
 ) -> Lens:
     """The lens in another state; arguments and errors are those of `Lens.at`."""
     _check(lens, focus_m, f_number, focal_length_mm, field_deg, focus)
@@ -72,7 +73,14 @@ def at(
         lens = lens.with_stop_radius(paraxial.stop_radius_mm(at_infinity(lens), f_number))
     if focus == "internal":
         return focused_inside(lens, focus_m, object_mm)
-    return replace(lens, film_z_mm=_film_z_mm(lens, focus_m, object_mm, focus))
+    if object_mm is not None and focus_m is None:
+        film_z = paraxial.image_z_mm(lens, -object_mm)
+        focus_m = (film_z + object_mm) / 1000
+    else:
+        focus_m = math.inf if focus_m is None else focus_m
+        film_z = paraxial.film_z_mm(lens, focus_m)
+    lens = replace(lens, film_z_mm=film_z)
+    return best_focused(lens, focus_m, wavelength_nm) if focus == "best" else lens
 
 
 def state_named(lens: Lens, name: str) -> Configuration:
@@ -163,16 +171,6 @@ def _factor_for_field(lens: Lens, field_deg: float) -> float:
         seen = min(math.degrees(reached) * 2, lens.half_field_deg * 2 if lens.half_field_deg else 360.0)
         raise InputError(lens.path, "field_deg", field_deg, f"a field that this lens sees (about {seen:.3g} degrees)")
     return radius / height
-
-
-def _film_z_mm(lens: Lens, focus_m: float | None, object_mm: float | None, focus: Focus) -> float:
-    if object_mm is not None and focus_m is None:
-        film_z = paraxial.image_z_mm(lens, -object_mm)
-        focus_m = (film_z + object_mm) / 1000
-    else:
-        focus_m = math.inf if focus_m is None else focus_m
-        film_z = paraxial.film_z_mm(lens, focus_m)
-    return best_focus_z_mm(lens, focus_m) if focus == "best" else film_z
 
 
 MOVES = 0.02  # a group moves whose travel is above this share of the largest travel

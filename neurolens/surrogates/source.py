@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import neurolens
 from neurolens.base.errors import InputError, ModelError
 from neurolens.base.files import atomic_write_text
-from neurolens.graph.c import Signature, write_c
+from neurolens.graph.c import NOTHING, Extras, Signature, write_c
 from neurolens.graph.glsl import write_glsl
 from neurolens.graph.program import (
     FILM_Z,
@@ -84,6 +84,8 @@ def export_source(
     parts: Parts = ALL,
     fix: Fix = FREE,
     name: str | None = None,
+    extras: Extras = NOTHING,
+    notes: Sequence[str] = (),
 ) -> Written:
     """Write a model, or one for each of several fixed wavelengths, as one function.
 
@@ -91,19 +93,27 @@ def export_source(
         language: "c" or "glsl".
         card: of the model, for the comment.
         name: of the function; None takes the lens's id.
+        extras, notes: what else the file holds, and lines of the comment on it.
 
     Raises:
         InputError: another language, a name that is no identifier, numbers that float32 cannot hold, a card that lacks
             what the comment says.
     """
     model = models[0]
-    own = _checked_name(language, model.lens.lens_id, name)
+    own = checked_name(language, model.lens.lens_id, name)
     waves = [m.domain.wavelength_nm for m in models]
     about = card, model.domain.to_dict(), waves, fix, [g.status for g in model.gates]
-    return _write(fused_program(models, parts, fix), Path(path), language, own, about)
+    return _write(fused_program(models, parts, fix), Path(path), language, own, about, extras, notes)
 
 
-def export_file(file: str | Path, path: str | Path, language: str, name: str | None = None) -> Written:
+def export_file(
+    file: str | Path,
+    path: str | Path,
+    language: str,
+    name: str | None = None,
+    extras: Extras = NOTHING,
+    notes: Sequence[str] = (),
+) -> Written:
     """Write the graph of a model's file, with everything it gives: the same rays to rounding, without torch.
 
     Arguments as of `export_source`; errors too, and a ModelError for a file that cannot be trusted.
@@ -113,14 +123,14 @@ def export_file(file: str | Path, path: str | Path, language: str, name: str | N
         raise ModelError(f"{file}: a model of many states (zoom, internal focus), expected one of one state")
     try:
         domain, codes = card["domain"], [gate["status"] for gate in card["gates"]]
-        own = _checked_name(language, str(card["lens"]["id"]), name)
+        own = checked_name(language, str(card["lens"]["id"]), name)
         about = card, domain, [domain["wavelength_nm"]], FREE, codes
     except (KeyError, TypeError) as error:
         raise _no_card(error) from error
-    return _write(lower(graph_of(file, data)), Path(path), language, own, about)
+    return _write(lower(graph_of(file, data)), Path(path), language, own, about, extras, notes)
 
 
-def _checked_name(language: str, lens_id: str, name: str | None) -> str:
+def checked_name(language: str, lens_id: str, name: str | None) -> str:
     if language not in WRITERS:
         raise InputError("export", "to", language, f"one of {', '.join(WRITERS)}")
     own = identifier(lens_id) if name is None else name
@@ -142,13 +152,28 @@ def _no_card(error: Exception) -> InputError:
     return InputError("export", "card", f"({type(error).__name__}: {error})", "a card of neurolens, whole")
 
 
-def _write(program: Program, target: Path, language: str, own: str, about: tuple[Any, ...]) -> Written:
+def _write(
+    program: Program,
+    target: Path,
+    language: str,
+    own: str,
+    about: tuple[Any, ...],
+    extras: Extras,
+    notes: Sequence[str],
+) -> Written:
     try:
-        comment = comment_of(*about)
+        comment = [*comment_of(*about), *lines_of(notes)]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise _no_card(error) from error
-    atomic_write_text(target, WRITERS[language](program, own, comment))
-    return Written(target, Signature.of(program, own), sum(program.count().values()))
+    return write_program(program, target, language, own, comment, extras)
+
+
+def write_program(
+    program: Program, target: Path, language: str, name: str, comment: Sequence[str], extras: Extras
+) -> Written:
+    """Write any program as a function of a checked name."""
+    atomic_write_text(target, WRITERS[language](program, name, comment, extras))
+    return Written(target, Signature.of(program, name), sum(program.count().values()))
 
 
 def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FREE) -> Program:
@@ -211,7 +236,12 @@ def comment_of(
     gone = {g["status"] for g in card["gates"]} - set(codes)
     told = {c: w for c, w in card["status_codes"].items() if int(c) not in gone}
     lines.append(f"Status: {'; '.join(f'{c} {w}' for c, w in told.items())}.")
-    flat = [" ".join(str(line).split()) for line in lines]
+    return lines_of(lines)
+
+
+def lines_of(texts: Sequence[str]) -> list[str]:
+    """Texts as lines of a comment."""
+    flat = [" ".join(str(text).split()) for text in texts]
     return [part for line in flat for part in textwrap.wrap(line, _WIDTH, break_long_words=False)]
 
 

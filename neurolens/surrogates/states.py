@@ -107,7 +107,7 @@ class StateSpace:
             if radius is None:
                 radius = image_radius_mm(self._lens(zoom, math.inf))[0]
             assert lens.film_z_mm is not None
-            film_z = film_range_mm(lens, focus_m, self.wavelength_nm, film_moves=False)
+            film_z = film_range_mm(lens, focus_m, self.wavelength_nm)
             focus = (focus_m, focus_m)
         return domain_of(
             lens,

@@ -95,7 +95,7 @@ def test_a_shot_zooms_and_focuses_inside() -> None:
     far = make_camera(zoom, Shot(FILM, 3.0, zoom=100.0))
     assert near.settings["film_z_mm"] < far.settings["film_z_mm"]
     assert near.settings["efl_mm"] < far.settings["efl_mm"] == pytest.approx(100, rel=1e-9)
-    for field, shot in (("zoom", Shot(FILM, 2.0, zoom="x")), ("focus", Shot(FILM, 2.0, focus="best"))):
+    for field, shot in (("zoom", Shot(FILM, 2.0, zoom="x")), ("focus", Shot(FILM, 2.0, focus="internal"))):
         for spec in ("thin", "pinhole", lens_models.exported("invariants")):
             with pytest.raises(InputError, match=field):
                 make_camera(spec, shot)

@@ -21,7 +21,8 @@ from neurolens.cameras.sampling import concentric_disk
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.film_plane import film_z_mm
 from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order
+from neurolens.optics.paraxial import first_order, system_of
+from neurolens.optics.prescription import Lens
 
 
 def square_grid(side: int) -> np.ndarray:
@@ -84,6 +85,7 @@ def test_weight_is_one_on_the_axis_and_the_fourth_power_of_the_cosine_off_it() -
 
 RETROFOCUS = ROOT / "lenses" / "angenieux_retrofocus_35.toml"
 TELEPHOTO = ROOT / "lenses" / "sigler_telephoto_100.toml"
+ZOOM = ROOT / "lenses" / "nikon_zoom_70_200.toml"
 
 
 def made(path: Path, focus_m: float = 2.0, **change: object) -> ThickLens:
@@ -110,12 +112,11 @@ def test_rays_of_a_film_point_meet_at_the_focus_distance_and_fill_the_entrance_p
     rays = camera.sample(at((height, 0.0), 576), square, wavelength)
     t = (-focus_m - rays.origin_m[2]) / rays.direction[2]
     met = rays.origin_m[:2] + t * rays.direction[:2]
-    lens = read_lens(path).at(focus_m=focus_m)
+    lens = read_lens(path).at(focus_m=focus_m, focus="best")
     data = first_order(lens)
     assert lens.film_z_mm is not None
-    image = lens.film_z_mm - data.rear_principal_z_mm
-    separation = data.rear_principal_z_mm - data.front_principal_z_mm
-    magnification = (1e3 * focus_m - separation - image) / image
+    magnification = paraxial_chief_slope(lens, height) * (data.entrance_pupil_z_mm - lens.film_z_mm + 1e3 * focus_m)
+    magnification /= height
     assert met[0] == pytest.approx(-1e-3 * height * magnification, rel=2e-4) and np.abs(met[1]).max() < 2e-5
     # On the plane of the entrance pupil the same rays fill its disc.
     t = (1e-3 * (data.entrance_pupil_z_mm - lens.film_z_mm) - rays.origin_m[2]) / rays.direction[2]
@@ -125,10 +126,34 @@ def test_rays_of_a_film_point_meet_at_the_focus_distance_and_fill_the_entrance_p
     assert np.mean(radius**2) == pytest.approx((data.entrance_pupil_diameter_mm / 2) ** 2 / 2, rel=0.02)
 
 
+def paraxial_chief_slope(lens: Lens, height_mm: float) -> float:
+    """Slope in the scene of the chief ray of a film point, marched surface by surface towards the scene."""
+    turned, exit_z = system_of(lens).turned(), first_order(lens).exit_pupil_z_mm
+    film_z, last_z = float(lens.film_z_mm or 0.0), float(lens.vertices_mm[-2])
+    slope = -height_mm / (film_z - exit_z)  # from the film point to the exit pupil's centre
+    return abs(turned.march(height_mm + slope * (film_z - last_z), slope).after[-1])
+
+
+@pytest.mark.parametrize("focus", ["best", "paraxial"])
+@pytest.mark.parametrize("focus_m", [math.inf, 2.0, 0.9])
+@pytest.mark.parametrize("path", [GAUSS, RETROFOCUS, TELEPHOTO, ZOOM])
+def test_ideal_cameras_frame_the_plane_in_focus_as_the_lens_does(path: Path, focus_m: float, focus: str) -> None:
+    """Chief rays of a film point of the lens and of its thin lens, thick lens and pinhole meet there (item 16)."""
+    lens = read_lens(path).at(focus_m=focus_m, focus=focus)  # type: ignore[arg-type]
+    height, depth = 8.0, 1e7 if math.isinf(focus_m) else 1e3 * focus_m  # from the film, mm
+    pupil = first_order(lens).entrance_pupil_z_mm - float(lens.film_z_mm or 0.0)
+    wanted = -paraxial_chief_slope(lens, height) * (depth + pupil)
+    for kind in ("thin", "thick", "pinhole"):
+        camera = make_camera(f"{kind}:{path}", Shot(FILM, focus_m, focus=focus))  # type: ignore[arg-type]
+        rays = camera.sample(at((height, 0.0), 1), np.full((2, 1), 0.5, np.float32), np.full(1, 550.0, np.float32))
+        t = (-1e-3 * depth - rays.origin_m[2]) / rays.direction[2]
+        assert 1e3 * (rays.origin_m + t * rays.direction)[0, 0] == pytest.approx(wanted, rel=2e-5), kind
+
+
 @pytest.mark.parametrize("path", [GAUSS, RETROFOCUS, TELEPHOTO])
 def test_light_falls_off_as_that_of_the_exit_pupil(path: Path) -> None:
     """The irradiance of a uniform disc, at any height (Foote 1915), is that of the paraxial exit pupil."""
-    camera = made(path, math.inf)
+    camera = made(path, math.inf, focus="paraxial")
     data = first_order(read_lens(path).at(focus_m=math.inf))
     distance = data.rear_focal_z_mm - data.exit_pupil_z_mm
     heights = np.array([0.0, 10.0, 20.0])
@@ -176,7 +201,8 @@ def test_shapes_of_the_stop_keep_the_exposure() -> None:
 
 def test_settings_are_those_of_the_lens_in_its_state() -> None:
     camera = made(GAUSS, f_number=4.0, efl_mm=35.0)
-    assert camera.settings["efl_mm"] == pytest.approx(35) and camera.settings["f_number"] == pytest.approx(4)
+    assert camera.settings["efl_mm"] == pytest.approx(35, rel=2e-3)  # of the film in best focus
+    assert camera.settings["f_number"] == pytest.approx(4, rel=2e-3)
     assert camera.settings["lens"]["sha256"] == lens_models.lens().at(focal_length_mm=35.0).sha256
 
 
@@ -314,7 +340,7 @@ def test_field_sets_the_circle_within_the_film() -> None:
     [
         ("fisheye-equal", {}, "camera"),
         ("fisheye-equidistant", {"zoom": 50.0}, "zoom"),
-        ("fisheye-equidistant", {"focus": "best"}, "focus"),
+        ("fisheye-equidistant", {"focus": "internal"}, "focus"),
         ("fisheye-equidistant", {"field_deg": 361.0}, "field_deg"),
         ("fisheye-orthographic", {"field_deg": 181.0}, "field_deg"),
         ("fisheye-equisolid", {"field_deg": 90.0, "efl_mm": 8.0}, "efl_mm"),

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import lens_models
@@ -18,10 +19,13 @@ import pytest
 from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
 from neurolens.base import status as st
-from neurolens.base.errors import InputError, ModelError
-from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
+from neurolens.base.errors import InputError, ModelError, NeurolensWarning
+from neurolens.cameras.model import ModelScene, OnnxCamera, OnnxLens, best_focus_z_mm, load_model
 from neurolens.cameras.pupil_boxes import PupilTable, tightened
 from neurolens.modelfile import onnxfile
+from neurolens.optics import focusing
+from neurolens.optics.apertures import Aperture
+from neurolens.optics.paraxial import film_z_mm, first_order
 
 ROOT = Path(__file__).parents[2]
 
@@ -386,6 +390,57 @@ def test_camera_settings_outside_the_domain(model: OnnxLens) -> None:
     for bad in (0.0, -1.0, math.nan):
         with pytest.raises(InputError):
             OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=bad)
+
+
+@pytest.mark.parametrize("focus_m", [math.inf, 1.5])
+@pytest.mark.parametrize(
+    "name",
+    ["laikin_double_gauss_50.ols-60", "laikin_double_gauss_50.mlp-16x2", "schneider_anamorphic_31.mlp-16x2",
+     "nikon_zoom_70_200.ols-64", "shimizu_fisheye_220.mlp-16x2"],
+)  # fmt: skip
+def test_the_best_focus_of_a_model_is_that_of_its_lens(name: str, focus_m: float) -> None:
+    """To what the model's error on the film allows: an error e of a spot at f/N is 2 N e of focus."""
+    model = load_model(ROOT / "models" / f"{name}.onnx")
+    lens, widest = lens_models.lens(name.split(".")[0]), model.card["domain"]["stop_radius_mm"]
+    paraxial = film_z_mm(lens, focus_m)
+    for share in (1.0, 0.4):
+        stopped = lens.with_stop_radius(widest * share)
+        found = best_focus_z_mm(ModelScene(model, paraxial, widest * share), focus_m, (400.0, 700.0))
+        exact = focusing.best_focus_z_mm(stopped, focus_m)
+        allowed = 2 * first_order(stopped).f_number * 4e-3 * model.card["errors"]["rms_um"] + 0.002
+        assert found == pytest.approx(exact, abs=allowed + 0.005 * abs(exact - paraxial))
+
+
+def test_an_aperture_s_blades_count_in_the_focus_of_both() -> None:
+    shape = Aperture(3)
+    lens, path = lens_models.lens().with_aperture(shape), ROOT / "models" / "laikin_double_gauss_50.ols-60.onnx"
+    model = load_model(path)
+    scene = ModelScene(model, film_z_mm(lens, 2.0), lens.stop_radius_mm, shape)
+    found = [best_focus_z_mm(s, 2.0, (400.0, 700.0)) for s in (scene, replace(scene, aperture=None))]
+    exact = [focusing.best_focus_z_mm(each, 2.0) for each in (lens, lens.with_aperture(None))]
+    assert found == pytest.approx(exact, abs=0.006) and exact[0] > exact[1] + 0.05  # the triangle has no far edge
+
+
+def test_cameras_are_in_best_focus_by_default(model: OnnxLens) -> None:
+    best, paraxial = (OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=math.inf, focus=f) for f in ("best", "paraxial"))
+    exact = lens_models.exact_camera(math.inf, None).settings["film_z_mm"]
+    assert paraxial.settings["film_z_mm"] == pytest.approx(film_z_mm(lens_models.lens(), math.inf))
+    assert best.settings["film_z_mm"] == pytest.approx(exact, abs=0.02)
+    assert exact < paraxial.settings["film_z_mm"] - 0.25
+    assert OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=math.inf).settings == best.settings
+
+
+def test_a_film_range_that_ends_before_best_focus_is_said_and_held(path: Path) -> None:
+    """Older models end at the paraxial image of infinity."""
+    older = load_model(path)
+    end = older.card["domain"]["film_z_mm"][0] = film_z_mm(lens_models.lens(), math.inf)
+    with pytest.warns(NeurolensWarning, match=rf"{path.name}: best focus needs its film at 91.3.* ends at {end:.6g}"):
+        camera = OnnxCamera(older, film_mm=(36.0, 24.0), focus_m=math.inf)
+    assert camera.settings["film_z_mm"] == end
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        OnnxCamera(older, film_mm=(36.0, 24.0), focus_m=math.inf, focus="paraxial")
+        OnnxCamera(older, film_mm=(36.0, 24.0), focus_m=2.0)
 
 
 def test_film_beyond_the_model_is_dark(model: OnnxLens) -> None:

@@ -153,7 +153,7 @@ def test_a_pinhole_maps_tangents_and_knows_no_focus(tmp_path: Path) -> None:
     data = first_order(hole)
     assert (data.efl_mm, data.f_number, data.exit_pupil_z_mm, data.entrance_pupil_z_mm) == (50.0, 100.0, 0.0, 0.0)
     for focus_m in (math.inf, 1.0, 0.01):
-        for focus in ("film", "best"):
+        for focus in ("paraxial", "best"):
             state = hole.at(focus_m=focus_m, focus=focus)  # type: ignore[arg-type]
             assert state.film_z_mm == 50.0
     assert hole.at(f_number=200).stop_radius_mm == 0.125

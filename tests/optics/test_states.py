@@ -316,10 +316,10 @@ def test_a_film_range_holds_best_focus_at_every_aperture_and_colour(name: str, f
     lens = tabled(name)
     internal = "nikon" in name
     lens = lens.at(zoom=100.0, focus_m=focus_m, focus="internal") if internal else lens
-    low, high = film_range_mm(lens, focus_m, (400.0, 700.0), film_moves=not internal)
+    low, high = film_range_mm(lens, focus_m, (400.0, 700.0))
     assert low < (lens.film_z_mm if internal else film_z_mm(lens, focus_m)) < high
     found = [
-        best_focus_z_mm(lens.with_stop_radius(lens.stop_radius_mm * share), focus_m, light, film_moves=not internal)
+        best_focus_z_mm(lens.with_stop_radius(lens.stop_radius_mm * share), focus_m, light)
         for share in (1.0, 0.7, 0.1)
         for light in ((400.0, 700.0), (400.0, 400.0), (475.0, 475.0), (700.0, 700.0))
     ]

@@ -1,0 +1,193 @@
+"""Cameras as source code: the rays of the camera itself, its constants, and an integrator of its own in C++."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import lens_models
+import numpy as np
+import pytest
+from camera_helpers import film_rays
+from command_line import failure
+from numpy.typing import NDArray
+
+from neurolens.base import status as st
+from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.fused import lens_graph
+from neurolens.cameras.model import OnnxCamera
+from neurolens.cameras.source import camera_program, extras_of
+from neurolens.cli import main
+from neurolens.optics.paraxial import film_z_mm
+from neurolens.surrogates.domain import sample_domain
+
+ROOT = Path(__file__).parents[2]
+LENS = ROOT / "lenses" / "laikin_double_gauss_50.toml"
+FILM, FOCUS_M = (36.0, 24.0), 1.2
+
+
+def camera(kind: str) -> ExactCamera | OnnxCamera:
+    made = make_camera(LENS if kind == "exact" else lens_models.exported(kind), Shot(FILM, FOCUS_M, 4.0))
+    assert isinstance(made, (ExactCamera, OnnxCamera))
+    return made
+
+
+@pytest.mark.parametrize("kind", ["exact", "invariants"])
+def test_a_camera_as_source_gives_its_own_rays(kind: str) -> None:
+    made = camera(kind)
+    graph = made.lens_graph() if isinstance(made, ExactCamera) else lens_graph(made)
+    program = camera_program(made.film, graph, derivatives=True)
+    film, square, wavelength = film_rays(made, 4000)
+    given = dict(zip(("film_x_mm", "film_y_mm", "u", "v", "wavelength_nm"), (*film, *square, wavelength), strict=True))
+    found = program.evaluate(given)
+    wanted = made.sample(film, square, wavelength)
+    both = (found["status"] == st.PASSED) & (wanted.status == st.PASSED)
+    assert both.mean() > 0.95 and (found["status"] != wanted.status).mean() < 1e-3
+    rows = [found[name] for name in ("x_m", "y_m", "z_m", "dx", "dy", "dz")]
+    assert np.abs(np.stack(rows) - [*wanted.origin_m, *wanted.direction])[:, both].max() < 5e-6
+    np.testing.assert_allclose(found["weight"][both], wanted.weight[both], rtol=2e-4)
+    assert not found["weight"][found["status"] != st.PASSED].any()
+    pupil, area = made.film.pupil.sample(film, square, wavelength)
+    np.testing.assert_allclose([found["pupil_x_mm"], found["pupil_y_mm"]], pupil, atol=2e-4)
+    np.testing.assert_allclose(found["area_mm2"], area, rtol=1e-3)
+    if isinstance(made, ExactCamera):
+        moves = made.sample_differentials(film, square, wavelength).differentials
+        assert moves is not None
+        slopes = np.stack([found[f"{row}_by_film_{by}_mm"] for row in ("dx", "dy", "dz") for by in "xy"])
+        assert np.abs(slopes - moves.direction.reshape(6, -1))[:, both].max() < 1e-5
+
+
+def test_the_position_of_the_film_is_within_the_error_that_is_told() -> None:
+    lens = lens_models.lens()
+    extras, (line,) = extras_of({}, 0.5, lambda focus_m: film_z_mm(lens, focus_m))
+    told = float(re.findall(r"within (\S+) um", line)[0])
+    focus = np.array([0.5, 0.61, 1.0, 3.0, 77.0, np.inf], np.float32)
+    found = extras.functions["film_z_mm"].evaluate({"focus_m": focus})["film_z_mm"]
+    exact = [film_z_mm(lens, float(f)) for f in focus]
+    assert 1e3 * np.abs(found - exact).max() <= 1.5 * told < 0.05
+    assert "film_z_mm" not in extras_of({}, np.inf, lambda focus_m: 1.0)[0].functions
+
+
+def test_the_exact_lens_as_a_function(tmp_path: Path) -> None:
+    """As C, of rays all over its domain: those of the tracer."""
+    header, shader = tmp_path / "a.h", tmp_path / "a.glsl"
+    assert main(["export", str(LENS), "--to", "c", "-o", str(header)]) == 0
+    assert main(["export", str(LENS), "--to", "glsl", "-o", str(shader)]) == 0
+    assert "const float LAIKIN_DOUBLE_GAUSS_50_PUPIL_Z_MM = (-17.27" in shader.read_text()
+    text = header.read_text()
+    domain = lens_models.domain()
+    s = sample_domain(domain, 500, 0)
+    columns = [c.float().numpy() for c in (s.film_x, s.film_y, s.pupil_x, s.pupil_y, s.wavelength_nm)]
+    rays = "\n".join(" ".join(f"{v:.9g}" for v in row) for row in zip(*columns, strict=True))
+    name = "laikin_double_gauss_50"
+    program = (
+        f'#include <stdio.h>\n#include "{header.name}"\nint main(void) {{ float a, b, c, d, w;\n'
+        f'while (scanf("%f %f %f %f %f", &a, &b, &c, &d, &w) == 5) {{\n'
+        f"const {name}_ray r = {name}(a, b, c, d, w, {name}_film_z_mm(2.0f), {name.upper()}_STOP_RADIUS_MAX_MM);\n"
+        f'printf("%.9g %.9g %.9g %.9g %.9g %d\\n", r.x_mm, r.y_mm, r.dx, r.dy, r.transmittance, r.status); }} }}\n'
+    )
+    assert "film_z_mm(focus_m): film plane of the paraxial focus" in text
+    found = np.array(run_compiled("c", program, tmp_path, rays).split(), np.float64).reshape(-1, 6).T
+    exact = ExactCamera(lens_models.lens(), film_mm=FILM, focus_m=2.0, bounds=domain.bounds)
+    exact._film_z_mm = film_z_mm(lens_models.lens(), 2.0)
+    wanted = exact._scene(np.stack(columns[:2]), np.stack(columns[2:4]), columns[4])
+    passed = wanted.status == st.PASSED
+    assert (found[5] == wanted.status).mean() > 0.998 and 50 < passed.sum() < 500
+    assert np.abs(found[:2] - wanted.scene_ray[:2])[:, passed].max() < 5e-4
+    assert np.abs(found[2:4] - wanted.scene_ray[3:5])[:, passed].max() < 5e-6
+    np.testing.assert_allclose(found[4][passed], wanted.transmittance[passed], rtol=1e-4)
+
+
+def run_compiled(language: str, source: str, folder: Path, given: str = "", *arguments: str) -> str:
+    """What a program prints; skipped where there is no compiler."""
+    compiler = shutil.which("c++" if language == "c++" else "cc")
+    if compiler is None:
+        pytest.skip("no compiler of C++ or C")
+    flags = ["-O1", "-Wall", "-Wextra", "-Werror", "-x", language, "-", "-o", str(folder / "a.out"), "-lm"]
+    done = subprocess.run([compiler, f"-I{folder}", *flags], input=source, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    command = [str(folder / "a.out"), *arguments]
+    return subprocess.run(command, input=given.encode(), capture_output=True, check=True).stdout.decode("latin-1")
+
+
+def test_an_integrator_in_c_plus_plus_sees_what_the_camera_sees(tmp_path: Path) -> None:
+    """Its picture of three spheres, pixel by pixel, against rays of the camera and the same spheres in numpy."""
+    file, width, height, samples = lens_models.exported("invariants"), 48, 32, 4
+    command = ["export", str(file), "--to", "c", "--camera", "--focus", str(FOCUS_M), "--name", "lens"]
+    assert main([*command, "-o", str(tmp_path / "lens_camera.h")]) == 0
+    source = (ROOT / "experiments" / "integrator.cpp").read_text()
+    printed = run_compiled("c++", source, tmp_path, "", str(width), str(samples)).encode("latin-1")
+    head = f"P6\n{width} {height}\n255\n".encode()
+    assert printed.startswith(head)
+    picture = np.frombuffer(printed[len(head) :], np.uint8).reshape(-1, 3).astype(int)
+    made = make_camera(file, Shot(FILM, FOCUS_M))
+    n = np.arange(width * height * samples)
+    a, b, u, v = ((0.5 + n * 1.1673039782614187**-k) % 1.0 for k in (1, 2, 3, 4))
+    pixel = n // samples
+    film = np.stack([0.5 - (pixel % width + a) / width, (pixel // width + b) / height - 0.5]) * np.array([FILM]).T
+    square = np.stack([u, v]).astype(np.float32)
+    wanted = np.empty((width * height, 3))
+    for channel, nm in enumerate((610.0, 550.0, 465.0)):
+        rays = made.sample(film.astype(np.float32), square, np.full(n.size, nm, np.float32))
+        seen = rays.weight * radiance(rays.origin_m, rays.direction, channel)
+        wanted[:, channel] = 255 * np.sqrt(seen.reshape(-1, samples).mean(1)).clip(0, 1)
+    difference = np.abs(picture - wanted)
+    assert (difference < 1.5).mean() > 0.995 and picture.std() > 20 and difference.mean() < 0.6
+
+
+def radiance(origin: NDArray[np.float32], direction: NDArray[np.float32], channel: int) -> NDArray[np.float64]:
+    """That of the spheres of experiments/integrator.cpp."""
+    text = (ROOT / "experiments" / "integrator.cpp").read_text()
+    rows = re.findall(r"^    \{\{(.*?)\}, (\S+)f, \{(.*?)\}\}", text, re.MULTILINE)
+    found, nearest = np.full(origin.shape[1], (0.35, 0.45, 0.6)[channel]), np.full(origin.shape[1], np.inf)
+    assert len(rows) == 3
+    for place, size, colour in rows:
+        centre, tint = ([float(t.strip(" f")) for t in part.split(",")] for part in (place, colour))
+        to, radius = origin - np.array(centre)[:, None], float(size)
+        along = (to * direction).sum(0)
+        d = along**2 - (to**2).sum(0) + radius**2
+        t = -along - np.sqrt(d.clip(0))
+        hit = (d > 0) & (t > 0) & (t < nearest)
+        normal = (to + t * direction) / radius
+        sun = (normal * np.array([[0.4], [0.7], [0.59]])).sum(0).clip(0)
+        found, nearest = np.where(hit, tint[channel] * (0.25 + 0.75 * sun), found), np.where(hit, t, nearest)
+    return found
+
+
+def test_states_of_a_zoom_are_chosen_when_a_camera_is_written(tmp_path: Path) -> None:
+    """A model of a whole zoom has no function of its own in C: its camera at a state has."""
+    zoom = ROOT / "models" / "nikon_zoom_80_200-range.states-64.onnx"
+    out = tmp_path / "zoom.h"
+    assert main(["export", str(zoom), "--to", "c", "--camera", "--zoom", "120", "-o", str(out)]) == 0
+    (efl,) = re.findall(r"_EFL_MM (\S+)f\n", out.read_text())
+    assert float(efl) == pytest.approx(120, rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--to", "onnx", "--camera"], "--to c or glsl"),
+        (["--to", "c", "--camera", "--fix", "focus=2"], "without --fix"),
+        (["--to", "c", "--derivatives"], "--to onnx"),
+        (["--to", "c", "--camera", "--zoom", "20"], "zoom"),
+        (["--to", "c", "--camera", "--name", "int"], "name"),
+    ],
+)
+def test_what_does_not_go_together(
+    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = lens_models.exported("invariants")
+    assert said in failure(capsys, "export", str(file), *words, "-o", str(tmp_path / "a.h"))
+    assert not (tmp_path / "a.h").exists()
+
+
+def test_the_outline_of_a_camera_in_glsl_is_a_texture(tmp_path: Path) -> None:
+    out = tmp_path / "a.glsl"
+    assert main(["export", str(lens_models.exported("invariants")), "--to", "glsl", "--camera", "-o", str(out)]) == 0
+    text = out.read_text()
+    wide, high = (int(n) for n in re.findall(r"texel, (\d+) wide, (\d+) high", text)[0])
+    table = np.fromfile(tmp_path / "a.glsl.outline.f32", "<f4").reshape(high, wide)
+    assert "in highp sampler2D outline" in text and np.isfinite(table).all() and table.std() > 0
