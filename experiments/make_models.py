@@ -301,25 +301,58 @@ def _make_of_one_state(entry: Entry, library: Library, out: Path, progress: Prog
                 made = fit_and_measure(prepared, settings, Path(scratch), _VIGNETTING_RAYS, report, fresh)
                 measured.append(made)
         measured = best_of_each_kind(measured) if entry.best else measured
-        candidates = exact_candidates(lens, domain, compiled=library.compile_exact and entry.promise)
-        candidates += [model_candidate(m.settings.label, load_model(m.file), domain.stop_radius_mm) for m in measured]
-        fused = (fused_candidate(f"{m.settings.label} fused", m.file, domain) for m in measured)
-        candidates += [c for c in fused if c is not None]
-        with progress.stage(f"{entry.state}: race") as report:
-            timed = race(candidates, domain, report=report)
-        rows = []
-        for m in measured:
-            row = _row(entry, lens, domain, m)
-            label, speedup = m.settings.label, timed.speedup(m.settings.label, "exact compiled")
-            row |= {
-                "ns_per_ray": timed.timing(label),
-                "fused_ns_per_ray": timed.timing(f"{label} fused"),
-                "exact_compiled_ns_per_ray": timed.timing("exact compiled"),
-                "speedup_over_compiled": speedup["min"] if speedup else None,
-                "promised_speedup": round(PROMISE * speedup["min"], 2) if speedup and entry.promise else None,
-            }
-            rows.append(_shipped(row, m.file, out))
-    return rows
+        files = {m.settings.label: m.file for m in measured}
+        times = _times(entry, library, lens, domain, files, progress)
+        rows = [_row(entry, lens, domain, m) | times[m.settings.label] for m in measured]
+        return [_shipped(row, m.file, out) for row, m in zip(rows, measured, strict=True)]
+
+
+def _times(
+    entry: Entry, library: Library, lens: Lens, domain: Domain, files: Mapping[str, Path], progress: Progress
+) -> dict[str, Row]:
+    """What the index says of the times of models, by their labels: one race with the exact tracer compiled."""
+    candidates = exact_candidates(lens, domain, compiled=library.compile_exact and entry.promise)
+    candidates += [model_candidate(label, load_model(file), domain.stop_radius_mm) for label, file in files.items()]
+    fused = (fused_candidate(f"{label} fused", file, domain) for label, file in files.items())
+    candidates += [c for c in fused if c is not None]
+    with progress.stage(f"{entry.state}: race") as report:
+        timed = race(candidates, domain, report=report)
+    found = {}
+    for label in files:
+        speedup = timed.speedup(label, "exact compiled")
+        found[label] = {
+            "ns_per_ray": timed.timing(label),
+            "fused_ns_per_ray": timed.timing(f"{label} fused"),
+            "exact_compiled_ns_per_ray": timed.timing("exact compiled"),
+            "speedup_over_compiled": speedup["min"] if speedup else None,
+            "promised_speedup": round(PROMISE * speedup["min"], 2) if speedup and entry.promise else None,
+        }
+    return found
+
+
+def time_models(library: Library, entries: Sequence[Entry], out: Path, progress: Progress) -> list[str]:
+    """Time the models that stand again, entry by entry, and write the index; zooms of many states keep their times.
+
+    Returns: entries that have no models of the present settings, as sentences.
+    """
+    missing = []
+    timed = [e for e in entries if not e.lens.many_states]
+    progress.plan({f"{e.state}: race": 20.0 for e in timed})
+    for entry in timed:
+        rows, left_out = _known(out)
+        if not _stands(entry, library.pairs, rows, out):
+            missing.append(f"{entry.state}: to be made first")
+            continue
+        mine = [row for row in rows if row["entry"] == entry.state]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NeurolensWarning)
+            lens = entry.lens.read()
+            files = {row["model"]: out / row["file"] for row in mine}
+            times = _times(entry, library, lens, entry.domain.of(lens), files, progress)
+        for row in mine:
+            row |= times[row["model"]]
+        write_index(_ordered(rows, library), left_out, out)
+    return missing
 
 
 def best_of_each_kind(measured: Sequence[Measured]) -> list[Measured]:
@@ -403,6 +436,7 @@ OPTIONS = (
     lab.option("lenses", metavar="LENS", nargs="*", help="entries whose name starts so (default: all)"),
     lab.option("--list", metavar="FILE", type=Path, default=_LIST, help="list (default: experiments/models.toml)"),
     lab.option("--again", action="store_true", help="make the chosen entries again"),
+    lab.option("--times", action="store_true", help="only time the models that are there (on a quiet machine)"),
     lab.out(lab.MODELS, "folder"),
 )
 
@@ -412,7 +446,11 @@ def run(args: argparse.Namespace) -> int:
     library = read_list(args.list)
     args.out.mkdir(parents=True, exist_ok=True)
     entries = chosen(library, args.lenses)
-    failed = make_models(library, entries, args.out, Progress(quiet=args.quiet), again=args.again)
+    progress = Progress(quiet=args.quiet)
+    if args.times:
+        failed = time_models(library, entries, args.out, progress)
+    else:
+        failed = make_models(library, entries, args.out, progress, again=args.again)
     print((args.out / "README.md").read_text(encoding="utf-8"))
     for line in failed:
         print(f"experiments: {line}", file=sys.stderr)

@@ -146,6 +146,11 @@ def test_an_entry_is_fitted_checked_and_timed(tmp_path: Path) -> None:
     assert only["ns_per_ray"]["min"] > 0 and only["lens_file"] == "lenses/cooke_triplet_50.toml"
     before = (tmp_path / "out" / "index.json").read_bytes()
     assert main(command) == 0 and (tmp_path / "out" / "index.json").read_bytes() == before
+    assert main([*command, "--times"]) == 0  # the same model, other times
+    (again,) = read_index(tmp_path / "out")
+    assert (
+        again["ns_per_ray"] != only["ns_per_ray"] and again["sha256"] == only["sha256"] and again.keys() == only.keys()
+    )
 
 
 @pytest.mark.parametrize(
