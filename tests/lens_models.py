@@ -20,6 +20,7 @@ from torch import Tensor
 from neurolens.base.errors import NeurolensWarning
 from neurolens.cameras.exact import ExactCamera
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
+from neurolens.optics import paraxial
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.surrogates.cores import Network
@@ -92,7 +93,9 @@ def gated(name: str) -> Prepared:
         lens, radius_mm = read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml"), None
     with warnings.catch_warnings():
         warnings.simplefilter("error", NeurolensWarning)  # every lost ray is told by a gate
-        domain = domain_of(lens, film_radius_mm=radius_mm, focus_m=(2.0, 2.0))
+        # One film plane: best focus of the outer zones of so strong elements is millimetres away.
+        film_z = paraxial.film_z_mm(lens, 2.0)
+        domain = domain_of(lens, film_radius_mm=radius_mm, focus_m=(2.0, 2.0), film_z_mm=(film_z, film_z))
         return prepare(make_pairs(lens, domain, PairSettings(train=5000, held_out=100, rim=5000)))
 
 
