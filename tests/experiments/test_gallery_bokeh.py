@@ -157,7 +157,7 @@ def test_the_masks_open_the_shares_that_the_text_gives() -> None:
 def test_an_anamorphic_lens_draws_upright_ovals() -> None:
     """Blur grows with the square of the focal length: four to one on film where the picture is squeezed two to one."""
     model = load_model(ROOT / "models" / f"{COOKE}.mlp-16x2.onnx")
-    taken = OnnxCamera(model, film_mm=(21.3, 17.8), focus_m=math.inf)
+    taken = OnnxCamera(model, film_mm=(21.3, 17.8), focus_m=math.inf, focus="paraxial")
     width, height = light_disc(taken, (0.0, 0.0, -2.0), count=4000).widths_mm
     squeeze = bokeh.squeeze_of(taken, 20.0)
     assert squeeze == pytest.approx(42.47 / 21.47, rel=0.01)
