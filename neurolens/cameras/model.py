@@ -14,18 +14,19 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
-from neurolens.cameras.cameragraph import UNIT_SLACK, weight_graph
+from neurolens.cameras.cameragraph import status_graph, weight_graph
 from neurolens.cameras.contract import RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
 from neurolens.cameras.lens_film import LensFilm, SceneRays, camera_rays
 from neurolens.cameras.lens_state import axial_transmittance, lens_state, squeeze_of
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
-from neurolens.cameras.onnxmaps import OnnxDerivatives, OnnxInverse, load_inverse
+from neurolens.cameras.onnxmaps import InverseRays, OnnxDerivatives, OnnxInverse, load_inverse
 from neurolens.cameras.onnxsession import joined, open_session, padded, run_session
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import pupil_graph
 from neurolens.cameras.pupil_search import outline_of
 from neurolens.cameras.sampling import arrived, check_film, positive
+from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.modelfile.states import STATE, state_for
@@ -161,7 +162,7 @@ class OnnxCamera:
         assert isinstance(scene, ModelScene)
         aim = front.aim(1e3 * point_m.astype(np.float64) + [[0], [0], [scene.film_z_mm]], pupil)
         out = inverse.from_scene(aim.position, aim.direction, wavelength_nm, scene.film_z_mm, scene.stop_radius_mm)
-        status = np.where(aim.status == st.PASSED, scene.stopped(out.status, out.stop_xy_mm), aim.status)
+        status = np.where(aim.status == st.PASSED, scene.status_of(out), aim.status)
         origin = 1e-3 * (aim.position - [[0], [0], [scene.film_z_mm]])
         squared = ((point_m - origin) ** 2).sum(0)
         with np.errstate(all="ignore"):
@@ -241,7 +242,7 @@ class OnnxFilm:
 
 @dataclass(frozen=True)
 class ModelScene:
-    """A model at one focus and stop. It knows a round stop; blades and masks are tested on its crossing."""
+    """A model at one focus and stop; it knows a round stop, `aperture` is the shape of another."""
 
     model: OnnxLens
     film_z_mm: float
@@ -250,18 +251,15 @@ class ModelScene:
 
     def __call__(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SceneRays:
         out = self.model.rays(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm)
-        status, ray = out.status, out.scene_ray
-        squared = np.einsum("in,in->n", ray[3:], ray[3:])
-        unit = np.abs(squared - 1) <= UNIT_SLACK  # false for NaN
-        status = np.where(unit | (status != st.PASSED), status, np.int32(st.OUTSIDE_DOMAIN))
-        return SceneRays(ray, out.transmittance, self.stopped(status, out.stop_xy_mm))
+        return SceneRays(out.scene_ray, out.transmittance, self.status_of(out))
 
-    def stopped(self, status: NDArray[np.int32], stop_xy_mm: FloatArray) -> NDArray[np.int32]:
-        """Status [N] with that of the stop's shape, where rays cross the stop at [2, N] mm."""
-        if self.aperture is None:
-            return status
-        inside = self.aperture.inside(stop_xy_mm[0], stop_xy_mm[1], self.stop_radius_mm)
-        return np.where(inside | (status != st.PASSED), status, np.int32(self.stop_status))
+    def status_of(self, rays: LensRays | InverseRays) -> NDArray[np.int32]:
+        """Status [N] of the model's rays with that of the stop's shape; see `status_graph`."""
+        given = {"scene_ray": rays.scene_ray, "lens_status": rays.status[None].astype(np.float32)}
+        if self.aperture is not None:
+            given |= {"stop_xy_mm": rays.stop_xy_mm, "stop_radius_mm": np.array([[self.stop_radius_mm]], np.float32)}
+            given |= {} if self.aperture.mask is None else {"mask": self.aperture.table}
+        return evaluate(status_graph(self.aperture, self.stop_status), given)["status"][0].astype(np.int32)
 
     @property
     def stop_status(self) -> int:
