@@ -98,11 +98,13 @@ def _disc(first: int, count: int, shift: float = 0.0) -> NDArray[np.float64]:
 
 def axis_irradiance(lens: Lens, wavelength_nm: float) -> float:
     """Irradiance at the film's centre from uniform surroundings of radiance 1, in sr: the integral of T cos."""
+    film_z = lens.film_z_mm
+    assert film_z is not None  # of a tracer's lens
 
     def share(sines: NDArray[np.float64]) -> NDArray[np.float64]:
         d = torch.from_numpy(np.stack([*sines, -np.sqrt(1 - (sines**2).sum(0))]))
         zero = torch.zeros_like(d[0])
-        rays = Rays(zero, zero, zero + lens.film_z_mm, *d)
+        rays = Rays(zero, zero, zero + film_z, *d)
         found = trace(lens, rays, wavelength_nm, transmittance=True)
         assert found.transmittance is not None
         return torch.where(found.status == 0, found.transmittance, 0.0).numpy()
