@@ -79,26 +79,23 @@ def spectrum_of(camera: Any, light_nm: tuple[float, float] = LIGHT_NM, only_nm: 
 
 
 def frame_of(camera: Any) -> Frame:
-    """The ideal camera of a lens, a model (by its card) or an ideal camera (by its rays close to the axis)."""
-    lens, card = getattr(camera, "lens", None), camera.settings.get("card")
-    if lens is not None:
+    """The ideal camera of any camera, by its first-order data; of models of lenses with cylinders, x by their rays."""
+    state, lens = camera.settings["lens_state"], getattr(camera, "lens", None)
+    y = state["pinhole_focal_length_mm"], state["entrance_pupil_offset_mm"]
+    if None in y:
+        return _measured(camera)
+    if state["squeeze"] == 1:
+        x = y
+    elif lens is not None:
         from neurolens.optics.paraxial import first_order
 
-        found = [first_order(lens, meridian=m) for m in ("x", "y")]
-        rows = [(d.efl_mm, d.rear_focal_z_mm, d.entrance_pupil_z_mm - d.front_focal_z_mm, d.entrance_pupil_z_mm)
-                for d in found]  # fmt: skip
-    elif card is not None and is_round(camera):
-        data = card["lens"]
-        efl, front, rear = (data[k] for k in ("efl_mm", "front_principal_z_mm", "rear_principal_z_mm"))
-        # The entrance pupil is the image of the exit pupil (Newton: x x' = -f^2).
-        pupil = -(efl**2) / (float(data["exit_pupil_z_mm"]) - rear - efl)
-        rows = [(efl, rear + efl, pupil, front - efl + pupil)] * 2
+        data, film = first_order(lens, meridian="x"), float(camera.settings["film_z_mm"])
+        focal, pupil = (data.front_focal_z_mm, data.rear_focal_z_mm), data.entrance_pupil_z_mm
+        x = film_plane.reach_mm(data.efl_mm, focal, pupil, film), film - pupil
     else:
-        return _measured(camera)
-    film = float(camera.settings["film_z_mm"])
-    # Film height over the slope of the paraxial chief ray; see `paraxial.chief_reach_mm`.
-    reach = [float(f + (film - focal) * pupil / f) for f, focal, pupil, _ in rows]
-    return Frame((reach[0], reach[1]), (film - float(rows[0][3]), film - float(rows[1][3])))
+        (reach, _), (pupil, _) = _measured(camera)
+        x = reach, pupil
+    return Frame((float(x[0]), float(y[0])), (float(x[1]), float(y[1])))
 
 
 def _measured(camera: Any) -> Frame:

@@ -72,7 +72,8 @@ def run_frames(args: argparse.Namespace, render: Callable[[argparse.Namespace], 
         out = args.out.with_name(f"{args.out.stem}.{number}{args.out.suffix}")
         if out.is_file() and not Files.of(out).checkpoint.exists() and not args.restart:
             continue
-        code = render(argparse.Namespace(**vars(args) | values | {"out": out, "seed": args.seed + frame}))
+        values |= {"out": out, "seed": args.seed + frame, "frame": frame}
+        code = render(argparse.Namespace(**vars(args) | values))
         if code:
             return code
     return 0
