@@ -266,7 +266,7 @@ class Bundle:
 
 def bundle(
     scene: Scene,
-    field_deg: Sequence[float],
+    field_deg: Sequence[float] | None,
     wavelength_nm: Sequence[float] = DEFAULT_NM,
     pattern: Pattern | None = None,
 ) -> Bundle:
@@ -274,12 +274,13 @@ def bundle(
 
     Args:
         scene: lens, object and meridional plane.
-        field_deg: angles of the chief ray of the first wavelength, from 0 to below 180.
+        field_deg: angles of the chief ray of the first wavelength, from 0 to below 180; None: `Scene.default_fields`.
         wavelength_nm: the first is the reference; all share the object point (or direction) of its chief ray.
         pattern: hexapolar with 8 rings where not given.
     """
     pattern = pattern or hexapolar(8)
-    fields, waves = tuple(float(f) for f in field_deg), tuple(float(w) for w in wavelength_nm)
+    fields = scene.default_fields() if field_deg is None else tuple(float(f) for f in field_deg)
+    waves = tuple(float(w) for w in wavelength_nm)
     shape = (len(fields), len(waves), len(pattern.weight))
     chief = scene.chief_rays(fields, waves[0])
     aim = Aim(scene, chief, shape, waves)

@@ -217,35 +217,26 @@ class Illumination(Result):
     cos4: Array
 
 
-def illumination(
-    scene: Scene, *, wavelength_nm: float = LINE_D_NM, fields: int = 21, n: int = 80, edge_deg: float | None = None
-) -> Illumination:
-    """Relative illumination up to the edge of the field, with n by n rays from each film point.
+def illumination(scene: Scene, *, fields: int = 21, n: int = 80) -> Illumination:
+    """Relative illumination at the d line up to the edge of the field, with n by n rays from each film point.
 
     Fields without a chief ray are NaN, and all are where the axis gets no light.
     """
-    angles = np.linspace(0, scene.edge_deg() if edge_deg is None else edge_deg, fields)
-    rays = bundle(scene.open, angles.tolist(), [wavelength_nm], hexapolar(6))
+    angles = np.linspace(0, scene.edge_deg(), fields)
+    rays = bundle(scene.open, angles.tolist(), [LINE_D_NM], hexapolar(6))
     film = on_plane(Rays(*(c[:, 0] for c in rays.film)), pupil_plane_z_mm(scene.lens))
     start, area = _grid(scene, rays.chief_height_mm, film, n)
     with torch.no_grad():
         light = area[:, None] * start.dz.reshape(fields, -1) ** 4
-        whole, seen = (_sum(light, lens, start, wavelength_nm) for lens in (scene.open.traced, scene.lens))
+        whole, seen = (_sum(light, lens, start) for lens in (scene.open.traced, scene.lens))
+    cos4 = np.where(angles < 90, np.cos(np.radians(angles)), 0.0) ** 4
     with np.errstate(divide="ignore", invalid="ignore"):  # dark fields, or an axis without light: NaN
         relative, unvignetted, passed = seen / (seen[0] or np.nan), whole / (whole[0] or np.nan), seen / whole
-    return Illumination(
-        wavelength_nm,
-        angles,
-        rays.chief_height_mm.numpy(),
-        relative,
-        unvignetted,
-        passed,
-        np.where(angles < 90, np.cos(np.radians(angles)), 0.0) ** 4,
-    )
+    return Illumination(LINE_D_NM, angles, rays.chief_height_mm.numpy(), relative, unvignetted, passed, cos4)
 
 
-def _sum(light: Tensor, lens: Lens, start: Rays, wavelength_nm: float) -> Array:
-    passed = (trace(lens, start, wavelength_nm).status == 0).reshape(light.shape)
+def _sum(light: Tensor, lens: Lens, start: Rays) -> Array:
+    passed = (trace(lens, start).status == 0).reshape(light.shape)
     found: Array = (light * passed).sum(1).where(torch.isfinite(light).all(1), torch.nan).numpy()
     return found
 

@@ -64,7 +64,7 @@ def spots(
     shift_mm: Sequence[float] | None = None,
 ) -> Spots:
     """Spot diagrams; the fields are those of `Scene.default_fields` and the shifts span the best foci if not given."""
-    rays = bundle(scene, scene.default_fields() if field_deg is None else field_deg, wavelength_nm, hexapolar(rings))
+    rays = bundle(scene, field_deg, wavelength_nm, hexapolar(rings))
     t, s = 1000 * rays.tangential_mm, 1000 * rays.sagittal_mm
     st, ss = rays.slopes
     moments = _Moments(rays)
@@ -166,7 +166,7 @@ def fans(
 ) -> Fans:
     """Ray fans of fields (`Scene.default_fields` if not given) with n points along each line of the stop."""
     pattern = fan(n)
-    rays = bundle(scene, scene.default_fields() if field_deg is None else field_deg, wavelength_nm, pattern)
+    rays = bundle(scene, field_deg, wavelength_nm, pattern)
     return Fans(
         np.array(rays.field_deg),
         np.array(rays.wavelength_nm),
@@ -215,7 +215,7 @@ def mtf(
     128 points an even disc of light comes within 0.001 of its Bessel function, and fields that lose up to two thirds
     of their light to the rims within 0.01 of a grid of 300 points, 0.0025 up to 50 cycles/mm.
     """
-    rays = bundle(scene, scene.default_fields() if field_deg is None else field_deg, wavelength_nm, grid(across))
+    rays = bundle(scene, field_deg, wavelength_nm, grid(across))
     f = np.linspace(0, 100, 101) if frequency_per_mm is None else np.asarray(frequency_per_mm, dtype=np.float64)
     n = working_f_number(scene, wavelength_nm[0])
     weight = (rays.weight / rays.weight.sum((1, 2), keepdim=True)).flatten(1)
