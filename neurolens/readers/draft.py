@@ -100,21 +100,22 @@ class State:
     film_given: bool = True
 
 
-@dataclass(frozen=True)
+@dataclass
 class Draft:
-    """All data found by a reader. Lengths in the file's unit.
+    """All data found by a reader; readers of text files fill it line by line. Lengths in the file's unit.
 
     Attributes:
         kind: name of the format, for the source line.
+        notes: lines of text.
         pupil, f_number: if given, they size the stop; else its diameter does.
         unit: "mm", "cm", "in", "m", or None if unknown.
     """
 
     file: str
     kind: str
-    rows: tuple[Row, ...]
+    rows: tuple[Row, ...] = ()
     name: str = ""
-    notes: str = ""
+    notes: list[str] = field(default_factory=list)
     states: tuple[State, ...] = ()
     pupil: float | None = None
     f_number: float | None = None
@@ -146,7 +147,7 @@ def lens_of(draft: Draft, given: Given | None = None) -> Lens:
         f_number=f_number,
         image_radius_mm=draft.image_radius,
         half_field_deg=given.half_field_deg or draft.half_field_deg,
-        notes=draft.notes,
+        notes="\n".join(draft.notes),
         rims=draft.rims,
         path=draft.file,
     )
