@@ -91,15 +91,11 @@ CONFIGURATION_KEYS = (
 
 @dataclass(frozen=True)
 class Table:
-    """One table of a file, read strictly.
-
-    Attributes:
-        where: goes in front of the key in errors, with its separator: "surface 3, ".
-    """
+    """One table of a file, read strictly."""
 
     data: Mapping[str, Any]
     file: str
-    where: str = ""
+    where: str = ""  # goes in front of the key in errors, with its separator: "surface 3, "
 
     def __contains__(self, key: str) -> bool:
         return key in self.data

@@ -35,19 +35,13 @@ Steps = Sequence[tuple[int, Action]]
 
 
 class Followed(NamedTuple):
-    """What following a sequence gives.
+    """What following a sequence gives."""
 
-    Attributes:
-        rays: point on the last surface and unit direction after it, lens frame, mm; along the axis for lost rays.
-        status: [N] int32 as in `trace`: the surface and the reason that ended a ray first.
-        power: [N], product over the steps of the unpolarised share that is transmitted or reflected, and absorption.
-        points: x, y, z of the meeting points of every step, lens frame, mm.
-    """
-
-    rays: Rays
-    status: Tensor
+    rays: Rays  # point on the last surface and unit direction after it, lens frame, mm; along the axis for lost rays
+    status: Tensor  # [N] int32 as in `trace`: the surface and the reason that ended a ray first
+    # [N], product over the steps of the unpolarised share that is transmitted or reflected, and absorption.
     power: Tensor
-    points: tuple[tuple[Tensor, Tensor, Tensor], ...]
+    points: tuple[tuple[Tensor, Tensor, Tensor], ...]  # x, y, z of the meeting points of every step, lens frame, mm
 
 
 def ghost(count: int, first: int, second: int) -> list[tuple[int, Action]]:
