@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensfile import MAX_SURFACES
+from neurolens.optics.lensfile import MAX_SURFACES, check_states
 from neurolens.optics.prescription import Configuration, Lens, Surface
-from neurolens.readers.assemble import UNKNOWN, check_states, finish, first_order, smaller_stop, with_rims
+from neurolens.readers.assemble import UNKNOWN, finish, first_order, smaller_stop, with_rims
 from neurolens.readers.source import UNITS_MM, Line, warn
 
 
