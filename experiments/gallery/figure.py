@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-import math
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from PIL import Image as Pictures
 
+from experiments import lab
 from experiments.gallery.cameras import TITLES, luminance
 from neurolens.analysis.plot_style import new_figure, style
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path
+from neurolens.evaluate.figures import rounded_up
 from neurolens.evaluate.image import Image, to_srgb
 
 DPI = 100  # a picture of 240 pixels is 2.4 inches wide: one pixel of it, one of the figure
@@ -63,7 +64,7 @@ def draw(title: str, rows: Sequence[Row], path: Path) -> None:
     if not rows:
         raise InputError("gallery figure", "rows", "(none)", "at least one panel")
     maps = [row.difference for row in rows if row.difference is not None]
-    scale = _rounded_up(max((float(np.percentile(m, 99.5)) for m in maps), default=0.0))
+    scale = rounded_up(max((float(np.percentile(m, 99.5)) for m in maps), default=1e-6))
     with style():
         figure, boxes, bar = _page(rows, bool(maps))
         figure.text(0.006, 1 - 0.08 / figure.get_figheight(), title, fontsize=12.5, fontweight="bold", va="top")
@@ -128,12 +129,6 @@ def _page(rows: Sequence[Row], maps: bool) -> tuple[Any, list[list[Any]], Any]:
     return figure, boxes, box(page[0] - _BAR + 0.08, _HEAD, 0.13, min(max(heights[0], 1.4), 2.6))
 
 
-def _rounded_up(value: float) -> float:
-    """1, 2 or 5 times a power of ten; 1e-6 where nothing differs."""
-    power = 10.0 ** math.floor(math.log10(max(value, 1e-6)))
-    return next(step * power for step in (1, 2, 5, 10) if step * power >= max(value, 1e-6) * (1 - 1e-9))
-
-
 def _scale_colours() -> list[int]:
     """R, G, B of the scale of the difference and of white, one after the other."""
     from matplotlib import colormaps
@@ -147,15 +142,8 @@ def _save_small(figure: Any, path: Path) -> None:
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=DPI, facecolor="white", format="png")
     picture = Pictures.open(drawn).convert("RGB")
-    for colours in (None, 256, 128, 64, 48, 32):
-        packed = io.BytesIO()
-        (picture if colours is None else _reduced(picture, colours)).save(packed, "PNG", optimize=True)
-        if packed.tell() <= MOST_BYTES:
-            with atomic_path(path) as temporary:
-                temporary.write_bytes(packed.getvalue())
-            return
-    size = f"{packed.tell()} bytes at 32 colours"
-    raise InputError(path, "size", f"({size})", f"at most {MOST_BYTES} bytes: smaller or fewer pictures")
+    fewer = (_reduced(picture, colours) for colours in (256, 128, 64, 48, 32))
+    lab.write_small_png(path, itertools.chain([picture], fewer), MOST_BYTES)
 
 
 def _reduced(picture: Any, colours: int) -> Any:

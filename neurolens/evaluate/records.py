@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import json
 import math
+import platform
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypedDict, TypeVar
 
@@ -17,6 +20,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 
 SCHEMA_VERSION = 1
+_PACKAGES = ("neurolens", "torch", "numpy", "onnxruntime", "onnx", "OpenEXR")
 R = TypeVar("R", bound=Mapping[str, Any])
 CLOSE_UM = 2.0  # a model within this RMS error counts as close: a quarter of a pixel of 36 mm at 4000 across
 
@@ -59,7 +63,7 @@ class Results:
             ns_per_ray of the camera alone, samples, width and height in pixels, threads.
         images: name, scene, camera, file_png and file_exr relative to the run folder, samples; except of the exact
             lens, `image.ImageErrors`.
-        image_settings: of `image.ImageSettings`.
+        image_settings: `image.SETTINGS`.
         domain_gain: what a domain taken from the scene gains: scene, text, and rows, for the whole lens and for the
             scene: such models with domain (its name) and `scenes.domain_facts`.
         figures: file, relative to the run folder, title, caption; wide where it goes across the page.
@@ -84,6 +88,15 @@ class Results:
     started: str = ""
     wall_s: float | None = None
     warnings: Sequence[str] = ()
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that a result depends on."""
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 def write_results(path: str | Path, results: Results) -> None:
