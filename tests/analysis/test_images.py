@@ -11,7 +11,7 @@ import pytest
 import torch
 from analysis_lenses import cartesian, library, slower, thin
 
-from neurolens.analysis.bundles import bundle, grid
+from neurolens.analysis.bundles import bundle, grid, hexapolar
 from neurolens.analysis.field_curves import distortion, illumination
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import layout_profile
