@@ -16,7 +16,7 @@ from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text, fingerprint_of, sha256_of
 from neurolens.base.progress import Progress, Report
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.candidates import EXACT, exact_candidates, exact_records, fused_candidate, model_candidate
+from neurolens.evaluate.candidates import EXACT, exact_candidates, exact_records, model_candidates
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
 from neurolens.evaluate.measure import FreshRays, measure, onnx_predictor, seconds_to_load, shared_rays
 from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
@@ -292,11 +292,7 @@ def _race(bench: Bench, files: Mapping[str, Path], report: Report) -> Race:
     """Race exported models, by name, and the exact tracer; "NAME fused" where a C compiler makes one."""
     s, domain = bench.settings, bench.domain
     candidates = exact_candidates(bench.lens.with_stop_radius(domain.stop_radius_mm), domain, compiled=s.compile_exact)
-    for name, file in files.items():
-        candidates.append(model_candidate(name, load_model(file), domain.stop_radius_mm))
-        fused = fused_candidate(f"{name} fused", file, domain) if s.threads == 1 else None
-        if fused is not None:
-            candidates.append(fused)
+    candidates += model_candidates(files, domain, s.threads)
     return race(candidates, domain, rounds=s.rounds, threads=s.threads, report=report)
 
 
