@@ -25,7 +25,7 @@ from experiments.promises import read_index
 from neurolens import __version__
 from neurolens.base.config import read_config
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of, sha256_of
+from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of, sha256_of, write_json
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import exact_candidates, model_candidate, model_candidates
@@ -177,7 +177,7 @@ _COLUMNS = lab.columns(
 def write_index(rows: Sequence[Row], left_out: Mapping[str, str], out: Path) -> None:
     """Write both; `left_out` gives the reason for each entry that has no models."""
     index = {"schema": 2, "command": "python -m experiments models", "versions": versions()}
-    lab.write_json(out / "index.json", index | {"models": list(rows), "left_out": dict(left_out)})
+    write_json(out / "index.json", index | {"models": list(rows), "left_out": dict(left_out)})
     reasons = "\n".join(f"- {state}: {reason}" for state, reason in left_out.items())
     parts = ["Not made:", reasons] if left_out else []
     atomic_write_text(out / "README.md", lab.page(_HEAD, lab.table(_COLUMNS, rows, "–"), *parts))

@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.base.files import atomic_write_text, fingerprint_of, sha256_of
+from neurolens.base.files import fingerprint_of, sha256_of, write_json
 from neurolens.base.progress import Progress, Report
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import EXACT, exact_candidates, exact_records, model_candidates
@@ -214,7 +214,7 @@ def _record(bench: Bench, row: Row, again: bool, report: Report) -> dict[str, An
         mark = mark if isinstance(error, NeurolensError) else ""
         made = {"failed": _reason(error)}
     record = plain({"fingerprint": mark, **head, "settings": asdict(row.settings), **made})
-    _write(file, record)
+    write_json(file, record)
     return record
 
 
@@ -270,7 +270,7 @@ def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]],
     for i, (row, record) in enumerate(zip(rows, records, strict=True)):
         if row.name in files:
             records[i] = plain({**record, **_times_of(record, timed), "race": mark})
-            _write(bench.record_file(row), records[i])
+            write_json(bench.record_file(row), records[i])
 
 
 def _known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
@@ -281,11 +281,6 @@ def _known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
     except (OSError, ValueError, RecursionError):
         return None
     return record if good and record.get("fingerprint") == fingerprint else None
-
-
-def _write(file: Path, record: dict[str, Any]) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(file, json.dumps(record, indent=1, allow_nan=False) + "\n")
 
 
 def _race(bench: Bench, files: Mapping[str, Path], report: Report) -> Race:
