@@ -111,11 +111,6 @@ def test_an_arc_lies_on_its_sphere_up_to_the_rim(radius: float, h: float) -> Non
         assert points[:, 0] == pytest.approx(3.0)
 
 
-def test_an_element_reaches_out_to_its_wider_rim() -> None:
-    outline = layout.element_outline(*biconvex().surfaces[:2])
-    assert np.abs(outline[:, 1]).max() == 12.0 and outline[:, 0].min() == 0.0 and outline[:, 0].max() == 6.0
-
-
 @pytest.mark.parametrize("semi_diameter_mm", [0.0, -1.0, math.inf, math.nan])
 def test_a_surface_without_extent_is_refused(semi_diameter_mm: float) -> None:
     with pytest.raises(InputError, match="surface 0, semi_diameter_mm"):
