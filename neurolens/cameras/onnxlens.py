@@ -191,11 +191,11 @@ def ray_columns(
     Raises:
         InputError: other shapes; more than `MAX_RAYS`.
     """
-    arrays: list[NDArray[Any]]
     try:
-        *arrays, wavelength = [np.asarray(v, dtype) for v in (*points.values(), wavelength_nm)]
+        given: list[NDArray[Any]] = [np.asarray(v, dtype) for v in (*points.values(), wavelength_nm)]
     except (ValueError, TypeError) as error:
         raise InputError(where, f"{', '.join(points)}, wavelength_nm", "(no arrays)", "arrays of numbers") from error
+    *arrays, wavelength = given
     count = arrays[0].shape[1] if arrays[0].ndim == 2 else MAX_RAYS
     for name, array in zip(points, arrays, strict=True):
         if array.shape != (rows, count) or count > MAX_RAYS:
