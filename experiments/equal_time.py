@@ -36,7 +36,7 @@ from neurolens.cameras.build import FUSED, Shot, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera, FusedExactCamera
 from neurolens.cameras.onnxlens import load_model
-from neurolens.evaluate.image import DEFAULT, flip, flip_map
+from neurolens.evaluate.image import EPS, flip, flip_map
 from neurolens.evaluate.records import plain
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
@@ -160,7 +160,7 @@ def _strings(value: Any) -> list[str]:
 
 SCENES = ("grid", "lights", "room")
 # Weight of a squared error: that of the RMSE, and of the relative MSE.
-MEASURES: dict[str, float | None] = {"mse": None, "rel_mse": DEFAULT.eps}
+MEASURES: dict[str, float | None] = {"mse": None, "rel_mse": EPS}
 _PASS_SEED, _SHORT_SEED, _REFERENCE_SEED = 100, 1000, 1_000_000
 
 

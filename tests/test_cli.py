@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import math
 import os
@@ -11,7 +10,6 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from command_line import described, failure, run_json
@@ -240,19 +238,6 @@ def test_render_shapes_the_stop_by_the_command_line_over_the_scene(
     assert shaped["camera"]["aperture"] == {"blades": 5, "rotation_deg": 0.0, "curvature": 0.5}
 
 
-def test_render_repeats_with_its_seed_and_takes_one_side_of_the_picture(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def shot(seed: int, name: str) -> Any:
-        args = ("render", scene, "--camera", "thin", "--width", 16, "--seed", seed, "-o", tmp_path / name, "--quiet")
-        assert run_json(capsys, *args, "--threads", 1)["height"] == 9
-        return read_exr(tmp_path / name)[0]
-
-    first = shot(3, "a.exr")
-    assert (first == shot(3, "b.exr")).all()
-    assert not (first == shot(4, "c.exr")).all()
-
-
 def test_a_width_alone_is_enough(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Of 36 x 24 mm, 16 pixels across and 11 down are 3% off, and none are nearer."""
     common = ("render", scene, "--camera", "thin", "--film", "36x24", "--samples", 1, "--quiet")
@@ -327,18 +312,6 @@ def test_an_interrupt_while_the_packages_are_read_is_one_line(begin: str) -> Non
     found = python(code, "lens", "--help")
     assert (found.returncode, found.stdout) == (130, "")
     assert found.stderr.strip() == "neurolens: interrupted; nothing was done"
-
-
-def test_a_full_disk_is_one_line(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr("neurolens.render.pictures.write_exr", full)
-    line = failure(capsys, "render", scene, "--camera", "thin", "-o", tmp_path / "a.exr", "--quiet")
-    kept = f"the render is kept: the same command resumes from {tmp_path / 'a.exr'}.part"
-    assert line == f"neurolens: No space left on device; {kept}"
 
 
 def python(code: str, *args: object) -> subprocess.CompletedProcess[str]:

@@ -1,4 +1,4 @@
-"""What the project says of itself in several files agrees."""
+"""What the project says of itself in several files agrees; the Python examples of its pages run."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 import tomllib
 from pathlib import Path
 
+import pytest
 from packaging.requirements import Requirement
 
 import neurolens
@@ -34,3 +35,17 @@ def test_licence_citation_and_changes_are_there_and_name_this_version() -> None:
     assert f"\nversion: {neurolens.__version__}\n" in citation and "\nlicense: MIT\n" in citation
     assert f"\n## {neurolens.__version__}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert (ROOT / "neurolens" / "py.typed").exists()
+
+
+EXAMPLES = [
+    pytest.param(code, id=f"{page}-{k}")
+    for page in ("README.md", "neurolens/README.md")
+    for k, code in enumerate(re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.S))
+]
+
+
+@pytest.mark.parametrize("code", EXAMPLES)
+def test_examples_run(code: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(ROOT)
+    exec(compile(code, "example", "exec"), {})  # noqa: S102 - our own pages
+    assert capsys.readouterr().out

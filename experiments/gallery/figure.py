@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from experiments.gallery.cameras import TITLES, luminance
 from neurolens.analysis.plot_style import new_figure, style
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
+from neurolens.evaluate.figures import rounded_up
 from neurolens.evaluate.image import Image, to_srgb
 
 DPI = 100  # a picture of 240 pixels is 2.4 inches wide: one pixel of it, one of the figure
@@ -63,7 +63,7 @@ def draw(title: str, rows: Sequence[Row], path: Path) -> None:
     if not rows:
         raise InputError("gallery figure", "rows", "(none)", "at least one panel")
     maps = [row.difference for row in rows if row.difference is not None]
-    scale = _rounded_up(max((float(np.percentile(m, 99.5)) for m in maps), default=0.0))
+    scale = rounded_up(max((float(np.percentile(m, 99.5)) for m in maps), default=1e-6))
     with style():
         figure, boxes, bar = _page(rows, bool(maps))
         figure.text(0.006, 1 - 0.08 / figure.get_figheight(), title, fontsize=12.5, fontweight="bold", va="top")
@@ -126,12 +126,6 @@ def _page(rows: Sequence[Row], maps: bool) -> tuple[Any, list[list[Any]], Any]:
         boxes.append([box(_LEFT + k * (wide + _GAP), top, across / DPI, tall) for k in range(columns)])
         top += tall + _FOOT + _LABEL
     return figure, boxes, box(page[0] - _BAR + 0.08, _HEAD, 0.13, min(max(heights[0], 1.4), 2.6))
-
-
-def _rounded_up(value: float) -> float:
-    """1, 2 or 5 times a power of ten; 1e-6 where nothing differs."""
-    power = 10.0 ** math.floor(math.log10(max(value, 1e-6)))
-    return next(step * power for step in (1, 2, 5, 10) if step * power >= max(value, 1e-6) * (1 - 1e-9))
 
 
 def _scale_colours() -> list[int]:

@@ -59,6 +59,28 @@ def camera_graph(
 
 
 @lru_cache(maxsize=16)
+def status_graph(aperture: Aperture | None = None, stopped: int = 0) -> Graph:
+    """What is left of a lens's status 0 (PASSED): rays of unit direction through the stop's shape.
+
+    Args:
+        aperture: shape of the stop's opening, tested on the crossing `stop_xy_mm`; None: the round one of the lens.
+        stopped: status of rays that the shape stops.
+
+    Inputs: `scene_ray` [6], `lens_status`; for an aperture `stop_xy_mm` [2], of the call `stop_radius_mm`, of a mask
+    the table `mask`. Output: `status`.
+    """
+    g = Graph()
+    ray, status = g.input("scene_ray", 6), g.input("lens_status")
+    if aperture is not None:
+        opened = aperture.opening(g, g.input("stop_xy_mm", 2), g.input("stop_radius_mm", per_call=True))
+        shut = g.select(status <= float(st.PASSED), float(stopped), status)
+        status = g.select(opened, status, shut)
+    unit = g.square(ray[3:]).between(1 - UNIT_SLACK, 1 + UNIT_SLACK)
+    g.outputs["status"] = g.select(unit, status, status.maximum(float(st.OUTSIDE_DOMAIN)))
+    return g
+
+
+@lru_cache(maxsize=16)
 def weight_graph(derivatives: tuple[str, ...] = (), aperture: Aperture | None = None, stopped: int = 0) -> Graph:
     """Weighted rays in the camera's frame, of rays of a lens.
 
@@ -67,8 +89,7 @@ def weight_graph(derivatives: tuple[str, ...] = (), aperture: Aperture | None = 
 
     Args:
         derivatives: names of derivatives of `scene_ray`, inputs and outputs, too.
-        aperture: shape of the stop's opening, tested on the crossing `stop_xy_mm`; None: the round one of the lens.
-        stopped: status of rays that the shape stops.
+        aperture, stopped: see `status_graph`.
 
     Inputs: `film_mm`, `pupil_mm` [2], `area_mm2`, `scene_ray` [6] (mm, lens frame), `transmittance`, `lens_status`, and
     derivatives [6] of the ray; of the call `film_z_mm`, `per_distance` (1 / Z), `scale` (1 / (Z^2 exposure)).
@@ -78,19 +99,15 @@ def weight_graph(derivatives: tuple[str, ...] = (), aperture: Aperture | None = 
     film, pupil, area, ray = g.input("film_mm", 2), g.input("pupil_mm", 2), g.input("area_mm2"), g.input("scene_ray", 6)
     through, status = g.input("transmittance"), g.input("lens_status")
     per_distance, scale, film_z = (g.input(name, per_call=True) for name in ("per_distance", "scale", "film_z_mm"))
-    unit = g.square(ray[3:]).between(1 - UNIT_SLACK, 1 + UNIT_SLACK)
-    if aperture is not None:
-        opened = aperture.opening(g, g.input("stop_xy_mm", 2), g.input("stop_radius_mm", per_call=True))
-        shut = g.select(status <= float(st.PASSED), float(stopped), status)
-        status = g.select(opened, status, shut)
-    lit, outside = g.constant(_NO_AREA) <= area, float(st.OUTSIDE_DOMAIN)
-    passed = (status <= float(st.PASSED)) & unit & lit
+    status = g.inline(status_graph(aperture, stopped), {"scene_ray": ray, "lens_status": status})["status"]
+    lit = g.constant(_NO_AREA) <= area
+    passed = (status <= float(st.PASSED)) & lit
     cos2 = 1.0 / (1.0 + g.square((pupil - film) * per_distance))
     weight = through.maximum(0.0) * area * cos2 * cos2 * scale
     place = g.concat(g.constant([0.0, 0.0]), film_z * -1e-3, g.constant([0.0, 0.0, 0.0]))
     g.outputs["ray"] = ray * _METRES + place
     g.outputs["weight"] = g.select(passed, weight, 0.0)
-    g.outputs["status"] = g.select(passed, float(st.PASSED), g.select(lit, status, outside).maximum(outside)).whole()
+    g.outputs["status"] = g.select(lit, status, float(st.OUTSIDE_DOMAIN)).whole()
     for name in derivatives:
         g.outputs[name] = g.input(name, 6) * _METRES
     return g

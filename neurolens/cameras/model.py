@@ -14,17 +14,19 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
-from neurolens.cameras.cameragraph import UNIT_SLACK, weight_graph
+from neurolens.cameras.cameragraph import status_graph, weight_graph
 from neurolens.cameras.contract import RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
 from neurolens.cameras.lens_film import LensFilm, SceneRays, camera_rays
+from neurolens.cameras.lens_state import axial_transmittance, lens_state, squeeze_of
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
-from neurolens.cameras.onnxmaps import OnnxDerivatives, OnnxInverse, load_inverse
+from neurolens.cameras.onnxmaps import InverseRays, OnnxDerivatives, OnnxInverse, load_inverse
 from neurolens.cameras.onnxsession import joined, open_session, padded, run_session
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import pupil_graph
 from neurolens.cameras.pupil_search import outline_of
 from neurolens.cameras.sampling import arrived, check_film, positive
+from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.modelfile.states import STATE, state_for
@@ -123,6 +125,7 @@ class OnnxCamera:
             "state": dict(zip((a.name for a in model.axes), model.state, strict=True)),
             "card": {k: v for k, v in card.items() if k not in _NOT_KEPT},
         }
+        self.settings["lens_state"] = _state_of(scene, used, self.settings["f_number"])
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
@@ -159,7 +162,7 @@ class OnnxCamera:
         assert isinstance(scene, ModelScene)
         aim = front.aim(1e3 * point_m.astype(np.float64) + [[0], [0], [scene.film_z_mm]], pupil)
         out = inverse.from_scene(aim.position, aim.direction, wavelength_nm, scene.film_z_mm, scene.stop_radius_mm)
-        status = np.where(aim.status == st.PASSED, scene.stopped(out.status, out.stop_xy_mm), aim.status)
+        status = np.where(aim.status == st.PASSED, scene.status_of(out), aim.status)
         origin = 1e-3 * (aim.position - [[0], [0], [scene.film_z_mm]])
         squared = ((point_m - origin) ** 2).sum(0)
         with np.errstate(all="ignore"):
@@ -239,7 +242,7 @@ class OnnxFilm:
 
 @dataclass(frozen=True)
 class ModelScene:
-    """A model at one focus and stop. It knows a round stop; blades and masks are tested on its crossing."""
+    """A model at one focus and stop; it knows a round stop, `aperture` is the shape of another."""
 
     model: OnnxLens
     film_z_mm: float
@@ -248,18 +251,15 @@ class ModelScene:
 
     def __call__(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SceneRays:
         out = self.model.rays(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm)
-        status, ray = out.status, out.scene_ray
-        squared = np.einsum("in,in->n", ray[3:], ray[3:])
-        unit = np.abs(squared - 1) <= UNIT_SLACK  # false for NaN
-        status = np.where(unit | (status != st.PASSED), status, np.int32(st.OUTSIDE_DOMAIN))
-        return SceneRays(ray, out.transmittance, self.stopped(status, out.stop_xy_mm))
+        return SceneRays(out.scene_ray, out.transmittance, self.status_of(out))
 
-    def stopped(self, status: NDArray[np.int32], stop_xy_mm: FloatArray) -> NDArray[np.int32]:
-        """Status [N] with that of the stop's shape, where rays cross the stop at [2, N] mm."""
-        if self.aperture is None:
-            return status
-        inside = self.aperture.inside(stop_xy_mm[0], stop_xy_mm[1], self.stop_radius_mm)
-        return np.where(inside | (status != st.PASSED), status, np.int32(self.stop_status))
+    def status_of(self, rays: LensRays | InverseRays) -> NDArray[np.int32]:
+        """Status [N] of the model's rays with that of the stop's shape; see `status_graph`."""
+        given = {"scene_ray": rays.scene_ray, "lens_status": rays.status[None].astype(np.float32)}
+        if self.aperture is not None:
+            given |= {"stop_xy_mm": rays.stop_xy_mm, "stop_radius_mm": np.array([[self.stop_radius_mm]], np.float32)}
+            given |= {} if self.aperture.mask is None else {"mask": self.aperture.table}
+        return evaluate(status_graph(self.aperture, self.stop_status), given)["status"][0].astype(np.int32)
 
     @property
     def stop_status(self) -> int:
@@ -282,6 +282,7 @@ _RINGS, _SPOKES = 192, 24  # rays of the best focus; many rings, since the stop'
 _WIDER = 1.3  # their disc over the axial pupil at the stop in use
 _STEPS = 4  # towards the film points from which rays go to the object
 _SHIFT = 1e-3  # of the film radius, for differences
+_SQUEEZED = 0.05  # of the film radius: height of the rays that tell a squeeze
 _BLUR_MM = 0.002  # growth of a spot that is worth a warning
 
 
@@ -368,6 +369,26 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
         best = scene.film_z_mm - float(along / across)
         film = np.where(np.isfinite(film), film, 0.0)
     return _Spot(best, (film.astype(np.float32), pupil.astype(np.float32), nanometres), moments, passed)
+
+
+def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: float) -> dict[str, Any]:
+    """The table `lens_state` of the settings, by the first-order data of the card."""
+    model, film_z = scene.model, scene.film_z_mm
+    lens, radius = model.card["lens"], model.card["domain"]["film_radius_mm"]
+    efl = lens["efl_mm"]
+    focal_points = lens["front_principal_z_mm"] - efl, lens["rear_principal_z_mm"] + efl
+    exit_z = float(lens.get("exit_pupil_z_mm", math.nan))
+    entrance = film_plane.entrance_pupil_z_mm(efl, focal_points, exit_z)
+    breathes = any(a.name == "focus" for a in model.axes)
+    return lens_state(
+        nominal_mm=None if breathes else efl,
+        efl_mm=efl,
+        pinhole_mm=film_plane.reach_mm(efl, focal_points, entrance, film_z),
+        entrance_pupil_mm=film_z - entrance,
+        f_number=f_number,
+        transmittance=axial_transmittance(scene, wavelength_nm),
+        squeeze=squeeze_of(scene, _SQUEEZED * radius, wavelength_nm),
+    )
 
 
 def _axial_pupil(domain: dict[str, Any], stop_radius_mm: float) -> FloatArray:

@@ -11,15 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from neurolens.analysis.layout import Layout, draw_section
-from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing, new_figure, plain_log_ticks, save, style
+from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing, plain_log_ticks
 from neurolens.base.errors import InputError
 from neurolens.evaluate.image import ImageErrors, checked_image, to_srgb
 from neurolens.evaluate.vignetting import Illumination
 from neurolens.optics.focusing import Breath, breathing, field_change, focus_states, nearest_focus_m
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
-
-_Box = tuple[float, float, float, float]  # left, bottom, width, height in shares of the figure
 
 _COLUMNS = 4  # with more, each picture would be too small
 
@@ -29,46 +27,43 @@ def side_by_side(
     error_maps: Mapping[str, ArrayLike],
     path: str | Path,
     captions: Mapping[str, str] | None = None,
-    exposure: float = 1.0,
-    error_label: str = "FLIP (0 to 1)",
-    error_max: float | None = None,
     title: str = "",
 ) -> Path:
-    """Renders in rows of four, each with its error image below; one colour bar serves all of them.
+    """Renders in rows of four, each with its FLIP error image below; one colour bar serves all of them.
 
     Args:
-        images: name to linear RGB [H, W, 3], shown with `exposure` through `image.to_srgb`; all of one shape.
+        images: name to linear RGB [H, W, 3], shown through `image.to_srgb`; all of one shape.
         error_maps: name to error [H, W]; a name without one (the reference) keeps its place below for its caption.
+            The scale ends at the 99.5th percentile of all (not the maximum: fireflies), rounded up.
         path: PNG, PDF or SVG to write.
         captions: name to one or two lines shown below its picture, for example `image_caption(...)`.
-        error_label: quantity and unit beside the colour bar.
-        error_max: top of the colour scale; by default the 99.5th percentile of all maps, rounded up.
     Raises:
         InputError: no image, shapes that differ, values that are not finite, a map without its image.
     """
     pictures = {name: checked_image(image, name) for name, image in images.items()}
     maps = {name: np.asarray(error, dtype=np.float64) for name, error in error_maps.items()}
     _check_shapes(pictures, maps)
-    scale = error_max or _rounded_up(maps)
+    scale = rounded_up(np.percentile(np.concatenate([m.ravel() for m in maps.values()]), 99.5)) if maps else 1.0
     height, width = next(iter(pictures.values())).shape[:2]
-    with style():
-        figure, places, bar_place = _page(len(pictures), height / width, bool(maps), title)
-        shown = None
-        for (name, picture), (top, below) in zip(pictures.items(), places, strict=True):
-            axes = figure.add_axes(top)
+    rows, each = math.ceil(len(pictures) / _COLUMNS), 2 if maps else 1
+    columns = math.ceil(len(pictures) / rows)
+    wide = max(2.45, 7.6 / columns)
+    with drawing(path, columns * wide + 1, rows * (each * wide * height / width + 1), title) as figure:
+        figure.set_layout_engine("compressed")  # for pictures, which keep their aspect
+        grid = figure.subplots(each * rows, columns, squeeze=False)
+        for axes in grid.flat:
             axes.set_axis_off()
-            axes.imshow(to_srgb(picture, exposure), interpolation="nearest")
-            axes.set_title(name, fontsize=10.5, fontweight="bold", pad=4)
+        for k, (name, picture) in enumerate(pictures.items()):
+            above, below = (grid[k // columns * each + i, k % columns] for i in (0, each - 1))
+            above.imshow(to_srgb(picture), interpolation="nearest")
+            above.set_title(name, fontsize=10.5, fontweight="bold", pad=4)
             if name in maps:
-                axes = figure.add_axes(below)
-                axes.set_axis_off()
-                shown = axes.imshow(maps[name], cmap="magma", vmin=0, vmax=scale, interpolation="nearest")
-            _caption(axes, (captions or {}).get(name, ""))
-        if shown is not None:
-            bar = figure.colorbar(shown, cax=figure.add_axes(bar_place))
-            bar.set_label(error_label)
+                shown = below.imshow(maps[name], cmap="magma", vmin=0, vmax=scale, interpolation="nearest")
+            _caption(below if name in maps else above, (captions or {}).get(name, ""))
+        if maps:
+            bar = figure.colorbar(shown, ax=grid, label="FLIP (0 to 1)", aspect=40)
             bar.outline.set_visible(False)
-        return save(figure, path)
+    return Path(path)
 
 
 def image_caption(errors: ImageErrors) -> str:
@@ -93,37 +88,8 @@ def _check_shapes(pictures: Mapping[str, Any], maps: Mapping[str, Any]) -> None:
             raise InputError("side by side", f"error map {name}", f"({error.shape})", f"finite values, {first[:2]}")
 
 
-def _page(count: int, aspect: float, maps: bool, title: str) -> tuple[Any, list[tuple[_Box, _Box]], _Box]:
-    """A figure, the (picture, error image) boxes of each of `count` pictures, and the box of the colour bar.
-
-    Explicit layout in inches: pictures keep their aspect and fill their width, which automatic layouts do not
-    guarantee.
-    """
-    rows = math.ceil(count / _COLUMNS)
-    columns = math.ceil(count / rows)
-    wide = max(2.45, 7.6 / columns)
-    tall, gap, name, words = wide * aspect, 0.12, 0.3, 0.46
-    band = name + tall + (gap / 2 + tall if maps else 0) + words
-    head, bar = (0.4 if title else 0.08), (0.95 if maps else gap)
-    page = (gap + columns * (wide + gap) + bar, head + rows * band)
-    figure = new_figure(*page)
-    figure.set_layout_engine("none")
-    if title:
-        figure.text(gap / page[0], 1 - 0.12 / page[1], title, fontsize=12.5, fontweight="bold", va="top")
-
-    def box(left: float, top: float, width: float, height: float) -> _Box:
-        return left / page[0], 1 - (top + height) / page[1], width / page[0], height / page[1]
-
-    places = []
-    for index in range(count):
-        left, top = gap + (index % columns) * (wide + gap), head + (index // columns) * band + name
-        places.append((box(left, top, wide, tall), box(left, top + tall + gap / 2, wide, tall)))
-    return figure, places, box(page[0] - bar + 0.08, head + name, 0.14, page[1] - head - name - words)
-
-
-def _rounded_up(maps: Mapping[str, Any]) -> float:
-    """99.5th percentile of all maps (not the maximum: fireflies), rounded up to 1, 2 or 5 times a power of ten."""
-    value = float(np.percentile(np.concatenate([m.ravel() for m in maps.values()]), 99.5)) if maps else 0.0
+def rounded_up(value: float) -> float:
+    """1, 2 or 5 times a power of ten; 1 for nothing."""
     if value <= 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))
@@ -172,53 +138,14 @@ def illumination_plot(
     return Path(path)
 
 
-_DASHES = ((0, ()), (0, (5, 2)), (0, (1.5, 1.5)))
-
-
-def breathing_plot(ways: Mapping[str, Sequence[Breath]], path: str | Path, title: str = "Focus breathing") -> Path:
-    """Three panels over one logarithmic axis of distance; one line for each way of focusing.
-
-    Args:
-        ways: name of the way ("film moves", "groups move") to its states. Infinity is left out: it has no place on the
-            axis.
-        path: PNG, PDF or SVG to write.
-
-    Raises:
-        InputError: a way with fewer than two finite distances.
-    """
-    if not ways:
-        raise InputError("breathing plot", "ways", "(none)", "at least one way of focusing")
-    with drawing(path, 7.6, 7.4) as figure:
-        panels = figure.subplots(3, 1, sharex=True)
-        for number, (name, breaths) in enumerate(ways.items()):
-            near = sorted((b for b in breaths if b.focus_m < 1e9), key=lambda b: b.focus_m)
-            if len(near) < 2:
-                raise InputError("breathing plot", name, f"({len(near)} distances)", "two finite distances or more")
-            colour, dashes = FIELD_COLOURS[number % len(FIELD_COLOURS)], _DASHES[number % len(_DASHES)]
-            look = {"color": colour, "ls": dashes, "lw": 1.8}
-            distance = [b.focus_m for b in near]
-            change = f"{name} (picture grows by {100 * field_change(breaths):.1f}%)"
-            panels[0].plot(distance, [b.field_deg for b in near], label=change, **look)
-            panels[1].plot(distance, [b.efl_mm for b in near], **look)
-            panels[2].plot(distance, [abs(b.magnification) for b in near], **look)
-        panels[0].set_title(title, loc="left", fontweight="bold")
-        panels[0].legend(loc="best")
-        labels = ("field of view (degrees,\nacross the image circle)", "focal length (mm)", "magnification")
-        for axes, label in zip(panels, labels, strict=True):
-            axes.set_ylabel(label)
-            axes.grid(True)
-            axes.ticklabel_format(axis="y", useOffset=False)
-        panels[2].set_xscale("log")
-        panels[2].set_yscale("log")
-        panels[2].set_xlabel("distance from object to film (m)")
-        plain_log_ticks(panels[2].xaxis, panels[2].yaxis)
-    return Path(path)
+_DASHES = ((0, ()), (0, (5, 2)))
 
 
 def draw_breathing(lens: Lens, path: str | Path, count: int = 48) -> dict[str, list[Breath]]:
     """Compute and draw a lens's breathing from its nearest focus to a thousand focal lengths.
 
-    Both ways of focusing are drawn where the lens file has focus states. Returns what is drawn, infinity first.
+    Three panels over one logarithmic axis of distance, which has no place for infinity; a line for each way of
+    focusing, both where the lens file has focus states. Returns what is drawn, infinity first.
     """
     data = first_order(lens.at())
     nearest = 1.05 * (4 * abs(data.efl_mm) + data.rear_principal_z_mm - data.front_principal_z_mm) / 1000
@@ -229,7 +156,22 @@ def draw_breathing(lens: Lens, path: str | Path, count: int = 48) -> dict[str, l
     far = max(abs(data.efl_mm), 10 * nearest)
     distances = [nearest * (far / nearest) ** (k / (count - 1)) for k in range(count)]
     found = {name: breathing(lens, [math.inf, *distances], way) for name, way in ways.items()}
-    breathing_plot(found, path, f"Focus breathing of {lens.name}")
+    with drawing(path, 7.6, 7.4) as figure:
+        panels = figure.subplots(3, 1, sharex=True)
+        for (name, breaths), colour, dashes in zip(found.items(), FIELD_COLOURS, _DASHES, strict=False):
+            look = {"label": f"{name} (picture grows by {100 * field_change(breaths):.1f}%)", "lw": 1.8}
+            near = [(b.field_deg, b.efl_mm, abs(b.magnification)) for b in breaths[1:]]
+            for axes, values in zip(panels, zip(*near, strict=True), strict=True):
+                axes.plot(distances, values, color=colour, ls=dashes, **look)
+        panels[0].set_title(f"Focus breathing of {lens.name}", loc="left", fontweight="bold")
+        panels[0].legend(loc="best")
+        labels = ("field of view (degrees,\nacross the image circle)", "focal length (mm)", "magnification")
+        for axes, label in zip(panels, labels, strict=True):
+            axes.set_ylabel(label)
+            axes.grid(True)
+            axes.ticklabel_format(axis="y", useOffset=False)
+        panels[2].set(xscale="log", yscale="log", xlabel="distance from object to film (m)")
+        plain_log_ticks(panels[2].xaxis, panels[2].yaxis)
     return found
 
 

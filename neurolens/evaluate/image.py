@@ -13,34 +13,12 @@ from neurolens.base.errors import InputError, NeurolensError
 Image = NDArray[np.float64]
 
 MIN_PAIRS = 4  # with fewer pairs the noise floor is too noisy to divide by
-
-
-@dataclass(frozen=True)
-class ImageSettings:
-    """Settings of the comparison of two linear pictures.
-
-    Attributes:
-        exposure: factor on linear RGB before the sRGB curve and the clip to [0, 1], for FLIP only.
-        pixels_per_degree: of visual angle, for FLIP; 67 is its authors' default (0.7 m from a 0.7 m wide 4K display).
-        eps: in the denominator of the relative MSE, in squared radiance, so that dark pixels do not dominate the mean.
-        trim: share of pixels dropped from the relative MSE, those of largest error (fireflies); 0 keeps all.
-    """
-
-    exposure: float = 1.0
-    pixels_per_degree: float = 67.0
-    eps: float = 1e-2
-    trim: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("exposure", "pixels_per_degree", "eps"):
-            value = getattr(self, name)
-            if not (0 < value < float("inf")):
-                raise InputError("image settings", name, value, "a positive number")
-        if not (0 <= self.trim < 1):
-            raise InputError("image settings", "trim", self.trim, "a share in [0, 1)")
-
-
-DEFAULT = ImageSettings()
+# In the denominator of the relative MSE, squared radiance, so that dark pixels do not dominate the mean.
+EPS = 1e-2
+# Of visual angle, for FLIP: its authors' default (0.7 m from a 0.7 m wide 4K display).
+PIXELS_PER_DEGREE = 67.0
+# Of the comparison, as a run's results have them; the exposure is a factor before the sRGB curve.
+SETTINGS = {"exposure": 1.0, "pixels_per_degree": PIXELS_PER_DEGREE, "eps": EPS}
 
 
 def checked_image(image: ArrayLike, name: str) -> Image:
@@ -74,11 +52,11 @@ def to_srgb(linear: ArrayLike, exposure: float = 1.0) -> Image:
     return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
 
 
-def rel_mse(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DEFAULT) -> float:
+def rel_mse(test: ArrayLike, reference: ArrayLike) -> float:
     """Relative mean squared error on linear radiance: mean over pixels and channels of (a - b)^2 / (b^2 + eps).
 
     Rousselle, Knaus, Zwicker 2011, "Adaptive sampling and reconstruction using greedy error minimization", with their
-    eps = 0.01. `settings.trim` drops that share of the worst pixels first, as they do against fireflies.
+    eps = 0.01.
 
     Args:
         test, reference: [H, W, 3] linear RGB.
@@ -86,16 +64,14 @@ def rel_mse(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DEF
         InputError: shapes that differ or are not [H, W, 3]; values that are not finite.
     """
     a, b = _checked_pair(test, reference)
-    errors = np.sort(((a - b) ** 2 / (b**2 + settings.eps)).mean(axis=2), axis=None)
-    kept = max(1, errors.size - int(settings.trim * errors.size))
-    return float(errors[:kept].mean())
+    return float(np.mean((a - b) ** 2 / (b**2 + EPS)))
 
 
-def flip_map(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DEFAULT) -> Image:
+def flip_map(test: ArrayLike, reference: ArrayLike) -> Image:
     """LDR-FLIP for each pixel, [H, W] in [0, 1]: what an observer sees when flipping between the two pictures.
 
     Andersson et al. 2020, "FLIP: a difference evaluator for alternating images", through their `flip-evaluator`.
-    Linear RGB goes through `to_srgb` with the stated exposure; the viewing distance is `pixels_per_degree`.
+    Linear RGB goes through `to_srgb`; the viewing distance is that of `PIXELS_PER_DEGREE`.
 
     Raises:
         InputError: as `rel_mse`.
@@ -106,17 +82,15 @@ def flip_map(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DE
         import flip_evaluator
     except ImportError as error:
         raise NeurolensError("FLIP needs flip-evaluator: pip install '.[train]' in the project's folder") from error
-    shown_a, shown_b = (np.ascontiguousarray(to_srgb(x, settings.exposure), dtype=np.float32) for x in (a, b))
-    errors, _, _ = flip_evaluator.evaluate(
-        shown_b, shown_a, "LDR", applyMagma=False, computeMeanError=False,
-        parameters={"ppd": settings.pixels_per_degree},
-    )  # fmt: skip
+    shown_a, shown_b = (np.ascontiguousarray(to_srgb(x), dtype=np.float32) for x in (a, b))
+    options = {"applyMagma": False, "computeMeanError": False, "parameters": {"ppd": PIXELS_PER_DEGREE}}
+    errors, _, _ = flip_evaluator.evaluate(shown_b, shown_a, "LDR", **options)
     return np.asarray(errors, dtype=np.float64).reshape(a.shape[:2])
 
 
-def flip(test: ArrayLike, reference: ArrayLike, settings: ImageSettings = DEFAULT) -> float:
+def flip(test: ArrayLike, reference: ArrayLike) -> float:
     """Mean of `flip_map`: 0 for equal pictures, 1 at most."""
-    return float(flip_map(test, reference, settings).mean())
+    return float(flip_map(test, reference).mean())
 
 
 def seed_pairs(count: int) -> list[tuple[int, int]]:
@@ -150,9 +124,7 @@ class ImageErrors:
     pairs: int
 
 
-def compare(
-    renders: Sequence[ArrayLike], exact_renders: Sequence[ArrayLike], settings: ImageSettings = DEFAULT
-) -> ImageErrors:
+def compare(renders: Sequence[ArrayLike], exact_renders: Sequence[ArrayLike]) -> ImageErrors:
     """Error of a surrogate's renders against exact ones, beside the noise floor.
 
     Render i of the surrogate is compared with exact render i, whose random numbers it shares (paired), and with exact
@@ -171,10 +143,10 @@ def compare(
 
     def errors(tests: Sequence[ArrayLike], measure: Callable[..., float]) -> list[float]:
         """Of each pair (i, j): test i against exact render j."""
-        return [measure(tests[i], exact_renders[j], settings) for i, j in ring[: len(tests)]]
+        return [measure(tests[i], exact_renders[j]) for i, j in ring[: len(tests)]]
 
     floor = float(np.mean(errors(exact_renders, flip)))
-    paired = float(np.mean([flip(a, b, settings) for a, b in zip(renders, exact_renders, strict=False)]))
+    paired = float(np.mean([flip(a, b) for a, b in zip(renders, exact_renders, strict=False)]))
     return ImageErrors(
         flip_paired=paired,
         paired_share=paired / floor if floor > 0 else None,

@@ -5,14 +5,11 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-from neurolens.analysis.plot_style import INK, new_figure, plain_log_ticks, save, style
 from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.methods import GROUPS
 from neurolens.evaluate.pages import DASH, Column, Record, markdown_table, number, show
-from neurolens.evaluate.plots import place_labels
-from neurolens.evaluate.records import pareto_front
+from neurolens.evaluate.plots import Kinds, trade_plot
 from neurolens.surrogates.source import MOST_WEIGHTS
 
 COLUMNS = (
@@ -53,6 +50,13 @@ _OF_A_LENS = tuple(
     "rms_um_at_21_6 direction_rms_deg position_rms_um_at_21_6 transmittance_rms false_pass false_block".split()
 )  # fmt: skip
 _WORST: dict[str, Callable[[Sequence[float]], float]] = {"speedup": min, "fused_speedup": min}
+
+_LOOK: Kinds = {
+    "paraxial": (GROUPS["paraxial"], "#7f7f7f", "D"),
+    "published": (GROUPS["published"], "#e69f00", "s"),
+    "ours": (GROUPS["ours"], "#0072b2", "o"),
+    "ablations": (GROUPS["ablations"], "#cc79a7", "^"),
+}
 
 NOTES = (
     "Errors on held-out rays at full aperture, as `neurolens.evaluate.rays` defines them, of the exported float32 "
@@ -115,7 +119,8 @@ def write_lens(name: str, records: Sequence[Record], facts: str, folder: Path) -
     """NAME.md and, where a method has errors, NAME.png."""
     folder.mkdir(parents=True, exist_ok=True)
     text = lens_page(name, records, facts)
-    if trade_plot(name, records, _exact(records), folder / f"{name}.png"):
+    named = [{**r, "name": r["method"]} for r in records]
+    if trade_plot(name, named, _exact(records), folder / f"{name}.png", _LOOK, "group"):
         text += f"\n![Error against time and against coefficients]({name}.png)\n"
     atomic_write_text(folder / f"{name}.md", text)
 
@@ -155,74 +160,3 @@ def _by_lens(found: Mapping[str, Sequence[Record]], methods: Sequence[str]) -> l
 
 def _cell(text: str) -> str:
     return text.replace("|", "/")
-
-
-_LOOK = {  # Okabe and Ito's colours; marker shapes distinguish the groups without them
-    "paraxial": ("#7f7f7f", "D"),
-    "published": ("#e69f00", "s"),
-    "ours": ("#0072b2", "o"),
-    "ablations": ("#cc79a7", "^"),
-}
-_ERRORS = {
-    "rms_um_at_21_6": "film-equivalent error, RMS (µm at 21.6 mm image radius)",
-    "direction_rms_deg": "direction error, RMS (degrees)",
-}
-
-
-def trade_plot(name: str, records: Sequence[Record], exact: Sequence[Record], path: Path) -> bool:
-    """Draw both panels, logarithmic; hollow markers are fused C. Returns whether there was anything to draw.
-
-    Exact tracers, which have no error, are lines at their time. The staircase is the front that nothing betters.
-    """
-    error = next((k for k in _ERRORS if any((number(r, k) or 0) > 0 for r in records)), None)
-    if error is None:
-        return False
-    shown = [r for r in records if (number(r, error) or 0) > 0]
-    with style():
-        figure = new_figure(13.0, 5.8)
-        left, right = figure.subplots(1, 2, sharey=True)
-        times = [*_points(shown, "ns_per_ray.min", error), *_points(shown, "fused_ns_per_ray.min", error)]
-        _panel(left, times, "time per ray (ns, one thread, best of the rounds)")
-        for one in exact:
-            time = number(one, "ns_per_ray.min")
-            if time:
-                look = {"color": INK, "lw": 1.0, "ls": "--" if "compiled" in one["name"] else ":"}
-                left.axvline(time, label=f"{one['name']} {time:.3g} ns", **look)
-        sizes = _points(shown, "coefficients_per_vector", error)
-        sizes += [p for p in _points(shown, "parameters", error) if number(p[2], "coefficients_per_vector") is None]
-        _panel(right, sizes, "coefficients of one vector output (networks: all weights)")
-        left.set_ylabel(_ERRORS[error])
-        plain_log_ticks(left.yaxis)
-        for axes in (left, right):
-            plain_log_ticks(axes.xaxis)
-            axes.grid(True, which="major")
-        figure.suptitle(f"{name}: error against time and size", x=0.01, ha="left", fontweight="bold")
-        handles = {
-            label: h for axes in (left, right) for h, label in zip(*axes.get_legend_handles_labels(), strict=True)
-        }
-        figure.legend(handles.values(), handles.keys(), loc="outside right upper")
-        for axes, points in ((left, times), (right, sizes)):
-            if points:
-                labels = [str(p[2]["method"]) for p in points]
-                place_labels(axes, [p[:2] for p in points], labels, fontsize=6.4, color="#333333")
-        save(figure, path)
-    return True
-
-
-def _points(records: Sequence[Record], key: str, error: str) -> list[tuple[float, float, Record, bool]]:
-    fused = key.startswith("fused")
-    return [(x, number(r, error) or 0.0, r, fused) for r in records if (x := number(r, key) or 0.0) > 0]
-
-
-def _panel(axes: Any, points: Sequence[tuple[float, float, Record, bool]], label: str) -> None:
-    axes.set(xscale="log", yscale="log", xlabel=label)
-    for group, (colour, marker) in _LOOK.items():
-        for fused in (False, True):
-            part = [p[:2] for p in points if p[2]["group"] == group and p[3] == fused]
-            if part:
-                look = {"mfc": "white" if fused else colour, "mec": colour, "ms": 6.5, "mew": 1.4, "ls": "none"}
-                said = GROUPS[group] + (", fused C" if fused else "")
-                axes.plot(*zip(*part, strict=True), marker, label=said, zorder=3, **look)
-    if points:
-        front = [points[i][:2] for i in pareto_front([p[:2] for p in points])]
-        axes.step(*zip(*front, strict=True), where="post", color=INK, lw=1.2, alpha=0.7, label="Pareto front")

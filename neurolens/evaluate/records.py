@@ -59,7 +59,7 @@ class Results:
             ns_per_ray of the camera alone, samples, width and height in pixels, threads.
         images: name, scene, camera, file_png and file_exr relative to the run folder, samples; except of the exact
             lens, `image.ImageErrors`.
-        image_settings: of `image.ImageSettings`.
+        image_settings: `image.SETTINGS`.
         domain_gain: what a domain taken from the scene gains: scene, text, and rows, for the whole lens and for the
             scene: such models with domain (its name) and `scenes.domain_facts`.
         figures: file, relative to the run folder, title, caption; wide where it goes across the page.

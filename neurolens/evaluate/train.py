@@ -30,9 +30,9 @@ from neurolens.evaluate.candidates import (
 from neurolens.evaluate.describe import layout_profile
 from neurolens.evaluate.experiment import Experiment, keep_inputs
 from neurolens.evaluate.figures import illumination_plot
-from neurolens.evaluate.image import DEFAULT
+from neurolens.evaluate.image import SETTINGS
 from neurolens.evaluate.measure import FRESH, MORE, Measured, fit_and_measure, onnx_predictor, shared_rays, what_is_poor
-from neurolens.evaluate.plots import error_against_coefficients_plot, pareto_plot
+from neurolens.evaluate.plots import trade_plot
 from neurolens.evaluate.rays import pixel_um, pupil_disc_share
 from neurolens.evaluate.records import Results, reaches, target_record, write_results
 from neurolens.evaluate.report import write_report
@@ -116,7 +116,7 @@ def run_experiment(
         exact=exact_records(timed),
         cameras=[*({"name": n, "ns_per_ray": timed.timing(n)} for n in _IDEAL if n in timed.ns), *drawn.cameras],
         images=drawn.images,
-        image_settings=asdict(DEFAULT) if drawn.images else None,
+        image_settings=SETTINGS if drawn.images else None,
         domain_gain=gain,
         figures=_draw(pairs, measured, timed, light, pictures) + drawn.figures,
         versions=versions(),
@@ -208,20 +208,18 @@ def _draw(
     lens, domain = pairs.lens, pairs.domain
     records = [m.record for m in measured]
     exact = [timed.record(n) for n in EXACT if n in timed.ns]
-    error = "rms_um" if any(r.get("rms_um") for r in records) else "direction_rms_deg"
-    if timed.ns:
-        pareto_plot(records, folder / "pareto.png", exact=exact, error=error, title=f"{lens.name}: error against time")
-    error_against_coefficients_plot(records, folder / "coefficients.png", error, title=f"{lens.name}: error, size")
     lens_layout(layout_profile(lens, domain), folder / "layout.png")
-    texts = [
-        *[("pareto", "Error against speed", "Held-out rays, full aperture, with the Pareto front.")] * bool(timed.ns),
-        ("coefficients", "Error against coefficients", "Coefficients per vector output, A and B terms both counted."),
-        ("layout", "The lens", "Rays of three fields, traced exactly."),
-    ]
+    texts = [("layout", "The lens", "Rays of three fields, traced exactly.")]
+    if trade_plot(lens.name, records, exact, folder / "trade.png"):
+        told = "Held-out rays, full aperture; coefficients per vector output, A and B terms both counted."
+        texts.insert(0, ("trade", "Error against time and size", told))
     if light:
         illumination_plot(light, folder / "illumination.png", title=f"{lens.name}: relative illumination")
         texts.append(("illumination", "Relative illumination", "Of a uniform scene, full aperture, far focus."))
-    return [{"file": f"{folder.name}/{stem}.png", "title": t, "caption": c} for stem, t, c in texts]
+    return [
+        {"file": f"{folder.name}/{stem}.png", "title": title, "caption": told, "wide": stem == "trade"}
+        for stem, title, told in texts
+    ]
 
 
 def _describe_lens(lens: Lens) -> dict[str, Any]:

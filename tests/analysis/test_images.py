@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from analysis_lenses import INF, cartesian, library, slower, thin
+from analysis_lenses import cartesian, library, slower, thin
 
-from neurolens.analysis.bundles import bundle, grid, hexapolar
+from neurolens.analysis.bundles import bundle, grid
 from neurolens.analysis.field_curves import distortion, illumination
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import layout_profile
@@ -158,10 +158,3 @@ def test_layout_rays_end_on_the_film_and_start_at_their_field() -> None:
 def test_a_stopped_down_lens_has_smaller_spots() -> None:
     given = library("laikin_double_gauss_50")
     assert spots(slower(given, 0.3), [0.0]).rms_um[0] < 0.05 * spots(given, [0.0]).rms_um[0]
-
-
-def test_results_are_plain_data() -> None:
-    data = spots(PINHOLE, [0.0], [D]).to_dict()
-    text = json.dumps(data)
-    assert "rms_um" in text and isinstance(data["passed"], list)
-    assert bundle(PINHOLE, [0.0], pattern=hexapolar(1)).passed.all() and PINHOLE.focus_m == INF

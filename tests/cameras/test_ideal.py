@@ -72,17 +72,6 @@ def test_conjugate_distances_obey_the_lens_equation() -> None:
         assert 1 / image + 1 / (1e3 * focus_m - image) == pytest.approx(1 / 50.0, rel=1e-12)
 
 
-def test_weight_is_one_on_the_axis_and_the_fourth_power_of_the_cosine_off_it() -> None:
-    pupil = square_grid(64)
-    wavelength = np.full(pupil.shape[1], 550, np.float32)
-    for lens in (ThinLens(50.0, 1.4, 1.0), ThinLens(50.0, 22.0, math.inf), Pinhole(50.0)):
-        axis = lens.sample(at((0.0, 0.0), pupil.shape[1]), pupil, wavelength)
-        assert axis.weight.mean() == pytest.approx(1, abs=2e-4)
-    for narrow in (ThinLens(50.0, 64.0, math.inf), Pinhole(50.0)):
-        corner = narrow.sample(at((18.0, 12.0), pupil.shape[1]), pupil, wavelength)
-        assert corner.weight.mean() == pytest.approx(math.cos(math.atan(math.hypot(18, 12) / 50)) ** 4, rel=1e-3)
-
-
 RETROFOCUS = ROOT / "lenses" / "angenieux_retrofocus_35.toml"
 TELEPHOTO = ROOT / "lenses" / "sigler_telephoto_100.toml"
 ZOOM = ROOT / "lenses" / "nikon_zoom_70_200.toml"

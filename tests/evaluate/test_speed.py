@@ -13,7 +13,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.candidates import camera_candidate, exact_candidates
-from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, pinned_threads, race
+from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, race
 from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of
 
@@ -23,14 +23,6 @@ LENSES = Path(__file__).parents[2] / "lenses"
 @pytest.fixture(scope="module")
 def domain() -> Domain:
     return domain_of(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml").at(), film_radius_mm=10.0)
-
-
-def test_threads_come_back_after_an_error() -> None:
-    before = torch.get_num_threads()
-    with pytest.raises(RuntimeError), pinned_threads():
-        assert torch.get_num_threads() == 1
-        raise RuntimeError
-    assert torch.get_num_threads() == before
 
 
 def test_a_race_of_cameras_and_the_eager_tracer(domain: Domain) -> None:
@@ -53,17 +45,6 @@ def test_ratios_are_taken_within_rounds() -> None:
     drifting = Race({"model": [1.0, 10.0, 10.0], "exact": [4.0, 40.0, 40.0]}, {"model": 1, "exact": 1}, 1, 3)
     assert drifting.speedup("model", "exact") == {"min": 4.0, "median": 4.0}
     assert drifting.speedup("model", "absent") is None
-
-
-def test_every_batch_covers_the_same_rays(domain: Domain) -> None:
-    done: dict[int, int] = {}
-
-    def prepare(rays: FilmRays) -> Call:
-        done[len(rays)] = done.get(len(rays), 0) + len(rays)
-        return lambda: None
-
-    race([Candidate("idle", prepare, (4096, 16384))], domain, rounds=1)
-    assert done[4096] == done[16384] > 0
 
 
 def test_what_cannot_run_is_reported_with_its_reason(domain: Domain) -> None:

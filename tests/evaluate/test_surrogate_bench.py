@@ -17,7 +17,7 @@ from neurolens.base.progress import Progress
 from neurolens.cli import main
 from neurolens.evaluate import methods as surrogate_bench
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
-from neurolens.evaluate.methods import Bench, BenchSettings, Row, all_rows, chosen_rows, run_bench
+from neurolens.evaluate.methods import Bench, BenchSettings, Row, run_bench
 from neurolens.evaluate.methods_page import lens_page, write_lens
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
@@ -70,13 +70,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def records_of(folder: Path) -> dict[str, dict[str, Any]]:
     return {f.stem: json.loads(f.read_text()) for f in (folder / "records" / TRIPLET).iterdir()}
-
-
-def test_the_command_leaves_tables_plots_and_its_configuration(made: Path) -> None:
-    assert "| ols-12 | 1 |" in (made / "summary.md").read_text()
-    config = json.loads((made / "config.json").read_text())
-    assert config["seed"] == 1 and config["settings"]["pairs"]["train"] == 2000 and config["versions"]["torch"]
-    assert {f.name for f in made.glob("*.*")} == {"config.json", "summary.md", f"{TRIPLET}.md", f"{TRIPLET}.png"}
 
 
 def test_one_record_a_method_with_every_figure(made: Path) -> None:
@@ -153,15 +146,6 @@ def test_a_lens_that_cannot_be_is_rows_too(tmp_path: Path) -> None:
     assert all("missing.toml" in r["failed"] for r in records)
     write_lens("missing", records, "", tmp_path)
     assert not (tmp_path / "missing.png").exists()
-
-
-def test_rows_by_name_group_and_method() -> None:
-    names = [r.name for r in all_rows()]
-    assert len(set(names)) == len(names)
-    assert {"thin", "ols-64", "mlp-32x2"} <= set(names)
-    assert {r.group for r in chosen_rows([])} == {"paraxial", "published", "ours"}
-    assert [r.name for r in chosen_rows(["ols-64", "thin", "ols-64"])] == ["ols-64", "thin"]
-    assert {r.settings.method for r in chosen_rows(["schrade"])} == {"schrade"}
 
 
 @pytest.mark.parametrize(

@@ -73,22 +73,6 @@ def test_the_disc_of_a_thin_lens_has_its_closed_form(place: str) -> None:
     assert found.axes_mm == pytest.approx((0.99 * expected, 0.99 * expected), rel=3e-3)
 
 
-@pytest.mark.parametrize("place", ["far", "edge"])
-def test_the_disc_found_backwards_is_that_of_light_traced_forwards(place: str) -> None:
-    taken = camera("exact")
-    side = 200
-    middle = ((np.arange(side) + 0.5) / side).astype(np.float32)
-    pupil = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
-    light = np.array(bokeh.light_towards(taken, 0.93 if place == "edge" else 0, FAR_M), np.float32)
-    out = taken.to_film(np.repeat(light[:, None], side**2, axis=1), pupil, np.full(side**2, 550, np.float32))
-    lit = out.status == st.PASSED
-    forwards = LightDisc(out.film_mm[:, lit].astype(float), out.weight[lit].astype(float) / side**2)
-    backwards = disc("exact", "round", place)
-    assert backwards.centre_mm == pytest.approx(forwards.centre_mm, abs=5e-3)
-    assert backwards.axes_mm == pytest.approx(forwards.axes_mm, rel=5e-3)
-    assert backwards.total == pytest.approx(forwards.total, rel=0.01)
-
-
 @pytest.mark.parametrize("kind", ["exact", "surrogate"])
 def test_rims_cut_cats_eyes_across_the_radius(kind: str) -> None:
     """Narrower, smaller and darker the nearer to the corner, long across the radius; a thin lens has none."""
@@ -131,11 +115,6 @@ def test_a_disc_has_the_corners_of_the_stop_and_its_area_passes(kind: str, stop:
     assert bokeh.passage(camera(kind, stop)) == pytest.approx(area, abs=0.003 if kind == "thin" else 0.025)
 
 
-def test_fifty_blades_are_round() -> None:
-    assert bokeh.passage(camera("thin", "50")) == pytest.approx(math.sin(math.pi / 25) * 25 / math.pi, abs=3e-3)
-    assert bokeh.outline_waves(disc("thin", "50", "far"))[1] < 0.01
-
-
 @pytest.mark.parametrize("kind", ["surrogate", "thin"])
 def test_a_heart_stands_behind_the_focus_and_hangs_before_it(kind: str) -> None:
     far, near = disc(kind, "heart", "far"), disc(kind, "heart", "near")
@@ -147,11 +126,6 @@ def test_a_heart_stands_behind_the_focus_and_hangs_before_it(kind: str) -> None:
     for found, sign in ((far, 1), (near, -1)):
         off = found.film_mm[1] - found.centre_mm[1]
         assert sign * (off**3 * found.flux).sum() > 0
-
-
-def test_the_masks_open_the_shares_that_the_text_gives() -> None:
-    for name, share in (("star", 0.452), ("heart", 0.470)):
-        assert shape(name).area_share == pytest.approx(share, abs=2e-3)  # type: ignore[union-attr]
 
 
 def test_an_anamorphic_lens_draws_upright_ovals() -> None:

@@ -115,12 +115,6 @@ def test_a_lens_that_cannot_be_done_is_said_and_the_others_go_on(
     assert json.loads((tmp_path / "index.json").read_text())["left_out"] == {}
 
 
-def test_a_broken_index_is_made_anew(tmp_path: Path, library: Library, made: dict[str, Any]) -> None:
-    (tmp_path / "index.json").write_text('{"models": [{"file": "two.ols-6.onnx", "lens_file": "a"}]}')
-    make_models.make_models(library, library.entry, tmp_path, QUIET)
-    assert len(files(tmp_path)) == 4
-
-
 def test_the_best_of_each_kind_has_the_smallest_error() -> None:
     errors = {"ols-20": 3.0, "ols-40": 2.0, "mlp-8x2": 1.0, "mlp-16x2": 1.5}
     measured = []
@@ -165,10 +159,3 @@ def test_an_entry_is_fitted_checked_and_timed(tmp_path: Path) -> None:
 def test_names_that_are_no_file_names_are_refused(entry: dict[str, Any]) -> None:
     with pytest.raises(InputError, match="entry"):
         from_dict(Library, {"entry": [entry]}, "test")
-
-
-def test_a_list_that_is_not_there_makes_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "models"
-    assert main(["models", "--list", str(tmp_path / "no.toml"), "--out", str(out)]) == 2
-    assert "no.toml" in capsys.readouterr().err
-    assert not out.exists()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,25 +10,20 @@ import numpy as np
 import pytest
 import torch
 
-from experiments import lab
-from experiments.__main__ import main
 from experiments.fused_speed import ray_candidate
-from experiments.mitsuba_speed import STAGES, Row, Settings, film_mm, profile, record
+from experiments.mitsuba_speed import Row, Settings, film_mm, record
 from experiments.trace_speed import (
     ASPHERIC_SURFACES,
-    LENSES,
     MAIN,
     film_rays,
     launched,
     lens_of,
-    memory_of,
     with_aspheres,
 )
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.contract import CameraRays, FloatArray
+from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.model import load_model
-from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.candidates import CompiledSource, fused_candidate
 from neurolens.evaluate.speed import Unavailable, race
 from neurolens.graph.compiler import find_compiler
@@ -37,7 +31,6 @@ from neurolens.graph.program import SCENE_RAY
 from neurolens.graph.scalars import lower
 from neurolens.optics.trace import trace
 from neurolens.optics.tracegraph import exact_graph
-from neurolens.render.scene import scene_from_tables
 from neurolens.surrogates.assemble import RAY_ONLY
 from neurolens.surrogates.domain import sample_domain
 
@@ -63,50 +56,8 @@ def test_figures_of_known_times_and_pictures() -> None:
     assert noisy["equal_noise"] == pytest.approx(2 * noisy["noise"] / found["noise"])
 
 
-def test_the_first_picture_is_kept_apart_and_white_is_taken_out() -> None:
-    made = Row("name", "RGB", "pinhole", lambda seed: np.full((2, 2, 3), seed, np.float32), np.float32(0.5))  # type: ignore[arg-type]
-    for seed in range(3):
-        made.run(seed)
-    assert len(made.seconds) == 2 and made.first_s > 0
-    assert [p.mean() for p in made.pictures] == [2, 4]
-
-
 def test_the_film_sees_what_a_field_of_90_degrees_does() -> None:
     assert film_mm({"sensor": {"fov": 90}}) == pytest.approx((100, 100))  # 50 mm behind the hole
-
-
-class Slow(Pinhole):
-    """A camera that takes longer than all the rest."""
-
-    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        np.linalg.svd(np.ones((600, 600)))
-        return super().sample(film_mm, pupil, wavelength_nm)
-
-
-def test_a_slow_camera_is_what_takes_the_time() -> None:
-    camera = {"position_m": [0, 1, 0], "look_at_m": [0, 1, -1], "focus_m": 2, "film_width_mm": 32, "film_height_mm": 18}
-    tables = {"camera": camera, "materials": {"grey": {"kind": "diffuse", "reflectance": [0.5, 0.5, 0.5]}}}
-    tables |= {"planes": [{"point_m": [0, 0, 0], "normal": [0, 1, 0], "material": "grey"}]}
-    tables |= {"environment": {"colour": [1, 1, 1]}}
-    scene = scene_from_tables(tables)
-    fast, slow = (profile(scene, kind(20, (32, 18)), 32, 18, 4) for kind in (Pinhole, Slow))
-    for shares in (fast, slow):
-        assert set(shares) == set(STAGES) and min(shares.values()) >= 0
-        assert sum(shares.values()) == pytest.approx(1)
-    assert fast["camera"] < 0.3 and fast["intersection"] > 0 and fast["random numbers"] > 0
-    assert slow["camera"] > 0.6
-
-
-FOLDER = Path(__file__).parents[2] / "lenses"
-
-
-def test_lenses_have_the_refractions_that_the_table_says() -> None:
-    lenses = {count: lens_of(count) for count in LENSES}
-    for count, lens in lenses.items():
-        # The anamorphic zoom's table leaves its last plane to the reader.
-        assert lens.refractions in (count, count - 1)
-    assert lenses[MAIN].refractions == MAIN
-    assert sum(s.cylinder is not None for s in lenses[57].surfaces) > 2
 
 
 def test_two_aspheres_change_the_rays_and_little_else() -> None:
@@ -120,35 +71,6 @@ def test_two_aspheres_change_the_rays_and_little_else() -> None:
     both = (a.status == 0) & (b.status == 0)
     assert both.sum() > 0.7 * (a.status == 0).sum() > 100
     assert 1e-2 < (a.rays.x - b.rays.x)[both].abs().max() < 3.0
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_rays_have_wavelengths_of_their_own(dtype: torch.dtype) -> None:
-    lens = lens_of(MAIN)
-    rays, wavelength = launched(lens, film_rays(lens, 1000), dtype)
-    assert {c.dtype for c in (*rays, wavelength)} == {dtype}
-    assert all(c.is_contiguous() for c in rays)
-    assert 400 <= wavelength.min() < 410 and 690 < wavelength.max() <= 700
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-def test_memory_is_measured_in_a_child() -> None:
-    found = lab.in_child(memory_of, str(FOLDER / "laikin_double_gauss_50.toml"), 100_000)
-    assert found["rays"] == 100_000
-    assert found["results_mb"] == pytest.approx(2.8)
-
-
-def test_a_child_that_fails_says_why() -> None:
-    with pytest.raises(lab.Unmeasured, match="missing 1 required positional argument"):
-        lab.in_child(lab.look_up, "alone")
-
-
-def test_a_lens_that_is_not_there_is_one_clear_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert main(["trace", "--quick", "--only", "zeiss", "--out", str(tmp_path)]) == 2
-    shown = capsys.readouterr().err.strip()
-    assert "--only" in shown and "laikin" in shown and "\n" not in shown
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_exact_graph_of_rays_alone_gives_the_rays_of_the_whole() -> None:

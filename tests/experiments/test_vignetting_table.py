@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from functools import partial
 from pathlib import Path
 
 import lens_models
@@ -11,8 +9,7 @@ import numpy as np
 import pytest
 from vignetting_oracle import vignetting_errors
 
-from experiments import outside, vignetting
-from experiments.__main__ import main
+from experiments import outside
 from experiments.vignetting import DOMAINS, OPENINGS, opening_errors, pupil_masks
 from neurolens.base import status as st
 from neurolens.cameras.onnxlens import load_model
@@ -61,33 +58,6 @@ def test_cats_eyes_have_the_same_shape(fisheye: LensModel, share: float) -> None
     for exact, said in masks.values():
         assert exact.sum() > 50
         assert (exact ^ said).sum() <= 0.004 * exact.sum() + 2
-
-
-def test_a_table_of_something_else_is_not_written_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["vignetting", "--only", "petzval", "--domain", "infinity", "--quiet", "--out", str(tmp_path)]
-    for text in ("half a fi", "3", '[{"lens": "other"}]'):
-        (tmp_path / "vignetting.json").write_text(text)
-        assert main(command) == 2
-        assert "rows of experiments vignetting" in capsys.readouterr().err
-        assert (tmp_path / "vignetting.json").read_text() == text
-
-
-@pytest.mark.slow
-def test_the_command_writes_rows_and_keeps_others(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(vignetting, "MODEL", ModelSettings("ols", terms=24, planes=False))
-    few = partial(make_pairs, settings=PairSettings(train=3000, held_out=10, rim=3000))
-    monkeypatch.setattr(vignetting, "make_pairs", few)
-    (tmp_path / "vignetting.json").write_text('[{"lens": "other", "domain": "infinity", "failed": "not round"}]')
-    command = ["vignetting", "--only", "petzval", "--domain", "infinity", "--rays", "4000", "--quiet"]
-    assert main([*command, "--out", str(tmp_path)]) == 0
-    rows = json.loads((tmp_path / "vignetting.json").read_text())
-    assert [r["lens"] for r in rows] == ["other", "petzval_portrait_100"]
-    assert "petzval_portrait_100" in capsys.readouterr().out
-    assert "other: not round" in (tmp_path / "vignetting.md").read_text()
-    assert (tmp_path / "vignetting.png").stat().st_size > 10_000
-    assert main([*command[:2], "no such lens", *command[3:]]) != 0
 
 
 def test_broken_promises_are_counted() -> None:

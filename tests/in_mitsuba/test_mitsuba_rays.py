@@ -1,16 +1,17 @@
-"""What needs no Mitsuba: film samples to rays in its camera frame, wavelengths for RGB, and the error without it."""
+"""What needs no Mitsuba: film samples to rays, wavelengths for RGB, the errors without it or with an old LLVM."""
 
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from neurolens.base.errors import NeurolensError
+from neurolens.base.errors import NeurolensError, NeurolensWarning
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.mitsuba import load_scene
+from neurolens.mitsuba import library, load_scene
 from neurolens.mitsuba.sensor import BATCH, ChannelWavelengths, FilmRays, wavelength_samples
 from neurolens.render.film import PixelGrid
 from neurolens.render.spectrum import SpectralRange
@@ -117,3 +118,22 @@ def test_without_mitsuba_one_error_names_the_extra(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     with pytest.raises(NeurolensError, match=r"pip install '\.\[mitsuba\]'"):
         load_scene("cornell-box")
+
+
+@pytest.mark.parametrize("version", [(15, 0, 6), (-1, -1, -1)])
+def test_an_llvm_too_old_is_named_with_the_variant_that_works(
+    version: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LLVM 15 would end the process: the default variant becomes one that needs none; one asked for is kept."""
+    taken: list[str] = []
+    mi = SimpleNamespace(
+        variant=lambda: None, variants=lambda: ["scalar_spectral", "llvm_ad_spectral"], set_variant=taken.append
+    )
+    dr = SimpleNamespace(detail=SimpleNamespace(llvm_version=lambda: version))
+    monkeypatch.setattr(library, "libraries", lambda: (mi, dr))
+    monkeypatch.setattr(library, "_compile", lambda variant: None)
+    with pytest.warns(NeurolensWarning, match="LLVM.*19 works.*variant scalar_spectral needs none and is taken"):
+        library.require_mitsuba()
+    with pytest.warns(NeurolensWarning, match="variant scalar_spectral needs none$"):
+        library.require_mitsuba("llvm_ad_spectral")
+    assert taken == ["scalar_spectral", "llvm_ad_spectral"]

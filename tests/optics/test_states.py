@@ -19,7 +19,6 @@ from neurolens.optics.focusing import (
     film_range_mm,
     focus_states,
     infinity_states,
-    monotone,
     nearest_focus_m,
 )
 from neurolens.optics.glass import LINE_D_NM
@@ -152,18 +151,6 @@ def test_a_derived_position_says_so_in_its_file(tmp_path: Path) -> None:
     assert zoomed.derived in read_lens(tmp_path / "zoomed.toml").notes
 
 
-def test_interpolation_stays_between_neighbours_and_keeps_its_rows() -> None:
-    x, rows = [0.0, 1.0, 1.5, 4.0], [[0.0, 5.0], [1.0, 2.0], [1.1, 2.0], [3.0, 9.0]]
-    for place, row in zip(x, rows, strict=True):
-        assert monotone(x, rows, place) == row
-    for i in range(3):
-        for t in (0.1, 0.5, 0.9):
-            found = monotone(x, rows, x[i] + t * (x[i + 1] - x[i]))
-            for value, a, b in zip(found, rows[i], rows[i + 1], strict=True):
-                assert min(a, b) - 1e-12 <= value <= max(a, b) + 1e-12
-    assert monotone([0.0, 2.0], [[1.0], [5.0]], 0.5) == pytest.approx([2.0])
-
-
 @pytest.mark.parametrize(
     ("configuration", "efl_mm", "half_field_deg"),
     [("72mm", 72.1, 17.0), ("135mm", 135.0, 9.15), ("194mm", 194.01, 6.0)],
@@ -224,14 +211,6 @@ def test_the_edge_of_the_image_circle_sees_the_field_asked_for() -> None:
 def test_states_that_a_double_gauss_has_not(state: dict, expected: str) -> None:
     with pytest.raises(InputError, match=expected):
         tabled("laikin_double_gauss_50").at(**state)
-
-
-@pytest.mark.parametrize(("name", "efl_mm"), [("brendel_tessar_100", 50), ("muller_fisheye_100", 14)])
-def test_rescaling_keeps_angles_and_f_number(name: str, efl_mm: float) -> None:
-    small = tabled(name).at(focal_length_mm=efl_mm)
-    assert first_order(small).efl_mm == pytest.approx(efl_mm, rel=1e-12)
-    assert first_order(small).f_number == pytest.approx(first_order(tabled(name)).f_number, rel=1e-12)
-    assert small.half_field_deg == tabled(name).half_field_deg
 
 
 # --- Stop

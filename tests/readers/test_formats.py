@@ -1,7 +1,9 @@
-"""Every lens of the library, written in each format that can say it, is read back to the same lens and rays."""
+"""Library lenses in every format come back; whatever else a file holds is a lens or one clear error."""
 
 from __future__ import annotations
 
+import random
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +12,13 @@ import torch
 from lens_formats import WRITERS, CannotSay, plain
 from shipped import PATHS
 
+from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.trace import Rays, trace
 from neurolens.readers.any_format import read_any
+from neurolens.readers.source import MAX_BYTES
 
 NO_DISPERSION = (".len", ".dat", ".txt")
 
@@ -98,3 +102,127 @@ def test_every_format_is_met_by_some_lens() -> None:
             except CannotSay:
                 pass
     assert said[".zmx"] >= 37 and said[".seq"] >= 35 and said[".len"] >= 20 and said[".dat"] >= 15, said
+
+
+GAUSS = plain(read_lens(Path(__file__).parents[2] / "lenses" / "laikin_double_gauss_50.toml"))
+CONSTANT = replace(GAUSS, surfaces=tuple(replace(s, V_d=None) for s in GAUSS.surfaces))
+TEXTS = {suffix: write(CONSTANT if suffix in (".len", ".dat", ".txt") else GAUSS) for suffix, write in WRITERS.items()}
+THICKNESS = repr(GAUSS.surfaces[0].thickness_mm)
+
+
+def read_text(text: str | bytes, suffix: str, tmp_path: Path) -> Lens:
+    path = tmp_path / f"lens{suffix}"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return read_any(path)
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+@pytest.mark.parametrize("word", ["nan", "inf", "-inf", "1e999", "5,8", "5.8mm", "0x1F", "1_0", "--5", "five"])
+def test_bad_number(word: str, suffix: str, tmp_path: Path) -> None:
+    text = TEXTS[suffix]
+    assert THICKNESS in text
+    with pytest.raises(InputError) as caught:
+        read_text(text.replace(THICKNESS, word, 1), suffix, tmp_path)
+    line = text[: text.index(THICKNESS)].count("\n") + 1
+    assert f"lens{suffix}" in str(caught.value)
+    assert suffix == ".json" or f"line {line}" in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"  \n\n", b"\0\1\2" * 500, b"\xff\xfe\0", b"\x89PNG\r\n\x1a\n" + bytes(range(256)), b"hello world\n"],
+    ids=["empty", "blank", "zeros", "half a letter", "picture", "prose"],
+)
+def test_content_that_is_no_lens(content: bytes, suffix: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=re.escape(f"lens{suffix}")):
+        read_text(content, suffix, tmp_path)
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_huge_file_is_refused_unread(suffix: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"more than {MAX_BYTES} bytes"):
+        read_text(TEXTS[suffix].encode() + b" " * MAX_BYTES, suffix, tmp_path)
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_too_many_surfaces_are_refused(suffix: str, tmp_path: Path) -> None:
+    first = next(s for s in CONSTANT.surfaces if s.n_d == 1 and not s.stop)
+    many = replace(CONSTANT, surfaces=(*CONSTANT.surfaces, *(replace(first, thickness_mm=1.0),) * 600))
+    with pytest.raises(InputError, match="at most 500|1 to 500"):
+        read_text(WRITERS[suffix](many), suffix, tmp_path)
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+@pytest.mark.parametrize("stops", [0, 2])
+def test_number_of_stops(stops: int, suffix: str, tmp_path: Path) -> None:
+    rows = list(CONSTANT.surfaces)
+    text = _without_stop(suffix)
+    if stops:
+        rows.insert(6, rows[CONSTANT.stop_index])
+        text = WRITERS[suffix](replace(CONSTANT, surfaces=tuple(rows)))
+    with pytest.raises(InputError, match="stop"):
+        read_text(text, suffix, tmp_path)
+
+
+def _without_stop(suffix: str) -> str:
+    marks = {".zmx": ("  STOP\n", ""), ".seq": ("  STO\n", ""), ".len": ("AST\n", ""), ".json": ("true", "false")}
+    if suffix in marks:
+        return TEXTS[suffix].replace(*marks[suffix])
+    lines = TEXTS[suffix].splitlines(keepends=True)
+    flat = next(k for k, line in enumerate(lines) if line.startswith("0.0\t"))
+    count = [line.replace(str(len(CONSTANT.surfaces)), str(len(CONSTANT.surfaces) - 1)) for line in lines[:flat]]
+    return "".join([*count, *lines[flat + 1 :]])
+
+
+@pytest.mark.parametrize("suffix", [".zmx", ".seq", ".len", ".json"])
+def test_a_file_cut_off_anywhere_is_noticed(suffix: str, tmp_path: Path) -> None:
+    text = TEXTS[suffix]
+    last = {".zmx": "BLNK", ".seq": "SI 0.0", ".len": "END ", ".json": "}"}[suffix]
+    end = text.rindex(last)
+    for cut in range(10, end, max(1, end // 60)):
+        with pytest.raises(InputError, match=re.escape(f"lens{suffix}")):
+            read_text(text[:cut], suffix, tmp_path)
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_mangled_files_never_raise_anything_else(suffix: str, tmp_path: Path) -> None:
+    chance, text = random.Random(1), TEXTS[suffix]
+    for _ in range(60):
+        letters = list(text)
+        for _ in range(chance.randint(1, 4)):
+            letters[chance.randrange(len(letters))] = chance.choice("0123456789.-+eE \n'\"&;!#/:SZ\x00\u00e9")
+        try:
+            lens = read_text("".join(letters), suffix, tmp_path)
+        except InputError as error:
+            assert f"lens{suffix}" in str(error) and "\n" not in str(error)
+        else:
+            assert lens.surfaces
+
+
+@pytest.mark.parametrize("suffix", [".zmx", ".seq", ".len"])
+def test_unknown_keyword_is_named_with_its_line(suffix: str, tmp_path: Path) -> None:
+    lines = TEXTS[suffix].splitlines()
+    for place in range(4, len(lines) - 4, 7):
+        broken = [*lines[:place], "QXW 1 2 3", *lines[place:]]
+        with pytest.raises(InputError, match=rf"line {place + 1}, QXW: got \(unknown keyword\)|line {place + 1}, &"):
+            read_text("\n".join(broken), suffix, tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["missing", "folder"])
+def test_no_file(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "lens.zmx"
+    if kind == "folder":
+        path.mkdir()
+    with pytest.raises(InputError, match="missing|not a regular file"):
+        read_any(path)
+
+
+def test_a_format_that_nobody_knows_lists_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"Zemax \(.zmx\).*CODE V.*OSLO|Zemax \(.zmx\).*OSLO.*CODE V"):
+        read_text("what is this", ".abc", tmp_path)
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_content_decides_whatever_the_suffix(suffix: str, tmp_path: Path) -> None:
+    assert len(read_text(TEXTS[suffix], ".lens_file", tmp_path).surfaces) == len(GAUSS.surfaces)

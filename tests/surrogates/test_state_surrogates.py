@@ -21,7 +21,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
-from neurolens.evaluate.check import check_states, random_states, space_of_card
+from neurolens.evaluate.check import check_states, space_of_card
 from neurolens.evaluate.rays import ray_errors
 from neurolens.modelfile.axes import Axis, product, weights
 from neurolens.optics.focusing import best_focus_z_mm
@@ -305,15 +305,6 @@ def test_promises_are_checked_at_fresh_states(tmp_path: Path) -> None:
     assert not promises[0].holds
     with pytest.raises(InputError, match="sha256"):
         space_of_card(card, loaded().axes, lens_models.LENSES / "ogawa_zoom_70_200.toml", exported())
-
-
-def test_random_states_cover_the_range() -> None:
-    states = random_states((ZOOM, FOCUS), 10, seed=4)
-    assert states == random_states((ZOOM, FOCUS), 10, seed=4) != random_states((ZOOM, FOCUS), 10, seed=5)
-    for k, axis in enumerate((ZOOM, FOCUS)):
-        low, high = axis.range
-        parts = sorted(int(10 * (s[k] - low) / (high - low)) for s in states)
-        assert parts == list(range(10))
 
 
 def test_lenses_with_cylinders_are_refused() -> None:
