@@ -18,12 +18,13 @@ from neurolens.modelfile.states import STATE
 
 Array = NDArray[np.float64]
 FOCUS = "focus_m"
+Focus = Literal["best", "widest", "paraxial"]
 
 SMALLEST = 1 / 16  # of the widest stop: at smaller ones the film stays
 _SAMPLES = (8, 12)  # distances and stops at which the film is placed, and where errors are measured
 _CHECKS = (4, 6)
 # Degrees in 1 / distance and in the stop's radius, and the error (mm) that is enough.
-_BEST, _BEST_MM = ((3, 2), (4, 4), (5, 6), (6, 8)), 2e-4
+_BEST, _BEST_MM = ((3, 2), (4, 4), (5, 6), (6, 8), (6, 10)), 2e-4
 _PARAXIAL, _PARAXIAL_MM = tuple((n, 0) for n in range(2, 13)), 1e-5
 _RISING, _RISING_MM = 200, 1e-4  # distances at which the film must rise; a fall by less is rounding
 
@@ -82,7 +83,7 @@ def film_function(
     nodes: Sequence[Focusing],
     axes: Sequence[Axis] = (),
     between: Sequence[tuple[Sequence[float], Focusing]] = (),
-    focus: Literal["best", "widest", "paraxial"] = "best",
+    focus: Focus = "best",
 ) -> FilmFunction:
     """The film by the distance in m (inf allowed) and, of "best", the stop's radius in mm.
 

@@ -303,8 +303,8 @@ def best_focus_z_mm(scene: ModelScene, focus_m: float, wavelength_nm: tuple[floa
 
 
 def best_focus_of_stops_mm(
-    scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float], stops_mm: FloatArray
-) -> FloatArray:
+    scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float], stops_mm: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """`best_focus_z_mm` at stop radii up to the scene's: of one set of rays, those that each lets through."""
     spot = _axial_spot(scene, focus_m, wavelength_nm)
     found = scene.model.rays(*spot.rays, scene.film_z_mm, scene.stop_radius_mm)
@@ -317,7 +317,7 @@ def best_focus_of_stops_mm(
     whole = spot.best_mm - scene.film_z_mm
     lens = scene.model.card["lens"]
     scale = 0.0 if math.isinf(focus_m) else (scene.film_z_mm - lens["infinity_film_z_mm"]) / lens["efl_mm"]
-    best: FloatArray = scene.film_z_mm + shift + (shift - whole) * scale**2
+    best: NDArray[np.float64] = scene.film_z_mm + shift + (shift - whole) * scale**2
     return best
 
 

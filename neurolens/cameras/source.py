@@ -12,8 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.focus_function import FOCUS, SMALLEST, Focusing, film_function, number_of
+from neurolens.cameras.focus_function import FOCUS, SMALLEST, Array, Focus, Focusing, film_function, number_of
 from neurolens.cameras.fused import LensGraph, whole_camera
 from neurolens.cameras.lens_film import LensFilm
 from neurolens.cameras.model import ModelScene, best_focus_of_stops_mm
@@ -119,7 +118,7 @@ def model_focusing(model: OnnxLens, state: Sequence[float] = (), stop_mm: float 
     def paraxial(focus_m: float) -> float:
         return float(lens["film_z_mm"]) if inside else film_z_mm(*planes, focus_m)
 
-    def best(focus_m: float, stops_mm: FloatArray) -> FloatArray:
+    def best(focus_m: float, stops_mm: Array) -> Array:
         distance = nearest if inside else focus_m
         scene = ModelScene(at, min(max(paraxial(distance), ends[0]), ends[1]), widest)
         return best_focus_of_stops_mm(scene, distance, light, stops_mm)
@@ -144,11 +143,11 @@ def film_extras(
     stops = f"stop radius {SMALLEST:.3g} to 1 times the widest" if by_stop else f"stop radius {wide:.4g} mm"
     first = " (of the first state)" if axes else ""
     reach = [f"object to film from {near:.4g} m{first} to infinity"] if distance else []
-    made = {
-        "film_z_mm": ("best" if by_stop else "widest", [stops, *reach], "least RMS spot on the axis", [STOP_RADIUS])
+    made: dict[str, tuple[Focus, list[str], str, list[str]]] = {
+        "film_z_mm": ("best" if by_stop else "widest", [stops, *reach], "the least RMS spot on the axis", [STOP_RADIUS])
     }
     if distance:
-        made["film_z_paraxial_mm"] = ("paraxial", reach, "paraxial image", [])
+        made["film_z_paraxial_mm"] = ("paraxial", reach, "the paraxial image", [])
     functions, lines = {}, []
     for name, (focus, limits, what, stop) in made.items():
         functions[name], error = film_function(nodes, axes, between, focus)

@@ -159,7 +159,8 @@ def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras 
     lines = "\n".join(f" * {line}".rstrip() for line in comment).replace("*/", "* /")
     text = _HEAD.format(comment=lines, name=name, guard=f"{macro}_H", macro=macro)
     live = program.live()
-    if any(program.steps[k].kind == "sqrt" for k in live):
+    kinds = [p.steps[k].kind for p in (program, *extras.functions.values()) for k in p.live()]
+    if "sqrt" in kinds:
         text += _SQRT.format(name=name, macro=macro)
     if any(program.steps[k].kind == "clamp" for k in live):
         text += _CLAMP.format(name=name, macro=macro)
@@ -173,7 +174,7 @@ def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras 
     text += "\n" * bool(extras.constants)
     text += "".join(f"#define {macro}_{key.upper()} {literal(v)}\n" for key, v in extras.constants.items())
     for key, function in extras.functions.items():
-        own = Writer(function, "sqrtf", f"{macro}_FMA")
+        own = Writer(function, f"{name}_sqrt", f"{macro}_FMA")
         text += f"\n{macro}_INLINE {one_number(own, f'{name}_{key}', 'const float')}"
     lookup = f"{{table}}[{name}_cell({{index}}, {{cells}}) * {{width}} + {{place}}]"
     writer = Writer(
