@@ -3,6 +3,7 @@
 base <- graph <- modelfile <- optics <- surrogates <- evaluate <- commands <- cli
                               optics <- analysis   <- evaluate
                  modelfile <- cameras <- render    <- evaluate
+                              optics, render <- flare <- evaluate
                                          render    <- mitsuba  <- evaluate
 """
 
@@ -33,11 +34,13 @@ PARTS = {
     "cameras": {"graph", "modelfile"},
     "render": {"cameras"},
     "mitsuba": {"cameras", "render"},
+    "flare": {"graph", "optics", "render"},
     "evaluate": {
-        *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba")
+        *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare")
     },
+    "blender": set(),
     "commands": {
-        *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba"),
+        *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare"),
         "evaluate",
     },
     "cli": {"commands"},
@@ -53,6 +56,7 @@ PACKAGES = {
     "readers": set(),
     "cameras": {"numpy", "onnxruntime", "onnx"},  # onnx when a camera is first asked for rays: it loads slowly
     "render": {"numpy", "OpenEXR", "PIL", "trimesh"},
+    "blender": {"bpy", "cycles"},  # of Blender's own Python, in the extension
 }
 # Besides those: the writer of ONNX; the one camera that traces rays exactly, the maker of cameras, which imports it
 # when one is asked for; the shapes of the stop, which are parts of graphs.

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import test_oracle as oracle
 import torch
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.flare.ghosts import GhostTracer, Pair
+from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Coating, Lens, Surface
-from neurolens.optics.sequence import Followed, follow, ghost
+from neurolens.optics.sequence import Followed, backwards, follow, ghost
 from neurolens.optics.trace import Rays, trace
 
 DATA = Path(__file__).parents[1] / "data" / "ghost_paths.json"
@@ -48,6 +52,21 @@ def compare(lens: Lens, entry: dict[str, Any], dtype: torch.dtype) -> int:
 def test_own_selection(dtype: torch.dtype) -> None:
     lenses = {e["name"]: oracle.own(e).lens for e in oracle.OWN}
     passed = sum(compare(lenses[e["lens"]], e, dtype) for e in json.loads(DATA.read_text())["ghosts"])
+    assert passed > 20
+
+
+def test_compiled_ghosts() -> None:
+    """The compiled form of the same paths: the power of the reference, in float32."""
+    lenses, passed = {e["name"]: oracle.own(e).lens for e in oracle.OWN}, 0
+    for entry in json.loads(DATA.read_text())["ghosts"]:
+        lens = lenses[entry["lens"]]
+        lens = replace(lens, film_z_mm=float(lens.vertices_mm[-1]))
+        rays = np.array([[*r["o"], *r["d"]] for r in entry["rays"]]).T
+        found = GhostTracer(lens, [Pair(*entry["ghost"])]).trace(rays, LINE_D_NM)
+        for row, power, worst in zip(entry["rays"], found.power[0], found.worst[0], strict=True):
+            if row["status"] == "ok" and worst <= 1:
+                passed += 1
+                assert power == pytest.approx(row["fresnel_unpolarised_product"], rel=2e-4)
     assert passed > 20
 
 
@@ -125,3 +144,38 @@ def test_impossible_sequences(steps: list[tuple[int, Any]], word: str) -> None:
         follow(plate(), beam(), steps)
     with pytest.raises(InputError):
         ghost(3, 1, 1)
+
+
+@pytest.mark.parametrize("polarised", [False, True])
+def test_light_goes_the_same_way_back(polarised: bool) -> None:
+    """Reversibility: the same points and, with the films of the way in the other order, the same share (Stokes)."""
+    lens = oracle.own(oracle.OWN[0]).lens
+    coated = tuple(replace(s, coating=Coating("one", ((1.38, 100.0),))) for s in lens.surfaces[:3])
+    lens = replace(lens, surfaces=(*coated, *lens.surfaces[3:]))
+    count, rays = len(lens.surfaces), oracle.launched(oracle.OWN[0]["rays"], torch.float64)
+    arrived = 0
+    for first, second in ((0, 1), (1, 4), (6, count - 1)):
+        steps = ghost(count, first, second)
+        there = follow(lens, rays, steps, 500.0, polarised=polarised)
+        back = Rays(*there.rays[:3], *(-d for d in there.rays[3:]))
+        again = follow(lens, back, backwards(steps), 500.0, towards="scene", polarised=polarised)
+        ok = there.status == st.PASSED
+        arrived += int(ok.sum())
+        assert torch.equal(again.status[ok], there.status[ok])
+        for a, b in zip(again.rays[3:], rays[3:], strict=True):
+            torch.testing.assert_close(-a[ok], b[ok], rtol=0, atol=1e-11)
+        torch.testing.assert_close(again.power[ok], there.power[ok], rtol=1e-11, atol=0)
+    assert arrived > 10
+
+
+def test_polarised_ghost_of_a_plate() -> None:
+    """Its power is the mean over the two polarisations of T^2 R^2, which the average at each surface is not."""
+    angle = 50.0
+    cos_i = math.cos(math.radians(angle))
+    cos_t = math.sqrt(1 - (math.sin(math.radians(angle)) / 1.5) ** 2)
+    r_s = ((cos_i - 1.5 * cos_t) / (cos_i + 1.5 * cos_t)) ** 2
+    r_p = ((1.5 * cos_i - cos_t) / (1.5 * cos_i + cos_t)) ** 2
+    exact, mean = (sum(((1 - r) * r) ** 2 for r in (r_s, r_p)) / 2, (r_s + r_p) / 2)
+    polarised = follow(plate(), beam(angle), ghost(3, 0, 1), polarised=True)
+    assert float(polarised.power) == pytest.approx(exact, rel=1e-12)
+    assert float(follow(plate(), beam(angle), ghost(3, 0, 1)).power) == pytest.approx(((1 - mean) * mean) ** 2)
