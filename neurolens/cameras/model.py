@@ -7,7 +7,7 @@ import warnings
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -287,6 +287,38 @@ def best_focus_z_mm(scene: ModelScene, focus_m: float, wavelength_nm: tuple[floa
     Raises:
         InputError: no ray passes.
     """
+    return _axial_spot(scene, focus_m, wavelength_nm).best_mm
+
+
+def best_focus_of_stops_mm(
+    scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float], stops_mm: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """`best_focus_z_mm` at stop radii up to the scene's: of one set of rays, those that each lets through."""
+    spot = _axial_spot(scene, focus_m, wavelength_nm)
+    found = scene.model.rays(*spot.rays, scene.film_z_mm, scene.stop_radius_mm)
+    radius = np.where(spot.passed, np.hypot(*found.stop_xy_mm), np.inf)
+    edge_mm = scene.stop_radius_mm * _WIDER / _RINGS  # from ring to ring: those at the edge count in part
+    share = ((stops_mm[:, None] - radius) / edge_mm + 0.5).clip(0, 1)
+    along, across = np.where(spot.passed, spot.moments, 0.0) @ share.T
+    shift = -along / across
+    # The object keeps its distance from the film: where that moves, its image moves by the square of its scale.
+    whole = spot.best_mm - scene.film_z_mm
+    lens = scene.model.card["lens"]
+    scale = 0.0 if math.isinf(focus_m) else (scene.film_z_mm - lens["infinity_film_z_mm"]) / lens["efl_mm"]
+    best: NDArray[np.float64] = scene.film_z_mm + shift + (shift - whole) * scale**2
+    return best
+
+
+class _Spot(NamedTuple):
+    """Best film of rays [N] of an axial point; film and pupil points [2, N], wavelengths; moments [2, N]; who pass."""
+
+    best_mm: float
+    rays: tuple[FloatArray, FloatArray, FloatArray]
+    moments: FloatArray
+    passed: NDArray[np.bool_]
+
+
+def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float]) -> _Spot:
     domain = scene.model.card["domain"]
     colours, weights = film_plane.colours(wavelength_nm)
     shape = len(colours), _RINGS, _SPOKES
@@ -324,7 +356,7 @@ def best_focus_z_mm(scene: ModelScene, focus_m: float, wavelength_nm: tuple[floa
             raise InputError(scene.model.path, "focus", "best", "a model that lets axial light pass")
         best = scene.film_z_mm - float(along / across)
         film = np.where(np.isfinite(film), film, 0.0)
-    return best
+    return _Spot(best, (film.astype(np.float32), pupil.astype(np.float32), nanometres), moments, passed)
 
 
 def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: float) -> dict[str, Any]:
