@@ -28,7 +28,6 @@ from experiments import lab
 from experiments.lab import Row
 from experiments.trace_speed import film_rays, with_aspheres
 from neurolens.base.errors import NeurolensError
-from neurolens.base.progress import Progress
 from neurolens.evaluate.speed import POOL, Call, Candidate, Race, race
 from neurolens.optics import glass
 from neurolens.optics.lensfile import read_lens
@@ -254,10 +253,8 @@ def run(args: argparse.Namespace) -> None:
     lens = read_lens(LENS).at()
     tables = {table.name + end: (table, bool(end)) for end in ("", PASSING) for table in (lens, with_aspheres(lens))}
     contests = [(name, dtype) for name in tables for dtype in DTYPES]
-    progress = Progress({f"{name}, {dtype}": 40.0 for name, dtype in contests}, quiet=args.quiet)
     rows: list[Row] = []
-    for name, dtype in contests:
-        with progress.stage(f"{name}, {dtype}") as report:
-            timed, agreement = contest(tables[name][0], dtype, tables[name][1], rounds, report)
+    for (name, dtype), report in lab.stages(contests, ", ".join, args.quiet, 40.0):
+        timed, agreement = contest(tables[name][0], dtype, tables[name][1], rounds, report)
         rows += rows_of(timed, dtype, name, agreement)
     print(lab.write_results(args.out, "optiland", page(rows, rounds), {"machine": lab.machine(), "rows": rows}))

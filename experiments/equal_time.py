@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -30,8 +28,7 @@ from experiments.equal_time_errors import (
     squared_error,
     weights,
 )
-from neurolens.base.files import atomic_path, sha256_of
-from neurolens.base.tomlfile import read_toml
+from neurolens.base.files import atomic_path, fingerprint_of, sha256_of
 from neurolens.cameras.build import FUSED, Shot, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera, FusedExactCamera
@@ -42,7 +39,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import render
-from neurolens.render.scene import CameraSettings, Scene, load_scene
+from neurolens.render.scene import CameraSettings, Scene, files_named, load_scene
 from neurolens.surrogates.domain import Domain
 
 EXACT, THIN = "exact", "thin lens"
@@ -91,11 +88,11 @@ class Shelf:
     def __init__(
         self, run: Path, file: Path, scene: Scene, name: str, camera: Camera, film: FilmSettings, size: tuple[int, int]
     ) -> None:
-        about = [neurolens.__version__, _source(), _scene_bytes(file), plain(camera.settings), film.__dict__, size]
-        model = camera.settings.get("model")
-        if model is not None:
-            about.append(sha256_of(model))
-        digest = hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()
+        package, model = Path(neurolens.__file__).parent, camera.settings.get("model")
+        read = [f for part in _SOURCES for f in sorted((package / part).rglob("*.py"))]
+        read += [file, *(file.parent / named for named in files_named(scene.settings)), *([model] if model else [])]
+        about = [[sha256_of(f) for f in read], plain(camera.settings), plain(film.__dict__), size]
+        digest = fingerprint_of([neurolens.__version__, *about])
         self.folder = run / scene.name / f"{name.replace(' ', '-')}-{digest[:16]}"
         self.size = size
         self.render = partial(render, scene, camera, width=size[0], height=size[1], film=film)
@@ -131,31 +128,6 @@ def _read(file: Path, shape: tuple[int, ...]) -> tuple[NDArray[np.float32], floa
         return None
     good = rgb.shape == shape and rgb.dtype == np.float32 and np.isfinite(rgb).all() and seconds > 0
     return (rgb, seconds) if good else None
-
-
-def _source() -> str:
-    digest = hashlib.sha256()
-    package = Path(neurolens.__file__).parent
-    for file in sorted(f for part in _SOURCES for f in (package / part).rglob("*.py")):
-        digest.update(file.read_bytes())
-    return digest.hexdigest()
-
-
-def _scene_bytes(file: Path) -> str:
-    """Hash of a scene file and of the files that it names, wherever it names one."""
-    digest = hashlib.sha256(file.read_bytes())
-    for named in sorted(set(_strings(read_toml(file)))):
-        beside = file.parent / named
-        if Path(named).suffix and beside.is_file():
-            digest.update(beside.read_bytes())
-    return digest.hexdigest()
-
-
-def _strings(value: Any) -> list[str]:
-    if isinstance(value, str):
-        return [value]
-    inner = list(value.values()) if isinstance(value, Mapping) else value if isinstance(value, list) else []
-    return [text for part in inner for text in _strings(part)]
 
 
 SCENES = ("grid", "lights", "room")

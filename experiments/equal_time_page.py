@@ -4,7 +4,7 @@ Against a converged exact render with other seeds: bias and variance told apart,
 lens is ahead, equal time and equal samples, FLIP maps and film-space error maps in micrometres; the exact lens and the
 network as compiled C, too. Renders are kept in the run folder: an interrupted run resumes, and
 what would give another picture is rendered again. Needs the extra "train" (torch, matplotlib, flip-evaluator) and a C
-compiler. Writes README.md, equal_time.csv, equal_time.json and three pictures a scene (about ten minutes).
+compiler. Writes README.md, equal_time.json and three pictures a scene (about ten minutes).
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -36,8 +36,7 @@ from experiments.equal_time import (
 )
 from experiments.equal_time_errors import Estimate, crossover_s, log_interpolate
 from neurolens.analysis.plot_style import FAINT, INK, drawing, plain_log_ticks
-from neurolens.base.files import atomic_path, atomic_write_text
-from neurolens.base.progress import Progress
+from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.figures import side_by_side
 from neurolens.evaluate.plots import family_colour
 from neurolens.evaluate.records import plain
@@ -70,8 +69,6 @@ def write(results: Sequence[SceneResult], folder: Path) -> str:
     """Write tables of all scenes and the pictures of each; returns the page."""
     data = {"machine": lab.machine(), "scenes": [_scene_data(r) for r in results]}
     lab.write_json(folder / "equal_time.json", plain(data))
-    points = [(r, c, level) for r in results for c in r.cameras.values() for level in c.levels]
-    atomic_write_text(folder / "equal_time.csv", lab.csv_text(_POINTS, points))
     for result in results:
         draw(result, folder)
     text = page(results)
@@ -192,19 +189,6 @@ def _time(seconds: float) -> str:
     return f"{float(f'{seconds / size:.2g}'):g} {name}"
 
 
-# Every measured point: squared errors as their roots; an empty cell where noise made the square negative.
-_POINTS = lab.columns(
-    ("scene", lambda p: p[0].name),
-    ("camera", lambda p: p[1].name),
-    ("samples", lambda p: p[2].samples),
-    ("seconds_min", lambda p: p[2].seconds_min, ".5g"),
-    ("seconds_median", lambda p: p[2].seconds_median, ".5g"),
-    ("rmse", lambda p: math.sqrt(p[2].mse) if p[2].mse > 0 else None, ".5g"),
-    ("relative_rmse", lambda p: math.sqrt(p[2].rel_mse) if p[2].rel_mse > 0 else None, ".5g"),
-    ("flip", lambda p: p[2].flip, ".5g"),
-)
-
-
 def _scene_data(result: SceneResult) -> lab.Row:
     def camera_data(c: CameraResult) -> lab.Row:
         return {
@@ -236,15 +220,8 @@ _MOST_BYTES = 150_000  # of a picture
 _TITLES = {"mse": "RMSE (linear radiance)", "rel_mse": "relative RMSE (share of 1)"}
 
 
-@dataclass(frozen=True)
-class Panel:
-    """One kind of error.
-
-    Attributes:
-        label: quantity and unit. curves: camera to (seconds [L], error [L]); what is not above 0 is left out.
-        floor: what the reference itself is worth, with its `floor_name`. levels: camera to an error that more samples
-            do not lower, drawn where it lies in view.
-    """
+class Panel(NamedTuple):
+    """One kind of error by camera: (seconds [L], error [L]), the reference's own, errors that samples do not lower."""
 
     label: str
     curves: Mapping[str, tuple[Sequence[float], Sequence[float]]]
@@ -301,13 +278,11 @@ def _fewer_colours(picture: Path) -> None:
     """Keep at most 256 colours of a PNG, half as many and so on until it is small enough for the repository."""
     with Image.open(picture) as full:
         pixels = full.convert("RGB")
-    for colours in (256, 128, 64, 32):
-        with atomic_path(picture) as temporary:
-            pixels.quantize(colours, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
-                temporary, optimize=True
-            )
-        if picture.stat().st_size <= _MOST_BYTES:
-            return
+
+    def reduced(colours: int) -> Image.Image:
+        return pixels.quantize(colours, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+
+    lab.write_small_png(picture, (reduced(n) for n in (256, 128, 64, 32)), _MOST_BYTES)
 
 
 _MARKERS = "osD^vP"
@@ -384,10 +359,8 @@ def run(args: argparse.Namespace) -> None:
     counts = QUICK if args.quick else Counts()
     folder = args.folder or lab.ROOT / "runs" / ("equal_time_quick" if args.quick else "equal_time")
     files = [scene_file(name) for name in args.scene or SCENES]
-    progress = Progress({file.stem: 1.0 for file in files}, quiet=args.quiet)
     done: list[SceneResult] = []
-    for file in files:
-        with progress.stage(file.stem) as report:
-            done.append(measure_scene(file, folder, counts, args.threads, report))
+    for file, report in lab.stages(files, lambda f: f.stem, args.quiet):
+        done.append(measure_scene(file, folder, counts, args.threads, report))
         text = write(done, args.out)
     print(f"{text}\nWritten to {args.out}")

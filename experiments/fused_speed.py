@@ -22,7 +22,6 @@ import numpy as np
 
 from experiments import lab
 from experiments.lab import Report
-from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxsession import open_session
 from neurolens.evaluate.candidates import (
@@ -342,10 +341,8 @@ def run(args: argparse.Namespace) -> None:
     find_compiler()
     rounds = lab.rounds_of(args)
     cases = lab.chosen(CASES, lambda c: c.file, args.only, "fused")
-    progress = Progress({c.file: 1.0 for c in cases}, quiet=args.quiet)
     rows, text = earlier(args.out, [Path(c.file).stem for c in cases]), ""
-    for case in cases:
-        with progress.stage(case.file) as report:
-            rows += measure(case, rounds=rounds, torch_compiled=not args.quick, report=report)
+    for case, report in lab.stages(cases, lambda c: c.file, args.quiet):
+        rows += measure(case, rounds=rounds, torch_compiled=not args.quick, report=report)
         text = write(rows, args.out, rounds)
     print(text)

@@ -21,7 +21,6 @@ from experiments import lab
 from experiments.lab import Row
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.base.progress import Progress
 from neurolens.evaluate.experiment import LensChoice
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
@@ -280,14 +279,12 @@ def run(args: argparse.Namespace) -> None:
     files = lab.chosen(sorted(lab.LENSES.glob("*.toml")), lambda f: f.stem, args.only, "inverse")
     records = lab.kept_rows(args.out / "inverse.json", "experiments inverse", lambda r: r["lens"], "lenses")
     missing = [f for f in files if args.again or f.stem not in records]
-    progress = Progress({f.stem: 20.0 for f in missing}, quiet=args.quiet)
     text = page(list(records.values()))
-    for file in missing:
-        with progress.stage(file.stem):
-            try:
-                records[file.stem] = measure_lens(file, args.rays, raw=args.raw)
-            except InputError as error:
-                records[file.stem] = {"lens": file.stem, "refused": str(error).removeprefix(f"{lab.ROOT}/")}
+    for file, _ in lab.stages(missing, lambda f: f.stem, args.quiet, 20.0):
+        try:
+            records[file.stem] = measure_lens(file, args.rays, raw=args.raw)
+        except InputError as error:
+            records[file.stem] = {"lens": file.stem, "refused": str(error).removeprefix(f"{lab.ROOT}/")}
         rows = sorted(records.values(), key=lambda r: str(r["lens"]))
         text = lab.write_results(args.out, "inverse", page(rows), {"lenses": rows})
     print(text)

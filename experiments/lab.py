@@ -15,14 +15,15 @@ import platform
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.base.files import atomic_write_text
+from neurolens.base.files import atomic_path, atomic_write_text
+from neurolens.base.progress import Progress, Report
 from neurolens.commands.arguments import QUIET_HELP, whole
 from neurolens.evaluate.pages import markdown_table
 
@@ -31,7 +32,6 @@ LENSES, SCENES, MODELS = ROOT / "lenses", ROOT / "experiments" / "scenes", ROOT 
 RESULTS = ROOT / "experiments" / "results"
 T = TypeVar("T")
 Row = dict[str, Any]
-Report = Callable[[float], None]
 
 
 # ---- Options. --------------------------------------------------------------------------------------------------------
@@ -85,6 +85,17 @@ def chosen(items: Sequence[T], name: Callable[[T], str], only: str, what: str) -
         known = ", ".join(dict.fromkeys(name(item) for item in items))
         raise InputError(f"experiments {what}", "--only", only, f"part of one of: {known}")
     return found
+
+
+def stages(
+    items: Iterable[T], name: Callable[[T], str], quiet: bool, seconds: float = 1.0
+) -> Iterator[tuple[T, Report]]:
+    """Items one after the other, each with what reports its progress; an equal plan of `seconds` for all."""
+    items = list(items)
+    progress = Progress({name(item): seconds for item in items}, quiet=quiet)
+    for item in items:
+        with progress.stage(name(item)) as report:
+            yield item, report
 
 
 def quiet_glasses() -> None:
@@ -202,6 +213,23 @@ def write_json(file: Path, data: Any) -> None:
     """Write JSON atomically, its folder made."""
     file.parent.mkdir(parents=True, exist_ok=True)
     atomic_write_text(file, json.dumps(data, indent=1, allow_nan=False) + "\n")
+
+
+def write_small_png(file: Path, pictures: Iterable[Any], most_bytes: int) -> None:
+    """Write the first of some pictures (of Pillow) that is small enough for the repository, as PNG.
+
+    Raises:
+        InputError: none is.
+    """
+    for picture in pictures:
+        packed = io.BytesIO()
+        picture.save(packed, "PNG", optimize=True)
+        if packed.tell() <= most_bytes:
+            with atomic_path(file) as temporary:
+                temporary.write_bytes(packed.getvalue())
+            return
+    size = f"({packed.tell()} bytes)"
+    raise InputError(file, "size", size, f"at most {most_bytes} bytes: smaller or fewer pictures")
 
 
 def kept_rows(path: Path, maker: str, key: Callable[[Row], Hashable], listed: str = "") -> dict[Any, Row]:

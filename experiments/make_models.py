@@ -34,8 +34,8 @@ from neurolens.evaluate.describe import lens_files
 from neurolens.evaluate.experiment import DomainChoice, Experiment, LensChoice, check_names
 from neurolens.evaluate.measure import Measured, fit_and_measure, shared_rays
 from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
+from neurolens.evaluate.records import versions
 from neurolens.evaluate.speed import race
-from neurolens.evaluate.train import versions
 from neurolens.evaluate.train_states import fit_and_measure_states, state_settings
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm

@@ -29,11 +29,11 @@ import neurolens
 from experiments import lab
 from experiments.lab import Report
 from experiments.mitsuba_scenes import our_scene, with_our_spectra
-from experiments.renderer_speed import thin_camera
 from neurolens import mitsuba
 from neurolens.base.errors import NeurolensError
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import Camera, FloatArray
+from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.records import plain
 from neurolens.mitsuba import require_mitsuba
@@ -291,6 +291,19 @@ def _stage_of(function: Function) -> str | None:
     return _FUNCTIONS.get(module, {}).get(name) or _STAGE.get(module, STAGES[-1])
 
 
+def thin_camera(scene: Scene) -> ThinLens:
+    """A 50 mm thin lens with the scene's focus and stop."""
+    settings = scene.settings.camera
+    film_mm = (settings.film_width_mm, settings.film_height_mm)
+    return ThinLens(50.0, settings.f_number or 2.8, settings.focus_m, film_mm)
+
+
+def mpaths_per_s(scene: Scene, repeats: int = 5, **options: Any) -> list[float]:
+    """Millions of paths a second of each of some renders through a thin lens; options as of `render`."""
+    camera = thin_camera(scene)
+    return [float(render(scene, camera, seed=k, **options).stats["mpaths_per_s"]) for k in range(repeats)]
+
+
 def memory_of(scene_file: str, width: int, samples: int) -> lab.Row:
     """Render a scene, in a fresh process.
 
@@ -440,11 +453,7 @@ def _scenes(found: Found, report: Report) -> None:
         camera = thin_camera(scene)
         height = round(SCENE_WIDTH * camera.film_mm[1] / camera.film_mm[0])
         size: dict[str, Any] = {"width": SCENE_WIDTH, "height": height, "samples": SCENE_SAMPLES}
-        speeds = []
-        for seed in range(repeats):
-            done = render(scene, camera, **size, threads=threads, seed=seed)
-            speeds.append(float(done.stats["mpaths_per_s"]))
-            report((k + (seed + 1) / (repeats + 1)) / len(SCENES))
+        speeds = mpaths_per_s(scene, repeats=repeats, threads=threads, **size)
         found.scenes.append(
             {
                 "scene": name,
@@ -454,6 +463,7 @@ def _scenes(found: Found, report: Report) -> None:
                 "shares": profile(scene, camera, SCENE_WIDTH, height, SCENE_SAMPLES),
             }
         )
+        report((k + 1) / len(SCENES))
 
 
 def _memory(found: Found, report: Report) -> None:

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from experiments import lab
 from neurolens.base import status as st
-from neurolens.base.progress import Progress
 from neurolens.cameras.onnxlens import OnnxLens, load_model
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.surrogates.model import ANY_WAVELENGTH_NM
@@ -183,9 +182,8 @@ OPTIONS = (
 def run(args: argparse.Namespace) -> int:
     """Send random numbers; 1 where a promise is broken."""
     broken = 0
-    for path in args.models:
-        with Progress(quiet=args.quiet).stage(path.stem) as report:
-            found = send(load_model(path), args.rays, args.seed, report)
+    for path, report in lab.stages(args.models, lambda p: p.stem, args.quiet):
+        found = send(load_model(path), args.rays, args.seed, report)
         print(f"{path}: {found.rays} rays, {found.inside} of them inside the domain, {found.passed} passed")
         for promise, count in found.broken.items():
             if count:

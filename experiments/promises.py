@@ -22,12 +22,13 @@ import torch
 
 from experiments import lab
 from experiments.lab import Row
-from experiments.renderer_speed import measure
+from experiments.mitsuba_speed import mpaths_per_s
 from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
 from neurolens.evaluate.speed import Race, race
 from neurolens.optics.lensfile import read_lens
+from neurolens.render.scene import load_scene
 from neurolens.surrogates.domain import Domain, domain_of
 
 
@@ -174,7 +175,7 @@ def check_floors(rounds: int = 20) -> list[Floor]:
         timing, reason = timed.timing(f"trace {kind}"), timed.unavailable.get(f"trace {kind}", "")
         speed = None if timing is None else 1000 / timing["min"]
         found.append(Floor(f"exact tracer, {kind}, one core, float32", floor, speed, "Mray/s", reason))
-    speed = measure(SCENE, threads=2, depth=3)["mpaths_per_s"]
+    speed = max(mpaths_per_s(load_scene(SCENE), threads=2, max_depth=3, samples=16))
     return [*found, Floor("render of the room, two cores, depth 3", RENDER_MPATH_S, speed, "Mpath/s")]
 
 

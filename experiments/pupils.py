@@ -1,6 +1,6 @@
 """What share of the rays that a pupil sends pass the lens: pupils of the literature, and the outlines of our cameras.
 
-On the lenses of the theses, beside their figures (half a minute). Writes passage.md, passage.json and passage.png.
+On the lenses of the theses, beside their figures (half a minute). Writes passage.md and passage.json.
 """
 
 from __future__ import annotations
@@ -11,15 +11,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from torch.quasirandom import SobolEngine
 
 from experiments import lab
-from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, drawing
 from neurolens.base.progress import Progress
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.pupil_boxes import PupilTable
@@ -70,10 +67,6 @@ CASES = (
     Case("laikin_double_gauss_50", 50.0, 1.8),
     Case("laikin_double_gauss_50", 50.0, 8.0),
 )
-# Those of the picture.
-_IN_PICTURE = (("laikin_double_gauss_50", 1.8), ("muller_fisheye_100", 4.0), ("mizuguchi_fisheye_10", 8.0))
-DRAWN = tuple(case for case in CASES if (case.lens, case.f_number) in _IN_PICTURE)
-
 # Steinert 2009, Table 5.3: percent of rays through the global pupil that pass, pixel (128, 96) of 512 x 384.
 TABLE_5_3 = {2.8: 64.31, 4.0: 35.8, 5.6: 18.1, 8.0: 9.0, 11.0: 5.1, 16.0: 3.0, 22.0: 1.7, 32.0: 0.8, 45.0: 0.4}
 
@@ -105,7 +98,6 @@ class Passage:
     lit_radius_mm: float
     dark: float
     lost: float
-    by_radius: dict[str, NDArray[np.float64]]
 
 
 def camera_of(case: Case) -> ExactCamera:
@@ -121,7 +113,7 @@ def measure(case: Case, samples: int = SAMPLES) -> Passage:
     found = time.perf_counter() - start
     outline = camera.film.outline
     film, square, wavelength = _samples(samples, 1, outline.film_radius_mm)
-    rates, by_radius = {}, {}
+    rates = {}
     true = true_irradiance(camera, samples)
     for name, make in METHODS.items():
         start = time.perf_counter()
@@ -130,9 +122,8 @@ def measure(case: Case, samples: int = SAMPLES) -> Passage:
         passed, light = _irradiance(camera, pupil, film, square, wavelength)
         sample_ns = _nanoseconds(pupil.sample, film, square, wavelength)
         rates[name] = Rate(float(passed.mean()), light / true, search_s, sample_ns)
-        by_radius[name] = _profile(np.hypot(*film), passed, outline.film_radius_mm)
     lost = lost_light(camera, film, square, wavelength)
-    return Passage(case, rates, outline.film_radius_mm, 1 - film.shape[1] / samples, lost, by_radius)
+    return Passage(case, rates, outline.film_radius_mm, 1 - film.shape[1] / samples, lost)
 
 
 def true_irradiance(camera: ExactCamera, samples: int) -> float:
@@ -237,12 +228,6 @@ def _nanoseconds(sample: SampleFunction, film: Any, square: Any, wavelength: Any
     return 1e9 * least / film.shape[1]
 
 
-def _profile(radius: Any, passed: Any, end: float, bins: int = 24) -> NDArray[np.float64]:
-    place = np.minimum((radius / end * bins).astype(int), bins - 1)
-    count = np.bincount(place, minlength=bins)
-    return np.bincount(place, weights=passed, minlength=bins) / np.maximum(count, 1)
-
-
 def pixel_rates(samples: int = SAMPLES) -> Iterator[tuple[float, float, float]]:
     """f-number, percent that passes from the pixel of Table 5.3 through the rear rim, and theirs; 36 x 27 mm film."""
     radius = math.hypot(128, 96) * 36 / 512
@@ -330,66 +315,11 @@ def _json(p: Passage) -> dict[str, Any]:
     }
 
 
-_SHOWN = (OURS, "radial ellipses", "pixel ellipse", "pixel disc", "Wu, two steps", "rear rim")
-
-
-def draw(passages: Sequence[Passage], path: Path) -> None:
-    """Above: rates against the film radius of some cases; below: what passes their pupil planes, and our outlines."""
-    with drawing(path, 3.6 * len(passages), 5.2) as figure:
-        axes = figure.subplots(2, len(passages), squeeze=False, height_ratios=(1.7, 1))
-        for column, p in enumerate(passages):
-            above, below = axes[:, column]
-            for method, colour in zip(_SHOWN, (INK, *FIELD_COLOURS), strict=False):
-                values = 100 * p.by_radius[method]
-                radius = (np.arange(values.size) + 0.5) * p.lit_radius_mm / values.size
-                above.plot(radius, values, color=colour, lw=2.2 if method == OURS else 1.3, label=method)
-            above.set(ylim=(0, 103), xlim=(0, p.lit_radius_mm), xlabel="film radius (mm)")
-            above.set_title(f"{p.case.name}, f/{p.case.f_number:g}", loc="left")
-            above.grid(axis="y")
-            _draw_outlines(below, camera_of(p.case))
-        axes[0, 0].set_ylabel("rays that pass (%)")
-        axes[0, 0].legend(loc="lower left")
-        axes[1, 0].set_ylabel("y on the pupil plane (mm)")
-
-
-def _draw_outlines(axes: Any, camera: ExactCamera) -> None:
-    """What passes at 550 nm (dots, on a grid a quarter wider) and our outlines, from the axis to the end of light."""
-    axes.set_aspect("equal", "box")
-    left, ticks = 0.0, []
-    square = np.stack([a.ravel() for a in np.meshgrid(*[(np.arange(36) + 0.5) / 36] * 2)]).astype(np.float32)
-    wavelength = np.full(square.shape[1], 550, np.float32)
-    for share in (0.0, 0.6, 0.85, 0.97):
-        film = np.zeros_like(square)
-        film[0] = radius = share * camera.film.outline.film_radius_mm
-        x, y = _polygon(camera.film.outline, radius)
-        middle, half = (x.min() + x.max()) / 2, (x.max() - x.min()) / 2
-        across, up = middle + 2.5 * half * (square[0] - 0.5), 2.5 * y.max() * (square[1] - 0.5)
-        points = np.stack([across, up]).astype(np.float32)
-        passed = camera.film.scene(film, points, wavelength).status == 0
-        left += 1.25 * half
-        axes.plot(points[0] - middle + left, points[1], ".", ms=1.1, color=FAINT, rasterized=True)
-        axes.plot(points[0][passed] - middle + left, points[1][passed], ".", ms=1.6, color=FIELD_COLOURS[0])
-        axes.plot(x - middle + left, y, color=INK, lw=1.2)
-        ticks.append((left, f"{radius:.1f}"))
-        left += 1.25 * half
-    axes.set_xticks([t for t, _ in ticks], [t for _, t in ticks])
-    axes.set_xlabel("pupils at film radius (mm), one scale")
-
-
-def _polygon(outline: PupilOutline, radius: float) -> tuple[Any, Any]:
-    """The closed outline of a film radius at 550 nm, on the pupil plane, mm."""
-    way = np.linspace(0, 4, 513)[:, None] - np.array([3.5, 0.5])  # round the edge of the unit square
-    square = np.clip(np.abs((way + 2) % 4 - 2) - 0.5, 0, 1).T.astype(np.float32)
-    film = np.repeat(np.array([[radius], [0]], np.float32), square.shape[1], 1)
-    x, y = outline.sample(film, square, np.full(square.shape[1], 550, np.float32))[0]
-    return x, y
-
-
 OPTIONS = (lab.count("rays", SAMPLES, "rays per method (default 131072)", 1000), lab.ONLY, lab.out())
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure every case of the theses and draw three."""
+    """Measure every case of the theses."""
     lab.quiet_glasses()
     cases = lab.chosen(CASES, lambda case: case.lens, args.only, "pupils")
     with Progress(quiet=args.quiet).stage("pupils") as report:
@@ -400,4 +330,3 @@ def run(args: argparse.Namespace) -> None:
         pixel = [] if args.only else list(pixel_rates(args.rays))
     data = {"film_mm": FILM_MM, "samples": args.rays, "cases": [_json(p) for p in done], "tessar_pixel": pixel}
     print(lab.write_results(args.out, "passage", page(done, pixel, args.rays), data))
-    draw([p for p in done if p.case in DRAWN] or done[:1], args.out / "passage.png")

@@ -3,7 +3,7 @@
 The lens is a textbook Cooke triplet whose rear air space was made 0.6 mm too long, as if a spacer were wrong. Free are
 that space and the film's place; the loss is the mean square distance of rays from their field's centroid, over three
 fields and three wavelengths. Rays start in front of the lens and fill the stop of the lens as it stands.
-Writes refine_spacing.json and refine_spacing.png.
+Writes refine_spacing.json.
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ import argparse
 import math
 import time
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,7 +20,6 @@ from experiments import lab
 from neurolens import __version__
 from neurolens.analysis.bundles import bundle
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.plot_style import drawing, wavelength_colour
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
@@ -70,7 +67,7 @@ OPTIONS = (lab.out(),)
 
 
 def run(args: argparse.Namespace) -> None:
-    """Refine, check the gradient, write figures and picture."""
+    """Refine, check the gradient, write figures."""
     file_lens = read_lens(lab.ROOT / LENS)
     right_mm = float(file_lens.surfaces[SPACE].thickness_mm)
     rows = list(file_lens.surfaces)
@@ -98,7 +95,6 @@ def run(args: argparse.Namespace) -> None:
         "versions": {"neurolens": __version__, "torch": torch.__version__},
     }
     lab.write_json(args.out / "refine_spacing.json", record)
-    draw(spots, refocused, refined, history, record, args.out / "refine_spacing.png")
     print((args.out / "refine_spacing.json").read_text())
 
 
@@ -136,30 +132,3 @@ def gradients(spots: Spots, at: Tensor) -> dict[str, list[float]]:
 def rms_um(spots: Spots, at: Tensor) -> float:
     """Root mean square spot radius over all fields, um."""
     return 1000 * math.sqrt(float(spots.loss(at)))
-
-
-def draw(spots: Spots, before: Tensor, after: Tensor, history: list[float], record: dict[str, Any], path: Path) -> None:
-    """Spots before and after, and the loss at every evaluation."""
-    title, below = "One spacing refined by gradients", f"{spots.lens.name}; the space after surface {SPACE}"
-    with drawing(path, 11.5, 6.2, title, below) as figure:
-        axes = figure.subplots(2, len(FIELDS_DEG) + 1, width_ratios=[*([1.0] * len(FIELDS_DEG)), 1.5])
-        for row, (values, name) in enumerate(((before, "0.6 mm too long, refocused"), (after, "refined"))):
-            x, y = (1000 * c for c in spots.land(values))
-            for f, angle in enumerate(FIELDS_DEG):
-                panel = axes[row, f]
-                for w, nm in enumerate(WAVELENGTHS_NM):
-                    on = spots.counts[f, w] > 0
-                    centre = [float(c[f][spots.counts[f] > 0].mean()) for c in (x, y)]
-                    panel.plot(x[f, w][on] - centre[0], y[f, w][on] - centre[1], ".", ms=2, color=wavelength_colour(nm))
-                panel.set(xlim=(-40, 40), ylim=(-40, 40), aspect="equal", title=f"{angle:g} degrees")
-                panel.set(xlabel="x, um", ylabel=f"{name}\ny, um" if f == 0 else "")
-        for nm in sorted(WAVELENGTHS_NM):
-            axes[0, 0].plot([], [], "o", ms=4, color=wavelength_colour(nm), label=f"{nm:.0f} nm")
-        axes[0, 0].legend(loc="upper left", fontsize=7, handletextpad=0.2)
-        curve = axes[0, -1]
-        curve.plot([1000 * math.sqrt(h) for h in history], "o-", ms=3)
-        curve.set(xlabel="evaluation", ylabel="RMS spot, um", title="all fields", ylim=(0, None))
-        axes[1, -1].axis("off")
-        spaces, sizes = record["space_mm"], record["rms_spot_um"]
-        lines = [f"{k}: {v:.4f} mm" for k, v in spaces.items()] + [f"RMS {k}: {v:.2f} um" for k, v in sizes.items()]
-        axes[1, -1].text(0, 0.95, "air space\n" + "\n".join(lines), va="top", fontsize=9)

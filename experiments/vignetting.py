@@ -4,7 +4,7 @@ Open, closed by two and four stops, and with blades, over every lens that is rou
 core); rows of an earlier run stay where a lens is not chosen. One fit per lens and domain serves every opening: the
 exact lens closed by some stops passes what it passes open and what crosses the stop within the smaller opening; so does
 the model, by its own stop crossing, as cameras test it outside the graph.
-Writes vignetting.md, vignetting.json and vignetting.png (cat's eyes, exact and of the model).
+Writes vignetting.md and vignetting.json.
 """
 
 from __future__ import annotations
@@ -20,13 +20,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from experiments import lab
 from experiments.lab import Row
-from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.progress import Progress
@@ -176,69 +174,6 @@ def page(rows: Sequence[Row]) -> str:
     return lab.page(*parts)
 
 
-_RADII = (0.0, 0.4, 0.7, 0.9, 1.0)  # shares of the film radius
-_POINTS = 200
-_EXACT, _MODEL = "#cfd8e3", "#d55e00"
-_SHOWN = ("full", "6 blades")
-
-
-def cats_eyes(models: Sequence[LensModel], path: Path) -> Path:
-    """Draw a row per model: exact passing pupils filled, the model's outlined, open and with blades two stops down."""
-    with drawing(path, 2.1 * len(_RADII), 2.2 * len(models) + 0.5) as figure:
-        grid = figure.subplots(len(models), len(_RADII), squeeze=False)
-        for axes_row, model in zip(grid, models, strict=True):
-            for axes, share in zip(axes_row, _RADII, strict=True):
-                _draw(axes, model, share)
-                axes.set_title(f"{share * model.domain.film_radius_mm:.1f} mm", fontsize=8)
-            axes_row[0].set_ylabel(model.lens.name[:28], fontsize=8)
-        figure.suptitle(
-            "Passing pupil by film radius: exact (filled), model (outline); open, and 6 blades 2 stops down", fontsize=9
-        )
-    return Path(path)
-
-
-def _draw(axes: Any, model: LensModel, share: float) -> None:
-    u, v, masks = pupil_masks(model, share)
-    for k, name in enumerate(_SHOWN):
-        exact, said = masks[name]
-        if exact.any():
-            fill = _EXACT if k == 0 else FIELD_COLOURS[0]
-            axes.contourf(u, v, exact.astype(float), levels=[0.5, 2.0], colors=[fill], alpha=1.0 - 0.55 * k)
-        if said.any():
-            axes.contour(u, v, said.astype(float), levels=[0.5], colors=[_MODEL], linewidths=0.9)
-    axes.set_aspect("equal")
-    axes.tick_params(labelsize=6, colors=INK)
-
-
-Masks = dict[str, tuple[np.ndarray, np.ndarray]]
-
-
-def pupil_masks(model: LensModel, share: float, points: int = _POINTS) -> tuple[np.ndarray, np.ndarray, Masks]:
-    """Grids u and v [points, points] of the pupil plane, mm, and what passes there, exact and by the model.
-
-    From a film point at `share` of the film radius along +x, on the first film plane, at the middle wavelength; masks
-    by name of opening.
-    """
-    b, d = model.domain.bounds, model.domain
-    row = min(len(b.low_mm) - 1, round(share * (len(b.low_mm) - 1)))
-    low, high, half = b.low_mm[row], b.high_mm[row], b.half_mm[row]
-    if low >= high:
-        low, high, half = -d.pupil_radius_mm, d.pupil_radius_mm, d.pupil_radius_mm
-    reach = 1.08 * max((high - low) / 2, half)
-    grid = torch.linspace(-reach, reach, points, dtype=torch.float64)
-    u, v = (t.reshape(-1) for t in torch.meshgrid(grid + (low + high) / 2, grid, indexing="xy"))
-    film_x = torch.full_like(u, share * d.film_radius_mm)
-    wavelength = torch.full_like(u, sum(d.wavelength_nm) / 2)
-    rays = FilmRays(film_x, torch.zeros_like(u), torch.full_like(u, d.film_z_mm[0]), u, v, wavelength)
-
-    def shaped(values: Tensor) -> np.ndarray:
-        return values.reshape(points, points).numpy()
-
-    masks = {k: (shaped(exact), shaped(said)) for k, (exact, said) in passing(model.lens, model, rays).items()}
-    return shaped(u), shaped(v), masks
-
-
-_DRAWN = ("laikin_double_gauss_50", "tajima_retrofocus_24", "isshiki_fisheye_10", "shimizu_fisheye_220")
 OPTIONS = (
     lab.count("rays", 100_000, "a lens (default 100000)", 1000),
     lab.ONLY,
@@ -249,7 +184,7 @@ OPTIONS = (
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure the lenses, draw four of them; the table is written after each."""
+    """Measure the lenses; the table is written after each."""
     files = [f for f in lens_files(args.lenses) if args.only in f.stem and not read_quietly(f).anamorphic]
     if not files:
         raise InputError("experiments vignetting", "--only", args.only, f"part of a lens's name in {args.lenses}")
@@ -262,8 +197,5 @@ def run(args: argparse.Namespace) -> None:
             rows[domain, file.stem] = measure(file, domain, args.rays)
             done = [rows[key] for key in sorted(rows)]
             text = lab.write_results(args.out, "vignetting", page(done), done)
-            report(0.9 * (i + 1) / len(jobs))
-        drawn = [f for f in files if f.stem in _DRAWN] or files[:1]
-        if not args.only or not (args.out / "vignetting.png").exists():
-            cats_eyes([model_of(f, DOMAINS["infinity"])[0] for f in drawn], args.out / "vignetting.png")
+            report((i + 1) / len(jobs))
     print(text)

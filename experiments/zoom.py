@@ -18,7 +18,7 @@ from experiments import lab
 from neurolens import __version__
 from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing
 from neurolens.base.errors import InputError
-from neurolens.base.progress import Progress, Report
+from neurolens.base.progress import Report
 from neurolens.evaluate.experiment import near_limit_m, wavelengths_nm
 from neurolens.evaluate.rays import ray_errors
 from neurolens.evaluate.train_states import AXIS_LABELS, error_axes, error_line, fit_and_measure_states
@@ -194,11 +194,9 @@ def run(args: argparse.Namespace) -> None:
     args.models.mkdir(parents=True, exist_ok=True)
     records = lab.kept_rows(args.out / "zoom.json", "experiments zoom", lambda r: r["case"], "cases")
     missing = [known[n] for n in args.cases or known if args.again or n not in records]
-    progress = Progress(dict.fromkeys((c.name for c in missing), 60.0), quiet=args.quiet)
     text = page(list(records.values()))
     with pinned_threads():
-        for case in missing:
-            with progress.stage(case.name) as report:
-                records[case.name] = measure_case(case, args.models, args.states, report)
+        for case, report in lab.stages(missing, lambda c: c.name, args.quiet, 60.0):
+            records[case.name] = measure_case(case, args.models, args.states, report)
             text = write_records(records, args.out)
     print(text)

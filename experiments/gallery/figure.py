@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +12,10 @@ from typing import Any
 import numpy as np
 from PIL import Image as Pictures
 
+from experiments import lab
 from experiments.gallery.cameras import TITLES, luminance
 from neurolens.analysis.plot_style import new_figure, style
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path
 from neurolens.evaluate.figures import rounded_up
 from neurolens.evaluate.image import Image, to_srgb
 
@@ -141,15 +142,8 @@ def _save_small(figure: Any, path: Path) -> None:
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=DPI, facecolor="white", format="png")
     picture = Pictures.open(drawn).convert("RGB")
-    for colours in (None, 256, 128, 64, 48, 32):
-        packed = io.BytesIO()
-        (picture if colours is None else _reduced(picture, colours)).save(packed, "PNG", optimize=True)
-        if packed.tell() <= MOST_BYTES:
-            with atomic_path(path) as temporary:
-                temporary.write_bytes(packed.getvalue())
-            return
-    size = f"{packed.tell()} bytes at 32 colours"
-    raise InputError(path, "size", f"({size})", f"at most {MOST_BYTES} bytes: smaller or fewer pictures")
+    fewer = (_reduced(picture, colours) for colours in (256, 128, 64, 48, 32))
+    lab.write_small_png(path, itertools.chain([picture], fewer), MOST_BYTES)
 
 
 def _reduced(picture: Any, colours: int) -> Any:

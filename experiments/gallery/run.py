@@ -37,7 +37,7 @@ from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress, Report
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import number, print_json, table
-from neurolens.evaluate.train import versions
+from neurolens.evaluate.records import versions
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
 

@@ -155,8 +155,7 @@ def _ideal_of(kind: str, path: Path, shot: Shot) -> Camera:
         _refuse(f"{kind}{path}", "film_offset_mm", shot.film_offset_mm or None, "left out: set focus_m")
     lens = _placed(read_lens(path), shot)
     camera = ideal_as(kind, lens, shot)
-    lens_facts = {"id": lens.lens_id, "name": lens.name, "sha256": lens.sha256}
-    camera.settings |= {"lens": lens_facts, "zoom": shot.zoom, "focusing": shot.focus, "derived": lens.derived}
+    camera.settings |= {"lens": lens.identity, "zoom": shot.zoom, "focusing": shot.focus, "derived": lens.derived}
     return camera
 
 

@@ -24,6 +24,7 @@ from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints,
 from neurolens.cameras.front_aim import FrontAim, front_aim
 from neurolens.cameras.fused import FusedFilm, LensGraph
 from neurolens.cameras.lens_film import LensFilm, SceneRays
+from neurolens.cameras.lens_state import axial_transmittance, lens_state
 from neurolens.cameras.outline_cache import kept_outline, search_key
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
@@ -32,7 +33,7 @@ from neurolens.cameras.sampling import arrived, check_film, positive
 from neurolens.optics import pupil_methods as known
 from neurolens.optics.focusing import best_focused
 from neurolens.optics.glass import LINE_D_NM, absorption_of
-from neurolens.optics.paraxial import first_order
+from neurolens.optics.paraxial import chief_reach_mm, first_order
 from neurolens.optics.prescription import Focus, Lens
 from neurolens.optics.pupil_methods import RadialPupil
 from neurolens.optics.pupils import (
@@ -128,7 +129,7 @@ class ExactCamera:
         data = first_order(self.lens)
         self.settings: dict[str, Any] = {
             "camera": "exact",
-            "lens": {"id": lens.lens_id, "name": lens.name, "sha256": lens.sha256},
+            "lens": lens.identity,
             "efl_mm": float(data.efl_mm),
             "f_number": float(data.f_number),
             "focus_m": None if math.isinf(self.focus_m) else self.focus_m,
@@ -142,6 +143,7 @@ class ExactCamera:
             "aperture": self.lens.aperture and self.lens.aperture.settings(),
             "dtype": dtype,
             "pupil": pupil,
+            "lens_state": self._state(first_order(lens).efl_mm),
         }
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
@@ -180,6 +182,19 @@ class ExactCamera:
             weight = through * aim.area / (self.film.exposure * ((point_m - origin) ** 2).sum(0))
         status = np.where(aim.status == st.PASSED, done.status.numpy(), aim.status)
         return arrived(film, origin, point_m, weight, status)
+
+    def _state(self, nominal_mm: float) -> dict[str, Any]:
+        """The table `lens_state` of the settings; `nominal_mm` is the focal length at infinity."""
+        data = first_order(self.lens)
+        return lens_state(
+            nominal_mm=nominal_mm,
+            efl_mm=data.efl_mm,
+            pinhole_mm=chief_reach_mm(self.lens),
+            entrance_pupil_mm=self._film_z_mm - data.entrance_pupil_z_mm,
+            f_number=data.f_number,
+            transmittance=axial_transmittance(self._scene, self._light_nm),
+            squeeze=abs(data.efl_mm / first_order(self.lens, meridian="x").efl_mm) if self.lens.anamorphic else 1.0,
+        )
 
     def lens_graph(self) -> LensGraph:
         """The lens as a graph.

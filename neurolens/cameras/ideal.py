@@ -26,6 +26,7 @@ from neurolens.cameras.contract import (
     RayDifferentials,
     towards,
 )
+from neurolens.cameras.lens_state import ideal_state
 from neurolens.cameras.sampling import ahead, arrived, check_film, concentric_disk, positive, sound, stratified
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.film_plane import film_z_mm
@@ -108,6 +109,7 @@ class ThinLens(_IdealLens):
             "film_mm": list(self.film_mm),
             "film_offset_mm": film_offset_mm,
             "aperture": aperture and aperture.settings(),
+            "lens_state": ideal_state(self.focal_mm, self.f_number, self.image_distance_mm),
         }
         self.aperture = aperture
         # On-axis integral of cos over solid angle, pi R^2 / (R^2 + s'^2), but for the constant.
@@ -231,6 +233,7 @@ class ThickLens(_IdealLens):
             "principal_z_mm": [front, rear],
             "entrance_pupil_z_mm": self.pupil_z_mm,
             "aperture": aperture and aperture.settings(),
+            "lens_state": ideal_state(f, self.f_number, self._seen / f, self.film_z_mm - self.pupil_z_mm),
         }
         # The exposure on the axis is pi rho^2 / (1 + rho^2), with the slope rho of the exit pupil's rim.
         self._exposure = 1.0 + (self.radius_mm * f / self._seen) ** 2

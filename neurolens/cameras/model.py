@@ -18,6 +18,7 @@ from neurolens.cameras.cameragraph import status_graph, weight_graph
 from neurolens.cameras.contract import RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
 from neurolens.cameras.lens_film import LensFilm, SceneRays, camera_rays
+from neurolens.cameras.lens_state import axial_transmittance, lens_state, squeeze_of
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.onnxmaps import InverseRays, OnnxDerivatives, OnnxInverse, load_inverse
 from neurolens.cameras.onnxsession import joined, open_session, padded, run_session
@@ -124,6 +125,7 @@ class OnnxCamera:
             "state": dict(zip((a.name for a in model.axes), model.state, strict=True)),
             "card": {k: v for k, v in card.items() if k not in _NOT_KEPT},
         }
+        self.settings["lens_state"] = _state_of(scene, used, self.settings["f_number"])
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
@@ -280,6 +282,7 @@ _RINGS, _SPOKES = 192, 24  # rays of the best focus; many rings, since the stop'
 _WIDER = 1.3  # their disc over the axial pupil at the stop in use
 _STEPS = 4  # towards the film points from which rays go to the object
 _SHIFT = 1e-3  # of the film radius, for differences
+_SQUEEZED = 0.05  # of the film radius: height of the rays that tell a squeeze
 _BLUR_MM = 0.002  # growth of a spot that is worth a warning
 
 
@@ -334,6 +337,26 @@ def best_focus_z_mm(scene: ModelScene, focus_m: float, wavelength_nm: tuple[floa
         best = scene.film_z_mm - float(along / across)
         film = np.where(np.isfinite(film), film, 0.0)
     return best
+
+
+def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: float) -> dict[str, Any]:
+    """The table `lens_state` of the settings, by the first-order data of the card."""
+    model, film_z = scene.model, scene.film_z_mm
+    lens, radius = model.card["lens"], model.card["domain"]["film_radius_mm"]
+    efl = lens["efl_mm"]
+    focal_points = lens["front_principal_z_mm"] - efl, lens["rear_principal_z_mm"] + efl
+    exit_z = float(lens.get("exit_pupil_z_mm", math.nan))
+    entrance = film_plane.entrance_pupil_z_mm(efl, focal_points, exit_z)
+    breathes = any(a.name == "focus" for a in model.axes)
+    return lens_state(
+        nominal_mm=None if breathes else efl,
+        efl_mm=efl,
+        pinhole_mm=film_plane.reach_mm(efl, focal_points, entrance, film_z),
+        entrance_pupil_mm=film_z - entrance,
+        f_number=f_number,
+        transmittance=axial_transmittance(scene, wavelength_nm),
+        squeeze=squeeze_of(scene, _SQUEEZED * radius, wavelength_nm),
+    )
 
 
 def _axial_pupil(domain: dict[str, Any], stop_radius_mm: float) -> FloatArray:

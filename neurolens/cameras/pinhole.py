@@ -34,6 +34,7 @@ from neurolens.cameras.contract import (
     RayDifferentials,
     towards,
 )
+from neurolens.cameras.lens_state import ideal_state
 from neurolens.cameras.sampling import ahead, arrived, check_film, positive, sound
 
 Array = NDArray[Any]
@@ -71,6 +72,7 @@ class Pinhole:
             "f_number": self.f_number,
             "focus_m": None,
             "film_mm": list(self.film_mm),
+            "lens_state": ideal_state(self.focal_mm, f_number, self.focal_mm),
         }
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
@@ -191,6 +193,7 @@ class Fisheye:
             "focus_m": None,
             "field_deg": 2 * math.degrees(self.widest_rad),
             "film_mm": list(self.film_mm),
+            "lens_state": ideal_state(self.focal_mm, f_number, self.focal_mm),
         }
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:

@@ -74,8 +74,7 @@ def run_surrogates(args: argparse.Namespace) -> int:
     from neurolens.evaluate.experiment import LensChoice
     from neurolens.evaluate.methods import Bench, chosen_rows, run_bench
     from neurolens.evaluate.methods_page import NOTES, summary_page, write_lens
-    from neurolens.evaluate.records import plain
-    from neurolens.evaluate.train import versions
+    from neurolens.evaluate.records import plain, versions
 
     rows, settings, out = chosen_rows(args.methods), _settings(args), args.out
     files = _lens_files(args.lenses)

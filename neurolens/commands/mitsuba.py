@@ -69,6 +69,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.cameras.build import make_camera
     from neurolens.mitsuba import load_scene, render
     from neurolens.mitsuba.library import libraries
+    from neurolens.render.exr_attributes import standard_attributes
     from neurolens.render.pictures import write_exr, write_png
 
     scene = load_scene(args.scene, args.variant)
@@ -93,7 +94,8 @@ def run(args: argparse.Namespace) -> int:
         "variant": mi.variant(),
     }
     metadata = {"version": __version__, "camera": plain(camera.settings), "render": plain(stats)}
-    write_exr(args.out, picture, metadata=metadata)
+    attributes = standard_attributes(camera.settings, picture.shape[1], picture.shape[0])
+    write_exr(args.out, picture, metadata=metadata, attributes=attributes)
     write_png(preview, picture, args.exposure)
     said = f"{width} x {height} in {duration(float(stats['seconds']))} ({mi.variant()})"
     data = {"file": str(args.out), "preview": str(preview), **stats, "camera": camera.settings}

@@ -116,7 +116,7 @@ def add_parser(subparsers: Any) -> None:
         help="workers, each pinned to a core if there are as many as cores (default: 2)",
     )  # fmt: skip
     add_json(parser, quiet=True)
-    parser.set_defaults(position_m=None, look_at_m=None)
+    parser.set_defaults(position_m=None, look_at_m=None, frame=None)
     parser.set_defaults(run=run_kept, kept="no picture was written; older files of that name are untouched")
 
 

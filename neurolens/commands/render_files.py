@@ -149,6 +149,7 @@ def write_pictures(
         NeurolensError: they cannot be written; with the way to resume.
     """
     from neurolens.render.colour import COLOUR_SPACES
+    from neurolens.render.exr_attributes import standard_attributes
     from neurolens.render.job import MEANING
     from neurolens.render.pictures import write_exr, write_png
 
@@ -158,8 +159,12 @@ def write_pictures(
     layers = {}
     if args.layers == "all" or not result.stats["complete"]:
         layers, told["layers"] = asdict(result.layers), MEANING
+    height, width = result.rgb.shape[:2]
+    attributes = standard_attributes(metadata["camera"], width, height, args.frame)
     try:
-        write_exr(files.out, result.rgb, half=args.half, metadata=told, space=space, layers=layers)
+        write_exr(
+            files.out, result.rgb, half=args.half, metadata=told, space=space, layers=layers, attributes=attributes
+        )
         write_png(files.preview, result.rgb, args.exposure)
     except (OSError, NeurolensError) as error:
         raise NeurolensError(f"{_said(error)}; {_rescued(files, result)}") from None

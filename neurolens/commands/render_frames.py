@@ -6,6 +6,7 @@ import argparse
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.commands.render_files import Files
@@ -73,11 +74,12 @@ def run_frames(args: argparse.Namespace, render: Callable[[argparse.Namespace], 
             raise InputError(_COMMAND, f"--{name}", getattr(args, option), f"left out: --key {name} sets it")
     digits = max(4, len(str(args.frames[-1])))
     for frame in args.frames:
-        values = {_QUANTITIES[name].option: _at(name, track, frame) for name, track in tracks.items()}
+        values: dict[str, Any] = {_QUANTITIES[name].option: _at(name, track, frame) for name, track in tracks.items()}
         out = args.out.with_name(f"{args.out.stem}.{frame:0{digits}d}{args.out.suffix}")
         if out.is_file() and not Files.of(out).checkpoint.exists() and not args.restart:
             continue
-        code = render(argparse.Namespace(**vars(args) | values | {"out": out, "seed": args.seed + frame}))
+        values |= {"out": out, "seed": args.seed + frame, "frame": frame}
+        code = render(argparse.Namespace(**vars(args) | values))
         if code:
             return code
     return 0

@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import json
 import math
+import platform
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypedDict, TypeVar
 
@@ -17,6 +20,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 
 SCHEMA_VERSION = 1
+_PACKAGES = ("neurolens", "torch", "numpy", "onnxruntime", "onnx", "OpenEXR")
 R = TypeVar("R", bound=Mapping[str, Any])
 CLOSE_UM = 2.0  # a model within this RMS error counts as close: a quarter of a pixel of 36 mm at 4000 across
 
@@ -84,6 +88,15 @@ class Results:
     started: str = ""
     wall_s: float | None = None
     warnings: Sequence[str] = ()
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that a result depends on."""
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 def write_results(path: str | Path, results: Results) -> None:

@@ -59,6 +59,7 @@ _STOPPED_COLUMNS = tuple(
     for stops in (2, 4)
     for what, key in (("false pass", "false_pass"), ("false block", "false_block"))
 )
+_AXIS_COLUMNS = (Column("zoom (mm)", "zoom", digits=5), Column("focus (1/m)", "focus", digits=5))
 _EXACT_COLUMNS = (
     Column("time min (ns/ray)", "ns_per_ray.min"),
     Column("median (ns/ray)", "ns_per_ray.median"),
@@ -133,7 +134,9 @@ def _use(folder: Path, results: Results) -> str:
     said += [f"error {show(rms, 3)} µm RMS"] if rms is not None else []
     said += [f"{show(fused, 3)} ns a ray as C"] if fused is not None else []
     said += [f"{show(plain, 3)} ns in onnxruntime"] if plain is not None else []
-    commands = (use_command(file, fused is not None), f"neurolens export {shlex.quote(file)} --to c -o lens.h")
+    commands = [use_command(file, fused is not None)]
+    if not best.get("states"):  # one of many states is no function of a ray alone
+        commands.append(f"neurolens export {shlex.quote(file)} --to c -o lens.h")
     lines = "".join(f"<pre>{text(c)}</pre>" for c in commands)
     return f"<section class='use'><h2>Use {text(best['name'])}</h2><p>{text(', '.join(said))}.</p>{lines}</section>"
 
@@ -220,10 +223,19 @@ def _models(models: Sequence[Record]) -> str:
     stopped = [m for m in models if m.get("stopped_down")]
     closed = table([str(m["name"]) for m in stopped], stopped, _STOPPED_COLUMNS)
     below = f"<h3>The same fits, stopped down</h3>{closed}" if closed else ""
-    more = table(names, models, _MORE_COLUMNS)
+    more = table(names, models, _MORE_COLUMNS) + _states(models)
     words = legend((*_MODEL_COLUMNS, *_MORE_COLUMNS, *_IMAGE_COLUMNS)) if models else ""
     folded = f"<details><summary>More figures</summary>{more}{below}</details>" if more else below
     return table(names, models, _MODEL_COLUMNS) + _notes([note, *notes] if models else []) + words + folded
+
+
+def _states(models: Sequence[Record]) -> str:
+    """Models of many states, state by state."""
+    rows = [(str(m["name"]), row) for m in models for row in m.get("states") or ()]
+    if not rows:
+        return ""
+    columns = (*_AXIS_COLUMNS, *_MODEL_COLUMNS, *_MORE_COLUMNS)
+    return "<h3>State by state</h3>" + table([n for n, _ in rows], [r for _, r in rows], columns)
 
 
 def _exact(records: Sequence[Record]) -> str:

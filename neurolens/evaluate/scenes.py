@@ -27,6 +27,7 @@ from neurolens.evaluate.speed import Candidate, race
 from neurolens.graph.compiler import has_compiler
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.render.exr_attributes import standard_attributes
 from neurolens.render.job import camera_axes
 from neurolens.render.pictures import write_exr, write_png
 from neurolens.render.primitives import Rays
@@ -96,7 +97,8 @@ def render_all(
             found.cameras.append(_camera_record(scene, name, result.stats))
             metadata = {"render": result.stats, "camera": camera.settings, "mean_of_renders": choice.seeds}
             file, mean = folder / f"{_stem(scene, name)}.exr", np.mean(renders[name], axis=0, dtype=np.float32)
-            write_exr(file, mean, half=True, metadata=metadata)
+            attributes = standard_attributes(camera.settings, choice.width, choice.height)
+            write_exr(file, mean, half=True, metadata=metadata, attributes=attributes)
             write_png(file.with_suffix(".png"), mean)
         _compare_scene(found, scene, choice, renders, folder)
     return found

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import functools
-import platform
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +31,7 @@ from neurolens.evaluate.image import SETTINGS
 from neurolens.evaluate.measure import FRESH, MORE, Measured, fit_and_measure, onnx_predictor, shared_rays, what_is_poor
 from neurolens.evaluate.plots import trade_plot
 from neurolens.evaluate.rays import pixel_um, pupil_disc_share
-from neurolens.evaluate.records import Results, reaches, target_record, write_results
+from neurolens.evaluate.records import Results, reaches, target_record, versions, write_results
 from neurolens.evaluate.report import write_report
 from neurolens.evaluate.scenes import Pictures, domain_facts, render_all, scene_gain
 from neurolens.evaluate.speed import Race, race
@@ -49,7 +46,6 @@ from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs
 
 _IDEAL = ("thin lens", "pinhole")
 _LIT_RAYS = 4096  # a film radius: a quarter of a second a model
-_PACKAGES = ("neurolens", "torch", "numpy", "onnxruntime", "onnx", "OpenEXR")
 
 
 def run_experiment(
@@ -251,12 +247,3 @@ def _describe_domain(lens: Lens, pairs: RayPairs) -> dict[str, Any]:
         "rays_rim": len(pairs.rim),
         "pixel_um": pixel_um(domain),
     }
-
-
-def versions() -> dict[str, str]:
-    """Versions of the packages that a result depends on."""
-    found = {"python": platform.python_version()}
-    for name in _PACKAGES:
-        with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found

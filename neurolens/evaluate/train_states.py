@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -14,15 +13,15 @@ from typing import Any
 from neurolens import __version__
 from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing, plain_log_ticks
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of
+from neurolens.base.files import atomic_path, fingerprint_of
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
-from neurolens.evaluate import pages
 from neurolens.evaluate.candidates import time_model
 from neurolens.evaluate.check import card_errors, errors_at, random_states
 from neurolens.evaluate.experiment import Experiment, keep_inputs
 from neurolens.evaluate.measure import FRESH, known_record, note_record, seconds_to_load
-from neurolens.evaluate.records import plain, reaches, target_record
+from neurolens.evaluate.records import Results, reaches, target_record, versions, write_results
+from neurolens.evaluate.report import write_report
 from neurolens.modelfile.axes import Axis
 from neurolens.surrogates.export import export_states
 from neurolens.surrogates.fit import ModelSettings
@@ -92,8 +91,7 @@ def fit_and_measure_states(
 def run_states(experiment: Experiment, folder: Path, *, progress: Progress, command: str = "") -> dict[str, Any]:
     """Fit and measure the polynomials of an experiment whose lens is in many states.
 
-    Writes config.toml, lenses/ (its lens file), models/*.onnx, states.png, results.json and report.html (a page with
-    the table and the plot).
+    Writes config.toml, lenses/ (its lens file), models/*.onnx, states.png, results.json and report.html.
 
     Raises:
         InputError: no model that supports many states, and mistakes in lens or domain.
@@ -121,42 +119,25 @@ def run_states(experiment: Experiment, folder: Path, *, progress: Progress, comm
     for record in records:
         record["ns_per_ray"] = time_model(load_model(folder / record["file"]), record["name"], rounds=8)
     states_plot({r["name"]: r["states"] for r in records}, space.axes[0], folder / "states.png")
-    results = {
-        "title": experiment.title,
-        "command": command,
-        "lens": {"name": space.lens.name, "file": Path(space.lens.path).name, "source": space.lens.source},
-        "axes": [a.to_dict() for a in space.axes],
-        "settings": plain(given),
-        "models": records,
-        "target": target_record(records, within_um) if within_um else None,
-        "seed": experiment.pairs.seed,
-        "started": started.isoformat(timespec="seconds"),
-        "wall_s": time.perf_counter() - clock,
-        "warnings": sorted({str(w.message) for w in heard if issubclass(w.category, UserWarning)})
-        + [f"left out, only polynomials support many states: {label}" for label in left_out],
-    }
-    atomic_write_text(folder / "results.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
-    atomic_write_text(folder / "report.html", _page(results))
-    return results
-
-
-def _page(results: Mapping[str, Any]) -> str:
-    keys = ("rms_um", "p99_um", "direction_rms_deg", "false_pass", "false_block")
-    names = [a["name"] for a in results["axes"]]
-    rows = []
-    for record in results["models"]:
-        for row in sorted(record["states"], key=lambda r: [r[n] for n in names]):
-            cells = [record["name"], *(f"{row[n]:.5g}" for n in names)]
-            rows.append([*cells, *("–" if row[k] is None else f"{row[k]:.3g}" for k in keys)])
-    head = "".join(f"<th>{pages.text(h)}</th>" for h in ("model", *names, *keys))
-    body = "".join("<tr>" + "".join(f"<td>{pages.text(c)}</td>" for c in row) + "</tr>" for row in rows)
-    title = pages.text(results["title"])
-    return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><h1>{title}</h1>'
-        f"<p>{pages.text(results['lens']['name'])}, one model of many states, at random states; rays not fitted."
-        f'</p><p><img src="states.png" alt="error over the state" style="max-width:100%"></p>'
-        f"<table border=1 cellpadding=4><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></html>\n"
+    told = sorted({str(w.message) for w in heard if issubclass(w.category, UserWarning)})
+    results = Results(
+        title=experiment.title,
+        command=command,
+        lens={"name": space.lens.name, "file": Path(space.lens.path).name, "source": space.lens.source},
+        domain={a.name: {"range": list(a.range), "unit": a.unit} for a in space.axes},
+        settings=given,
+        models=records,
+        target=target_record(records, within_um) if within_um else None,
+        figures=[{"file": "states.png", "title": "Error over the state", "caption": "At random states.", "wide": True}],
+        versions=versions(),
+        seed=experiment.pairs.seed,
+        started=started.isoformat(timespec="seconds"),
+        wall_s=time.perf_counter() - clock,
+        warnings=[*told, *(f"left out, only polynomials support many states: {label}" for label in left_out)],
     )
+    write_results(folder / "results.json", results)
+    write_report(folder, results)
+    return asdict(results)
 
 
 def _fingerprint(space: StateSpace, settings: StateSettings, states: int) -> str:
@@ -171,10 +152,8 @@ AXIS_LABELS = {"zoom": "focal length (mm)", "focus": "1 / distance in focus (1/m
 def states_plot(
     models: Mapping[str, Sequence[Mapping[str, Any]]],
     axis: Axis,
-    path: str | Path,
-    *,
-    title: str = "One model of many states",
-) -> Path:
+    path: Path,
+) -> None:
     """Film-equivalent RMS over the first state axis, and false passes and blocks below it.
 
     Args:
@@ -191,7 +170,7 @@ def states_plot(
                 x, share = [r[axis.name] for r in rows], [100 * (r[key] or 0.0) for r in rows]
                 bottom.plot(x, share, mark, ms=4, color=colour, alpha=0.8, label=f"{name}: {key.replace('_', ' ')}")
         error_axes(top, axis, [r["rms_um"] for rows in models.values() for r in rows])
-        top.set_title(title, loc="left", fontweight="bold")
+        top.set_title("One model of many states", loc="left", fontweight="bold")
         top.set_ylabel("film-equivalent RMS (um)")
         top.legend(loc="best", fontsize="small")
         bottom.set_ylabel("share of rays (%)")
@@ -199,7 +178,6 @@ def states_plot(
         bottom.set_xlabel(AXIS_LABELS.get(axis.name, f"{axis.name} ({axis.unit})"))
         bottom.grid(True)
         bottom.legend(loc="best", fontsize="small")
-    return Path(path)
 
 
 def error_line(axes: Any, axis: Axis, rows: Sequence[Mapping[str, Any]], colour: str, label: str) -> None:

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from neurolens.base.errors import InputError
+from neurolens.optics.film_plane import LINE_D_NM
 
 # Fraunhofer lines, nm (helium d; hydrogen F and C).
-LINE_D_NM = 587.5618
 LINE_F_NM = 486.1327
 LINE_C_NM = 656.2725
 

@@ -1,4 +1,4 @@
-"""Where the film lies for an object distance: to first order, and the colours of best focus; for lenses and cameras."""
+"""Film, pupils and framing to first order, and the colours of best focus; for lenses and cameras."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 
+LINE_D_NM = 587.5618  # helium, yellow: where first-order data stand
 COLOURS = 7  # wavelengths that stand for a range
 _LEAST = 1e-3  # weight of a colour that the eye does not see: infrared light has a focus, too
 
@@ -40,6 +41,21 @@ def film_z_mm(
         nearest = (max(4 * efl_mm, 0.0) + separation) / 1000
         raise InputError(file, "focus_m", focus_m, f"at least {nearest:.4g} m, four focal lengths")
     return rear_principal_z_mm + 2 * d * efl_mm / (d + math.sqrt(d * (d - 4 * efl_mm)))
+
+
+def reach_mm(efl_mm: float, focal_z_mm: tuple[float, float], entrance_pupil_z_mm: float, film_z_mm: float) -> float:
+    """Film height (mm) over the slope of the chief ray, of a lens known by its focal points, front and rear, and pupil.
+
+    f + x' e / f, with x' the film's distance behind the rear focal point and e the pupil's behind the front one.
+    """
+    film, pupil = film_z_mm - focal_z_mm[1], entrance_pupil_z_mm - focal_z_mm[0]
+    return float(efl_mm + film * pupil / efl_mm)
+
+
+def entrance_pupil_z_mm(efl_mm: float, focal_z_mm: tuple[float, float], exit_pupil_z_mm: float) -> float:
+    """The entrance pupil of which the exit pupil (inf allowed) is the image, by the focal points (x x' = -f^2)."""
+    behind = exit_pupil_z_mm - focal_z_mm[1]
+    return focal_z_mm[0] - efl_mm**2 / behind if behind else math.inf
 
 
 def colours(range_nm: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

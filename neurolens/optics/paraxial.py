@@ -158,14 +158,11 @@ def _pinhole(lens: Lens, indices: list[Any]) -> FirstOrder:
 
 
 def chief_reach_mm(lens: Lens) -> float:
-    """Film height (mm) over the slope of the paraxial chief ray in the scene, which passes the entrance pupil's centre.
-
-    f + x' e / f, with x' the film's distance behind the rear focal point and e the pupil's behind the front one.
-    """
+    """Film height (mm) over the slope of the paraxial chief ray in the scene, which passes the entrance pupil."""
     data = first_order(lens)
     assert lens.film_z_mm is not None
-    film, pupil = lens.film_z_mm - data.rear_focal_z_mm, data.entrance_pupil_z_mm - data.front_focal_z_mm
-    return float(data.efl_mm + film * pupil / data.efl_mm)
+    focal_points = data.front_focal_z_mm, data.rear_focal_z_mm
+    return film_plane.reach_mm(data.efl_mm, focal_points, data.entrance_pupil_z_mm, lens.film_z_mm)
 
 
 def framing_mm(lens: Lens, focus_m: float) -> tuple[float, float]:

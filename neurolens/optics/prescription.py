@@ -185,6 +185,12 @@ class Lens:
         rows[-1][1] = None
         return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
+    @property
+    def identity(self) -> dict[str, str]:
+        """Which lens this is, for the settings of cameras: id, name, designer, source and hash."""
+        texts = {"id": self.lens_id, "name": self.name, "designer": self.designer, "source": self.source}
+        return texts | {"sha256": self.sha256}
+
     def at(
         self,
         *,

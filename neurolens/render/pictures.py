@@ -45,6 +45,7 @@ def write_exr(
     metadata: dict[str, Any] | None = None,
     space: ColourSpace = SRGB,
     layers: Mapping[str, ArrayLike] | None = None,
+    attributes: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a picture as OpenEXR: channels R, G and B, then layers, ZIP compression, atomically.
 
@@ -57,6 +58,7 @@ def write_exr(
         metadata: JSON-able settings, kept as one JSON text in the attribute "neurolens".
         space: colour space to store.
         layers: [H, W] more channels by name, always float32, inf allowed; "depth" becomes the channel Z.
+        attributes: more of the header, see `exr_attributes`.
 
     Raises:
         InputError: another shape, no pixels, complex or text, not finite, a layer with NaN or of a colour's name,
@@ -87,6 +89,7 @@ def write_exr(
         "adoptedNeutral": np.array(space.white, np.float32),
         "colorInteropID": space.interop_id,
         METADATA_KEY: text,
+        **(attributes or {}),
     }
     with atomic_path(path) as temporary:
         try:

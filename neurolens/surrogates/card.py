@@ -110,10 +110,7 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
     data = first_order(lens)
     curvature = float(lens.surfaces[0].curvature)
     return {
-        "id": lens.lens_id,
-        "name": lens.name,
-        "source": lens.source,
-        "sha256": lens.sha256,
+        **lens.identity,
         "surfaces": len(lens.surfaces),
         "refractions": sum(not s.stop for s in lens.surfaces),
         "efl_mm": float(data.efl_mm),
