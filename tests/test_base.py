@@ -1,7 +1,5 @@
 """The base: files that are whole or not there, settings, what progress says of the time left."""
 
-from __future__ import annotations
-
 import io
 import math
 import os

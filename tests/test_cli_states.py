@@ -1,7 +1,5 @@
 """The command line on lens states, whole tables, doubtful lenses; C, GLSL and ONNX of a model file."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from pathlib import Path

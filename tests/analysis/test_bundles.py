@@ -1,7 +1,5 @@
 """Bundles, spots, MTF, point spread, distortion and illumination: every ray where it was aimed; closed forms."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Seidel sums against closed forms of thin lenses (Welford 1986, 12.2), stop shifts, and exact rays."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

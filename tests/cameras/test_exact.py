@@ -1,7 +1,5 @@
 """The exact lens and its models as cameras: exposure, focus, agreement; the same picture through every known pupil."""
 
-from __future__ import annotations
-
 import math
 from copy import copy
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Errors of rays and of vignetting whose size is known in closed form; a real lens agrees with itself."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import asdict, replace

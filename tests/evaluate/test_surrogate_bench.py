@@ -1,7 +1,5 @@
 """The benchmark of surrogates: records that are made once, failures that are rows, pages that say what was measured."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

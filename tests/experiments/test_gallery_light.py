@@ -1,7 +1,5 @@
 """Falloff, depth of field, bokeh, pinhole and fisheyes of the gallery, against closed forms and forward tracing."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Measurements: goals that cannot be missed unseen, kept rows, promises, pupils, benches on known times."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache, partial

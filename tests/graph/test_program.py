@@ -1,7 +1,5 @@
 """Programs of float steps in another order and as C; low-order derivatives of graphs whose derivatives are known."""
 
-from __future__ import annotations
-
 import ctypes
 from pathlib import Path
 

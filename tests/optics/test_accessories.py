@@ -1,7 +1,5 @@
 """Filters, hoods, pinholes and shapes of the stop: geometry, areas in closed form, what the tracer lets through."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -217,27 +215,23 @@ def name(shape: Aperture) -> str:
     return f"{shape.blades} blades {shape.curvature}" if shape.blades else f"mask at {shape.rotation_deg:g}"
 
 
-def square_of_points(side: int = 1501) -> tuple[np.ndarray, np.ndarray]:
+def square_of_points(side: int) -> tuple[np.ndarray, np.ndarray]:
     """Even points over the square round a circle of radius 1."""
     places = (np.arange(side) + 0.5) / side * 2 - 1
     x, y = np.meshgrid(places, places)
     return x.ravel(), y.ravel()
 
 
-@pytest.mark.parametrize("blades", [3, 4, 5, 6, 8, 50])
-def test_the_area_of_straight_blades_is_that_of_the_polygon_in_the_circle(blades: int) -> None:
-    """n / (2 pi) sin(2 pi / n): 75.7% for five, 82.7% for six."""
-    expected = blades / (2 * math.pi) * math.sin(2 * math.pi / blades)
-    x, y = square_of_points()
-    share = Aperture(blades, 13.0).inside(2.5 * x, 2.5 * y, 2.5).sum() / (x * x + y * y <= 1).sum()
-    assert Aperture(blades).area_share == pytest.approx(expected, abs=1e-12)
-    assert share == pytest.approx(expected, abs=1e-3)
-
-
 @pytest.mark.parametrize("shape", SHAPES, ids=name)
 def test_counted_points_agree_with_the_area(shape: Aperture) -> None:
-    x, y = square_of_points()
-    assert shape.inside(x, y, 1.0).sum() / (x * x + y * y <= 1).sum() == pytest.approx(shape.area_share, abs=2e-3)
+    """Of straight blades that is n / (2 pi) sin(2 pi / n) of the circle: 75.7% for five, 82.7% for six."""
+    x, y = square_of_points(801)
+    share = shape.inside(2.5 * x, 2.5 * y, 2.5).sum() / (x * x + y * y <= 1).sum()
+    straight = bool(shape.blades) and not shape.curvature
+    assert share == pytest.approx(shape.area_share, abs=1e-3 if straight else 2e-3)
+    if straight:
+        expected = shape.blades / (2 * math.pi) * math.sin(2 * math.pi / shape.blades)
+        assert shape.area_share == pytest.approx(expected, abs=1e-12)
 
 
 def test_blades_curve_from_a_polygon_to_the_circle() -> None:

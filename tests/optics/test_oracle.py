@@ -1,7 +1,5 @@
 """Rays and ghost paths traced with 50 digits: points, directions, blocked rays, Fresnel products, first-order data."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass

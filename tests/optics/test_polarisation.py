@@ -1,7 +1,5 @@
 """Polarised transmission against reference paths, closed forms (plates, Fresnel's rhomb) and Jones calculus."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

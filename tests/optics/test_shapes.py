@@ -1,7 +1,5 @@
 """Conics, cylinders and aspheres: perfect foci, known points, equal shapes; the graph of a lens agrees."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The tracer under what should not happen; gradients and ray differentials against finite differences."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Library lenses in every format come back, by command too; whatever else a file holds is a lens or one clear error."""
 
-from __future__ import annotations
-
 import json
 import random
 import re

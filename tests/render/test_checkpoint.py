@@ -1,7 +1,5 @@
 """A render that ends early goes on to the same picture, bit for bit; a checkpoint of anything else is refused."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """Pictures survive the disk; what they say of their own pixels: sample count, variance, depth, blocked rays."""
 
-from __future__ import annotations
-
 import tracemalloc
 from collections.abc import Callable
 from copy import deepcopy

@@ -1,7 +1,5 @@
 """Light transport against closed forms and another renderer: lights, furnaces, absorption, the Cornell box."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Boundaries where rays end in each way, and poor data: a good model, or one clear refusal."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Published polynomials: frame, choice of terms, pupil tests; Taylor series against first order and traced rays."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

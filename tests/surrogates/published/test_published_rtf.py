@@ -1,7 +1,5 @@
 """Ray-transfer functions, tables of rays, and cells of the light field: nodes, ellipses, who passes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache
