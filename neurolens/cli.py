@@ -50,6 +50,7 @@ def build_parser() -> Parser:
         convert,
         evaluate,
         export,
+        flare,
         glass,
         lens,
         mitsuba,
@@ -61,7 +62,7 @@ def build_parser() -> Parser:
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    for command in (lens, analyse, glass, convert, train, models, evaluate, export, render, mitsuba, bench):
+    for command in (lens, analyse, glass, convert, train, models, evaluate, export, render, flare, mitsuba, bench):
         command.add_parser(subparsers)
     return parser
 

@@ -3,6 +3,7 @@
 base <- graph <- modelfile <- optics <- surrogates <- evaluate <- commands <- cli
                               optics <- analysis   <- evaluate
                  modelfile <- cameras <- render    <- evaluate
+                              optics, render <- flare <- evaluate
                                          render    <- mitsuba  <- evaluate
 """
 
@@ -31,11 +32,12 @@ PARTS = {
     "cameras": {"graph", "modelfile"},
     "render": {"cameras"},
     "mitsuba": {"cameras", "render"},
+    "flare": {"graph", "optics", "render"},
     "evaluate": {
-        *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba")
+        *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare")
     },
     "commands": {
-        *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba"),
+        *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare"),
         "evaluate",
     },
     "cli": {"commands"},

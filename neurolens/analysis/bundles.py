@@ -29,17 +29,11 @@ _EDGE = 1e-7
 
 
 class Pattern(NamedTuple):
-    """Pupil points, each [P].
+    """Pupil points, each [P], as shares of the stop's radius."""
 
-    Attributes:
-        tangential, sagittal: shares of the stop's radius, in the meridional plane of the field (positive on the side
-            on which its image lies) and across it.
-        weight: share of the stop's area that a point stands for; sums to 1 (0 for the points of a fan).
-    """
-
-    tangential: Tensor
-    sagittal: Tensor
-    weight: Tensor
+    tangential: Tensor  # in the meridional plane of the field, positive on the side on which its image lies
+    sagittal: Tensor  # across it
+    weight: Tensor  # share of the stop's area that a point stands for; sums to 1 (0 for the points of a fan)
 
 
 def hexapolar(rings: int) -> Pattern:
@@ -222,31 +216,21 @@ class Bundle:
 
     Tangential coordinates, of the stop and of the film, grow towards the side on which the image lies (the negative
     side of the scene's `axis`); sagittal ones along the other transverse axis.
-
-    Attributes:
-        start: before the front surface, travelling to the film.
-        film: on the film plane.
-        tangential_mm, sagittal_mm: film points relative to the chief ray of the first wavelength.
-        status: of the trace with all rims and the stop; rays that could not be aimed count as missing surface 0.
-        weight: energy of each ray: beam area in mm^2 (distant object) or solid angle in sr; 0 where it is blocked.
-        open_weight: the same without the rims.
-        path_mm: optical path from the wavefront (or object point) to the film.
-        chief_height_mm: [F], image height of the chief ray of the first wavelength, positive.
     """
 
     scene: Scene
     field_deg: tuple[float, ...]
     wavelength_nm: tuple[float, ...]
     pattern: Pattern
-    start: Rays
-    film: Rays
-    tangential_mm: Tensor
-    sagittal_mm: Tensor
-    status: Tensor
-    weight: Tensor
-    open_weight: Tensor
-    path_mm: Tensor
-    chief_height_mm: Tensor
+    start: Rays  # before the front surface, travelling to the film
+    film: Rays  # on the film plane
+    tangential_mm: Tensor  # film points relative to the chief ray of the first wavelength
+    sagittal_mm: Tensor  # the same
+    status: Tensor  # of the trace with all rims and the stop; rays that could not be aimed count as missing surface 0
+    weight: Tensor  # energy of each ray: beam area in mm^2 (distant object) or solid angle in sr; 0 where it is blocked
+    open_weight: Tensor  # the same without the rims
+    path_mm: Tensor  # optical path from the wavefront (or object point) to the film
+    chief_height_mm: Tensor  # [F], image height of the chief ray of the first wavelength, positive
 
     @property
     def passed(self) -> Tensor:
@@ -266,7 +250,7 @@ class Bundle:
 
 def bundle(
     scene: Scene,
-    field_deg: Sequence[float],
+    field_deg: Sequence[float] | None,
     wavelength_nm: Sequence[float] = DEFAULT_NM,
     pattern: Pattern | None = None,
 ) -> Bundle:
@@ -274,12 +258,13 @@ def bundle(
 
     Args:
         scene: lens, object and meridional plane.
-        field_deg: angles of the chief ray of the first wavelength, from 0 to below 180.
+        field_deg: angles of the chief ray of the first wavelength, from 0 to below 180; None: `Scene.default_fields`.
         wavelength_nm: the first is the reference; all share the object point (or direction) of its chief ray.
         pattern: hexapolar with 8 rings where not given.
     """
     pattern = pattern or hexapolar(8)
-    fields, waves = tuple(float(f) for f in field_deg), tuple(float(w) for w in wavelength_nm)
+    fields = scene.default_fields() if field_deg is None else tuple(float(f) for f in field_deg)
+    waves = tuple(float(w) for w in wavelength_nm)
     shape = (len(fields), len(waves), len(pattern.weight))
     chief = scene.chief_rays(fields, waves[0])
     aim = Aim(scene, chief, shape, waves)

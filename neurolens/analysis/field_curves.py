@@ -29,24 +29,15 @@ _VISIBLE_NM = (380.0, 780.0)
 
 @dataclass(frozen=True)
 class Colour(Result):
-    """Colour of a lens; the film's place counts as zero focus, shifts positive away from the lens.
+    """Colour of a lens; the film's place counts as zero focus, shifts positive away from the lens."""
 
-    Attributes:
-        spectrum_nm: [L], 380 to 780.
-        zone: [3] shares of the stop's radius: paraxial, half of the area, edge.
-        focus_shift_mm: [L, 3] where rays of each zone cross the axis; NaN where a rim blocks them.
-        field_deg, height_mm: [F], of the chief ray of the first line.
-        line_nm: [W]; the first is the reference.
-        lateral_um: [F, W] image height less that of the reference.
-    """
-
-    spectrum_nm: Array
-    zone: Array
-    focus_shift_mm: Array
-    field_deg: Array
-    height_mm: Array
-    line_nm: Array
-    lateral_um: Array
+    spectrum_nm: Array  # [L], 380 to 780
+    zone: Array  # [3] shares of the stop's radius: paraxial, half of the area, edge
+    focus_shift_mm: Array  # [L, 3] where rays of each zone cross the axis; NaN where a rim blocks them
+    field_deg: Array  # [F], of the chief ray of the first line
+    height_mm: Array  # [F], of the same
+    line_nm: Array  # [W]; the first is the reference
+    lateral_um: Array  # [F, W] image height less that of the reference
 
 
 def colour(
@@ -79,22 +70,15 @@ _CLOSE = 1e-3  # stop radii; differences are central, so that the error is of th
 
 @dataclass(frozen=True)
 class Curvature(Result):
-    """Foci over F fields from the axis to the edge, one wavelength.
-
-    Attributes:
-        field_deg, height_mm: [F] of the chief ray.
-        tangential_mm, sagittal_mm: [F] along the axis from the film, positive away from the lens.
-        petzval_mm: [F] the Petzval surface at these heights, drawn through the sagittal focus on the axis.
-        petzval_radius_mm: its radius, positive when its centre lies towards +z; inf when flat; NaN with cylinders.
-    """
+    """Foci over F fields from the axis to the edge, one wavelength."""
 
     wavelength_nm: float
-    field_deg: Array
-    height_mm: Array
-    tangential_mm: Array
-    sagittal_mm: Array
-    petzval_mm: Array
-    petzval_radius_mm: float
+    field_deg: Array  # [F] of the chief ray
+    height_mm: Array  # [F] of the chief ray
+    tangential_mm: Array  # [F] along the axis from the film, positive away from the lens
+    sagittal_mm: Array  # [F] the same
+    petzval_mm: Array  # [F] the Petzval surface at these heights, drawn through the sagittal focus on the axis
+    petzval_radius_mm: float  # its radius, positive when its centre lies towards +z; inf when flat; NaN with cylinders
 
 
 def curvature(
@@ -140,25 +124,17 @@ _SMALL_DEG = 1e-3  # the field whose image height gives the scale
 
 @dataclass(frozen=True)
 class Distortion(Result):
-    """Distortion over F fields from the axis to the edge.
-
-    Attributes:
-        field_deg, height_mm: [F] of the chief ray.
-        scale_mm: image height per radian at the axis: the focal length for a distant object.
-        error_percent: projection to [F], 100 (height / ideal - 1); 0 on the axis, NaN where the projection ends.
-        best: the projection of least root mean square error over the whole field.
-        reference: rectilinear below 60 degrees of half field, `best` from there on.
-        edge_percent: error of `reference` at the edge of the field.
-    """
+    """Distortion over F fields from the axis to the edge."""
 
     wavelength_nm: float
-    field_deg: Array
-    height_mm: Array
-    scale_mm: float
+    field_deg: Array  # [F] of the chief ray
+    height_mm: Array  # [F] of the chief ray
+    scale_mm: float  # image height per radian at the axis: the focal length for a distant object
+    # Projection to [F], 100 (height / ideal - 1); 0 on the axis, NaN where the projection ends.
     error_percent: dict[str, Array]
-    best: str
-    reference: str
-    edge_percent: float
+    best: str  # the projection of least root mean square error over the whole field
+    reference: str  # rectilinear below 60 degrees of half field, `best` from there on
+    edge_percent: float  # error of `reference` at the edge of the field
 
 
 def distortion(
@@ -198,54 +174,37 @@ _MARGIN = 0.08  # margin of the grid around the bundle, as film points beside th
 
 @dataclass(frozen=True)
 class Illumination(Result):
-    """Light over F fields from the axis to the edge, one wavelength, glass without losses.
-
-    Attributes:
-        field_deg, height_mm: [F] of the chief ray.
-        relative: [F] film irradiance over that on the axis.
-        unvignetted: [F] the same without rims: natural falloff, pupil growth and distortion.
-        passed: [F] share of the stop's light that no rim takes.
-        cos4: [F] cos^4 of the field angle, 0 from 90 degrees on.
-    """
+    """Light over F fields from the axis to the edge, one wavelength, glass without losses."""
 
     wavelength_nm: float
-    field_deg: Array
-    height_mm: Array
-    relative: Array
-    unvignetted: Array
-    passed: Array
-    cos4: Array
+    field_deg: Array  # [F] of the chief ray
+    height_mm: Array  # [F] of the chief ray
+    relative: Array  # [F] film irradiance over that on the axis
+    unvignetted: Array  # [F] the same without rims: natural falloff, pupil growth and distortion
+    passed: Array  # [F] share of the stop's light that no rim takes
+    cos4: Array  # [F] cos^4 of the field angle, 0 from 90 degrees on
 
 
-def illumination(
-    scene: Scene, *, wavelength_nm: float = LINE_D_NM, fields: int = 21, n: int = 80, edge_deg: float | None = None
-) -> Illumination:
-    """Relative illumination up to the edge of the field, with n by n rays from each film point.
+def illumination(scene: Scene, *, fields: int = 21, n: int = 80) -> Illumination:
+    """Relative illumination at the d line up to the edge of the field, with n by n rays from each film point.
 
     Fields without a chief ray are NaN, and all are where the axis gets no light.
     """
-    angles = np.linspace(0, scene.edge_deg() if edge_deg is None else edge_deg, fields)
-    rays = bundle(scene.open, angles.tolist(), [wavelength_nm], hexapolar(6))
+    angles = np.linspace(0, scene.edge_deg(), fields)
+    rays = bundle(scene.open, angles.tolist(), [LINE_D_NM], hexapolar(6))
     film = on_plane(Rays(*(c[:, 0] for c in rays.film)), pupil_plane_z_mm(scene.lens))
     start, area = _grid(scene, rays.chief_height_mm, film, n)
     with torch.no_grad():
         light = area[:, None] * start.dz.reshape(fields, -1) ** 4
-        whole, seen = (_sum(light, lens, start, wavelength_nm) for lens in (scene.open.traced, scene.lens))
+        whole, seen = (_sum(light, lens, start) for lens in (scene.open.traced, scene.lens))
+    cos4 = np.where(angles < 90, np.cos(np.radians(angles)), 0.0) ** 4
     with np.errstate(divide="ignore", invalid="ignore"):  # dark fields, or an axis without light: NaN
         relative, unvignetted, passed = seen / (seen[0] or np.nan), whole / (whole[0] or np.nan), seen / whole
-    return Illumination(
-        wavelength_nm,
-        angles,
-        rays.chief_height_mm.numpy(),
-        relative,
-        unvignetted,
-        passed,
-        np.where(angles < 90, np.cos(np.radians(angles)), 0.0) ** 4,
-    )
+    return Illumination(LINE_D_NM, angles, rays.chief_height_mm.numpy(), relative, unvignetted, passed, cos4)
 
 
-def _sum(light: Tensor, lens: Lens, start: Rays, wavelength_nm: float) -> Array:
-    passed = (trace(lens, start, wavelength_nm).status == 0).reshape(light.shape)
+def _sum(light: Tensor, lens: Lens, start: Rays) -> Array:
+    passed = (trace(lens, start).status == 0).reshape(light.shape)
     found: Array = (light * passed).sum(1).where(torch.isfinite(light).all(1), torch.nan).numpy()
     return found
 

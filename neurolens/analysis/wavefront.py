@@ -1,4 +1,4 @@
-"""Wavefront aberration from the path lengths of the exact trace, and the point spread, geometric and by diffraction."""
+"""Point spread, geometric and by diffraction, with the wavefront by the path lengths of the exact trace."""
 
 from __future__ import annotations
 
@@ -10,54 +10,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens.analysis.bundles import Bundle, Pattern, bundle, grid, hexapolar, points
+from neurolens.analysis.bundles import Bundle, bundle, grid, hexapolar, points
 from neurolens.analysis.fields import DEFAULT_NM, Array, Result, Scene
 from neurolens.analysis.spots import working_f_number
-from neurolens.optics.glass import LINE_D_NM
-
-
-@dataclass(frozen=True)
-class Wavefront(Result):
-    """Wavefront of F fields at P pupil points, one wavelength.
-
-    Attributes:
-        pupil_tangential, pupil_sagittal: [P] shares of the stop's radius.
-        opd_waves: [F, P], positive as for an undercorrected lens; about the chief ray's film point; NaN where blocked.
-        rms_waves: [F], weighted by energy, less its mean and the tilt of best fit.
-    """
-
-    wavelength_nm: float
-    field_deg: Array
-    pupil_tangential: Array
-    pupil_sagittal: Array
-    opd_waves: Array
-    rms_waves: Array
-
-
-def wavefront(
-    scene: Scene,
-    field_deg: Sequence[float] | None = None,
-    *,
-    wavelength_nm: float = LINE_D_NM,
-    pattern: Pattern | None = None,
-) -> Wavefront:
-    """Wavefront aberration on a hexapolar pattern of 12 rings, or on another."""
-    pattern = pattern or hexapolar(12)
-    rays = bundle(scene, scene.default_fields() if field_deg is None else field_deg, [wavelength_nm], pattern)
-    waves = opd_mm(rays)[:, 0] / (wavelength_nm * 1e-6)
-    film = torch.stack([torch.ones_like(waves), rays.film.dx[:, 0], rays.film.dy[:, 0]], -1)  # [F, P, 3]
-    rms = [_rms(w, f, a) for w, f, a in zip(waves, film, rays.weight[:, 0], strict=True)]
-    return Wavefront(
-        wavelength_nm, np.array(rays.field_deg), pattern.tangential.numpy(), pattern.sagittal.numpy(),
-        waves.numpy(), np.array(rms),
-    )  # fmt: skip
 
 
 def opd_mm(rays: Bundle) -> Tensor:
     """Path difference [F, W, P] in mm from the chief ray of each wavelength, NaN where a ray is blocked.
 
-    Each ray's path is taken to its foot of the perpendicular from the chief ray's film point (of the first wavelength):
-    a reference sphere about that point whose radius is large against the aberrations.
+    Positive as for an undercorrected lens. Each ray's path is taken to its foot of the perpendicular from the chief
+    ray's film point (of the first wavelength): a reference sphere about that point whose radius is large against the
+    aberrations.
     """
     chief = bundle(rays.scene.open, rays.field_deg, rays.wavelength_nm, points([0.0], [0.0]))
     return path_to_chief_mm(chief) - path_to_chief_mm(rays)
@@ -75,16 +38,6 @@ def cosines(rays: Bundle) -> tuple[Tensor, Tensor]:
     return (-x, y) if rays.scene.axis == "x" else (-y, x)
 
 
-def _rms(waves: Tensor, film: Tensor, weight: Tensor) -> float:
-    seen = torch.isfinite(waves) & (weight > 0)
-    if int(seen.sum()) < 4:
-        return math.nan
-    root = torch.sqrt(weight[seen] / weight[seen].sum())
-    a, b = film[seen] * root[:, None], waves[seen] * root
-    fit = torch.linalg.lstsq(a, b[:, None]).solution[:, 0]
-    return float(torch.linalg.vector_norm(b - a @ fit))
-
-
 _BINS, _POINTS = 49, 97  # of the geometric and the diffraction image, odd: one on the centre
 _FINEST = 128  # points across the pupil that are still traced
 _HELD = 0.98  # share of the geometric spot's energy that the window holds
@@ -92,51 +45,35 @@ _HELD = 0.98  # share of the geometric spot's energy that the window holds
 
 @dataclass(frozen=True)
 class Psf(Result):
-    """Point spread of F fields; images are indexed [tangential, sagittal], centred on the spot's centroid.
-
-    Attributes:
-        half_width_um: [F], from the centre of the image to its edge; NaN without light.
-        geometric: [F, 49, 49] share of all wavelengths' energy in each square; what lies outside is missing; NaN
-            without light.
-        diffraction: [F, 97, 97] at the first wavelength, 1 at the peak of the same pupil without aberrations; NaN where
-            the aberrations are too large for it (then diffraction is negligible against `geometric`) or almost
-            no light arrives.
-        strehl: [F], greatest value of `diffraction`.
-        pupil_points: [F], points across the pupil that the diffraction image needs; 0 without light.
-        airy_um: radius of the first dark ring on the axis.
-    """
+    """Point spread of F fields; images are indexed [tangential, sagittal], centred on the spot's centroid."""
 
     field_deg: Array
     wavelength_nm: Array
-    half_width_um: Array
+    half_width_um: Array  # [F], from the centre of the image to its edge; NaN without light
+    # [F, 49, 49] share of all wavelengths' energy in each square; what lies outside is missing; NaN without light.
     geometric: Array
+    # [F, 97, 97] at the first wavelength, 1 at the peak of the same pupil without aberrations; NaN where the
+    # aberrations are too large for it (then diffraction is negligible against `geometric`) or almost no light arrives.
     diffraction: Array
-    strehl: Array
-    pupil_points: Array
-    airy_um: float
+    strehl: Array  # [F], greatest value of `diffraction`
+    pupil_points: Array  # [F], points across the pupil that the diffraction image needs; 0 without light
+    airy_um: float  # radius of the first dark ring on the axis
 
 
-def psf(
-    scene: Scene,
-    field_deg: Sequence[float] | None = None,
-    wavelength_nm: Sequence[float] = DEFAULT_NM,
-    *,
-    half_width_um: float | None = None,
-) -> Psf:
-    """Point spread of fields; the window holds the spot and six Airy radii unless its half width is given.
+def psf(scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] = DEFAULT_NM) -> Psf:
+    """Point spread of fields; the window holds the spot and six Airy radii.
 
     Raises:
         InputError: a pinhole, whose rays do not meet: it has no focus that waves could be summed about.
     """
     scene.require_power()
-    fields = scene.default_fields() if field_deg is None else field_deg
     airy = 1.22e-3 * wavelength_nm[0] * working_f_number(scene, wavelength_nm[0])
-    rays = bundle(scene, fields, wavelength_nm, grid(64))
+    rays = bundle(scene, field_deg, wavelength_nm, grid(64))
     half, geometric, diffraction, needed = [], [], [], []
-    for k, field in enumerate(fields):
+    for k, field in enumerate(rays.field_deg):
         t, s, w = (v[k].flatten() for v in (rays.tangential_mm, rays.sagittal_mm, rays.weight))
         centre, radius = _spot(t, s, w)
-        window = half_width_um / 1000 if half_width_um else max(6e-3 * np.nan_to_num(airy), 1.1 * radius)
+        window = max(6e-3 * np.nan_to_num(airy), 1.1 * radius)
         if not (window > 0 and w.sum() > 0):
             window = math.nan
         geometric.append(_histogram(t - centre[0], s - centre[1], w, window))
@@ -145,7 +82,7 @@ def psf(
         half.append(1000 * window)
         needed.append(count)
     return Psf(
-        np.array(fields), np.array(wavelength_nm), np.array(half), np.stack(geometric), np.stack(diffraction),
+        np.array(rays.field_deg), np.array(wavelength_nm), np.array(half), np.stack(geometric), np.stack(diffraction),
         np.stack(diffraction).max((1, 2)), np.array(needed, dtype=np.float64), airy,
     )  # fmt: skip
 
@@ -166,10 +103,9 @@ def _histogram(t: Tensor, s: Tensor, w: Tensor, half_mm: float) -> Array:
         return np.full((_BINS, _BINS), np.nan)
     keep = w > 0
     edges = np.linspace(-half_mm, half_mm, _BINS + 1)
+    found: Array
     found, _, _ = np.histogram2d(t[keep].numpy(), s[keep].numpy(), bins=(edges, edges), weights=w[keep].numpy())
-    total = float(w.sum())
-    result: Array = found / total if total else found
-    return result
+    return found / float(w.sum())
 
 
 def _needed(scene: Scene, field: float, wavelength_nm: float, half_mm: float) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 from neurolens.base.errors import InputError
@@ -59,6 +60,14 @@ def broadband(n_before: float, n_after: float, at_nm: float = BROADBAND_NM) -> C
     return Coating(f"broadband {at_nm:g}", _oriented(layers, n_before, n_after))
 
 
+# By the names of lens files: what makes them of the media on both sides and a wavelength, and the usual wavelength.
+_DESIGNS: dict[str, tuple[Callable[[float, float, float], Coating], float]] = {
+    "quarter-wave": (lambda n_before, n_after, at_nm: quarter_wave(at_nm), DESIGN_NM),
+    "v-coat": (v_coat, DESIGN_NM),
+    "broadband": (broadband, BROADBAND_NM),
+}
+
+
 def design(name: str, n_before: float, n_after: float, file: str | Path = "coating", where: str = "name") -> Coating:
     """A coating by the name that lens files use: "bare", "quarter-wave", "v-coat 500", "broadband".
 
@@ -70,26 +79,20 @@ def design(name: str, n_before: float, n_after: float, file: str | Path = "coati
     Raises:
         InputError: an unknown name, a wavelength that is not positive, a design that the media do not allow.
     """
-    kind, _, wavelength = name.partition(" ")
-    if kind not in ("bare", "quarter-wave", "v-coat", "broadband") or (kind == "bare" and name != kind):
-        raise InputError(file, where, name, KNOWN)
-    if kind == "bare":
+    if name == "bare":
         return Coating(name, ())
-    usual_nm = BROADBAND_NM if kind == "broadband" else DESIGN_NM
+    kind, _, wavelength = name.partition(" ")
+    make, at_nm = _DESIGNS.get(kind, (None, math.nan))
     try:
-        at_nm = float(wavelength) if name != kind else usual_nm
+        at_nm = float(wavelength) if name != kind else at_nm
     except ValueError:
         at_nm = math.nan
-    if not 0 < at_nm < math.inf:
+    if make is None or not 0 < at_nm < math.inf:
         raise InputError(file, where, name, KNOWN)
     if n_before == n_after:
         raise InputError(file, where, name, f"a surface between two different media (both are {n_before:g})")
-    if kind == "quarter-wave":
-        return Coating(name, quarter_wave(at_nm=at_nm).layers)
-    if kind == "broadband":
-        return Coating(name, broadband(n_before, n_after, at_nm).layers)
     try:
-        return Coating(name, v_coat(n_before, n_after, at_nm).layers)
+        return Coating(name, make(n_before, n_after, at_nm).layers)
     except InputError as error:
         raise InputError(file, where, name, f"another design: {error}") from None
 

@@ -36,20 +36,13 @@ _TINY_MM = 1e-3
 
 @dataclass(frozen=True)
 class Check:
-    """One figure of a lens, computed and stated.
+    """One figure of a lens, computed and stated."""
 
-    Attributes:
-        quantity: name with its unit.
-        computed, stated: None if unknown.
-        doubt: why the figure casts doubt on the table, a clause; empty where it does not.
-        state: zoom or focus state of the file, empty for the table itself.
-    """
-
-    quantity: str
-    computed: float | None
+    quantity: str  # name with its unit
+    computed: float | None  # None if unknown, as the next
     stated: float | None = None
-    doubt: str = ""
-    state: str = ""
+    doubt: str = ""  # why the figure casts doubt on the table, a clause; empty where it does not
+    state: str = ""  # zoom or focus state of the file, empty for the table itself
 
 
 def check_lens(lens: Lens) -> list[Check]:

@@ -91,15 +91,11 @@ CONFIGURATION_KEYS = (
 
 @dataclass(frozen=True)
 class Table:
-    """One table of a file, read strictly.
-
-    Attributes:
-        where: goes in front of the key in errors, with its separator: "surface 3, ".
-    """
+    """One table of a file, read strictly."""
 
     data: Mapping[str, Any]
     file: str
-    where: str = ""
+    where: str = ""  # goes in front of the key in errors, with its separator: "surface 3, "
 
     def __contains__(self, key: str) -> bool:
         return key in self.data
@@ -203,9 +199,7 @@ def read_lens(path: str | Path) -> Lens:
         stated_efl_x_mm=table.optional("efl_x_mm"),
     )
     lens = _with_rims(lens, table)
-    check_clearance(lens.surfaces, file)
-    for c in lens.configurations:
-        check_clearance(lens.with_gaps(dict(c.thickness_mm)).surfaces, file, f'configuration "{c.name}", ')
+    check_states(lens)
     unknown = ", ".join(str(k) for k, s in enumerate(surfaces) if s.n_d != 1 and s.V_d is None and s.glass is None)
     if unknown:
         message = f"{file}: V_d is not given after surface {unknown}: the index is taken as constant"
@@ -214,6 +208,13 @@ def read_lens(path: str | Path) -> Lens:
     for name in (coating["name"] for coating in data.get("coating", []) if coating["name"] not in used):
         warnings.warn(f'{file}: coating "{name}": no surface has it', NeurolensWarning, stacklevel=2)
     return lens
+
+
+def check_states(lens: Lens) -> None:
+    """Raise for rims beyond their sphere and surfaces that overlap, in the table and in every state of it."""
+    check_clearance(lens.surfaces, lens.path)
+    for c in lens.configurations:
+        check_clearance(lens.with_gaps(dict(c.thickness_mm)).surfaces, lens.path, f'configuration "{c.name}", ')
 
 
 def _with_rims(lens: Lens, table: Table) -> Lens:

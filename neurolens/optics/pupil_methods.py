@@ -23,27 +23,23 @@ from neurolens.optics.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.optics.trace import trace
 
 Array = NDArray[np.float64]
+# Of the hull film points and points across; of Wu's search film points, rays of a fan, planes; pixels along the film's
+# radius and probe rays of each; intervals of the radius and samples of each.
+_HULL, _WU, _PIXELS, _RADIAL = (32, 96), (24, 801, 241), (256, 128), (50, 2000)
+_HALVINGS = 20  # of the step to the last ray that passes
 # Whether rays pass from film points (radius [N], 0) through points [2, N] of a plane, at the d line: bool [N].
 Passes = Callable[[Array, Array], NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
 class RadialPupil:
-    """Boxes or ellipses on a plane, one for each interval of the film radius.
+    """Boxes or ellipses on a plane, one for each interval of the film radius."""
 
-    Attributes:
-        pupil_z_mm: the plane, lens frame.
-        film_radius_mm: outer end of the last of R equal intervals.
-        centre, along, across: [R] mm, for a film point on +x: centre on the x axis, half widths; negative where no ray
-            was found.
-        shape: "box" or "ellipse".
-    """
-
-    pupil_z_mm: float
-    film_radius_mm: float
-    centre: Array
-    along: Array
-    across: Array
+    pupil_z_mm: float  # the plane, lens frame
+    film_radius_mm: float  # outer end of the last of R equal intervals
+    centre: Array  # [R] mm, for a film point on +x: on the x axis
+    along: Array  # [R] mm, half width, negative where no ray was found
+    across: Array  # [R] mm, the same
     shape: Literal["box", "ellipse"]
 
     def sample(self, film_mm: Array, square: Array, wavelength_nm: object = None) -> tuple[Array, Array]:
@@ -71,17 +67,21 @@ class RadialPupil:
 
 def passes_through(lens: Lens, pupil_z_mm: float) -> Passes:
     """Whether rays from the film of a focused lens through points of a plane pass the lens, at the d line."""
-    film_z = lens.film_z_mm
-    if film_z is None:
-        raise InputError(lens.path, "film_z_mm", None, "a focused lens: lens.at(focus_m=...)")
+    film_z = _film_z_mm(lens)
 
     def passes(radius: Array, points: Array) -> NDArray[np.bool_]:
         x, u, v = (torch.from_numpy(np.ascontiguousarray(a)) for a in (radius, *points))
-        rays = camera_rays(x, torch.zeros_like(x), float(film_z), u, v, pupil_z_mm)
+        rays = camera_rays(x, torch.zeros_like(x), film_z, u, v, pupil_z_mm)
         with torch.no_grad():
             return trace(lens, rays, LINE_D_NM).status.numpy() == 0
 
     return passes
+
+
+def _film_z_mm(lens: Lens) -> float:
+    if lens.film_z_mm is None:
+        raise InputError(lens.path, "film_z_mm", None, "a focused lens: lens.at(focus_m=...)")
+    return float(lens.film_z_mm)
 
 
 def rear_rim(lens: Lens, film_radius_mm: float) -> RadialPupil:
@@ -102,9 +102,9 @@ def global_exit_pupil(lens: Lens, film_radius_mm: float) -> RadialPupil:
     return _disc(data.exit_pupil_z_mm, film_radius_mm, data.exit_pupil_diameter_mm / 2)
 
 
-def hull_disc(lens: Lens, film_radius_mm: float, *, rows: int = 32, points: int = 96) -> RadialPupil:
+def hull_disc(lens: Lens, film_radius_mm: float) -> RadialPupil:
     """The axial disc on the pupil plane that holds the passing rays of the whole film."""
-    plane = pupil_plane_z_mm(lens)
+    plane, (rows, points) = pupil_plane_z_mm(lens), _HULL
     start = _reach_on(lens, plane, film_radius_mm)
     grid = np.linspace(-start, start, points)
     film, u, v = (
@@ -115,25 +115,24 @@ def hull_disc(lens: Lens, film_radius_mm: float, *, rows: int = 32, points: int 
     return _disc(plane, film_radius_mm, float(np.hypot(u, v)[passed].max()) + step)
 
 
-def wu_exit_pupil(lens: Lens, film_radius_mm: float, *, film_points: int = 24, planes: int = 241) -> RadialPupil:
+def wu_exit_pupil(lens: Lens, film_radius_mm: float) -> RadialPupil:
     """One exit pupil, found by a search in two steps (after Wu et al. 2010, 2011).
 
     The first follows the tangential fan of film points to its two last passing rays; the second goes across it from
     the middle of the fan. The pupil is the axial disc that holds all those rays where it is smallest as seen from
     the film.
     """
-    film_z = lens.film_z_mm
+    film_z, (film_points, rays, planes) = _film_z_mm(lens), _WU
     rear = float(lens.vertices_mm[len(lens.surfaces) - 1])
     passes = passes_through(lens, rear)
     radius = np.linspace(0, film_radius_mm, film_points)
     reach = _reach_on(lens, rear, film_radius_mm)
-    fan = np.linspace(-reach, reach, 801)
+    fan = np.linspace(-reach, reach, rays)
     low, high = _ends(passes, radius, fan, lambda t: np.stack([t, np.zeros_like(t)]))
     lit = low <= high
     radius, low, high = radius[lit], low[lit], high[lit]
     middle = (low + high) / 2
     _, side = _ends(passes, radius, fan[fan >= 0], lambda t: np.stack([np.broadcast_to(middle[:, None], t.shape), t]))
-    assert film_z is not None
     z = np.linspace(rear - 3 * abs(first_order(lens).efl_mm), rear + 0.7 * (film_z - rear), planes)
     share = ((z - film_z) / (rear - film_z))[:, None]
     x = [radius + share * (end - radius) for end in (low, high, middle)]
@@ -142,23 +141,15 @@ def wu_exit_pupil(lens: Lens, film_radius_mm: float, *, film_points: int = 24, p
     return _disc(float(z[best]), film_radius_mm, float(hull[best]))
 
 
-def pixel_pupils(
-    lens: Lens,
-    film_radius_mm: float,
-    shape: Literal["disc", "ellipse"],
-    *,
-    pixels: int = 256,
-    probes: int = 128,
-    seed: int = 0,
-) -> RadialPupil:
+def pixel_pupils(lens: Lens, film_radius_mm: float, shape: Literal["disc", "ellipse"]) -> RadialPupil:
     """A pupil for every pixel from probe rays (Steinert et al. 2011): the disc, or the ellipse, about those that pass.
 
     By symmetry one film radius stands for all pixels at it. Probes that pass are few when the stop is closed: the
     disc about them is widened by half the distance between probes, and searched a second time inside it.
     """
-    plane = pupil_plane_z_mm(lens)
+    plane, (pixels, probes) = pupil_plane_z_mm(lens), _PIXELS
     passes = passes_through(lens, plane)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     film = (np.arange(pixels) + 0.5) * film_radius_mm / pixels
     centre, along = np.zeros(pixels), np.full(pixels, hull_disc(lens, film_radius_mm).along[0])
     across = along.copy()
@@ -183,23 +174,15 @@ def pixel_pupils(
     return RadialPupil(plane, film_radius_mm, centre, along, across, "ellipse")
 
 
-def radial_bounds(
-    lens: Lens,
-    film_radius_mm: float,
-    shape: Literal["box", "ellipse"],
-    *,
-    intervals: int = 50,
-    samples: int = 2000,
-    seed: int = 0,
-) -> RadialPupil:
+def radial_bounds(lens: Lens, film_radius_mm: float, shape: Literal["box", "ellipse"]) -> RadialPupil:
     """Bounds of the passing rays in each interval of the film radius (Pharr, Jakob and Humphreys 2016, 6.4.5).
 
     The box about random points of the plane that pass, widened by a step of so many samples; "ellipse" takes the
     ellipse inside the box, which loses what lies in the corners.
     """
-    plane = pupil_plane_z_mm(lens)
+    plane, (intervals, samples) = pupil_plane_z_mm(lens), _RADIAL
     passes = passes_through(lens, plane)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     reach = np.full(intervals, hull_disc(lens, film_radius_mm).along[0])
     film = (np.arange(intervals)[:, None] + rng.random((intervals, samples))) * film_radius_mm / intervals
     u, v = (reach[:, None] * (2 * rng.random((intervals, samples)) - 1) for _ in range(2))
@@ -219,16 +202,12 @@ def _disc(plane: float, film_radius_mm: float, radius: float) -> RadialPupil:
 
 def _reach_on(lens: Lens, plane: float, film_radius_mm: float) -> float:
     """Distance from the axis on a plane within which lies all that enters the rear rim from the film."""
-    film_z = lens.film_z_mm
-    if film_z is None:
-        raise InputError(lens.path, "film_z_mm", None, "a focused lens: lens.at(focus_m=...)")
+    film_z = _film_z_mm(lens)
     stretch = (film_z - plane) / (film_z - float(lens.vertices_mm[len(lens.surfaces) - 1]))
     return 1.05 * lens.surfaces[-1].semi_diameter_mm * abs(stretch) + film_radius_mm * abs(1 - stretch)
 
 
-def _ends(
-    passes: Passes, film: Array, fan: Array, point: Callable[[Array], Array], halvings: int = 20
-) -> tuple[Array, Array]:
+def _ends(passes: Passes, film: Array, fan: Array, point: Callable[[Array], Array]) -> tuple[Array, Array]:
     """First and last passing place t [M] of a fan of points point(t) for each film radius [M]; inf, -inf where none."""
     t = np.broadcast_to(fan, (film.size, fan.size))
     passed = passes(np.repeat(film, fan.size), point(t).reshape(2, -1)).reshape(t.shape)
@@ -239,7 +218,7 @@ def _ends(
         (fan[fan.size - 1 - np.argmax(passed[:, ::-1], axis=1)], 1.0),
     ):
         width = step
-        for _ in range(halvings):
+        for _ in range(_HALVINGS):
             width /= 2
             further = place + sign * width
             place = np.where(passes(film, point(further[:, None]).reshape(2, -1)), further, place)

@@ -28,26 +28,22 @@ from neurolens.optics.passing import (
 )
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Hit, Medium, Rays, fresnel_transmittance, root, times
-from neurolens.optics.transmission import normal_at, way_mm
+from neurolens.optics.transmission import Step, normal_at, pass_surface, unpolarised, way_mm
+from neurolens.optics.transmission import power as power_of
 
 Action = Literal["T", "R"]
+Towards = Literal["scene", "film"]
 Steps = Sequence[tuple[int, Action]]
 
 
 class Followed(NamedTuple):
-    """What following a sequence gives.
+    """What following a sequence gives."""
 
-    Attributes:
-        rays: point on the last surface and unit direction after it, lens frame, mm; along the axis for lost rays.
-        status: [N] int32 as in `trace`: the surface and the reason that ended a ray first.
-        power: [N], product over the steps of the unpolarised share that is transmitted or reflected, and absorption.
-        points: x, y, z of the meeting points of every step, lens frame, mm.
-    """
-
-    rays: Rays
-    status: Tensor
+    rays: Rays  # point on the last surface and unit direction after it, lens frame, mm; along the axis for lost rays
+    status: Tensor  # [N] int32 as in `trace`: the surface and the reason that ended a ray first
+    # [N], of unpolarised light, what surfaces transmit or reflect and glass does not absorb.
     power: Tensor
-    points: tuple[tuple[Tensor, Tensor, Tensor], ...]
+    points: tuple[tuple[Tensor, Tensor, Tensor], ...]  # x, y, z of the meeting points of every step, lens frame, mm
 
 
 def ghost(count: int, first: int, second: int) -> list[tuple[int, Action]]:
@@ -64,29 +60,40 @@ def ghost(count: int, first: int, second: int) -> list[tuple[int, Action]]:
     return [*there, (second, "R"), *back, (first, "R"), *again]
 
 
-def follow(lens: Lens, rays: Rays, steps: Steps, wavelength_nm: Tensor | float = glass.LINE_D_NM) -> Followed:
-    """Follow light from the scene along a sequence of surfaces.
+def follow(
+    lens: Lens,
+    rays: Rays,
+    steps: Steps,
+    wavelength_nm: Tensor | float = glass.LINE_D_NM,
+    *,
+    towards: Towards = "film",
+    polarised: bool = False,
+) -> Followed:
+    """Follow light along a sequence of surfaces.
 
     Args:
         lens: the prescription; every rim and the stop are tested at every crossing.
-        rays: points and unit directions [N] towards the film, lens frame, mm; float32 or float64.
+        rays: points and unit directions [N], lens frame, mm; float32 or float64.
         steps: surfaces in the order in which they are met, "T" refracted or "R" reflected.
         wavelength_nm: number or [N].
+        towards: "film" for light that enters at the front, "scene" for light that enters at the rear.
+        polarised: whether to follow the polarisation that each surface gives to the light, or to average it there.
 
     Raises:
         InputError: as `trace` for rays and wavelengths; no steps, a surface that does not exist or is not the next one
             in the direction of travel.
     """
     check_rays(rays, wavelength_nm)
-    _check(len(lens.surfaces), steps)
+    _check(len(lens.surfaces), steps, towards)
     wavelength_nm, lit = sound_wavelength(lens, wavelength_nm, rays.x.dtype)
     glasses, vertices = media(lens, wavelength_nm), lens.vertices_mm
     absorption = absorption_per_mm(lens, wavelength_nm)
-    mode = Mode(sense=1, guard=True, freeze=False)
-    r, tests = start(rays, glasses[0], mode, st.blocked(steps[0][0], st.MISSED), lit)
+    mode = Mode(sense=1 if towards == "film" else -1, guard=True, freeze=False)
+    after = glasses[0 if mode.sense > 0 else -1]
+    r, tests = start(rays, after, mode, st.blocked(steps[0][0], st.MISSED), lit)
     power, vertex = torch.ones_like(r.x), 0.0
+    field = unpolarised([times(d, 1 / after.n) for d in r[3:]]) if polarised else None
     points = []
-    after = glasses[0]
     for position, (k, action) in enumerate(steps):
         r, vertex = r._replace(z=r.z + (vertex - vertices[k])), vertices[k]
         ahead = mode.sense > 0
@@ -96,13 +103,23 @@ def follow(lens: Lens, rays: Rays, steps: Steps, wavelength_nm: Tensor | float =
         absorbed = absorption[k if ahead else k + 1]
         if absorbed is not None:
             power = power * torch.exp(-way_mm(r, hit, before) * absorbed)
-        power = power * _share(lens.surfaces[k], hit, before, after, mode.sense, wavelength_nm, action)
+        if field is None:
+            power = power * _share(lens.surfaces[k], hit, before, after, mode.sense, wavelength_nm, action)
+        there, media_met = (r, mode.sense), (before, after)
         if action == "R":
             r, after, mode = _reflect(lens.surfaces[k], r, hit, mode.sense), before, mode._replace(sense=-mode.sense)
         else:
             r, _, _ = bend(lens.surfaces[k], k, r, hit, before, after, mode, tests)
+        if field is not None:
+            field = _polarised(field, lens.surfaces[k], hit, *there, r, media_met, after, wavelength_nm, action)
     r = along_axis(unit(r._replace(z=r.z + vertex), after), tests, mode.sense, vertex)
+    power = power if field is None else power * power_of(field)
     return Followed(r, tests.status(), tests.only(power, 0.0), tuple(points))
+
+
+def backwards(steps: Steps) -> list[tuple[int, Action]]:
+    """The steps of the same way from its end."""
+    return list(reversed(steps))
 
 
 def _reflect(surface: Surface, r: Rays, hit: Hit, sense: int) -> Rays:
@@ -126,11 +143,40 @@ def _share(
     return transmitted if action == "T" else torch.where(q2 > 0, 1 - transmitted, 1.0)
 
 
-def _check(count: int, steps: Steps) -> None:
+def _polarised(
+    field: Tensor,
+    surface: Surface,
+    hit: Hit,
+    r: Rays,
+    sense: int,
+    behind: Rays,
+    met: tuple[Medium, Medium],
+    after: Medium,
+    wavelength_nm: Any,
+    action: Action,
+) -> Tensor:
+    """The fields of the light after a surface; `met` are the media as the light meets them, `after` that behind."""
+    layers = surface.coating.layers if surface.coating else ()
+    step = Step(
+        normal_at(surface, hit),
+        [times(d, 1 / met[0].n) for d in r[3:]],
+        [times(d, 1 / after.n) for d in behind[3:]],
+        met[0].n,
+        met[1].n,
+        layers,
+        sense,
+        action == "R",
+    )
+    return pass_surface(field, step, wavelength_nm)
+
+
+def _check(count: int, steps: Steps, towards: Towards) -> None:
     """Surfaces must follow one another as light meets them."""
     if not steps:
         raise InputError("sequence", "steps", "(none)", "at least one surface")
-    at, sense = steps[0][0] - 1, 1
+    if towards not in ("scene", "film"):
+        raise InputError("sequence", "towards", towards, '"scene" or "film"')
+    at, sense = (-1, 1) if towards == "film" else (count, -1)
     for n, (k, action) in enumerate(steps):
         if action not in ("T", "R"):
             raise InputError("sequence", f"step {n}", action, '"T" or "R"')

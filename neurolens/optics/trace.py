@@ -45,21 +45,16 @@ class Crossing(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """What tracing gives.
+    """What tracing gives."""
 
-    Attributes:
-        rays: point on the last surface met (lens frame, mm) and unit direction after it. Rays that missed a surface or
-            were totally reflected are replaced by a finite ray along the axis; those that only a rim stops go on.
-        status: [N] int32, see `neurolens.base.status`.
-        transmittance: [N], power of unpolarised light that arrives: of surfaces and absorption; None unless requested.
-        crossings: surface index to `Crossing`, for the recorded surfaces.
-        path: the rays on and after every surface, in the order of travel, or empty if not requested.
-    """
-
+    # Point on the last surface met (lens frame, mm) and unit direction after it. Rays that missed a surface or were
+    # totally reflected are replaced by a finite ray along the axis; those that only a rim stops go on.
     rays: Rays
-    status: Tensor
+    status: Tensor  # [N] int32, see `neurolens.base.status`
+    # [N], power of unpolarised light that arrives: of surfaces and absorption; None unless requested.
     transmittance: Tensor | None
-    crossings: dict[int, Crossing]
+    crossings: dict[int, Crossing]  # surface index to `Crossing`, for the recorded surfaces
+    # The rays on and after every surface, in the order of travel, or empty if not requested.
     path: tuple[Rays, ...] = ()
 
 
@@ -283,15 +278,11 @@ def _fill(whole: Any, part: Any, at: slice) -> None:
 
 
 class Differentials(NamedTuple):
-    """A traced ray and its derivatives.
+    """A traced ray and its derivatives."""
 
-    Attributes:
-        traced: as `trace` gives it.
-        derivatives: for every parameter, the derivatives of the resulting ray: x, y, z (mm per unit of it) and
-            direction, each [N]; 0 for rays that do not go on. Points move on the last surface.
-    """
-
-    traced: Traced
+    traced: Traced  # as `trace` gives it
+    # For every parameter, the derivatives of the resulting ray: x, y, z (mm per unit of it) and direction, each [N]; 0
+    # for rays that do not go on. Points move on the last surface.
     derivatives: tuple[Rays, ...]
 
 

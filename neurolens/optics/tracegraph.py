@@ -66,7 +66,7 @@ class _Tracing:
     def _surface(self, k: int, s: Surface) -> None:
         g, d = self.graph, self.d
         nearest = d * -g.dot(self.x, d) + self.x  # of the ray's points, to the vertex
-        met = _meet_plain(nearest, d, float(s.curvature)) if is_plain(s) else _meet_shape(nearest, d, s)
+        met = meet_plain(nearest, d, float(s.curvature)) if is_plain(s) else meet_shape(nearest, d, s)
         self.x = met.point
         self.tests += [(test, st.blocked(k, st.MISSED)) for test in met.tests]
         if s.stop:
@@ -137,9 +137,9 @@ def _above(square: Value) -> Test:
     return square.graph.constant(_TINY), square
 
 
-def _meet_plain(m: Value, d: Value, c: float) -> _Meeting:
-    """Meet a sphere or a plane from the ray's point m nearest to the vertex (Feder's e, M1 and L)."""
-    if not c:
+def meet_plain(m: Value, d: Value, c: float | Value) -> _Meeting:
+    """Meet a sphere or a plane from the ray's point m nearest to the vertex (Feder's e, M1 and L), towards -z."""
+    if not isinstance(c, Value) and not c:
         return _Meeting(d * -(m[2] / d[2]) + m, -d[2], [])
     f = m.graph.square(m) * c + m[2] * -2.0
     q2 = f * -c + d[2] * d[2]
@@ -148,8 +148,8 @@ def _meet_plain(m: Value, d: Value, c: float) -> _Meeting:
     return _Meeting(d * way + m, q, [_above(q2)])
 
 
-def _meet_shape(m: Value, d: Value, surface: Surface) -> _Meeting:
-    """Meet a surface that is no sphere and no plane, as `_meet_plain`."""
+def meet_shape(m: Value, d: Value, surface: Surface) -> _Meeting:
+    """Meet a surface that is no sphere and no plane, as `meet_plain`."""
     w = (float(surface.cylinder != "y"), float(surface.cylinder != "x"))
     if surface.asphere:
         return _meet_asphere(m, d, surface, w)

@@ -14,7 +14,7 @@ from neurolens.optics.glass import by_figures
 from neurolens.optics.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
 from neurolens.optics.paraxial import FirstOrder
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.sag import check_clearance, check_figures
+from neurolens.optics.sag import check_figures
 from neurolens.readers.source import warn
 
 # A diameter that the file does not give, until `finish` has found it.
@@ -93,13 +93,6 @@ def with_rims(lens: Lens) -> Lens:
     return derived
 
 
-def check_states(lens: Lens) -> None:
-    """Raise for rims beyond their sphere and surfaces that overlap, in the table and in every state of it."""
-    check_clearance(lens.surfaces, lens.path)
-    for c in lens.configurations:
-        check_clearance(lens.with_gaps(dict(c.thickness_mm)).surfaces, lens.path, f'configuration "{c.name}", ')
-
-
 def first_order(lens: Lens) -> FirstOrder:
     """First-order data in the y-z plane; of a lens without power there, in the x-z plane.
 
@@ -123,22 +116,19 @@ def _check_rows(rows: Sequence[Surface], file: str) -> None:
     if len(rows) > MAX_SURFACES:
         raise InputError(file, "surfaces", f"({len(rows)} of them)", f"at most {MAX_SURFACES}")
     for k, s in enumerate(rows):
-        where = f"surface {k}, "
-        if math.isnan(s.radius_mm) or s.radius_mm == 0:
-            raise InputError(file, f"{where}radius", s.radius_mm, "a number other than 0, or a plane")
-        if not math.isfinite(s.thickness_mm):
-            raise InputError(file, f"{where}thickness", s.thickness_mm, "a finite length")
-        if s.diameter_mm <= 0 or math.isinf(s.diameter_mm):
-            raise InputError(file, f"{where}diameter", s.diameter_mm, "a length above 0")
-        if not 1 <= s.n_d <= MAX_INDEX:
-            raise InputError(file, f"{where}index", s.n_d, f"a refractive index from 1 to {MAX_INDEX}")
-        if s.V_d is not None and not (s.V_d > 0 and math.isfinite(s.V_d)):
-            raise InputError(file, f"{where}Abbe number", s.V_d, "a number above 0")
-        if not math.isfinite(s.conic) or not all(math.isfinite(a) for _, a in s.asphere):
-            raise InputError(file, f"{where}asphere", (s.conic, s.asphere), "finite coefficients")
-        for power, _ in s.asphere:
-            if not 2 <= power <= MAX_POWER:
-                raise InputError(file, f"{where}asphere, power", power, f"a power from 2 to {MAX_POWER}")
+        terms = (s.conic, *(a for _, a in s.asphere))
+        figures = (
+            ("radius", s.radius_mm, abs(s.radius_mm) > 0, "a number other than 0, or a plane"),
+            ("thickness", s.thickness_mm, math.isfinite(s.thickness_mm), "a finite length"),
+            ("diameter", s.diameter_mm, math.isnan(s.diameter_mm) or 0 < s.diameter_mm < math.inf, "a length above 0"),
+            ("index", s.n_d, 1 <= s.n_d <= MAX_INDEX, f"a refractive index from 1 to {MAX_INDEX}"),
+            ("Abbe number", s.V_d, s.V_d is None or 0 < s.V_d < math.inf, "a number above 0"),
+            ("asphere", (s.conic, s.asphere), all(map(math.isfinite, terms)), "finite coefficients"),
+            *(("asphere, power", p, 2 <= p <= MAX_POWER, f"a power from 2 to {MAX_POWER}") for p, _ in s.asphere),
+        )
+        for name, value, sound, expected in figures:
+            if not sound:
+                raise InputError(file, f"surface {k}, {name}", value, expected)
     check_figures(rows, file)
     stops = [k for k, s in enumerate(rows) if s.stop]
     if len(stops) != 1:

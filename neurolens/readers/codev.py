@@ -27,64 +27,50 @@ from neurolens.readers.source import read_lines, warn
 
 
 @dataclass
-class File:
+class File(Draft):
     """A file while it is read."""
 
-    path: str
+    kind: str = "CODE V"
     blocks: list[Block] = field(default_factory=list)
     closed: bool = False  # whether the image has come
     zoom: Zoom = field(default_factory=Zoom)
     radii: bool | None = None
-    title: str = ""
-    unit: str | None = None
-    pupil: float | None = None
-    f_number: float | None = None
     fields: dict[str, list[float]] = field(default_factory=dict)
     private: dict[str, dict[str, Any]] = field(default_factory=dict)
     private_nm: list[float] | None = None
     ignored: Counter[str] = field(default_factory=Counter)
 
 
-def draft_of(file: File) -> Draft:
-    """The draft of a file that has been read to its end.
+def _complete(file: File) -> None:
+    """Set what follows from all surfaces.
 
     Raises:
         InputError: no surface, a solve or a shape that the lens model cannot represent.
     """
     first, *middle, image = file.blocks
     if not middle:
-        raise InputError(file.path, "S", "(no surface)", "at least one surface between object and image")
+        raise InputError(file.file, "S", "(no surface)", "at least one surface between object and image")
     if image.curvature:
-        warn(file.path, "the image surface is curved; the film is taken as plane")
+        warn(file.file, "the image surface is curved; the film is taken as plane")
     for text, count in file.ignored.items():
         if count:
-            warn(file.path, f"{text} ({count})")
+            warn(file.file, f"{text} ({count})")
     # The image lies off the last thickness by the thickness of SI: a defocus.
     middle[-1].thickness += image.thickness
     for k, block in enumerate(middle[:-1]):
         if block.solved:
             raise block.start.error("PIM", f"(on surface {k + 1})", "the last surface")
-    rows = tuple(Row(b.surface(shape_of(b)), aperture=not math.isnan(b.semi_diameter)) for b in middle)
-    angles, heights = (_edge(file, pairs) for pairs in ((("XAN", "YAN"),), (("XIM", "YIM"), ("XRI", "YRI"))))
-    if _edge(file, (("XOB", "YOB"),)) and not angles:
-        warn(file.path, "the field is given as an object height: left out")
-    return Draft(
-        file=file.path,
-        kind="CODE V",
-        rows=rows,
-        name=file.title,
-        states=tuple(file.zoom.states(middle, first.thickness, image.thickness)),
-        pupil=file.pupil,
-        f_number=file.f_number,
-        object_distance=first.thickness,
-        film_given=not (middle[-1].solved and middle[-1].thickness == image.thickness),
-        unit=file.unit,
-        half_field_deg=angles,
-        image_radius=heights,
-    )
+    file.rows = tuple(Row(b.surface(shape_of(b)), aperture=not math.isnan(b.semi_diameter)) for b in middle)
+    file.half_field_deg = _edge(file, ("XAN", "YAN"))
+    file.image_radius = _edge(file, ("XIM", "YIM"), ("XRI", "YRI"))
+    if _edge(file, ("XOB", "YOB")) and not file.half_field_deg:
+        warn(file.file, "the field is given as an object height: left out")
+    file.states = tuple(file.zoom.states(middle, first.thickness, image.thickness))
+    file.object_distance = first.thickness
+    file.film_given = not (middle[-1].solved and middle[-1].thickness == image.thickness)
 
 
-def _edge(file: File, pairs: tuple[tuple[str, str], ...]) -> float | None:
+def _edge(file: File, *pairs: tuple[str, str]) -> float | None:
     """The field point farthest from the axis; None where the file has none of that kind."""
     far = 0.0
     for x, y in pairs:
@@ -133,8 +119,9 @@ def read_seq(path: str | Path, given: Given | None = None) -> Lens:
         elif not _system(file, command):
             _surface(file, command)
     if not file.closed:
-        raise InputError(file.path, "SI", "(missing)", "an image surface at the end of the lens")
-    return lens_of(draft_of(file), given)
+        raise InputError(file.file, "SI", "(missing)", "an image surface at the end of the lens")
+    _complete(file)
+    return lens_of(file, given)
 
 
 def looks_like_seq(head: str) -> bool:
@@ -153,7 +140,7 @@ def _private(file: File, command: Command) -> None:
         raise command.line.error("PRV", command.name, "PWL and wavelengths before the glasses")
     else:
         file.private[command.word] = {**private_glass(command, file.private_nm), "material": command.word}
-        warn(file.path, f"private glass {command.word} is reduced to n_d and V_d")
+        warn(file.file, f"private glass {command.word} is reduced to n_d and V_d")
 
 
 def _system(file: File, command: Command) -> bool:
@@ -165,7 +152,7 @@ def _system(file: File, command: Command) -> bool:
         case "TIT" if words and words[0].upper().startswith("Z") and words[0][1:].isdecimal():
             file.zoom.title(command)
         case "TIT":
-            file.title = " ".join(words).strip("\"' ")
+            file.name = " ".join(words).strip("\"' ")
         case "DIM":
             unit = words[0].upper()[:1] if words else ""
             if unit not in UNITS:
@@ -176,7 +163,7 @@ def _system(file: File, command: Command) -> bool:
             file.pupil, file.f_number = (value, None) if name == "EPD" else (None, value)
         case "TEM":
             if abs(command.numbers()[0] - ROOM) > 5:
-                warn(file.path, f"indices are those at {ROOM} degrees, not at {' '.join(words)}")
+                warn(file.file, f"indices are those at {ROOM} degrees, not at {' '.join(words)}")
         case "PRV":
             file.private_nm = []
         case _ if name in FIELDS:
@@ -238,7 +225,7 @@ def _new_surface(file: File, command: Command) -> None:
     numbers = command.numbers(command.words[:2], 2)
     if file.radii is None and numbers[0] != 0:
         file.radii = False
-        warn(file.path, f"line {line.number}: no RDM before it; surfaces have curvatures, CODE V's default, not radii")
+        warn(file.file, f"line {line.number}: no RDM before it; surfaces have curvatures, CODE V's default, not radii")
     first = numbers[0]
     block = Block(line, curvature=first if not (file.radii and first) else 1 / first, thickness=numbers[1])
     if name == "SO" and block.thickness >= INFINITE:

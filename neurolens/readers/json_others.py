@@ -148,7 +148,7 @@ def _iset(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: str)
         kind="ISET",
         rows=tuple(Row(s, aperture=True) for s in surfaces),
         name=_line(data.get("name")),
-        notes=_line(data.get("description")),
+        notes=[_line(data.get("description"))],
         film_given=surfaces[-1].thickness_mm > 0,
         unit="mm",
     )

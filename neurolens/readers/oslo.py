@@ -38,17 +38,11 @@ class Block(draft.Block):
 
 
 @dataclass
-class File:
+class File(Draft):
     """A file while it is read."""
 
-    path: str
+    kind: str = "OSLO"
     blocks: list[Block] = field(default_factory=list)
-    name: str = ""
-    notes: list[str] = field(default_factory=list)
-    unit: str | None = None
-    beam: float | None = None
-    angle: float | None = None
-    begun: bool = False
     ended: bool = False
 
 
@@ -63,10 +57,11 @@ def read_len(path: str | Path, given: Given | None = None) -> Lens:
         for part in _parts(line.text):
             _read(file, Line(line.file, line.number, part))
     if not file.ended:
-        raise InputError(file.path, "END", "(missing)", "END and the number of the image surface")
+        raise InputError(file.file, "END", "(missing)", "END and the number of the image surface")
     if len(file.blocks) < 3:
-        raise InputError(file.path, "NXT", f"({len(file.blocks)} surfaces)", "object, at least one surface, and image")
-    return lens_of(_draft(file), given)
+        raise InputError(file.file, "NXT", f"({len(file.blocks)} surfaces)", "object, at least one surface, and image")
+    _complete(file)
+    return lens_of(file, given)
 
 
 def looks_like_len(head: str) -> bool:
@@ -85,9 +80,9 @@ def _read(file: File, line: Line) -> None:
     word, rest = line.words[0].upper(), line.words[1:]
     if word == "LEN":
         quoted = re.search('"([^"]*)"', line.text)
-        file.name, file.begun = quoted[1] if quoted else "", True
+        file.name = quoted[1] if quoted else ""
         file.blocks.append(Block(line))
-    elif not file.begun or file.ended:
+    elif not file.blocks or file.ended:
         raise line.error(word, "(here)", "commands between LEN NEW and END: configurations and the rest are not read")
     elif word in IGNORED:
         pass
@@ -103,7 +98,10 @@ def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:
             value = line.numbers(word, rest[:1])[0]
             if value < 0 or (word == "EBR" and value == 0):
                 raise line.error(word, value, "a number above 0")
-            file.beam, file.angle = (value, file.angle) if word == "EBR" else (file.beam, value)
+            if word == "EBR":
+                file.pupil = 2 * value
+            else:
+                file.half_field_deg = value if 1e-3 < value < 90 else None
         case "UNI":
             mm = line.numbers(word, rest[:1])[0]
             file.unit = next((name for name, value in UNITS_MM.items() if value == mm), None)
@@ -159,25 +157,17 @@ def _glass(line: Line, rest: list[str]) -> dict[str, Any]:
     return named_glass(rest[0], line.file, f"line {line.number}, GLA")
 
 
-def _draft(file: File) -> Draft:
+def _complete(file: File) -> None:
+    """Set what follows from all surfaces."""
     first, *middle, _ = file.blocks
+    last = middle[-1]
     for k, block in enumerate(middle, start=1):
-        if block.solved and block is not middle[-1]:
+        if block.solved and block is not last:
             raise block.start.error("PY", f"(on surface {k})", "the last surface")
     distance = first.values.get("TH", 0.0)
-    last = middle[-1]
-    return Draft(
-        file=file.path,
-        kind="OSLO",
-        rows=tuple(Row(_surface_of(block), aperture=block.checked) for block in middle),
-        name=file.name,
-        notes="\n".join(file.notes),
-        pupil=None if file.beam is None else 2 * file.beam,
-        half_field_deg=file.angle if file.angle and 1e-3 < file.angle < 90 else None,
-        object_distance=math.inf if distance >= INFINITE else distance,
-        film_given=not (last.solved and "TH" not in last.values),
-        unit=file.unit,
-    )
+    file.rows = tuple(Row(_surface_of(block), aperture=block.checked) for block in middle)
+    file.object_distance = math.inf if distance >= INFINITE else distance
+    file.film_given = not (last.solved and "TH" not in last.values)
 
 
 def _surface_of(block: Block) -> Surface:

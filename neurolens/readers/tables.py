@@ -59,7 +59,7 @@ def read_table(path: str | Path, given: Given | None = None) -> Lens:
         kind="lens table",
         rows=tuple(Row(s, aperture=True) for s in surfaces),
         name=next((c for c in comments if any(map(str.isalpha, c))), ""),
-        notes="\n".join(comments),
+        notes=comments,
         film_given=surfaces[-1].thickness_mm != 0,
     )
     return lens_of(draft, given)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -36,17 +35,12 @@ from neurolens.readers.zemax_model import (
 
 
 @dataclass
-class File:
+class File(Draft):
     """A file while it is read."""
 
-    path: str
+    kind: str = "Zemax"
     blocks: list[Block] = field(default_factory=list)
     zoom: Zoom = field(default_factory=Zoom)
-    name: str = ""
-    notes: list[str] = field(default_factory=list)
-    unit: str | None = None
-    pupil: float | None = None
-    f_number: float | None = None
     makers: list[str] = field(default_factory=list)
     working: Line | None = None  # where the f-number is said to be the working one
     field_type: int = 0
@@ -56,8 +50,8 @@ class File:
     oddities: list[str] = field(default_factory=list)
 
 
-def draft_of(file: File) -> Draft:
-    """The draft of a file that has been read to its end.
+def _complete(file: File) -> None:
+    """Set what follows from all surfaces.
 
     Raises:
         InputError: a file that was cut off, a shape that the lens model cannot hold, the working f-number of a near
@@ -68,7 +62,7 @@ def draft_of(file: File) -> Draft:
         block.semi_diameter = block.semi_diameter if block.clear is None else block.clear
         if block.kind == "COORDBRK" and block.glass is None:
             block.medium = before.medium  # it stands in the medium of the surface before it
-    rows = tuple(Row(b.surface(shape_of(b)), b.aperture) for b in file.blocks[1:-1])
+    file.rows = tuple(Row(b.surface(shape_of(b)), b.aperture) for b in file.blocks[1:-1])
     for block in file.blocks:
         if math.isnan(block.thickness):
             raise block.start.error("DISZ", "(missing)", "the thickness behind every surface (is the file cut off?)")
@@ -79,35 +73,26 @@ def draft_of(file: File) -> Draft:
     if file.f_number is not None and file.working and math.isfinite(file.blocks[0].thickness):
         raise file.working.error("FNUM", "(the working f-number of a near object)", "ENPD, FLOA, or FNUM with flag 0")
     for text in (*file.oddities, *(f"{text} ({count})" for text, count in file.ignored.items() if count)):
-        warn(file.path, text)
+        warn(file.file, text)
     last = file.blocks[-2]
-    return Draft(
-        file=file.path,
-        kind="Zemax",
-        rows=rows,
-        name=file.name,
-        notes="\n".join(file.notes).strip(),
-        states=tuple(draft_states(file.zoom, file.blocks, file.f_number is not None)),
-        pupil=file.pupil,
-        f_number=file.f_number,
-        object_distance=file.blocks[0].thickness,
-        film_given=not (last.solve and last.solve[0] == "MAZH" and last.thickness == 0),
-        unit=file.unit,
-        rims="estimated" if any(b.automatic and not b.stop for b in file.blocks[1:-1]) else "source",
-        **dict(_field(file)),
-    )
+    file.notes = ["\n".join(file.notes).strip()]
+    file.states = tuple(draft_states(file.zoom, file.blocks, file.f_number is not None))
+    file.object_distance = file.blocks[0].thickness
+    file.film_given = not (last.solve and last.solve[0] == "MAZH" and last.thickness == 0)
+    file.rims = "estimated" if any(b.automatic and not b.stop for b in file.blocks[1:-1]) else "source"
+    _set_field(file)
 
 
-def _field(file: File) -> Iterator[tuple[str, float]]:
+def _set_field(file: File) -> None:
     """Half field or image radius: the field point farthest from the axis. FTYP 0 angle, 2 and 3 image height."""
     points = [(x, y) for x, y in zip(*(file.heights.get(k, [0.0] * 100) for k in ("XFLN", "YFLN")), strict=False)]
     edge = max((math.hypot(x, y) for x, y in points[: file.fields or None]), default=0.0)
     if edge > 0 and file.field_type == 0:
-        yield "half_field_deg", edge
+        file.half_field_deg = edge
     elif edge > 0 and file.field_type in (2, 3):
-        yield "image_radius", edge
+        file.image_radius = edge
     elif edge > 0:
-        warn(file.path, f"the field is given as type {file.field_type} (not an angle, not an image height): left out")
+        warn(file.file, f"the field is given as type {file.field_type} (not an angle, not an image height): left out")
 
 
 UNITS = {"MM": "mm", "CM": "cm", "IN": "in", "INCH": "in", "METER": "m", "METERS": "m", "M": "m"}
@@ -132,8 +117,9 @@ def read_zmx(path: str | Path, given: Given | None = None) -> Lens:
     for line in read_lines(path):
         _read(file, line)
     if len(file.blocks) < 3:
-        raise InputError(file.path, "SURF", f"({len(file.blocks)} surfaces)", "object, at least one surface, and image")
-    return lens_of(draft_of(file), given)
+        raise InputError(file.file, "SURF", f"({len(file.blocks)} surfaces)", "object, at least one surface, and image")
+    _complete(file)
+    return lens_of(file, given)
 
 
 def looks_like_zmx(head: str) -> bool:

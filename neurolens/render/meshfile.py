@@ -34,17 +34,13 @@ _FACE = "f I J K, counted from 1, or back from -1"
 
 @dataclass(frozen=True)
 class TriangleSet:
-    """A mesh as read.
+    """A mesh as read."""
 
-    Attributes:
-        vertices: [V, 3] float64 m. faces: [T, 3] counted from 0. uv: [V, 2] texture coordinates, from the lower left
-            corner of a picture, or None. normals: [V, 3] unit vectors to interpolate, or None.
-    """
-
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
+    vertices: NDArray[np.float64]  # [V, 3] float64 m
+    faces: NDArray[np.int64]  # [T, 3] counted from 0
+    # [V, 2] texture coordinates, from the lower left corner of a picture, or None.
     uv: NDArray[np.float64] | None = None
-    normals: NDArray[np.float64] | None = None
+    normals: NDArray[np.float64] | None = None  # [V, 3] unit vectors to interpolate, or None
 
 
 def read_mesh(scene: Path, field: str, settings: MeshSettings, part: TriangleSet | None = None) -> TriangleSet:

@@ -225,7 +225,7 @@ def square_of_points(side: int) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("shape", SHAPES, ids=name)
 def test_counted_points_agree_with_the_area(shape: Aperture) -> None:
     """Of straight blades that is n / (2 pi) sin(2 pi / n) of the circle: 75.7% for five, 82.7% for six."""
-    x, y = square_of_points(801)
+    x, y = square_of_points(1201)
     share = shape.inside(2.5 * x, 2.5 * y, 2.5).sum() / (x * x + y * y <= 1).sum()
     straight = bool(shape.blades) and not shape.curvature
     assert share == pytest.approx(shape.area_share, abs=1e-3 if straight else 2e-3)

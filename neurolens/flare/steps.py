@@ -1,0 +1,165 @@
+"""One surface as a graph, refracting or reflecting: the step that ghosts are traced by, on compiled code.
+
+Light always travels towards -z here: in a frame that is mirrored (z reversed) while it goes to the film. So one step
+serves both ways, and `tracegraph` has its intersections. A sphere or plane is a number of the call; any other surface
+is its own function. Fresnel's reflectance is written without the difference of nearly equal roots, which float32 would
+lose where glasses are cemented; a coating's is a polynomial in the cosine on the side of the lower index, fitted to its
+transfer matrices at one wavelength.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+
+from neurolens.graph.ir import Graph, Value
+from neurolens.optics import coatings
+from neurolens.optics.apertures import Aperture
+from neurolens.optics.prescription import Surface
+from neurolens.optics.tracegraph import meet_plain, meet_shape
+
+Action = Literal["T", "R"]
+STATE = 8  # rows: x, y, z (mm, this step's frame), direction, power, largest r^2 over the rim's so far
+LOST = 1e30  # of that ratio: the ray meets no surface, or is totally reflected where it should go on
+CALL = ("shift_mm", "curvature", "per_rim2", "n_before", "n_after", "n_step", "absorbed_per_mm")
+DEGREE = 10  # of a coating's reflectance
+_TINY = 1e-30
+_FAINT = 2e-4  # reflectance that no ghost is seen by
+
+
+class Kind(NamedTuple):
+    """What one function of the compiled code does; steps of equal kind share it.
+
+    Attributes:
+        action: "T" refracted or "R" reflected.
+        surface: None for spheres and planes, whose curvature is a number of the call; else the surface, whose figures
+            are constants, seen by light that travels towards -z.
+        bends: whether the media differ. coated: whether the reflectance is a polynomial of the call.
+        absorbs: whether the medium before the surface takes light.
+        aperture: the shape of the stop's opening, tested there; None is round.
+    """
+
+    action: Action
+    surface: Surface | None = None
+    bends: bool = True
+    coated: bool = False
+    absorbs: bool = False
+    aperture: Aperture | None = None
+
+
+def step_graph(kind: Kind) -> Graph:
+    """Input `state` [8] and numbers of the call `call`; output `state` [8] after the surface, in the next step's frame.
+
+    The order of `call` is `CALL`, then the coefficients of a coating's reflectance, lowest first.
+    """
+    g = Graph()
+    state, call = g.input("state", STATE), g.input("call", len(CALL) + (DEGREE + 1), per_call=True)
+    shift, curvature, per_rim2, n1, n2, n_step, absorbed = (call[k] for k in range(len(CALL)))
+    d, power, worst = state[3:6], state[6], state[7]
+    x = g.concat(state[0:2], state[2] + shift)
+    nearest = d * -g.dot(x, d) + x
+    met = meet_plain(nearest, d, curvature) if kind.surface is None else meet_shape(nearest, d, kind.surface)
+    point, q = met.point, met.cosine
+    normal = met.normal
+    if normal is None:
+        normal = g.concat(point[0:2] * -curvature, 1.0 - point[2] * curvature)
+    # On the near half of a sphere: beyond it there is no glass.
+    tests = [*met.tests, (g.constant(_TINY), normal[2])]
+    ratio2 = g.square(point[0:2]) * per_rim2
+    if kind.absorbs:  # exp(-2 u) as (1 - tanh u) / (1 + tanh u), which every writer has
+        way = g.dot(point - x, d) * absorbed * 0.5
+        t = way.tanh()
+        power = power * ((1.0 - t) / (1.0 + t))
+    if kind.bends:
+        ratio = n1 / n2
+        cos2 = ratio * ratio * (q * q + -1.0) + 1.0
+        cos = cos2.maximum(0.0).sqrt()
+        reflected = _coated(g, call, q, cos, n_step) if kind.coated else _fresnel(n1, n2, n_step, q, cos)
+        if kind.action == "R":
+            power = power * g.select(g.constant(_TINY) <= cos2, reflected, 1.0)
+        else:
+            tests.append((g.constant(_TINY), cos2))
+            power = power * (1.0 - reflected)
+            d = d * ratio + normal * (ratio * q - cos)
+    if kind.action == "R":
+        d = d + normal * (q * 2.0)
+        point, d = point * [1.0, 1.0, -1.0], d * [1.0, 1.0, -1.0]
+    if kind.aperture is not None:
+        opened = kind.aperture.opening(g, point[0:2], 1.0 / per_rim2.sqrt())
+        ratio2 = g.select(opened, ratio2, LOST)
+    on = ratio2 <= LOST  # false for NaN
+    for low, high in tests:
+        on = on & (low <= high)
+    g.outputs["after"] = g.concat(point, d, power, g.select(on, worst.maximum(ratio2), LOST))
+    return g
+
+
+def film_graph() -> Graph:
+    """Where light meets the film: input `state` and the film's `shift_mm`; output `film`: x, y (mm), power, worst.
+
+    Power is 0 where any rim stopped the ray.
+    """
+    g = Graph()
+    state, shift = g.input("state", STATE), g.input("shift_mm", per_call=True)
+    z, dz, worst = state[2] + shift, state[5], state[7]
+    place = state[0:2] - state[3:5] * (z / dz)
+    arrives = (worst <= 1.0) & (dz <= -_TINY)
+    g.outputs["film"] = g.concat(place, g.select(arrives, state[6], 0.0), worst)
+    return g
+
+
+def _fresnel(n1: Value, n2: Value, n_step: Value, cos_i: Value, cos_t: Value) -> Value:
+    """(Rs + Rp) / 2 of a bare surface; n_step = n2^2 - n1^2 (Born and Wolf, 1.5.2, by a^2 - b^2 = (a - b)(a + b)).
+
+    With s = n1 c1 + n2 c2 and p = n2 c1 + n1 c2: rs = -n_step / s^2, rp = n_step (c1^2 - (n1 / n2)^2 (1 - c1^2)) / p^2.
+    """
+    s, p = n1 * cos_i + n2 * cos_t, n2 * cos_i + n1 * cos_t
+    ratio, c2 = n1 / n2, cos_i * cos_i
+    lack = c2 + ratio * ratio * (c2 + -1.0)
+    rs, rp = n_step / (s * s), n_step * lack / (p * p)
+    return (rs * rs + rp * rp) * 0.5
+
+
+def _coated(g: Graph, call: Value, cos_i: Value, cos_t: Value, n_step: Value) -> Value:
+    """The polynomial of a coating, in 1 - c with c the cosine on the side of the lower index."""
+    u = 1.0 - g.select(g.constant(0.0) <= n_step, cos_i, cos_t)
+    first = len(CALL)
+    total = call[first + DEGREE]
+    for k in reversed(range(DEGREE)):
+        total = total * u + call[first + k]
+    return total.maximum(0.0).minimum(1.0)
+
+
+def reflectance_fit(
+    layers: Sequence[tuple[float, float]], n_before: float, n_after: float, wavelength_nm: float, sense: int
+) -> tuple[list[float], float]:
+    """Coefficients of a coating's reflectance in 1 - c (c on the side of the lower index), and the largest error.
+
+    By least relative squares at Chebyshev's places: ghosts live on what is left near normal incidence. n_before and
+    n_after are as light of this sense meets them. The error is relative, of a reflectance of at least `_FAINT`.
+    """
+    c = 0.5 + 0.5 * np.cos((np.arange(64) + 0.5) * math.pi / 64)
+    low, high = min(n_before, n_after), max(n_before, n_after)
+    there = np.sqrt(1 - (low / high) ** 2 * (1 - c * c))
+    cos_i = torch.from_numpy(c if n_before <= n_after else there)
+    exact = coatings.reflectance(cos_i, n_before, n_after, layers, wavelength_nm, sense).numpy()
+    fit = np.polynomial.Chebyshev.fit(1 - c, exact, DEGREE, domain=(0, 1), w=1 / (exact + _FAINT))
+    worst = np.abs(fit(1 - c) - exact) / (exact + _FAINT)
+    return fit.convert(kind=np.polynomial.Polynomial).coef.tolist(), float(worst.max())
+
+
+def seen(surface: Surface, towards_film: bool) -> Surface:
+    """The figures of a surface in the frame in which the light travels towards -z; what passes light is left out."""
+    turn = -1.0 if towards_film else 1.0
+    return Surface(
+        turn * surface.radius_mm,
+        0.0,
+        surface.diameter_mm,
+        conic=surface.conic,
+        asphere=tuple((power, turn * a) for power, a in surface.asphere),
+        cylinder=surface.cylinder,
+    )

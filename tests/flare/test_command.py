@@ -1,0 +1,43 @@
+"""`neurolens flare` on the command line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from neurolens.cli import main
+from neurolens.render.pictures import read_exr, read_layers
+
+
+def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "flare.exr"
+    assert main(["flare", "laikin_double_gauss_50", "--light", "15,8"]) == 0
+    said = capsys.readouterr().out
+    assert "66 pairs" in said and "g12-11" in said
+    small = ["--width", "48", "--samples", "4096", "--wavelengths", "3", "--layers", "2", "--json"]
+    assert main(["flare", "laikin_double_gauss_50", "--light", "15,8,0.5/0.4/0.3", "-o", str(out), *small]) == 0
+    told = json.loads(capsys.readouterr().out)
+    rgb, metadata = read_exr(out)
+    layers = read_layers(out)
+    assert rgb.shape == (32, 48, 3) and rgb.sum() > 0
+    assert metadata["flare"]["ghosts"] == told["ghosts"]
+    top = [g["name"] for g in told["ghosts"][0][:2]]
+    names = [f"{name}.{c}" for name in (*top, "rest") for c in "RGB"]
+    assert set(layers) == set(names)
+    np.testing.assert_allclose(sum(layers[f"{name}.R"] for name in (*top, "rest")), rgb[..., 0], rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--light", "180,0"], "within 90 degrees"),
+        (["--light", "1"], "AZ,EL"),
+        (["--light", "1,2,3/4"], "AZ,EL"),
+        (["--light", "0,0", "-o", "x.png"], ".exr"),
+        (["--light", "0,0", "--coating", "velvet"], "velvet"),
+    ],
+)
+def test_bad_words(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["flare", "laikin_double_gauss_50", *words]) == 2
+    assert said in capsys.readouterr().err

@@ -1,0 +1,207 @@
+"""Ghosts as compiled code against the exact path by path, closed forms, and what light may not do."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
+from neurolens.flare.ghosts import GhostTracer, Pair, coated, ghost_pairs
+from neurolens.flare.picture import Light, Raster, axis_irradiance, ghost_picture, ghost_table, light_rays
+from neurolens.optics.apertures import Aperture
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Coating, Lens, Surface
+from neurolens.optics.radiometry import film_light
+from neurolens.optics.sequence import follow, ghost
+from neurolens.optics.trace import Rays, trace
+
+LENSES = Path(__file__).parents[2] / "lenses"
+
+
+def lens_of(name: str, **state: float) -> Lens:
+    return read_lens(LENSES / f"{name}.toml").at(focus_m=math.inf, **state)
+
+
+def double_gauss() -> Lens:
+    return lens_of("laikin_double_gauss_50")
+
+
+def plate(gap: float = 10.0) -> Lens:
+    """Glass 4 mm thick, a stop, the film."""
+    rows = Surface(math.inf, 4.0, 20.0, 1.5), Surface(math.inf, 6.0, 20.0), Surface(math.inf, gap, 20.0, stop=True)
+    return Lens("plate", "", rows, 2.0, film_z_mm=10.0 + gap)
+
+
+def exact(lens: Lens, rays: np.ndarray, pair: Pair, wavelength_nm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Film points [2, N], power [N] and whether they arrive [N], in float64."""
+    steps = ghost(len(lens.surfaces), *pair)
+    found = follow(lens, Rays(*torch.from_numpy(rays.copy())), steps, wavelength_nm)
+    assert lens.film_z_mm is not None
+    way = (lens.film_z_mm - found.rays.z) / found.rays.dz
+    place = torch.stack([found.rays.x + way * found.rays.dx, found.rays.y + way * found.rays.dy])
+    return place.numpy(), found.power.numpy(), (found.status == st.PASSED).numpy()
+
+
+CASES = {
+    "spheres": lambda: double_gauss(),
+    "blades": lambda: replace(double_gauss().at(f_number=5.6), aperture=Aperture(blades=6)),
+    "coated": lambda: coated(double_gauss(), "broadband"),
+    "aspheres": lambda: lens_of("phone_lens_6"),
+    "cylinders": lambda: lens_of("schneider_anamorphic_31"),
+    "absorbing": lambda: replace(
+        double_gauss(),
+        surfaces=tuple(replace(s, absorption_per_mm=0.02 * (s.n_d > 1)) for s in double_gauss().surfaces),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_compiled_ghosts_are_the_exact_ones(case: str) -> None:
+    lens = CASES[case]()
+    pairs = ghost_pairs(lens)
+    tracer = GhostTracer(lens, pairs[:: max(1, len(pairs) // (3 if case == "aspheres" else 9))])
+    rays, _ = light_rays(lens, Light(7.0, -4.0), 0, 3000)
+    found = tracer.trace(rays, 480.0)
+    arrived = 0
+    for number, pair in enumerate(tracer.pairs):
+        place, power, passed = exact(lens, rays, pair, 480.0)
+        mine = found.worst[number] <= 1
+        edge = np.abs(found.worst[number] - 1) < 1e-4
+        assert np.all((mine == passed) | edge)
+        both = mine & passed
+        arrived += int(both.sum())
+        # Within a pixel of 5 um; far outside the picture the error grows as the distance does.
+        near = both & (np.hypot(*place) < 100)
+        off = np.hypot(*(found.film_xy_mm[number][:, near] - place[:, near]))
+        assert off.max(initial=0.0) < 5e-3 and (not near.any() or np.median(off) < 5e-4)
+        assert found.power[number][both] == pytest.approx(power[both], rel=1e-3, abs=2e-4**2)
+        assert np.all(found.power[number][~mine] == 0)
+    assert arrived > 300
+
+
+def test_a_plate_by_hand() -> None:
+    lens = plate()
+    tracer = GhostTracer(lens)
+    assert tracer.pairs == (Pair(0, 1),)
+    angle = math.radians(10)
+    ray = np.array([[0.0, 0, -1, math.sin(angle), 0, math.cos(angle)]]).T
+    found = tracer.trace(ray, 550.0, direct=True)
+    inside = math.tan(math.asin(math.sin(angle) / 1.5))
+    outside = math.tan(angle)
+    assert found.film_xy_mm[0, 0, 0] == pytest.approx(17 * outside + 12 * inside, abs=1e-5)
+    assert found.film_xy_mm[1, 0, 0] == pytest.approx(17 * outside + 4 * inside, abs=1e-5)
+    cos_t = math.cos(math.asin(math.sin(angle) / 1.5))
+    r_s = ((math.cos(angle) - 1.5 * cos_t) / (math.cos(angle) + 1.5 * cos_t)) ** 2
+    r_p = ((1.5 * math.cos(angle) - cos_t) / (1.5 * math.cos(angle) + cos_t)) ** 2
+    r = (r_s + r_p) / 2
+    assert found.power[0, 0] == pytest.approx(r * r * (1 - r) ** 2, rel=1e-6)
+    assert found.power[1, 0] == pytest.approx((1 - r) ** 2, rel=1e-6)
+
+
+def test_direct_light_is_the_plain_trace() -> None:
+    lens = double_gauss()
+    rays, _ = light_rays(lens, Light(3.0, 2.0), 0, 2000)
+    plain = trace(lens, Rays(*torch.from_numpy(rays.copy())), 550.0, towards="film", transmittance=True)
+    found = GhostTracer(lens, []).trace(rays, 550.0, direct=True)
+    passed = (plain.status == 0).numpy()
+    assert plain.transmittance is not None and passed.sum() > 500
+    assert np.all((found.worst[0] <= 1) == passed)
+    np.testing.assert_allclose(found.power[0][passed], plain.transmittance.numpy()[passed], rtol=2e-6)
+
+
+def test_energy_of_a_point_is_irradiance_times_pupil() -> None:
+    """Light that gets through is that of the entrance pupil, pi (f / 2 N)^2."""
+    lens = double_gauss().at(f_number=4.0)
+    rays, area = light_rays(lens, Light(0.0, 0.0), 0, 100_000)
+    found = GhostTracer(lens, []).trace(rays, 587.6, direct=True)
+    lit = found.power[0] > 0
+    efl = float(first_order(lens).efl_mm)
+    assert area * lit.mean() == pytest.approx(math.pi * (efl / 8) ** 2, rel=0.01)
+    assert 0.3 < found.power[0][lit].mean() < 0.7  # twelve bare surfaces
+
+
+def test_the_exposure_is_the_integral_of_the_pupil() -> None:
+    lens = double_gauss()
+    assert axis_irradiance(lens, 550.0) == pytest.approx(
+        film_light(lens, [0.0], wavelength_nm=550.0).irradiance[0], rel=3e-3
+    )
+
+
+def test_a_picture_holds_the_light_that_falls_on_it() -> None:
+    """A film that holds every ghost of a plate: the picture's sum is the rays' power, in every layer."""
+    lens = plate()
+    tracer, raster, light = GhostTracer(lens), Raster((60.0, 40.0), 120, 80), Light(5.0, 0.0, (2.0, 2.0, 2.0))
+    picture = ghost_picture(tracer, [light], raster, wavelengths=3, samples=4096, layers=[1], threads=1)
+    assert picture.shape == (2, 80, 120, 3) and not picture[0].any()
+    rays, area = light_rays(lens, light, 0, 4096)
+    flux = 2 * area * tracer.trace(rays, 550.0).power[0].mean()
+    pixel = (60.0 / 120) ** 2
+    expected = flux / pixel / axis_irradiance(lens, 550.0)
+    np.testing.assert_allclose(picture[1].sum((0, 1)), expected, rtol=2e-3)
+    # The light stands to the right: so do its image and, in a plate, its ghost.
+    places = picture[1].sum((0, 2)) @ (np.arange(120) + 0.5) / picture[1].sum()
+    found = tracer.trace(rays, 550.0)
+    assert places == pytest.approx(60 - 2 * np.average(found.film_xy_mm[0, 0], weights=found.power[0]), abs=0.1)
+    assert places > 61
+
+
+def test_what_coatings_and_sides_are_for() -> None:
+    lens, light = double_gauss(), Light(15.0, 8.0)
+    bare = ghost_table(GhostTracer(lens), light, 550.0)
+    few = ghost_table(GhostTracer(coated(lens, "quarter-wave")), light, 550.0)
+    total = [sum(g.energy for g in rows) for rows in (bare, few)]
+    assert total[1] < 0.2 * total[0]
+    one_side = ghost_pairs(lens, one_side=True)
+    assert set(one_side) < set(ghost_pairs(lens)) and len(ghost_pairs(lens)) == 66
+    assert bare == sorted(bare, key=lambda g: -g.energy)
+
+
+@pytest.mark.parametrize("name", ["panavision_anamorphic_zoom_21", "shimizu_fisheye_220"])
+def test_extremes_stay_finite(name: str) -> None:
+    """57 surfaces, 220 degrees; light on the axis, at 89 degrees, in the near field; no rays at all."""
+    lens = lens_of(name)
+    pairs = ghost_pairs(lens)
+    tracer = GhostTracer(lens, pairs[:: max(1, len(pairs) // 9)])
+    for light in (Light(0.0, 0.0), Light(89.0, 0.0), Light(10.0, 70.0, distance_m=0.05)):
+        for nm in (380.0, 780.0):
+            rays, _ = light_rays(lens, light, 0, 400)
+            found = tracer.trace(rays, nm, direct=True)
+            lit = found.worst <= 1
+            assert np.isfinite(found.power).all() and np.all((found.power >= 0) & (found.power <= 1))
+            assert np.isfinite(np.moveaxis(found.film_xy_mm, 1, 2)[lit]).all()
+    assert tracer.trace(np.zeros((6, 0)), 550.0).power.shape == (len(tracer.pairs), 0)
+    broken = np.full((6, 3), np.nan)
+    assert np.all(tracer.trace(broken, 550.0).power == 0)
+
+
+BAD = [
+    (lambda: Light(180.0, 0.0), "within 90 degrees"),
+    (lambda: Light(0.0, 90.0), "within 90 degrees"),
+    (lambda: Light(math.nan, 0.0), "within 90 degrees"),
+    (lambda: Light(0.0, 0.0, distance_m=0.0), "positive distance"),
+    (lambda: Light(0.0, 0.0, (1.0, -1.0, 0.0)), "at least 0"),
+    (lambda: GhostTracer(plate(), [Pair(1, 2)]), "surfaces that reflect"),
+    (lambda: GhostTracer(replace(plate(), film_z_mm=None)), "focused"),
+    (lambda: GhostTracer(plate()).trace(np.zeros((3, 4)), 550.0), r"\[6, N\]"),
+    (lambda: coated(plate(), "velvet"), "velvet"),
+]
+
+
+@pytest.mark.parametrize(("call", "word"), BAD)
+def test_refusals(call: object, word: str) -> None:
+    with pytest.raises(InputError, match=word):
+        call()  # type: ignore[operator]
+
+
+def test_coatings_of_the_file_stay() -> None:
+    lens = plate()
+    own = Coating("own", ((1.7, 50.0),))
+    lens = replace(lens, surfaces=(replace(lens.surfaces[0], coating=own), *lens.surfaces[1:]))
+    after = coated(lens, "quarter-wave")
+    assert after.surfaces[0].coating == own and after.surfaces[1].coating is not None
+    assert after.surfaces[2].coating is None
