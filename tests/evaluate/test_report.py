@@ -165,7 +165,7 @@ def test_it_says_what_to_use(run_dir: Path) -> None:
     poor = {**results["models"][0], "name": "fast", "fused_ns_per_ray": {"min": 1.0}, "poor": ["false pass 3%"]}
     models = [slow, thin, poor, *results["models"]]
     page = Page(write_report(run_dir, Results(**{**results, "models": models})).read_text())
-    head = page.text.partition("In short")[0]
+    head = page.text.partition("Notes and warnings")[0]
     assert "Use ols-40" in head and "3.25 ns a ray as C" in head
     assert f"--camera fused:{run_dir}/models/ols-40.onnx" in head
     target = {"within_um": 0.001, "met": False, "model": "close", "rms_um": 0.01}
