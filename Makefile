@@ -2,6 +2,7 @@
 #
 #   make demo     train, evaluate and render the quickstart (4 CPU minutes after installing)
 #   make test     tests, then lint, format and types
+#   make test-blender   the extension in Blender 5.0, in .venv-blender (Python 3.11; about 400 MB, once)
 #   make bench    the tracer's speed, then models against it; fails when a promised ratio is lost
 #   make models   fit again every model of models/
 #   make gallery  what real lenses do: render and measure every effect
@@ -16,6 +17,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+BLENDER_VENV := .venv-blender
+BLENDER_INSTALLED := $(BLENDER_VENV)/.installed
+BLENDER_PACKAGES := bpy==5.0.0 numpy==1.26.4 pytest==9.2.0
 
 # Versions come from constraints.txt alone; a slow mirror should not fail the build.
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -24,7 +28,7 @@ export PIP_DEFAULT_TIMEOUT ?= 120
 export OMP_NUM_THREADS ?= 2
 export MPLBACKEND ?= Agg
 
-.PHONY: demo test bench models gallery lint format clean
+.PHONY: demo test test-blender bench models gallery lint format clean
 .DELETE_ON_ERROR:
 
 demo: $(INSTALLED)
@@ -34,6 +38,10 @@ demo: $(INSTALLED)
 test: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile --durations=10
 	$(MAKE) --no-print-directory lint
+
+# Blender as a module wants Python 3.11 and numpy 1: an environment of its own.
+test-blender: $(BLENDER_INSTALLED)
+	$(BLENDER_VENV)/bin/python -m pytest -q --confcutdir=tests/blender tests/blender
 
 bench: $(INSTALLED)
 	$(BIN)/python -m experiments trace
@@ -55,7 +63,7 @@ format: $(INSTALLED)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache build *.egg-info
+	rm -rf $(VENV) $(BLENDER_VENV) .pytest_cache .mypy_cache .ruff_cache build *.egg-info
 
 # torch goes first, by itself, at the tested version: it brings setuptools, which then builds the project without fetching anything unpinned.
 $(INSTALLED): pyproject.toml constraints.txt
@@ -71,4 +79,17 @@ $(INSTALLED): pyproject.toml constraints.txt
 	"$$found" -m venv $(VENV) || { echo "'$$found -m venv' failed: is the venv module installed (Debian: python3-venv)?" >&2; exit 1; }
 	$(BIN)/python -m pip install --quiet -c constraints.txt torch
 	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[train,dev]'
+	@touch $@
+
+$(BLENDER_INSTALLED): Makefile
+	@set -e; found=; \
+	for candidate in "$(PYTHON)" python3.11 python3; do \
+	    if "$$candidate" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null; then found=$$candidate; break; fi; \
+	done; \
+	if [ -z "$$found" ]; then \
+	    echo "Blender 5.0 as a module needs Python 3.11: try make test-blender PYTHON=/path/to/python3.11" >&2; exit 1; \
+	fi; \
+	echo "Setting up $(BLENDER_VENV) with $$found (once; Blender is large)"; \
+	"$$found" -m venv $(BLENDER_VENV)
+	$(BLENDER_VENV)/bin/python -m pip install --quiet $(BLENDER_PACKAGES)
 	@touch $@

@@ -56,13 +56,15 @@ def build_parser() -> Parser:
         mitsuba,
         models,
         render,
+        stmap,
         train,
     )
 
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    for command in (lens, analyse, glass, convert, train, models, evaluate, export, render, flare, mitsuba, bench):
+    commands = lens, analyse, glass, convert, train, models, evaluate, export, render, stmap, flare, mitsuba, bench
+    for command in commands:
         command.add_parser(subparsers)
     return parser
 

@@ -30,7 +30,7 @@ GAUSS, SINGLET, PHONE, ZOOM, TESSAR = (
         "brendel_tessar_100",
     )
 )
-COMMANDS = ("lens", "analyse", "glass", "convert", "train", "models", "evaluate", "export", "render")
+COMMANDS = ("lens", "analyse", "glass", "convert", "train", "models", "evaluate", "export", "render", "stmap")
 
 
 @pytest.mark.parametrize("command", [[], *([c] for c in COMMANDS)])
@@ -332,15 +332,16 @@ def test_without_torch_a_lens_file_names_the_extra_and_the_thin_lens_renders(sce
     assert done.returncode == 0 and (tmp_path / "a.exr").exists()
 
 
-def test_without_torch_glass_is_found_lenses_are_converted_and_c_is_written(tmp_path: Path) -> None:
+def test_without_torch_glass_is_found_lenses_are_converted_c_and_maps_are_written(tmp_path: Path) -> None:
     file = ROOT / "models" / "laikin_double_gauss_50.ols-36.onnx"
     (tmp_path / "a.dat").write_text("# 50 mm\n30 5 1.5 20\n0 5 0 10\n-30 45 1 20\n")
     commands = [
         ["glass", "N-BK7"],
         ["convert", str(tmp_path / "a.dat"), "-o", str(tmp_path / "a.toml")],
         ["export", str(file), "--to", "c", "-o", str(tmp_path / "a.h"), "--name", "gauss"],
+        ["stmap", str(file), "--size", "32x18", "--film", "32x18", "-o", str(tmp_path / "a")],
     ]
-    done = python(WITHOUT_TORCH.replace("main(sys.argv[1:])", f"[main(c) for c in {commands!r}] != [0] * 3"))
+    done = python(WITHOUT_TORCH.replace("main(sys.argv[1:])", f"[main(c) for c in {commands!r}] != [0] * 4"))
     assert done.returncode == 0, done.stderr
     assert "needs torch" in done.stdout and (tmp_path / "a.toml").exists() and (tmp_path / "a.h").exists()
 

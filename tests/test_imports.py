@@ -38,6 +38,7 @@ PARTS = {
     "evaluate": {
         *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare")
     },
+    "blender": set(),
     "commands": {
         *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare"),
         "evaluate",
@@ -55,6 +56,7 @@ PACKAGES = {
     "readers": set(),
     "cameras": {"numpy", "onnxruntime", "onnx"},  # onnx when a camera is first asked for rays: it loads slowly
     "render": {"numpy", "OpenEXR", "PIL", "trimesh"},
+    "blender": {"bpy", "cycles"},  # of Blender's own Python, in the extension
 }
 # Besides those: the writer of ONNX; the one camera that traces rays exactly, the maker of cameras, which imports it
 # when one is asked for; the shapes of the stop, which are parts of graphs.
@@ -65,6 +67,7 @@ EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
     "neurolens.cameras.exact": ({"optics"}, {"torch"}),
     "neurolens.cameras.outline_cache": ({"optics"}, {"torch"}),
     "neurolens.cameras.build": ({"optics"}, set()),
+    "neurolens.cameras.field": ({"optics"}, set()),  # first-order data of lenses that are traced
 }
 # Modules that load torch or onnx; others load these when they are needed.
 SLOW = {"neurolens.cameras.exact", "neurolens.cameras.outline_cache", "neurolens.graph.onnx"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,19 +43,22 @@ _QUANTITIES = {
 }
 
 
-def add_frames(parser: argparse.ArgumentParser) -> None:
-    """Add --frames and --key."""
+LENS_KEYS = "focus", "f-number", "zoom"
+_RENDERED = (
+    "render these frames to OUT.0001.exr and so on; a frame that exists is kept (--restart: none is), an "
+    "interrupted one goes on; the seed grows by the frame's number; --json prints an object a frame"
+)
+
+
+def add_frames(parser: argparse.ArgumentParser, does: str = _RENDERED, names: Sequence[str] = (*_QUANTITIES,)) -> None:
+    """Add --frames and --key; `names` are the quantities of the keys."""
     group = parser.add_argument_group("frames")
-    group.add_argument(
-        "--frames", metavar="FIRST:LAST[:STEP]", type=_frames,
-        help="render these frames to OUT.0001.exr and so on; a frame that exists is kept (--restart: none is), an "
-        "interrupted one goes on; the seed grows by the frame's number; --json prints an object a frame",
-    )  # fmt: skip
-    measures = ", ".join(f"{name} (linear in {q.linear_in})" for name, q in _QUANTITIES.items())
+    group.add_argument("--frames", metavar="FIRST:LAST[:STEP]", type=_frames, help=does)
+    measures = ", ".join(f"{name} (linear in {_QUANTITIES[name].linear_in})" for name in names)
+    points = "; position and look-at are X/Y/Z in m" if "position" in names else ""
     group.add_argument(
         "--key", metavar="NAME=FRAME:VALUE,...", action="append", default=[],
-        help=f"values at frames, repeatable: {measures}; position and look-at are X/Y/Z in m; before the first key and "
-        "after the last one they stay",
+        help=f"values at frames, repeatable: {measures}{points}; before the first key and after the last one they stay",
     )  # fmt: skip
 
 
@@ -65,17 +68,8 @@ def run_frames(args: argparse.Namespace, render: Callable[[argparse.Namespace], 
     Raises:
         InputError: a key that is none, or of a quantity that the command line sets too.
     """
-    tracks = dict(_track(text) for text in args.key)
-    if len(tracks) < len(args.key):
-        raise InputError(_COMMAND, "--key", args.key, "each quantity once")
-    for name in tracks:
-        option = _QUANTITIES[name].option
-        if getattr(args, option, None) is not None:
-            raise InputError(_COMMAND, f"--{name}", getattr(args, option), f"left out: --key {name} sets it")
-    digits = max(4, len(str(args.frames[-1])))
-    for frame in args.frames:
-        values: dict[str, Any] = {_QUANTITIES[name].option: _at(name, track, frame) for name, track in tracks.items()}
-        out = args.out.with_name(f"{args.out.stem}.{frame:0{digits}d}{args.out.suffix}")
+    for frame, number, values in frames_of(args):
+        out = args.out.with_name(f"{args.out.stem}.{number}{args.out.suffix}")
         if out.is_file() and not Files.of(out).checkpoint.exists() and not args.restart:
             continue
         values |= {"out": out, "seed": args.seed + frame, "frame": frame}
@@ -83,6 +77,27 @@ def run_frames(args: argparse.Namespace, render: Callable[[argparse.Namespace], 
         if code:
             return code
     return 0
+
+
+def frames_of(
+    args: argparse.Namespace, command: str = _COMMAND, names: Sequence[str] = (*_QUANTITIES,)
+) -> Iterator[tuple[int, str, dict[str, Any]]]:
+    """The frames of --frames: number, its digits in file names, and the options that the keys set there.
+
+    Raises:
+        InputError: a key that is none, or of a quantity that the command line sets too.
+    """
+    tracks = dict(_track(text, command, names) for text in args.key)
+    if len(tracks) < len(args.key):
+        raise InputError(command, "--key", args.key, "each quantity once")
+    for name in tracks:
+        option = _QUANTITIES[name].option
+        if getattr(args, option, None) is not None:
+            raise InputError(command, f"--{name}", getattr(args, option), f"left out: --key {name} sets it")
+    digits = max(4, len(str(args.frames[-1])))
+    for frame in args.frames:
+        values = {_QUANTITIES[name].option: _at(name, track, frame) for name, track in tracks.items()}
+        yield frame, f"{frame:0{digits}d}", values
 
 
 def _frames(text: str) -> range:
@@ -95,11 +110,11 @@ def _frames(text: str) -> range:
     raise argparse.ArgumentTypeError(f"got {text!r}, expected FIRST:LAST or FIRST:LAST:STEP, at most {_MOST} frames")
 
 
-def _track(text: str) -> tuple[str, list[tuple[int, list[float]]]]:
+def _track(text: str, command: str, names: Sequence[str]) -> tuple[str, list[tuple[int, list[float]]]]:
     """Name and keys, (frame, measures), of one --key."""
     name, _, rest = text.partition("=")
-    if name not in _QUANTITIES:
-        raise InputError(_COMMAND, "--key", text, f"NAME=FRAME:VALUE,... with NAME of {', '.join(_QUANTITIES)}")
+    if name not in names:
+        raise InputError(command, "--key", text, f"NAME=FRAME:VALUE,... with NAME of {', '.join(names)}")
     quantity = _QUANTITIES[name]
     keys: list[tuple[int, list[float]]] = []
     for word in rest.split(","):
@@ -112,7 +127,7 @@ def _track(text: str) -> tuple[str, list[tuple[int, list[float]]]]:
         later = frame.isascii() and frame.isdecimal() and len(frame) <= 7 and (not keys or int(frame) > keys[-1][0])
         if not later or len(numbers) != quantity.size or not all(good):
             form = "X/Y/Z in m" if quantity.size > 1 else "a number above 0"
-            raise InputError(_COMMAND, f"--key {name}", word, f"FRAME:VALUE, frames increasing, VALUE {form}")
+            raise InputError(command, f"--key {name}", word, f"FRAME:VALUE, frames increasing, VALUE {form}")
         keys.append((int(frame), [quantity.to(v) for v in numbers]))
     return name, keys
 

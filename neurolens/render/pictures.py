@@ -91,6 +91,25 @@ def write_exr(
         METADATA_KEY: text,
         **(attributes or {}),
     }
+    _write_part(path, header, channels)
+
+
+def write_data_exr(path: Path, channels: Mapping[str, FloatArray], metadata: Mapping[str, Any]) -> None:
+    """Write channels [H, W] float32 that are no colours as OpenEXR, atomically; `metadata` as in `write_exr`.
+
+    Raises:
+        InputError, OSError: as `write_exr`.
+    """
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "colorInteropID": "data",
+        METADATA_KEY: json.dumps(metadata, allow_nan=False),
+    }
+    _write_part(path, header, {name: np.ascontiguousarray(plane) for name, plane in channels.items()})
+
+
+def _write_part(path: Path, header: dict[str, Any], channels: dict[str, Any]) -> None:
     with atomic_path(path) as temporary:
         try:
             OpenEXR.File([OpenEXR.Part(header, channels)]).write(str(temporary))

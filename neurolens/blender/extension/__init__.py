@@ -1,0 +1,25 @@
+"""Real lenses as cameras of Cycles: a panel at the camera's data. For Blender's own Python; imports no neurolens."""
+
+from __future__ import annotations
+
+import bpy
+
+from .panel import CLASSES, LIBRARY, CameraSettings
+
+
+def register() -> None:
+    """Add menu, operators and panel."""
+    for each in CLASSES:
+        bpy.utils.register_class(each)
+    bpy.types.Camera.neurolens = bpy.props.PointerProperty(type=CameraSettings)
+    bpy.types.Scene.neurolens_before = bpy.props.StringProperty(options={"HIDDEN"})
+    LIBRARY.load()
+
+
+def unregister() -> None:
+    """Take them away; cameras keep their lenses, and render."""
+    LIBRARY.close()
+    del bpy.types.Scene.neurolens_before
+    del bpy.types.Camera.neurolens
+    for each in reversed(CLASSES):
+        bpy.utils.unregister_class(each)

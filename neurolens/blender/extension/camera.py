@@ -1,0 +1,252 @@
+"""A lens put on a camera, and taken off it: what is changed is first written down on the camera and the scene.
+
+The shader's text and its compiled form are kept in the .blend file, and its settings are the custom camera's own
+properties: the file renders where the extension is missing, and keyframes and drivers act on them directly.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import bpy
+
+from .library import LensError, LensFacts, Setting, Variant, fitting_width_mm, refusals, refused
+
+# Of the camera and of the scene, what `apply` changes; the scene's first camera of this extension writes the scene's.
+_CAMERA = (
+    "type", "custom_mode", "custom_filepath", "custom_bytecode", "custom_bytecode_hash",
+    "sensor_fit", "sensor_width", "sensor_height", "lens",
+)  # fmt: skip
+_TEXT = "neurolens "  # the names of our shaders in a file start so
+
+
+def camera_of(context: Any) -> Any:
+    """The camera object that operators act on: the panel's, else the scene's.
+
+    Raises:
+        LensError: there is none, or it belongs to another file.
+    """
+    shown = context.object if getattr(context, "camera", None) is not None else None
+    found = shown if shown is not None and shown.type == "CAMERA" else context.scene.camera
+    if found is None:
+        raise LensError("The scene has no camera: add one (Add > Camera), and make it the scene's")
+    if found.type != "CAMERA":
+        raise LensError(f"The scene's camera {found.name!r} is a {found.type.lower()}, not a camera")
+    if found.data.library is not None:
+        raise LensError(f"The camera {found.name!r} is linked from another file: make it local first")
+    return found
+
+
+def applied(camera: Any) -> bool:
+    """Whether camera data carry a lens of the extension."""
+    return bool(camera.neurolens.before) and camera.type == "CUSTOM"
+
+
+def setting_of(scene: Any, found: Any) -> Setting:
+    """What the scene asks of a lens on this camera object."""
+    camera, render = found.data, scene.render
+    focus = focus_m(found) if camera.dof.use_dof else None
+    custom = camera.cycles_custom
+    f_number = float(custom["f_number"]) if applied(camera) and "f_number" in custom else None
+    return Setting(
+        sensor_mm=sensor_mm(camera, render),
+        pixels=max(1, round(render.resolution_x * render.resolution_percentage / 100)),
+        focus_m=focus,
+        focus_object="" if camera.dof.focus_object is None else camera.dof.focus_object.name,
+        f_number=f_number,
+        unit_m=scene.unit_settings.scale_length if scene.unit_settings.system != "NONE" else 1.0,
+        on_gpu=_on_other_gpu(scene),
+    )
+
+
+def focus_m(found: Any) -> float:
+    """Distance along the view to what is in focus, as Cycles has it."""
+    dof = found.data.dof
+    if dof.focus_object is None:
+        return float(dof.focus_distance)
+    frame = found.matrix_world.normalized()
+    away = dof.focus_object.matrix_world.translation - frame.translation
+    return abs(float(away.dot(frame.col[2].xyz)))
+
+
+def sensor_mm(camera: Any, render: Any) -> tuple[float, float]:
+    """Width and height that the picture shows, as Cycles gives them to shaders."""
+    across = render.resolution_x * render.pixel_aspect_x
+    down = render.resolution_y * render.pixel_aspect_y
+    fit = camera.sensor_fit
+    if fit == "AUTO":
+        longer = camera.sensor_width
+        return (longer, longer * down / across) if across >= down else (longer * across / down, longer)
+    if fit == "HORIZONTAL":
+        return camera.sensor_width, camera.sensor_width * down / across
+    return camera.sensor_height * across / down, camera.sensor_height
+
+
+def _on_other_gpu(scene: Any) -> bool:
+    if scene.cycles.device != "GPU":
+        return False
+    found = bpy.context.preferences.addons.get("cycles")
+    return found is None or found.preferences.compute_device_type != "OPTIX"
+
+
+def apply(scene: Any, found: Any, lens: LensFacts, kind: str, *, fit_sensor: bool = False) -> None:
+    """Put a lens on a camera object.
+
+    Raises:
+        LensError: it cannot be; nothing has changed.
+    """
+    camera = found.data
+    if (why := refused(bpy.app.version, bpy.app.build_options.cycles_osl)) is not None:
+        raise LensError(why)
+    if kind not in lens.variants:
+        raise LensError(f"{lens.name} has no {kind} form here: {', '.join(lens.variants)}")
+    variant, setting = lens.variants[kind], setting_of(scene, found)
+    width = None
+    if fit_sensor:
+        width = fitting_width_mm(variant, setting)
+        setting = _resized(setting, width)
+    if wrong := refusals(variant, setting):
+        raise LensError("; ".join(wrong))
+    try:
+        source = variant.path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise LensError(f"The shader {variant.path} cannot be read: {error}") from None
+    memory = _remembered(scene, camera)
+    try:
+        _set(scene, camera, lens, variant, source, width)
+    except LensError:
+        _put_back(scene, camera, memory)
+        raise
+    if not camera.neurolens.before:
+        camera.neurolens.before = json.dumps(memory["camera"])
+        if not scene.neurolens_before:
+            scene.neurolens_before = json.dumps(memory["scene"])
+    camera.neurolens.on = f"{lens.lens_id}/{kind}"
+
+
+def _resized(setting: Setting, width_mm: float) -> Setting:
+    from dataclasses import replace
+
+    share = width_mm / setting.sensor_mm[0]
+    return replace(setting, sensor_mm=(width_mm, setting.sensor_mm[1] * share))
+
+
+def _set(scene: Any, camera: Any, lens: LensFacts, variant: Variant, source: str, width_mm: float | None) -> None:
+    """Change camera and scene, and compile the shader.
+
+    Raises:
+        LensError: it does not compile.
+    """
+    first = not applied(camera)
+    opened = camera.dof.aperture_fstop if camera.dof.use_dof else None
+    scene.render.engine = "CYCLES"
+    scene.cycles.shading_system = True
+    if _on_other_gpu(scene):
+        scene.cycles.device = "CPU"
+    if width_mm is not None:
+        render = scene.render
+        across, down = (width_mm, width_mm * sensor_mm(camera, render)[1] / sensor_mm(camera, render)[0])
+        camera.sensor_fit, camera.sensor_width = "AUTO", max(across, down)
+    camera.type, camera.custom_mode = "CUSTOM", "INTERNAL"
+    old = camera.custom_shader
+    camera.custom_shader = _text(f"{_TEXT}{variant.path.name}", source)
+    _drop(old)
+    if first and not _is_animated(camera, "lens"):
+        camera.lens = max(1.0, lens.efl_mm)  # what the viewport shows is framed by it
+    camera.dof.use_dof = True  # or Cycles does not tell shaders the focus
+    _compile(camera)
+    custom = camera.cycles_custom
+    if first and opened is not None and "f_number" in custom:
+        custom["f_number"] = max(float(opened), variant.f_number)
+
+
+def _text(name: str, source: str) -> Any:
+    """A text of the file with this content; one that another camera uses is shared."""
+    for text in bpy.data.texts:
+        if text.name.startswith(name) and text.as_string().rstrip("\n") == source.rstrip("\n"):
+            return text
+    text = bpy.data.texts.new(name)
+    text.from_string(source)
+    return text
+
+
+def _compile(camera: Any) -> None:
+    try:
+        from cycles.osl import update_custom_camera_shader
+    except ImportError as error:
+        raise LensError(f"Cycles cannot compile shaders here: {error}") from None
+    said: list[str] = []
+    try:
+        done = update_custom_camera_shader(camera, lambda kind, text: said.append(text) if "ERROR" in kind else None)
+    except ImportError as error:
+        raise LensError(f"Cycles cannot compile shaders here: {error}") from None
+    if not done:
+        raise LensError(f"The shader does not compile: {'; '.join(said) or 'see the console'}")
+
+
+def _is_animated(camera: Any, path: str) -> bool:
+    data = camera.animation_data
+    if data is None:
+        return False
+    driven = any(driver.data_path == path for driver in data.drivers)
+    return driven or (data.action is not None)
+
+
+def _remembered(scene: Any, camera: Any) -> dict[str, Any]:
+    """What `apply` changes, as it is, JSON-able."""
+    kept = {name: getattr(camera, name) for name in _CAMERA}
+    kept["custom_shader"] = None if camera.custom_shader is None else camera.custom_shader.name
+    kept["use_dof"] = camera.dof.use_dof
+    kept["custom"] = {k: _plain(v) for k, v in camera.cycles_custom.items()}
+    cycles = scene.cycles
+    before = {"engine": scene.render.engine, "shading_system": cycles.shading_system, "device": cycles.device}
+    return {"camera": kept, "scene": before}
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if hasattr(value, "to_list") else value
+
+
+def take_back(scene: Any, found: Any) -> None:
+    """Take the lens off a camera object: all that `apply` changed is as it was.
+
+    The scene's render settings stay while another camera of the scene carries a lens.
+
+    Raises:
+        LensError: there is none.
+    """
+    camera = found.data
+    if not camera.neurolens.before:
+        raise LensError(f"The camera {found.name!r} carries no lens of neurolens")
+    memory: dict[str, Any] = {"camera": json.loads(camera.neurolens.before)}
+    others = (o.data for o in scene.objects if o.type == "CAMERA" and o.data != camera)
+    if scene.neurolens_before and not any(applied(other) for other in others):
+        memory["scene"] = json.loads(scene.neurolens_before)
+        scene.neurolens_before = ""
+    _put_back(scene, camera, memory)
+    camera.neurolens.before = camera.neurolens.on = ""
+
+
+def _put_back(scene: Any, camera: Any, memory: dict[str, Any]) -> None:
+    text, kept = camera.custom_shader, dict(memory["camera"])
+    custom, shader = kept.pop("custom"), kept.pop("custom_shader")
+    camera.dof.use_dof = kept.pop("use_dof")
+    camera.custom_shader = bpy.data.texts.get(shader) if shader else None
+    for name, value in kept.items():
+        setattr(camera, name, value)
+    for name in list(camera.cycles_custom.keys()):
+        del camera.cycles_custom[name]
+    for name, value in custom.items():
+        camera.cycles_custom[name] = value
+    if before := memory.get("scene"):
+        scene.cycles.device, scene.cycles.shading_system = before["device"], before["shading_system"]
+        scene.render.engine = before["engine"]
+    _drop(text)
+
+
+def _drop(text: Any) -> None:
+    """Remove a shader of ours that nothing uses."""
+    ours = text is not None and text.name.startswith(_TEXT)
+    if ours and not bpy.data.user_map(subset={text})[text]:
+        bpy.data.texts.remove(text)

@@ -1,0 +1,211 @@
+"""What the extension knows of its lenses, and what is wrong with a setting. Without Blender: plain Python."""
+
+from __future__ import annotations
+
+import json
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+FACTS = "lenses.json"  # beside shaders/ and thumbnails/, in the extension and in its user folder
+SCHEMA = 1
+KINDS = {"polynomial": "Polynomial", "network": "Network", "exact": "Exact"}
+OLDEST = (4, 5, 0)  # the first Blender whose Cycles runs cameras written in OSL
+BEYOND = 1.02  # a film of 36 x 24 mm over an image circle of 43.2 mm is as lenses are engraved
+NOMINAL = 1.02  # and so is f/1.8 for f/1.83
+_HEADROOM = 1.001  # of a near limit, for rounding
+
+
+class LensError(Exception):
+    """One sentence for the user; whatever raised it has left the scene as it was."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One shader of a lens.
+
+    Attributes:
+        kind: of `KINDS`. model: its name ("ols-64"), "" of an exact lens. path: of the OSL source.
+        rms_um: error of rays on the film, None of an exact lens. poor: what its card calls poor.
+        film_radius_mm: of the picture. f_number: the widest. nearest_m: the nearest focus, None where there is none.
+        notes: what the shader leaves out.
+    """
+
+    kind: str
+    model: str
+    path: Path
+    rms_um: float | None
+    film_radius_mm: float
+    f_number: float
+    nearest_m: float | None
+    poor: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class LensFacts:
+    """One lens of the menu; `variants` by kind, `picture` None without a thumbnail."""
+
+    lens_id: str
+    name: str
+    efl_mm: float
+    f_number: float
+    year: int | None
+    source: str
+    picture: Path | None
+    variants: dict[str, Variant]
+
+    @property
+    def line(self) -> str:
+        """Focal length, f-number and year."""
+        year = "" if self.year is None else f", {self.year}"
+        return f"{self.efl_mm:.3g} mm f/{self.f_number:.2g}{year}"
+
+    @property
+    def number(self) -> int:
+        """For menus: the same whatever other lenses there are, since files keep numbers, not names."""
+        return zlib.crc32(self.lens_id.encode()) & 0x7FFFFFFF
+
+
+def read_library(folders: Sequence[Path]) -> tuple[dict[str, LensFacts], list[str]]:
+    """The lenses of folders by id, those of later folders in place of earlier ones, and what could not be read."""
+    found: dict[str, LensFacts] = {}
+    wrong: list[str] = []
+    for folder in folders:
+        file = folder / FACTS
+        if not file.is_file():
+            continue
+        try:
+            data = json.loads(file.read_text(encoding="utf-8"))
+            if data["schema"] != SCHEMA:
+                raise ValueError(f"its schema is {data['schema']}, this extension reads {SCHEMA}")
+            for entry in data["lenses"]:
+                lens = _lens(folder, entry)
+                kept = found[lens.lens_id].variants if lens.lens_id in found else {}
+                lens.variants.update({k: v for k, v in kept.items() if k not in lens.variants})
+                found[lens.lens_id] = lens
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            wrong.append(f"{file} cannot be read: {type(error).__name__}: {error}")
+    return dict(sorted(found.items(), key=lambda item: (item[1].efl_mm, item[0]))), wrong
+
+
+def _lens(folder: Path, entry: dict[str, Any]) -> LensFacts:
+    variants = {}
+    for v in entry["variants"]:
+        if v["kind"] not in KINDS:
+            raise ValueError(f"variant {v['kind']!r}")
+        variants[v["kind"]] = Variant(
+            kind=v["kind"],
+            model=str(v.get("model") or ""),
+            path=_inside(folder, v["file"]),
+            rms_um=None if v.get("rms_um") is None else float(v["rms_um"]),
+            film_radius_mm=float(v["film_radius_mm"]),
+            f_number=float(v["f_number"]),
+            nearest_m=None if v.get("nearest_m") is None else float(v["nearest_m"]),
+            poor=tuple(map(str, v.get("poor") or ())),
+            notes=tuple(map(str, v.get("notes") or ())),
+        )
+    picture = entry.get("picture")
+    return LensFacts(
+        lens_id=str(entry["id"]),
+        name=str(entry["name"]),
+        efl_mm=float(entry["efl_mm"]),
+        f_number=float(entry["f_number"]),
+        year=None if entry.get("year") is None else int(entry["year"]),
+        source=str(entry.get("source") or ""),
+        picture=None if picture is None else _inside(folder, picture),
+        variants=variants,
+    )
+
+
+def _inside(folder: Path, name: str) -> Path:
+    """A file of the folder; the facts may come from elsewhere."""
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise ValueError(f"{name!r} leads out of the folder")
+    return path
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a scene asks of a lens.
+
+    Attributes:
+        sensor_mm: width and height that are exposed. pixels: of the picture's width, as rendered.
+        focus_m: distance in focus; None where depth of field is off. focus_object: its name, "" for a distance.
+        f_number: None where the shader's own.
+        unit_m: metres a unit of the scene. on_gpu: whether a GPU that cannot run OSL cameras is chosen.
+    """
+
+    sensor_mm: tuple[float, float]
+    pixels: int
+    focus_m: float | None
+    focus_object: str = ""
+    f_number: float | None = None
+    unit_m: float = 1.0
+    on_gpu: bool = False
+
+
+def refused(version: tuple[int, ...], has_osl: bool = True) -> str | None:
+    """Why this Blender cannot run the lenses, if it cannot."""
+    if tuple(version[:3]) < OLDEST:
+        said = ".".join(map(str, version[:3]))
+        return f"This is Blender {said}: cameras written in OSL need {'.'.join(map(str, OLDEST[:2]))} or later"
+    return None if has_osl else "This Blender was built without Open Shading Language, which lenses are written in"
+
+
+def refusals(variant: Variant, setting: Setting) -> list[str]:
+    """Why a lens is not put on a camera."""
+    found = []
+    diagonal, circle = math.hypot(*setting.sensor_mm), 2 * variant.film_radius_mm
+    if diagonal > BEYOND * circle:
+        width, height = setting.sensor_mm
+        fitting = fitting_width_mm(variant, setting)
+        found.append(
+            f"The sensor, {width:.4g} x {height:.4g} mm, is larger than the lens's picture of {circle:.4g} mm: "
+            f"make it at most {fitting:.4g} mm wide, or fit the sensor"
+        )
+    if too_near(variant, setting):
+        what = f"The focus object {setting.focus_object!r}" if setting.focus_object else "The focus distance"
+        found.append(f"{what} is {setting.focus_m:.4g} m away, nearer than the lens focuses: {variant.nearest_m:.4g} m")
+    return found
+
+
+def too_near(variant: Variant, setting: Setting) -> bool:
+    """Whether the focus is nearer than the near limit."""
+    if setting.focus_m is None or variant.nearest_m is None:
+        return False
+    return setting.focus_m * _HEADROOM < variant.nearest_m
+
+
+def fitting_width_mm(variant: Variant, setting: Setting) -> float:
+    """The widest sensor of the setting's shape that the lens's picture fills, rounded down to 0.01 mm."""
+    width, height = setting.sensor_mm
+    return math.floor(100 * 2 * variant.film_radius_mm * width / math.hypot(width, height)) / 100
+
+
+def notes(variant: Variant, setting: Setting) -> list[str]:
+    """What else the user should know of a setting that works."""
+    found = []
+    if setting.f_number is not None and setting.f_number * NOMINAL < variant.f_number:
+        found.append(f"The lens opens to f/{variant.f_number:.3g}: f/{setting.f_number:.3g} is that")
+    if setting.focus_m is None:
+        found.append("Depth of field is off: Cycles does not say where the focus is")
+    if setting.unit_m != 1.0:
+        found.append(f"A unit of this scene is {setting.unit_m:g} m; the lens takes it for 1 m")
+    if setting.on_gpu:
+        found.append("OSL cameras run on the CPU, or on a GPU by OptiX")
+    error = error_px(variant, setting)
+    if error is not None and error > 1:
+        found.append(f"The model's error is {error:.2g} pixels of this picture")
+    if variant.poor:
+        found.append(f"The model is poor, as its card says: {', '.join(variant.poor)}")
+    return [*found, *variant.notes]
+
+
+def error_px(variant: Variant, setting: Setting) -> float | None:
+    """RMS error of the model in pixels of this picture; None of an exact lens."""
+    return None if variant.rms_um is None else variant.rms_um / (1e3 * setting.sensor_mm[0] / setting.pixels)

@@ -1,0 +1,259 @@
+"""Menu, operators and panel: at the camera's data properties, "Lens (neurolens)"."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+import bpy.utils.previews
+
+from . import camera as on_camera
+from .library import KINDS, LensError, LensFacts, error_px, notes, read_library, refusals, refused
+
+_FIRST = ("f_number", "focus", "film_shift", "zoom")  # of the settings, before the others
+
+
+class Library:
+    """The lenses, and their thumbnails; read once, and again by `load`."""
+
+    def __init__(self) -> None:
+        self.lenses: dict[str, LensFacts] = {}
+        self.wrong: list[str] = []
+        self.items: list[tuple[str, str, str, int, int]] = []  # kept: Blender does not hold the texts of menus
+        self.pictures: Any = None
+
+    def load(self) -> None:
+        """Read the extension's folder and the user's."""
+        self.close()
+        folders = [Path(__file__).parent]
+        try:
+            folders.append(Path(bpy.utils.extension_path_user(__package__, create=False)))
+        except ValueError:
+            pass  # not run as an extension
+        self.lenses, self.wrong = read_library(folders)
+        self.pictures = bpy.utils.previews.new()
+        self.items = []
+        for lens_id, lens in self.lenses.items():
+            icon = 0
+            if lens.picture is not None and lens.picture.is_file():
+                icon = self.pictures.load(lens_id, str(lens.picture), "IMAGE").icon_id
+            self.items.append((lens_id, f"{lens.name} ({lens.line})", lens.source, icon, lens.number))
+
+    def close(self) -> None:
+        """Let go of the thumbnails."""
+        if self.pictures is not None:
+            bpy.utils.previews.remove(self.pictures)
+            self.pictures = None
+
+
+LIBRARY = Library()
+
+
+def _lens_items(_props: Any, _context: Any) -> list[tuple[str, str, str, int, int]]:
+    return LIBRARY.items or [("NONE", "no lenses", "the extension holds none", 0, 0)]
+
+
+def _changed(props: Any, context: Any) -> None:
+    """A lens chosen in the menu of a camera that carries one is put on at once."""
+    props.message = ""
+    camera = props.id_data
+    if not on_camera.applied(camera) or props.busy:
+        return
+    found = next((o for o in context.scene.objects if o.data == camera), None)
+    if found is None:
+        return
+    try:
+        on_camera.apply(context.scene, found, lens_of(props), kind_of(props))
+    except LensError as error:
+        props.message = str(error)
+
+
+class CameraSettings(bpy.types.PropertyGroup):
+    """On every camera: what is chosen, and what there was before."""
+
+    __annotations__ = {
+        "lens": bpy.props.EnumProperty(name="Lens", items=_lens_items, update=_changed),
+        "kind": bpy.props.EnumProperty(
+            name="Form",
+            items=[
+                ("polynomial", "Polynomial", "A polynomial fitted to the lens", 0),
+                ("network", "Network", "A small neural network fitted to the lens", 1),
+                ("exact", "Exact", "Every surface traced: slow, without error", 2),
+            ],
+            update=_changed,
+        ),
+        "message": bpy.props.StringProperty(options={"HIDDEN", "SKIP_SAVE"}),
+        "before": bpy.props.StringProperty(options={"HIDDEN"}),
+        "on": bpy.props.StringProperty(options={"HIDDEN"}),
+        "busy": bpy.props.BoolProperty(options={"HIDDEN", "SKIP_SAVE"}),
+    }
+
+
+def lens_of(props: Any) -> LensFacts:
+    """The lens that is chosen.
+
+    Raises:
+        LensError: the library does not have it.
+    """
+    if props.lens not in LIBRARY.lenses:
+        raise LensError("The chosen lens is not in the library: choose another")
+    return LIBRARY.lenses[props.lens]
+
+
+def kind_of(props: Any) -> str:
+    """The form that is chosen, or the first that the lens has."""
+    variants = lens_of(props).variants
+    return props.kind if props.kind in variants else next(iter(variants), "")
+
+
+class _Operator(bpy.types.Operator):
+    """One line on an error, in the panel and as the operator's report."""
+
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Any) -> set[str]:
+        props = None
+        try:
+            found = on_camera.camera_of(context)
+            props = found.data.neurolens
+            props.message = ""
+            self.act(context, found, props)
+        except LensError as error:
+            if props is not None:
+                props.message = str(error)
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+    def act(self, context: Any, found: Any, props: Any) -> None:
+        raise NotImplementedError
+
+
+class NEUROLENS_OT_apply(_Operator):
+    """Put the chosen lens on this camera: as a custom camera of Cycles, in Open Shading Language"""
+
+    bl_idname = "neurolens.apply"
+    bl_label = "Put the Lens On"
+    __annotations__ = {
+        "lens": bpy.props.StringProperty(name="Lens", description="Its id; empty: the one chosen in the panel"),
+        "kind": bpy.props.StringProperty(name="Form", description=f"{', '.join(KINDS)}; empty: the panel's"),
+        "fit_sensor": bpy.props.BoolProperty(name="Fit Sensor", description="Make the sensor as large as the picture"),
+    }
+
+    def act(self, context: Any, found: Any, props: Any) -> None:
+        lens_id, kind = self.lens or props.lens, self.kind
+        if lens_id not in LIBRARY.lenses:
+            known = ", ".join(LIBRARY.lenses) or "none: the extension was packed without"
+            raise LensError(f"There is no lens {lens_id!r}; lenses: {known}")
+        lens = LIBRARY.lenses[lens_id]
+        chosen = kind or (props.kind if props.kind in lens.variants else next(iter(lens.variants), ""))
+        on_camera.apply(context.scene, found, lens, chosen, fit_sensor=self.fit_sensor)
+        props.busy = True
+        props.lens, props.kind = lens_id, chosen
+        props.busy = False
+
+
+class NEUROLENS_OT_take_back(_Operator):
+    """Take the lens off this camera: everything that it changed is as it was"""
+
+    bl_idname = "neurolens.take_back"
+    bl_label = "Take the Lens Off"
+
+    def act(self, context: Any, found: Any, props: Any) -> None:
+        on_camera.take_back(context.scene, found)
+
+
+class NEUROLENS_OT_reload(bpy.types.Operator):
+    """Read the library again, after `neurolens blender add`"""
+
+    bl_idname = "neurolens.reload"
+    bl_label = "Read Lenses Again"
+
+    def execute(self, context: Any) -> set[str]:
+        LIBRARY.load()
+        for line in LIBRARY.wrong:
+            self.report({"WARNING"}, line)
+        return {"FINISHED"}
+
+
+class NEUROLENS_PT_lens(bpy.types.Panel):
+    """The lens of a camera."""
+
+    bl_label = "Lens (neurolens)"
+    bl_space_type, bl_region_type, bl_context = "PROPERTIES", "WINDOW", "data"
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return getattr(context, "camera", None) is not None
+
+    def draw(self, context: Any) -> None:
+        layout, camera = self.layout, context.camera
+        layout.use_property_split = True
+        if (why := refused(bpy.app.version, bpy.app.build_options.cycles_osl)) is not None:
+            layout.label(text=why, icon="ERROR")
+            return
+        for line in LIBRARY.wrong:
+            layout.label(text=line, icon="ERROR")
+        props = camera.neurolens
+        layout.template_icon_view(props, "lens", show_labels=True, scale=6.0)
+        layout.prop(props, "lens", text="")
+        try:
+            lens, kind = lens_of(props), kind_of(props)
+        except LensError as error:
+            layout.label(text=str(error), icon="ERROR")
+            return
+        layout.label(text=lens.line)
+        row = layout.row(align=True)
+        for name in lens.variants:
+            row.prop_enum(props, "kind", name)
+        if props.message:
+            _wrapped(layout, props.message, "ERROR")
+        found = context.object if context.object is not None and context.object.type == "CAMERA" else None
+        if found is None or found.data != camera:
+            return
+        self._draw_scene(context, found, lens, kind)
+
+    def _draw_scene(self, context: Any, found: Any, lens: LensFacts, kind: str) -> None:
+        layout, camera = self.layout, found.data
+        variant, setting = lens.variants[kind], on_camera.setting_of(context.scene, found)
+        wrong = refusals(variant, setting)
+        if not on_camera.applied(camera):
+            layout.operator("neurolens.apply", icon="CAMERA_DATA")
+            if wrong:
+                layout.operator("neurolens.apply", text="Fit Sensor and Put On").fit_sensor = True
+        else:
+            layout.operator("neurolens.take_back", icon="LOOP_BACK")
+            self._draw_settings(camera)
+        layout.operator("neurolens.reload", icon="FILE_REFRESH")
+        error = error_px(variant, setting)
+        layout.label(text="Every surface is traced" if error is None else f"Error: {error:.2g} pixels (RMS)")
+        for line in (*wrong, *notes(variant, setting)):
+            _wrapped(layout, line, "INFO" if line not in wrong else "ERROR")
+
+    def _draw_settings(self, camera: Any) -> None:
+        """The shader's own parameters: what is keyframed is what Cycles reads."""
+        layout, custom = self.layout, camera.cycles_custom
+        names = [n for n in _FIRST if n in custom] + [n for n in custom.keys() if n not in _FIRST]
+        column = layout.column()
+        column.prop(camera.dof, "focus_object")
+        distance = column.row()
+        distance.active = camera.dof.focus_object is None
+        distance.prop(camera.dof, "focus_distance")
+        column.prop(camera, "sensor_width")
+        for name in names:
+            column.prop(custom, f'["{name}"]')
+
+
+def _wrapped(layout: Any, text: str, icon: str, width: int = 60) -> None:
+    """A sentence in lines that the panel can show."""
+    words, line, first = text.split(), "", True
+    for word in [*words, None]:
+        if word is None or len(line) + len(word) > width:
+            layout.label(text=line, icon=icon if first else "BLANK1")
+            line, first = "", False
+        if word is not None:
+            line = f"{line} {word}".strip()
+
+
+CLASSES = (CameraSettings, NEUROLENS_OT_apply, NEUROLENS_OT_take_back, NEUROLENS_OT_reload, NEUROLENS_PT_lens)

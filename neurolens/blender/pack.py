@@ -1,0 +1,192 @@
+"""The extension as a zip that Blender installs, and lenses added to one or to its user folder.
+
+blender_manifest.toml, *.py     the extension, neurolens/blender/extension
+lenses.json                     facts of every lens, see `extension.library`
+shaders/NAME.osl                one a form of a lens
+thumbnails/NAME.png             its section
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import sys
+import zipfile
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path
+
+EXTENSION = Path(__file__).parent / "extension"
+FACTS, SCHEMA = "lenses.json", 1
+_ID = "neurolens"
+_CODE = ("__init__.py", "camera.py", "library.py", "panel.py", "blender_manifest.toml")
+_THEN = (1980, 1, 1, 0, 0, 0)  # the zip of the same lenses is the same, byte for byte
+_YEAR = re.compile(r"\b(1[89]\d\d|20\d\d)\b(?!,?\d)")
+_LARGEST = 1 << 26
+
+
+@dataclass(frozen=True)
+class Form:
+    """A shader of a lens; see `extension.library.Variant` for the numbers."""
+
+    kind: str
+    model: str
+    osl: str
+    rms_um: float | None
+    film_radius_mm: float
+    f_number: float
+    nearest_m: float | None
+    poor: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class PackedLens:
+    """A lens of the menu: `lens_id` names its files; `picture` is a PNG, None without."""
+
+    lens_id: str
+    name: str
+    efl_mm: float
+    f_number: float
+    source: str
+    picture: bytes | None
+    forms: list[Form]
+
+    def files(self) -> dict[str, bytes]:
+        """Contents by place."""
+        found = {f"shaders/{self._stem(f)}.osl": f.osl.encode() for f in self.forms}
+        if self.picture is not None:
+            found[f"thumbnails/{self.lens_id}.png"] = self.picture
+        return found
+
+    def facts(self) -> dict[str, Any]:
+        """The entry of `lenses.json`."""
+        variants = [
+            {k: v for k, v in asdict(f).items() if k != "osl"} | {"file": f"shaders/{self._stem(f)}.osl"}
+            for f in self.forms
+        ]
+        return {
+            "id": self.lens_id,
+            "name": self.name,
+            "efl_mm": self.efl_mm,
+            "f_number": self.f_number,
+            "year": year_of(self.source),
+            "source": self.source,
+            "picture": None if self.picture is None else f"thumbnails/{self.lens_id}.png",
+            "variants": variants,
+        }
+
+    def _stem(self, form: Form) -> str:
+        return f"{self.lens_id}.{form.model or form.kind}"
+
+
+def year_of(source: str) -> int | None:
+    """The year that a source names, of several the first: the lens's own stands before the book that reprints it."""
+    found = _YEAR.search(source)
+    return None if found is None else int(found[1])
+
+
+def write_pack(out: Path, lenses: Iterable[PackedLens]) -> None:
+    """Write the extension with these lenses, atomically.
+
+    Raises:
+        InputError: two lenses of one id. OSError: a place that cannot be written.
+    """
+    packed = list(lenses)
+    if len({p.lens_id for p in packed}) < len(packed):
+        raise InputError(out, "lenses", [p.lens_id for p in packed], "each id once")
+    files = {name: (EXTENSION / name).read_bytes() for name in _CODE}
+    for lens in packed:
+        files |= lens.files()
+    _write_zip(out, files | {FACTS: _facts(lens.facts() for lens in packed)})
+
+
+def add_to_zip(path: Path, lens: PackedLens) -> None:
+    """Put a lens into a packed extension, in place of one of its id.
+
+    Raises:
+        InputError: no extension of ours.
+    """
+    try:
+        with zipfile.ZipFile(path) as packed:
+            if sum(i.file_size for i in packed.infolist()) > _LARGEST:
+                raise InputError(path, "size", "(too large)", f"at most {_LARGEST} bytes unpacked")
+            files = {i.filename: packed.read(i) for i in packed.infolist() if not i.is_dir()}
+        known = _entries(json.loads(files[FACTS]))
+    except (OSError, zipfile.BadZipFile, KeyError, ValueError, TypeError) as error:
+        raise InputError(path, "file", f"({error})", "a zip that `neurolens blender build` wrote") from None
+    _write_zip(path, files | lens.files() | {FACTS: _facts(_merged(known, lens))})
+
+
+def add_to_folder(folder: Path, lens: PackedLens) -> None:
+    """Put a lens into the extension's user folder, which is made, in place of one of its id.
+
+    Raises:
+        InputError: facts there that are not ours. OSError: a place that cannot be written.
+    """
+    file = folder / FACTS
+    try:
+        known = _entries(json.loads(file.read_text(encoding="utf-8"))) if file.exists() else []
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(file, "file", f"({error})", "facts that neurolens wrote") from None
+    for name, data in {**lens.files(), FACTS: _facts(_merged(known, lens))}.items():  # the facts last: they name files
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(folder / name) as temporary:
+            temporary.write_bytes(data)
+
+
+def user_folders() -> list[Path]:
+    """User folders of the extension where a Blender on this machine has it installed, the newest Blender first."""
+    home = Path.home()
+    if given := os.environ.get("BLENDER_USER_RESOURCES"):
+        places = [Path(given)]
+    else:
+        root = {
+            "darwin": home / "Library" / "Application Support" / "Blender",
+            "win32": Path(os.environ.get("APPDATA", home)) / "Blender Foundation" / "Blender",
+        }.get(sys.platform, Path(os.environ.get("XDG_CONFIG_HOME", home / ".config")) / "blender")
+        places = [p for p in root.glob("*") if re.fullmatch(r"\d+\.\d+", p.name)]
+        places.sort(key=lambda p: [int(n) for n in p.name.split(".")], reverse=True)
+    installed = (p for place in places for p in sorted((place / "extensions").glob(f"*/{_ID}/blender_manifest.toml")))
+    return [p.parents[2] / ".user" / p.parents[1].name / _ID for p in installed]
+
+
+def _entries(data: Mapping[str, Any]) -> list[dict[str, Any]]:
+    if data["schema"] != SCHEMA:
+        raise ValueError(f"schema {data['schema']}")
+    return [dict(entry) for entry in data["lenses"] if entry["id"] and entry["variants"]]
+
+
+def _merged(known: Iterable[dict[str, Any]], lens: PackedLens) -> list[dict[str, Any]]:
+    """The entries with the lens; forms of it that are kept are those that it does not bring."""
+    mine = lens.facts()
+    kinds = {v["kind"] for v in mine["variants"]}
+    others = []
+    for entry in known:
+        if entry["id"] != lens.lens_id:
+            others.append(entry)
+            continue
+        mine["variants"] += [v for v in entry["variants"] if v["kind"] not in kinds]
+        mine["picture"] = mine["picture"] or entry.get("picture")
+    return [*others, mine]
+
+
+def _facts(entries: Iterable[Mapping[str, Any]]) -> bytes:
+    return (json.dumps({"schema": SCHEMA, "lenses": list(entries)}, indent=1, allow_nan=False) + "\n").encode()
+
+
+def _write_zip(out: Path, files: Mapping[str, bytes]) -> None:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as packed:
+        for name in sorted(files):
+            info = zipfile.ZipInfo(name, _THEN)
+            info.compress_type, info.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
+            packed.writestr(info, files[name])
+    with atomic_path(out) as temporary:
+        temporary.write_bytes(buffer.getvalue())

@@ -1,0 +1,457 @@
+"""Where a camera sees what lies at a point of its picture: its undistorted place, both ways, and the light there.
+
+Picture points are mm on the film as the picture is looked at: x right, y up, origin at its centre. What a point of the
+picture shows is the centroid of the light that arrives there: the mean, over pupil and wavelengths and by weight, of
+where its rays meet the object. It is what a picture shows as the place of a thing, whatever the stop, also where the
+focus is not perfect; the ray through the stop's centre differs from it by the coma.
+
+The object is a plane across the axis for the rectilinear projection, a sphere about the entrance pupil for the others,
+at the distance in focus unless another is asked for. Undistorted places are those of an ideal camera: a point at the
+lens's paraxial entrance pupil, whose picture has the lens's paraxial size on the axis (chief rays; of a lens with
+cylinders, in each of its meridians). A point nearer or farther than the object is seen from elsewhere than the
+entrance pupil's centre, for that moves with the field: `Field.parallax_mm` says by how much its place is wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError
+from neurolens.cameras.pinhole import PROJECTIONS
+from neurolens.optics import film_plane
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+RECTILINEAR = "rectilinear"
+TARGETS = (RECTILINEAR, *PROJECTIONS)
+WIDEST_DEG = 85.0  # field that is laid on a plane: there a picture is 11 focal lengths from the axis
+LIGHT_NM = (400.0, 700.0)
+
+_PUPIL = 6, 24  # rings of pupil samples, and samples of a ring
+_RAYS = 1 << 17  # at once
+_ROUND, _OTHER = (513, 1), (97, 64)  # radii and azimuths of the tables
+_BEYOND = 1.02  # radius of the film's corner over that of the light: as lenses are engraved
+_FINER = 4  # rings and azimuths of the map back, over those of the map there
+_EDGE = 16  # points on each side of the film
+_TRIED, _AZIMUTHS, _UNEVEN = (0.4, 0.7, 0.95), 7, 3e-6  # where roundness is tried; of the radius
+_HALVINGS = 24
+_STEPS = 6  # of Newton's method
+_SMALL = 0.004  # of the radius: where the size on the axis is measured, of cameras that do not know it
+
+
+class Frame(NamedTuple):
+    """The ideal camera that a picture is compared with: size on the film of a slope of 1, along x and y, mm; distance
+    of its point before the film in each meridian, mm."""
+
+    reach_mm: tuple[float, float]
+    pupil_mm: tuple[float, float]
+
+
+class Light(NamedTuple):
+    """What film points see: direction [3, N] from the ideal camera's point, x right, y up, z towards the scene, not of
+    unit length; light [N] over that on the axis; angle of the mean ray to the axis [N], rad."""
+
+    direction: Array
+    light: Array
+    angle: Array
+
+
+Spectrum = tuple[Array, Array]  # wavelengths in nm and weights
+
+
+def spectrum_of(camera: Any, light_nm: tuple[float, float] = LIGHT_NM, only_nm: float | None = None) -> Spectrum:
+    """One wavelength, or those of a range by the eye's sensitivity, within what the camera takes."""
+    low, high = camera.wavelength_nm or light_nm
+    if only_nm is not None:
+        if camera.wavelength_nm is not None and not low <= only_nm <= high:
+            raise InputError(camera.name, "wavelength_nm", only_nm, f"a wavelength from {low:g} to {high:g} nm")
+        return np.array([float(only_nm)]), np.ones(1)
+    if not camera.dispersive and getattr(camera, "achromatic", False):
+        return np.array([550.0]), np.ones(1)
+    return film_plane.colours((max(low, light_nm[0]), min(high, light_nm[1])))
+
+
+def frame_of(camera: Any) -> Frame:
+    """The ideal camera of any camera, by its first-order data; of models of lenses with cylinders, x by their rays."""
+    state, lens = camera.settings["lens_state"], getattr(camera, "lens", None)
+    y = state["pinhole_focal_length_mm"], state["entrance_pupil_offset_mm"]
+    if None in y:
+        return _measured(camera)
+    if state["squeeze"] == 1:
+        x = y
+    elif lens is not None:
+        from neurolens.optics.paraxial import first_order
+
+        data, film = first_order(lens, meridian="x"), float(camera.settings["film_z_mm"])
+        focal, pupil = (data.front_focal_z_mm, data.rear_focal_z_mm), data.entrance_pupil_z_mm
+        x = film_plane.reach_mm(data.efl_mm, focal, pupil, film), film - pupil
+    else:
+        (reach, _), (pupil, _) = _measured(camera)
+        x = reach, pupil
+    return Frame((float(x[0]), float(y[0])), (float(x[1]), float(y[1])))
+
+
+def _measured(camera: Any) -> Frame:
+    """From where points close to the axis are seen on two planes, in both meridians."""
+    height = _SMALL * math.hypot(*camera.film_mm) / 2
+    points = height * np.array([[1.0, 0, -1, 0, 2, 0, -2, 0], [0, 1, 0, -1, 0, 2, 0, -2]])
+    near, far, origin = 1000.0, 3000.0, Frame((1.0, 1.0), (0.0, 0.0))
+    sizes = []
+    for distance in (near, far):  # by the middle of the pupil
+        found = seen(camera, points, spectrum_of(camera), origin, RECTILINEAR, distance / 1000, (1, 1))
+        x, y = found.direction[:2] * distance / height
+        once, twice = np.array([x[0] - x[2], y[1] - y[3]]) / 2, np.array([x[4] - x[6], y[5] - y[7]]) / 4
+        sizes.append((4 * once - twice) / 3)  # the error goes with the square
+    growth = [(b - a) / (far - near) for a, b in zip(*sizes, strict=True)]  # per mm: 1 / reach
+    pupil = [near - a / g for a, g in zip(sizes[0], growth, strict=True)]
+    return Frame((float(1 / growth[0]), float(1 / growth[1])), (float(pupil[0]), float(pupil[1])))
+
+
+def seen(
+    camera: Any,
+    picture_mm: Array,
+    spectrum: Spectrum,
+    frame: Frame,
+    target: str,
+    distance_m: float,
+    pupil: tuple[int, int] = _PUPIL,
+) -> Light:
+    """What picture points [2, N] show; see the module.
+
+    Args:
+        distance_m: from the film to the object on the axis, inf allowed.
+        pupil: see `_pupil_samples`.
+    """
+    (waves, weights), (square, shares) = spectrum, _pupil_samples(*pupil)
+    each = np.tile(square, waves.size).astype(np.float32)
+    nm = np.repeat(waves, shares.size).astype(np.float32)
+    share = np.outer(weights / weights.sum(), shares).reshape(-1)
+    count, step = picture_mm.shape[1], max(1, _RAYS // nm.size)
+    direction, light, angle = np.zeros((3, count)), np.zeros(count), np.zeros(count)
+    for start in range(0, count, step):
+        part = slice(start, start + step)
+        film = np.repeat(-picture_mm[:, part], nm.size, axis=1).astype(np.float32)
+        points = film.shape[1] // nm.size
+        rays = camera.sample(film, np.tile(each, points), np.tile(nm, points))
+        weight = rays.weight.astype(np.float64).reshape(points, -1) * share
+        way = rays.direction.astype(np.float64).reshape(3, points, -1)
+        place = _on_object(rays.origin_m.astype(np.float64).reshape(way.shape), way, frame, target, distance_m)
+        light[part], mean = weight.sum(1), np.einsum("inm,nm->in", way, weight)
+        angle[part] = np.arctan2(np.hypot(mean[0], mean[1]), -mean[2])
+        sound = np.isfinite(place).all(0)
+        met, place = np.where(sound, weight, 0.0), np.where(sound, place, 0.0)
+        direction[:, part] = np.einsum("inm,nm->in", place, met) / np.maximum(met.sum(1), 1e-30)
+    return Light(direction, light, angle)
+
+
+def _pupil_samples(rings: int, around: int) -> tuple[Array, Array]:
+    """Points [2, N] of the unit square and their weights, which integrate what is smooth over a pupil.
+
+    All cameras map concentric squares to concentric copies of the pupil: rings by Gauss, equal steps around. One sample
+    is the centre.
+    """
+    if around == 1:
+        return np.full((2, 1), 0.5), np.ones(1)
+    node, weight = np.polynomial.legendre.leggauss(rings)
+    size = np.sqrt((1 + node) / 2)  # the area of a square goes with its square
+    turn = (np.arange(around) + 0.5) * (8 / around)  # along the edge of the square from +x, which is 8 long
+    from_x = 4 - np.abs(4 - turn)
+    a, b = np.clip(2 - from_x, -1, 1), np.sign(4 - turn) * np.clip(np.minimum(from_x, 4 - from_x), 0, 1)
+    square = (1 + np.stack([np.outer(size, a), np.outer(size, b)])) / 2
+    return square.reshape(2, -1), np.repeat(weight / 2 / around, around)
+
+
+def _on_object(origin: Array, way: Array, frame: Frame, target: str, distance_m: float) -> Array:
+    """Directions [3, ...] from the ideal camera's point to where rays (camera frame, m) meet the object; z forward."""
+    flip, pupil = np.array([1.0, 1.0, -1.0])[:, None, None], 1e-3 * np.array(frame.pupil_mm)
+    with np.errstate(all="ignore"):
+        if target == RECTILINEAR:
+            slope = np.where(way[2] < -1e-3, way[:2] / -way[2], np.nan)
+            if math.isinf(distance_m):
+                return np.concatenate([slope, np.ones_like(slope[:1])])
+            place = origin[:2] + slope * (distance_m + origin[2])
+            # Each meridian is seen from its own pupil: a direction of which z is 1.
+            return np.concatenate([place / (distance_m - pupil)[:, None, None], np.ones_like(slope[:1])])
+        if math.isinf(distance_m):
+            return way * flip
+        radius = distance_m - pupil.mean()
+        start = origin + np.array([0.0, 0.0, pupil.mean()])[:, None, None]
+        along = (start * way).sum(0)
+        root = np.sqrt(along**2 + radius**2 - (start**2).sum(0))
+        found: Array = (start + (root - along) * way) * flip / radius
+        return found
+
+
+def laid(direction: Array, frame: Frame, target: str) -> Complex:
+    """Undistorted places x + i y [N], mm, of directions [3, N]."""
+    side = np.hypot(direction[0], direction[1])
+    angle = np.arctan2(side, direction[2])
+    with np.errstate(all="ignore"):
+        rho = np.tan(angle) if target == RECTILINEAR else PROJECTIONS[target].radius(angle)
+    rho = rho / np.where(side > 0, side, 1.0)
+    found: Complex = frame.reach_mm[0] * rho * direction[0] + 1j * (frame.reach_mm[1] * rho * direction[1])
+    return found
+
+
+def is_round(camera: Any) -> bool:
+    """Whether points at some azimuths, none of which is another's mirror image, are seen alike."""
+    corner = math.hypot(*camera.film_mm) / 2
+    angle = np.arange(_AZIMUTHS) * 0.83
+    turn = np.exp(1j * np.tile(angle, len(_TRIED)))
+    points = np.repeat(corner * np.array(_TRIED), angle.size) * turn
+    found = seen(camera, np.stack([points.real, points.imag]), spectrum_of(camera), Frame((1, 1), (0, 0)),
+                 "equidistant", math.inf)  # fmt: skip
+    place = (laid(found.direction, Frame((1, 1), (0, 0)), "equidistant") / turn).reshape(len(_TRIED), -1)
+    light = found.light.reshape(place.shape) > 0
+    lit = light.all(1)  # a row that is dark in part is not round, one that is dark says nothing
+    uneven = np.abs(place[lit] - place[lit].mean(1, keepdims=True))
+    return bool((lit | ~light.any(1)).all() and (uneven <= _UNEVEN * np.abs(place[lit])).all())
+
+
+@dataclass(frozen=True)
+class Polar:
+    """A map of the plane to itself near the identity, on rings: of each point its ratio to where it goes.
+
+    Attributes:
+        end: radius of the last ring, mm; beyond it the map goes on straight along the radius.
+        ratio: [R, A] complex, at equal steps of radius (from 0) and azimuth (from +x); A is 1 where the map is round.
+        slope: [A] complex, derivative along the radius at the last ring.
+        shift: what is added everywhere.
+    """
+
+    end: float
+    ratio: Complex
+    slope: Complex
+    shift: complex = 0j
+
+    @classmethod
+    def of(cls, end: float, place: Complex) -> Polar:
+        """Of where the points of the rings go, [R, A]; the first ring is the centre."""
+        rings, turn = place.shape[0], turns(place.shape[1])
+        shift = complex(place[0].mean())
+        radius = np.linspace(0, end, rings)[:, None]
+        ratio = np.ones_like(place)
+        ratio[1:] = (place[1:] - shift) / (radius[1:] * turn)
+        ratio[0] = (4 * ratio[1] - ratio[2]) / 3  # even about the centre
+        a, b, c = place[-1], place[-2], place[-3]
+        return cls(end, ratio, (3 * a - 4 * b + c) / (2 * radius[1] * turn), shift)
+
+    def __call__(self, point: Complex) -> Complex:
+        """Where points go."""
+        radius = np.abs(point)
+        inner = np.minimum(radius, self.end)
+        turn = point / np.where(radius > 0, radius, 1.0)
+        found: Complex = on_rings(self.ratio, self.end, point) * (inner * turn) + self.shift
+        if (radius > self.end).any():
+            found = found + on_rings(np.stack([self.slope] * 4), self.end, point) * ((radius - inner) * turn)
+        return found
+
+
+def turns(azimuths: int) -> Complex:
+    """Unit vectors to equally spaced azimuths, [A]."""
+    found: Complex = np.exp(2j * math.pi * np.arange(azimuths) / azimuths)
+    return found
+
+
+def on_rings(table: NDArray[Any], end: float, point: Complex) -> NDArray[Any]:
+    """A table [R, A] on rings from the centre to `end` at points, by cubics; those beyond as on the last ring."""
+    rings, azimuths = table.shape
+    place = np.minimum(np.abs(point), end) * ((rings - 1) / end)
+    row = np.clip(place.astype(np.intp) - 1, 0, rings - 4)
+    along = _lagrange(place - row)
+    if azimuths == 1:
+        column = np.ascontiguousarray(table[:, 0])
+        return np.asarray(sum(w * column[row + k] for k, w in enumerate(along)))
+    around = np.angle(point) * (azimuths / (2 * math.pi))
+    first = np.floor(around).astype(np.intp) - 1
+    columns = [((first + j) % azimuths, w) for j, w in enumerate(_lagrange(around - first))]
+    return np.asarray(sum(w * v * table[row + k, c] for k, w in enumerate(along) for c, v in columns))
+
+
+def _lagrange(t: Array) -> list[Array]:
+    """Weights of four values at 0, 1, 2 and 3."""
+    a, b, c = t - 1, t - 2, t - 3
+    return [-a * b * c / 6, t * b * c / 2, -t * a * c / 2, t * a * b / 6]
+
+
+@dataclass(frozen=True)
+class Field:
+    """A camera's picture and its undistorted one.
+
+    Attributes:
+        to_ideal, to_picture: undistorted place of a picture point and back, both x + i y in mm.
+        frame, target: see the module.
+        end_mm: radius of the tables: the film's corner, or where the light ends.
+        field_deg: widest angle to the axis of light that arrives within it.
+        light: [R, A] on the rings of `to_ideal`, over that on the axis.
+        parallax_mm: by how much undistorted places of points at other distances (m from the film) are wrong, the worst
+            of the film's edge.
+        spectrum: wavelengths in nm and weights.
+    """
+
+    to_ideal: Polar
+    to_picture: Polar
+    frame: Frame
+    target: str
+    end_mm: float
+    field_deg: float
+    light: Array
+    parallax_mm: dict[float, float]
+    spectrum: Spectrum
+
+    def ideal(self, point: Complex) -> Complex:
+        """Undistorted places of picture points, mm."""
+        return self.to_ideal(point)
+
+    def picture(self, place: Complex) -> Complex:
+        """Picture points of undistorted places, mm."""
+        point = self.to_picture(place)
+        if self.light.shape[1] > 1:  # its tables are coarse: a step makes one nearly the inverse of the other
+            point = np.where(np.abs(point) < self.end_mm, point + (place - self.to_ideal(point)), point)
+        return point
+
+    def lit(self, point: Complex) -> NDArray[np.bool_]:
+        """Whether light arrives at picture points."""
+        if (self.light > 0).all():
+            return np.asarray(np.abs(point) <= self.end_mm * (1 + 1e-9))
+        return self.relative_light(point) > 0
+
+    def relative_light(self, point: Complex) -> Array:
+        """Light at picture points over that on the axis; 0 beyond the end of light."""
+        value = np.maximum(on_rings(self.light, self.end_mm, point), 0.0)
+        return np.where(np.abs(point) <= self.end_mm * (1 + 1e-9), value, 0.0)
+
+    def directions(self, point: Complex) -> Array:
+        """Unit vectors [3, N] (z towards the scene) of picture points, of a field laid out as `equidistant`."""
+        assert self.target == "equidistant"
+        place = self.ideal(point)
+        place = place.real / self.frame.reach_mm[0] + 1j * (place.imag / self.frame.reach_mm[1])
+        angle = np.abs(place)
+        turn = place / np.where(angle > 0, angle, 1.0)
+        return np.stack([np.sin(angle) * turn.real, np.sin(angle) * turn.imag, np.cos(angle)])
+
+
+def field_of(
+    camera: Any,
+    focus_m: float,
+    target: str = RECTILINEAR,
+    *,
+    frame: Frame | None = None,
+    spectrum: Spectrum | None = None,
+    distance_m: float | None = None,
+) -> Field:
+    """Trace a camera's field.
+
+    Args:
+        camera: any of this package; its stop and focus are those in use.
+        focus_m: distance from the film to what is in focus.
+        frame: the ideal camera, found where it is not given. spectrum: see `spectrum_of`.
+        distance_m: to the object, if not that in focus.
+
+    Raises:
+        InputError: an object nearer than the entrance pupil; a field beyond `WIDEST_DEG`, or a picture that is dark in
+            the corners, for a plane; a picture that folds.
+    """
+    frame, spectrum = frame or frame_of(camera), spectrum or spectrum_of(camera)
+    distance = focus_m if distance_m is None else distance_m
+    nearest = 1e-3 * max(frame.pupil_mm)
+    if not distance > nearest:
+        raise InputError(camera.name, "distance_m", distance, f"more than {nearest:.4g} m, the entrance pupil's")
+    rings, azimuths = _ROUND if is_round(camera) else _OTHER
+
+    def at(points: Complex, distance_m: float) -> tuple[Complex, Light]:
+        found = seen(camera, np.stack([points.real, points.imag]), spectrum, frame, target, distance_m)
+        return np.where(found.light > 0, laid(found.direction, frame, target), np.nan), found
+
+    corner = math.hypot(*camera.film_mm) / 2
+    end = corner if azimuths > 1 else _end_of_light(lambda r: at(np.array([r + 0j]), distance)[1].light[0] > 0, corner)
+    points = (np.linspace(0, end, rings)[:, None] * turns(azimuths)).reshape(-1)
+    place, found = at(points, distance)
+    edge = _film_edge(camera.film_mm)
+    edge_place, _ = at(edge / _BEYOND, distance)
+    widest = math.degrees(float(np.where(found.light > 0, found.angle, 0.0).max()))
+    if target == RECTILINEAR:
+        _check_plane(camera, widest, bool(np.isfinite(edge_place).all()), end)
+    place = _filled(place.reshape(rings, azimuths))
+    rising = (np.diff(np.abs(place - place[:1]), axis=0) > 0).all(1)
+    if not rising.all():
+        fold = end * (int(np.argmin(rising)) + 1) / (rings - 1)
+        raise InputError(camera.name, "film_mm", camera.film_mm, f"no picture beyond {fold:.4g} mm, where it folds")
+    to_ideal, light = Polar.of(end, place), found.light.reshape(rings, azimuths)
+    others = [] if math.isinf(distance) else [d for d in (math.inf, 2 * distance, distance / 2) if d > 2 * nearest]
+    moved = {d: np.abs(at(edge / _BEYOND, d)[0] - edge_place) for d in others}
+    parallax = {d: float(np.nanmax(m, initial=0.0)) for d, m in moved.items()}
+    to_picture = _inverted(to_ideal)
+    light = light / light[0].mean()
+    return Field(to_ideal, to_picture, frame, target, end, widest, light, parallax, spectrum)
+
+
+def _film_edge(film_mm: tuple[float, float]) -> Complex:
+    """Points round the edge of a film, mm."""
+    line, half = np.linspace(-1, 1, _EDGE), np.array(film_mm) / 2
+    sides = [line * half[0] + 1j * half[1], line * half[0] - 1j * half[1],
+             half[0] + 1j * half[1] * line, -half[0] + 1j * half[1] * line]  # fmt: skip
+    return np.concatenate(sides)
+
+
+def _end_of_light(lit: Callable[[float], bool], corner: float) -> float:
+    """Radius up to which a round picture is lit, at most that of the corner."""
+    steps = np.linspace(0, corner, 33)
+    dark = next((k for k, r in enumerate(steps) if not lit(float(r))), None)
+    if dark is None:
+        return corner
+    low, high = float(steps[max(dark - 1, 0)]), float(steps[dark])
+    for _ in range(_HALVINGS):
+        low, high = ((low + high) / 2, high) if lit((low + high) / 2) else (low, (low + high) / 2)
+    return low
+
+
+def _check_plane(camera: Any, widest_deg: float, bright: bool, end_mm: float) -> None:
+    """Refuse what cannot be laid on a plane."""
+    other = "--projection equidistant, or a smaller film"
+    if widest_deg > WIDEST_DEG:
+        raise InputError(camera.name, "field", f"({widest_deg:.4g} degrees from the axis)",
+                         f"at most {WIDEST_DEG:g}, to be laid on a plane: {other}")  # fmt: skip
+    if not bright:
+        film, diagonal = " x ".join(f"{v:g}" for v in camera.film_mm), math.hypot(*camera.film_mm)
+        lit = f"{2 * end_mm:.4g} mm" if 2 * end_mm < diagonal else "less"
+        raise InputError(camera.name, "film_mm", f"({film} mm, {diagonal:.4g} mm across corners, of which {lit} lit)",
+                         f"a film within the image circle: {other}")  # fmt: skip
+
+
+def _filled(place: Complex) -> Complex:
+    """Places [R, A], of each azimuth those beyond the end of light straight on."""
+    for k in range(place.shape[1]):
+        dark = np.flatnonzero(~np.isfinite(place[:, k]))
+        if dark.size and dark[0] > 1:
+            first = int(dark[0])
+            step = place[first - 1, k] - place[first - 2, k]
+            place[first:, k] = place[first - 1, k] + step * np.arange(1, place.shape[0] - first + 1)
+    if not np.isfinite(place).all():
+        raise InputError("camera", "film_mm", "(dark)", "a picture that light reaches near its centre")
+    return place
+
+
+def _inverted(forward: Polar) -> Polar:
+    """The map back, by Newton's method from rings to where they come from."""
+    rings, azimuths = (_FINER * n - (_FINER - 1) * (n == 1) for n in forward.ratio.shape)
+    turn = turns(azimuths)
+    radius = np.linspace(0, forward.end, rings)
+    mean = np.abs(forward(radius[:, None] * turn) - forward.shift).mean(1)
+    goal = np.linspace(0, mean[-1], rings)[:, None] * turn
+    point = np.interp(np.abs(goal), mean, radius) * turn
+    small = 1e-6 * forward.end
+    for _ in range(_STEPS):
+        wrong = forward(point) - goal
+        ax, ay = ((forward(point + h) - forward(point - h)) / (2 * small) for h in (small, 1j * small))
+        det = ax.real * ay.imag - ax.imag * ay.real
+        step = (wrong.real * ay.imag - wrong.imag * ay.real) + 1j * (wrong.imag * ax.real - wrong.real * ax.imag)
+        point = point - step / det
+    return Polar.of(float(mean[-1]), point)

@@ -1,0 +1,348 @@
+"""The extension in Blender: installed from its zip, put on a camera, taken off, undone, saved, and what it says."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+bpy = pytest.importorskip("bpy", reason="Blender as a module (bpy) is not installed: make test-blender runs these")
+
+from neurolens.blender.pack import Form, PackedLens, add_to_folder, user_folders, write_pack  # noqa: E402
+
+# A pinhole that shows its settings as a colour.
+SHADER = """
+shader camera(
+  float f_number = 1.81 [[ string label = "F-Number", float min = 1.0 ]],
+  int blades = 0 [[ string label = "Blades" ]],
+  int vignetting = 1 [[ string widget = "checkBox" ]],
+  output point position = 0.0, output vector direction = 0.0, output color throughput = 1.0)
+{
+  vector raster = camera_shader_raster_position();
+  vector size = 0;
+  float focus = 0;
+  getattribute("cam:sensor_size", size);
+  getattribute("cam:focal_distance", focus);
+  direction = normalize(vector((raster[0] - 0.5) * size[0], (raster[1] - 0.5) * size[1], 50.0));
+  throughput = color(f_number / 10.0, focus / 10.0, blades / 10.0);
+}
+"""
+BROKEN = "shader camera(output point position = 0.0) { nonsense; }"
+MODULE = "bl_ext.user_default.neurolens"
+
+
+def packed(lens_id: str = "gauss", osl: str = SHADER, picture: bytes | None = None) -> PackedLens:
+    forms = [
+        Form("polynomial", "ols-60", osl, 0.17, 21.6, 1.81, 0.7),
+        Form("exact", "", osl, None, 21.6, 1.81, None),
+    ]
+    return PackedLens(lens_id, f"Lens {lens_id}", 49.6, 1.8, "US 2,701,982 (Angenieux, 1955)", picture, forms)
+
+
+def phone() -> PackedLens:
+    form = Form("network", "mlp-16x2", SHADER, 20.0, 3.6, 2.4, 0.1, ["pixels"], ["nothing absorbs"])
+    return PackedLens("phone", "Phone lens", 5.9, 2.4, "US 7,535,658", None, [form])
+
+
+def png() -> bytes:
+    """A grey picture of 8 by 8 pixels."""
+    import struct
+    import zlib
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    rows = zlib.compress(b"".join(b"\0" + b"\x80" * 8 for _ in range(8)))
+    head = struct.pack(">IIBBBBB", 8, 8, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The zip, installed as from disk and enabled."""
+    out = tmp_path_factory.mktemp("pack") / "neurolens.zip"
+    write_pack(out, [packed(picture=png()), phone(), packed("broken", BROKEN)])
+    bpy.ops.extensions.package_install_files(filepath=str(out), repo="user_default", enable_on_install=True)
+    yield out
+    bpy.ops.preferences.addon_disable(module=MODULE)
+
+
+@pytest.fixture
+def scene() -> Any:
+    """Blender's first scene, of 32 by 18 pixels; white surroundings and nothing else."""
+    bpy.ops.wm.read_homefile(app_template="", use_factory_startup=True)
+    scene = bpy.context.scene
+    for found in list(bpy.data.objects):
+        if found.type != "CAMERA":
+            bpy.data.objects.remove(found)
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 32, 18, 100
+    scene.cycles.samples = 1
+    scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (1, 1, 1, 1)
+    return scene
+
+
+def middle(scene: Any, folder: Path, frame: int = 1) -> list[float]:
+    """Colour of the middle of a render."""
+    scene.frame_set(frame)
+    scene.render.filepath = str(folder / "render.exr")
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.render.image_settings.color_depth = "32"
+    scene.view_settings.view_transform = "Raw"
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(scene.render.filepath)
+    at = 4 * (9 * 32 + 16)
+    colour = list(image.pixels[at : at + 3])
+    bpy.data.images.remove(image)
+    return colour
+
+
+def everything(scene: Any) -> dict[str, Any]:
+    """What a camera and the render settings say, as far as Blender lets it be read."""
+    found: dict[str, Any] = {}
+    for name, thing in (("camera", scene.camera.data), ("dof", scene.camera.data.dof), ("cycles", scene.cycles),
+                        ("render", scene.render)):  # fmt: skip
+        for p in thing.bl_rna.properties:
+            if p.type in ("INT", "FLOAT", "BOOLEAN", "STRING", "ENUM") and p.identifier != "is_evaluated":
+                value = getattr(thing, p.identifier)
+                found[f"{name}.{p.identifier}"] = list(value) if getattr(p, "is_array", False) else value
+    found["custom"] = dict(scene.camera.data.cycles_custom.items())
+    found["texts"] = [t.name for t in bpy.data.texts]
+    return found
+
+
+def test_zip_is_one_that_blender_accepts_and_shows(installed: Path) -> None:
+    script = Path(sys.modules["bl_pkg"].__file__).parent / "cli" / "blender_ext.py"
+    done = subprocess.run([sys.executable, script, "validate", installed], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    menu = bpy.data.cameras.new("c").neurolens.bl_rna.properties["lens"]
+    assert menu.type == "ENUM"
+    module = sys.modules[f"{MODULE}.panel"]
+    assert [item[:2] for item in module.LIBRARY.items] == [
+        ("phone", "Phone lens (5.9 mm f/2.4)"),
+        ("broken", "Lens broken (49.6 mm f/1.8, 1955)"),
+        ("gauss", "Lens gauss (49.6 mm f/1.8, 1955)"),
+    ]
+    pictures = module.LIBRARY.pictures  # without a screen they have no numbers to draw by
+    assert pictures.keys() == {"gauss"} and tuple(pictures["gauss"].image_size) == (8, 8)
+
+
+def test_put_on_and_taken_back_leaves_no_trace(scene: Any) -> None:
+    camera = scene.camera.data
+    scene.render.engine, camera.sensor_fit, camera.lens = "BLENDER_EEVEE", "VERTICAL", 77.0
+    camera.sensor_height = 20.0
+    before = everything(scene)
+    assert bpy.ops.neurolens.apply(lens="gauss", kind="polynomial") == {"FINISHED"}
+    assert (camera.type, camera.custom_mode, scene.render.engine) == ("CUSTOM", "INTERNAL", "CYCLES")
+    assert scene.cycles.shading_system and camera.dof.use_dof and camera.lens == pytest.approx(49.6)
+    assert set(camera.cycles_custom.keys()) == {"f_number", "blades", "vignetting"}
+    assert bpy.ops.neurolens.apply(lens="gauss", kind="exact") == {"FINISHED"}
+    assert bpy.ops.neurolens.take_back() == {"FINISHED"}
+    assert everything(scene) == before
+
+
+def test_a_custom_camera_of_the_users_own_comes_back(scene: Any, tmp_path: Path) -> None:
+    camera = scene.camera.data
+    scene.render.engine, scene.cycles.shading_system = "CYCLES", True
+    text = bpy.data.texts.new("mine")
+    text.from_string(SHADER.replace("blades / 10.0", "0.75"))
+    camera.type, camera.custom_mode, camera.custom_shader = "CUSTOM", "INTERNAL", text
+    from cycles.osl import update_custom_camera_shader
+
+    assert update_custom_camera_shader(camera, print)
+    camera.cycles_custom["f_number"] = 3.0
+    seen = middle(scene, tmp_path)
+    before = everything(scene)
+    bpy.ops.neurolens.apply(lens="gauss", kind="polynomial")
+    assert middle(scene, tmp_path)[2] == pytest.approx(0, abs=1e-3)
+    bpy.ops.neurolens.take_back()
+    assert everything(scene) == before
+    assert middle(scene, tmp_path) == pytest.approx(seen, abs=1e-6) and camera.custom_shader == text
+
+
+def test_settings_of_the_scene_stay_for_the_other_camera(scene: Any) -> None:
+    scene.render.engine = "BLENDER_EEVEE"
+    other = bpy.data.objects.new("other", bpy.data.cameras.new("other"))
+    scene.collection.objects.link(other)
+    first = scene.camera
+    bpy.ops.neurolens.apply(lens="gauss", kind="polynomial")
+    scene.camera = other
+    bpy.ops.neurolens.apply(lens="gauss", kind="polynomial")
+    assert first.data.custom_shader == other.data.custom_shader
+    scene.camera = first
+    bpy.ops.neurolens.take_back()
+    assert scene.render.engine == "CYCLES" and other.data.type == "CUSTOM" and first.data.type == "PERSP"
+    scene.camera = other
+    bpy.ops.neurolens.take_back()
+    assert scene.render.engine == "BLENDER_EEVEE" and not scene.cycles.shading_system and not bpy.data.texts
+
+
+def test_undo_takes_both_back(scene: Any) -> None:
+    bpy.ops.ed.undo_push(message="start")
+    bpy.ops.neurolens.apply(lens="gauss", kind="polynomial")
+    bpy.ops.ed.undo_push(message="apply")
+    bpy.ops.neurolens.take_back()
+    bpy.ops.ed.undo_push(message="take back")
+    assert bpy.context.scene.camera.data.type == "PERSP"
+    bpy.ops.ed.undo()
+    assert bpy.context.scene.camera.data.type == "CUSTOM"
+    bpy.ops.ed.undo()
+    assert bpy.context.scene.camera.data.type == "PERSP" and not bpy.context.scene.cycles.shading_system
+    bpy.ops.ed.redo()
+    assert bpy.context.scene.camera.data.type == "CUSTOM"
+    assert bpy.ops.neurolens.take_back() == {"FINISHED"}
+
+
+def test_settings_are_animated_saved_and_rendered_without_the_extension(scene: Any, tmp_path: Path) -> None:
+    camera = scene.camera.data
+    target = bpy.data.objects.new("target", None)
+    scene.collection.objects.link(target)
+    view = scene.camera.matrix_world.normalized().col[2].xyz
+    for frame, metres in ((1, 2.0), (3, 4.0)):
+        target.location = scene.camera.location - metres * view
+        target.keyframe_insert("location", frame=frame)
+    bpy.ops.neurolens.apply(lens="gauss", kind="polynomial")
+    camera.dof.focus_object = target
+    for frame, value in ((1, 2.0), (3, 6.0)):
+        camera.cycles_custom["f_number"] = value
+        camera.keyframe_insert('cycles_custom["f_number"]', frame=frame)
+    camera.driver_add('cycles_custom["blades"]').driver.expression = "2 * frame"
+    # Between two keys alike, Blender eases.
+    expected = {1: (0.2, 0.2, 0.2), 2: (0.4, 0.3, 0.4), 3: (0.6, 0.4, 0.6)}
+    for frame, colour in expected.items():
+        assert middle(scene, tmp_path, frame) == pytest.approx(colour, abs=0.01)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "kept.blend"))
+    bpy.ops.preferences.addon_disable(module=MODULE)
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "kept.blend"))
+        for frame, colour in expected.items():
+            assert middle(bpy.context.scene, tmp_path, frame) == pytest.approx(colour, abs=0.01)
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "again.blend"))
+    finally:
+        bpy.ops.preferences.addon_enable(module=MODULE)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "again.blend"))
+    props = bpy.context.scene.camera.data.neurolens
+    assert (props.lens, props.kind, props.on) == ("gauss", "polynomial", "gauss/polynomial")
+    assert bpy.ops.neurolens.take_back() == {"FINISHED"}
+    assert bpy.context.scene.camera.data.type == "PERSP"
+
+
+def said(**given: Any) -> str:
+    """The message of an operator that must fail."""
+    with pytest.raises(RuntimeError) as failed:
+        bpy.ops.neurolens.apply(**given)
+    return str(failed.value).removeprefix("Error: ").strip()
+
+
+def test_what_cannot_be_is_one_sentence_and_changes_nothing(scene: Any) -> None:
+    gauss = {"lens": "gauss", "kind": "polynomial"}
+    camera, before = scene.camera, everything(scene)
+    assert "There is no lens 'other'; lenses: phone, broken, gauss" in said(lens="other")
+    assert "larger than the lens's picture of 7.2 mm" in said(lens="phone")
+    assert "does not compile" in said(lens="broken", kind="polynomial")
+    assert "has no network form here: polynomial, exact" in said(lens="gauss", kind="network")
+    assert everything(scene) == before
+    near = bpy.data.objects.new("nose", None)
+    scene.collection.objects.link(near)
+    near.location = camera.location - 0.5 * camera.matrix_world.normalized().col[2].xyz
+    camera.data.dof.use_dof, camera.data.dof.focus_object = True, near
+    before = everything(scene)
+    bpy.context.view_layer.update()
+    assert "The focus object 'nose' is 0.5 m away, nearer than the lens focuses: 0.7 m" in said(**gauss)
+    assert everything(scene) == before
+    scene.camera = near
+    assert "'nose' is a empty, not a camera" in said(**gauss)
+    scene.camera = None
+    assert "The scene has no camera" in said(**gauss)
+    with pytest.raises(RuntimeError, match="no camera"):
+        bpy.ops.neurolens.take_back()
+    scene.camera = camera
+    with pytest.raises(RuntimeError, match="carries no lens"):
+        bpy.ops.neurolens.take_back()
+
+
+def test_a_sensor_is_fitted_to_a_small_lens_and_comes_back(scene: Any) -> None:
+    before = everything(scene)
+    bpy.ops.neurolens.apply(lens="phone", fit_sensor=True)
+    camera = scene.camera.data
+    assert math.hypot(camera.sensor_width, camera.sensor_width * 18 / 32) == pytest.approx(7.2, abs=0.02)
+    bpy.ops.neurolens.take_back()
+    assert everything(scene) == before
+
+
+class Paper:
+    """A layout that writes down what is drawn on it."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def label(self, text: str, icon: str = "") -> None:
+        self.lines.append(text)
+
+    def prop(self, thing: Any, name: str, text: str | None = None) -> None:
+        self.lines.append(f"<{name}>")
+
+    def prop_enum(self, thing: Any, name: str, value: str) -> None:
+        self.lines.append(f"<{name}:{value}>")
+
+    def operator(self, name: str, **look: Any) -> Any:
+        self.lines.append(f"({name})")
+        return SimpleNamespace()
+
+    def template_icon_view(self, *args: Any, **look: Any) -> None:
+        self.lines.append("[picture]")
+
+    def row(self, align: bool = False) -> Paper:
+        return self
+
+    column = row
+
+
+def panel(scene: Any) -> list[str]:
+    """Lines of the panel of the scene's camera."""
+    paper = Paper()
+    drawn = SimpleNamespace(layout=paper)
+    shown = sys.modules[f"{MODULE}.panel"].NEUROLENS_PT_lens
+    for name in ("_draw_scene", "_draw_settings"):
+        setattr(drawn, name, getattr(shown, name).__get__(drawn))
+    shown.draw(drawn, SimpleNamespace(scene=scene, camera=scene.camera.data, object=scene.camera))
+    return paper.lines
+
+
+def test_panel_shows_lens_settings_error_and_what_leaves_the_domain(scene: Any) -> None:
+    scene.camera.data.neurolens.lens = "gauss"
+    lines = panel(scene)
+    assert {"[picture]", "49.6 mm f/1.8, 1955", "<kind:polynomial>", "<kind:exact>", "(neurolens.apply)"} <= set(lines)
+    bpy.ops.neurolens.apply()
+    camera = scene.camera.data
+    camera.cycles_custom["f_number"] = 1.0
+    camera.dof.focus_distance = 0.3
+    text = "\n".join(panel(scene))
+    assert "(neurolens.take_back)" in text and '<["blades"]>' in text and "<focus_distance>" in text
+    assert "Error: 0.00015 pixels (RMS)" in text  # 0.17 um of pixels of 36 mm / 32
+    assert "The lens opens to f/1.81: f/1 is that" in text
+    assert "The focus distance is 0.3 m away, nearer than the lens" in text
+    camera.neurolens.lens = "phone"  # is put on at once, or says why not
+    text = "\n".join(panel(scene))
+    assert "larger than the lens's picture" in text and camera.neurolens.on == "gauss/polynomial"
+
+
+def test_lenses_of_the_user_folder_join_the_menu(scene: Any) -> None:
+    [folder] = user_folders()
+    try:
+        add_to_folder(folder, packed("mine"))
+        bpy.ops.neurolens.reload()
+        assert bpy.ops.neurolens.apply(lens="mine", kind="exact") == {"FINISHED"}
+        (folder / "lenses.json").write_text(json.dumps({"schema": 99, "lenses": []}))
+        bpy.ops.neurolens.reload()
+        assert any("schema is 99" in line for line in panel(scene))
+        assert bpy.ops.neurolens.take_back() == {"FINISHED"}
+    finally:
+        (folder / "lenses.json").unlink()
+        bpy.ops.neurolens.reload()
