@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
+from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
-from neurolens.cameras.fused import FusedFilm, LensGraph
+from neurolens.cameras.fused import Compiled, FusedFilm, LensGraph
 from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.lens_state import axial_transmittance, lens_state
 from neurolens.cameras.outline_cache import kept_outline, search_key
@@ -143,7 +143,7 @@ class ExactCamera:
             "aperture": self.lens.aperture and self.lens.aperture.settings(),
             "dtype": dtype,
             "pupil": pupil,
-            "lens_state": self._state(first_order(lens).efl_mm),
+            "lens_state": state_of(self.lens, self._light_nm, float(first_order(lens).efl_mm)),
         }
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
@@ -182,19 +182,6 @@ class ExactCamera:
             weight = through * aim.area / (self.film.exposure * ((point_m - origin) ** 2).sum(0))
         status = np.where(aim.status == st.PASSED, done.status.numpy(), aim.status)
         return arrived(film, origin, point_m, weight, status)
-
-    def _state(self, nominal_mm: float) -> dict[str, Any]:
-        """The table `lens_state` of the settings; `nominal_mm` is the focal length at infinity."""
-        data = first_order(self.lens)
-        return lens_state(
-            nominal_mm=nominal_mm,
-            efl_mm=data.efl_mm,
-            pinhole_mm=chief_reach_mm(self.lens),
-            entrance_pupil_mm=self._film_z_mm - data.entrance_pupil_z_mm,
-            f_number=data.f_number,
-            transmittance=axial_transmittance(self._scene, self._light_nm),
-            squeeze=abs(data.efl_mm / first_order(self.lens, meridian="x").efl_mm) if self.lens.anamorphic else 1.0,
-        )
 
     def lens_graph(self) -> LensGraph:
         """The lens as a graph.
@@ -257,7 +244,7 @@ class ExactCamera:
             return passes_at_any_azimuth(self.lens, r, film_z, u, v, pupil_z, wavelength_nm, self.film_mm).numpy()
 
 
-class FusedExactCamera(ExactCamera):
+class FusedExactCamera(Compiled, ExactCamera):
     """A prescription without coatings and absorption as a compiled camera: the rays of `ExactCamera` to rounding.
 
     Args and attributes are those of `ExactCamera`, whose `dtype` is float32 here; for differentials see `FusedFilm`.
@@ -266,26 +253,48 @@ class FusedExactCamera(ExactCamera):
         InputError: as `ExactCamera`; no C compiler; coatings or glass that absorbs.
     """
 
-    rays_a_call = MANY_RAYS_A_CALL
-
     def __init__(self, lens: Lens, **kwargs: Any) -> None:
         check_bare(lens)
         super().__init__(lens, **kwargs)
         self._fused = FusedFilm(self.film, self.lens_graph(), self.film_mm)
         self.settings |= {"runtime": "fused"}
 
-    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
-        return self._fused.sample(film_mm, pupil, wavelength_nm)
 
-    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays, which come from the same pass."""
-        return self._fused.sample(film_mm, pupil, wavelength_nm, True)
+def state_of(lens: Lens, wavelength_nm: tuple[float, float], nominal_mm: float | None = None) -> dict[str, Any]:
+    """The table `lens_state` of a lens that `at` has placed; `nominal_mm` is its focal length at infinity."""
+    data, film_z = first_order(lens), lens.film_z_mm
+    assert film_z is not None
 
-    @property
-    def differentials_error(self) -> float | None:
-        """See `FusedFilm.moves_error`."""
-        return self._fused.moves_error
+    def along_the_axis(film: FloatArray, _pupil: FloatArray, nanometres: FloatArray) -> SceneRays:
+        x, y, light = (torch.from_numpy(a).double() for a in (*film, nanometres))
+        ones = torch.ones_like(x)
+        done = trace(lens, Rays(x, y, film_z * ones, 0 * x, 0 * x, -ones), light, transmittance=True)
+        assert done.transmittance is not None
+        return SceneRays(torch.stack(list(done.rays)).numpy(), done.transmittance.numpy(), done.status.numpy())
+
+    with torch.no_grad():
+        through = axial_transmittance(along_the_axis, wavelength_nm)
+    return lens_state(
+        nominal_mm=nominal_mm,
+        efl_mm=data.efl_mm,
+        pinhole_mm=chief_reach_mm(lens),
+        entrance_pupil_mm=film_z - data.entrance_pupil_z_mm,
+        f_number=data.f_number,
+        transmittance=through,
+        squeeze=abs(data.efl_mm / first_order(lens, meridian="x").efl_mm) if lens.anamorphic else 1.0,
+    )
+
+
+def placed_settings(lens: Lens, film_mm: tuple[float, float], focus_m: float) -> dict[str, Any]:
+    """What the settings of an exact camera say of lens and film, of a lens that `at` has placed, without a camera."""
+    nominal = None if lens.infinity_mm else float(first_order(lens).efl_mm)
+    return {
+        "camera": "exact",
+        "lens": lens.identity,
+        "focus_m": None if math.isinf(focus_m) else focus_m,
+        "film_mm": list(film_mm),
+        "lens_state": state_of(lens, (400.0, 700.0), nominal),
+    }
 
 
 def check_bare(lens: Lens) -> None:

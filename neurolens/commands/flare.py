@@ -98,13 +98,17 @@ def run(args: argparse.Namespace) -> int:
     found |= {"ghosts": [[_about(ghost) for ghost in of_light] for of_light in rows]}
     if args.out is not None:
         found["out"] = str(args.out)
-        _write(args, tracer, lights, rows, found)
+        _write(args, tracer, lens, lights, rows, found)
     found["seconds"] = time.perf_counter() - began
     return answer(args, found, lambda: _text(lens, lights, rows, found))
 
 
-def _write(args: argparse.Namespace, tracer: Any, lights: list[Light], rows: list[list[Ghost]], about: Any) -> None:
+def _write(
+    args: argparse.Namespace, tracer: Any, lens: Lens, lights: list[Light], rows: list[list[Ghost]], about: Any
+) -> None:
+    from neurolens.cameras.exact import placed_settings
     from neurolens.flare.picture import Raster, ghost_picture
+    from neurolens.render.exr_attributes import standard_attributes
     from neurolens.render.pictures import write_exr
 
     energy: dict[Any, float] = {}
@@ -123,7 +127,8 @@ def _write(args: argparse.Namespace, tracer: Any, lights: list[Light], rows: lis
     layers = {f"{name}.{c}": picture[n, ..., k] for n, name in enumerate(names) for k, c in enumerate("RGB")}
     settings = {k: v for k, v in vars(args).items() if isinstance(v, str | int | float | list | tuple | None)}
     metadata = {"neurolens": __version__, "flare": {**about, "settings": plain(settings)}}
-    write_exr(args.out, picture.sum(0), metadata=metadata, layers=layers if args.layers else None)
+    header = standard_attributes(placed_settings(lens, args.film, args.focus), raster.width, raster.height)
+    write_exr(args.out, picture.sum(0), metadata=metadata, layers=layers if args.layers else None, attributes=header)
 
 
 def _light(text: str) -> Light:

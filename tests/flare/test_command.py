@@ -1,11 +1,10 @@
 """`neurolens flare` on the command line."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 
 from neurolens.cli import main
@@ -22,6 +21,8 @@ def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     told = json.loads(capsys.readouterr().out)
     rgb, metadata = read_exr(out)
     layers = read_layers(out)
+    header = OpenEXR.File(str(out), header_only=True).header()
+    assert header["lensModel"] == "Double Gauss 50 mm f/1.8" and round(header["effectiveFocalLength"], 3) == 49.637
     assert rgb.shape == (32, 48, 3) and rgb.sum() > 0
     assert metadata["flare"]["ghosts"] == told["ghosts"]
     top = [g["name"] for g in told["ghosts"][0][:2]]
