@@ -21,7 +21,7 @@ from neurolens.cameras.lens_film import LensFilm, SceneRays, camera_rays
 from neurolens.cameras.lens_state import axial_transmittance, lens_state, squeeze_of
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.onnxmaps import InverseRays, OnnxDerivatives, OnnxInverse, load_inverse
-from neurolens.cameras.onnxsession import joined, open_session, padded, run_session
+from neurolens.cameras.onnxsession import joined, open_session, run_batches
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import pupil_graph
 from neurolens.cameras.pupil_search import outline_of
@@ -223,21 +223,9 @@ class OnnxFilm:
 
     def sample(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `LensFilm.sample`."""
-        count = film_mm.shape[1]
-        found: dict[str, NDArray[Any]] = {
-            name: np.empty((6 if name == "ray" else 1, count), np.int32 if name == "status" else np.float32)
-            for name in _OUTPUTS
-        }
-        # Calls of about the same size: few rays cost nearly as much as many.
-        ends = np.linspace(0, count, max(1, round(count / RAYS_A_CALL)) + 1).astype(int)
-        for start, end in zip(ends[:-1], ends[1:], strict=True):
-            part = slice(start, end)
-            given = {"film_mm": film_mm[:, part], "square": square[:, part], "wavelength_nm": wavelength_nm[None, part]}
-            feeds = {name: padded(values) for name, values in given.items()}
-            done = run_session(self._path, self._session, tuple(_OUTPUTS), feeds)
-            for whole, piece in zip(found.values(), done, strict=True):
-                whole[:, part] = piece[..., : end - start]
-        return camera_rays(found)
+        rays = {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None]}
+        done = run_batches(self._path, self._session, tuple(_OUTPUTS), rays, {}, 3 * RAYS_A_CALL // 2)
+        return camera_rays({name: np.atleast_2d(values) for name, values in zip(_OUTPUTS, done, strict=True)})
 
 
 @dataclass(frozen=True)
@@ -270,8 +258,8 @@ class ModelScene:
         self, derivatives: OnnxDerivatives, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray
     ) -> SceneRays:
         """As a call, with `SceneRays.d_film`."""
-        moves = derivatives(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm).d_film
-        return self(film, pupil, wavelength_nm)._replace(d_film=moves)
+        out = derivatives(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm)
+        return SceneRays(out.rays.scene_ray, out.rays.transmittance, self.status_of(out.rays), out.d_film)
 
     def passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
         """Whether rays pass at one wavelength; bool [N]."""

@@ -111,8 +111,8 @@ def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, An
     """
     model = inverse.model
     check_gates(model)
-    base, card, front = Path(path).with_suffix(""), card_of(model, errors or {}), model.lens.surfaces[0]
-    shape = {
+    base, card, front = Path(path).with_suffix(""), card_of(model, errors or {}), model.front
+    shape = front and {
         "curvature": float(front.curvature),
         "conic": float(front.conic),
         "asphere": [[int(p), float(a)] for p, a in front.asphere],
@@ -125,7 +125,7 @@ def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, An
             "steps": STEPS,
             "tolerance": TOLERANCE,
             "direction": model.direction,
-            "front": shape if model.direction == "angle" else None,
+            "front": shape,
             "fit": inverse.report,
         }
         graph = build(inverse, ONNX, largest_angle(model))
