@@ -100,7 +100,7 @@ def film_function(
     samples = _SAMPLES_OF_STATES if axes and focus == "best" else _SAMPLES
     if focus == "paraxial":
         samples = (_PARAXIAL[-1][0] + 4, 1)
-    choices = [(i, j) for i, j in choices if i < samples[0] and j < samples[1]]
+    choices = tuple((i, j) for i, j in choices if i < samples[0] and j < samples[1])
 
     def grid(distances: Array, stops: Array) -> tuple[Array, Array]:
         by_stop = {"best": SMALLEST + (1 - SMALLEST) * stops, "widest": np.ones(1), "paraxial": np.zeros(0)}

@@ -117,7 +117,7 @@ def followed(
 
 def state_ranges(axes: Sequence[Axis]) -> dict[str, float]:
     """The range of each of a state's numbers as constants."""
-    constants = {}
+    constants: dict[str, float] = {}
     for axis, name in zip(axes, state_names(axes), strict=True):
         word, _, unit = name.partition("_")
         constants |= {f"{word}_min_{unit}": axis.range[0], f"{word}_max_{unit}": axis.range[1]}

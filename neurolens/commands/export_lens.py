@@ -44,7 +44,8 @@ def write_lens(file: Path, args: argparse.Namespace) -> Written:
     """The lens as a function of film and pupil point, wavelength, film position, stop radius and, of a range, zoom."""
     lens = read_lens(file)
     name = checked_name(args.to, lens.lens_id, args.name)
-    axes, lines = (), []
+    axes: tuple[Axis, ...] = ()
+    lines = []
     if args.zoom == RANGE:
         axis, error_mm = gap_axis(lens)
         axes, nodes = (axis,), [lens.at(zoom=v) for v in axis.nodes]
