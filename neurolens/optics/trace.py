@@ -127,12 +127,7 @@ def passing(lens: Lens, rays: Rays, wavelength_nm: float, *, towards: Towards = 
     """Whether rays pass the whole lens, bool [N]: where the status of `trace` is 0, bit for bit.
 
     Rays that are lost are left out of the work on later surfaces. For questions of which most are answered by no.
-
-    Args:
-        lens, rays, towards: as for `trace`. wavelength_nm: of all rays.
-
-    Raises:
-        InputError: as `trace`.
+    Arguments and errors are those of `trace`, with one wavelength.
     """
     check_rays(rays, wavelength_nm)
     _keep_memory()
