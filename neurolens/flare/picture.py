@@ -64,12 +64,14 @@ class Light:
         return np.array([math.sin(a) * math.cos(e), math.sin(e), -math.cos(a) * math.cos(e)])
 
 
-def light_rays(lens: Lens, light: Light, first: int, count: int, shift: float = 0.0) -> tuple[Floats, float]:
+def light_rays(
+    lens: Lens, light: Light, first: int, count: int, shift: float = 0.0, jitter: float = 0.0
+) -> tuple[Floats, float]:
     """Rays number `first` and following of a light, [6, count] lens frame, and the area in mm^2 that all N share: the
     irradiance at the lens times area / N is the light of one of N rays.
 
     Args:
-        shift: of the sequence, for each wavelength another.
+        shift: of the sequence, for each wavelength another. jitter: see `_disc`.
     """
     front = lens.surfaces[0]
     depth = float(sag_mm(front, front.semi_diameter_mm, 0.0))
@@ -78,7 +80,7 @@ def light_rays(lens: Lens, light: Light, first: int, count: int, shift: float = 
     side = np.cross(ahead, [0.0, 1.0, 0.0] if abs(ahead[1]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
     up = np.cross(side, ahead)
-    x, y = radius * _disc(first, count, shift)
+    x, y = radius * _disc(first, count, shift, jitter)
     across = side[:, None] * x + up[:, None] * y
     target = centre[:, None] + across
     if math.isinf(light.distance_m):
@@ -89,10 +91,14 @@ def light_rays(lens: Lens, light: Light, first: int, count: int, shift: float = 
     return np.concatenate([target, direction]), math.pi * radius**2
 
 
-def _disc(first: int, count: int, shift: float = 0.0) -> NDArray[np.float64]:
-    """Points [2, count] of the unit disc, of equal shares: the R2 sequence from a number on, shifted."""
+def _disc(first: int, count: int, shift: float = 0.0, jitter: float = 0.0) -> NDArray[np.float64]:
+    """Points [2, count] of the unit disc, of equal shares: the R2 sequence from a number on, shifted.
+
+    `jitter` moves each by up to so much of the square's side: regular places make patterns in a picture.
+    """
     n = np.arange(first, first + count) + 1.0
-    u, v = (n / _PLASTIC + shift) % 1, (n / _PLASTIC**2 + 0.5 * shift) % 1
+    moved = jitter * np.random.default_rng([first, int(shift * 2**32)]).random((2, count))
+    u, v = (n / _PLASTIC + shift + moved[0]) % 1, (n / _PLASTIC**2 + 0.5 * shift + moved[1]) % 1
     return np.sqrt(u) * np.stack([np.cos(2 * math.pi * v), np.sin(2 * math.pi * v)])
 
 
@@ -193,7 +199,8 @@ def ghost_picture(
         film = np.zeros((count, raster.height, raster.width), np.float32)
         area = 0.0
         for first in range(0, samples, _AT_ONCE):
-            rays, area = light_rays(tracer.lens, light, first, min(_AT_ONCE, samples - first), k / wavelengths)
+            part = min(_AT_ONCE, samples - first)
+            rays, area = light_rays(tracer.lens, light, first, part, k / wavelengths, samples**-0.5)
             tracer.splat(film, rays, float(spectral.centres_nm[k]), 1 / pixel_mm, given)
         colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / wavelengths
         return film, colour * (area / samples / (pixel_mm**2 * exposure))
