@@ -27,11 +27,11 @@ from neurolens.graph.ir import Graph
 from neurolens.graph.newton import solve, with_jacobian
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.optics.surfaces import Rays
+from neurolens.optics.sag import front_rays
 from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, front_rays, scene_system, stop_system
+from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, scene_system, stop_system
 from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
@@ -96,8 +96,8 @@ def _published(inverse: InverseModel, rays: FilmRays) -> dict[str, Any]:
     passed = forward.status == st.PASSED
     rays = rays.select(passed)
     x, y = forward.stop_x[passed], forward.stop_y[passed]
-    *position, v, _ = front_rays(model, Rays(*(c[passed] for c in forward.rays)), torch.float64)
-    wanted = torch.cat([torch.stack(position) / model.scales.position_mm, v])
+    position, v = torch.from_numpy(front_rays(model.front, *(c[passed].numpy() for c in forward.rays))[0]).split(2)
+    wanted = torch.cat([position / model.scales.position_mm, v])
     scene = _plain(scene_system(model), {"wanted": wanted, "wavelength_nm": rays.wavelength_nm[None]})
     return {"stop": _plain(stop_system(model), _stop_inputs(model, rays, x, y)), "scene": scene}
 

@@ -27,7 +27,8 @@ _DESCRIPTION = """\
 Write an exported model in another form: a self-contained C99 header (one function for a ray, one for
 arrays that compilers vectorise), a GLSL function, or an ONNX file. Domain guard, stop, rims,
 transmittance and status codes are those of the model; the card is a comment at the top. Constants
-(planes, ranges) and the film's position for a focus stand beside it. A lens file gives the exact lens.
+(planes, ranges) and the film's position for a focus stand beside it. Of a model of a zoom's whole range
+(or of internal focus) the state is an argument. A lens file gives the exact lens.
 With --camera, the whole camera for one focus and stop: film point and two random numbers in, weighted
 ray out, its pupil's outline as a table in the file (of GLSL, the data of a texture beside it).
 Needs the extra "train" (torch); without it C and GLSL are written from the graph in the file,
@@ -43,6 +44,7 @@ examples:
   neurolens export models/laikin_double_gauss_50.ols-60.onnx --to c -o gauss.h
   neurolens export models/NAME.onnx --to glsl -o lens.glsl --fix wavelengths=450,550,650 --fix focus=2
   neurolens export runs/quickstart --to c -o ray.h --only ray
+  neurolens export models/ZOOM-range.states-64.onnx --to c -o zoom.h      # any focal length: NAME_at(zoom_mm)
   neurolens export lenses/NAME.toml --to c -o exact.h                     # every surface; no coatings
   neurolens export models/NAME.onnx --to c -o cam.h --camera --focus 2 --f-number 2.8 --derivatives
   neurolens export models/NAME.onnx --to onnx -o laser.onnx --fix wavelengths=633
@@ -120,18 +122,23 @@ def run(args: argparse.Namespace) -> int:
         check_writable(args.out)
         return _answer(args, _about(_write_camera(file, args) if args.camera else _write_exact(file, args)))
     check_writable(args.out)
-    if args.to != "onnx" and set(parts) == set(_PARTS) and not given and find_spec("torch") is None:
-        from neurolens.modelfile.onnxfile import read_checked
+    from neurolens.cameras.onnxlens import load_model
+
+    loaded = load_model(file)
+    card, whole = loaded.card, set(parts) == set(_PARTS) and not given
+    if loaded.axes and (args.to == "onnx" or not whole):
+        raise InputError(
+            "neurolens export", str(file), "(a model of many states)", "--to c or glsl without --fix, --only"
+        )
+    if loaded.axes or (args.to != "onnx" and whole and find_spec("torch") is None):
         from neurolens.surrogates.source import export_file
 
-        extras, notes = model_extras(read_checked(file)[1])
+        extras, notes = model_extras(loaded)
         return _answer(args, _about(export_file(file, args.out, args.to, args.name, extras, notes)))
-    from neurolens.cameras.model import load_model
     from neurolens.surrogates.source import Parts, export_source
     from neurolens.surrogates.specialise import fixed_models
     from neurolens.surrogates.stored import load_fitted
 
-    card = load_model(file).card
     model = load_fitted(file)
     fix = _fix(given, model)
     models = fixed_models(model, fix)
@@ -140,7 +147,8 @@ def run(args: argparse.Namespace) -> int:
         about: dict[str, Any] = _write_inverse(models[0], args.out) if args.inverse else {}
     else:
         asked = Parts(*(name in parts for name in _PARTS[1:]))
-        extras, notes = model_extras(card, focusing=fix.film_z_mm is None)
+        stop = fix.stop_radius_mm if asked.vignetting else model.domain.stop_radius_mm
+        extras, notes = model_extras(loaded, film=fix.film_z_mm is None, stop_mm=stop)
         written = export_source(
             models, args.out, args.to, card, parts=asked, fix=fix, name=args.name, extras=extras, notes=notes
         )
@@ -187,8 +195,11 @@ def _write_camera(file: Path, args: argparse.Namespace) -> Written:
 def _write_exact(file: Path, args: argparse.Namespace) -> Written:
     """The exact lens of a file as a function of film and pupil point, wavelength, film position and stop radius."""
     from neurolens.cameras.exact import check_bare
-    from neurolens.cameras.source import extras_of
+    from neurolens.cameras.focus_function import Focusing
+    from neurolens.cameras.source import film_extras
+    from neurolens.graph.c import Extras
     from neurolens.graph.scalars import lower
+    from neurolens.optics.focusing import best_focus_of_stops_mm
     from neurolens.optics.lensfile import read_lens
     from neurolens.optics.paraxial import film_z_mm, first_order
     from neurolens.optics.pupils import image_radius_mm, pupil_bounds, pupil_plane_z_mm
@@ -205,8 +216,14 @@ def _write_exact(file: Path, args: argparse.Namespace) -> Written:
         "pupil_radius_mm": disc, "stop_radius_max_mm": float(lens.stop_radius_mm),
         "wavelength_min_nm": _LIGHT_NM[0], "wavelength_max_nm": _LIGHT_NM[1],
     }  # fmt: skip
-    near = _NEAR_EFL * abs(float(data.efl_mm)) / 1000
-    extras, notes = extras_of(constants, near, lambda focus_m: film_z_mm(lens, focus_m))
+    apart = abs(float(data.rear_principal_z_mm - data.front_principal_z_mm))
+
+    def best(focus_m: float, stops_mm: Any) -> Any:
+        return best_focus_of_stops_mm(lens, focus_m, stops_mm, _LIGHT_NM)
+
+    near = (_NEAR_EFL * abs(float(data.efl_mm)) + apart) / 1000
+    focusing = Focusing(near, float(lens.stop_radius_mm), lambda focus_m: film_z_mm(lens, focus_m), best)
+    functions, notes = film_extras([focusing])
     comment = [
         f"{lens.name}: every surface traced, written by neurolens {__version__}. Surfaces are bare.",
         f"Lens data: {lens.source} (sha256 {str(lens.sha256)[:16]}).",
@@ -218,7 +235,7 @@ def _write_exact(file: Path, args: argparse.Namespace) -> Written:
         *notes,
     ]
     program = lower(exact_graph(lens, plane, _LIGHT_NM))
-    return write_program(program, args.out, args.to, name, lines_of(comment), extras)
+    return write_program(program, args.out, args.to, name, lines_of(comment), Extras(constants, functions))
 
 
 def _about(written: Written, bands_nm: Sequence[float] = ()) -> dict[str, Any]:
@@ -227,6 +244,7 @@ def _about(written: Written, bands_nm: Sequence[float] = ()) -> dict[str, Any]:
     return {
         "function": s.name,
         "inputs": s.inputs,
+        "state": s.state,
         "outputs": [*s.outputs, "status"],
         "bands_nm": bands_nm if s.bands > 1 else [],
         "operations_per_ray": written.operations,

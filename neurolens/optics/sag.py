@@ -116,6 +116,27 @@ def meet_front(
     return px, py
 
 
+def front_rays(
+    shape: Shape | None, x: Array, y: Array, z: Array, dx: Array, dy: Array, dz: Array
+) -> tuple[Array, Array]:
+    """Scene rays as models have them, and the solid angle per area of their direction vectors [N].
+
+    Rows [4, N]: x and y (mm) on the front surface, and the direction vector, theta (dx, dy) / |(dx, dy)| with theta
+    from -z; of first-order models, which have no shape, the slope.
+
+    Args:
+        shape: None is the plane z = 0. The rest: as of `meet_front`, unit directions away from the lens.
+    """
+    x, y = meet_front(shape, x, y, z, dx, dy, dz)
+    with np.errstate(all="ignore"):
+        if shape is None:
+            return np.stack([x, y, dx / -dz, dy / -dz]), np.abs(dz) ** 3
+        sine = np.hypot(dx, dy)
+        angle = np.arctan2(sine, -dz)
+        ratio = np.where(sine > 1e-12, angle / sine, 1.0)
+        return np.stack([x, y, ratio * dx, ratio * dy]), np.where(angle > 1e-12, sine / angle, 1.0)
+
+
 def end_mm(surface: Surface) -> float:
     """Distance from the axis at which a surface's conic ends: the radius of a sphere; inf where it goes on."""
     stretch = 1 + float(surface.conic)

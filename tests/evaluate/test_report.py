@@ -168,10 +168,10 @@ def test_it_says_what_to_use_and_what_words_mean(run_dir: Path) -> None:
     poor = {**results["models"][0], "name": "fast", "fused_ns_per_ray": {"min": 1.0}, "poor": ["false pass 3%"]}
     source = write_report(run_dir, Results(**{**results, "models": [slow, thin, poor, *results["models"]]})).read_text()
     page = Page(source)
-    head = page.text.partition("In short")[0]
+    head = page.text.partition("Notes and warnings")[0]
     assert "Use ols-40" in head and "3.25 ns a ray as C" in head
     assert f"--camera fused:{run_dir}/models/ols-40.onnx" in head
-    assert "5 %" in page.text  # FLIP with the same random numbers, as a share of noise
+    assert "of noise (%)" in page.text  # FLIP with the same random numbers, as a share of noise
     table = source.partition("<section><h2>Models")[2].partition("</table>")[0]
     headings = re.findall(r"<th scope='col'(.*?)>", table)
     assert len(headings) > 5 and all("title='" in h for h in headings)

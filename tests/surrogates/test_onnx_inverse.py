@@ -152,7 +152,7 @@ def test_nonsense_gets_a_status(tmp_path: Path) -> None:
     back = loaded.from_scene(points, np.stack([c, a, b]), 550.0)
     assert (back.status != st.PASSED)[~np.isfinite(points).all(0)].all()
     for bad in (np.zeros(3), [["a"], ["b"]]):
-        with pytest.raises(InputError, match="points"):
+        with pytest.raises(InputError, match="film_xy_mm"):
             loaded.through_stop(bad, np.zeros((2, 3)), 550.0)
 
 
