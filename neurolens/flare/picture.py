@@ -17,7 +17,8 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.flare.ghosts import Floats, GhostTracer, Pair
+from neurolens.flare.ghosts import GhostTracer, Pair
+from neurolens.flare.stack import Floats
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import sag_mm
 from neurolens.optics.trace import Rays, trace
