@@ -24,7 +24,8 @@ SMALLEST = 1 / 16  # of the widest stop: at smaller ones the film stays
 _SAMPLES = (8, 12)  # distances and stops at which the film is placed, and where errors are measured
 _CHECKS = (4, 6)
 # Degrees in 1 / distance and in the stop's radius, and the error (mm) that is enough.
-_BEST, _BEST_MM = ((3, 2), (4, 4), (5, 6), (6, 8), (6, 10)), 2e-4
+_SAMPLES_OF_STATES = (5, 8)  # at each of the nodes
+_BEST, _BEST_MM = ((3, 2), (4, 4), (4, 6), (5, 6), (6, 8), (6, 10)), 2e-4
 _PARAXIAL, _PARAXIAL_MM = tuple((n, 0) for n in range(2, 13)), 1e-5
 _RISING, _RISING_MM = 200, 1e-4  # distances at which the film must rise; a fall by less is rounding
 
@@ -97,12 +98,16 @@ def film_function(
     """
     moved = np.isfinite(nodes[0].nearest_m)
     choices, enough = (_BEST, _BEST_MM) if focus == "best" else (_PARAXIAL, _PARAXIAL_MM)
+    samples = _SAMPLES_OF_STATES if axes and focus == "best" else _SAMPLES
+    if focus == "paraxial":
+        samples = (_PARAXIAL[-1][0] + 4, 1)
+    choices = tuple((i, j) for i, j in choices if i < samples[0] and j < samples[1])
 
     def grid(distances: Array, stops: Array) -> tuple[Array, Array]:
         by_stop = {"best": SMALLEST + (1 - SMALLEST) * stops, "widest": np.ones(1), "paraxial": np.zeros(0)}
         return distances if moved else np.zeros(1), by_stop[focus]
 
-    fit, check = grid(*(_roots(n) for n in _SAMPLES)), grid(*(np.linspace(0, 1, n) for n in _CHECKS))
+    fit, check = grid(*(_roots(n) for n in samples)), grid(*(np.linspace(0, 1, n) for n in _CHECKS))
     placed = np.array([node.places(*fit) for node in nodes])
     checked = [(state, lens, lens.places(*check)) for state, lens in between or [((), nodes[0])]]
     found: list[FilmFunction] = []
