@@ -59,10 +59,11 @@ class Focusing:
 
 
 class FilmFunction(NamedTuple):
-    """The film's position as a program, and its largest error (mm) at places between those of the fit."""
+    """The film's position as a graph and its program, and its largest error (mm) at places between those of the fit."""
 
     program: Program
     error_mm: float
+    graph: Graph
 
 
 def number_of(axes: Sequence[Axis], nodes: Sequence[float], rule: str = "") -> float | Program:
@@ -111,9 +112,10 @@ def film_function(
     checked = [(state, lens, lens.places(*check)) for state, lens in between or [((), nodes[0])]]
     found: list[FilmFunction] = []
     for degrees in choices:
-        program = _fitted(nodes, axes, placed, fit, degrees)
+        graph = _fitted(nodes, axes, placed, fit, degrees)
+        program = lower(graph)
         error = max(_error(program, axes, *known, check) for known in checked)
-        found.append(FilmFunction(program, error))
+        found.append(FilmFunction(program, error, graph))
         if error < enough:
             break
     return min(found, key=lambda f: f.error_mm)
@@ -136,7 +138,7 @@ def _roots(count: int) -> Array:
 
 def _fitted(
     nodes: Sequence[Focusing], axes: Sequence[Axis], placed: Array, at: tuple[Array, Array], degrees: tuple[int, int]
-) -> Program:
+) -> Graph:
     """The function of polynomials of these degrees: least squares of what is `placed` [nodes, D, S] at each node."""
     moved, by_stop = (len(places) > 1 for places in at)
     across, along = degrees[0] * moved, degrees[1] * by_stop
@@ -158,7 +160,7 @@ def _fitted(
         used = exponents[:, [k for k, there in enumerate((moved, by_stop)) if there]]
         z = g.dot(numbers[0:count], g.polynomial(used, np.eye(count), g.concat(*rows)))
     g.outputs["film_z_mm"] = z.maximum(film[0]).minimum(film[1]) if film else z
-    return lower(g)
+    return g
 
 
 def _centred(share: Any) -> Any:

@@ -168,7 +168,7 @@ def film_extras(
         made["film_z_paraxial_mm"] = ("paraxial", reach, "the paraxial image", [])
     functions, lines = {}, []
     for name, (focus, limits, what, stop) in made.items():
-        functions[name], error = film_function(nodes, axes, between, focus)
+        functions[name], error, _ = film_function(nodes, axes, between, focus)
         given = ", ".join([*state, *distance, *(stop if by_stop else [])])
         lines.append(
             f"{name}({given}): film plane of {what}, {', '.join(limits)}, beyond as at the end; within "

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, check_writable
+from neurolens.base.files import atomic_path, atomic_write_text, check_writable
 from neurolens.commands.arguments import add_json, positive
 from neurolens.commands.output import answer
 from neurolens.commands.render import film_size
@@ -28,6 +28,7 @@ arrays that compilers vectorise), a GLSL function, or an ONNX file. Domain guard
 transmittance and status codes are those of the model; the card is a comment at the top. Constants
 (planes, ranges) and the film's position for a focus stand beside it. Of a model of a zoom's whole range
 (or of internal focus) the state is an argument. A lens file gives the exact lens.
+OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades and more are its inputs.
 With --camera, the whole camera for one focus and stop: film point and two random numbers in, weighted
 ray out, its pupil's outline as a table in the file (of GLSL, the data of a texture beside it).
 Needs the extra "train" (torch); without it C and GLSL are written from the graph in the file,
@@ -47,6 +48,7 @@ examples:
   neurolens export models/ZOOM-range.states-64.onnx --to c -o zoom.h      # any focal length: NAME_at(zoom_mm)
   neurolens export lenses/NAME.toml --to c -o exact.h                     # every surface; no coatings
   neurolens export models/NAME.onnx --to c -o cam.h --camera --focus 2 --f-number 2.8 --derivatives
+  neurolens export models/NAME.onnx --to osl -o lens.osl                  # for Blender; lenses/NAME.toml: exact
   neurolens export models/NAME.onnx --to onnx -o laser.onnx --fix wavelengths=633
   neurolens export models/NAME.onnx --to onnx -o lens.onnx --derivatives  # for ray differentials
   neurolens export models/NAME.onnx --to onnx -o a.onnx --inverse         # and a.stop.onnx, a.scene.onnx"""
@@ -59,14 +61,14 @@ _HELD_OUT, _VIGNETTING, _TRAIN = 20_000, 100_000, 15_000
 def add_parser(subparsers: Any) -> None:
     """Add the command to the command line."""
     parser = subparsers.add_parser(
-        "export", help="source code (C, GLSL) of a model; fix what a scene fixes", description=_DESCRIPTION,
+        "export", help="source code (C, GLSL, OSL) of a model; fix what a scene fixes", description=_DESCRIPTION,
         epilog=_EPILOG,
     )  # fmt: skip
     parser.add_argument(
         "model", metavar="MODEL", type=Path,
-        help="exported model (.onnx), or a run folder with one model; of C and GLSL, a lens file (.toml), too",
+        help="exported model (.onnx), or a run folder with one model; of C, GLSL and OSL, a lens file (.toml), too",
     )  # fmt: skip
-    parser.add_argument("--to", choices=("c", "glsl", "onnx"), required=True, help="form to write")
+    parser.add_argument("--to", choices=("c", "glsl", "osl", "onnx"), required=True, help="form to write")
     parser.add_argument("-o", "--out", metavar="FILE", type=Path, required=True, help="file to write")
     parser.add_argument(
         "--fix", metavar="KEY=VALUE", action="append", default=[], help="a value fixed by the scene (see below)"
@@ -114,6 +116,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("neurolens export", "--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")
     if args.to != "onnx" and ((args.derivatives and not args.camera) or args.inverse):
         raise InputError("neurolens export", "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
+    if args.to == "osl":
+        return _write_osl(file, args, bool(given) or set(parts) != set(_PARTS))
     exact = file.suffix == ".toml"
     if args.camera or exact:
         if args.to == "onnx" or given or set(parts) != set(_PARTS):
@@ -157,6 +161,25 @@ def run(args: argparse.Namespace) -> int:
             models, args.out, args.to, card, parts=asked, fix=fix, name=args.name, extras=extras, notes=notes
         )
         about = _about(written, [m.domain.wavelength_nm[0] for m in models])
+    return _answer(args, about)
+
+
+def _write_osl(file: Path, args: argparse.Namespace, partly: bool) -> int:
+    """A camera for Cycles."""
+    from neurolens.commands.export_osl import shader_of
+
+    if partly or args.camera or args.f_number is not None or args.focus != math.inf:
+        expected = "none of them: stop and focus are inputs of the shader, which is a whole camera"
+        raise InputError(
+            "neurolens export", "--fix, --only, --camera, --focus, --f-number", "(with --to osl)", expected
+        )
+    check_writable(args.out)
+    shader = shader_of(file, zoom=args.zoom, name=args.name, quiet=args.json)
+    atomic_write_text(args.out, shader.text)
+    about = {
+        "function": shader.name, "inputs": shader.parameters, "operations_per_ray": shader.operations,
+        "passing": shader.passing,
+    }  # fmt: skip
     return _answer(args, about)
 
 
