@@ -3,7 +3,8 @@
 Ten million photons of 550 nm for each place of the light, with 10 reflections at most, and for one place with 2 and 5.
 His photons left the light in a cone tuned by hand and 30 to 32% of them reached the sensor, in 7867 to 9017 s (2008);
 ours are aimed at the sphere about the front surface, so that their share is another: both are told. Compiling is not
-counted. Writes photons.md, photons.json and photons.png (the flare alone, 9 wavelengths, and beside it all pairs of reflections without chance).
+counted. Writes photons.md, photons.json and photons.png (the flare alone, 9 wavelengths; beside it all pairs of
+reflections without chance).
 """
 
 from __future__ import annotations
