@@ -25,6 +25,7 @@ from neurolens.optics.aiming import without_rims
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, pupil_bounds, pupil_plane_z_mm
+from neurolens.optics.sag import same_medium
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
@@ -122,9 +123,7 @@ def _check(lens: Lens, radius: Array) -> None:
 
 def _rings(lens: Lens) -> set[int]:
     """Rows that bend nothing and are not the stop: hoods and other rings."""
-    air = (1.0, None, None)
-    media = [air, *((float(s.n_d), s.V_d, s.glass) for s in lens.surfaces)]
-    return {k for k, s in enumerate(lens.surfaces) if not s.stop and media[k] == media[k + 1]}
+    return {k for k, s in enumerate(lens.surfaces) if not s.stop and same_medium(lens.surfaces, k)}
 
 
 class _Search:

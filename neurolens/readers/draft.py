@@ -12,6 +12,7 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_SURFACES, check_states
 from neurolens.optics.prescription import Configuration, Lens, Surface
+from neurolens.optics.sag import same_medium
 from neurolens.readers.assemble import UNKNOWN, finish, first_order, smaller_stop, with_rims
 from neurolens.readers.source import UNITS_MM, Line, warn
 
@@ -220,7 +221,6 @@ def _without_dummies(draft: Draft) -> Draft:
 
 
 def _is_dummy(draft: Draft, k: int) -> bool:
-    s, row = draft.rows[k].surface, draft.rows[k]
-    before = draft.rows[k - 1].surface if k else Surface(math.inf, 0.0, 1.0)
-    same = (s.n_d, s.V_d, s.glass) == (before.n_d, before.V_d, before.glass)
-    return same and math.isinf(s.radius_mm) and not s.stop and not s.asphere and not row.aperture
+    s = draft.rows[k].surface
+    flat = math.isinf(s.radius_mm) and not s.stop and not s.asphere and not draft.rows[k].aperture
+    return flat and same_medium([row.surface for row in draft.rows], k)
