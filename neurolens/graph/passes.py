@@ -53,7 +53,7 @@ def pruned(graph: Graph, outputs: Mapping[str, Value] | None = None) -> Graph:
     place: dict[int, Value] = {}  # a node's value among the new ones
     kept: dict[int, list[int]] = {}  # the old rows that it holds, in order
 
-    def rows_of(number: int, rows: Sequence[int]) -> Value:
+    def rows_of(number: int, rows: Collection[int]) -> Value:
         """New value of old rows; a single row stands for any."""
         known = kept[number]
         if graph.nodes[number].rows == 1:
