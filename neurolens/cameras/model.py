@@ -217,7 +217,7 @@ class OnnxFilm:
     def sample(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `LensFilm.sample`."""
         rays = {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None]}
-        done = run_batches(self._path, self._session, tuple(_OUTPUTS), rays, {}, 3 * RAYS_A_CALL // 2)
+        done = run_batches(self._path, self._session, tuple(_OUTPUTS), rays, {}, RAYS_A_CALL)
         return camera_rays({name: np.atleast_2d(values) for name, values in zip(_OUTPUTS, done, strict=True)})
 
 
