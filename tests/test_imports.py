@@ -7,8 +7,6 @@ base <- graph <- modelfile <- optics <- surrogates <- evaluate <- commands <- cl
                                          render    <- mitsuba  <- evaluate
 """
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

@@ -27,13 +27,11 @@ from neurolens.optics.trace import trace
 
 
 def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) -> list[float]:
-    """Values at a place between rows of values: exactly the row at its own place, between two rows linear or cubic.
+    """Values [M] at a place between rows of values [R][M] at ascending places x [R]: a row's own at its place.
 
-    Piecewise cubic with the derivatives of Fritsch and Butland (1984), "A method for constructing local monotone
-    piecewise cubic interpolants": a value stays between those of its two rows, so that no gap can turn negative.
-
-    Args:
-        x: [R] ascending places. rows: [R][M] values. place: from x[0] to x[-1].
+    Of two rows linear, else piecewise cubic with the derivatives of Fritsch and Butland (1984), "A method for
+    constructing local monotone piecewise cubic interpolants": a value stays between those of its two rows, so that no
+    gap can turn negative.
     """
     if len(x) == 1:
         return list(rows[0])
@@ -249,16 +247,13 @@ _NEAREST = 0.5  # of the way from the last surface to the paraxial image: no fil
 def best_focus_z_mm(
     lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[float, float] = (400.0, 700.0)
 ) -> float:
-    """Film plane (lens frame, mm) of least RMS spot for the axial point `focus_m` metres from it.
+    """Film plane (lens frame, mm) of least RMS spot for the axial point `focus_m` metres from it, for a range of light.
 
     Rays of the colours of `film_plane.colours` are spread evenly over the entrance pupil, and those that stop and rims
     let through count: the focus of a lens with spherical aberration shifts as it is stopped down. The plane follows in
     closed form: the spot's second moment is a parabola in z. With pure third-order spherical aberration it lies two
     thirds of the way from the paraxial to the marginal focus; of a lens with cylinders it is that of the whole spot. A
     pinhole's film stays in place.
-
-    Args:
-        wavelength_nm: range of the light.
 
     Raises:
         InputError: no ray passes, or focus nearer than four focal lengths.
@@ -409,15 +404,11 @@ class Breath:
 
 
 def breathing(lens: Lens, focus_m: Sequence[float], focus: Focus = "paraxial") -> list[Breath]:
-    """The lens at several focus distances.
+    """The lens, in the zoom position wanted, at several focus distances from object to film, `inf` allowed.
 
     With h the radius of the image circle at infinity focus (the film does not grow) and x' the film's distance behind
     the rear focal point: the magnification is -x'/f, and the chief ray of the film's edge leaves at
     atan(h / `paraxial.chief_reach_mm`).
-
-    Args:
-        lens: in the zoom position wanted.
-        focus_m: distances from object to film, `inf` allowed.
 
     Raises:
         InputError: no distance, or one that the lens does not reach; "internal" for a lens without focus states.

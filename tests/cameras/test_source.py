@@ -1,7 +1,5 @@
 """Cameras as source code: the rays of the camera itself, its constants, and an integrator of its own in C++."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

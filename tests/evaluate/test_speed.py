@@ -1,7 +1,5 @@
 """The timing harness: what it reports, never how fast. Thresholds belong to `make bench`."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Ghosts as compiled code against the exact path by path, closed forms, and what light may not do."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

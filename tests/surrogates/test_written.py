@@ -1,7 +1,5 @@
 """What exported files hold: the card, the coefficients, source code; what is refused when damaged."""
 
-from __future__ import annotations
-
 import base64
 import json
 import math

@@ -1,7 +1,5 @@
 """Models in every form: torch in float32, ONNX by onnxruntime, C compiled, GLSL by a software OpenGL."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile
