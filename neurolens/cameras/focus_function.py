@@ -24,7 +24,8 @@ SMALLEST = 1 / 16  # of the widest stop: at smaller ones the film stays
 _SAMPLES = (8, 12)  # distances and stops at which the film is placed, and where errors are measured
 _CHECKS = (4, 6)
 # Degrees in 1 / distance and in the stop's radius, and the error (mm) that is enough.
-_BEST, _BEST_MM = ((3, 2), (4, 4), (5, 6), (6, 8), (6, 10)), 2e-4
+_SAMPLES_OF_STATES = (5, 8)  # at each of the nodes
+_BEST, _BEST_MM = ((3, 2), (4, 4), (4, 6), (5, 6), (6, 8), (6, 10)), 2e-4
 _PARAXIAL, _PARAXIAL_MM = tuple((n, 0) for n in range(2, 13)), 1e-5
 _RISING, _RISING_MM = 200, 1e-4  # distances at which the film must rise; a fall by less is rounding
 
@@ -58,10 +59,11 @@ class Focusing:
 
 
 class FilmFunction(NamedTuple):
-    """The film's position as a program, and its largest error (mm) at places between those of the fit."""
+    """The film's position as a graph and its program, and its largest error (mm) at places between those of the fit."""
 
     program: Program
     error_mm: float
+    graph: Graph
 
 
 def number_of(axes: Sequence[Axis], nodes: Sequence[float], rule: str = "") -> float | Program:
@@ -96,19 +98,24 @@ def film_function(
     """
     moved = np.isfinite(nodes[0].nearest_m)
     choices, enough = (_BEST, _BEST_MM) if focus == "best" else (_PARAXIAL, _PARAXIAL_MM)
+    samples = _SAMPLES_OF_STATES if axes and focus == "best" else _SAMPLES
+    if focus == "paraxial":
+        samples = (_PARAXIAL[-1][0] + 4, 1)
+    choices = tuple((i, j) for i, j in choices if i < samples[0] and j < samples[1])
 
     def grid(distances: Array, stops: Array) -> tuple[Array, Array]:
         by_stop = {"best": SMALLEST + (1 - SMALLEST) * stops, "widest": np.ones(1), "paraxial": np.zeros(0)}
         return distances if moved else np.zeros(1), by_stop[focus]
 
-    fit, check = grid(*(_roots(n) for n in _SAMPLES)), grid(*(np.linspace(0, 1, n) for n in _CHECKS))
+    fit, check = grid(*(_roots(n) for n in samples)), grid(*(np.linspace(0, 1, n) for n in _CHECKS))
     placed = np.array([node.places(*fit) for node in nodes])
     checked = [(state, lens, lens.places(*check)) for state, lens in between or [((), nodes[0])]]
     found: list[FilmFunction] = []
     for degrees in choices:
-        program = _fitted(nodes, axes, placed, fit, degrees)
+        graph = _fitted(nodes, axes, placed, fit, degrees)
+        program = lower(graph)
         error = max(_error(program, axes, *known, check) for known in checked)
-        found.append(FilmFunction(program, error))
+        found.append(FilmFunction(program, error, graph))
         if error < enough:
             break
     return min(found, key=lambda f: f.error_mm)
@@ -131,7 +138,7 @@ def _roots(count: int) -> Array:
 
 def _fitted(
     nodes: Sequence[Focusing], axes: Sequence[Axis], placed: Array, at: tuple[Array, Array], degrees: tuple[int, int]
-) -> Program:
+) -> Graph:
     """The function of polynomials of these degrees: least squares of what is `placed` [nodes, D, S] at each node."""
     moved, by_stop = (len(places) > 1 for places in at)
     across, along = degrees[0] * moved, degrees[1] * by_stop
@@ -153,7 +160,7 @@ def _fitted(
         used = exponents[:, [k for k, there in enumerate((moved, by_stop)) if there]]
         z = g.dot(numbers[0:count], g.polynomial(used, np.eye(count), g.concat(*rows)))
     g.outputs["film_z_mm"] = z.maximum(film[0]).minimum(film[1]) if film else z
-    return lower(g)
+    return g
 
 
 def _centred(share: Any) -> Any:

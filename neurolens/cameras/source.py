@@ -7,7 +7,7 @@ written in: from a film point and two random numbers to a weighted ray, at one f
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -79,19 +79,17 @@ def model_extras(model: OnnxLens, *, film: bool = True, stop_mm: float | None = 
 
     Returns them with lines for the comment: what the functions are, their range and measured error.
     """
-    axes, constants, functions = model.axes, dict[str, float](), dict[str, Program]()
+    axes = model.axes
     cards = model.card["states"]["nodes"] if axes else [model.card]
-    for names, part, key, rule in _NUMBERS:
-        for name, values in zip(names, np.atleast_2d(np.array([card[part][key] for card in cards]).T), strict=True):
-            found = number_of(axes, values, rule)
-            if isinstance(found, Program):
-                functions[name] = found
-            else:
-                constants[name] = found
-    for axis in axes:
-        (name,) = state_names([axis])
-        word, _, unit = name.partition("_")
-        constants |= {f"{word}_{end}_{unit}": value for end, value in zip(("min", "max"), axis.range, strict=True)}
+    constants, functions = followed(
+        axes,
+        [
+            (name, values, rule)
+            for names, part, key, rule in _NUMBERS
+            for name, values in zip(names, np.atleast_2d(np.array([card[part][key] for card in cards]).T), strict=True)
+        ],
+    )
+    constants |= state_ranges(axes)
     lines = [f"Functions of the state ({', '.join(state_names(axes))}): {', '.join(functions)}."] if functions else []
     if film:
         nodes = [model_focusing(model, state, stop_mm) for state in product(axes)] if axes else None
@@ -104,6 +102,26 @@ def model_extras(model: OnnxLens, *, film: bool = True, stop_mm: float | None = 
         )
         functions, lines = functions | placed, lines + said
     return Extras(constants, functions), lines
+
+
+def followed(
+    axes: Sequence[Axis], numbers: Iterable[tuple[str, Sequence[float], str]]
+) -> tuple[dict[str, float], dict[str, Program]]:
+    """Numbers by name, their values at the nodes and their rule (see `number_of`), as constants or functions."""
+    found = {name: number_of(axes, values, rule) for name, values, rule in numbers}
+    return (
+        {name: value for name, value in found.items() if isinstance(value, float)},
+        {name: value for name, value in found.items() if isinstance(value, Program)},
+    )
+
+
+def state_ranges(axes: Sequence[Axis]) -> dict[str, float]:
+    """The range of each of a state's numbers as constants."""
+    constants: dict[str, float] = {}
+    for axis, name in zip(axes, state_names(axes), strict=True):
+        word, _, unit = name.partition("_")
+        constants |= {f"{word}_min_{unit}": axis.range[0], f"{word}_max_{unit}": axis.range[1]}
+    return constants
 
 
 def model_focusing(model: OnnxLens, state: Sequence[float] = (), stop_mm: float | None = None) -> Focusing:
@@ -150,7 +168,7 @@ def film_extras(
         made["film_z_paraxial_mm"] = ("paraxial", reach, "the paraxial image", [])
     functions, lines = {}, []
     for name, (focus, limits, what, stop) in made.items():
-        functions[name], error = film_function(nodes, axes, between, focus)
+        functions[name], error, _ = film_function(nodes, axes, between, focus)
         given = ", ".join([*state, *distance, *(stop if by_stop else [])])
         lines.append(
             f"{name}({given}): film plane of {what}, {', '.join(limits)}, beyond as at the end; within "

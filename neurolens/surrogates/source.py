@@ -47,11 +47,13 @@ if TYPE_CHECKING:
 # Nothing fixed. Wavelengths are fixed in the models themselves, one model a table; film plane and stop here too.
 FREE = Fix()
 WRITERS = {"c": write_c, "glsl": write_glsl}
+OSL = "osl"  # of whole cameras: `cameras.osl`
 MOST_NODES = 256  # of a model of many states
 _SAME_MM = 1e-5  # a mm of focal length: what rounding may do between two forms of one model
 MOST_WEIGHTS = 20_000  # each is a step, and compilers take minutes; larger products of matrices go by blocks
 _WIDTH = 110
-# Keywords of C11, C++20 and GLSL 4.60 and words reserved there, functions of GLSL, names of the code that is written.
+# Keywords of C11, C++20 and GLSL 4.60 and words reserved there, types and functions of GLSL and OSL,
+# names of the code that is written.
 _WORDS = """
     alignas alignof and and_eq asm auto bitand bitor bool break case catch char char8_t char16_t char32_t class co_await
     co_return co_yield compl concept const const_cast consteval constexpr constinit continue decltype default delete do
@@ -64,6 +66,7 @@ _WORDS = """
     precision readonly resource sample sampler shared smooth subroutine superp uniform varying writeonly
     abs all any clamp cross distance div dot equal fract inverse length main max min mix mod normalize outer reflect
     refract round sign step texture transpose radians degrees isnan isinf
+    color point vector normal matrix string closure shader surface displacement volume light noise hash random emit
     size_t ptrdiff_t max_align_t offsetof linux unix errno signal
     ray rays i r c x y count band known band_first
 """.split()
@@ -164,12 +167,12 @@ def program_of_states(file: str | Path, data: bytes, card: Mapping[str, Any]) ->
 
 
 def checked_name(language: str, lens_id: str, name: str | None) -> str:
-    if language not in WRITERS:
-        raise InputError("export", "to", language, f"one of {', '.join(WRITERS)}")
+    if language not in (*WRITERS, OSL):
+        raise InputError("export", "to", language, f"one of {', '.join((*WRITERS, OSL))}")
     own = identifier(lens_id) if name is None else name
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,99}", own) or "__" in own or _taken(own):
         expected = (
-            "letters, digits and single underscores, a letter first, and no word of C, C++ or GLSL or of the code"
+            "letters, digits and single underscores, a letter first, and no word of C, C++, GLSL or OSL or of the code"
         )
         raise InputError("export", "name", own, expected)
     return own

@@ -8,6 +8,7 @@ from pathlib import Path
 import lens_models
 import numpy as np
 import pytest
+import torch
 from camera_helpers import film_rays
 from command_line import failure
 from numpy.typing import ArrayLike, NDArray
@@ -15,14 +16,17 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.base import status as st
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.focus_function import Focusing
+from neurolens.cameras.focus_function import Focusing, number_of
 from neurolens.cameras.fused import lens_graph
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.source import camera_program, film_extras, model_extras
 from neurolens.cli import main
+from neurolens.commands.export_lens import gap_axis, lens_program, pupil_planes_mm
 from neurolens.optics.focusing import best_focus_of_stops_mm, best_focus_z_mm
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import film_z_mm, first_order
+from neurolens.optics.surfaces import Rays
+from neurolens.optics.trace import trace
 from neurolens.surrogates.domain import sample_domain
 
 ROOT = Path(__file__).parents[2]
@@ -135,6 +139,37 @@ def test_the_exact_lens_as_a_function(tmp_path: Path) -> None:
     assert np.abs(found[:2] - wanted.scene_ray[:2])[:, passed].max() < 5e-4
     assert np.abs(found[2:4] - wanted.scene_ray[3:5])[:, passed].max() < 5e-6
     np.testing.assert_allclose(found[4][passed], wanted.transmittance[passed], rtol=1e-4)
+
+
+@pytest.mark.parametrize("zoom_mm", [146.1, 80.3])
+def test_the_zoom_of_an_exact_lens_is_an_argument(zoom_mm: float) -> None:
+    """Between the source's positions: rays of the tracer through the lens zoomed there."""
+    lens = read_lens(LENS.with_name("nikon_zoom_70_200.toml"))
+    axis, error_mm = gap_axis(lens)
+    assert error_mm < 1e-4
+    nodes = [lens.at(zoom=v) for v in axis.nodes]
+    planes = pupil_planes_mm(nodes, (axis,))
+    program, at = lens_program(nodes, (axis,), planes), lens.at(zoom=zoom_mm)
+    film_z, random = best_focus_z_mm(at, 5.0), np.random.default_rng(3)
+    plane = number_of((axis,), planes)
+    pupil_z = plane if isinstance(plane, float) else float(plane.evaluate({"zoom_mm": zoom_mm})["value"])
+    film, pupil = random.uniform(-15, 15, (2, 400)), random.uniform(-16, 16, (2, 400))
+    names = ("film_x_mm", "film_y_mm", "pupil_x_mm", "pupil_y_mm", "wavelength_nm", "film_z_mm", "stop_radius_mm")
+    numbers = (*film, *pupil, 550.0, film_z, at.stop_radius_mm)
+    found = program.evaluate(dict(zip(names, numbers, strict=True)) | {"zoom_mm": zoom_mm})
+    way = np.stack([*(pupil - film), np.full(400, pupil_z - film_z)])
+    way /= np.sqrt((way**2).sum(0))
+    rays = Rays(*(torch.as_tensor(row) for row in (*film, np.full(400, film_z), *way)))
+    out = trace(at, rays, 550.0, towards="scene")
+    passed = out.status.numpy() == st.PASSED
+    assert passed.sum() > 60 and (found["status"] != out.status.numpy()).mean() < 0.01
+    passed &= found["status"] == st.PASSED
+    exact = np.stack([c.numpy() for c in out.rays])
+    assert np.abs(found["x_mm"] - exact[0])[passed].max() < 2e-3 and np.abs(found["dy"] - exact[4])[passed].max() < 2e-5
+    assert (
+        program.evaluate(dict(zip(names, numbers, strict=True)) | {"zoom_mm": 60.0})["status"].min()
+        == st.OUTSIDE_DOMAIN
+    )
 
 
 def run_compiled(language: str, source: str, folder: Path, given: str = "", *arguments: str) -> str:

@@ -124,6 +124,7 @@ def test_the_best_of_each_kind_has_the_smallest_error() -> None:
     assert [m.settings.label for m in make_models.best_of_each_kind(beyond)] == ["ols-40", "mlp-8x2"]
 
 
+@pytest.mark.slow
 def test_an_entry_is_fitted_checked_and_timed(tmp_path: Path) -> None:
     (tmp_path / "list.toml").write_text(
         "compile_exact = false\n[pairs]\ntrain = 3000\nheld_out = 3000\nrim = 3000\n"
