@@ -104,7 +104,7 @@ def _row(tracer: PhotonTracer, x: int, y: int, most: int, his: float | None, cou
     part(count - 1)  # compiles
     began = time.perf_counter()
     with ThreadPoolExecutor(threads) as pool:
-        books = sum(pool.map(part, range(0, count, _AT_ONCE))) / count
+        books = np.sum(list(pool.map(part, range(0, count, _AT_ONCE))), 0) / count
     seconds = time.perf_counter() - began
     by = books[:12]
     return Row(x, y, most, seconds, his, by.sum(), by[1:].sum(), by[2], by[4], by[5:].sum(), *books[12:])
