@@ -55,6 +55,7 @@ def build_parser() -> Parser:
         lens,
         mitsuba,
         models,
+        projection,
         render,
         stmap,
         train,
@@ -63,8 +64,8 @@ def build_parser() -> Parser:
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    commands = lens, analyse, glass, convert, train, models, evaluate, export, render, stmap, flare, mitsuba, bench
-    for command in commands:
+    read = lens, analyse, glass, convert, stmap, projection
+    for command in (*read, train, models, evaluate, export, render, flare, mitsuba, bench):
         command.add_parser(subparsers)
     return parser
 
