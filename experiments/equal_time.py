@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -29,14 +28,13 @@ from experiments.equal_time_errors import (
     weights,
 )
 from neurolens.base.files import atomic_path, fingerprint_of, sha256_of
-from neurolens.cameras.build import FUSED, Shot, make_camera
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.exact import ExactCamera, FusedExactCamera
+from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.onnxlens import load_model
+from neurolens.evaluate import scenes
 from neurolens.evaluate.image import EPS, flip, flip_map
 from neurolens.evaluate.records import plain
 from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import CameraSettings, Scene, files_named, load_scene
@@ -44,9 +42,8 @@ from neurolens.surrogates.domain import Domain
 
 EXACT, THIN = "exact", "thin lens"
 LENS = "laikin_double_gauss_50"
-# Name in the tables to the file in models/; those named fused run as compiled C (`cameras.fused`).
+# Name in the tables to the file in models/.
 MODELS = {"ols-28": f"{LENS}.ols-28.onnx", "mlp-16x2": f"{LENS}.mlp-16x2.onnx"}
-MODELS["fused mlp-16x2"] = MODELS["mlp-16x2"]
 FUSED_EXACT = "fused exact"
 EXACTS = (EXACT, FUSED_EXACT)
 
@@ -57,26 +54,16 @@ def scene_cameras(shot: CameraSettings) -> tuple[dict[str, Camera], ExactCamera]
     All of the lens share the pupil bounds of the models' domain, so that the same random numbers are the same rays.
     """
     lens = read_lens(lab.LENSES / f"{LENS}.toml")
-    data = first_order(lens)
-    widest = shot.f_number is None or shot.f_number < data.f_number
-    f_number = data.f_number if widest else float(shot.f_number or 0)
-    bounds = Domain.from_dict(load_model(lab.MODELS / MODELS["ols-28"]).card["domain"]).bounds
-    film = (shot.film_width_mm, shot.film_height_mm)
-    set_ = Shot(film, shot.focus_m, None if widest else f_number, wavelength_nm=shot.wavelengths_nm)
-
-    same: dict[str, Any] = {
-        "film_mm": film,
-        "focus_m": shot.focus_m,
-        "f_number": set_.f_number,
-        "wavelength_nm": shot.wavelengths_nm,
-        "bounds": bounds,
-    }
-    cameras: dict[str, Camera] = {EXACT: ExactCamera(lens, **same)}
-    for name, model in MODELS.items():
-        cameras[name] = make_camera(f"{FUSED if name.startswith('fused') else ''}{lab.MODELS / model}", set_)
-    cameras[FUSED_EXACT] = FusedExactCamera(lens, **same)
-    cameras[THIN] = make_camera(f"thin:{lab.LENSES / LENS}.toml", set_)
-    return cameras, ExactCamera(lens, dtype="float64", **same)
+    files = {name: lab.MODELS / file for name, file in MODELS.items()}
+    domain = Domain.from_dict(load_model(files["ols-28"]).card["domain"])
+    plain = scenes.scene_cameras(lens, domain, files, shot)
+    fused = scenes.scene_cameras(lens, domain, {"mlp-16x2": files["mlp-16x2"]}, shot, fused=True)
+    cameras = {EXACT: plain[EXACT], **{name: plain[name] for name in files}}
+    cameras |= {"fused mlp-16x2": fused["mlp-16x2"], FUSED_EXACT: fused[EXACT], THIN: plain[THIN]}
+    settings = {name: plain[EXACT].settings[name] for name in ("focus_m", "f_number")}
+    film, light = plain[EXACT].film_mm, shot.wavelengths_nm
+    truth = ExactCamera(lens, dtype="float64", film_mm=film, wavelength_nm=light, bounds=domain.bounds, **settings)
+    return cameras, truth
 
 
 _SOURCES = ("base", "cameras", "graph", "modelfile", "optics", "render")  # folders that a picture depends on

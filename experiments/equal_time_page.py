@@ -36,7 +36,7 @@ from experiments.equal_time import (
 )
 from experiments.equal_time_errors import Estimate, crossover_s, log_interpolate
 from neurolens.analysis.plot_style import FAINT, INK, drawing, plain_log_ticks
-from neurolens.base.files import atomic_write_text
+from neurolens.base.files import atomic_write_text, write_json
 from neurolens.evaluate.figures import side_by_side
 from neurolens.evaluate.plots import family_colour
 from neurolens.evaluate.records import plain
@@ -68,7 +68,7 @@ scene's tables are not in them.
 def write(results: Sequence[SceneResult], folder: Path) -> str:
     """Write tables of all scenes and the pictures of each; returns the page."""
     data = {"machine": lab.machine(), "scenes": [_scene_data(r) for r in results]}
-    lab.write_json(folder / "equal_time.json", plain(data))
+    write_json(folder / "equal_time.json", plain(data))
     for result in results:
         draw(result, folder)
     text = page(results)

@@ -27,11 +27,11 @@ from neurolens.graph.ir import Graph
 from neurolens.graph.newton import solve, with_jacobian
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.optics.surfaces import Rays
+from neurolens.optics.sag import front_rays
 from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, front_rays, scene_system, stop_system
+from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, scene_system, stop_system
 from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
@@ -43,12 +43,11 @@ AWAY = 1.0
 _STARTS = 7
 
 
-def measure_lens(file: Path, rays: int, uniform: int = 10_000, terms: int = 64, raw: bool = False) -> Row:
+def measure_lens(file: Path, rays: int, uniform: int = 10_000, terms: int = 64) -> Row:
     """One record: lens, focus_m, and the shares of rays that each iteration finds.
 
     Args:
         rays: that pass the lens (a tenth otherwise than by three steps). uniform: stop points.
-        raw: whether a model as published too, of raw monomials chosen by matching pursuit, is inverted both ways.
 
     Raises:
         InputError: a lens that cannot be fitted.
@@ -62,7 +61,7 @@ def measure_lens(file: Path, rays: int, uniform: int = 10_000, terms: int = 64, 
         inverse = fit_inverse(model, known.pairs)
         held_out = known.pairs.held_out.inputs
         few = held_out.select(slice(0, rays // 10))
-        record: Row = {
+        return {
             "lens": file.stem,
             "focus_m": ["inf" if math.isinf(f) else f for f in domain.focus_m],
             "fit": inverse.report,
@@ -75,10 +74,6 @@ def measure_lens(file: Path, rays: int, uniform: int = 10_000, terms: int = 64, 
             "uniform": _uniform(inverse, uniform),
             "rays": rays,
         }
-        if raw:
-            made = fit_inverse(fit_model(known, ModelSettings("omp", basis="raw", terms=40)), known.pairs)
-            record["raw"] = {"published": _published(made, few), "ours": convergence(made, few)}
-        return record
 
 
 def _domain(lens: Lens) -> Domain:
@@ -96,8 +91,8 @@ def _published(inverse: InverseModel, rays: FilmRays) -> dict[str, Any]:
     passed = forward.status == st.PASSED
     rays = rays.select(passed)
     x, y = forward.stop_x[passed], forward.stop_y[passed]
-    *position, v, _ = front_rays(model, Rays(*(c[passed] for c in forward.rays)), torch.float64)
-    wanted = torch.cat([torch.stack(position) / model.scales.position_mm, v])
+    position, v = torch.from_numpy(front_rays(model.front, *(c[passed].numpy() for c in forward.rays))[0]).split(2)
+    wanted = torch.cat([position / model.scales.position_mm, v])
     scene = _plain(scene_system(model), {"wanted": wanted, "wavelength_nm": rays.wavelength_nm[None]})
     return {"stop": _plain(stop_system(model), _stop_inputs(model, rays, x, y)), "scene": scene}
 
@@ -192,11 +187,6 @@ or none was found; "missed": of those, where one of 49 other starts leads to a r
 that have a ray, those that it does not find."""
 
 
-_RAW = """\
-The same where the model is as published: raw monomials, 20 coefficients per component, orthogonal matching pursuit.
-Its polynomials vary more off the data, and full steps from the first-order map leave the data."""
-
-
 def _share(title: str, path: str, rest: bool = False) -> lab.Column:
     """A share in percent; `rest`: what is missing to 1."""
 
@@ -229,22 +219,11 @@ def _map_columns(which: str) -> list[lab.Column]:
     ]
 
 
-_UNIFORM_KEYS = {
-    "passed": "passed",
-    "blocked": "blocked",
-    "outside": "outside",
-    "no ray": "unsolved",
-    "missed": "missed",
-}
+_OUTCOMES = ("passed", "blocked", "outside", "unsolved", "missed")
 _UNIFORM_COLUMNS = [
     lab.Column("lens", "lens"),
-    *(_share(title, f"uniform.{key}") for title, key in _UNIFORM_KEYS.items()),
+    *(_share("no ray" if k == "unsolved" else k, f"uniform.{k}") for k in _OUTCOMES),
     *_published_columns("uniform.published_missed", "uniform.published_away"),
-]
-_RAW_COLUMNS = [
-    *lab.columns(("lens", "lens"), ("map", "map")),
-    *_published_columns("missed", "away"),
-    _share("ours: 3", "converged", rest=True),
 ]
 
 
@@ -255,12 +234,6 @@ def page(records: Sequence[Row]) -> str:
     for which, title in _MAPS.items():
         parts += [f"## {title}", lab.table(_map_columns(which), done)]
     parts += ["## Stop points uniform over the stop", _UNIFORM, lab.table(_UNIFORM_COLUMNS, done)]
-    raw = [
-        {"lens": r["lens"], "map": m, **r["raw"]["published"][m], "converged": r["raw"]["ours"][m]["converged"]}
-        for r in done
-        for m in (_MAPS if "raw" in r else ())
-    ]
-    parts += ["## A model of raw monomials", _RAW, lab.table(_RAW_COLUMNS, raw)] if raw else []
     refused = [f"- {r['lens']}: {r['refused']}" for r in records if "refused" in r]
     return lab.page(*parts, *(["Not measured:", "\n".join(refused)] if refused else []))
 
@@ -268,7 +241,6 @@ def page(records: Sequence[Row]) -> str:
 OPTIONS = (
     lab.ONLY,
     lab.count("rays", 100_000, "per lens (default: 100000)", 1000),
-    lab.option("--raw", action="store_true", help="also invert a model of raw monomials (30 s per lens)"),
     lab.option("--again", action="store_true", help="measure the chosen lenses again"),
     lab.out(),
 )
@@ -282,7 +254,7 @@ def run(args: argparse.Namespace) -> None:
     text = page(list(records.values()))
     for file, _ in lab.stages(missing, lambda f: f.stem, args.quiet, 20.0):
         try:
-            records[file.stem] = measure_lens(file, args.rays, raw=args.raw)
+            records[file.stem] = measure_lens(file, args.rays)
         except InputError as error:
             records[file.stem] = {"lens": file.stem, "refused": str(error).removeprefix(f"{lab.ROOT}/")}
         rows = sorted(records.values(), key=lambda r: str(r["lens"]))

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.base.files import atomic_path, atomic_write_text
+from neurolens.base.files import atomic_path, atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
 from neurolens.commands.arguments import QUIET_HELP, whole
 from neurolens.evaluate.pages import markdown_table
@@ -207,12 +207,6 @@ def write_results(folder: Path, name: str, text: str, data: Any) -> str:
     atomic_write_text(folder / f"{name}.md", text)
     write_json(folder / f"{name}.json", data)
     return text
-
-
-def write_json(file: Path, data: Any) -> None:
-    """Write JSON atomically, its folder made."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(file, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
 def write_small_png(file: Path, pictures: Iterable[Any], most_bytes: int) -> None:

@@ -25,10 +25,10 @@ from experiments.promises import read_index
 from neurolens import __version__
 from neurolens.base.config import read_config
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of, sha256_of
+from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of, sha256_of, write_json
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.candidates import exact_candidates, fused_candidate, model_candidate
+from neurolens.evaluate.candidates import exact_candidates, model_candidate, model_candidates
 from neurolens.evaluate.check import check_model, check_states
 from neurolens.evaluate.describe import lens_files
 from neurolens.evaluate.experiment import DomainChoice, Experiment, LensChoice, check_names
@@ -177,7 +177,7 @@ _COLUMNS = lab.columns(
 def write_index(rows: Sequence[Row], left_out: Mapping[str, str], out: Path) -> None:
     """Write both; `left_out` gives the reason for each entry that has no models."""
     index = {"schema": 2, "command": "python -m experiments models", "versions": versions()}
-    lab.write_json(out / "index.json", index | {"models": list(rows), "left_out": dict(left_out)})
+    write_json(out / "index.json", index | {"models": list(rows), "left_out": dict(left_out)})
     reasons = "\n".join(f"- {state}: {reason}" for state, reason in left_out.items())
     parts = ["Not made:", reasons] if left_out else []
     atomic_write_text(out / "README.md", lab.page(_HEAD, lab.table(_COLUMNS, rows, "–"), *parts))
@@ -212,42 +212,38 @@ def make_models(
         except NeurolensError as error:
             reason = " ".join(str(error).split())
         known, left_out = _known(out)  # anew: another process may have made other entries meanwhile
-        left_out.pop(entry.state, None)
-        left_out |= {entry.state: reason} if reason else {}
-        written = {row["file"] for row in made}
-        for row in known:
-            if row["entry"] == entry.state and row["file"] not in written:
-                (out / row["file"]).unlink(missing_ok=True)
-        known = [*(row for row in known if row["entry"] != entry.state), *made]
-        write_index(_ordered(known, library), left_out, out)
-    if {e.state for e in entries} == {e.state for e in library.entry}:
-        states = {e.state for e in library.entry}
-        for row in known:
-            if row["entry"] not in states:
-                (out / row["file"]).unlink(missing_ok=True)
-        known = [row for row in known if row["entry"] in states]
-        left_out = {state: reason for state, reason in left_out.items() if state in states}
-    write_index(_ordered(known, library), left_out, out)
+        left_out = {k: v for k, v in left_out.items() if k != entry.state} | ({entry.state: reason} if reason else {})
+        _keep([*(row for row in known if row["entry"] != entry.state), *made], left_out, library, out, before=known)
+    known, left_out = _known(out)
+    states = {e.state for e in library.entry}
+    if {e.state for e in entries} < states:
+        states |= {*left_out, *(row["entry"] for row in known)}
+    left_out = {state: reason for state, reason in left_out.items() if state in states}
+    known = _keep([row for row in known if row["entry"] in states], left_out, library, out, before=known)
     broken = [f"{row['file']}: does not hold: {', '.join(row['broken'])}" for row in known if row.get("broken")]
     return [*(f"{state}: left out: {reason}" for state, reason in left_out.items()), *broken]
+
+
+def _keep(
+    rows: Sequence[Row], left_out: Mapping[str, str], library: Library, out: Path, before: Sequence[Row] = ()
+) -> list[Row]:
+    """Write the index in the order of the list, others last, and remove files that only rows from `before` have."""
+    for file in {row["file"] for row in before} - {row["file"] for row in rows}:
+        (out / file).unlink(missing_ok=True)
+    place = {entry.state: i for i, entry in enumerate(library.entry)}
+    rows = sorted(rows, key=lambda row: place.get(row["entry"], len(place)))
+    write_index(rows, left_out, out)
+    return rows
 
 
 def _known(out: Path) -> tuple[list[Row], dict[str, str]]:
     """Rows and left-out entries of an existing index; empty for an unreadable one, which is replaced."""
     try:
-        rows = [row for row in read_index(out) if row.keys() >= {*_KEPT, "ns_per_ray", "speedup_over_compiled"}]
+        rows = [row for row in read_index(out) if row.keys() >= {*_KEPT, "entry", "ns_per_ray"}]
         left_out = json.loads((out / "index.json").read_text(encoding="utf-8")).get("left_out", {})
     except (InputError, OSError, ValueError):
         return [], {}
-    for row in rows:  # one of before entries were named
-        row.setdefault("entry", row["file"].removesuffix(".onnx").rpartition(".")[0])
     return rows, dict(left_out)
-
-
-def _ordered(rows: Sequence[Row], library: Library) -> list[Row]:
-    """In the order of the list, others last."""
-    place = {entry.state: i for i, entry in enumerate(library.entry)}
-    return sorted(rows, key=lambda row: place.get(row["entry"], len(place)))
 
 
 def fingerprint(entry: Entry, pairs: PairSettings) -> str:
@@ -312,9 +308,7 @@ def _times(
 ) -> dict[str, Row]:
     """What the index says of the times of models, by their labels: one race with the exact tracer compiled."""
     candidates = exact_candidates(lens, domain, compiled=library.compile_exact and entry.promise)
-    candidates += [model_candidate(label, load_model(file), domain.stop_radius_mm) for label, file in files.items()]
-    fused = (fused_candidate(f"{label} fused", file, domain) for label, file in files.items())
-    candidates += [c for c in fused if c is not None]
+    candidates += model_candidates(files, domain)
     with progress.stage(f"{entry.state}: race") as report:
         timed = race(candidates, domain, report=report)
     found = {}
@@ -351,7 +345,7 @@ def time_models(library: Library, entries: Sequence[Entry], out: Path, progress:
             times = _times(entry, library, lens, entry.domain.of(lens), files, progress)
         for row in mine:
             row |= times[row["model"]]
-        write_index(_ordered(rows, library), left_out, out)
+        _keep(rows, left_out, library, out)
     return missing
 
 

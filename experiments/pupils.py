@@ -42,10 +42,6 @@ class Case:
     theirs: dict[str, float] = field(default_factory=dict)
     source: str = ""
 
-    @property
-    def name(self) -> str:
-        return f"{self.lens.rsplit('_', 1)[0].replace('_', ' ')} {self.focal_length_mm:g} mm"
-
 
 def _steinert(lens: str, mm: float, figures: dict[float, tuple[float, float]], name: str = "") -> list[Case]:
     source = f"Steinert 2009, Table 5.2{f', {name}' if name else ''}"
@@ -78,36 +74,19 @@ SAMPLES = 2**17
 SampleFunction = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 
-@dataclass(frozen=True)
-class Rate:
-    """Of one method: share of the rays from lit film points that pass; irradiance found over the true one (mean over
-    the film); search time in s; time of a sample in ns."""
-
-    passed: float
-    light: float
-    search_s: float
-    sample_ns: float
-
-
-@dataclass(frozen=True)
-class Passage:
-    """Rates of a case by method; the lit radius, the dark share of the film, light that `OURS` is known to lose."""
-
-    case: Case
-    rates: dict[str, Rate]
-    lit_radius_mm: float
-    dark: float
-    lost: float
-
-
 def camera_of(case: Case) -> ExactCamera:
     """The lens of a case on `FILM_MM`, focused at infinity."""
     lens = read_lens(lab.LENSES / f"{case.lens}.toml").at(focal_length_mm=case.focal_length_mm, f_number=case.f_number)
     return ExactCamera(lens, film_mm=FILM_MM, focus_m=math.inf)
 
 
-def measure(case: Case, samples: int = SAMPLES) -> Passage:
-    """Rates of every method for a case, in light of 400 to 700 nm."""
+def measure(case: Case, samples: int = SAMPLES) -> lab.Row:
+    """A case in light of 400 to 700 nm.
+
+    Returns: the case; lit_radius_mm; dark, the share of the film; lost, the share of light that `OURS` is known to
+        lose; and rates of every method: the share of the rays from lit film points that pass, light (irradiance found
+        over the true one, mean over the film), search_s, and sample_ns of a sample.
+    """
     start = time.perf_counter()
     camera = camera_of(case)
     found = time.perf_counter() - start
@@ -121,9 +100,19 @@ def measure(case: Case, samples: int = SAMPLES) -> Passage:
         search_s = found if name == OURS else time.perf_counter() - start
         passed, light = _irradiance(camera, pupil, film, square, wavelength)
         sample_ns = _nanoseconds(pupil.sample, film, square, wavelength)
-        rates[name] = Rate(float(passed.mean()), light / true, search_s, sample_ns)
-    lost = lost_light(camera, film, square, wavelength)
-    return Passage(case, rates, outline.film_radius_mm, 1 - film.shape[1] / samples, lost)
+        rate = {"passed": float(passed.mean()), "light": light / true, "search_s": search_s, "sample_ns": sample_ns}
+        rates[name] = rate
+    return {
+        "lens": case.lens,
+        "focal_length_mm": case.focal_length_mm,
+        "f_number": case.f_number,
+        "lit_radius_mm": outline.film_radius_mm,
+        "dark": 1 - film.shape[1] / samples,
+        "lost": lost_light(camera, film, square, wavelength),
+        "theirs_percent": case.theirs,
+        "source": case.source,
+        "rates": rates,
+    }
 
 
 def true_irradiance(camera: ExactCamera, samples: int) -> float:
@@ -267,12 +256,16 @@ this project before, between 33 film radii. outlines (ours): `neurolens.cameras.
 """
 
 
-def _rate(method: str, p: Passage) -> str:
-    theirs = p.case.theirs.get(method)
-    return f"{100 * p.rates[method].passed:.1f}" + (f" [{theirs:g}]" if theirs is not None else "")
+def _name(row: lab.Row) -> str:
+    return f"{row['lens'].rsplit('_', 1)[0].replace('_', ' ')} {row['focal_length_mm']:g} mm"
 
 
-_LENS = (("lens", "case.name"), ("f/", "case.f_number", "g"))
+def _rate(method: str, row: lab.Row) -> str:
+    theirs = row["theirs_percent"].get(method)
+    return f"{100 * row['rates'][method]['passed']:.1f}" + (f" [{theirs:g}]" if theirs is not None else "")
+
+
+_LENS = (("lens", _name), ("f/", "f_number", "g"))
 _RATES = lab.columns(
     *_LENS,
     ("dark %", "dark", ".1f", 100),
@@ -284,10 +277,10 @@ _RATES = lab.columns(
 _LIGHT = lab.columns(*_LENS, *((method, f"rates.{method}.light", ".1f", 100) for method in METHODS))
 
 
-def page(passages: Sequence[Passage], pixel: Sequence[Sequence[float]], samples: int) -> str:
+def page(passages: Sequence[lab.Row], pixel: Sequence[Sequence[float]], samples: int) -> str:
     """The whole page in Markdown; `pixel`: of `pixel_rates`."""
     width, height = FILM_MM
-    sources = dict.fromkeys(f"- {p.case.name}: {p.case.source}." for p in passages if p.case.source)
+    sources = dict.fromkeys(f"- {_name(p)}: {p['source']}." for p in passages if p["source"])
     parts = [_INTRO.format(width=width, height=height, samples=samples), lab.table(_RATES, passages), _METHODS]
     parts += ["## Light found, percent", lab.table(_LIGHT, passages), "Figures in brackets:", "\n".join(sources)]
     if pixel:
@@ -299,20 +292,6 @@ def page(passages: Sequence[Passage], pixel: Sequence[Sequence[float]], samples:
             lab.table(head, rows),
         ]
     return lab.page(*parts)
-
-
-def _json(p: Passage) -> dict[str, Any]:
-    return {
-        "lens": p.case.lens,
-        "focal_length_mm": p.case.focal_length_mm,
-        "f_number": p.case.f_number,
-        "lit_radius_mm": p.lit_radius_mm,
-        "dark": p.dark,
-        "lost": p.lost,
-        "theirs_percent": p.case.theirs,
-        "source": p.case.source,
-        "rates": {name: vars(rate) for name, rate in p.rates.items()},
-    }
 
 
 OPTIONS = (lab.count("rays", SAMPLES, "rays per method (default 131072)", 1000), lab.ONLY, lab.out())
@@ -328,5 +307,5 @@ def run(args: argparse.Namespace) -> None:
             done.append(measure(case, args.rays))
             report(len(done) / (len(cases) + 1))
         pixel = [] if args.only else list(pixel_rates(args.rays))
-    data = {"film_mm": FILM_MM, "samples": args.rays, "cases": [_json(p) for p in done], "tessar_pixel": pixel}
+    data = {"film_mm": FILM_MM, "samples": args.rays, "cases": done, "tessar_pixel": pixel}
     print(lab.write_results(args.out, "passage", page(done, pixel, args.rays), data))

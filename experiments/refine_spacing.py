@@ -20,6 +20,7 @@ from experiments import lab
 from neurolens import __version__
 from neurolens.analysis.bundles import bundle
 from neurolens.analysis.fields import Scene
+from neurolens.base.files import write_json
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
@@ -94,7 +95,7 @@ def run(args: argparse.Namespace) -> None:
         "wavelengths_nm": WAVELENGTHS_NM,
         "versions": {"neurolens": __version__, "torch": torch.__version__},
     }
-    lab.write_json(args.out / "refine_spacing.json", record)
+    write_json(args.out / "refine_spacing.json", record)
     print((args.out / "refine_spacing.json").read_text())
 
 

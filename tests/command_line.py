@@ -1,7 +1,5 @@
 """Running commands as from a shell: what they print as JSON, and the one line of those that fail."""
 
-from __future__ import annotations
-
 import json
 from contextlib import redirect_stdout
 from functools import cache

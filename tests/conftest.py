@@ -1,5 +1,6 @@
 """Order of the tests: those marked slow run last, so that a mistake shows within seconds."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -40,6 +41,15 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def quick_races() -> Iterator[None]:
+    """Races of few rays and samples: no test judges a clock."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("neurolens.evaluate.speed.POOL", 16384)
+        patch.setattr("neurolens.evaluate.speed._SAMPLES", 1)
+        yield
 
 
 @pytest.fixture

@@ -4,8 +4,6 @@ Rays are [K, N] float32, bound as buffer 0; the result [M, N] is buffer 1, M the
 is no such OpenGL, with the reason on stderr; 4 where the shader does not compile.
 """
 
-from __future__ import annotations
-
 import ctypes
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Small surrogates of real lenses for tests, fitted in about a second each and kept while the tests run."""
 
-from __future__ import annotations
-
 import base64
 import json
 import math

@@ -1,7 +1,5 @@
 """The shipped prescriptions, read once, and rays that tests of several folders turn round or move."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from functools import cache

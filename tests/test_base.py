@@ -1,7 +1,5 @@
 """The base: files that are whole or not there, settings, what progress says of the time left."""
 
-from __future__ import annotations
-
 import io
 import math
 import os
@@ -18,7 +16,7 @@ from hypothesis import strategies as st
 from neurolens.base.config import apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, check_writable
-from neurolens.base.progress import Progress, duration
+from neurolens.base.progress import Progress
 
 
 def test_files_are_whole_or_as_before(tmp_path: Path) -> None:
@@ -265,14 +263,6 @@ class Clock:
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(0, "0.0 s"), (-1, "0.0 s"), (0.44, "0.4 s"), (9.96, "10 s"), (59.7, "1 min 00 s"), (185, "3 min 05 s")],
-)
-def test_durations_read_well(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
 
 
 def test_time_left_follows_the_pace_of_the_stage_and_the_plan_of_the_rest() -> None:

@@ -1,7 +1,5 @@
 """The command line from outside: help, one line an error, JSON with units in its keys, files that are whole."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """`neurolens render` when things go wrong: signals, places that cannot be written, checkpoints."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

@@ -1,7 +1,5 @@
 """Files and command lines of an attacker: one clear line each, in bounded time and memory (experiments/fuzz.py)."""
 
-from __future__ import annotations
-
 import os
 import struct
 import time

@@ -7,8 +7,6 @@ base <- graph <- modelfile <- optics <- surrogates <- evaluate <- commands <- cl
                                          render    <- mitsuba  <- evaluate
 """
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys
@@ -70,7 +68,8 @@ EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
     "neurolens.cameras.field": ({"optics"}, set()),  # first-order data of lenses that are traced
 }
 # Modules that load torch or onnx; others load these when they are needed.
-SLOW = {"neurolens.cameras.exact", "neurolens.cameras.outline_cache", "neurolens.graph.onnx"}
+SLOW = {"neurolens.cameras.exact", "neurolens.cameras.outline_cache", "neurolens.commands.export_lens"}
+SLOW |= {"neurolens.graph.onnx"}
 # What loads in a base install: these parts, and what converts lens files, looks up glass and writes C.
 LEAN = ("graph", "modelfile", "cameras", "render", "mitsuba", "commands", "cli", "base", "readers")
 LEAN_MODULES = {

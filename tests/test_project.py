@@ -1,7 +1,5 @@
 """What the project says of itself in several files agrees; the Python examples of its pages run."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """False passes and blocks at one stop, traced at that stop: `evaluate.measure` is held to it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

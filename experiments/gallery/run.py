@@ -33,7 +33,7 @@ from experiments.gallery.measures import MEASURES
 from experiments.gallery.settings import Effect, find_effects, read_effect
 from experiments.lab import Row as Record
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_write_text
+from neurolens.base.files import atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import number, print_json, table
@@ -90,7 +90,7 @@ def run_effect(
         "fingerprint": fingerprint,
     }
     draw(effect.title, rows, out / f"{effect.name}.png")
-    lab.write_json(out / f"{effect.name}.json", _plain(record))
+    write_json(out / f"{effect.name}.json", _plain(record))
     return record
 
 

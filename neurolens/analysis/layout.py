@@ -88,10 +88,7 @@ class Layout(Result):
 def layout_profile(scene: Scene, film_radius_mm: float | None = None) -> Layout:
     """Section of a lens with meridional fans of rays to the axis, 70% and the edge of the film, d line.
 
-    Args:
-        film_radius_mm: edge of the film; that of the image circle if not given.
-
-    A field from which no ray of the section passes has no rays.
+    The edge of the film is that of the image circle if not given. A field of which none passes has no rays.
     """
     lens = scene.lens
     radius = scene.image_radius_mm if film_radius_mm is None else film_radius_mm

@@ -130,8 +130,7 @@ def _diffraction(
 def diffraction_image(rays: Bundle, centre_mm: tuple[float, float], half_mm: float, points: int = _POINTS) -> Array:
     """Diffraction image of a bundle of one field and one wavelength, [points, points]; see `Psf.diffraction`.
 
-    Args:
-        centre_mm: tangential and sagittal centre of the image, from the chief ray's film point.
+    Its centre is given as tangential and sagittal distance from the chief ray's film point.
     """
     wave = 2 * math.pi / (rays.wavelength_nm[0] * 1e-6)
     keep = rays.passed[0, 0]

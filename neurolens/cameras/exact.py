@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
+from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
-from neurolens.cameras.fused import FusedFilm, LensGraph
+from neurolens.cameras.fused import Compiled, FusedFilm, LensGraph
 from neurolens.cameras.lens_film import LensFilm, SceneRays
 from neurolens.cameras.lens_state import axial_transmittance, lens_state
 from neurolens.cameras.outline_cache import kept_outline, search_key
@@ -244,7 +244,7 @@ class ExactCamera:
             return passes_at_any_azimuth(self.lens, r, film_z, u, v, pupil_z, wavelength_nm, self.film_mm).numpy()
 
 
-class FusedExactCamera(ExactCamera):
+class FusedExactCamera(Compiled, ExactCamera):
     """A prescription without coatings and absorption as a compiled camera: the rays of `ExactCamera` to rounding.
 
     Args and attributes are those of `ExactCamera`, whose `dtype` is float32 here; for differentials see `FusedFilm`.
@@ -253,26 +253,11 @@ class FusedExactCamera(ExactCamera):
         InputError: as `ExactCamera`; no C compiler; coatings or glass that absorbs.
     """
 
-    rays_a_call = MANY_RAYS_A_CALL
-
     def __init__(self, lens: Lens, **kwargs: Any) -> None:
         check_bare(lens)
         super().__init__(lens, **kwargs)
         self._fused = FusedFilm(self.film, self.lens_graph(), self.film_mm)
         self.settings |= {"runtime": "fused"}
-
-    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
-        return self._fused.sample(film_mm, pupil, wavelength_nm)
-
-    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays, which come from the same pass."""
-        return self._fused.sample(film_mm, pupil, wavelength_nm, True)
-
-    @property
-    def differentials_error(self) -> float | None:
-        """See `FusedFilm.moves_error`."""
-        return self._fused.moves_error
 
 
 def state_of(lens: Lens, wavelength_nm: tuple[float, float], nominal_mm: float | None = None) -> dict[str, Any]:

@@ -139,6 +139,26 @@ class FusedFilm:
         return {"rays": rays} | {name: np.array([[value]], np.float32) for name, value in per_call.items()}
 
 
+class Compiled:
+    """What compiled cameras have in place of their lens's own sampling: `FusedFilm`."""
+
+    _fused: FusedFilm
+    rays_a_call = MANY_RAYS_A_CALL
+
+    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
+        return self._fused.sample(film_mm, pupil, wavelength_nm)
+
+    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """As `sample`, with the differentials of the rays, which come from the same pass."""
+        return self._fused.sample(film_mm, pupil, wavelength_nm, True)
+
+    @property
+    def differentials_error(self) -> float | None:
+        """See `FusedFilm.moves_error`."""
+        return self._fused.moves_error
+
+
 def lens_graph(camera: OnnxCamera) -> LensGraph:
     """The graph of a model, in the state and with the stop of its camera.
 
@@ -151,7 +171,7 @@ def lens_graph(camera: OnnxCamera) -> LensGraph:
     return LensGraph(graph, scene.stop_radius_mm, scene.aperture, int(model.card["lens"].get("stop_surface", 0)))
 
 
-class FusedCamera(OnnxCamera):
+class FusedCamera(Compiled, OnnxCamera):
     """An exported model as a compiled camera: the rays of `OnnxCamera` to rounding, at a fraction of its cost.
 
     Args and attributes are those of `OnnxCamera`. Differentials (see `FusedFilm`) need no model exported with
@@ -161,29 +181,14 @@ class FusedCamera(OnnxCamera):
         InputError: as `OnnxCamera`; no C compiler; a model of operators that have no such form.
     """
 
-    rays_a_call = MANY_RAYS_A_CALL
-
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._fused = FusedFilm(self.film, lens_graph(self), self.film_mm)
         self.settings |= {"runtime": "fused"}
 
-    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
-        return self._fused.sample(film_mm, pupil, wavelength_nm)
-
-    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays, which come from the same pass."""
-        return self._fused.sample(film_mm, pupil, wavelength_nm, True)
-
     def for_worker(self) -> FusedCamera:
         """This camera: compiled code needs no session of its own."""
         return self
-
-    @property
-    def differentials_error(self) -> float | None:
-        """See `FusedFilm.moves_error`."""
-        return self._fused.moves_error
 
 
 class _Compiled:

@@ -1,10 +1,10 @@
-"""Ideal lenses: the thin lens, and the thick lens with the principal planes and pupils of a real one.
+"""Ideal lenses: the thick lens with principal planes and pupils of a real one, and the thin lens, where all are one.
 
-The thin lens has perfect focus on one plane and no aberration. The thick lens is that of Kolb, Mitchell and Hanrahan
-1995, "A Realistic Camera Model for Computer Graphics": a ray of a film point through the exit pupil goes on from the
-rear principal plane H' at the same height on the front one H, towards the object point conjugate to the film point. No
-aberration and no rims; but where the film's picture is, how large, and how its light falls off (cos^4 about the exit
-pupil) are the real lens's to first order.
+The thick lens is that of Kolb, Mitchell and Hanrahan 1995, "A Realistic Camera Model for Computer Graphics": a ray of a
+film point through the exit pupil goes on from the rear principal plane H' at the same height on the front one H,
+towards the object point conjugate to the film point. Perfect focus on one plane, no aberration and no rims; but where
+the film's picture is, how large, and how its light falls off (cos^4 about the exit pupil) are the real lens's to first
+order.
 """
 
 from __future__ import annotations
@@ -34,145 +34,7 @@ from neurolens.optics.film_plane import film_z_mm
 _QUADRATURE = 256  # points a side
 
 
-class _IdealLens:
-    """What the two share: an opening of `radius_mm`, round or of the shape of `aperture`; no colour."""
-
-    dispersive = False
-    achromatic = True
-    wavelength_nm: tuple[float, float] | None = None
-    radius_mm: float
-    aperture: Aperture | None
-    _part = 1.0  # of the exposure on the axis, that a shape lets through
-
-    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        raise NotImplementedError
-
-    def _part_through(self) -> float:
-        """Share of the light on the axis that passes the shape."""
-        if self.aperture is None:
-            return 1.0
-        square, wavelength = stratified(_QUADRATURE, (550.0, 550.0))
-        return float(self.sample(np.zeros_like(square), square, wavelength).weight.mean(dtype=np.float64))
-
-    def _stopped(self, opening_mm: NDArray[Any], status: NDArray[np.int32]) -> NDArray[np.int32]:
-        """The status, of those that pass outside the shape, at points [2, N] of the opening, the rim's."""
-        if self.aperture is None:
-            return status
-        inside = self.aperture.inside(opening_mm[0], opening_mm[1], self.radius_mm)
-        return np.where(inside | (status != st.PASSED), status, st.blocked(0, st.RIM)).astype(np.int32)
-
-
-class ThinLens(_IdealLens):
-    """A thin lens of focal length `focal_mm` and diameter `focal_mm / f_number`.
-
-    Args:
-        focal_mm: focal length.
-        f_number: focal length over aperture diameter; it does not change with focus.
-        focus_m: distance from film to the object in focus, or infinity.
-        film_mm: width and height of the film.
-        aperture: shape of the opening; None is round.
-        film_offset_mm: moves the film away from the lens (negative: towards it) after focusing.
-
-    Raises:
-        InputError: a value is not above 0, `focus_m` is below 4 focal lengths, or the offset leaves no way to the film.
-    """
-
-    name = "thin"
-    rays_a_call = MANY_RAYS_A_CALL
-
-    def __init__(
-        self,
-        focal_mm: float,
-        f_number: float,
-        focus_m: float,
-        film_mm: tuple[float, float] = (36.0, 24.0),
-        *,
-        aperture: Aperture | None = None,
-        film_offset_mm: float = 0.0,
-    ) -> None:
-        self.focal_mm = positive("focal_mm", focal_mm)
-        self.f_number = positive("f_number", f_number)
-        self.focus_m = positive("focus_m", focus_m, infinite=True)
-        self.film_mm = check_film(film_mm)
-        self.image_distance_mm = film_z_mm(self.focal_mm, 0.0, 0.0, self.focus_m)
-        self._object_distance_mm = 1e3 * self.focus_m - self.image_distance_mm
-        if film_offset_mm:
-            self.image_distance_mm = positive("film_offset_mm, film distance", self.image_distance_mm + film_offset_mm)
-            power = 1 / self.focal_mm - 1 / self.image_distance_mm  # negative: what is sharp is virtual
-            self._object_distance_mm = 1 / power if power else math.inf
-        self.radius_mm = self.focal_mm / (2 * self.f_number)
-        self.settings: dict[str, Any] = {
-            "camera": self.name,
-            "efl_mm": self.focal_mm,
-            "f_number": self.f_number,
-            "focus_m": None if math.isinf(self.focus_m) else self.focus_m,
-            "film_mm": list(self.film_mm),
-            "film_offset_mm": film_offset_mm,
-            "aperture": aperture and aperture.settings(),
-            "lens_state": ideal_state(self.focal_mm, self.f_number, self.image_distance_mm),
-        }
-        self.aperture = aperture
-        # On-axis integral of cos over solid angle, pi R^2 / (R^2 + s'^2), but for the constant.
-        self._exposure = 1.0 + (self.radius_mm / self.image_distance_mm) ** 2
-        self._part = self._part_through()
-
-    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays for film points [2, N] in mm and pupil samples [2, N]; the wavelength changes nothing."""
-        count = film_mm.shape[1]
-        behind = np.float32(self.image_distance_mm)
-        in_front = np.float32(self._object_distance_mm)
-        lens = concentric_disk(pupil) * np.float32(self.radius_mm)  # [2, N] mm
-
-        # All rays of a film point leave for the point where its ray through the lens centre meets the focus plane;
-        # written per unit of depth, infinity is no special case.
-        direction = np.empty((3, count), np.float32)
-        direction[:2] = -film_mm / behind - lens / in_front
-        direction[2] = -1.0
-        with np.errstate(over="ignore", invalid="ignore"):
-            direction /= np.sqrt(np.einsum("in,in->n", direction, direction))
-            # w = A cos^4 / s'^2 over the exposure on the axis.
-            tangent = (lens - film_mm) / behind
-            cos2 = 1.0 / (1.0 + np.einsum("in,in->n", tangent, tangent))
-
-        origin = np.empty((3, count), np.float32)
-        np.multiply(lens, np.float32(1e-3), out=origin[:2])
-        origin[2] = -1e-3 * behind
-
-        weight = cos2 * cos2 * np.float32(self._exposure / self._part)
-        status = self._stopped(lens, np.zeros(count, np.int32))
-        weight = np.where(status == st.PASSED, weight, np.float32(0))
-        return sound(CameraRays(origin, direction, weight, status), cos2, pupil)
-
-    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays, which turn about their points on the lens."""
-        rays = self.sample(film_mm, pupil, wavelength_nm)
-        slope = np.zeros((3, 2, film_mm.shape[1]), np.float32)
-        slope[0, 0] = slope[1, 1] = -1 / self.image_distance_mm
-        return replace(rays, differentials=towards(rays.direction / -rays.direction[2], slope, rays.origin_m))
-
-    def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """cos^4 of the angles between the axis and the rays from lens to film."""
-        tangent = (concentric_disk(pupil) * np.float32(self.radius_mm) - film_mm) / np.float32(self.image_distance_mm)
-        return np.square(1.0 / (1.0 + np.einsum("in,in->n", tangent, tangent))).astype(np.float32)
-
-    def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
-        """Film points of scene points [3, N] in m through points of the lens chosen by `pupil`."""
-        lens = concentric_disk(pupil).astype(np.float64) * self.radius_mm
-        behind, in_front = self.image_distance_mm, self._object_distance_mm
-        origin = np.concatenate([1e-3 * lens, np.full((1, lens.shape[1]), -1e-3 * behind)])
-        with np.errstate(all="ignore"):
-            depth = -1e-3 * behind - point_m[2].astype(np.float64)
-            slope = (point_m[:2] - origin[:2]) / depth
-            # The inverse of `sample`: the slope of the ray gives the film point.
-            film = -behind * (slope + lens / in_front)
-            # The weight of `sample`, times mm^2 of film for each m^2 of a plane square to the ray.
-            tangent2 = (((lens - film) / behind) ** 2).sum(0)
-            weight = self._exposure / self._part / (1 + tangent2) ** 2 * (behind / depth) ** 2
-            weight *= np.sqrt(1 + (slope**2).sum(0))
-        return arrived(film, origin, point_m, weight, self._stopped(lens, ahead(depth)))
-
-
-class ThickLens(_IdealLens):
+class ThickLens:
     """An ideal lens with two principal planes and two pupils; planes are z in mm, lens frame.
 
     Args:
@@ -191,6 +53,12 @@ class ThickLens(_IdealLens):
         InputError: a value that is not finite or not above 0, `focus_m` below 4 focal lengths, a film in front of H' or
             in the exit pupil.
     """
+
+    dispersive = False
+    achromatic = True
+    wavelength_nm: tuple[float, float] | None = None
+    rays_a_call = MANY_RAYS_A_CALL
+    _part = 1.0  # of the exposure on the axis, that a shape lets through
 
     def __init__(
         self,
@@ -237,7 +105,9 @@ class ThickLens(_IdealLens):
         }
         # The exposure on the axis is pi rho^2 / (1 + rho^2), with the slope rho of the exit pupil's rim.
         self._exposure = 1.0 + (self.radius_mm * f / self._seen) ** 2
-        self._part = self._part_through()
+        if aperture is not None:
+            square, wavelength = stratified(_QUADRATURE, (550.0, 550.0))
+            self._part = float(self.sample(np.zeros_like(square), square, wavelength).weight.mean(dtype=np.float64))
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Rays for film points [2, N] in mm and pupil samples [2, N]; the wavelength changes nothing."""
@@ -297,6 +167,48 @@ class ThickLens(_IdealLens):
     def _slopes(self, film_mm: NDArray[Any], entrance_mm: NDArray[Any]) -> NDArray[Any]:
         """Slopes [2, N] of the film-side rays of film points towards the images of points of the entrance pupil."""
         return entrance_mm * (self.focal_mm / self._seen) - film_mm * (self._x / self._seen)
+
+    def _stopped(self, opening_mm: NDArray[Any], status: NDArray[np.int32]) -> NDArray[np.int32]:
+        """The status, of those that pass outside the shape, at points [2, N] of the opening, the rim's."""
+        if self.aperture is None:
+            return status
+        inside = self.aperture.inside(opening_mm[0], opening_mm[1], self.radius_mm)
+        return np.where(inside | (status != st.PASSED), status, st.blocked(0, st.RIM)).astype(np.int32)
+
+
+class ThinLens(ThickLens):
+    """A thin lens of focal length `focal_mm` and diameter `focal_mm / f_number`.
+
+    Args:
+        focal_mm: focal length.
+        f_number: focal length over aperture diameter; it does not change with focus.
+        focus_m: distance from film to the object in focus, or infinity.
+        film_mm: width and height of the film.
+        aperture: shape of the opening; None is round.
+        film_offset_mm: moves the film away from the lens (negative: towards it) after focusing.
+
+    Raises:
+        InputError: a value is not above 0, `focus_m` is below 4 focal lengths, or the offset leaves no way to the film.
+    """
+
+    def __init__(
+        self,
+        focal_mm: float,
+        f_number: float,
+        focus_m: float,
+        film_mm: tuple[float, float] = (36.0, 24.0),
+        *,
+        aperture: Aperture | None = None,
+        film_offset_mm: float = 0.0,
+    ) -> None:
+        film_at_mm = None
+        if film_offset_mm:
+            focused = film_z_mm(positive("focal_mm", focal_mm), 0.0, 0.0, positive("focus_m", focus_m, infinite=True))
+            film_at_mm = positive("film_offset_mm, film distance", focused + film_offset_mm)
+        super().__init__(focal_mm, f_number, focus_m, film_mm, film_at_mm=film_at_mm, aperture=aperture, name="thin")
+        for key in ("film_z_mm", "principal_z_mm", "entrance_pupil_z_mm"):
+            del self.settings[key]
+        self.settings |= {"camera": "thin", "film_offset_mm": film_offset_mm}
 
 
 def _finite(field: str, value: float) -> float:

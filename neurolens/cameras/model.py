@@ -7,7 +7,7 @@ import warnings
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from neurolens.cameras.lens_film import LensFilm, SceneRays, camera_rays
 from neurolens.cameras.lens_state import axial_transmittance, lens_state, squeeze_of
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.onnxmaps import InverseRays, OnnxDerivatives, OnnxInverse, load_inverse
-from neurolens.cameras.onnxsession import joined, open_session, padded, run_session
+from neurolens.cameras.onnxsession import joined, open_session, run_batches
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import pupil_graph
 from neurolens.cameras.pupil_search import outline_of
@@ -223,21 +223,9 @@ class OnnxFilm:
 
     def sample(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `LensFilm.sample`."""
-        count = film_mm.shape[1]
-        found: dict[str, NDArray[Any]] = {
-            name: np.empty((6 if name == "ray" else 1, count), np.int32 if name == "status" else np.float32)
-            for name in _OUTPUTS
-        }
-        # Calls of about the same size: few rays cost nearly as much as many.
-        ends = np.linspace(0, count, max(1, round(count / RAYS_A_CALL)) + 1).astype(int)
-        for start, end in zip(ends[:-1], ends[1:], strict=True):
-            part = slice(start, end)
-            given = {"film_mm": film_mm[:, part], "square": square[:, part], "wavelength_nm": wavelength_nm[None, part]}
-            feeds = {name: padded(values) for name, values in given.items()}
-            done = run_session(self._path, self._session, tuple(_OUTPUTS), feeds)
-            for whole, piece in zip(found.values(), done, strict=True):
-                whole[:, part] = piece[..., : end - start]
-        return camera_rays(found)
+        rays = {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None]}
+        done = run_batches(self._path, self._session, tuple(_OUTPUTS), rays, {}, 3 * RAYS_A_CALL // 2)
+        return camera_rays({name: np.atleast_2d(values) for name, values in zip(_OUTPUTS, done, strict=True)})
 
 
 @dataclass(frozen=True)
@@ -270,8 +258,8 @@ class ModelScene:
         self, derivatives: OnnxDerivatives, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray
     ) -> SceneRays:
         """As a call, with `SceneRays.d_film`."""
-        moves = derivatives(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm).d_film
-        return self(film, pupil, wavelength_nm)._replace(d_film=moves)
+        out = derivatives(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm)
+        return SceneRays(out.rays.scene_ray, out.rays.transmittance, self.status_of(out.rays), out.d_film)
 
     def passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
         """Whether rays pass at one wavelength; bool [N]."""
@@ -299,6 +287,38 @@ def best_focus_z_mm(scene: ModelScene, focus_m: float, wavelength_nm: tuple[floa
     Raises:
         InputError: no ray passes.
     """
+    return _axial_spot(scene, focus_m, wavelength_nm).best_mm
+
+
+def best_focus_of_stops_mm(
+    scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float], stops_mm: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """`best_focus_z_mm` at stop radii up to the scene's: of one set of rays, those that each lets through."""
+    spot = _axial_spot(scene, focus_m, wavelength_nm)
+    found = scene.model.rays(*spot.rays, scene.film_z_mm, scene.stop_radius_mm)
+    radius = np.where(spot.passed, np.hypot(*found.stop_xy_mm), np.inf)
+    edge_mm = scene.stop_radius_mm * _WIDER / _RINGS  # from ring to ring: those at the edge count in part
+    share = ((stops_mm[:, None] - radius) / edge_mm + 0.5).clip(0, 1)
+    along, across = np.where(spot.passed, spot.moments, 0.0) @ share.T
+    shift = -along / across
+    # The object keeps its distance from the film: where that moves, its image moves by the square of its scale.
+    whole = spot.best_mm - scene.film_z_mm
+    lens = scene.model.card["lens"]
+    scale = 0.0 if math.isinf(focus_m) else (scene.film_z_mm - lens["infinity_film_z_mm"]) / lens["efl_mm"]
+    best: NDArray[np.float64] = scene.film_z_mm + shift + (shift - whole) * scale**2
+    return best
+
+
+class _Spot(NamedTuple):
+    """Best film of rays [N] of an axial point; film and pupil points [2, N], wavelengths; moments [2, N]; who pass."""
+
+    best_mm: float
+    rays: tuple[FloatArray, FloatArray, FloatArray]
+    moments: FloatArray
+    passed: NDArray[np.bool_]
+
+
+def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, float]) -> _Spot:
     domain = scene.model.card["domain"]
     colours, weights = film_plane.colours(wavelength_nm)
     shape = len(colours), _RINGS, _SPOKES
@@ -336,7 +356,7 @@ def best_focus_z_mm(scene: ModelScene, focus_m: float, wavelength_nm: tuple[floa
             raise InputError(scene.model.path, "focus", "best", "a model that lets axial light pass")
         best = scene.film_z_mm - float(along / across)
         film = np.where(np.isfinite(film), film, 0.0)
-    return best
+    return _Spot(best, (film.astype(np.float32), pupil.astype(np.float32), nanometres), moments, passed)
 
 
 def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: float) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.onnxsession import open_session, padded, run_session
+from neurolens.cameras.onnxsession import open_session, run_batches
 from neurolens.modelfile.cardcheck import check_card
 from neurolens.modelfile.onnxfile import read_checked, without_outputs
 from neurolens.modelfile.states import STATE, axes_of, card_at, default_state, state_numbers
@@ -127,26 +127,23 @@ class OnnxLens:
         """
         if state is not None:
             return self._in_state(state).rays(film_xy_mm, pupil_xy_mm, wavelength_nm, film_z_mm, stop_radius_mm)
-        film, pupil, wavelength = _columns(film_xy_mm, pupil_xy_mm, wavelength_nm)
-        domain = self.card["domain"]
-        stop = np.array([domain["stop_radius_mm"] if stop_radius_mm is None else stop_radius_mm], np.float32)
-        plane = np.atleast_1d(
-            np.asarray(self.card["lens"]["film_z_mm"] if film_z_mm is None else film_z_mm, np.float32)
-        )
-        count = film.shape[1]
-        if plane.shape == (count,) and count > 1:
-            return self._by_plane(film, pupil, wavelength, plane, stop)
-        if plane.shape != (1,):
+        points = {"film_xy_mm": film_xy_mm, "pupil_xy_mm": pupil_xy_mm}
+        columns = ray_columns("OnnxLens.rays", 2, points, wavelength_nm)
+        stop = self.card["domain"]["stop_radius_mm"] if stop_radius_mm is None else stop_radius_mm
+        film_z_mm = self.card["lens"]["film_z_mm"] if film_z_mm is None else film_z_mm
+        plane, count = np.atleast_1d(np.asarray(film_z_mm, np.float32)), columns.shape[1]
+        if plane.shape not in ((1,), (count,)):
             raise InputError("OnnxLens.rays", "film_z_mm", plane.shape, f"a number or an array ({count},)")
-        if 0 < count <= BATCH:
-            return self._run(film, pupil, wavelength, plane, stop)
-        out = _empty(count)
-        for start in range(0, count, BATCH):
-            part = slice(start, start + BATCH)
-            done = self._run(film[:, part], pupil[:, part], wavelength[part], plane, stop)
-            for whole, piece in zip(out, done, strict=True):
-                whole[..., part] = piece
-        return out
+        if len(plane) == 1:
+            return self._run(columns, plane, stop)
+        planes, at = np.unique(plane, return_inverse=True)
+        parts = [self._run(columns[:, at == k], planes[k : k + 1], stop) for k in range(len(planes))]
+        place = np.argsort(np.argsort(at, kind="stable"), kind="stable")
+        return LensRays(*(np.concatenate(of_one, -1)[..., place] for of_one in zip(*parts, strict=True)))
+
+    def _run(self, rays: FloatArray, plane: FloatArray, stop_radius_mm: float) -> LensRays:
+        call = {"film_z_mm": plane, "stop_radius_mm": stop_radius_mm} | ({STATE: self.state} if self.axes else {})
+        return LensRays(*run_batches(self.path, self._session, tuple(OUTPUTS), {"rays": rays}, call, BATCH))
 
     def _in_state(self, state: float | Sequence[float]) -> OnnxLens:
         """`at`, for any numbers: out of range, where there is no domain, rays are sent with that of this state."""
@@ -155,27 +152,6 @@ class OnnxLens:
             other.card = card_at(self.card, self.axes, values)
         other.state = values
         return other
-
-    def _by_plane(
-        self, film: FloatArray, pupil: FloatArray, wavelength: FloatArray, plane: FloatArray, stop: FloatArray
-    ) -> LensRays:
-        out = _empty(film.shape[1])
-        for z in np.unique(plane):
-            at = np.flatnonzero((plane == z) | (np.isnan(plane) & np.isnan(z)))
-            done = self.rays(film[:, at], pupil[:, at], wavelength[at], float(z), float(stop[0]))
-            for whole, piece in zip(out, done, strict=True):
-                whole[..., at] = piece
-        return out
-
-    def _run(
-        self, film: FloatArray, pupil: FloatArray, wavelength: FloatArray, plane: FloatArray, stop: FloatArray
-    ) -> LensRays:
-        count, rays = film.shape[1], padded(np.concatenate([film, pupil, wavelength[None]]))
-        feeds = {"rays": rays, "film_z_mm": plane, "stop_radius_mm": stop}
-        if self.axes:
-            feeds[STATE] = np.array(self.state, np.float32)
-        out = run_session(self.path, self._session, tuple(OUTPUTS), feeds)
-        return LensRays(*(a[..., :count] for a in out))
 
 
 def load_model(path: str | Path, lens: str | None = None, threads: int = 1) -> OnnxLens:
@@ -207,26 +183,27 @@ def load_model(path: str | Path, lens: str | None = None, threads: int = 1) -> O
     return model
 
 
-def _columns(film: ArrayLike, pupil: ArrayLike, wavelength: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    where = "OnnxLens.rays"
+def ray_columns(
+    where: str, rows: int, points: Mapping[str, ArrayLike], wavelength_nm: ArrayLike, dtype: type = np.float32
+) -> NDArray[Any]:
+    """Arrays [rows, N] of points or directions, by name, and wavelengths [N] or one for all, below each other.
+
+    Raises:
+        InputError: other shapes; more than `MAX_RAYS`.
+    """
     try:
-        arrays = [np.asarray(a, dtype=np.float32) for a in (film, pupil, wavelength)]
+        given: list[NDArray[Any]] = [np.asarray(v, dtype) for v in (*points.values(), wavelength_nm)]
     except (ValueError, TypeError) as error:
-        raise InputError(where, "film_xy_mm, pupil_xy_mm, wavelength_nm", "(no arrays)", "arrays of numbers") from error
-    f, p, w = arrays
-    if f.ndim != 2 or f.shape[0] != 2 or f.shape[1] > MAX_RAYS:
-        raise InputError(where, "film_xy_mm", f"({f.shape})", f"an array (2, N) with N up to {MAX_RAYS}")
-    if p.shape != f.shape:
-        raise InputError(where, "pupil_xy_mm", f"({p.shape})", f"the shape of film_xy_mm, {f.shape}")
-    if w.shape not in ((), (f.shape[1],)):
-        raise InputError(where, "wavelength_nm", f"({w.shape})", f"a number or an array ({f.shape[1]},)")
-    return f, p, np.broadcast_to(w, (f.shape[1],))
-
-
-def _empty(count: int) -> LensRays:
-    shapes = ((6, count), (count,), (2, count))
-    scene, power, stop = (np.empty(shape, np.float32) for shape in shapes)
-    return LensRays(scene, power, stop, np.empty(count, np.int32))
+        raise InputError(where, f"{', '.join(points)}, wavelength_nm", "(no arrays)", "arrays of numbers") from error
+    *arrays, wavelength = given
+    count = arrays[0].shape[1] if arrays[0].ndim == 2 else MAX_RAYS
+    for name, array in zip(points, arrays, strict=True):
+        if array.shape != (rows, count) or count > MAX_RAYS:
+            expected = f"an array ({rows}, N) with N up to {MAX_RAYS}, the same for all"
+            raise InputError(where, name, f"({array.shape})", expected)
+    if wavelength.shape not in ((), (count,)):
+        raise InputError(where, "wavelength_nm", f"({wavelength.shape})", f"a number or an array ({count},)")
+    return np.concatenate([*arrays, np.broadcast_to(wavelength, (1, count))])
 
 
 def _check_reference(model: OnnxLens) -> None:

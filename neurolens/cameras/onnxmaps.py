@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.onnxlens import DERIVATIVES, INPUTS, OUTPUTS, LensRays, OnnxLens
+from neurolens.cameras.onnxlens import DERIVATIVES, INPUTS, OUTPUTS, LensRays, OnnxLens, ray_columns
 from neurolens.cameras.onnxsession import open_session, run_batches
 from neurolens.modelfile.cardcheck import check_card, is_number
 from neurolens.modelfile.onnxfile import read_checked
-from neurolens.optics.sag import meet_front
+from neurolens.optics.sag import front_rays
 
 # Rays a call: these graphs have more rows than those of models alone.
 _DERIVATIVES_BATCH, _INVERSE_BATCH = 8192, 4096
@@ -60,10 +60,10 @@ class OnnxDerivatives:
         self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray, film_z_mm: float, stop_radius_mm: float
     ) -> LensDerivatives:
         """Rays and derivatives for film and pupil points [2, N] mm and wavelengths [N] nm, as `OnnxLens.rays`."""
-        rays = np.concatenate([film, pupil, wavelength_nm[None]]).astype(np.float32)
+        rays = {"rays": np.concatenate([film, pupil, wavelength_nm[None]]).astype(np.float32)}
         call = {"film_z_mm": film_z_mm, "stop_radius_mm": stop_radius_mm}
         names = (*OUTPUTS, *DERIVATIVES)
-        out = run_batches(self.model.path, self._session, names, ("rays", rays), call, _DERIVATIVES_BATCH)
+        out = run_batches(self.model.path, self._session, names, rays, call, _DERIVATIVES_BATCH)
         return LensDerivatives(LensRays(*out[:4]), *(np.moveaxis(d, 0, 1) for d in out[4:]))
 
 
@@ -108,8 +108,8 @@ class OnnxInverse:
         Raises:
             InputError: arrays of other shapes, or no file of this map.
         """
-        film, stop, wavelength = _arrays(film_xy_mm, 2, stop_xy_mm, 2, wavelength_nm)
-        return self._run("stop", np.concatenate([film, stop, wavelength]), film_z_mm, stop_radius_mm)
+        points = {"film_xy_mm": film_xy_mm, "stop_xy_mm": stop_xy_mm}
+        return self._run("stop", ray_columns("OnnxInverse", 2, points, wavelength_nm), film_z_mm, stop_radius_mm)
 
     def from_scene(
         self,
@@ -129,19 +129,10 @@ class OnnxInverse:
         Raises:
             InputError: arrays of other shapes, or no file of this map.
         """
-        origin, d, wavelength = _arrays(origin_mm, 3, direction, 3, wavelength_nm)
-        front = self.front
-        x, y = meet_front(front, *origin, *d)
-        with np.errstate(all="ignore"):
-            sine = np.hypot(d[0], d[1])
-            if front is None:  # first order: slopes
-                v, solid = d[:2] / -d[2], np.abs(d[2]) ** 3
-            else:
-                angle = np.arctan2(sine, -d[2])
-                safe = np.where(sine > 1e-12, sine, 1.0)
-                v = d[:2] * np.where(sine > 1e-12, angle / safe, 1.0)
-                solid = np.where(angle > 1e-12, sine / np.where(angle > 1e-12, angle, 1.0), 1.0)
-        out = self._run("scene", np.stack([x, y, v[0], v[1], wavelength[0]]), film_z_mm, stop_radius_mm)
+        lines = {"origin_mm": origin_mm, "direction": direction}
+        *rays, wavelength = ray_columns("OnnxInverse", 3, lines, wavelength_nm, np.float64)
+        known, solid = front_rays(self.front, *rays)
+        out = self._run("scene", np.concatenate([known, [wavelength]]), film_z_mm, stop_radius_mm)
         with np.errstate(all="ignore"):  # area of direction vectors to solid angle
             return out._replace(density=(out.density / solid).astype(np.float32))
 
@@ -170,7 +161,7 @@ class OnnxInverse:
             "stop_radius_mm": domain["stop_radius_mm"] if stop_radius_mm is None else stop_radius_mm,
         }
         with np.errstate(over="ignore"):
-            rays = (_GIVEN[name], given.astype(np.float32))
+            rays = {_GIVEN[name]: given.astype(np.float32)}
         return InverseRays(*run_batches(self.path, session, InverseRays._fields, rays, call, _INVERSE_BATCH))
 
 
@@ -244,23 +235,3 @@ def _check(inverse: OnnxInverse, name: str, card: dict[str, Any]) -> None:
     back = (off < 1e-3 * float(card["domain"]["pupil_radius_mm"])) & (found.status == st.PASSED)
     if not (back.size and back.mean() >= 0.9):
         raise ModelError(f"{inverse.path}: {name} map: {int(back.sum())} of {back.size} reference rays come back")
-
-
-def _arrays(a: ArrayLike, rows_a: int, b: ArrayLike, rows_b: int, wavelength: ArrayLike) -> list[NDArray[np.float64]]:
-    """Three arrays [rows, N] of float64.
-
-    Raises:
-        InputError: other shapes.
-    """
-    try:
-        first, second, w = (np.asarray(v, np.float64) for v in (a, b, wavelength))
-    except (ValueError, TypeError) as error:
-        raise InputError("OnnxInverse", "points", "(no arrays)", "arrays of numbers") from error
-    if first.ndim != 2 or len(first) != rows_a:
-        raise InputError("OnnxInverse", "points", f"({first.shape})", f"an array ({rows_a}, N)")
-    count = first.shape[1]
-    if second.shape != (rows_b, count):
-        raise InputError("OnnxInverse", "points, directions", f"({second.shape})", f"an array ({rows_b}, {count})")
-    if w.shape not in ((), (count,)):
-        raise InputError("OnnxInverse", "wavelength_nm", f"({w.shape})", f"a number or an array ({count},)")
-    return [first, second, np.broadcast_to(w, (1, count))]

@@ -91,7 +91,39 @@ def joined(
     return bytes(whole.SerializeToString())
 
 
-def padded(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def run_batches(
+    path: Path,
+    session: Any,
+    outputs: Sequence[str],
+    rays: Mapping[str, NDArray[np.float32]],
+    call: Mapping[str, Any],
+    batch: int,
+) -> list[NDArray[Any]]:
+    """The outputs for any number of rays, which are the last axis of all of them.
+
+    Args:
+        rays: inputs [K, N]. call: the other inputs, the same for all rays.
+        batch: rays a call of onnxruntime, at most.
+
+    Raises:
+        ModelError: onnxruntime cannot run the model `path`.
+    """
+    count = next(iter(rays.values())).shape[1]
+    numbers = {name: np.atleast_1d(np.asarray(value, np.float32)) for name, value in call.items()}
+    # Calls of about the same size: few rays cost nearly as much as many.
+    ends = np.linspace(0, count, max(1, -(-count // batch)) + 1).astype(int)
+    parts = []
+    for start, end in zip(ends[:-1], ends[1:], strict=True):
+        feeds = {name: _padded(columns[:, start:end]) for name, columns in rays.items()} | numbers
+        try:
+            done = session.run(list(outputs), feeds)
+        except Exception as error:  # onnxruntime raises types of its own, without a common base
+            raise ModelError(f"{path}: onnxruntime cannot run it ({_first_line(error)})") from error
+        parts.append([values[..., : end - start] for values in done])
+    return parts[0] if len(parts) == 1 else [np.concatenate(of_one, -1) for of_one in zip(*parts, strict=True)]
+
+
+def _padded(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """The same columns [R, N] and further ones of zeros where N would make onnxruntime slow.
 
     Rows a power of two apart share cache lines, which makes matrix products a third slower.
@@ -100,47 +132,6 @@ def padded(values: NDArray[np.float32]) -> NDArray[np.float32]:
     whole = np.zeros((rows, count + 16 if count % 1024 == 0 else count), np.float32)
     whole[:, :count] = values
     return whole
-
-
-def run_session(
-    path: Path, session: Any, outputs: Sequence[str], feeds: Mapping[str, NDArray[np.float32]]
-) -> list[NDArray[Any]]:
-    """The outputs asked for.
-
-    Raises:
-        ModelError: onnxruntime cannot run the model `path`.
-    """
-    try:
-        found: list[NDArray[Any]] = session.run(list(outputs), dict(feeds))
-    except Exception as error:  # onnxruntime raises types of its own, without a common base
-        raise ModelError(f"{path}: onnxruntime cannot run it ({_first_line(error)})") from error
-    return found
-
-
-def run_batches(
-    path: Path,
-    session: Any,
-    outputs: Sequence[str],
-    rays: tuple[str, NDArray[np.float32]],
-    call: Mapping[str, float],
-    batch: int,
-) -> list[NDArray[Any]]:
-    """The outputs for any number of rays.
-
-    Args:
-        rays: name of the input, and its columns [K, N]. call: the other inputs, a number each.
-        batch: rays a call of onnxruntime.
-
-    Raises:
-        ModelError: as of `run_session`.
-    """
-    name, columns = rays
-    numbers = {key: np.array([value], np.float32) for key, value in call.items()}
-    parts = [
-        run_session(path, session, outputs, {name: np.ascontiguousarray(columns[:, i : i + batch]), **numbers})
-        for i in range(0, max(columns.shape[1], 1), batch)
-    ]
-    return [np.concatenate(of_one, -1) for of_one in zip(*parts, strict=True)]
 
 
 def _first_line(error: Exception) -> str:

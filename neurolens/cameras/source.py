@@ -7,24 +7,24 @@ written in: from a film point and two random numbers to a weighted ray, at one f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from neurolens.base.errors import InputError
+from neurolens.cameras.focus_function import FOCUS, SMALLEST, Array, Focus, Focusing, film_function, number_of
 from neurolens.cameras.fused import LensGraph, whole_camera
 from neurolens.cameras.lens_film import LensFilm
+from neurolens.cameras.model import ModelScene, best_focus_of_stops_mm
+from neurolens.cameras.onnxlens import OnnxLens
 from neurolens.graph.c import Extras
-from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import with_film_derivatives
-from neurolens.graph.program import Program
+from neurolens.graph.program import STOP_RADIUS, Program
 from neurolens.graph.scalars import lower
+from neurolens.modelfile.axes import Axis, product
+from neurolens.modelfile.stategraph import state_names
 from neurolens.optics.film_plane import film_z_mm
 
-_DEGREES = range(2, 13)
-_ENOUGH_MM = 1e-5  # error of the film's position: a twentieth of a wavelength
-_ACROSS = 400  # distances at which it is measured
 CAMERA_FRAME = """\
 Camera frame: metres, origin at the film's centre, the camera looks along -z, y up, x right. Film points are mm in the
 lens frame: the picture on the film stands on its head. u and v are random numbers in [0, 1). The film value is the mean
@@ -58,42 +58,120 @@ def camera_program(film: LensFilm, lens: LensGraph, derivatives: bool = False, o
     return program
 
 
-def model_extras(card: Mapping[str, Any], focusing: bool = True) -> tuple[Extras, list[str]]:
-    """Constants of a model's card and, if `focusing`, the film's position for a focus; see `extras_of`."""
-    lens, d = card["lens"], card["domain"]
-    low, high = d["film_z_mm"]
-    constants = {
-        "efl_mm": lens["efl_mm"], "film_radius_mm": d["film_radius_mm"], "film_z_min_mm": low, "film_z_max_mm": high,
-        "pupil_z_mm": d["pupil_z_mm"], "pupil_radius_mm": d["pupil_radius_mm"],
-        "stop_radius_max_mm": d["stop_radius_mm"], "wavelength_min_nm": d["wavelength_nm"][0],
-        "wavelength_max_nm": d["wavelength_nm"][1],
-    }  # fmt: skip
-    near = float(d["focus_m"][1]) if focusing else math.inf
-    planes = lens["efl_mm"], lens["front_principal_z_mm"], lens["rear_principal_z_mm"]
-    return extras_of(constants, near, lambda focus_m: film_z_mm(*planes, focus_m))
+# Names in the source, where they stand in the card, and how they follow a state (as in `modelfile.states`).
+_NUMBERS = (
+    (("efl_mm",), "lens", "efl_mm", "reciprocal"),
+    (("film_radius_mm",), "domain", "film_radius_mm", "square"),
+    (("film_z_min_mm", "film_z_max_mm"), "domain", "film_z_mm", ""),
+    (("pupil_z_mm",), "domain", "pupil_z_mm", ""),
+    (("pupil_radius_mm",), "domain", "pupil_radius_mm", "square"),
+    (("stop_radius_max_mm",), "domain", "stop_radius_mm", ""),
+    (("wavelength_min_nm", "wavelength_max_nm"), "domain", "wavelength_nm", ""),
+)
+_BETWEEN = (0.12, 0.42, 0.83)  # of the range of each axis: states at which functions of them are measured
 
 
-def extras_of(
-    constants: Mapping[str, float], near_m: float, place: Callable[[float], float]
-) -> tuple[Extras, list[str]]:
-    """Constants, and the film's position as a function `film_z_mm` of the distance in focus, from infinity to `near_m`.
+def model_extras(model: OnnxLens, *, film: bool = True, stop_mm: float | None = None) -> tuple[Extras, list[str]]:
+    """Constants of a model's card, those that follow a state as functions of it, and the film's position.
 
     Args:
-        place: the film's position in mm at a distance in m; a polynomial of 1 / distance is fitted to it.
+        film: whether the film is to be placed. stop_mm: a fixed radius of the stop; None leaves it an argument.
 
-    Returns them with lines for the comment: the function's range and measured error.
+    Returns them with lines for the comment: what the functions are, their range and measured error.
     """
-    if not 0 < near_m < math.inf:
-        return Extras(constants), []
-    vergence = (1 - np.cos(np.pi * (np.arange(_ACROSS) + 0.5) / _ACROSS)) / (2 * near_m)
-    z = np.array([place(1 / v) for v in vergence])
-    for degree in _DEGREES:
-        g = Graph()
-        fit = np.polynomial.Polynomial.fit(vergence, z, degree, domain=[0, 1 / near_m], window=[0, 1 / near_m])
-        g.outputs["film_z_mm"] = g.series(1.0 / g.input("focus_m"), fit.coef)
-        program = lower(g)
-        error = float(np.abs(program.evaluate({"focus_m": 1 / vergence})["film_z_mm"] - z).max())
-        if error < _ENOUGH_MM:
-            break
-    said = f"film_z_mm(focus_m): film plane of the paraxial focus, object to film from {near_m:.4g} m to infinity, "
-    return Extras(constants, {"film_z_mm": program}), [f"{said}within {1e3 * error:.2g} um (measured)."]
+    axes = model.axes
+    cards = model.card["states"]["nodes"] if axes else [model.card]
+    constants, functions = followed(
+        axes,
+        [
+            (name, values, rule)
+            for names, part, key, rule in _NUMBERS
+            for name, values in zip(names, np.atleast_2d(np.array([card[part][key] for card in cards]).T), strict=True)
+        ],
+    )
+    constants |= state_ranges(axes)
+    lines = [f"Functions of the state ({', '.join(state_names(axes))}): {', '.join(functions)}."] if functions else []
+    if film:
+        nodes = [model_focusing(model, state, stop_mm) for state in product(axes)] if axes else None
+        between = [tuple(a.range[0] + (a.range[1] - a.range[0]) * share for a in axes) for share in _BETWEEN]
+        placed, said = film_extras(
+            nodes or [model_focusing(model, (), stop_mm)],
+            axes,
+            [(state, model_focusing(model, state, stop_mm)) for state in between] if axes else (),
+            by_stop=stop_mm is None,
+        )
+        functions, lines = functions | placed, lines + said
+    return Extras(constants, functions), lines
+
+
+def followed(
+    axes: Sequence[Axis], numbers: Iterable[tuple[str, Sequence[float], str]]
+) -> tuple[dict[str, float], dict[str, Program]]:
+    """Numbers by name, their values at the nodes and their rule (see `number_of`), as constants or functions."""
+    found = {name: number_of(axes, values, rule) for name, values, rule in numbers}
+    return (
+        {name: value for name, value in found.items() if isinstance(value, float)},
+        {name: value for name, value in found.items() if isinstance(value, Program)},
+    )
+
+
+def state_ranges(axes: Sequence[Axis]) -> dict[str, float]:
+    """The range of each of a state's numbers as constants."""
+    constants: dict[str, float] = {}
+    for axis, name in zip(axes, state_names(axes), strict=True):
+        word, _, unit = name.partition("_")
+        constants |= {f"{word}_min_{unit}": axis.range[0], f"{word}_max_{unit}": axis.range[1]}
+    return constants
+
+
+def model_focusing(model: OnnxLens, state: Sequence[float] = (), stop_mm: float | None = None) -> Focusing:
+    """How a model in a state is focused, with its stop as wide as it goes, or fixed."""
+    at = model.at(*state) if state else model
+    lens, domain = at.card["lens"], at.card["domain"]
+    light, widest = tuple(domain["wavelength_nm"]), float(domain["stop_radius_mm"])
+    inside = any(a.name == "focus" for a in at.axes)  # its groups have moved
+    nearest, ends = float(domain["focus_m"][1]), tuple(domain["film_z_mm"])
+    planes = lens["efl_mm"], lens["front_principal_z_mm"], lens["rear_principal_z_mm"]
+
+    def paraxial(focus_m: float) -> float:
+        return float(lens["film_z_mm"]) if inside else film_z_mm(*planes, focus_m)
+
+    def best(focus_m: float, stops_mm: Array) -> Array:
+        distance = nearest if inside else focus_m
+        scene = ModelScene(at, min(max(paraxial(distance), ends[0]), ends[1]), widest)
+        return best_focus_of_stops_mm(scene, distance, light, stops_mm)
+
+    return Focusing(math.inf if inside else nearest, stop_mm or widest, paraxial, best, ends)
+
+
+def film_extras(
+    nodes: Sequence[Focusing],
+    axes: Sequence[Axis] = (),
+    between: Sequence[tuple[Sequence[float], Focusing]] = (),
+    *,
+    by_stop: bool = True,
+) -> tuple[dict[str, Program], list[str]]:
+    """The film's position as functions: `film_z_mm`, best focus, and `film_z_paraxial_mm`, where the film focuses.
+
+    Arguments as of `film_function`; not `by_stop`: at the widest stop alone. Returns them with lines for the comment:
+    range and measured error.
+    """
+    near, wide, state = nodes[0].nearest_m, nodes[0].stop_radius_mm, list(state_names(axes))
+    distance = [FOCUS] if math.isfinite(near) else []
+    stops = f"stop radius {SMALLEST:.3g} to 1 times the widest" if by_stop else f"stop radius {wide:.4g} mm"
+    first = " (of the first state)" if axes else ""
+    reach = [f"object to film from {near:.4g} m{first} to infinity"] if distance else []
+    made: dict[str, tuple[Focus, list[str], str, list[str]]] = {
+        "film_z_mm": ("best" if by_stop else "widest", [stops, *reach], "the least RMS spot on the axis", [STOP_RADIUS])
+    }
+    if distance:
+        made["film_z_paraxial_mm"] = ("paraxial", reach, "the paraxial image", [])
+    functions, lines = {}, []
+    for name, (focus, limits, what, stop) in made.items():
+        functions[name], error, _ = film_function(nodes, axes, between, focus)
+        given = ", ".join([*state, *distance, *(stop if by_stop else [])])
+        lines.append(
+            f"{name}({given}): film plane of {what}, {', '.join(limits)}, beyond as at the end; within "
+            f"{1e3 * error:.2g} um (measured)."
+        )
+    return functions, lines

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import platform
 from dataclasses import asdict
@@ -69,7 +68,7 @@ def add_surrogate_arguments(parser: argparse.ArgumentParser, lenses: str) -> Non
 
 def run_surrogates(args: argparse.Namespace) -> int:
     """Make missing records, and write the pages after every lens."""
-    from neurolens.base.files import atomic_write_text
+    from neurolens.base.files import atomic_write_text, write_json
     from neurolens.base.progress import Progress
     from neurolens.evaluate.experiment import LensChoice
     from neurolens.evaluate.methods import Bench, chosen_rows, run_bench
@@ -89,7 +88,7 @@ def run_surrogates(args: argparse.Namespace) -> int:
         "versions": versions(),
         "machine": {"processor": platform.processor() or platform.machine(), "system": platform.platform()},
     }
-    atomic_write_text(out / "config.json", json.dumps(plain(config), indent=1) + "\n")
+    write_json(out / "config.json", plain(config))
     facts = f"{_conditions(args, settings)} {NOTES}"
     found: dict[str, Any] = {}
     for bench, records in run_bench(benches, rows, Progress(quiet=args.quiet), again=args.again):

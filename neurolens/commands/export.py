@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
-from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, check_writable
+from neurolens.base.files import atomic_path, atomic_write_text, check_writable
 from neurolens.commands.arguments import add_json, positive
 from neurolens.commands.output import answer
 from neurolens.commands.render import film_size
@@ -27,7 +26,9 @@ _DESCRIPTION = """\
 Write an exported model in another form: a self-contained C99 header (one function for a ray, one for
 arrays that compilers vectorise), a GLSL function, or an ONNX file. Domain guard, stop, rims,
 transmittance and status codes are those of the model; the card is a comment at the top. Constants
-(planes, ranges) and the film's position for a focus stand beside it. A lens file gives the exact lens.
+(planes, ranges) and the film's position for a focus stand beside it. Of a model of a zoom's whole range
+(or of internal focus) the state is an argument. A lens file gives the exact lens.
+OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades and more are its inputs.
 With --camera, the whole camera for one focus and stop: film point and two random numbers in, weighted
 ray out, its pupil's outline as a table in the file (of GLSL, the data of a texture beside it).
 Needs the extra "train" (torch); without it C and GLSL are written from the graph in the file,
@@ -43,8 +44,11 @@ examples:
   neurolens export models/laikin_double_gauss_50.ols-60.onnx --to c -o gauss.h
   neurolens export models/NAME.onnx --to glsl -o lens.glsl --fix wavelengths=450,550,650 --fix focus=2
   neurolens export runs/quickstart --to c -o ray.h --only ray
+  neurolens export lenses/ZOOM.toml --to c -o zoom.h --zoom range         # gaps as the focal length asks
+  neurolens export models/ZOOM-range.states-64.onnx --to c -o zoom.h      # any focal length: NAME_at(zoom_mm)
   neurolens export lenses/NAME.toml --to c -o exact.h                     # every surface; no coatings
   neurolens export models/NAME.onnx --to c -o cam.h --camera --focus 2 --f-number 2.8 --derivatives
+  neurolens export models/NAME.onnx --to osl -o lens.osl                  # for Blender; lenses/NAME.toml: exact
   neurolens export models/NAME.onnx --to onnx -o laser.onnx --fix wavelengths=633
   neurolens export models/NAME.onnx --to onnx -o lens.onnx --derivatives  # for ray differentials
   neurolens export models/NAME.onnx --to onnx -o a.onnx --inverse         # and a.stop.onnx, a.scene.onnx"""
@@ -52,21 +56,19 @@ _PARTS = ("ray", "transmittance", "stop", "vignetting")
 _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
 # Rays for the errors of an ONNX file with fixed inputs; rays to fit inverse maps.
 _HELD_OUT, _VIGNETTING, _TRAIN = 20_000, 100_000, 15_000
-# Of an exact lens: its wavelengths; the nearest focus of its function of that, in focal lengths.
-_LIGHT_NM, _NEAR_EFL = (400.0, 700.0), 10.0
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the command to the command line."""
     parser = subparsers.add_parser(
-        "export", help="source code (C, GLSL) of a model; fix what a scene fixes", description=_DESCRIPTION,
+        "export", help="source code (C, GLSL, OSL) of a model; fix what a scene fixes", description=_DESCRIPTION,
         epilog=_EPILOG,
     )  # fmt: skip
     parser.add_argument(
         "model", metavar="MODEL", type=Path,
-        help="exported model (.onnx), or a run folder with one model; of C and GLSL, a lens file (.toml), too",
+        help="exported model (.onnx), or a run folder with one model; of C, GLSL and OSL, a lens file (.toml), too",
     )  # fmt: skip
-    parser.add_argument("--to", choices=("c", "glsl", "onnx"), required=True, help="form to write")
+    parser.add_argument("--to", choices=("c", "glsl", "osl", "onnx"), required=True, help="form to write")
     parser.add_argument("-o", "--out", metavar="FILE", type=Path, required=True, help="file to write")
     parser.add_argument(
         "--fix", metavar="KEY=VALUE", action="append", default=[], help="a value fixed by the scene (see below)"
@@ -95,7 +97,9 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     group.add_argument("--f-number", metavar="N", type=positive("an f-number"), help="default: the widest")
     group.add_argument(
-        "--zoom", metavar="STATE", help="state of a zoom by name or focal length; of a lens file, always"
+        "--zoom",
+        metavar="STATE",
+        help="state of a zoom by name or focal length; of a lens file also range: an argument, not of a camera",
     )
     add_json(parser)
     parser.set_defaults(run=run, kept="nothing is written")
@@ -112,26 +116,37 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("neurolens export", "--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")
     if args.to != "onnx" and ((args.derivatives and not args.camera) or args.inverse):
         raise InputError("neurolens export", "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
+    if args.to == "osl":
+        return _write_osl(file, args, bool(given) or set(parts) != set(_PARTS))
     exact = file.suffix == ".toml"
     if args.camera or exact:
         if args.to == "onnx" or given or set(parts) != set(_PARTS):
             what = "a camera" if args.camera else "a lens file"
             raise InputError("neurolens export", str(file), f"({what})", "--to c or glsl, without --fix and --only")
         check_writable(args.out)
-        return _answer(args, _about(_write_camera(file, args) if args.camera else _write_exact(file, args)))
+        if args.camera:
+            return _answer(args, _about(_write_camera(file, args)))
+        from neurolens.commands.export_lens import write_lens
+
+        return _answer(args, _about(write_lens(file, args)))
     check_writable(args.out)
-    if args.to != "onnx" and set(parts) == set(_PARTS) and not given and find_spec("torch") is None:
-        from neurolens.modelfile.onnxfile import read_checked
+    from neurolens.cameras.onnxlens import load_model
+
+    loaded = load_model(file)
+    card, whole = loaded.card, set(parts) == set(_PARTS) and not given
+    if loaded.axes and (args.to == "onnx" or not whole):
+        raise InputError(
+            "neurolens export", str(file), "(a model of many states)", "--to c or glsl without --fix, --only"
+        )
+    if loaded.axes or (args.to != "onnx" and whole and find_spec("torch") is None):
         from neurolens.surrogates.source import export_file
 
-        extras, notes = model_extras(read_checked(file)[1])
+        extras, notes = model_extras(loaded)
         return _answer(args, _about(export_file(file, args.out, args.to, args.name, extras, notes)))
-    from neurolens.cameras.model import load_model
     from neurolens.surrogates.source import Parts, export_source
     from neurolens.surrogates.specialise import fixed_models
     from neurolens.surrogates.stored import load_fitted
 
-    card = load_model(file).card
     model = load_fitted(file)
     fix = _fix(given, model)
     models = fixed_models(model, fix)
@@ -140,11 +155,31 @@ def run(args: argparse.Namespace) -> int:
         about: dict[str, Any] = _write_inverse(models[0], args.out) if args.inverse else {}
     else:
         asked = Parts(*(name in parts for name in _PARTS[1:]))
-        extras, notes = model_extras(card, focusing=fix.film_z_mm is None)
+        stop = fix.stop_radius_mm if asked.vignetting else model.domain.stop_radius_mm
+        extras, notes = model_extras(loaded, film=fix.film_z_mm is None, stop_mm=stop)
         written = export_source(
             models, args.out, args.to, card, parts=asked, fix=fix, name=args.name, extras=extras, notes=notes
         )
         about = _about(written, [m.domain.wavelength_nm[0] for m in models])
+    return _answer(args, about)
+
+
+def _write_osl(file: Path, args: argparse.Namespace, partly: bool) -> int:
+    """A camera for Cycles."""
+    from neurolens.commands.export_osl import shader_of
+
+    if partly or args.camera or args.f_number is not None or args.focus != math.inf:
+        expected = "none of them: stop and focus are inputs of the shader, which is a whole camera"
+        raise InputError(
+            "neurolens export", "--fix, --only, --camera, --focus, --f-number", "(with --to osl)", expected
+        )
+    check_writable(args.out)
+    shader = shader_of(file, zoom=args.zoom, name=args.name, quiet=args.json)
+    atomic_write_text(args.out, shader.text)
+    about = {
+        "function": shader.name, "inputs": shader.parameters, "operations_per_ray": shader.operations,
+        "passing": shader.passing,
+    }  # fmt: skip
     return _answer(args, about)
 
 
@@ -184,49 +219,13 @@ def _write_camera(file: Path, args: argparse.Namespace) -> Written:
     return write_program(program, args.out, args.to, name, lines_of(comment), Extras(constants))
 
 
-def _write_exact(file: Path, args: argparse.Namespace) -> Written:
-    """The exact lens of a file as a function of film and pupil point, wavelength, film position and stop radius."""
-    from neurolens.cameras.exact import check_bare
-    from neurolens.cameras.source import extras_of
-    from neurolens.graph.scalars import lower
-    from neurolens.optics.lensfile import read_lens
-    from neurolens.optics.paraxial import film_z_mm, first_order
-    from neurolens.optics.pupils import image_radius_mm, pupil_bounds, pupil_plane_z_mm
-    from neurolens.optics.tracegraph import exact_graph
-    from neurolens.surrogates.source import checked_name, lines_of, write_program
-
-    lens = read_lens(file).at(zoom=args.zoom)
-    check_bare(lens)
-    name, plane, data = checked_name(args.to, lens.lens_id, args.name), pupil_plane_z_mm(lens), first_order(lens)
-    infinity, (radius, _) = film_z_mm(lens, math.inf), image_radius_mm(lens)
-    disc = pupil_bounds(lens, radius, (infinity, infinity), _LIGHT_NM, rows=9).disc_mm
-    constants = {
-        "efl_mm": float(data.efl_mm), "film_radius_mm": radius, "film_z_infinity_mm": infinity, "pupil_z_mm": plane,
-        "pupil_radius_mm": disc, "stop_radius_max_mm": float(lens.stop_radius_mm),
-        "wavelength_min_nm": _LIGHT_NM[0], "wavelength_max_nm": _LIGHT_NM[1],
-    }  # fmt: skip
-    near = _NEAR_EFL * abs(float(data.efl_mm)) / 1000
-    extras, notes = extras_of(constants, near, lambda focus_m: film_z_mm(lens, focus_m))
-    comment = [
-        f"{lens.name}: every surface traced, written by neurolens {__version__}. Surfaces are bare.",
-        f"Lens data: {lens.source} (sha256 {str(lens.sha256)[:16]}).",
-        "Lens frame: mm, front vertex at z = 0, film at z > 0. Rays go from the film point through the pupil point on "
-        f"the plane z = {plane:.6g} mm; the ray that comes out is a point on the front surface and a unit direction.",
-        f"Wavelengths from {_LIGHT_NM[0]:g} to {_LIGHT_NM[1]:g} nm. Status: 0 passed; at surface k, counted from 0 at "
-        f"the front, {st.blocked(0, st.MISSED)} + 4 k missed, {st.blocked(0, st.RIM)} + 4 k beyond its rim, "
-        f"{st.blocked(0, st.TOTAL_REFLECTION)} + 4 k totally reflected.",
-        *notes,
-    ]
-    program = lower(exact_graph(lens, plane, _LIGHT_NM))
-    return write_program(program, args.out, args.to, name, lines_of(comment), extras)
-
-
 def _about(written: Written, bands_nm: Sequence[float] = ()) -> dict[str, Any]:
     """What --json tells of source code."""
     s = written.signature
     return {
         "function": s.name,
         "inputs": s.inputs,
+        "state": s.state,
         "outputs": [*s.outputs, "status"],
         "bands_nm": bands_nm if s.bands > 1 else [],
         "operations_per_ray": written.operations,

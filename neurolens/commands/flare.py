@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -14,6 +15,7 @@ from neurolens.base.progress import Progress
 from neurolens.commands.arguments import (
     add_json,
     add_lens_state,
+    between,
     check_suffix,
     lens_path,
     state_of,
@@ -34,7 +36,8 @@ Prints the brightest by energy, place and size; with -o writes their picture as 
 added to a render of the same lens, film and focus: R, G and B are all ghosts, and each of the
 brightest --layers is one layer, NAME.R, .G, .B (g07-03: reflected at surface 7, then at 3,
 counted from 0 at the front), the rest is "rest". Values are those of `neurolens render`: a
-white card of radiance 1 is 1 on the axis. Needs the extra "train" (torch) and a C compiler."""
+white card of radiance 1 is 1 on the axis. With --photons light goes on by chance instead, with
+any number of reflections, smoothed by a kernel. Needs the extra "train" (torch) and a C compiler."""
 _EPILOG = """\
 examples:
   neurolens flare laikin_double_gauss_50 --light 15,8
@@ -50,9 +53,9 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("file", metavar="LENS", type=Path, help="lens file, or the name of one of lenses/")
     parser.add_argument(
-        "--light", metavar="AZ,EL[,E]", action="append", required=True, dest="lights",
-        help="degrees to the right of and above the axis, as the camera sees it, and irradiance at the lens (radiance "
-        "times solid angle in sr; a number or R/G/B; default 1); repeatable",
+        "--light", metavar="AZ,EL[,E[,M]]", action="append", required=True, dest="lights",
+        help="degrees to the right of and above the axis, as the camera sees it, irradiance at the lens (radiance "
+        "times solid angle in sr; a number or R/G/B; default 1), and distance in metres (default inf); repeatable",
     )  # fmt: skip
     parser.add_argument(
         "--coating", metavar="NAME",
@@ -73,6 +76,15 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--layers", metavar="N", type=whole(0, 64), default=0, help="brightest ghosts as layers (default: 0)"
     )
+    parser.add_argument(
+        "--photons", metavar="N", type=whole(1, 1 << 30),
+        help="instead of all pairs, photons with up to --reflections by chance, N a light and wavelength",
+    )  # fmt: skip
+    parser.add_argument("--reflections", metavar="N", type=whole(1, 1000), default=10, help="default: 10")
+    parser.add_argument(
+        "--kernel", metavar="PX", type=between(0, 100, "pixels"), default=3.0,
+        help="radius of the kernel that smooths photons (default: 3)",
+    )  # fmt: skip
     parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=2, help="default: 2")
     add_lens_state(parser, efl="as tabled", f_number="the widest")
     add_json(parser, quiet=True)
@@ -86,6 +98,8 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.optics.lensfile import read_lens
 
     lights = [_light(text) for text in args.lights]
+    if args.photons and args.layers:
+        raise InputError("neurolens flare", "--layers", args.layers, "0 with --photons, which know no single ghosts")
     if args.out is not None:
         check_suffix(args.out, "--out", (".exr",))
     args.focus = float("inf") if args.focus is None else args.focus
@@ -107,7 +121,8 @@ def _write(
     args: argparse.Namespace, tracer: Any, lens: Lens, lights: list[Light], rows: list[list[Ghost]], about: Any
 ) -> None:
     from neurolens.cameras.exact import placed_settings
-    from neurolens.flare.picture import Raster, ghost_picture
+    from neurolens.flare.photons import PhotonTracer
+    from neurolens.flare.picture import Raster, ghost_picture, photon_picture
     from neurolens.render.exr_attributes import standard_attributes
     from neurolens.render.pictures import write_exr
 
@@ -118,11 +133,14 @@ def _write(
     top = sorted(energy, key=lambda pair: -energy[pair])[: args.layers]
     layer_of = {pair: number for number, pair in enumerate(top)}
     raster = Raster(args.film, args.width, max(1, round(args.width * args.film[1] / args.film[0])))
-    with Progress(quiet=args.quiet or args.json).stage("ghosts") as done:
-        picture = ghost_picture(
-            tracer, lights, raster, wavelengths=args.wavelengths, samples=args.samples, threads=args.threads,
-            layers=[layer_of.get(pair, len(top)) for pair in tracer.pairs], done=done,
-        )  # fmt: skip
+    options: dict[str, Any] = {"wavelengths": args.wavelengths, "threads": args.threads}
+    with Progress(quiet=args.quiet or args.json).stage("photons" if args.photons else "ghosts") as options["done"]:
+        if args.photons:
+            more = {"photons": args.photons, "most_reflections": args.reflections, "kernel_px": args.kernel}
+            picture = photon_picture(PhotonTracer(lens), lights, raster, **options, **more)[None]
+        else:
+            in_layers = [layer_of.get(pair, len(top)) for pair in tracer.pairs]
+            picture = ghost_picture(tracer, lights, raster, samples=args.samples, layers=in_layers, **options)
     names = [*(pair.name for pair in top), "rest"]
     layers = {f"{name}.{c}": picture[n, ..., k] for n, name in enumerate(names) for k, c in enumerate("RGB")}
     settings = {k: v for k, v in vars(args).items() if isinstance(v, str | int | float | list | tuple | None)}
@@ -138,12 +156,13 @@ def _light(text: str) -> Light:
     try:
         angles = [float(word) for word in words[:2]]
         rgb = [float(word) for word in (words[2] if len(words) > 2 else "1").split("/")]
+        distance = float(words[3]) if len(words) > 3 else math.inf
     except ValueError:
-        angles, rgb = [], []
-    if len(angles) != 2 or len(words) > 3 or len(rgb) not in (1, 3):
-        raise InputError("neurolens flare", "--light", text, "AZ,EL or AZ,EL,E or AZ,EL,R/G/B: numbers")
+        angles, rgb, distance = [], [], math.inf
+    if len(angles) != 2 or len(words) > 4 or len(rgb) not in (1, 3):
+        raise InputError("neurolens flare", "--light", text, "AZ,EL[,E[,M]], numbers, E also as R/G/B")
     try:
-        return Light(angles[0], angles[1], (rgb[0], rgb[-2 % len(rgb)], rgb[-1]))
+        return Light(angles[0], angles[1], (rgb[0], rgb[-2 % len(rgb)], rgb[-1]), distance)
     except InputError as error:
         raise InputError("neurolens flare", "--light", text, error.expected) from None
 

@@ -26,7 +26,6 @@ from neurolens.commands.arguments import (
 from neurolens.commands.output import answer, number, table
 
 if TYPE_CHECKING:
-    from neurolens.evaluate.describe import LensFacts
     from neurolens.optics.prescription import Lens
     from neurolens.optics.rims import Rim, RimRule
 
@@ -107,13 +106,13 @@ def run(args: argparse.Namespace) -> int:
         if path is not None:
             check_suffix(path, option, _LAYOUT_SUFFIXES)
             check_folder(path, option)
-    from neurolens.evaluate.describe import describe_lens, file_doubts, glass_table, layout_profile
+    from neurolens.evaluate.describe import file_doubts, glass_table, layout_profile, lens_facts
     from neurolens.optics.lensfile import read_lens
     from neurolens.surrogates.domain import domain_of
 
     began = time.perf_counter()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NeurolensWarning)  # repeated by `describe_lens`
+        warnings.simplefilter("ignore", NeurolensWarning)  # repeated by `lens_facts`
         tabled = read_lens(args.file)
     lens = state_of(args, tabled)
     focus, film_z = focus_of(args, tabled, lens), float(lens.film_z_mm or 0.0)
@@ -121,11 +120,11 @@ def run(args: argparse.Namespace) -> int:
     configurations = [
         {"name": c.name, "efl_mm": c.efl_mm, "object_distance_mm": c.object_distance_mm} for c in tabled.configurations
     ]
-    facts = describe_lens(lens, domain)
-    facts.warnings.extend(file_doubts(tabled))
+    facts = lens_facts(lens, domain)
+    facts["warnings"] += file_doubts(tabled)
     data = {
         "file": str(args.file),
-        **facts.to_dict(),
+        **facts,
         "zoom": args.zoom,
         "focusing": args.focusing,
         "derived": lens.derived,
@@ -145,13 +144,13 @@ def run(args: argparse.Namespace) -> int:
         found = draw_breathing(lens, args.breathing)
         data["breathing"] = {name: [asdict(b) for b in breaths] for name, breaths in found.items()}
     data["seconds"] = time.perf_counter() - began
-    return answer(args, data, lambda: _lens_text(facts, data))
+    return answer(args, data, lambda: _lens_text(data))
 
 
-def _lens_text(facts: LensFacts, data: dict[str, Any]) -> str:
-    """The facts with the rest of what is printed as JSON, as a page of text."""
-    by = f", {facts.designer}" if facts.designer else ""
-    parts = [f"{facts.name}{by}\n{facts.source}", _first_order(facts), _light(facts), _surfaces(data["surfaces"])]
+def _lens_text(data: dict[str, Any]) -> str:
+    """What is printed as JSON, as a page of text."""
+    by = f", {data['designer']}" if data["designer"] else ""
+    parts = [f"{data['name']}{by}\n{data['source']}", _first_order(data), _light(data), _surfaces(data["surfaces"])]
     if data["configurations"]:
         zoom = [f"{c['name']} ({number(c['efl_mm'])} mm)" for c in data["configurations"] if not _near(c)]
         near = [f"{c['name']} ({number(c['object_distance_mm'])} mm)" for c in data["configurations"] if _near(c)]
@@ -159,7 +158,7 @@ def _lens_text(facts: LensFacts, data: dict[str, Any]) -> str:
         parts += [f"Focus states (--zoom, or --focusing internal): {', '.join(near)} to the object"] if near else []
     if data["derived"]:
         parts.append(f"Derived: {data['derived']}")
-    parts += [f"Warning: {text}" for text in facts.warnings]
+    parts += [f"Warning: {text}" for text in data["warnings"]]
     if data["layout"]:
         parts.append(f"Layout drawn in {data['layout']}")
     if data["breathing_plot"]:
@@ -171,22 +170,22 @@ def _near(configuration: dict[str, Any]) -> bool:
     return configuration["object_distance_mm"] is not None
 
 
-def _first_order(facts: LensFacts) -> str:
-    data = facts.first_order
-    focus = "infinity" if math.isinf(facts.focus_m) else f"{facts.focus_m:g} m"
-    across = facts.efl_x_mm is not None
+def _first_order(data: dict[str, Any]) -> str:
+    focus = "infinity" if math.isinf(data["focus_m"]) else f"{data['focus_m']:g} m"
+    across = data["efl_x_mm"] is not None
+    planes = f"{_mm(data['front_principal_z_mm'])}, {_mm(data['rear_principal_z_mm'])}"
     rows = [
-        ("focal length", _mm(data.efl_mm), "in the y-z plane, as all that follows" if across else ""),
-        *((("", _mm(facts.efl_x_mm), "in the x-z plane"),) if across else ()),
-        ("back focus", _mm(data.back_focus_mm), "last vertex to rear focal point"),
-        ("f-number", f"f/{number(data.f_number)}", "focal length over entrance pupil"),
-        ("working f-number", f"f/{number(facts.working_f_number)}", "of the real marginal ray at this focus"),
-        ("principal planes", f"{_mm(data.front_principal_z_mm)}, {_mm(data.rear_principal_z_mm)}", "front H, rear H'"),
-        ("entrance pupil", _mm(data.entrance_pupil_z_mm), f"diameter {_mm(data.entrance_pupil_diameter_mm)}"),
-        ("exit pupil", _mm(data.exit_pupil_z_mm), f"diameter {_mm(data.exit_pupil_diameter_mm)}"),
-        ("film plane", _mm(facts.film_z_mm), f"focus at {focus}"),
-        ("stop", f"surface {facts.stop_surface}", f"diameter {_mm(facts.stop_diameter_mm)}"),
-        ("refractions", str(facts.refractions), ""),
+        ("focal length", _mm(data["efl_mm"]), "in the y-z plane, as all that follows" if across else ""),
+        *((("", _mm(data["efl_x_mm"]), "in the x-z plane"),) if across else ()),
+        ("back focus", _mm(data["back_focus_mm"]), "last vertex to rear focal point"),
+        ("f-number", f"f/{number(data['f_number'])}", "focal length over entrance pupil"),
+        ("working f-number", f"f/{number(data['working_f_number'])}", "of the real marginal ray at this focus"),
+        ("principal planes", planes, "front H, rear H'"),
+        ("entrance pupil", _mm(data["entrance_pupil_z_mm"]), f"diameter {_mm(data['entrance_pupil_diameter_mm'])}"),
+        ("exit pupil", _mm(data["exit_pupil_z_mm"]), f"diameter {_mm(data['exit_pupil_diameter_mm'])}"),
+        ("film plane", _mm(data["film_z_mm"]), f"focus at {focus}"),
+        ("stop", f"surface {data['stop_surface']}", f"diameter {_mm(data['stop_diameter_mm'])}"),
+        ("refractions", str(data["refractions"]), ""),
     ]
     return _columns(rows)
 
@@ -195,17 +194,17 @@ def _mm(value: float | None) -> str:
     return f"{number(value, 6)} mm"
 
 
-def _light(facts: LensFacts) -> str:
-    stated, anamorphic = facts.half_field_deg, facts.efl_x_mm is not None
+def _light(data: dict[str, Any]) -> str:
+    stated, anamorphic = data["half_field_deg"], data["efl_x_mm"] is not None
     along, states = " along y" if anamorphic else "", "" if stated is None else f"; the file states {stated:g}"
     share_of = "of rays uniform over the film and over the disc of all passing rays, 5% wider"
     reached = f"reached at the edge of the film{along}{states}"
     rows = [
-        ("image radius", f"{number(facts.image_radius_mm)} mm", f"from {facts.image_radius_from}"),
-        ("half field", _degrees(facts.half_field_reached_deg), reached),
-        *((("", _degrees(facts.half_field_reached_x_deg), "along x"),) if anamorphic else ()),
-        ("rays that pass", f"{100 * facts.passing_share:.1f}%", share_of),
-        *(("", f"{100 * e['share']:.1f}%", e["text"]) for e in facts.ended),
+        ("image radius", f"{number(data['image_radius_mm'])} mm", f"from {data['image_radius_from']}"),
+        ("half field", _degrees(data["half_field_reached_deg"]), reached),
+        *((("", _degrees(data["half_field_reached_x_deg"]), "along x"),) if anamorphic else ()),
+        ("rays that pass", f"{100 * data['passing_share']:.1f}%", share_of),
+        *(("", f"{100 * e['share']:.1f}%", e["text"]) for e in data["ended"]),
     ]
     return _columns(rows)
 

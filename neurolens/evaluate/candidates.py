@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import ThinLens
-from neurolens.cameras.model import OnnxLens
+from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.rays import frame_width_mm
 from neurolens.evaluate.records import ExactRecord, Timing
@@ -139,6 +139,15 @@ def model_candidate(name: str, model: OnnxLens, stop_radius_mm: float) -> Candid
         return partial(model.rays, film, pupil, columns[5], film_z_mm, stop_radius_mm)
 
     return Candidate(name, prepare)
+
+
+def model_candidates(files: Mapping[str, Path], domain: Domain, threads: int = 1) -> list[Candidate]:
+    """Exported models by name, in onnxruntime; and on one thread "NAME fused", as C, where that is possible."""
+    found: list[Candidate | None] = []
+    for name, file in files.items():
+        found.append(model_candidate(name, load_model(file), domain.stop_radius_mm))
+        found += [fused_candidate(f"{name} fused", file, domain)] if threads == 1 else []
+    return [candidate for candidate in found if candidate is not None]
 
 
 def time_model(model: OnnxLens, name: str, *, rounds: int, threads: int = 1) -> Timing | None:

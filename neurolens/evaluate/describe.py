@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ from neurolens.optics.focusing import at_infinity
 from neurolens.optics.glass import glass_of, table_notes
 from neurolens.optics.lenscheck import check_lens, doubts, film_edge_mm, verdict
 from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import FirstOrder, first_order
+from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, image_radius_mm
 from neurolens.optics.trace import trace
@@ -28,12 +28,10 @@ _RAYS = 65536
 _NEGLIGIBLE = 1e-4  # share of the rays below which a blocking surface is not listed
 
 
-@dataclass(frozen=True)
-class LensFacts:
-    """A lens placed by `Lens.at`, over a domain; d line unless stated otherwise.
+def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
+    """Figures of a lens placed by `Lens.at`, over a domain, as JSON has them; d line unless stated otherwise.
 
-    Attributes:
-        first_order: of an anamorphic lens in the y-z plane.
+    Returns: those of the file; `FirstOrder`, of an anamorphic lens in the y-z plane; and
         efl_x_mm: in the x-z plane; None of a round lens.
         working_f_number: of the real marginal ray (y-z); None where no ray passes.
         image_radius_from: what the radius follows from.
@@ -42,40 +40,8 @@ class LensFacts:
             anamorphic lens; None where none does. half_field_reached_x_deg is None of a round lens, too.
         passing_share: of rays uniform over the film and pupil discs of the domain.
         ended: what stops the others, a list of {status, text, share}, largest share first.
+        warnings: sentences.
     """
-
-    name: str
-    designer: str
-    source: str
-    rims: str
-    sha256: str
-    refractions: int
-    first_order: FirstOrder
-    efl_x_mm: float | None
-    working_f_number: float | None
-    film_z_mm: float
-    focus_m: float
-    stop_surface: int
-    stop_diameter_mm: float
-    image_radius_mm: float
-    image_radius_from: str
-    half_field_deg: float | None
-    half_field_reached_deg: float | None
-    half_field_reached_x_deg: float | None
-    passing_share: float
-    ended: list[dict[str, Any]]
-    warnings: list[str]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Flat, for JSON."""
-        found = dict[str, Any]()
-        for key, value in asdict(self).items():
-            found |= {k: float(v) for k, v in value.items()} if key == "first_order" else {key: value}
-        return found
-
-
-def describe_lens(lens: Lens, domain: Domain) -> LensFacts:
-    """Figures of a lens placed by `Lens.at`."""
     radius, radius_from = image_radius_mm(lens)
     film_z = float(lens.film_z_mm if lens.film_z_mm is not None else domain.film_z_mm[0])
     passing, ended = passing_share(lens, domain)
@@ -87,29 +53,24 @@ def describe_lens(lens: Lens, domain: Domain) -> LensFacts:
         where = " and ".join(axis for axis, deg in (("y", reached), ("x", reached_x)) if deg is None)
         along = f", along {where}" if lens.anamorphic else ""
         notes.append(f"no ray reaches the edge of the film ({domain.film_radius_mm:.4g} mm from the axis{along})")
-    return LensFacts(
-        name=lens.name,
-        designer=lens.designer,
-        source=lens.source,
-        rims=lens.rims,
-        sha256=lens.sha256,
-        refractions=lens.refractions,
-        first_order=first_order(lens),
-        efl_x_mm=float(first_order(lens, meridian="x").efl_mm) if lens.anamorphic else None,
-        working_f_number=working_f_number(lens, domain, film_z),
-        film_z_mm=film_z,
-        focus_m=domain.focus_m[0],
-        stop_surface=lens.stop_index,
-        stop_diameter_mm=2 * lens.stop_radius_mm,
-        image_radius_mm=radius,
-        image_radius_from=radius_from,
-        half_field_deg=lens.half_field_deg,
-        half_field_reached_deg=reached,
-        half_field_reached_x_deg=reached_x if lens.anamorphic else None,
-        passing_share=passing,
-        ended=ended,
-        warnings=notes,
-    )
+    return {
+        **{key: getattr(lens, key) for key in ("name", "designer", "source", "rims", "sha256", "refractions")},
+        **{key: float(value) for key, value in asdict(first_order(lens)).items()},
+        "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if lens.anamorphic else None,
+        "working_f_number": working_f_number(lens, domain, film_z),
+        "film_z_mm": film_z,
+        "focus_m": domain.focus_m[0],
+        "stop_surface": lens.stop_index,
+        "stop_diameter_mm": 2 * lens.stop_radius_mm,
+        "image_radius_mm": radius,
+        "image_radius_from": radius_from,
+        "half_field_deg": lens.half_field_deg,
+        "half_field_reached_deg": reached,
+        "half_field_reached_x_deg": reached_x if lens.anamorphic else None,
+        "passing_share": passing,
+        "ended": ended,
+        "warnings": notes,
+    }
 
 
 def glass_table(lens: Lens) -> list[dict[str, Any]]:

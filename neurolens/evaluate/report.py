@@ -9,7 +9,6 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
@@ -27,7 +26,7 @@ from neurolens.evaluate.pages import (
     table,
     text,
 )
-from neurolens.evaluate.records import CLOSE_UM, Results, pareto_front, reaches, to_use, use_command
+from neurolens.evaluate.records import CLOSE_UM, Results, pareto_front, to_use, use_command
 
 _MODEL_COLUMNS = (
     Column("error RMS (µm)", "rms_um", about="distance between exact and modelled ray on the plane in focus, "
@@ -100,7 +99,6 @@ def write_report(run_dir: str | Path, results: Results) -> Path:
     body = [
         _header(results, title),
         _use(folder, results),
-        section("In short", _headline(results)),
         _warnings(results),
         section("Models, on rays held out from the fit", _models(results.models)),
         section("Exact tracers", _exact(results.exact)),
@@ -144,49 +142,6 @@ def _use(folder: Path, results: Results) -> str:
 def _names(records: Sequence[Record], last: str, first: str = "scene") -> list[str]:
     """What records are of: the scene or the domain, then the camera or the model."""
     return [" · ".join(str(r[key]) for key in (first, last) if r.get(key)) for r in records]
-
-
-def _headline(results: Results) -> str:
-    """The main figures, each with its model; missing ones are left out."""
-    models = results.models
-    close = [m for m in models if reaches(m, CLOSE_UM)]
-    within = f"within {CLOSE_UM:g} µm"
-    rims = [{"name": m["name"], "worse": max(_pair)} for m in models if len(_pair := _false(m)) == 2]
-    shares = _worst_shares(results.images)
-    cards = (
-        _card("lowest error, RMS", models, "rms_um", 1, "µm", min),
-        _card("lowest direction error, RMS", models, "direction_rms_deg", 1, "°", min),
-        _card(f"least time in onnxruntime, {within}", close, "ns_per_ray.min", 1, "ns/ray", min),
-        _card(f"least time as C, {within}", close, "fused_ns_per_ray.min", 1, "ns/ray", min),
-        _card(f"as C, over the exact lens as C, {within}", close, "fused_speedup", 1, "times", max),
-        _card("vignetting: false pass or false block, the larger, at best", rims, "worse", 100, "%", min),
-        _card("pictures: FLIP from exact over that of noise, best in its worst scene", shares, "share", 100, "%", min),
-    )
-    return f"<div class='cards'>{''.join(cards)}</div>" if any(cards) else ""
-
-
-def _false(model: Record) -> list[float]:
-    return [v for v in (number(model, "false_pass"), number(model, "false_block")) if v is not None]
-
-
-def _worst_shares(images: Sequence[Record]) -> list[dict[str, Any]]:
-    """FLIP of each camera's pictures from exact ones of the same random numbers, over that of noise; worst scene."""
-    worst: dict[str, float] = {}
-    for record in images:
-        share, camera = number(record, "paired_share"), str(record.get("camera", ""))
-        if share is not None and not camera.startswith("exact"):  # which is 0 by definition
-            worst[camera] = max(share, worst.get(camera, 0.0))
-    return [{"name": camera, "share": share} for camera, share in worst.items()]
-
-
-def _card(label: str, records: Sequence[Record], key: str, factor: float, unit: str, best: Any) -> str:
-    found = [(value, r) for r in records if (value := number(r, key)) is not None]
-    if not found:
-        return ""
-    value, record = best(found, key=lambda pair: pair[0])
-    who = record.get("name", "")
-    shown = f"{show(value * factor, 3)}<small> {text(unit)}</small>"
-    return f"<div class='card'><span>{text(label)}</span><b>{shown}</b><span>{text(who)}</span></div>"
 
 
 def _warnings(results: Results) -> str:

@@ -20,9 +20,8 @@ from neurolens.evaluate.candidates import (
     exact_c_candidate,
     exact_candidates,
     exact_records,
-    fused_candidate,
     ideal_cameras,
-    model_candidate,
+    model_candidates,
 )
 from neurolens.evaluate.describe import layout_profile
 from neurolens.evaluate.experiment import Experiment, keep_inputs
@@ -158,10 +157,7 @@ def _race(experiment: Experiment, prepared: Prepared, measured: Sequence[Measure
     with progress.stage("race for speed") as report:
         candidates = exact_candidates(lens, domain, compiled=chosen.compile_exact)
         candidates += [exact_c_candidate(lens, domain)] if chosen.threads == 1 else []
-        for m in measured:
-            candidates.append(model_candidate(m.settings.label, load_model(m.file), domain.stop_radius_mm))
-            fused = fused_candidate(f"{m.settings.label} fused", m.file, domain) if chosen.threads == 1 else None
-            candidates += [fused] if fused else []
+        candidates += model_candidates({m.settings.label: m.file for m in measured}, domain, chosen.threads)
         candidates += ideal_cameras(lens, domain)
         timed = race(candidates, domain, threads=chosen.threads, rounds=chosen.rounds, report=report)
     for m in measured:

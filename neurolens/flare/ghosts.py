@@ -18,20 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.flare.steps import CALL, DEGREE, LOST, STATE, Action, Kind, film_graph, reflectance_fit, seen, step_graph
-from neurolens.graph.c import Signature, write_c
-from neurolens.graph.compiler import load_compiled
-from neurolens.graph.scalars import lower
-from neurolens.optics import glass
+from neurolens.flare.stack import Floats, Stack, entering, reflects
+from neurolens.flare.steps import LOST, STATE
 from neurolens.optics.designs import design
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.shapes import is_plain
+from neurolens.optics.prescription import Lens
 
-Floats = NDArray[np.float32]
-_WIDTH = len(CALL) + DEGREE + 1
 _BLOCK = 512  # rays whose states, 32 bytes each before every surface, fit the second cache
 _NO_LAYERS = np.zeros(1, np.int32)
-_ACTIONS: tuple[tuple[Action, int], ...] = (("T", 1), ("T", -1), ("R", 1), ("R", -1))
 
 
 class Pair(NamedTuple):
@@ -58,13 +51,6 @@ def ghost_pairs(lens: Lens, *, one_side: bool = False) -> tuple[Pair, ...]:
     return tuple(p for p in pairs if not one_side or (p.first > lens.stop_index) == (p.second > lens.stop_index))
 
 
-def reflects(lens: Lens, k: int) -> bool:
-    """Whether surface k reflects any light: the medium changes there, or it is coated."""
-    s = lens.surfaces[k]
-    before = lens.surfaces[k - 1] if k else None
-    return bool(s.coating and s.coating.layers) or _medium(before) != _medium(s)
-
-
 def coated(lens: Lens, name: str) -> Lens:
     """The lens with a coating of `optics.designs` on each bare surface between glass and air.
 
@@ -78,10 +64,6 @@ def coated(lens: Lens, name: str) -> Lens:
         rows.append(replace(s, coating=coating))
         before = float(s.n_d)
     return replace(lens, surfaces=tuple(rows))
-
-
-def _medium(s: Surface | None) -> tuple[object, ...]:
-    return (None, 1.0, None) if s is None else (s.glass, 1.0 if s.glass else float(s.n_d), s.V_d)
 
 
 class GhostRays(NamedTuple):
@@ -105,28 +87,24 @@ class GhostTracer:
         pairs: the ghosts to follow; None takes all.
 
     Attributes:
-        pairs: of the lens, in the order of the results.
-        fit_error: the largest relative error of a coating's fitted reflectance so far; see `steps.reflectance_fit`.
+        pairs: of the lens, in the order of the results. stack: its compiled steps.
 
     Raises:
         InputError: no C compiler, or one that fails; a lens without film position; pairs that it has not.
     """
 
     def __init__(self, lens: Lens, pairs: Sequence[Pair] | None = None) -> None:
-        if lens.film_z_mm is None:
-            raise InputError(lens.path, "film_z_mm", None, "a focused lens (Lens.at)")
-        self.lens, self.fit_error = lens, 0.0
+        self.lens = lens
         known = ghost_pairs(lens)
         self.pairs = known if pairs is None else tuple(pairs)
         for pair in self.pairs:
             if pair not in known:
                 raise InputError(lens.path, "ghost", pair.name, f"one of {len(known)} pairs of surfaces that reflect")
-        kinds = {place: self._kind(*place) for place in self._places()}
-        wanted = tuple(dict.fromkeys(kinds.values()))
-        self._functions = np.zeros((len(lens.surfaces), len(_ACTIONS)), np.int32)
-        for (k, which), kind in kinds.items():
-            self._functions[k, which] = wanted.index(kind)
-        self._call = _compiled(wanted)
+        self.stack = Stack(lens, self._places())
+        driver = _DRIVER.format(block=_BLOCK, lost=LOST)
+        self._call, pointer = self.stack.compiled(driver, "ghosts"), ctypes.c_void_p
+        whole, real = ctypes.c_int, ctypes.c_float
+        self._call.argtypes = [ctypes.c_size_t, whole, whole, whole, real, real, whole, whole, *[pointer] * 7]
 
     def trace(self, rays: Floats, wavelength_nm: float, *, direct: bool = False) -> GhostRays:
         """Follow light [6, N] (point in mm and unit direction towards the film, lens frame) along every pair.
@@ -159,13 +137,13 @@ class GhostTracer:
         raster: tuple[float, int, int] = (0.0, 0, 0),
         layers: NDArray[np.int32] = _NO_LAYERS,
     ) -> None:
-        start, surfaces = _entering(rays), len(self.lens.surfaces)
-        numbers, shift = self._numbers(wavelength_nm)
+        start, surfaces = entering(rays), len(self.lens.surfaces)
+        numbers, shift = self.stack.numbers(wavelength_nm)
         index = np.full((surfaces, surfaces), -1, np.int32)
         for number, pair in enumerate(self.pairs):
             index[pair.second, pair.first] = number
         room = np.empty((surfaces + 4) * STATE * _BLOCK, np.float32)
-        pointers = [a.ctypes.data for a in (start, self._functions, numbers, index, layers, room, out)]
+        pointers = [a.ctypes.data for a in (start, self.stack.functions, numbers, index, layers, room, out)]
         self._call(start.shape[1], surfaces, len(self.pairs), int(direct), shift, *raster, *pointers)
 
     def _places(self) -> list[tuple[int, int]]:
@@ -175,95 +153,10 @@ class GhostTracer:
             needed |= {(second, 2), (first, 3)} | {(k, 1) for k in range(first + 1, second)}
         return sorted(needed)
 
-    def _kind(self, k: int, which: int) -> Kind:
-        lens, s, (action, sense) = self.lens, self.lens.surfaces[k], _ACTIONS[which]
-        return Kind(
-            action,
-            None if is_plain(s) else seen(s, sense > 0),
-            reflects(lens, k),
-            bool(s.coating and s.coating.layers),
-            any(t.glass is not None or t.absorption_per_mm for t in lens.surfaces),
-            lens.aperture if s.stop else None,
-        )
 
-    def _numbers(self, wavelength_nm: float) -> tuple[Floats, float]:
-        """Numbers of the call [surfaces, actions, _WIDTH] at a wavelength, and the last step's shift to the film."""
-        lens, z = self.lens, [float(v) for v in self.lens.vertices_mm]
-        n = [1.0, *(float(glass.index_of(s, wavelength_nm)) for s in lens.surfaces)]
-        a = [0.0, *(float(glass.absorption_of(s, wavelength_nm) or 0.0) for s in lens.surfaces)]
-        found = np.zeros((len(lens.surfaces), len(_ACTIONS), _WIDTH), np.float32)
-        for k, s in enumerate(lens.surfaces):
-            for which, (_, sense) in enumerate(_ACTIONS):
-                before, after = (k, k + 1) if sense > 0 else (k + 1, k)
-                # The ray comes in the frame of the surface before; at the front and the rear in its own.
-                gap = sense * (z[k] - z[k - sense]) if 0 <= k - sense < len(lens.surfaces) else 0.0
-                curvature = -sense * float(s.curvature) if is_plain(s) else 0.0
-                step = (n[after] - n[before]) * (n[after] + n[before])
-                row = (gap, curvature, 1 / s.semi_diameter_mm**2, n[before], n[after], step, a[before])
-                found[k, which, : len(CALL)] = row
-                if s.coating and s.coating.layers:
-                    fit, error = reflectance_fit(s.coating.layers, n[before], n[after], wavelength_nm, sense)
-                    found[k, which, len(CALL) :] = fit
-                    self.fit_error = max(self.fit_error, error)
-        assert lens.film_z_mm is not None
-        return found, float(lens.film_z_mm) - z[len(lens.surfaces) - 1]
-
-
-def _entering(rays: Floats) -> Floats:
-    """States before the first surface: moved near the front vertex, mirrored."""
-    given = np.asarray(rays, np.float64)
-    if given.ndim != 2 or given.shape[0] != 6:
-        raise InputError("ghosts", "rays", f"({given.shape})", "an array [6, N]")
-    place, d = given[:3], given[3:]
-    state = np.empty((STATE, given.shape[1]), np.float32)
-    state[:3], state[3:6], state[6], state[7] = place - (place * d).sum(0) * d, d, 1, 0
-    state[[2, 5]] *= -1
-    return state
-
-
-def _compiled(kinds: Sequence[Kind]) -> ctypes._NamedFuncPointer:
-    """The function over blocks of rays for these kinds of steps."""
-    text, runs = "", []
-    for number, kind in enumerate(kinds):
-        program = lower(step_graph(kind)).in_order_of_need()
-        name = f"step_{number}"
-        text += write_c(program, name, ["One surface."])
-        text += _adapter(Signature.of(program, name), f"run_{number}", "state", "after", "call")
-        runs.append(f"run_{number}")
-    program = lower(film_graph()).in_order_of_need()
-    text += write_c(program, "film", ["The film."])
-    text += _adapter(Signature.of(program, "film"), "run_film", "state", "film", "shift_mm")
-    call = load_compiled(
-        text + _DRIVER.format(runs=", ".join(runs), block=_BLOCK, state=STATE, width=_WIDTH, lost=LOST)
-    ).ghosts
-    pointer = ctypes.c_void_p
-    whole, real = ctypes.c_int, ctypes.c_float
-    call.argtypes = [ctypes.c_size_t, whole, whole, whole, real, real, whole, whole, *[pointer] * 7]
-    call.restype = None
-    return call
-
-
-def _adapter(s: Signature, name: str, taken: str, given: str, numbers: str) -> str:
-    """A function of pointers to rows, in the order of `flare.steps`, for one that `write_c` has written."""
-
-    def place(row: str, array: str, of: str) -> str:
-        return f"{array}[{row.removeprefix(of + '_') if row != of else 0}]"
-
-    arguments = [
-        *(place(row, "in", taken) for row in s.per_ray),
-        *(place(row, "call", numbers) for row in s.per_call),
-        *(place(row, "out", given) for row in s.outputs),
-    ]
-    head = f"static void {name}(size_t n, const float *const *in, const float *call, float *const *out)"
-    return f"\n{head}\n{{\n    (void)call;\n    {s.name}_rays(n, {', '.join(arguments)});\n}}\n"
-
-
-# States are blocks of rows; `which` 0 to 3 are refraction towards the film and back, and reflection of light that goes
-# to the film and back. A way ends where no ray is left on it.
+# A way ends where no ray is left on it. Ways: a pair each, then the direct light.
 _DRIVER = """
-typedef void step(size_t, const float *const *, const float *, float *const *);
-static step *const steps[] = {{ {runs} }};
-enum {{ BLOCK = {block}, STATE = {state}, ROOM = BLOCK * STATE, WIDTH = {width} }};
+enum {{ BLOCK = {block}, ROOM = BLOCK * STATE }};
 
 struct film {{
     float shift, per_mm;
@@ -272,47 +165,36 @@ struct film {{
     float *out;
 }};
 
-static int go(
-    size_t n, const float *from, float *to, int k, int which, const int *functions, const float *numbers)
+static int left_after(struct lens lens, int k, int action, size_t n, const float *from, float *to)
 {{
-    const float *in[STATE];
-    float *out[STATE];
-    for (int r = 0; r < STATE; r++) {{
-        in[r] = from + r * BLOCK;
-        out[r] = to + r * BLOCK;
-    }}
-    steps[functions[4 * k + which]](n, in, numbers + (4 * k + which) * WIDTH, out);
     int left = 0;
+    go(lens, k, action, n, from, to, BLOCK);
     for (size_t i = 0; i < n; i++)
-        left |= out[STATE - 1][i] <= 1.0f;
+        left |= to[(STATE - 1) * BLOCK + i] <= 1.0f;
     return left;
 }}
 
 /* Light of a way at the film: kept ray by ray, or shared among the four pixels around its place. */
 static void arrive(size_t n, const float *from, struct film film, int way, size_t at, size_t count)
 {{
-    float kept[4 * BLOCK], *const out = film.width ? kept : film.out + 4 * way * count + at;
-    const size_t row = film.width ? BLOCK : count;
-    const float *in[STATE];
-    float *rows[4];
-    for (int r = 0; r < STATE; r++)
-        in[r] = from + r * BLOCK;
-    for (int r = 0; r < 4; r++)
-        rows[r] = out + r * row;
-    run_film(n, in, &film.shift, rows);
-    if (!film.width) return;
+    float kept[4 * BLOCK], *const x = kept, *const y = kept + BLOCK, *const power = kept + 2 * BLOCK;
+    if (!film.width) {{
+        meet_film(n, from, BLOCK, film.shift, film.out + 4 * way * count + at, count);
+        return;
+    }}
+    meet_film(n, from, BLOCK, film.shift, kept, BLOCK);
     float *const picture = film.out + (size_t)film.layer[way] * film.width * film.height;
     for (size_t i = 0; i < n; i++) {{
-        const float u = 0.5f * film.width - 0.5f - rows[0][i] * film.per_mm;
-        const float v = 0.5f * film.height - 0.5f + rows[1][i] * film.per_mm;
-        if (!(rows[2][i] > 0.0f && u > -1.0f && v > -1.0f && u < film.width && v < film.height)) continue;
-        const int x = (int)(u + 1.0f) - 1, y = (int)(v + 1.0f) - 1;
-        const float right = u - x, below = v - y;
+        const float u = 0.5f * film.width - 0.5f - x[i] * film.per_mm;
+        const float v = 0.5f * film.height - 0.5f + y[i] * film.per_mm;
+        if (!(power[i] > 0.0f && u > -1.0f && v > -1.0f && u < film.width && v < film.height)) continue;
+        const int left = (int)(u + 1.0f) - 1, top = (int)(v + 1.0f) - 1;
+        const float right = u - left, below = v - top;
         for (int k = 0; k < 4; k++) {{
-            const int px = x + (k & 1), py = y + (k >> 1);
+            const int px = left + (k & 1), py = top + (k >> 1);
             if (px >= 0 && py >= 0 && px < film.width && py < film.height)
                 picture[(size_t)py * film.width + px] +=
-                    rows[2][i] * (k & 1 ? right : 1.0f - right) * (k >> 1 ? below : 1.0f - below);
+                    power[i] * (k & 1 ? right : 1.0f - right) * (k >> 1 ? below : 1.0f - below);
         }}
     }}
 }}
@@ -322,6 +204,7 @@ void ghosts(
     const float *start, const int *functions, const float *numbers, const int *index, const int *layer, float *room,
     float *out)
 {{
+    const struct lens lens = {{ surfaces, functions, numbers }};
     const struct film film = {{ shift, per_mm, width, height, layer, out }};
     for (size_t at = 0; at < count; at += BLOCK) {{
         const size_t n = count - at < BLOCK ? count - at : BLOCK;
@@ -337,7 +220,7 @@ void ghosts(
         int reached = 0;
         while (reached < surfaces) {{
             float *const here = ahead + reached * ROOM;
-            if (!go(n, here, here + ROOM, reached, 0, functions, numbers)) break;
+            if (!left_after(lens, reached, 0, n, here, here + ROOM)) break;
             reached++;
         }}
         if (direct && reached == surfaces)
@@ -347,12 +230,12 @@ void ghosts(
             int lowest = j;
             for (int i = j - 1; i >= 0; i--)
                 if (wanted[i] >= 0) lowest = i;
-            int left = lowest < j && go(n, ahead + j * ROOM, back, j, 2, functions, numbers);
+            int left = lowest < j && left_after(lens, j, 2, n, ahead + j * ROOM, back);
             for (int i = j - 1; left && i >= lowest; i--) {{
-                if (wanted[i] >= 0 && go(n, back, spare, i, 3, functions, numbers)) {{
-                    float *from = spare, *to = again;
+                float *from = spare, *to = again;
+                if (wanted[i] >= 0 && left_after(lens, i, 3, n, back, spare)) {{
                     int k = i + 1;
-                    for (; k < surfaces && go(n, from, to, k, 0, functions, numbers); k++) {{
+                    for (; k < surfaces && left_after(lens, k, 0, n, from, to); k++) {{
                         float *const other = from;
                         from = to;
                         to = other;
@@ -360,7 +243,7 @@ void ghosts(
                     if (k == surfaces)
                         arrive(n, from, film, wanted[i], at, count);
                 }}
-                left = i > lowest && go(n, back, spare, i, 1, functions, numbers);
+                left = i > lowest && left_after(lens, i, 1, n, back, spare);
                 float *const other = back;
                 back = spare;
                 spare = other;

@@ -17,7 +17,9 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.flare.ghosts import Floats, GhostTracer, Pair
+from neurolens.flare.ghosts import GhostTracer, Pair
+from neurolens.flare.photons import PhotonTracer
+from neurolens.flare.stack import Floats
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import sag_mm
 from neurolens.optics.trace import Rays, trace
@@ -64,12 +66,15 @@ class Light:
         return np.array([math.sin(a) * math.cos(e), math.sin(e), -math.cos(a) * math.cos(e)])
 
 
-def light_rays(lens: Lens, light: Light, first: int, count: int, shift: float = 0.0) -> tuple[Floats, float]:
+def light_rays(
+    lens: Lens, light: Light, first: int, count: int, shift: float = 0.0, jitter: float = 0.0
+) -> tuple[Floats, float]:
     """Rays number `first` and following of a light, [6, count] lens frame, and the area in mm^2 that all N share: the
-    irradiance at the lens times area / N is the light of one of N rays.
+    irradiance at the lens times area / N is the light of one of N rays. All carry the same: they are uniform across the
+    way of a light far away, and in solid angle from a near one.
 
     Args:
-        shift: of the sequence, for each wavelength another.
+        shift: of the sequence, for each wavelength another. jitter: see `_disc`.
     """
     front = lens.surfaces[0]
     depth = float(sag_mm(front, front.semi_diameter_mm, 0.0))
@@ -77,22 +82,34 @@ def light_rays(lens: Lens, light: Light, first: int, count: int, shift: float = 
     ahead = light.towards
     side = np.cross(ahead, [0.0, 1.0, 0.0] if abs(ahead[1]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
-    up = np.cross(side, ahead)
-    x, y = radius * _disc(first, count, shift)
-    across = side[:, None] * x + up[:, None] * y
-    target = centre[:, None] + across
+    across = np.stack([side, np.cross(side, ahead)], 1) @ _disc(first, count, shift, jitter)
     if math.isinf(light.distance_m):
-        direction = np.broadcast_to(-ahead[:, None], target.shape)
-    else:
-        direction = target - (1000 * light.distance_m * ahead)[:, None]
-        direction = direction / np.linalg.norm(direction, axis=0)
-    return np.concatenate([target, direction]), math.pi * radius**2
+        target = centre[:, None] + radius * across
+        return np.concatenate([target, np.broadcast_to(-ahead[:, None], target.shape)]), math.pi * radius**2
+    source = 1000 * light.distance_m * ahead
+    far = float(np.linalg.norm(source - centre))
+    if far <= 1.01 * radius:
+        expected = f"a light outside the lens, beyond {radius / 1000:.3g} m"
+        raise InputError("light", "distance_m", light.distance_m, expected)
+    # Uniform in solid angle over the cone that holds the sphere about the front surface.
+    solid = 1 - math.sqrt(1 - (radius / far) ** 2)
+    off = across * np.sqrt(solid * (2 - solid * (across**2).sum(0)))
+    towards = (centre - source) / far
+    off -= towards[:, None] * (towards @ off)
+    cos = 1 - solid * (across**2).sum(0)
+    sine = np.sqrt(np.maximum(1 - cos**2, 0)) / np.maximum(np.linalg.norm(off, axis=0), 1e-300)
+    direction = towards[:, None] * cos + off * sine
+    return np.concatenate([source[:, None] + direction * (far - radius), direction]), 2 * math.pi * solid * far**2
 
 
-def _disc(first: int, count: int, shift: float = 0.0) -> NDArray[np.float64]:
-    """Points [2, count] of the unit disc, of equal shares: the R2 sequence from a number on, shifted."""
+def _disc(first: int, count: int, shift: float = 0.0, jitter: float = 0.0) -> NDArray[np.float64]:
+    """Points [2, count] of the unit disc, of equal shares: the R2 sequence from a number on, shifted.
+
+    `jitter` moves each by up to so much of the square's side: regular places make patterns in a picture.
+    """
     n = np.arange(first, first + count) + 1.0
-    u, v = (n / _PLASTIC + shift) % 1, (n / _PLASTIC**2 + 0.5 * shift) % 1
+    moved = jitter * np.random.default_rng([first, int(shift * 2**32)]).random((2, count))
+    u, v = (n / _PLASTIC + shift + moved[0]) % 1, (n / _PLASTIC**2 + 0.5 * shift + moved[1]) % 1
     return np.sqrt(u) * np.stack([np.cos(2 * math.pi * v), np.sin(2 * math.pi * v)])
 
 
@@ -161,6 +178,10 @@ class Raster:
     width: int
     height: int
 
+    @property
+    def per_mm(self) -> float:
+        return self.width / self.film_mm[0]
+
 
 def ghost_picture(
     tracer: GhostTracer,
@@ -183,24 +204,85 @@ def ghost_picture(
     """
     given = [0] * len(tracer.pairs) if layers is None else list(layers)
     count = max(given, default=0) + 1
-    spectral = SpectralRange(*wavelength_nm, bins=wavelengths)
-    pixel_mm = raster.film_mm[0] / raster.width
-    exposure = axis_irradiance(tracer.lens, 0.5 * sum(wavelength_nm))
-    tasks = [(light, k) for light in lights for k in range(wavelengths)]
 
-    def one(task: tuple[Light, int]) -> tuple[Floats, NDArray[np.float64]]:
-        light, k = task
-        film = np.zeros((count, raster.height, raster.width), np.float32)
+    def splat(rays: Floats, nm: float, film: Floats, seed: int) -> None:
+        tracer.splat(film, rays, nm, raster.per_mm, given)
+
+    spectral = SpectralRange(*wavelength_nm, bins=wavelengths)
+    return _picture(tracer.lens, lights, raster, spectral, samples, (count, threads), splat, done)
+
+
+def photon_picture(
+    tracer: PhotonTracer,
+    lights: Sequence[Light],
+    raster: Raster,
+    *,
+    wavelength_nm: tuple[float, float] = (400.0, 700.0),
+    wavelengths: int = 15,
+    photons: int = 1 << 20,
+    most_reflections: int = 10,
+    kernel_px: float = 3.0,
+    threads: int = 2,
+    done: Callable[[float], None] = lambda share: None,
+) -> Floats:
+    """The photons of lights that were reflected at least once, [H, W, 3] linear sRGB, by density estimation.
+
+    Args:
+        photons: of each light and wavelength. kernel_px: radius of the kernel (Epanechnikov's, 2 / pi (1 - r^2)).
+    """
+
+    def splat(rays: Floats, nm: float, film: Floats, seed: int) -> None:
+        found = tracer.trace(rays, nm, most_reflections=most_reflections, seed=seed)
+        x, y = found.film_xy_mm[:, found.reflections > 0] * raster.per_mm
+        edges = (np.arange(raster.height + 1) - raster.height / 2, np.arange(raster.width + 1) - raster.width / 2)
+        film[0] += np.histogram2d(y, -x, bins=edges)[0]
+
+    spectral = SpectralRange(*wavelength_nm, bins=wavelengths)
+    picture = _picture(tracer.lens, lights, raster, spectral, photons, (1, threads), splat, done)[0]
+    return _smoothed(picture, kernel_px)
+
+
+def _picture(
+    lens: Lens,
+    lights: Sequence[Light],
+    raster: Raster,
+    spectral: SpectralRange,
+    samples: int,
+    layers_threads: tuple[int, int],
+    splat: Callable[[Floats, float, Floats, int], None],
+    done: Callable[[float], None],
+) -> Floats:
+    """Film [layers, H, W, 3] of rays of every light and bin of the spectrum, which `splat` adds to [layers, H, W]."""
+    (layers, threads), bins = layers_threads, spectral.bins
+    exposure = axis_irradiance(lens, 0.5 * (spectral.low_nm + spectral.high_nm))
+    tasks = [(number, light, k) for number, light in enumerate(lights) for k in range(bins)]
+
+    def one(task: tuple[int, Light, int]) -> tuple[Floats, NDArray[np.float64]]:
+        number, light, k = task
+        film = np.zeros((layers, raster.height, raster.width), np.float32)
         area = 0.0
         for first in range(0, samples, _AT_ONCE):
-            rays, area = light_rays(tracer.lens, light, first, min(_AT_ONCE, samples - first), k / wavelengths)
-            tracer.splat(film, rays, float(spectral.centres_nm[k]), 1 / pixel_mm, given)
-        colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / wavelengths
-        return film, colour * (area / samples / (pixel_mm**2 * exposure))
+            rays, area = light_rays(lens, light, first, min(_AT_ONCE, samples - first), k / bins, samples**-0.5)
+            # A seed of its own, the same for any number of threads.
+            splat(rays, float(spectral.centres_nm[k]), film, (number * bins + k) * samples + first)
+        colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / bins
+        return film, colour * (area * raster.per_mm**2 / samples / exposure)
 
-    picture = np.zeros((count, raster.height, raster.width, 3), np.float32)
+    picture = np.zeros((layers, raster.height, raster.width, 3), np.float32)
     with ThreadPoolExecutor(threads) as pool:
         for number, (film, colour) in enumerate(pool.map(one, tasks)):
             picture += film[..., None] * colour.astype(np.float32)
             done((number + 1) / len(tasks))
     return picture
+
+
+def _smoothed(picture: Floats, radius: float) -> Floats:
+    """A picture [H, W, 3] under a kernel that keeps its sum; light goes over the edges as if dark surrounded it."""
+    reach = math.ceil(radius)
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    kernel = np.maximum(1 - (x * x + y * y) / max(radius, 1e-9) ** 2, 0)
+    kernel[reach, reach] = 1
+    size = [n + 2 * reach for n in picture.shape[:2]]
+    whole = np.fft.rfft2(picture, size, axes=(0, 1)) * np.fft.rfft2(kernel / kernel.sum(), size)[..., None]
+    kept = np.fft.irfft2(whole, size, axes=(0, 1))[reach : size[0] - reach, reach : size[1] - reach]
+    return np.maximum(kept, 0).astype(np.float32)

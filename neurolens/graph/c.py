@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.graph.program import Argument, Program, Step
+from neurolens.graph.program import Argument, Mixture, Program, Step
 
 _HEAD = """\
 /*
@@ -96,6 +97,7 @@ class Signature:
         name: of the function. per_ray, per_call: inputs, in order.
         outputs: floats in order; then comes status, where the program has one.
         bands: wavelengths of the coefficient tables; a function of several takes `band`, a number from 0.
+        state: names of the numbers of a state, of which NAME_at makes the argument `state`.
         tables: each is an array [cells, columns], which its number of cells follows, NAME_cells.
     """
 
@@ -106,6 +108,7 @@ class Signature:
     bands: int = 1
     tables: tuple[str, ...] = ()
     status: bool = True
+    state: tuple[str, ...] = ()
 
     @staticmethod
     def of(program: Program, name: str) -> Signature:
@@ -117,7 +120,10 @@ class Signature:
         looked = dict.fromkeys(s.name for s in steps if s.kind == "lookup")
         tables = tuple(name for name in looked if name not in program.own_tables)
         outputs = tuple(o for o in program.outputs if o != "status")
-        return Signature(name, per_ray, per_call, outputs, program.tables, tables, "status" in program.outputs)
+        mixture, bands = program.mixture, program.tables
+        state = () if mixture is None else tuple(s.name for s in mixture.program.steps if s.kind == "input")
+        given = bands if mixture is None else 1
+        return Signature(name, per_ray, per_call, outputs, given, tables, "status" in program.outputs, state)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -153,7 +159,8 @@ def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras 
     lines = "\n".join(f" * {line}".rstrip() for line in comment).replace("*/", "* /")
     text = _HEAD.format(comment=lines, name=name, guard=f"{macro}_H", macro=macro)
     live = program.live()
-    if any(program.steps[k].kind == "sqrt" for k in live):
+    kinds = [p.steps[k].kind for p in (program, *extras.functions.values()) for k in p.live()]
+    if "sqrt" in kinds:
         text += _SQRT.format(name=name, macro=macro)
     if any(program.steps[k].kind == "clamp" for k in live):
         text += _CLAMP.format(name=name, macro=macro)
@@ -167,7 +174,7 @@ def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras 
     text += "\n" * bool(extras.constants)
     text += "".join(f"#define {macro}_{key.upper()} {literal(v)}\n" for key, v in extras.constants.items())
     for key, function in extras.functions.items():
-        own = Writer(function, "sqrtf", f"{macro}_FMA")
+        own = Writer(function, f"{name}_sqrt", f"{macro}_FMA")
         text += f"\n{macro}_INLINE {one_number(own, f'{name}_{key}', 'const float')}"
     lookup = f"{{table}}[{name}_cell({{index}}, {{cells}}) * {{width}} + {{place}}]"
     writer = Writer(
@@ -177,7 +184,12 @@ def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras 
     results = [f"    ray.{o} = {writer.value(program.outputs[o].argument)};" for o in signature.outputs]
     if "status" in program.outputs:
         results.append(f"    ray.status = (int){writer.value(program.outputs['status'].argument)};")
-    if writer.table:
+    if program.mixture is not None:
+        own = Writer(program.mixture.program, "sqrtf", f"{macro}_FMA")
+        parts = state_parts(program.mixture, writer.table, own, "const float")
+        text += _STATE.format(name=name, macro=macro, **parts)
+        body.insert(0, "    const float *const c = state->c;")
+    elif writer.table:
         rows = ",\n".join("    {" + ", ".join(literal(v) for v in row) + "}" for row in np.array(writer.table).T)
         text += f"\nstatic const float {name}_table[{program.tables}][{len(writer.table)}] = {{\n{rows}}};\n"
         body.insert(0, f"    const float *const c = {name}_table[band];")
@@ -194,10 +206,57 @@ def one_number(writer: Writer, name: str, local: str) -> str:
     """A function of the inputs of a program that gives its one output; `local` declares its variables."""
     program = writer.program
     arguments = ", ".join(f"float {program.steps[k].name}" for k in program.live() if _input(program, k))
-    steps = [(k, program.steps[k]) for k in program.live() if not _input(program, k)]
-    lines = [f"    {local} t{k} = {writer.step(step)};" for k, step in steps]
     (found,) = program.outputs.values()
+    lines = steps_of(writer, local)
     return "\n".join([f"float {name}({arguments})", "{", *lines, f"    return {writer.value(found.argument)};", "}\n"])
+
+
+def steps_of(writer: Writer, local: str) -> list[str]:
+    """The steps of a program as lines; `local` declares their variables."""
+    steps = [(k, writer.program.steps[k]) for k in writer.program.live() if not _input(writer.program, k)]
+    return [f"    {local} t{k} = {writer.step(step)};" for k, step in steps]
+
+
+_STATE = """
+/* One state: made once by {name}_at, handed to every call. Out of its range every ray is outside the domain. */
+typedef struct {{
+    int inside;
+    float c[{count}];
+}} {name}_state;
+
+static const float {name}_nodes[{size}] = {{
+    {rows}}};
+
+{macro}_UNUSED static inline {name}_state {name}_at({arguments})
+{{
+{steps}
+    const float feature[{features}] = {{{made}}};
+    {name}_state state;
+    state.inside = {inside} > 0.5f;
+    for (int i = 0; i < {count}; i++) {{
+        float sum = 0.0f;
+        for (int k = 0; k < {features}; k++) sum += {name}_nodes[{features} * i + k] * feature[k];
+        state.c[i] = sum;
+    }}
+    return state;
+}}
+"""
+
+
+def state_parts(mixture: Mixture, table: Sequence[Sequence[float]], writer: Writer, local: str) -> dict[str, Any]:
+    """What the function of a state is written of: numbers [n][nodes] and, by a writer of its program, its features."""
+    rows = np.array(table or [[0.0] * mixture.transform.shape[1]]) @ mixture.transform.T
+    program = mixture.program
+    return {
+        "count": len(rows),
+        "features": rows.shape[1],
+        "size": rows.size,
+        "rows": ",\n    ".join(", ".join(literal(v) for v in row) for row in rows),
+        "arguments": ", ".join(f"float {step.name}" for step in program.steps if step.kind == "input"),
+        "steps": "\n".join(steps_of(writer, local)),
+        "made": ", ".join(writer.value(e.argument) for key, e in program.outputs.items() if key != "inside"),
+        "inside": writer.value(program.outputs["inside"].argument),
+    }
 
 
 def _input(program: Program, k: int) -> bool:
@@ -206,9 +265,13 @@ def _input(program: Program, k: int) -> bool:
 
 def _functions(s: Signature, macro: str, body: list[str], results: list[str]) -> str:
     fields = "\n".join([*(f"    float {o};" for o in s.outputs), *["    int status;"] * s.status])
-    band = ["int band"] if s.bands > 1 else []
-    guard = [f"    const int known = band >= 0 && band < {s.bands};", "    if (!known) band = 0;"] if band else []
-    if band:
+    band, guard, chosen = [], [], []
+    if s.state:
+        band, chosen = [f"const {s.name}_state *{macro}_RESTRICT state"], ["state"]
+        results = [*results, "    if (!state->inside) ray.status = 1;"]
+    elif s.bands > 1:
+        band, chosen = ["int band"], ["band"]
+        guard = [f"    const int known = band >= 0 && band < {s.bands};", "    if (!known) band = 0;"]
         results = [*results, "    if (!known) ray.status = 1;"]
     tables = [f"const float *{macro}_RESTRICT {t}, int {t}_cells" for t in s.tables]
     one = ",\n    ".join([*(f"float {i}" for i in s.inputs), *tables, *band])
@@ -223,7 +286,7 @@ def _functions(s: Signature, macro: str, body: list[str], results: list[str]) ->
             *[f"int *{macro}_RESTRICT status"] * s.status,
         ]
     )
-    known = [*s.per_call, *(f"{t}, {t}_cells" for t in s.tables), *(["band"] if band else [])]
+    known = [*s.per_call, *(f"{t}, {t}_cells" for t in s.tables), *chosen]
     given = ", ".join([*(f"{i}[i]" for i in s.per_ray), *known])
     stores = "\n".join(f"        {o}[i] = ray.{o};" for o in (*s.outputs, *["status"] * s.status))
     unused = "".join(f"    (void){i};\n" for i in s.inputs)

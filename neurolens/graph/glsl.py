@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from neurolens.graph.c import NOTHING, Extras, Signature, Writer, literal, one_number
+from neurolens.graph.c import NOTHING, Extras, Signature, Writer, literal, one_number, state_parts
 from neurolens.graph.program import Program
 
 _HEAD = """\
@@ -22,11 +22,38 @@ _LOOKUP = "texelFetch({table}, ivec2({place}, clamp(int({index}), 0, textureSize
 _OWN_LOOKUP = "{table}[{width} * clamp(int({index}), 0, {cells} - 1) + {place}]"
 
 
+_STATE = """
+// One state: made once by {name}_at, handed to every call. Out of its range every ray is outside the domain.
+struct {name}_state {{
+    bool inside;
+    float c[{count}];
+}};
+
+const float {name}_nodes[{size}] = float[{size}](
+    {rows}
+);
+
+{name}_state {name}_at({arguments})
+{{
+{steps}
+    float feature[{features}] = float[{features}]({made});
+    {name}_state state;
+    state.inside = {inside} > 0.5;
+    for (int i = 0; i < {count}; i++) {{
+        float sum = 0.0;
+        for (int k = 0; k < {features}; k++) sum += {name}_nodes[{features} * i + k] * feature[k];
+        state.c[i] = sum;
+    }}
+    return state;
+}}
+"""
+
+
 def write_glsl(program: Program, name: str, comment: Sequence[str], extras: Extras = NOTHING) -> str:
     """The text of a function; arguments as of `c.write_c`."""
     signature = Signature.of(program, name)
     lines = "\n".join(f" * {line}".rstrip() for line in comment).replace("*/", "* /")
-    place = f"{name}_table[band_first + {{}}]"
+    place = "state.c[{}]" if signature.state else f"{name}_table[band_first + {{}}]"
     writer = Writer(program, "sqrt", place=place, lookup=_LOOKUP, own_lookup=_OWN_LOOKUP, name=name)
     live = program.live()
     body = [f"    float t{k} = {writer.step(program.steps[k])};" for k in live if program.steps[k].kind != "input"]
@@ -37,7 +64,10 @@ def write_glsl(program: Program, name: str, comment: Sequence[str], extras: Extr
     for key, function in extras.functions.items():
         text += f"\n{one_number(Writer(function, 'sqrt'), f'{name}_{key}', 'float')}"
     constants = {table: numbers.reshape(-1) for table, numbers in program.own_tables.items()}
-    if writer.table:
+    if program.mixture is not None:
+        parts = state_parts(program.mixture, writer.table, Writer(program.mixture.program, "sqrt"), "float")
+        text += _STATE.format(name=name, **parts)
+    elif writer.table:
         constants["table"] = np.array(writer.table).T.reshape(-1)
     for table, values in constants.items():
         numbers = [literal(v) for v in values]
@@ -45,7 +75,10 @@ def write_glsl(program: Program, name: str, comment: Sequence[str], extras: Extr
         size = len(numbers)
         text += f"\nconst float {name}_{table}[{size}] = float[{size}](\n    {rows}\n);\n"
     band = []
-    if signature.bands > 1:
+    if signature.state:
+        band = [f"in {name}_state state"]
+        results.append("    if (!state.inside) status = 1;")
+    elif signature.bands > 1:
         band = ["in int band"]
         first = f"    int band_first = {len(writer.table)} * clamp(band, 0, {signature.bands - 1});"
         body = [first, *body]

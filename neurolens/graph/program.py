@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError
+from neurolens.base.status import OUTSIDE_DOMAIN
 
 # select(a, b, x, y) is x where a <= b, else y; so NaN in a or b gives y. clamp(x, limit) is x within -limit and limit,
 # at the one on its side beyond; NaN becomes one of the two (not in GLSL). Its limit is a number above 0. lookup(indices
@@ -127,18 +128,40 @@ _FOLDED: dict[str, Callable[..., Any]] = {
 }
 
 
+@dataclass(frozen=True)
+class Mixture:
+    """How the numbers of a state come of those of its nodes, a coefficient table each.
+
+    Attributes:
+        program: of the state's own numbers: outputs `feature_0` ..., and `inside`, 1 where the state is in range.
+        transform: [K, nodes]: features @ transform are the weights of the tables.
+    """
+
+    program: Program
+    transform: NDArray[np.float64]
+
+    def weights(self, inputs: Mapping[str, ArrayLike]) -> tuple[NDArray[np.float64], bool]:
+        """[nodes] of a state, and whether it is in range."""
+        found = self.program.evaluate(inputs)
+        inside = bool(found.pop("inside"))
+        return np.array(list(found.values()), np.float64) @ self.transform, inside
+
+
 @dataclass
 class Program:
     """Steps in order, and the named results.
 
     Attributes:
         tables: coefficient tables, the length of every literal.
+        mixture: where the tables are not chosen by `band`, but mixed by a state. Nothing but sums of numbers that
+            differ between tables may then have been folded into others.
         own_tables: numbers [cells, columns] that lookups read and that no caller gives, by name.
     """
 
     tables: int = 1
     steps: list[Step] = field(default_factory=list)
     outputs: dict[str, Expr] = field(default_factory=dict)
+    mixture: Mixture | None = None
     own_tables: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     _known: dict[Step, int] = field(default_factory=dict)
 
@@ -264,7 +287,7 @@ class Program:
         def moved(argument: Argument) -> Argument:
             return place[argument] if isinstance(argument, int) else argument
 
-        found = Program(self.tables, own_tables=self.own_tables)
+        found = Program(self.tables, mixture=self.mixture, own_tables=self.own_tables)
         for step in (self.steps[k] for k in order):
             found._append(replace(step, arguments=tuple(moved(a) for a in step.arguments)))
         found.outputs = {name: Expr(found, moved(e.argument)) for name, e in self.outputs.items()}
@@ -315,12 +338,15 @@ class Program:
         """Results in float32, step by step as the written sources have them (fma rounds once).
 
         Args:
-            inputs: rows [N] by their names, and tables [cells, columns].
+            inputs: rows [N] by their names, and tables [cells, columns]; of a mixture, the numbers of the state.
         """
         found: dict[int, NDArray[np.float32]] = {}
+        weights, inside = (None, True) if self.mixture is None else self.mixture.weights(inputs)
 
         def value(argument: Argument) -> NDArray[np.float32]:
-            return np.asarray(np.float32(argument[table])) if isinstance(argument, tuple) else found[argument]
+            if not isinstance(argument, tuple):
+                return found[argument]
+            return np.asarray(np.float32(argument[table] if weights is None else weights @ argument))
 
         with np.errstate(all="ignore"):
             for k in self.live():
@@ -341,4 +367,7 @@ class Program:
                 if step.kind == "fma":  # the product is exact in float64
                     given = [g.astype(np.float64) for g in given]
                 found[k] = np.asarray(_FOLDED[step.kind](*given), dtype=np.float32)
-        return {name: value(e.argument) for name, e in self.outputs.items()}
+        results = {name: value(e.argument) for name, e in self.outputs.items()}
+        if not inside:
+            results[STATUS] = np.full_like(results[STATUS], OUTSIDE_DOMAIN)
+        return results

@@ -148,11 +148,8 @@ def find(name: str, file: str | Path = "glass catalogue", where: str = "glass") 
     Case, blanks, hyphens and brackets do not count. Of several makers' glasses of one name it is that of the first in
     `MAKERS` (`same_name` lists them). A name without N- is not matched to the glass with it: SK16 is Hikari's.
 
-    Args:
-        file, where: the place to name in an error.
-
     Raises:
-        InputError: an unknown name; the nearest ones are suggested.
+        InputError: an unknown name, at the place `file`, `where`; the nearest ones are suggested.
     """
     glasses = same_name(name)
     if not glasses:

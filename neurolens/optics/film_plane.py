@@ -18,15 +18,11 @@ _LEAST = 1e-3  # weight of a colour that the eye does not see: infrared light ha
 def film_z_mm(
     efl_mm: float, front_principal_z_mm: float, rear_principal_z_mm: float, focus_m: float, file: str | Path = "camera"
 ) -> float:
-    """Film plane (mm, frame of the principal planes) that focuses an object `focus_m` metres from the film.
+    """Film plane (mm, frame of the principal planes) that focuses an object `focus_m` metres (or inf) from the film.
 
     With D that distance less the separation of the principal planes, the image lies behind the rear one by the smaller
     root of s'^2 - D s' + D f = 0. Written 2 D f / (D + sqrt(D (D - 4 f))) it keeps its digits: the usual form,
     (D - sqrt(D (D - 4 f))) / 2, is the difference of two numbers that are nearly equal for a far object.
-
-    Args:
-        focus_m: inf allowed.
-        file: what an error names.
 
     Raises:
         InputError: an object nearer than four focal lengths, or a distance that is not a positive number.

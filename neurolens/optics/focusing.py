@@ -27,13 +27,11 @@ from neurolens.optics.trace import trace
 
 
 def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) -> list[float]:
-    """Values at a place between rows of values: exactly the row at its own place, between two rows linear or cubic.
+    """Values [M] at a place between rows of values [R][M] at ascending places x [R]: a row's own at its place.
 
-    Piecewise cubic with the derivatives of Fritsch and Butland (1984), "A method for constructing local monotone
-    piecewise cubic interpolants": a value stays between those of its two rows, so that no gap can turn negative.
-
-    Args:
-        x: [R] ascending places. rows: [R][M] values. place: from x[0] to x[-1].
+    Of two rows linear, else piecewise cubic with the derivatives of Fritsch and Butland (1984), "A method for
+    constructing local monotone piecewise cubic interpolants": a value stays between those of its two rows, so that no
+    gap can turn negative.
     """
     if len(x) == 1:
         return list(rows[0])
@@ -249,16 +247,13 @@ _NEAREST = 0.5  # of the way from the last surface to the paraxial image: no fil
 def best_focus_z_mm(
     lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[float, float] = (400.0, 700.0)
 ) -> float:
-    """Film plane (lens frame, mm) of least RMS spot for the axial point `focus_m` metres from it.
+    """Film plane (lens frame, mm) of least RMS spot for the axial point `focus_m` metres from it, for a range of light.
 
     Rays of the colours of `film_plane.colours` are spread evenly over the entrance pupil, and those that stop and rims
     let through count: the focus of a lens with spherical aberration shifts as it is stopped down. The plane follows in
     closed form: the spot's second moment is a parabola in z. With pure third-order spherical aberration it lies two
     thirds of the way from the paraxial to the marginal focus; of a lens with cylinders it is that of the whole spot. A
     pinhole's film stays in place.
-
-    Args:
-        wavelength_nm: range of the light.
 
     Raises:
         InputError: no ray passes, or focus nearer than four focal lengths.
@@ -274,6 +269,43 @@ def best_focus_z_mm(
             raise InputError(lens.path, "focus", "best", "a lens that axial light passes and bends")
         film_z = -float((w * along).sum() / (w * across).sum())
     return film_z
+
+
+_COARSER = 4.0  # stops below the widest by more are left to rays of their own: few rings lie within them
+
+
+def best_focus_of_stops_mm(
+    lens: Lens, focus_m: float, stops_mm: Sequence[float], wavelength_nm: tuple[float, float] = (400.0, 700.0)
+) -> NDArray[np.float64]:
+    """`best_focus_z_mm` at some stop radii up to the lens's own, of those of its rays that each lets through.
+
+    Raises:
+        InputError: as `best_focus_z_mm`.
+    """
+    stops = np.asarray(stops_mm, np.float64)
+    if lens.anamorphic or lens.aperture is not None:  # too few rays for their parts
+        each = (lens.with_stop_radius(float(r)) for r in stops)
+        return np.array([best_focus_z_mm(one, focus_m, wavelength_nm) for one in each])
+    widest, whole = float(lens.stop_radius_mm), best_focus_z_mm(lens, focus_m, wavelength_nm)
+    if paraxial.is_pinhole(lens):
+        return np.full(stops.shape, whole)
+    small = stops < widest / _COARSER
+    found = np.empty(stops.shape)
+    if small.any():
+        narrow = lens.with_stop_radius(widest / _COARSER)
+        found[small] = best_focus_of_stops_mm(narrow, focus_m, stops[small].tolist(), wavelength_nm)
+    wavelengths, weights = film_plane.colours(wavelength_nm if lens.dispersive else (LINE_D_NM, LINE_D_NM))
+    moments = _moments(lens, whole - 1000 * focus_m, wavelengths, at_stop=True)
+    along, across, squared = (m.numpy() for m in moments)
+    # Rings are of equal areas: those at the edge count in part.
+    ring = (_WIDER * widest) ** 2 / along.shape[1]
+    share = ((stops[~small, None, None, None] ** 2 - squared) / ring + 0.5).clip(0, 1) * weights[:, None, None]
+    z = -(share * along).sum((1, 2, 3)) / (share * across).sum((1, 2, 3))
+    # The object keeps its distance from the film: where that moves, its image moves by the square of its scale.
+    data = paraxial.first_order(lens)
+    scale = 0.0 if math.isinf(focus_m) else float((whole - data.rear_focal_z_mm) / data.efl_mm)
+    found[~small] = z + (z - whole) * scale**2
+    return found
 
 
 def best_focused(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float] = (400.0, 700.0)) -> Lens:
@@ -336,21 +368,27 @@ def axial_rays(lens: Lens, object_z_mm: float) -> Rays:
     return Rays(dx * t, dy * t, object_z_mm + dz * t, dx, dy, dz)
 
 
-def _moments(lens: Lens, object_z_mm: float, wavelength_nm: NDArray[np.float64]) -> tuple[Tensor, Tensor]:
+def _moments(
+    lens: Lens, object_z_mm: float, wavelength_nm: NDArray[np.float64], at_stop: bool = False
+) -> tuple[Tensor, ...]:
     """Of each ray [colours, rings, spokes] x0 tx + y0 ty and tx^2 + ty^2, with (x0, y0) where it meets the plane z = 0
     and (tx, ty) its slopes; 0 of one that is blocked. The sum of (x0 + z tx)^2 is least where the first make up for z
-    times the second.
+    times the second. `at_stop`: the square of its radius there, too.
     """
     rays = axial_rays(lens, object_z_mm)
     count, colours = len(rays.x), len(wavelength_nm)
+    record = (lens.stop_index,) if at_stop else ()
     with torch.no_grad():
         many = Rays(*(c.repeat(colours) for c in rays))
-        out = trace(lens, many, torch.from_numpy(wavelength_nm).repeat_interleave(count), towards="film")
+        nm = torch.from_numpy(wavelength_nm).repeat_interleave(count)
+        out = trace(lens, many, nm, towards="film", record=record)
     r, passed = out.rays, out.status == 0
     tx, ty = r.dx / r.dz, r.dy / r.dz
     along, across = (r.x - r.z * tx) * tx + (r.y - r.z * ty) * ty, tx * tx + ty * ty
     shape = (colours, _RINGS, 1) if count == _RINGS else (colours, _RINGS_OF_SPOKES, _SPOKES)
-    return along.where(passed, 0.0).reshape(shape), across.where(passed, 0.0).reshape(shape)
+    found = [along.where(passed, 0.0), across.where(passed, 0.0)]
+    found += [c.x * c.x + c.y * c.y for c in out.crossings.values()]
+    return tuple(m.reshape(shape) for m in found)
 
 
 @dataclass(frozen=True)
@@ -366,15 +404,11 @@ class Breath:
 
 
 def breathing(lens: Lens, focus_m: Sequence[float], focus: Focus = "paraxial") -> list[Breath]:
-    """The lens at several focus distances.
+    """The lens, in the zoom position wanted, at several focus distances from object to film, `inf` allowed.
 
     With h the radius of the image circle at infinity focus (the film does not grow) and x' the film's distance behind
     the rear focal point: the magnification is -x'/f, and the chief ray of the film's edge leaves at
     atan(h / `paraxial.chief_reach_mm`).
-
-    Args:
-        lens: in the zoom position wanted.
-        focus_m: distances from object to film, `inf` allowed.
 
     Raises:
         InputError: no distance, or one that the lens does not reach; "internal" for a lens without focus states.

@@ -96,8 +96,7 @@ def absorption_of(surface: Surface, wavelength_nm: Any) -> Any:
 def check_against_table(surface: Surface, file: str | Path, where: str) -> None:
     """Look a surface's glass up when a lens is read; nothing to do for a surface without one.
 
-    Args:
-        file, where: the place to name, for example "surface 3, ".
+    `file` and `where`, for example "surface 3, ", are the place that messages name.
 
     Warns:
         NeurolensWarning: the stated n_d or V_d (n_d = 1 and None count as not stated) is not the catalogue's within

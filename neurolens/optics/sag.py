@@ -90,10 +90,9 @@ def _root(square: Any) -> Any:
 def meet_front(
     shape: Shape | None, x: Array, y: Array, z: Array, dx: Array, dy: Array, dz: Array
 ) -> tuple[Array, Array]:
-    """(x, y) where the line of each ray meets the front surface next to its vertex; NaN where it does not.
+    """(x, y) where the line of each ray meets the front surface, None the plane z = 0, next to its vertex; else NaN.
 
-    Args:
-        shape: None is the plane z = 0. The rest: points (mm) and directions of either sense, float64 [N].
+    Rays are points (mm) and directions of either sense, float64 [N].
     """
     # Before the lens light travels towards +z, or from the side and beyond: the sense is that of the camera ray's end.
     dx, dy, dz = -dx, -dy, -dz
@@ -116,6 +115,25 @@ def meet_front(
     return px, py
 
 
+def front_rays(
+    shape: Shape | None, x: Array, y: Array, z: Array, dx: Array, dy: Array, dz: Array
+) -> tuple[Array, Array]:
+    """Scene rays as models have them, and the solid angle per area of their direction vectors [N].
+
+    Rows [4, N]: x and y (mm) on the front surface, and the direction vector, theta (dx, dy) / |(dx, dy)| with theta
+    from -z; of first-order models, which have no shape, the slope. Arguments as of `meet_front`, unit directions away
+    from the lens.
+    """
+    x, y = meet_front(shape, x, y, z, dx, dy, dz)
+    with np.errstate(all="ignore"):
+        if shape is None:
+            return np.stack([x, y, dx / -dz, dy / -dz]), np.abs(dz) ** 3
+        sine = np.hypot(dx, dy)
+        angle = np.arctan2(sine, -dz)
+        ratio = np.where(sine > 1e-12, angle / sine, 1.0)
+        return np.stack([x, y, ratio * dx, ratio * dy]), np.where(angle > 1e-12, sine / angle, 1.0)
+
+
 def end_mm(surface: Surface) -> float:
     """Distance from the axis at which a surface's conic ends: the radius of a sphere; inf where it goes on."""
     stretch = 1 + float(surface.conic)
@@ -125,11 +143,8 @@ def end_mm(surface: Surface) -> float:
 def check_figures(surfaces: Sequence[Surface], file: str, state: str = "") -> None:
     """Raise for figures that no lens has, whose squares and inverses would overflow; a NaN is not yet known.
 
-    Args:
-        state: prefix of the surface in messages, for a zoom state of the file.
-
     Raises:
-        InputError: names the file, the surface and the figure.
+        InputError: names the file, the zoom state if there is one, the surface and the figure.
     """
     for k, s in enumerate(surfaces):
         rim = min(s.semi_diameter_mm, 1e6)
@@ -155,11 +170,8 @@ def check_clearance(surfaces: Sequence[Surface], file: str, state: str = "") -> 
     decide; other shapes are also tested in between. A stop that bends nothing may lie inside an element beside which
     it is listed; what stands on both sides of it must be clear of each other.
 
-    Args:
-        state: prefix of the surface in messages, for a zoom state of the file.
-
     Raises:
-        InputError: names the file, the surface and by how much.
+        InputError: names the file, the zoom state if there is one, the surface and by how much.
     """
     check_figures(surfaces, file, state)
     for k, s in enumerate(surfaces):

@@ -28,7 +28,7 @@ from neurolens.optics.passing import (
 )
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Hit, Medium, Rays, fresnel_transmittance, root, times
-from neurolens.optics.transmission import Step, normal_at, pass_surface, unpolarised, way_mm
+from neurolens.optics.transmission import normal_at, pass_surface, step_at, unpolarised, way_mm
 from neurolens.optics.transmission import power as power_of
 
 Action = Literal["T", "R"]
@@ -103,15 +103,15 @@ def follow(
         absorbed = absorption[k if ahead else k + 1]
         if absorbed is not None:
             power = power * torch.exp(-way_mm(r, hit, before) * absorbed)
-        if field is None:
-            power = power * _share(lens.surfaces[k], hit, before, after, mode.sense, wavelength_nm, action)
-        there, media_met = (r, mode.sense), (before, after)
+        surface, came, sense, met = lens.surfaces[k], r, mode.sense, (before, after)
         if action == "R":
-            r, after, mode = _reflect(lens.surfaces[k], r, hit, mode.sense), before, mode._replace(sense=-mode.sense)
+            r, after, mode = _reflect(surface, r, hit, sense), before, mode._replace(sense=-sense)
         else:
-            r, _, _ = bend(lens.surfaces[k], k, r, hit, before, after, mode, tests)
-        if field is not None:
-            field = _polarised(field, lens.surfaces[k], hit, *there, r, media_met, after, wavelength_nm, action)
+            r, _, _ = bend(surface, k, r, hit, before, after, mode, tests)
+        if field is None:
+            power = power * _share(surface, hit, *met, sense, wavelength_nm, action)
+        else:
+            field = pass_surface(field, step_at(surface, hit, came, r, *met, sense, action == "R"), wavelength_nm)
     r = along_axis(unit(r._replace(z=r.z + vertex), after), tests, mode.sense, vertex)
     power = power if field is None else power * power_of(field)
     return Followed(r, tests.status(), tests.only(power, 0.0), tuple(points))
@@ -141,33 +141,6 @@ def _share(
     q2 = hit.q2 + (after.n - before.n) * (after.n + before.n)
     transmitted = fresnel_transmittance(hit.q, root(q2, True), before, after)
     return transmitted if action == "T" else torch.where(q2 > 0, 1 - transmitted, 1.0)
-
-
-def _polarised(
-    field: Tensor,
-    surface: Surface,
-    hit: Hit,
-    r: Rays,
-    sense: int,
-    behind: Rays,
-    met: tuple[Medium, Medium],
-    after: Medium,
-    wavelength_nm: Any,
-    action: Action,
-) -> Tensor:
-    """The fields of the light after a surface; `met` are the media as the light meets them, `after` that behind."""
-    layers = surface.coating.layers if surface.coating else ()
-    step = Step(
-        normal_at(surface, hit),
-        [times(d, 1 / met[0].n) for d in r[3:]],
-        [times(d, 1 / after.n) for d in behind[3:]],
-        met[0].n,
-        met[1].n,
-        layers,
-        sense,
-        action == "R",
-    )
-    return pass_surface(field, step, wavelength_nm)
 
 
 def _check(count: int, steps: Steps, towards: Towards) -> None:

@@ -127,12 +127,7 @@ def passing(lens: Lens, rays: Rays, wavelength_nm: float, *, towards: Towards = 
     """Whether rays pass the whole lens, bool [N]: where the status of `trace` is 0, bit for bit.
 
     Rays that are lost are left out of the work on later surfaces. For questions of which most are answered by no.
-
-    Args:
-        lens, rays, towards: as for `trace`. wavelength_nm: of all rays.
-
-    Raises:
-        InputError: as `trace`.
+    Arguments and errors are those of `trace`, with one wavelength.
     """
     check_rays(rays, wavelength_nm)
     _keep_memory()
@@ -142,7 +137,7 @@ def passing(lens: Lens, rays: Rays, wavelength_nm: float, *, towards: Towards = 
 
 
 def compile_trace(
-    lens: Lens, *, towards: Towards = "scene", transmittance: Transmittance = False, record: Sequence[int] = ()
+    lens: Lens, *, towards: Towards = "scene", transmittance: Transmittance = False
 ) -> Callable[[Rays, Tensor], Traced]:
     """The same trace with the prescription folded in as constants, compiled by torch for chunks of one length.
 
@@ -151,7 +146,7 @@ def compile_trace(
     """
 
     def run(rays: Rays, wavelength_nm: Tensor) -> Traced:
-        return _trace_chunk(lens, rays, wavelength_nm, towards, _Wanted(transmittance, tuple(record), False), False)
+        return _trace_chunk(lens, rays, wavelength_nm, towards, _Wanted(transmittance, (), False), False)
 
     for surface in lens.surfaces:
         # Read the catalogue now: compiled code cannot read files.
@@ -287,14 +282,9 @@ class Differentials(NamedTuple):
 
 
 def trace_differentials(
-    lens: Lens,
-    rays: Rays,
-    derivatives: Sequence[Rays],
-    wavelength_nm: Tensor | float = glass.LINE_D_NM,
-    *,
-    towards: Towards = "scene",
+    lens: Lens, rays: Rays, derivatives: Sequence[Rays], wavelength_nm: Tensor | float = glass.LINE_D_NM
 ) -> Differentials:
-    """Trace rays together with their derivatives.
+    """Trace camera rays together with their derivatives.
 
     Args:
         derivatives: of the rays with respect to some parameters, one `Rays` each (components [N]), such as those of
@@ -313,13 +303,13 @@ def trace_differentials(
         with forward_ad.dual_level():
             pairs = zip(rays, derivative, strict=True)
             dual = Rays(*(forward_ad.make_dual(r.contiguous(), t.contiguous()) for r, t in pairs))
-            out = trace(lens, dual, wavelength_nm, towards=towards)
+            out = trace(lens, dual, wavelength_nm)
             parts = [forward_ad.unpack_dual(c) for c in out.rays]
             moved = (torch.zeros_like(p.primal) if p.tangent is None else p.tangent for p in parts)
             # A lost ray was replaced by one along the axis, whose derivative is 0 already; others may carry NaN.
             carried.append(Rays(*(torch.nan_to_num(s, 0.0, 0.0, 0.0) for s in moved)))
             traced = out._replace(rays=Rays(*(p.primal for p in parts)))
-    traced = trace(lens, rays, wavelength_nm, towards=towards) if traced is None else traced
+    traced = trace(lens, rays, wavelength_nm) if traced is None else traced
     return Differentials(traced, tuple(carried))
 
 

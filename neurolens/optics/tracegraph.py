@@ -51,11 +51,12 @@ class _Tracing:
         self._through()
 
     def _through(self) -> None:
-        g, lens, vertex = self.graph, self.lens, 0.0
-        for k in range(len(lens.surfaces) - 1, -1, -1):
-            here = float(lens.vertices_mm[k])
-            self.x = g.concat(self.x[0:2], self.x[2] + (vertex - here))
-            vertex = here
+        g, lens = self.graph, self.lens
+        last = len(lens.surfaces) - 1
+        for k in range(last, -1, -1):
+            # Gaps as the lens has them: those that are equal stay so in every state of a zoom.
+            gap = float(lens.surfaces[k].thickness_mm) if k < last else -float(lens.vertices_mm[k])
+            self.x = g.concat(self.x[0:2], self.x[2] + gap)
             self._surface(k, lens.surfaces[k])
         g.outputs["scene_ray"] = g.concat(self.x, self.d)
         if self.whole:

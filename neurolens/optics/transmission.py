@@ -35,6 +35,16 @@ class Step(NamedTuple):
     reflected: bool = False  # whether the rays are reflected there (ghosts) rather than transmitted
 
 
+def step_at(
+    surface: Surface, hit: Hit, r: Rays, away: Rays, before: Medium, after: Medium, sense: int, reflected: bool = False
+) -> Step:
+    """The step of rays that meet a surface and go away from it; the media are those as the light meets them."""
+    pairs = (r, before), (away, before if reflected else after)
+    ahead, behind = ([times(d, 1 / m.n) for d in rays[3:]] for rays, m in pairs)
+    layers = surface.coating.layers if surface.coating else ()
+    return Step(normal_at(surface, hit), ahead, behind, before.n, after.n, layers, sense, reflected)
+
+
 def unpolarised(direction: Vector) -> Tensor:
     """Two orthogonal fields of unit power across unit directions (x, y, z each [N]), for `pass_surface` and `power`.
 
@@ -153,13 +163,10 @@ class _Polarised(_Absorbed):
 
     def pass_surface(self, k: int, r: Rays, hit: Hit, bent: Rays, q: Tensor, before: Medium, after: Medium) -> None:
         self._cross_medium(k, r, hit, before)
-        surface = self._lens.surfaces[k]
-        layers = surface.coating.layers if surface.coating else ()
-        if before is after and not layers:
+        step = step_at(self._lens.surfaces[k], hit, r, bent, before, after, self._sense)
+        if before is after and not step.layers:
             return
-        ahead, behind = ([times(d, 1 / m.n) for d in rays[3:]] for rays, m in ((r, before), (bent, after)))
-        step = Step(normal_at(surface, hit), ahead, behind, before.n, after.n, layers, self._sense)
-        field = unpolarised(ahead) if self._field is None else self._field
+        field = unpolarised(step.before) if self._field is None else self._field
         self._field = pass_surface(field, step, self._wavelength_nm)
 
     def arrived(self) -> Tensor:

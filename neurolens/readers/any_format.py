@@ -40,12 +40,9 @@ FORMATS = (
 
 
 def read_any(path: str | Path, given: Given | None = None) -> Lens:
-    """The lens of a file in any format that neurolens reads, its own TOML too.
+    """The lens of a file in any format that neurolens reads, its own TOML too, with what the file lacks from `given`.
 
     The content decides; the suffix is used if the content is not recognised.
-
-    Args:
-        given: values from the user that the file lacks (name, source, f-number, units).
 
     Raises:
         InputError: a file in no known format, or the mistake in it; names file and line.

@@ -42,14 +42,14 @@ class Line:
         expected = f"one of the keywords read: {', '.join(known)}{suggestion(keyword, known)}"
         return self.error(keyword, "(unknown keyword)", expected)
 
-    def number_of(self, keyword: str, word: str, expected: str = "a finite number") -> float:
+    def number_of(self, keyword: str, word: str) -> float:
         """A finite number from one word of this line."""
         try:
             value = float(word) if "_" not in word and len(word) <= MAX_WORD else math.nan
         except ValueError:
             value = math.nan
         if not abs(value) <= LARGEST:
-            raise self.error(keyword, word, expected)
+            raise self.error(keyword, word, "a finite number")
         return value
 
     def positive(self, keyword: str, words: Sequence[str]) -> float:

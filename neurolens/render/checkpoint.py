@@ -106,10 +106,7 @@ def _rays(camera: Camera) -> str:
 
 
 def write_checkpoint(path: Path, film: Film, identity: dict[str, Any], spent: dict[str, float]) -> None:
-    """Write the film's present sums; workers may continue meanwhile.
-
-    Args:
-        identity: of the job. spent: seconds so far, by the names of `SPENT`.
+    """Write the film's present sums and the seconds spent, by the names of `SPENT`; workers may continue meanwhile.
 
     Raises:
         OSError: it cannot be written; an older checkpoint is still there.

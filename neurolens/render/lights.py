@@ -8,7 +8,7 @@ it fills. (The sky and the sun are groups of `neurolens.render.environment`.)
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,11 +94,8 @@ class Lights:
             return LightSamples(direction, distance, light, np.zeros_like(scale) if group.sizeless else scale, scale)
         direction, distance, scale = np.empty_like(point), np.empty_like(choice), np.empty_like(choice)
         inverse_pdf = np.empty_like(choice)
-        for first, group in self._groups:
-            rows = np.flatnonzero((light >= first) & (light < first + group.count))
-            if not rows.size:
-                continue
-            aimed = group.sample(light[rows] - first, point.take(rows, axis=1), square.take(rows, axis=1))
+        for group, rows, number in self._by_group(light):
+            aimed = group.sample(number, point.take(rows, axis=1), square.take(rows, axis=1))
             direction[:, rows], distance[rows], scale[rows] = aimed
             scale[rows] /= self.probability.take(light[rows])
             inverse_pdf[rows] = 0 if group.sizeless else scale[rows]
@@ -111,13 +108,17 @@ class Lights:
             point: [3, N] from where. distance: [N] to the hit. cosine: [N] at the light, above 0.
         """
         density = np.zeros_like(distance)
+        for group, rows, number in self._by_group(light):
+            density[rows] = group.pdf(number, point.take(rows, axis=1), distance[rows], cosine[rows])
+        density *= self.probability.take(light)
+        return density
+
+    def _by_group(self, light: Numbers) -> Iterator[tuple[LightGroup, Numbers, Numbers]]:
+        """The groups that lights [N] belong to, the places of theirs, and their numbers in the group."""
         for first, group in self._groups:
             rows = np.flatnonzero((light >= first) & (light < first + group.count))
             if rows.size:
-                hit = (point.take(rows, axis=1), distance[rows], cosine[rows])
-                density[rows] = group.pdf(light[rows] - first, *hit)
-        density *= self.probability.take(light)
-        return density
+                yield group, rows, light[rows] - first
 
 
 def _irradiance(

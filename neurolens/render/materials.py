@@ -190,12 +190,9 @@ class GlossyLobes:
 
 
 def fresnel_dielectric(cos_in: FloatArray, relative_index: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unpolarised reflectance [N] and refracted cosine [N] of a smooth surface.
+    """Unpolarised reflectance [N] and refracted cosine [N] of a smooth surface; 1 and 0 where all is reflected.
 
-    Args:
-        cos_in: cosine of incidence, 0 to 1. relative_index: index beyond the surface over index before it.
-
-    Total reflection gives reflectance 1 and cosine 0.
+    `cos_in` is the cosine of incidence, 0 to 1; `relative_index` the index beyond the surface over that before it.
     """
     sin2 = (1 - cos_in * cos_in) / (relative_index * relative_index)
     cos_out = np.sqrt(np.maximum(1 - sin2, 0))

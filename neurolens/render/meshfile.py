@@ -1,26 +1,30 @@
 """Reads triangle meshes: OBJ and PLY files, or tables of the scene itself; nothing is merged or repaired.
 
 Files are checked so that no vertex and no face is lost silently; PLY is then read by trimesh, which ignores what it
-does not understand. Texture coordinates and normals of an OBJ file count where every face has them.
+does not understand. Texture coordinates and normals of an OBJ file count where every face has them. Of the MTL files
+that it names, diffuse colours and pictures are read (Kd, map_Kd) and nothing else; a material of the scene with the
+name that `usemtl` says comes before theirs.
 """
 
 from __future__ import annotations
 
 import io
 import math
+import os
 import re
 import warnings
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import read_bytes
-from neurolens.render.scenetables import FARTHEST_M, MeshSettings
+from neurolens.render.scenetables import FARTHEST_M, Material, MeshSettings, Texture, Vector
 
 LARGEST_FILE = 500_000_000  # bytes
 _LARGEST_HEADER = 100_000
@@ -30,6 +34,8 @@ _CORNER = re.compile(rf"{_INDEX}(?:/(?:{_INDEX})?(?:/{_INDEX})?)?")
 # Of each kind of line: the fewest and most words after it, how many are used, what is expected.
 _OBJ_LINES = {"v": (3, 7, 3, "v X Y Z"), "vt": (2, 3, 2, "vt U V"), "vn": (3, 3, 3, "vn X Y Z")}
 _FACE = "f I J K, counted from 1, or back from -1"
+_LARGEST_MTL, _MOST = 4_000_000, 1000  # bytes of an MTL file, materials
+_GREY: Vector = (0.8, 0.8, 0.8)  # of a material that says nothing
 
 
 @dataclass(frozen=True)
@@ -41,6 +47,13 @@ class TriangleSet:
     # [V, 2] texture coordinates, from the lower left corner of a picture, or None.
     uv: NDArray[np.float64] | None = None
     normals: NDArray[np.float64] | None = None  # [V, 3] unit vectors to interpolate, or None
+
+
+class Used(NamedTuple):
+    """Materials of an OBJ file: the MTL files that it names, and the material's name of each triangle."""
+
+    libraries: list[str]
+    names: list[str]
 
 
 def read_mesh(scene: Path, field: str, settings: MeshSettings, part: TriangleSet | None = None) -> TriangleSet:
@@ -128,6 +141,10 @@ def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
 
     Errors as of `read_mesh`.
     """
+    return _read(scene, field, path)[0]
+
+
+def _read(scene: Path, field: str, path: Path) -> tuple[TriangleSet, Used]:
     kind = path.suffix.lower()
     try:
         if kind not in (".obj", ".ply"):
@@ -140,7 +157,7 @@ def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
         raise InputError(scene, field, str(path), f"a mesh file that trimesh can read ({error})") from None
 
 
-def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> TriangleSet:
+def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[TriangleSet, Used]:
     """The triangles of an OBJ file. A vertex of the mesh is a corner as its faces write it; polygons become fans."""
     if b"\0" in content:
         raise InputError(scene, field, str(path), "a text file, without zero bytes")
@@ -148,9 +165,14 @@ def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> TriangleSe
     text = content.decode("utf-8-sig", "replace").replace("\\\r\n", " ").replace("\\\n", " ")
     values: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
     corners: dict[tuple[int, ...], int] = {}
-    faces = []
+    faces, name, materials = [], "", Used([], [])
     for number, line in enumerate(text.splitlines(), 1):
-        kind, *words = line.partition("#")[0].split() or [""]
+        bare = line.partition("#")[0].strip()
+        kind, *words = bare.split() or [""]
+        if kind == "mtllib":
+            materials.libraries.append(bare[len(kind) :].strip())  # names may hold blanks
+        elif kind == "usemtl":
+            name = bare[len(kind) :].strip()
         if kind not in ("f", *_OBJ_LINES):
             continue
         place = f"{field} {path.name}, line {number}"
@@ -159,6 +181,7 @@ def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> TriangleSe
                 raise InputError(scene, place, line[:60], _FACE)
             first, *rest = (corners.setdefault(c, len(corners)) for c in _corners(scene, place, words, values))
             faces += [(first, *edge) for edge in pairwise(rest)]
+            materials.names.extend([name] * (len(rest) - 1))
             continue
         least, most, used, form = _OBJ_LINES[kind]
         if not least <= len(words) <= most or not all(map(_is_number, words)):
@@ -170,7 +193,7 @@ def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> TriangleSe
         for kind, row in zip(values, rows, strict=True)
     )
     assert vertices is not None  # every corner has one
-    return TriangleSet(vertices, np.array(faces, np.int64).reshape(-1, 3), uv, normals)
+    return TriangleSet(vertices, np.array(faces, np.int64).reshape(-1, 3), uv, normals), materials
 
 
 def _is_number(word: str) -> bool:
@@ -201,7 +224,7 @@ def _corners(scene: Path, field: str, words: list[str], values: dict[str, list[l
     return corners
 
 
-def _read_ply(scene: Path, field: str, path: Path, content: bytes) -> TriangleSet:
+def _read_ply(scene: Path, field: str, path: Path, content: bytes) -> tuple[TriangleSet, Used]:
     """The triangles of a PLY file, no fewer than the faces of its header, which are no more than the file can hold."""
     from trimesh.exchange.ply import load_ply
 
@@ -223,7 +246,7 @@ def _read_ply(scene: Path, field: str, path: Path, content: bytes) -> TriangleSe
         raise InputError(scene, field, str(path), f"{least} triangles, as the file says, not {len(faces)}")
     uv, normals = getattr(loaded.get("visual"), "uv", None), loaded.get("vertex_normals")
     extra = [None if x is None or len(x) != len(vertices) else np.asarray(x, np.float64) for x in (uv, normals)]
-    return TriangleSet(vertices, faces, *extra)
+    return TriangleSet(vertices, faces, *extra), Used([], [])
 
 
 def encloses(mesh: TriangleSet, point: NDArray[np.float64]) -> bool:
@@ -251,3 +274,111 @@ def _is_closed(corners: NDArray[np.float64]) -> bool:
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     forth, back = (np.unique(pair, axis=0, return_counts=True) for pair in (edges, edges[:, ::-1]))
     return forth[0].shape == back[0].shape and all(np.array_equal(x, y) for x, y in zip(forth, back, strict=True))
+
+
+@dataclass
+class Parts:
+    """Meshes of one material each, and the materials and textures that come with them."""
+
+    meshes: list[MeshSettings] = field(default_factory=list)
+    triangles: list[TriangleSet] = field(default_factory=list)
+    materials: dict[str, Material] = field(default_factory=dict)
+    textures: dict[str, Texture] = field(default_factory=dict)
+
+    def add(self, scene: Path, place: str, mesh: MeshSettings, known: Mapping[str, Material]) -> None:
+        """Add a mesh: as it is where it has a material, else cut by the materials of its file.
+
+        Raises:
+            InputError: as of `read_mesh`; a file without materials, or with some that are defined nowhere.
+        """
+        if mesh.material is not None:
+            self.meshes.append(mesh)
+            self.triangles.append(read_mesh(scene, place, mesh))
+            return
+        if mesh.file is None or mesh.file.suffix.lower() != ".obj":
+            expected = "the name of a material; only an OBJ file with usemtl brings its own"
+            raise InputError(scene, f"{place}.material", "(missing)", expected)
+        whole, used = _read(scene, f"{place}.file", scene.parent / mesh.file)
+        libraries = list(dict.fromkeys(used.libraries))
+        found = _library(scene, mesh.file, libraries)
+        numbers = {name: k for k, name in enumerate(dict.fromkeys(used.names))}
+        number = np.array([numbers[name] for name in used.names], np.int64)
+        for name, k in numbers.items():
+            material = name if name in known else f"{mesh.file.stem}:{name}"
+            if name not in known:
+                if name not in found:
+                    expected = f"a material of the scene or of {', '.join(libraries) or 'an MTL file'}"
+                    raise InputError(scene, f"{place}.file, usemtl", name or "(none before a face)", expected)
+                self._define(material, found[name], whole.uv is not None, scene.parent / mesh.file)
+            part = replace(mesh, material=material)
+            self.meshes.append(part)
+            self.triangles.append(read_mesh(scene, place, part, _part(whole, number == k)))
+
+    def _define(self, name: str, given: tuple[Vector, Path | None], coordinates: bool, file: Path) -> None:
+        colour, picture = given
+        if picture is not None and not coordinates:
+            told = f"{file}: it has no texture coordinates: {picture.name} is left out"
+            warnings.warn(told, NeurolensWarning, stacklevel=2)
+        if picture is None or not coordinates:
+            self.materials[name] = Material("diffuse", reflectance=colour)
+            return
+        self.textures[name] = Texture("image", file=picture)
+        self.materials[name] = Material("diffuse", texture=name)
+
+
+def _part(mesh: TriangleSet, chosen: NDArray[np.bool_]) -> TriangleSet:
+    """Some triangles of a mesh, with the vertices that they need."""
+    rows, faces = np.unique(mesh.faces[chosen], return_inverse=True)
+    uv, normals = (None if values is None else values[rows] for values in (mesh.uv, mesh.normals))
+    return TriangleSet(mesh.vertices[rows], faces.reshape(-1, 3).astype(np.int64), uv, normals)
+
+
+def _library(scene: Path, mesh: Path, libraries: list[str]) -> dict[str, tuple[Vector, Path | None]]:
+    """Colour, and picture beside the scene if there is one, of every material of the MTL files."""
+    found: dict[str, tuple[Vector, Path | None]] = {}
+    for listed in libraries:
+        whole = (scene.parent / mesh).parent / PurePosixPath(listed)
+        for name in [listed] if os.path.isfile(whole) else listed.split():  # several names, or one with blanks
+            file = mesh.parent / PurePosixPath(name.replace("\\", "/"))
+            found |= _read_mtl(scene.parent / file, file.parent)
+            if len(found) > _MOST:
+                raise InputError(file, "newmtl", f"({len(found)} materials)", f"at most {_MOST}")
+    return found
+
+
+def _read_mtl(path: Path, folder: Path) -> dict[str, tuple[Vector, Path | None]]:
+    """Materials of an MTL file; `folder`: where it lies, seen from the scene.
+
+    Raises:
+        InputError: as of `read_bytes`; a colour or picture that is none.
+    """
+    content = read_bytes(path, _LARGEST_MTL, "an MTL file beside the OBJ file")
+    found: dict[str, tuple[Vector, Path | None]] = {}
+    name = ""
+    for number, line in enumerate(content.decode("utf-8-sig", "replace").splitlines(), 1):
+        word, _, rest = line.partition("#")[0].strip().partition(" ")
+        rest = rest.strip()
+        if word == "newmtl":
+            name = rest
+            found[name] = (_GREY, None)
+        elif word in ("Kd", "map_Kd") and name not in found:
+            raise InputError(path, f"line {number}, {word}", rest[:60], "newmtl before it")
+        elif word == "Kd":
+            found[name] = (_colour(path, number, rest), found[name][1])
+        elif word == "map_Kd":
+            if not rest or rest.startswith("-"):
+                raise InputError(path, f"line {number}, map_Kd", rest[:60], "the name of a picture, without options")
+            found[name] = (found[name][0], folder / PurePosixPath(rest.replace("\\", "/")))
+    return found
+
+
+def _colour(path: Path, number: int, text: str) -> Vector:
+    """Linear RGB; one number stands for three."""
+    words = text.split()
+    try:
+        values = [float(word) for word in words * (3 if len(words) == 1 else 1)] if len(text) < 100 else []
+    except ValueError:
+        values = []
+    if len(values) != 3 or not all(0 <= v <= 1 for v in values):
+        raise InputError(path, f"line {number}, Kd", text[:60], "three numbers from 0 to 1")
+    return values[0], values[1], values[2]

@@ -20,8 +20,7 @@ from neurolens.optics.apertures import Aperture
 from neurolens.render import scenetables as tables
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.illuminants import Spectrum, check_name, check_spectrum, illuminant, read_spectrum
-from neurolens.render.meshfile import TriangleSet, encloses
-from neurolens.render.mtlfile import Parts
+from neurolens.render.meshfile import Parts, TriangleSet, encloses
 from neurolens.render.pictures import make_aperture, read_environment, read_pictures
 from neurolens.render.scenetables import BLACK, Checked, Material, MeasuredSpectrum, Texture, Vector, require
 

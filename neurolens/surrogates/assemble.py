@@ -223,10 +223,7 @@ class DirectionSeries:
 def scene_ray(model: LensModel, values: CoreValues, series: DirectionSeries, form: Form) -> Value:
     """Position on the front surface (mm) and unit direction, 6 rows."""
     g, position = values.transmittance.graph, values.vectors[POSITION]
-    if model.direction == "slope":  # first-order models give the position in the plane of the front vertex
-        z = g.affine(np.zeros((1, 2)), position)
-    else:
-        z = sag(position, model.lens.surfaces[0], form)
+    z = g.affine(np.zeros((1, 2)), position) if model.front is None else sag(position, model.front, form)
     direction = series.decode(values.vectors[DIRECTION]) if values.unit is None else values.unit
     return g.concat(position, z, direction)
 

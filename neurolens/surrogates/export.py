@@ -9,17 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
 from neurolens.graph.derive import derivative, with_derivatives
-from neurolens.graph.ir import Graph, Value
 from neurolens.graph.onnx import Mixing, write_onnx
 from neurolens.graph.program import RAY
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.modelfile.axes import Axis
+from neurolens.modelfile.stategraph import state_graph
 from neurolens.modelfile.states import STATE
 from neurolens.optics.focusing import at_infinity
 from neurolens.optics.paraxial import first_order
@@ -112,8 +111,8 @@ def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, An
     """
     model = inverse.model
     check_gates(model)
-    base, card, front = Path(path).with_suffix(""), card_of(model, errors or {}), model.lens.surfaces[0]
-    shape = {
+    base, card, front = Path(path).with_suffix(""), card_of(model, errors or {}), model.front
+    shape = front and {
         "curvature": float(front.curvature),
         "conic": float(front.conic),
         "asphere": [[int(p), float(a)] for p, a in front.asphere],
@@ -126,7 +125,7 @@ def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, An
             "steps": STEPS,
             "tolerance": TOLERANCE,
             "direction": model.direction,
-            "front": shape if model.direction == "angle" else None,
+            "front": shape,
             "fit": inverse.report,
         }
         graph = build(inverse, ONNX, largest_angle(model))
@@ -156,36 +155,11 @@ def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | 
 
 
 def mixing_of(axes: Sequence[Axis]) -> Mixing:
-    """How constants follow the state: the products of the axes' features, those of the last axis fastest."""
-    g = Graph()
-    state, film_z = g.input(STATE, len(axes), per_call=True), g.input("film_z_mm", per_call=True)
-    low, high = zip(*(a.limits for a in axes), strict=True)
-    within = state.between(low, high)
-    inside = within[0]
-    found = _axis_features(axes[0], state[0])
-    transform: NDArray[np.float64] = axes[0].to_features
-    for k, axis in enumerate(axes[1:], 1):
-        inside = inside & within[k]
-        own = _axis_features(axis, state[k])
-        count = own.rows
-        # Kronecker's product: every feature so far times every one of this axis.
-        found = g.take(found, np.repeat(np.arange(found.rows), count).tolist()) * g.take(
-            own, np.tile(np.arange(count), found.rows).tolist()
-        )
-        transform = np.asarray(np.kron(transform, axis.to_features), np.float64)
-    g.outputs = {"features": found, "film_z_mm": g.select(inside, film_z, _NOWHERE)}
+    """How constants follow the state; one out of range puts the film where no domain is."""
+    g, transform = state_graph(axes)
+    film_z = g.input("film_z_mm", per_call=True)
+    g.outputs["film_z_mm"] = g.select(g.outputs.pop("inside"), film_z, _NOWHERE)
     return Mixing(g, transform)
-
-
-def _axis_features(axis: Axis, value: Value) -> Value:
-    """[K rows] as `Axis.features`, T_j by their recurrence."""
-    g, (factor, offset) = value.graph, axis.pieces
-    coordinate = 1.0 / value if axis.reciprocal else value
-    t = (coordinate * factor + offset).clip(-1.0, 1.0)
-    chebyshev = [g.constant(np.ones_like(factor)), t]
-    for _ in range(2, axis.degree + 1):
-        chebyshev.append((t + t) * chebyshev[-1] - chebyshev[-2])
-    return g.concat(g.constant(1.0), *(c + -((-1.0) ** j) for j, c in enumerate(chebyshev) if j))
 
 
 def state_card(model: StateModel, errors: dict[str, Any]) -> dict[str, Any]:

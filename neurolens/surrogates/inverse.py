@@ -28,7 +28,7 @@ from neurolens.graph.ir import Exponents, Graph, Value
 from neurolens.graph.newton import determinant, limited_newton
 from neurolens.graph.passes import pruned
 from neurolens.graph.program import RAY
-from neurolens.optics.sag import meet_front
+from neurolens.optics.sag import front_rays
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.assemble import (
     EXACT,
@@ -43,7 +43,7 @@ from neurolens.surrogates.assemble import (
 )  # fmt: skip
 from neurolens.surrogates.cores import DIRECTION, MIRROR, POSITION, ROUND, STOP, CoreValues, Field, Units
 from neurolens.surrogates.domain import FilmRays
-from neurolens.surrogates.lightfield import Encoding, angle_vector
+from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import LensModel, Prediction, prediction_of
 
 Array = NDArray[np.float64]
@@ -167,10 +167,11 @@ class InverseModel:
         Raises:
             InputError: as `LensModel.predict`.
         """
-        *position, v, per_steradian = front_rays(self.model, scene, film_z.dtype)
-        given = {"front_rays": torch.stack([*position, *v, wavelength_nm])}
-        found = self._solved("scene", given, film_z, stop_radius_mm, steps)
-        return found._replace(density=found.density / per_steradian)
+        found = front_rays(self.model.front, *(c.detach().double().numpy() for c in scene))
+        known, solid = (torch.from_numpy(a).to(film_z.dtype) for a in found)
+        given = {"front_rays": torch.cat([known, wavelength_nm[None]])}
+        out = self._solved("scene", given, film_z, stop_radius_mm, steps)
+        return out._replace(density=out.density / solid)
 
     def _solved(
         self, name: str, given: dict[str, Tensor], film_z: Tensor, stop_radius_mm: float | None, steps: int
@@ -183,21 +184,6 @@ class InverseModel:
         density, residual = (out[n].expand(1, len(rays))[0] for n in ("density", "residual"))
         residual = torch.where(torch.isfinite(residual), residual, torch.inf)
         return InverseRays(rays, prediction_of(out, len(rays)), density, residual)
-
-
-def front_rays(model: LensModel, scene: Rays, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Scene rays as the model has them: x and y on the front surface (mm), [N] each, its direction vector [2, N], and
-    the solid angle per area of direction vectors [N]."""
-    flat = model.direction == "slope"
-    point = meet_front(None if flat else model.lens.surfaces[0], *(c.detach().double().numpy() for c in scene))
-    x, y = (torch.from_numpy(c).to(dtype) for c in point)
-    d = scene[3:]
-    if flat:
-        return x, y, torch.stack([d[0], d[1]]) / -d[2], d[2].abs() ** 3
-    sine = torch.hypot(d[0], d[1])
-    angle = torch.atan2(sine, -d[2])
-    near_axis = angle <= 1e-12
-    return x, y, angle_vector(*d), torch.where(near_axis, 1.0, sine / torch.where(near_axis, 1.0, angle))
 
 
 @lru_cache(maxsize=16)

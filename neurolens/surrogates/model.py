@@ -22,7 +22,7 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import RAY, WAVELENGTH
 from neurolens.modelfile import DOMAIN_SLACK
-from neurolens.optics.prescription import Lens
+from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.assemble import EXACT, model_graph
 from neurolens.surrogates.cores import Core
@@ -164,6 +164,11 @@ class LensModel:
     @cached_property
     def _derivative_graph(self) -> Graph:
         return with_derivatives(self.graph, _DIFFERENTIATED, [("rays", k) for k in range(5)])
+
+    @property
+    def front(self) -> Surface | None:
+        """The surface on which scene rays are taken; None: the plane of its vertex, of first-order models."""
+        return None if self.direction == "slope" else self.lens.surfaces[0]
 
     @property
     def wavelength_limits_nm(self) -> tuple[float, float]:

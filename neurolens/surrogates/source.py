@@ -13,7 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 import neurolens
+from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.base.files import atomic_write_text
 from neurolens.graph.c import NOTHING, Extras, Signature, write_c
@@ -30,8 +33,11 @@ from neurolens.graph.program import (
     Program,
 )
 from neurolens.graph.scalars import lower
+from neurolens.modelfile.axes import product
 from neurolens.modelfile.graph import graph_of
 from neurolens.modelfile.onnxfile import read_checked
+from neurolens.modelfile.stategraph import mixture_of, state_names
+from neurolens.modelfile.states import axes_of
 from neurolens.surrogates.assemble import ALL, SCALARS, Parts, model_graph
 from neurolens.surrogates.specialise import Fix
 
@@ -41,9 +47,13 @@ if TYPE_CHECKING:
 # Nothing fixed. Wavelengths are fixed in the models themselves, one model a table; film plane and stop here too.
 FREE = Fix()
 WRITERS = {"c": write_c, "glsl": write_glsl}
+OSL = "osl"  # of whole cameras: `cameras.osl`
+MOST_NODES = 256  # of a model of many states
+_SAME_MM = 1e-5  # a mm of focal length: what rounding may do between two forms of one model
 MOST_WEIGHTS = 20_000  # each is a step, and compilers take minutes; larger products of matrices go by blocks
 _WIDTH = 110
-# Keywords of C11, C++20 and GLSL 4.60 and words reserved there, functions of GLSL, names of the code that is written.
+# Keywords of C11, C++20 and GLSL 4.60 and words reserved there, types and functions of GLSL and OSL,
+# names of the code that is written.
 _WORDS = """
     alignas alignof and and_eq asm auto bitand bitor bool break case catch char char8_t char16_t char32_t class co_await
     co_return co_yield compl concept const const_cast consteval constexpr constinit continue decltype default delete do
@@ -56,6 +66,7 @@ _WORDS = """
     precision readonly resource sample sampler shared smooth subroutine superp uniform varying writeonly
     abs all any clamp cross distance div dot equal fract inverse length main max min mix mod normalize outer reflect
     refract round sign step texture transpose radians degrees isnan isinf
+    color point vector normal matrix string closure shader surface displacement volume light noise hash random emit
     size_t ptrdiff_t max_align_t offsetof linux unix errno signal
     ray rays i r c x y count band known band_first
 """.split()
@@ -116,27 +127,52 @@ def export_file(
 ) -> Written:
     """Write the graph of a model's file, with everything it gives: the same rays to rounding, without torch.
 
+    Of a model of many states (zoom, internal focus) the state is an argument: NAME_at makes it of numbers.
+
     Arguments as of `export_source`; errors too, and a ModelError for a file that cannot be trusted.
     """
     data, card = read_checked(file)
-    if card.get("states"):
-        raise ModelError(f"{file}: a model of many states (zoom, internal focus), expected one of one state")
     try:
         domain, codes = card["domain"], [gate["status"] for gate in card["gates"]]
         own = checked_name(language, str(card["lens"]["id"]), name)
         about = card, domain, [domain["wavelength_nm"]], FREE, codes
     except (KeyError, TypeError) as error:
         raise _no_card(error) from error
-    return _write(lower(graph_of(file, data)), Path(path), language, own, about, extras, notes)
+    program = program_of_states(file, data, card) if card.get("states") else lower(graph_of(file, data))
+    return _write(program, Path(path), language, own, about, extras, notes)
+
+
+def program_of_states(file: str | Path, data: bytes, card: Mapping[str, Any]) -> Program:
+    """The program of a model of many states: a table of numbers for each of its nodes, mixed by the state.
+
+    Raises:
+        InputError: more than `MOST_NODES`. ModelError: a graph whose numbers follow the state in another way.
+    """
+    axes = axes_of(card)
+    nodes = product(axes)
+    if len(nodes) > MOST_NODES:
+        raise InputError(file, "states.nodes", f"({len(nodes)})", f"at most {MOST_NODES}, or onnxruntime for it")
+    program = lower([graph_of(file, data, node) for node in nodes])
+    program.mixture = mixture_of(axes)
+    for known in card["states"]["reference"]:
+        rows = (*known["rays"], known["film_z_mm"][0], known["stop_radius_mm"])
+        given = dict(zip((*RAY, WAVELENGTH, FILM_Z, STOP_RADIUS), rows, strict=True))
+        wanted = lower(graph_of(file, data, known["state"])).evaluate(given)
+        found = program.evaluate(given | dict(zip(state_names(axes), known["state"], strict=True)))
+        passed = np.broadcast_to(wanted[STATUS] == st.PASSED, np.shape(known["rays"][0]))
+        off = [np.abs(found[name] - wanted[name])[passed].max(initial=0) for name in SCENE_RAY]
+        if (found[STATUS] != wanted[STATUS]).any() or not max(off) <= _SAME_MM * max(1.0, abs(card["lens"]["efl_mm"])):
+            raise ModelError(f"{file}: graph: its numbers do not follow the state as sums of the nodes'")
+    return program
 
 
 def checked_name(language: str, lens_id: str, name: str | None) -> str:
-    if language not in WRITERS:
-        raise InputError("export", "to", language, f"one of {', '.join(WRITERS)}")
+    if language not in (*WRITERS, OSL):
+        raise InputError("export", "to", language, f"one of {', '.join((*WRITERS, OSL))}")
     own = identifier(lens_id) if name is None else name
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,99}", own) or "__" in own or _taken(own):
         expected = (
-            "letters, digits and single underscores, a letter first, and no word of C, C++ or GLSL or of the code"
+            "letters, digits and single underscores, a letter first, and no word of C, C++, GLSL or OSL or of the code"
         )
         raise InputError("export", "name", own, expected)
     return own
@@ -220,6 +256,16 @@ def comment_of(
         f"{d['pupil_radius_mm']:.6g} mm on the plane z = {d['pupil_z_mm']:.6g} mm; stop radius up to "
         f"{d['stop_radius_mm']:.6g} mm; wavelength {', '.join(_span(*w) for w in waves)} nm.",
     ]
+    if card.get("states"):
+        axes = axes_of(card)
+        names = state_names(axes)
+        spans = ", ".join(f"{n} {_span(*a.range)}" for n, a in zip(names, axes, strict=True))
+        at = ", ".join(f"{n} {a.range[0]:.6g}" for n, a in zip(names, axes, strict=True))
+        lines.append(f"States: {spans}. Focal length and domain above are those at {at}.")
+        lines.append(
+            f"Argument state: NAME_at({', '.join(names)}) makes it, once for all rays of a state; zoom_mm is the focal "
+            "length at infinity focus, focus_per_m is 1 / (distance from film to object in m), 0 at infinity."
+        )
     if len(waves) > 1:
         bands = ", ".join(f"{k}: {w[0]:g} nm" for k, w in enumerate(waves))
         lines.append(f"Argument band: {bands}.")

@@ -1,7 +1,5 @@
 """Lenses whose behaviour is known in closed form, and the library's for everything else."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from dataclasses import replace

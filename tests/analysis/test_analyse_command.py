@@ -3,9 +3,6 @@
 And lenses or wishes at their limits: no light, no glass, doubtful tables, far wavelengths.
 """
 
-from __future__ import annotations
-
-import json
 import math
 import warnings
 from dataclasses import replace
@@ -15,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from analysis_lenses import thin
+from command_line import failure, run_json
 from PIL import Image
 from shipped import LENSES
 
@@ -33,14 +31,8 @@ TESSAR = LENSES / "brendel_tessar_100.toml"
 ANAMORPHIC = LENSES / "schneider_anamorphic_31.toml"
 
 
-def run_json(capsys: pytest.CaptureFixture[str], *args: object) -> dict[str, Any]:
-    assert main(["analyse", *map(str, args), "--json"]) == 0
-    data: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return data
-
-
 def test_everything_at_once(capsys: pytest.CaptureFixture[str]) -> None:
-    data = run_json(capsys, TESSAR, "--f-number", 5.6)
+    data = run_json(capsys, "analyse", TESSAR, "--f-number", 5.6)
     assert set(WHATS) <= set(data) and data["notes"] == []
     assert len(data["spots"]["rms_um"]) == 5 and "tangential_um" not in data["spots"]
     assert data["distortion"]["scale_mm"] == pytest.approx(100, rel=0.01)
@@ -50,7 +42,7 @@ def test_everything_at_once(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_state_fields_and_wavelengths(capsys: pytest.CaptureFixture[str]) -> None:
     options = ("--focus", 2, "--fields", 0, 10, "--wavelengths", 587.5618, "--focusing", "best", "--full")
-    data = run_json(capsys, TESSAR, "spots", *options)
+    data = run_json(capsys, "analyse", TESSAR, "spots", *options)
     assert data["focus_m"] == 2 and data["spots"]["wavelength_nm"] == [587.5618]
     assert data["spots"]["field_deg"] == [0, 10] and len(data["spots"]["tangential_um"]) == 2
     # Best focus was asked for, at the d line: next to nothing is left to gain.
@@ -80,22 +72,12 @@ def test_text_and_picture_of_each(
 def test_an_anamorphic_lens_in_both_planes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scale = {}
     for axis in "xy":
-        data = run_json(capsys, ANAMORPHIC, "distortion", "layout", "--axis", axis, "-o", tmp_path)
+        data = run_json(capsys, "analyse", ANAMORPHIC, "distortion", "layout", "--axis", axis, "-o", tmp_path)
         scale[axis] = data["distortion"]["scale_mm"]
     assert 1.2 < max(scale.values()) / min(scale.values()) < 2.5
     assert len(list(tmp_path.iterdir())) == 4
     assert main(["analyse", str(ANAMORPHIC), "seidel"]) == 2
     assert "symmetric" in capsys.readouterr().err
-
-
-def error_of(capsys: pytest.CaptureFixture[str], *args: object) -> str:
-    try:
-        code = main(["analyse", *map(str, args)])
-    except SystemExit as exit_:
-        code = int(exit_.code or 0)
-    error = capsys.readouterr().err
-    assert code == 2 and len(error.strip().splitlines()) == 1
-    return error
 
 
 @pytest.mark.parametrize(
@@ -110,7 +92,7 @@ def error_of(capsys: pytest.CaptureFixture[str], *args: object) -> str:
     ],
 )
 def test_bad_input_is_one_line(args: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert words in error_of(capsys, TESSAR, *args)
+    assert words in failure(capsys, "analyse", TESSAR, *args)
 
 
 @pytest.fixture
@@ -123,7 +105,7 @@ def pinhole(tmp_path: Path) -> Path:
 def test_a_stop_wider_than_the_rims(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The outermost ray that passes counts: with the stop three times as wide, the lens is as fast as its rims."""
     lens = LENSES / "thorlabs_lb1471_biconvex_50.toml"
-    data = run_json(capsys, lens, "spots", "psf", "--f-number", 1.0, "--fields", 0, "-o", tmp_path)
+    data = run_json(capsys, "analyse", lens, "spots", "psf", "--f-number", 1.0, "--fields", 0, "-o", tmp_path)
     assert len(list(tmp_path.iterdir())) == 2
     assert data["spots"]["working_f_number"] == pytest.approx(49.1 / 25.4, rel=0.06)
     assert data["spots"]["airy_um"] == pytest.approx(1.22 * D / 1000 * data["spots"]["working_f_number"])
@@ -141,35 +123,35 @@ def test_no_light_is_one_error_or_a_gap(tmp_path: Path, capsys: pytest.CaptureFi
     assert np.isnan(image.half_width_um).all() and image.pupil_points[0] == 0
     plot_spots(spots(dark, fields), tmp_path / "spots.png", "", "")
     plot_psf(image, tmp_path / "psf.png", "", "")
-    assert "field 80: got (no light" in error_of(capsys, GAUSS, "spots", "--fields", 0, 80)
-    assert "expected at most 2" in error_of(capsys, GAUSS, "mtf", "--fields", 80)
+    assert "field 80: got (no light" in failure(capsys, "analyse", GAUSS, "spots", "--fields", 0, 80)
+    assert "expected at most 2" in failure(capsys, "analyse", GAUSS, "mtf", "--fields", 80)
 
 
 def test_a_stop_beyond_all_glass_warns_of_no_division(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         lens = LENSES / "muller_fisheye_100.toml"
-        data = run_json(capsys, lens, "vignetting", "spots", "--f-number", 0.3, "-o", tmp_path)
+        data = run_json(capsys, "analyse", lens, "vignetting", "spots", "--f-number", 0.3, "-o", tmp_path)
     assert data["vignetting"]["relative"][0] in (None, 1.0)
     assert data["spots"]["working_f_number"] == pytest.approx(4, rel=0.02)
     assert any("V_d is not given" in w for w in data["warnings"])
 
 
 def test_a_pinhole_has_no_focus(pinhole: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    data = run_json(capsys, pinhole)
+    data = run_json(capsys, "analyse", pinhole)
     assert data["spots"]["working_f_number"] == pytest.approx(50 / 0.4)
     assert data["spots"]["geometric_um"][0] == pytest.approx(200, rel=1e-5)
     assert data["spots"]["best_shift_mm"][0] is None
     assert not {"colour", "curvature", "psf", "seidel"} & set(data) and len(data["notes"]) == 4
     for what in ("colour", "curvature", "psf"):
-        assert "a pinhole" in error_of(capsys, pinhole, what)
+        assert "a pinhole" in failure(capsys, "analyse", pinhole, what)
 
 
 def test_doubtful_tables_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fisheye = run_json(capsys, LENSES / "shimizu_fisheye_220.toml", "distortion")["warnings"]
+    fisheye = run_json(capsys, "analyse", LENSES / "shimizu_fisheye_220.toml", "distortion")["warnings"]
     assert any("negative thickness" in w for w in fisheye) and any("estimated" in w for w in fisheye)
-    assert run_json(capsys, GAUSS, "seidel")["warnings"] == []
-    zoom = run_json(capsys, LENSES / "nikon_zoom_70_200.toml", "distortion", "--zoom", 100)
+    assert run_json(capsys, "analyse", GAUSS, "seidel")["warnings"] == []
+    zoom = run_json(capsys, "analyse", LENSES / "nikon_zoom_70_200.toml", "distortion", "--zoom", 100)
     assert any("interpolated" in n for n in zoom["notes"])
     wrong = tmp_path / "wrong.toml"
     text = (LENSES / "thorlabs_lb1471_biconvex_50.toml").read_text(encoding="utf-8")
@@ -179,17 +161,17 @@ def test_doubtful_tables_are_named(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 def test_options_may_stand_before_what(capsys: pytest.CaptureFixture[str]) -> None:
-    data = run_json(capsys, GAUSS, "--f-number", 8, "seidel", "--axis", "x", "distortion")
+    data = run_json(capsys, "analyse", GAUSS, "--f-number", 8, "seidel", "--axis", "x", "distortion")
     assert "seidel" in data and "distortion" in data and "spots" not in data
-    assert "neurolens analyse --help" in error_of(capsys, GAUSS, "seidel", "--zoon", 3)
+    assert "neurolens analyse --help" in failure(capsys, "analyse", GAUSS, "seidel", "--zoon", 3)
 
 
 def test_far_wavelengths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for nm in (20000, 100):
-        assert "from 300 to 2500" in error_of(capsys, GAUSS, "spots", "--wavelengths", nm)
+        assert "from 300 to 2500" in failure(capsys, "analyse", GAUSS, "spots", "--wavelengths", nm)
     acrylic = tmp_path / "acrylic.toml"
     text = (LENSES / "thorlabs_lb1471_biconvex_50.toml").read_text(encoding="utf-8")
     acrylic.write_text(text.replace('n_d = 1.5168, V_d = 64.17, material = "N-BK7"', 'glass = "PMMA"'), "utf-8")
-    told = run_json(capsys, acrylic, "spots", "--wavelengths", 2200)["warnings"]
+    told = run_json(capsys, "analyse", acrylic, "spots", "--wavelengths", 2200)["warnings"]
     assert any("PMMA" in w and "extrapolated at 2200 nm" in w for w in told)
-    assert any("guess" in w for w in run_json(capsys, GAUSS, "spots", "--wavelengths", 2200)["warnings"])
+    assert any("guess" in w for w in run_json(capsys, "analyse", GAUSS, "spots", "--wavelengths", 2200)["warnings"])

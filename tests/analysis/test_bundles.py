@@ -1,21 +1,25 @@
-"""Bundles: every ray where it was aimed, whatever the lens; energy, paths and perfect foci."""
+"""Bundles, spots, MTF, point spread, distortion and illumination: every ray where it was aimed; closed forms."""
 
-from __future__ import annotations
-
+import json
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
-from analysis_lenses import INF, cartesian, library, scene, thin
+from analysis_lenses import INF, cartesian, library, scene, slower, thin
 
 from neurolens.analysis.bundles import Pattern, bundle, fan, grid, hexapolar, points
+from neurolens.analysis.field_curves import distortion, illumination
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.spots import working_f_number
-from neurolens.analysis.wavefront import opd_mm
+from neurolens.analysis.layout import layout_profile
+from neurolens.analysis.spots import diffraction_mtf, fans, mtf, spots, working_f_number
+from neurolens.analysis.wavefront import diffraction_image, opd_mm, psf
 from neurolens.base.errors import InputError
+from neurolens.optics import accessories
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.pupils import camera_rays
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
@@ -137,3 +141,142 @@ def test_blades_cut_the_bundle_and_count_as_the_stop() -> None:
     assert float(cut.weight[0].sum() / whole.weight[0].sum()) == pytest.approx(2 / math.pi, rel=0.01)
     assert float(cut.weight.sum() / cut.open_weight.sum()) == pytest.approx(1, rel=2e-3)
     assert working_f_number(square, 587.5618) == pytest.approx(working_f_number(given, 587.5618))
+
+
+D = 587.5618
+PINHOLE = Scene(replace(accessories.pinhole(50.0, 0.2, image_radius_mm=40.0), film_z_mm=50.0))
+
+
+def moved(given: Scene, shift_mm: float) -> Scene:
+    return replace(given, lens=replace(given.lens, film_z_mm=given.film_z_mm + shift_mm))
+
+
+def test_a_pinhole_falls_off_as_cos4_and_does_not_distort() -> None:
+    light = illumination(PINHOLE, fields=6)
+    assert light.relative == pytest.approx(light.cos4, rel=2e-3)
+    assert (light.passed == 1).all()
+    bent = distortion(PINHOLE)
+    assert bent.reference == "rectilinear, f tan" and bent.scale_mm == pytest.approx(50)
+    assert np.abs(bent.error_percent[bent.reference]).max() < 1e-6
+
+
+def test_illumination_of_a_real_lens_is_what_the_film_sees() -> None:
+    """Brute force: every ray from the film to the rear element, weighted by cos^4."""
+    given = library("laikin_double_gauss_50")
+    light = illumination(given, fields=4, n=100)
+    lens, z = given.lens, float(given.lens.vertices_mm[len(given.lens.surfaces) - 1])
+    line = torch.linspace(-1, 1, 400, dtype=torch.float64) * lens.surfaces[-1].semi_diameter_mm
+    px, py = (t.reshape(-1) for t in torch.meshgrid(line, line, indexing="ij"))
+    sums = []
+    for height in light.height_mm:
+        rays = camera_rays(torch.zeros_like(px), torch.full_like(px, -height), given.film_z_mm, px, py, z)
+        sums.append(float((rays.dz**4 * (trace(lens, rays).status == 0)).sum()))
+    assert light.relative == pytest.approx(np.array(sums) / sums[0], abs=4e-3)
+    assert light.relative == pytest.approx(light.unvignetted * light.passed, rel=1e-9)
+
+
+def test_distortion_names_the_projection_of_a_fisheye() -> None:
+    found = distortion(library("mizuguchi_fisheye_10"))
+    assert found.reference == found.best == "equisolid, 2 f sin(theta/2)"
+    assert distortion(library("ogawa_zoom_70_200")).reference == "rectilinear, f tan"
+    json.dumps(found.to_dict())
+
+
+def test_spots_agree_with_their_own_points_through_focus() -> None:
+    given = library("brendel_tessar_100")
+    found = spots(given, [0.0, 15.0], shift_mm=[-0.2, 0.0, 0.3])
+    for k, shift in enumerate((-0.2, 0.0, 0.3)):
+        again = spots(moved(given, shift), [0.0, 15.0], shift_mm=[0.0])
+        assert found.through_focus_um[:, k] == pytest.approx(again.rms_um, rel=1e-6)
+    best = spots(moved(given, float(found.best_shift_mm[1])), [15.0], shift_mm=[0.0])
+    assert best.rms_um[0] == pytest.approx(found.best_rms_um[1], rel=1e-6)
+    assert best.rms_um[0] < min(spots(moved(given, s), [15.0], shift_mm=[0.0]).rms_um[0] for s in (-0.5, 0.5))
+
+
+def test_a_defocused_perfect_spot_is_a_disc() -> None:
+    """RMS radius of an even disc is its radius over the square root of two."""
+    given = moved(cartesian(stop_mm=2.0), 0.5)
+    found = spots(given, [0.0], [D], rings=24)
+    assert found.geometric_um[0] == pytest.approx(1000 * 0.5 * 2.0 / 100, rel=2e-3)
+    assert found.rms_um[0] == pytest.approx(found.geometric_um[0] / math.sqrt(2), rel=2e-3)
+    assert found.best_shift_mm[0] == pytest.approx(-0.5, abs=1e-6) and found.best_rms_um[0] < 1e-3
+    assert found.airy_um == pytest.approx(1.22 * D * 1e-3 * 25, rel=2e-3)
+
+
+def test_mtf_of_a_defocused_perfect_spot() -> None:
+    """An even disc of diameter d has the MTF |2 J1(pi f d) / (pi f d)|, past its zeros too."""
+    given = moved(cartesian(stop_mm=2.0), 1.0)
+    f = np.linspace(0, 120, 61)
+    a = torch.as_tensor(np.pi * f * 2 * 2.0 / 100)
+    wanted = torch.where(a > 0, 2 * torch.special.bessel_j1(a) / a, 1.0).abs().numpy()
+    found, in_focus = (mtf(given, [0.0], [D], frequency_per_mm=f, shift_mm=shift) for shift in (0.0, -1.0))
+    for contrast in (found.tangential[0], found.sagittal[0]):
+        assert contrast == pytest.approx(wanted, abs=1e-3)
+    assert in_focus.tangential[0] == pytest.approx(1, abs=1e-6)
+    assert working_f_number(given, D) == pytest.approx(25, rel=2e-3)
+
+
+def test_mtf_where_rims_cut_the_pupil_is_that_of_a_finer_grid() -> None:
+    lens = library("laikin_double_gauss_50")
+    some = dict(field_deg=[20.0], wavelength_nm=[D], frequency_per_mm=[10, 30, 50])
+    assert mtf(lens, **some).tangential == pytest.approx(mtf(lens, **some, across=240).tangential, abs=2.5e-3)
+
+
+def test_diffraction_limit() -> None:
+    limit = diffraction_mtf(np.array([0.0, 100.0, 1e6 / D / 10, 1e9]), D, 10.0)
+    assert limit[0] == 1 and limit[2:] == pytest.approx(0, abs=1e-9)
+    # Half way to the cut-off: 2/pi (pi/3 - sqrt(3)/4).
+    half = diffraction_mtf(np.array([1e6 / D / 20]), D, 10.0)
+    assert half[0] == pytest.approx(2 / math.pi * (math.pi / 3 - math.sqrt(3) / 4))
+
+
+def test_diffraction_image_of_a_perfect_lens_is_airys() -> None:
+    """(2 J1(x) / x)^2, x = pi r / (lambda N), and its first dark ring."""
+    given = cartesian(stop_mm=2.0)
+    n = working_f_number(given, D)
+    half = 3e-6 * D * n
+    image = diffraction_image(bundle(given, [0.0], [D], grid(64)), (0.0, 0.0), half, points=61)
+    r = torch.linspace(-half, half, 61, dtype=torch.float64).abs()
+    x = math.pi * r / (D * 1e-6 * n)
+    wanted = torch.where(x > 0, (2 * torch.special.bessel_j1(x) / x) ** 2, 1.0).numpy()
+    assert image[30] == pytest.approx(wanted, abs=3e-3) and image[:, 30] == pytest.approx(wanted, abs=3e-3)
+
+
+def test_a_quarter_wave_of_defocus_leaves_a_strehl_ratio_of_81_percent() -> None:
+    given = cartesian(stop_mm=2.0)
+    shift = 8 * 0.25 * D * 1e-6 * working_f_number(given, D) ** 2  # W020 = shift / (8 N^2)
+    found = psf(moved(given, shift), [0.0], [D])
+    assert found.strehl[0] == pytest.approx((math.sin(math.pi / 4) / (math.pi / 4)) ** 2, abs=5e-3)
+    waves = opd_mm(bundle(moved(given, shift), [0.0], [D], hexapolar(12))) / (D * 1e-6)
+    assert float(waves.max() - waves.min()) == pytest.approx(0.25, rel=1e-2)
+
+
+def test_large_aberrations_leave_the_geometric_image() -> None:
+    found = psf(library("laikin_double_gauss_50"), [0.0])
+    assert np.isnan(found.diffraction).all() and np.isnan(found.strehl).all()
+    assert found.geometric.sum() == pytest.approx(1, abs=0.02)
+
+
+def test_fans_are_odd_on_the_axis_and_meet_the_chief_ray() -> None:
+    found = fans(thin(1.0), [0.0, 5.0], n=9)
+    t, s = found.tangential_um, found.sagittal_um
+    assert t[0] == pytest.approx(-t[0, :, ::-1], abs=1e-6) and t[0] == pytest.approx(s[0], abs=1e-6)
+    assert t[:, 0, 4] == pytest.approx(0, abs=1e-6) and s[:, :, 4] == pytest.approx(0, abs=1e-6)
+    # Undercorrected: rays from above the axis land below.
+    assert t[0, 0, -1] < 0
+
+
+def test_layout_rays_end_on_the_film_and_start_at_their_field() -> None:
+    given = library("shimizu_fisheye_220")
+    data = layout_profile(given)
+    fields = {r.label: r.points for r in data.rays}
+    assert len(fields) == 3 and all(p[-1, 0] == pytest.approx(given.film_z_mm) for p in fields.values())
+    edge = fields[next(k for k in fields if k.startswith("edge"))]
+    angle = math.degrees(math.atan2(edge[0, 1] - edge[1, 1], edge[1, 0] - edge[0, 0]))
+    assert angle == pytest.approx(given.fields_at([data.film_half_height_mm])[0], abs=1e-6) and angle > 100
+    assert len(data.rays) == 21
+
+
+def test_a_stopped_down_lens_has_smaller_spots() -> None:
+    given = library("laikin_double_gauss_50")
+    assert spots(slower(given, 0.3), [0.0]).rms_um[0] < 0.05 * spots(given, [0.0]).rms_um[0]

@@ -1,7 +1,5 @@
 """What the cameras' tests share: cameras by name, samples of the unit square, mean film values."""
 
-from __future__ import annotations
-
 from copy import copy
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Cameras by name and with options: white surroundings, blades and masks, zoom; the same rays through all."""
 
-from __future__ import annotations
-
 from copy import copy
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Fused cameras against the cameras that they stand for: same random numbers, same rays."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Exported models: loading checks, rays in batches, the camera; without torch."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """Outlines kept between runs: found again bit for bit, made anew when damaged, never taken for another lens's."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Outlines of the pupil, of known shapes and of real lenses: nothing lost, hardly anything wasted, evenly filled."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Cameras as source code: the rays of the camera itself, its constants, and an integrator of its own in C++."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
@@ -10,18 +8,25 @@ from pathlib import Path
 import lens_models
 import numpy as np
 import pytest
+import torch
 from camera_helpers import film_rays
 from command_line import failure
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base import status as st
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.focus_function import Focusing, number_of
 from neurolens.cameras.fused import lens_graph
-from neurolens.cameras.model import OnnxCamera
-from neurolens.cameras.source import camera_program, extras_of
+from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.cameras.source import camera_program, film_extras, model_extras
 from neurolens.cli import main
-from neurolens.optics.paraxial import film_z_mm
+from neurolens.commands.export_lens import gap_axis, lens_program, pupil_planes_mm
+from neurolens.optics.focusing import best_focus_of_stops_mm, best_focus_z_mm
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.paraxial import film_z_mm, first_order
+from neurolens.optics.surfaces import Rays
+from neurolens.optics.trace import trace
 from neurolens.surrogates.domain import sample_domain
 
 ROOT = Path(__file__).parents[2]
@@ -60,15 +65,49 @@ def test_a_camera_as_source_gives_its_own_rays(kind: str) -> None:
         assert np.abs(slopes - moves.direction.reshape(6, -1))[:, both].max() < 1e-5
 
 
-def test_the_position_of_the_film_is_within_the_error_that_is_told() -> None:
-    lens = lens_models.lens()
-    extras, (line,) = extras_of({}, 0.5, lambda focus_m: film_z_mm(lens, focus_m))
+@pytest.mark.parametrize("name", ["laikin_double_gauss_50", "phone_lens_6"])
+def test_the_film_of_a_focus_and_stop_is_that_of_best_focus(name: str) -> None:
+    """Of an exact lens, within the error that is told; it rises as objects come nearer, and stays beyond the ends."""
+    lens = read_lens(LENS.with_name(f"{name}.toml")).at()
+    near_m, widest = 12e-3 * float(first_order(lens).efl_mm), float(lens.stop_radius_mm)
+
+    def best(focus_m: float, stops_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        return best_focus_of_stops_mm(lens, focus_m, stops_mm)
+
+    functions, lines = film_extras([Focusing(near_m, widest, lambda focus_m: film_z_mm(lens, focus_m), best)])
+    told, told_paraxial = (float(re.findall(r"within (\S+) um", line)[0]) for line in lines)
+    assert told < 1 and told_paraxial < 0.01
+
+    def film(focus_m: ArrayLike, stop_mm: ArrayLike) -> NDArray[np.float32]:
+        return functions["film_z_mm"].evaluate({"focus_m": focus_m, "stop_radius_mm": stop_mm})["film_z_mm"]
+
+    for focus_m, share in ((np.inf, 1.0), (np.inf, 0.31), (3.1 * near_m, 0.77), (1.02 * near_m, 0.93), (near_m, 0.1)):
+        found = float(film(focus_m, share * widest))
+        assert 1e3 * abs(found - best_focus_z_mm(lens.with_stop_radius(share * widest), focus_m)) < 2 * told + 0.2
+        paraxial = float(functions["film_z_paraxial_mm"].evaluate({"focus_m": focus_m})["film_z_mm"])
+        assert 1e3 * abs(paraxial - film_z_mm(lens, focus_m)) < 2 * told_paraxial
+    distances = near_m / np.linspace(1e-6, 1, 5000)
+    for share in (0.07, 0.5, 1.0):
+        z = film(distances, share * widest).astype(np.float64)
+        assert np.diff(z).min() > -1e-4 and z[-1] > z[0] + 0.05 * (z[-1] - film_z_mm(lens, np.inf))
+        ends = film([np.inf, 1e30, 1e9, -1.0, near_m, 0.5 * near_m, 0.0], share * widest)
+        assert (ends[:4] == ends[0]).all() and (ends[4:] == ends[4]).all() and ends[4] > ends[0]
+    assert film(2.0, 0.0) == film(2.0, widest / 16) and film(2.0, 3 * widest) == film(2.0, widest)
+
+
+def test_the_film_of_a_model_is_where_its_camera_has_it() -> None:
+    file = lens_models.exported("invariants")
+    extras, (line, _) = model_extras(load_model(file))
     told = float(re.findall(r"within (\S+) um", line)[0])
-    focus = np.array([0.5, 0.61, 1.0, 3.0, 77.0, np.inf], np.float32)
-    found = extras.functions["film_z_mm"].evaluate({"focus_m": focus})["film_z_mm"]
-    exact = [film_z_mm(lens, float(f)) for f in focus]
-    assert 1e3 * np.abs(found - exact).max() <= 1.5 * told < 0.05
-    assert "film_z_mm" not in extras_of({}, np.inf, lambda focus_m: 1.0)[0].functions
+    for focus_m, f_number in ((np.inf, None), (0.9, 8.0)):
+        made = OnnxCamera(load_model(file), film_mm=FILM, focus_m=focus_m, f_number=f_number)
+        given = {"focus_m": focus_m, "stop_radius_mm": made.settings["stop_radius_mm"]}
+        found = float(extras.functions["film_z_mm"].evaluate(given)["film_z_mm"])
+        assert 1e3 * abs(found - made.film.film_z_mm) < told + 1.0 < 3
+    fixed, _ = model_extras(load_model(file), stop_mm=made.settings["stop_radius_mm"])
+    alone = fixed.functions["film_z_mm"].evaluate({"focus_m": 0.9})["film_z_mm"]
+    assert 1e3 * abs(float(alone) - made.film.film_z_mm) < 2
+    assert not model_extras(load_model(file), film=False)[0].functions
 
 
 def test_the_exact_lens_as_a_function(tmp_path: Path) -> None:
@@ -86,19 +125,51 @@ def test_the_exact_lens_as_a_function(tmp_path: Path) -> None:
     program = (
         f'#include <stdio.h>\n#include "{header.name}"\nint main(void) {{ float a, b, c, d, w;\n'
         f'while (scanf("%f %f %f %f %f", &a, &b, &c, &d, &w) == 5) {{\n'
-        f"const {name}_ray r = {name}(a, b, c, d, w, {name}_film_z_mm(2.0f), {name.upper()}_STOP_RADIUS_MAX_MM);\n"
+        f"const {name}_ray r = {name}(a, b, c, d, w, {name}_film_z_mm(2.0f, STOP), STOP);\n"
         f'printf("%.9g %.9g %.9g %.9g %.9g %d\\n", r.x_mm, r.y_mm, r.dx, r.dy, r.transmittance, r.status); }} }}\n'
     )
-    assert "film_z_mm(focus_m): film plane of the paraxial focus" in text
+    program = program.replace("STOP", f"{name.upper()}_STOP_RADIUS_MAX_MM")
+    assert "film_z_paraxial_mm(focus_m): film plane of the paraxial image" in text
     found = np.array(run_compiled("c", program, tmp_path, rays).split(), np.float64).reshape(-1, 6).T
     exact = ExactCamera(lens_models.lens(), film_mm=FILM, focus_m=2.0, bounds=domain.bounds)
-    exact._film_z_mm = film_z_mm(lens_models.lens(), 2.0)
+    exact._film_z_mm = best_focus_z_mm(lens_models.lens(), 2.0)
     wanted = exact._scene(np.stack(columns[:2]), np.stack(columns[2:4]), columns[4])
     passed = wanted.status == st.PASSED
     assert (found[5] == wanted.status).mean() > 0.998 and 50 < passed.sum() < 500
     assert np.abs(found[:2] - wanted.scene_ray[:2])[:, passed].max() < 5e-4
     assert np.abs(found[2:4] - wanted.scene_ray[3:5])[:, passed].max() < 5e-6
     np.testing.assert_allclose(found[4][passed], wanted.transmittance[passed], rtol=1e-4)
+
+
+@pytest.mark.parametrize("zoom_mm", [146.1, 80.3])
+def test_the_zoom_of_an_exact_lens_is_an_argument(zoom_mm: float) -> None:
+    """Between the source's positions: rays of the tracer through the lens zoomed there."""
+    lens = read_lens(LENS.with_name("nikon_zoom_70_200.toml"))
+    axis, error_mm = gap_axis(lens)
+    assert error_mm < 1e-4
+    nodes = [lens.at(zoom=v) for v in axis.nodes]
+    planes = pupil_planes_mm(nodes, (axis,))
+    program, at = lens_program(nodes, (axis,), planes), lens.at(zoom=zoom_mm)
+    film_z, random = best_focus_z_mm(at, 5.0), np.random.default_rng(3)
+    plane = number_of((axis,), planes)
+    pupil_z = plane if isinstance(plane, float) else float(plane.evaluate({"zoom_mm": zoom_mm})["value"])
+    film, pupil = random.uniform(-15, 15, (2, 400)), random.uniform(-16, 16, (2, 400))
+    names = ("film_x_mm", "film_y_mm", "pupil_x_mm", "pupil_y_mm", "wavelength_nm", "film_z_mm", "stop_radius_mm")
+    numbers = (*film, *pupil, 550.0, film_z, at.stop_radius_mm)
+    found = program.evaluate(dict(zip(names, numbers, strict=True)) | {"zoom_mm": zoom_mm})
+    way = np.stack([*(pupil - film), np.full(400, pupil_z - film_z)])
+    way /= np.sqrt((way**2).sum(0))
+    rays = Rays(*(torch.as_tensor(row) for row in (*film, np.full(400, film_z), *way)))
+    out = trace(at, rays, 550.0, towards="scene")
+    passed = out.status.numpy() == st.PASSED
+    assert passed.sum() > 60 and (found["status"] != out.status.numpy()).mean() < 0.01
+    passed &= found["status"] == st.PASSED
+    exact = np.stack([c.numpy() for c in out.rays])
+    assert np.abs(found["x_mm"] - exact[0])[passed].max() < 2e-3 and np.abs(found["dy"] - exact[4])[passed].max() < 2e-5
+    assert (
+        program.evaluate(dict(zip(names, numbers, strict=True)) | {"zoom_mm": 60.0})["status"].min()
+        == st.OUTSIDE_DOMAIN
+    )
 
 
 def run_compiled(language: str, source: str, folder: Path, given: str = "", *arguments: str) -> str:
@@ -157,11 +228,59 @@ def radiance(origin: NDArray[np.float32], direction: NDArray[np.float32], channe
     return found
 
 
+ZOOM = ROOT / "models" / "nikon_zoom_80_200-range.states-64.onnx"
+PLANES = ("efl_mm", "film_radius_mm", "film_z_min_mm", "film_z_max_mm", "pupil_z_mm", "pupil_radius_mm")
+
+
+def test_the_state_of_a_zoom_is_an_argument(tmp_path: Path) -> None:
+    """A model of a whole zoom as C: rays, planes and the film of a focus at any state are the model's own."""
+    header = tmp_path / "zoom.h"
+    assert main(["export", str(ZOOM), "--to", "c", "--name", "zoom", "-o", str(header)]) == 0
+    text = header.read_text()
+    assert "ZOOM_ZOOM_MIN_MM 80.0886" in text and "ZOOM_ZOOM_MAX_MM 200.30" in text
+    assert "zoom_at(float zoom_mm)" in text and "film_z_mm(zoom_mm, focus_m, stop_radius_mm)" in text
+    model, states = load_model(ZOOM), (80.0886, 93.7, 151.2, 200.307)
+    given, wanted = [], []
+    for state in states:
+        at = model.at(state)
+        random, domain = np.random.default_rng(int(state)), at.card["domain"]
+        spread = np.sqrt(random.random((2, 300))) * [[domain["film_radius_mm"]], [0.7 * domain["pupil_radius_mm"]]]
+        x, y = np.stack([np.cos(turn := 2 * np.pi * random.random((2, 300))), np.sin(turn)]) * spread
+        rays = np.stack([x[0], y[0], x[1], y[1], random.uniform(400, 700, 300)]).astype(np.float32)
+        film = np.float32(np.mean(domain["film_z_mm"]))
+        given += [(state, film, *ray) for ray in rays.T]
+        wanted.append(at.rays(rays[:2], rays[2:4], rays[4], float(film)))
+    given += [(79.9, film, *rays.T[0]), (np.nan, film, *rays.T[0])]
+    planes = ", ".join(f"zoom_{name}(s)" for name in PLANES)
+    program = (
+        f'#include <stdio.h>\n#include "{header.name}"\nint main(void) {{ float s, z, a, b, c, d, w;\n'
+        'while (scanf("%f %f %f %f %f %f %f", &s, &z, &a, &b, &c, &d, &w) == 7) {\n'
+        "const zoom_state state = zoom_at(s);\n"
+        "const zoom_ray r = zoom(a, b, c, d, w, z, ZOOM_STOP_RADIUS_MAX_MM, &state);\n"
+        'printf("%.9g %.9g %.9g %.9g %.9g %d", r.x_mm, r.y_mm, r.dx, r.dy, r.transmittance, r.status);\n'
+        f'printf("{" %.9g" * len(PLANES)} %.9g\\n", {planes}, zoom_film_z_mm(s, 3.0f, 9.0f)); }} }}\n'
+    )
+    lines = "\n".join(" ".join(f"{v:.9g}" for v in row) for row in given)
+    found = np.array(run_compiled("c", program, tmp_path, lines).split(), np.float64).reshape(len(given), -1).T
+    assert (found[5, -2:] == st.OUTSIDE_DOMAIN).all()
+    for k, (state, rays_of_state) in enumerate(zip(states, wanted, strict=True)):
+        part, at = found[:, 300 * k : 300 * k + 300], model.at(state)
+        passed = (part[5] == st.PASSED) & (rays_of_state.status == st.PASSED)
+        assert (part[5] == rays_of_state.status).mean() > 0.99 and passed.sum() > 50
+        assert np.abs(part[:2] - rays_of_state.scene_ray[:2])[:, passed].max() < 5e-4
+        assert np.abs(part[2:4] - rays_of_state.scene_ray[3:5])[:, passed].max() < 5e-6
+        np.testing.assert_allclose(part[4][passed], rays_of_state.transmittance[passed], atol=1e-4)
+        lens, domain = at.card["lens"], at.card["domain"]
+        known = [lens["efl_mm"], domain["film_radius_mm"], *domain["film_z_mm"], domain["pupil_z_mm"]]
+        np.testing.assert_allclose(part[6:12, 0], [*known, domain["pupil_radius_mm"]], rtol=2e-6)
+        f_number = lens["f_number"] * lens["stop_radius_mm"] / 9.0
+        film_mm = OnnxCamera(model, film_mm=FILM, focus_m=3.0, f_number=f_number, zoom=state).film.film_z_mm
+        assert abs(part[12, 0] - film_mm) < 4e-3
+
+
 def test_states_of_a_zoom_are_chosen_when_a_camera_is_written(tmp_path: Path) -> None:
-    """A model of a whole zoom has no function of its own in C: its camera at a state has."""
-    zoom = ROOT / "models" / "nikon_zoom_80_200-range.states-64.onnx"
     out = tmp_path / "zoom.h"
-    assert main(["export", str(zoom), "--to", "c", "--camera", "--zoom", "120", "-o", str(out)]) == 0
+    assert main(["export", str(ZOOM), "--to", "c", "--camera", "--zoom", "120", "-o", str(out)]) == 0
     (efl,) = re.findall(r"_EFL_MM (\S+)f\n", out.read_text())
     assert float(efl) == pytest.approx(120, rel=2e-3)
 

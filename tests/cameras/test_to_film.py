@@ -1,7 +1,5 @@
 """From scene points to the film: there and back, and the same picture by light tracing as by path tracing."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from pathlib import Path

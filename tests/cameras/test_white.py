@@ -1,7 +1,5 @@
 """White surroundings through every camera, at extremes too, and with vignetting switched off."""
 
-from __future__ import annotations
-
 import math
 from copy import copy
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Promises of a card on fresh rays: true ones hold, whatever the seed; each one that is not true fails by itself."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """How near the nearest thing in view is: a ball on the axis has it in closed form."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Image error: closed forms of the relative MSE, what FLIP must obey, the noise floor, bad input."""
 
-from __future__ import annotations
-
 import math
 import sys
 

@@ -1,7 +1,5 @@
 """What `neurolens train --lens FILE` takes for a lens that nobody has tried: its promises hold on fresh rays."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

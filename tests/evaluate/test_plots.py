@@ -1,7 +1,5 @@
 """Plots: whole PNG files with something on them, units on the axes, geometry of the lens section, bad input."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

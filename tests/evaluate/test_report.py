@@ -1,12 +1,9 @@
 """Records of a run, read back as written, and the report: complete, offline, and safe against hostile names."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
 import random
-import re
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -161,21 +158,16 @@ def test_every_picture_and_link_exists_and_nothing_needs_the_network(run_dir: Pa
     assert "http" not in path.read_text(encoding="utf-8")
 
 
-def test_it_says_what_to_use_and_what_words_mean(run_dir: Path) -> None:
+def test_it_says_what_to_use(run_dir: Path) -> None:
     results = full_results("ols-40")
     slow = {**results["models"][0], "name": "close", "rms_um": 0.01, "fused_ns_per_ray": {"min": 9.0}}
     thin = {"name": "thin", "family": "paraxial", "rms_um": 1.0, "fused_ns_per_ray": {"min": 0.9}}
     poor = {**results["models"][0], "name": "fast", "fused_ns_per_ray": {"min": 1.0}, "poor": ["false pass 3%"]}
-    source = write_report(run_dir, Results(**{**results, "models": [slow, thin, poor, *results["models"]]})).read_text()
-    page = Page(source)
-    head = page.text.partition("In short")[0]
+    models = [slow, thin, poor, *results["models"]]
+    page = Page(write_report(run_dir, Results(**{**results, "models": models})).read_text())
+    head = page.text.partition("Notes and warnings")[0]
     assert "Use ols-40" in head and "3.25 ns a ray as C" in head
     assert f"--camera fused:{run_dir}/models/ols-40.onnx" in head
-    assert "5 %" in page.text  # FLIP with the same random numbers, as a share of noise
-    table = source.partition("<section><h2>Models")[2].partition("</table>")[0]
-    headings = re.findall(r"<th scope='col'(.*?)>", table)
-    assert len(headings) > 5 and all("title='" in h for h in headings)
-    assert "C (ns/ray)" in table and "onnxruntime (ns/ray)" in table and "What the words mean" in page.text
     target = {"within_um": 0.001, "met": False, "model": "close", "rms_um": 0.01}
     page = Page(write_report(run_dir, Results(**{**results, "models": [slow], "target": target})).read_text())
     assert "the closest, as none is within 0.001 µm" in page.text

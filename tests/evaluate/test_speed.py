@@ -1,7 +1,5 @@
 """The timing harness: what it reports, never how fast. Thresholds belong to `make bench`."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -60,6 +58,7 @@ def test_what_cannot_run_is_reported_with_its_reason(domain: Domain) -> None:
     assert result.speedup("pinhole", "absent") is None
 
 
+@pytest.mark.slow
 def test_without_a_compiler_the_compiled_tracer_is_unavailable(domain: Domain) -> None:
     import torch._inductor.config as inductor
 

@@ -1,7 +1,5 @@
 """The benchmark of surrogates: records that are made once, failures that are rows, pages that say what was measured."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
@@ -130,15 +128,6 @@ def test_other_settings_and_lost_files_are_made_again(tmp_path: Path, monkeypatc
     assert run(bench, accident)[0]["failed"] == "ZeroDivisionError: by accident"
     run(bench, accident)
     assert len(fitted) == 6  # tried again
-
-
-def test_stored_weights_are_rows_of_their_own(tmp_path: Path) -> None:
-    network = ModelSettings("mlp", units=6, layers=1, steps=20)
-    rows = (Row("net", "ours", network), Row("net-int8", "ours", network, weights="int8"))
-    settings = replace(SETTINGS, pairs=PairSettings(2000, 1000, 2000), vignetting_rays=20_000)
-    whole, small = run(bench_of(tmp_path, settings=settings), *rows)
-    assert small["rms_um"] > 2 * whole["rms_um"] and small["bytes"] != whole["bytes"]
-    assert small["fingerprint"] != whole["fingerprint"]
 
 
 def test_a_lens_that_cannot_be_is_rows_too(tmp_path: Path) -> None:

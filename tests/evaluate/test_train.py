@@ -1,7 +1,5 @@
 """The whole line on small experiments: lens file to report, many states, and on again after an interruption."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -9,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import lens_models
+import numpy as np
 import pytest
 
 from experiments.zoom import CASES, page
@@ -21,9 +20,12 @@ from neurolens.evaluate.experiment import default_experiment, read_experiment
 from neurolens.evaluate.measure import fit_and_measure
 from neurolens.evaluate.train import run_experiment
 from neurolens.evaluate.train_states import fit_and_measure_states, state_settings
-from neurolens.surrogates.fit import ModelSettings, prepare
+from neurolens.surrogates.cores import Network
+from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
+from neurolens.surrogates.fits import checkpoint
 from neurolens.surrogates.pairs import make_pairs
 from neurolens.surrogates.states_fit import StateSettings
+from neurolens.surrogates.stored import load_fitted
 
 pytestmark = pytest.mark.slow
 
@@ -240,3 +242,24 @@ def test_a_second_run_takes_the_model_that_is_there(tmp_path: Path) -> None:
     assert (tmp_path / "tiny.onnx").stat().st_mtime_ns == written
     text = page([{"case": CASES[0].name, "axes": [a.to_dict() for a in space.axes], "fixed": [], **first}])
     assert CASES[0].name in text and "80.09" in text
+
+
+def test_a_training_that_was_interrupted_is_taken_up_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next run of the same command ends with the very same weights."""
+    monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
+    settings, data = ModelSettings("mlp", units=10, layers=2, steps=40), lens_models.prepared()
+
+    def interrupt(share: float) -> None:
+        if share > 0.3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_and_measure(data, settings, tmp_path, 2000, interrupt)
+    file = tmp_path / f"{settings.label}.training.npz"
+    with np.load(file) as left:
+        assert b'"ended": false' in left["header"].tobytes()
+    made = load_fitted(fit_and_measure(data, settings, tmp_path, 2000, lambda share: None).file).core
+    whole = fit_model(data, settings).core
+    assert isinstance(made, Network) and isinstance(whole, Network) and not file.exists()
+    for a, b in zip((*made.hidden, made.output), (*whole.hidden, whole.output), strict=True):
+        assert all(np.array_equal(x.astype(np.float32), y.astype(np.float32)) for x, y in zip(a, b, strict=True))

@@ -1,7 +1,5 @@
 """Cameras of gallery shots for tests: the exact lens, a shipped surrogate and the thin lens, without pictures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

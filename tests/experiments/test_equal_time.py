@@ -1,7 +1,5 @@
 """Equal time: bias and variance of known renders, errors in the film's space, laws of time, kept renders."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from copy import copy

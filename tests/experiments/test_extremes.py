@@ -1,7 +1,5 @@
 """The table of numerics: what it may never show, on every case with few rays; its reference against closed forms."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import takewhile

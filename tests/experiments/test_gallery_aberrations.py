@@ -2,8 +2,6 @@
 lens does not.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

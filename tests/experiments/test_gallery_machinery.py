@@ -1,7 +1,5 @@
 """The gallery's files, windows, widened lenses and cache, and one small effect from its file to the page."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

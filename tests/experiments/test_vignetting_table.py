@@ -1,7 +1,5 @@
 """Vignetting of fitted models against the exact lens, and random numbers through an exported one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import lens_models

@@ -1,7 +1,5 @@
 """`neurolens flare` on the command line."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -33,12 +31,25 @@ def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     np.testing.assert_allclose(sum(layers[f"{name}.R"] for name in (*top, "rest")), rgb[..., 0], rtol=1e-5, atol=1e-9)
 
 
+def test_photons_paint_the_ghosts(tmp_path: Path) -> None:
+    """The light of photons with two reflections at most is that of the ghosts, block by block, within its noise."""
+    common = ["laikin_double_gauss_50", "--light", "12,5", "--width", "24", "--wavelengths", "2", "--quiet"]
+    blocks = []
+    for words in (["--samples", "65536"], ["--photons", "400000", "--reflections", "2", "--kernel", "0"]):
+        out = tmp_path / "one.exr"
+        assert main(["flare", *common, *words, "-o", str(out)]) == 0
+        blocks.append(read_exr(out)[0][..., 1].reshape(2, 8, 3, 8).sum((1, 3)))
+    np.testing.assert_allclose(blocks[1], blocks[0], rtol=0.12)
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["--light", "180,0"], "within 90 degrees"),
         (["--light", "1"], "AZ,EL"),
         (["--light", "1,2,3/4"], "AZ,EL"),
+        (["--light", "1,2,1,0"], "positive distance"),
+        (["--light", "1,2", "--photons", "9", "--layers", "2", "-o", "x.exr"], "--layers"),
         (["--light", "0,0", "-o", "x.png"], ".exr"),
         (["--light", "0,0", "--coating", "velvet"], "velvet"),
     ],

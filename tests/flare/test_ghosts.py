@@ -1,7 +1,5 @@
 """Ghosts as compiled code against the exact path by path, closed forms, and what light may not do."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +11,7 @@ import torch
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.flare.ghosts import GhostTracer, Pair, coated, ghost_pairs
+from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import Light, Raster, axis_irradiance, ghost_picture, ghost_table, light_rays
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
@@ -169,7 +168,7 @@ def test_extremes_stay_finite(name: str) -> None:
     lens = lens_of(name)
     pairs = ghost_pairs(lens)
     tracer = GhostTracer(lens, pairs[:: max(1, len(pairs) // 9)])
-    for light in (Light(0.0, 0.0), Light(89.0, 0.0), Light(10.0, 70.0, distance_m=0.05)):
+    for light in (Light(0.0, 0.0), Light(89.0, 0.0), Light(10.0, 70.0, distance_m=0.2)):
         for nm in (380.0, 780.0):
             rays, _ = light_rays(lens, light, 0, 400)
             found = tracer.trace(rays, nm, direct=True)
@@ -187,6 +186,7 @@ BAD = [
     (lambda: Light(math.nan, 0.0), "within 90 degrees"),
     (lambda: Light(0.0, 0.0, distance_m=0.0), "positive distance"),
     (lambda: Light(0.0, 0.0, (1.0, -1.0, 0.0)), "at least 0"),
+    (lambda: light_rays(plate(), Light(0.0, 0.0, distance_m=0.005), 0, 9), "outside the lens"),
     (lambda: GhostTracer(plate(), [Pair(1, 2)]), "surfaces that reflect"),
     (lambda: GhostTracer(replace(plate(), film_z_mm=None)), "focused"),
     (lambda: GhostTracer(plate()).trace(np.zeros((3, 4)), 550.0), r"\[6, N\]"),
@@ -207,3 +207,58 @@ def test_coatings_of_the_file_stay() -> None:
     after = coated(lens, "quarter-wave")
     assert after.surfaces[0].coating == own and after.surfaces[1].coating is not None
     assert after.surfaces[2].coating is None
+
+
+@pytest.mark.parametrize("distance_m", [math.inf, 3.0, 0.08])
+def test_lights_send_what_the_front_receives(distance_m: float) -> None:
+    """Light through the front rim's disc: that of a point source, by quadrature over the disc."""
+    lens = plate()
+    light = Light(20.0, 10.0, distance_m=distance_m)
+    rays, area = light_rays(lens, light, 0, 200_000)
+    way = -rays[2] / rays[5]
+    at = rays[:2] + way * rays[3:5]
+    inside = np.hypot(*at) <= 10.0
+    cos = -light.towards[2]
+    expected = math.pi * 100 * cos
+    if math.isfinite(distance_m):
+        r, angle = np.meshgrid(10 * np.sqrt((np.arange(400) + 0.5) / 400), np.arange(64) * math.pi / 32)
+        disc = np.stack([r * np.cos(angle), r * np.sin(angle), 0 * r], -1)
+        to = 1000 * distance_m * light.towards - disc
+        far = np.linalg.norm(to, axis=-1)
+        expected = math.pi * 100 * np.mean(-to[..., 2] / far**3) * (1000 * distance_m) ** 2
+    assert area * inside.mean() == pytest.approx(expected, rel=4e-3)
+
+
+def test_photons_are_the_ghosts_and_none_is_lost() -> None:
+    lens, light, count = double_gauss(), Light(15.0, 8.0), 1 << 17
+    rays, _ = light_rays(lens, light, 0, count)
+    exact = GhostTracer(lens).trace(rays[:, : 1 << 15], 550.0, direct=True)
+    direct, twice = float(exact.power[-1].mean()), float(exact.power[:-1].sum(0).mean())
+    tracer = PhotonTracer(lens)
+    for most in (0, 2, 10):
+        found = tracer.trace(rays, 550.0, most_reflections=most, seed=most)
+        times = np.bincount(found.reflections, minlength=4)
+        assert found.cast == count == times.sum() + found.left + found.stopped + found.absorbed + found.cut
+        assert not times[1::2].any() and found.absorbed == 0  # an even number leads to the film
+        for share, expected in ((times[0], direct), (times[2], twice if most else 0.0)):
+            assert share / count == pytest.approx(expected, abs=4 * math.sqrt(expected / count) + 2e-4 * expected)
+    again = tracer.trace(rays, 550.0, most_reflections=10, seed=10)
+    assert np.array_equal(again.film_xy_mm, found.film_xy_mm)
+    # Where they arrive, too.
+    mean = found.film_xy_mm[:, found.reflections == 0].mean(1)
+    place = exact.film_xy_mm[-1] @ exact.power[-1] / exact.power[-1].sum()
+    assert mean == pytest.approx(place, abs=0.01)
+
+
+def test_photons_are_absorbed_as_beer_says() -> None:
+    lens = plate()
+    grey = replace(lens, surfaces=(replace(lens.surfaces[0], absorption_per_mm=0.2), *lens.surfaces[1:]))
+    rays, _ = light_rays(grey, Light(0.0, 0.0), 0, 1 << 16)
+    inside = np.hypot(*rays[:2]) < 9.9
+    found = PhotonTracer(grey).trace(rays[:, inside], 550.0, most_reflections=0)
+    through = 0.96**2 * math.exp(-0.8)
+    assert found.reflections.size / found.cast == pytest.approx(through, abs=4 * math.sqrt(through / found.cast))
+    nothing = PhotonTracer(grey).trace(np.zeros((6, 0)), 550.0)
+    assert nothing.cast == 0 and nothing.film_xy_mm.shape == (2, 0)
+    with pytest.raises(InputError, match="most_reflections"):
+        PhotonTracer(grey).trace(rays, 550.0, most_reflections=-1)

@@ -1,7 +1,5 @@
 """Compiled libraries: kept for the next time, never taken from a folder that others can write to."""
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Operators of graphs: derivatives against central differences, one rule each; torch and C against numpy; Newton."""
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What needs no Mitsuba: film samples to rays, wavelengths for RGB, the errors without it or with an old LLVM."""
 
-from __future__ import annotations
-
 import sys
 from types import SimpleNamespace
 

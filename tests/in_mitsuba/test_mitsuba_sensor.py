@@ -4,8 +4,6 @@ Skipped where the extra "mitsuba", or for its compiled variants libLLVM, is not 
 mitsuba, which Python would then take for the package.)
 """
 
-from __future__ import annotations
-
 import math
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Graphs read from model files against onnxruntime."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import lens_models

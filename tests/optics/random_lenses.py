@@ -1,7 +1,5 @@
 """Lenses that nobody would build but that could be built: random surfaces, clear of each other, for property tests."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Glass: catalogue names, indices against published ones, absorption, gradients; what a lens file states."""
 
-from __future__ import annotations
-
 import json
 import math
 import warnings

@@ -1,7 +1,5 @@
 """Thin films against the package tmm, closed forms and conservation of energy; designs against what they promise."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

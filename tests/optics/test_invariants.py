@@ -1,7 +1,5 @@
 """What every lens keeps, whatever its surfaces: étendue and energy. Over the whole library, float64."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 The project's own selection (tests/data) is always checked; the whole reference set (../shared/data) where it is there.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass

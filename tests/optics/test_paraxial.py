@@ -1,7 +1,5 @@
 """First-order data against formulas of text books and against exact rays near the axis."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

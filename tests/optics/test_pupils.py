@@ -1,7 +1,5 @@
 """Pupils of lenses, and how the literature samples them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

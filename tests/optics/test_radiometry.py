@@ -1,7 +1,5 @@
 """Light on the film against closed forms; its factors are what their names say, and multiply to the whole."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Properties of tracing that hold for any lens at all; the same random lenses at every run."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

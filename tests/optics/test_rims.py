@@ -1,7 +1,5 @@
 """Rays aimed at the stop, and rims derived from them: what the rule lets through passes, nothing overlaps."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Ghost paths against 50-digit references, closed forms of a plate, and the plain trace."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What a photographer changes: zoom, size, f-number, focus; against traced rays, sources and closed forms."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 Each writer raises `CannotSay` for what its format has no words for.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Glass catalogues of Zemax, and glasses that no catalogue has."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """CODE V sequence files in the details of their definition: media, what sizes the stop, zooms, refusals by line."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

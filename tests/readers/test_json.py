@@ -1,7 +1,5 @@
 """JSON prescriptions: the reference set where it is there, DeepLens and ISET, what the forms may say or get wrong."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

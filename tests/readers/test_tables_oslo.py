@@ -1,7 +1,5 @@
 """Plain tables and OSLO files in the details of their definitions, and their refusals by line."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Zemax files in the details of their definition: closed forms, what sizes the stop, states, and refusals by line."""
 
-from __future__ import annotations
-
 import math
 import re
 import warnings

@@ -1,7 +1,5 @@
 """What the renderer's tests share: scenes from tables, radiance along one ray, comparisons of noisy means."""
 
-from __future__ import annotations
-
 import math
 import resource
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """A render that ends early goes on to the same picture, bit for bit; a checkpoint of anything else is refused."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -19,7 +17,7 @@ from render_helpers import FILM, PINHOLE, SIZE, THIN, WHITE, diffuse, files_of_a
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.ideal import ThinLens
-from neurolens.render.checkpoint import SPENT, digest, write_checkpoint
+from neurolens.render.checkpoint import SPENT, write_checkpoint
 from neurolens.render.film import Film, Tiling
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import RenderResult, Watch, render
@@ -190,21 +188,6 @@ def test_meshes_traced_by_something_else_are_refused(tmp_path: Path, monkeypatch
     with pytest.raises(InputError, match="meshes traced by: got 'Embree', expected 'the built-in tree' as asked now"):
         kept_render(part, scene=with_mesh)
     kept_render(bare)  # without meshes it is no matter
-
-
-def test_the_digest_of_a_scene_sees_every_part_and_nothing_else() -> None:
-    assert digest(lit_scene()) == digest(lit_scene()) != digest(lit_scene(0.7000001))
-    pairs: list[tuple[Any, Any]] = [
-        (("ab", "c"), ("a", "bc")),
-        ((1, (2, 3)), (1, 2, 3)),
-        (np.zeros(2), np.zeros((2, 1))),
-        (np.zeros(1, np.float32), np.zeros(1, np.int32)),
-        ({"a": None}, {}),
-        (1, "1"),
-    ]
-    assert all(digest(a) != digest(b) for a, b in pairs)
-    transposed = np.arange(6).reshape(2, 3).T
-    assert digest({"a": transposed, "b": 2}) == digest({"b": 2, "a": np.ascontiguousarray(transposed)})
 
 
 def rewritten(part: Path, change: Callable[[dict[str, bytes]], None], compression: int = zipfile.ZIP_STORED) -> None:

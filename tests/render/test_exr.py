@@ -1,19 +1,26 @@
-"""Pictures survive the disk: layouts, types, metadata, and errors worth reading."""
+"""Pictures survive the disk; what they say of their own pixels: sample count, variance, depth, blocked rays."""
 
-from __future__ import annotations
-
+import tracemalloc
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
-from render_helpers import files_of_at_most
+from render_helpers import FILM, SIZE, WHITE, diffuse, files_of_at_most, lit_scene, scene
 
 from neurolens.base.errors import InputError
+from neurolens.cameras.contract import CameraRays
+from neurolens.cameras.ideal import ThinLens
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.render.film import BYTES_A_PIXEL, COLUMNS, PixelGrid
+from neurolens.render.film_settings import FilmSettings
+from neurolens.render.job import Job, develop
 from neurolens.render.pictures import read_exr, read_layers, write_exr, write_png
+from neurolens.render.renderer import Watch, render
 
 PICTURE = np.random.default_rng(0).random((5, 7, 3), np.float32) * 10
 
@@ -141,3 +148,140 @@ def test_preview_is_srgb_at_the_asked_exposure(tmp_path: Path) -> None:
     assert np.all(np.asarray(Image.open(path)) == 255)
     with pytest.raises(InputError, match="shape"):
         write_png(path, np.zeros((2, 3)))
+
+
+# One wavelength: the film is grey, and light of radiance 1 gives 1 whatever the sample.
+GREY: dict[str, Any] = {"wavelengths_nm": [550, 550], "position_m": [0, 0, 0], "look_at_m": [0, 0, -1]}
+
+
+class Coin(Pinhole):
+    """Weight 2 for half of the pupil and 0 for the other, of which a quarter of all is blocked."""
+
+    def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
+        rays = super().sample(film_mm, pupil, wavelength_nm)
+        weight = np.where(pupil[0] < 0.5, np.float32(2), np.float32(0))
+        status = np.where(pupil[0] < 0.75, 0, 6).astype(np.int32)
+        return CameraRays(rays.origin_m, rays.direction, weight, status)
+
+
+@pytest.mark.parametrize(("mode", "paths"), [("one", 1), ("hero", 1), ("lanes", 4)])
+def test_variance_is_that_of_a_coin(mode: Any, paths: int) -> None:
+    """n tosses of 0 or 2, half of each (Sobol' points see to it): the variance of their mean is 1 / (n - 1)."""
+    made, samples = scene(GREY, environment=WHITE), 64
+    camera = Coin(4000.0, FILM, 1.0)
+    found = render(made, camera, **SIZE, samples=samples, film=FilmSettings(wavelengths=mode))
+    scale = float(found.rgb.mean())  # the coin's exposure
+    assert found.rgb == pytest.approx(np.full((24, 36, 3), scale), rel=1e-3)
+    tosses = samples // paths
+    assert found.layers.variance == pytest.approx(np.full((24, 36), scale**2 / (tosses - 1)), rel=2e-2)
+    assert np.all(found.layers.samples == samples)
+
+
+def test_one_sample_has_no_variance_and_every_sample_is_counted() -> None:
+    made = scene(GREY, environment=WHITE)
+    one = render(made, Pinhole(400.0, FILM), **SIZE, samples=1).layers
+    assert np.all(np.isinf(one.variance)) and np.all(one.samples == 1)
+    odd = render(made, Pinhole(400.0, FILM), **SIZE, samples=37).layers
+    assert np.all(odd.samples == 37) and np.all(odd.variance < 1e-6)
+
+
+def test_variance_follows_the_noise_of_renders_with_other_seeds() -> None:
+    """A rough scene at few samples: Sobol' points do better than independent ones, by less than an order."""
+    made = lit_scene(camera=GREY)
+    found = [render(made, ThinLens(50.0, 2.0, 3.0, FILM), **SIZE, samples=8, seed=s) for s in range(12)]
+    scatter = np.var([f.rgb[..., 1] for f in found], axis=0, ddof=1).mean()
+    stated = np.mean([f.layers.variance for f in found])
+    assert 0.7 < stated / scatter < 10
+
+
+@pytest.mark.parametrize("camera", [Pinhole(30.0, FILM), ThinLens(30.0, 1.4, 3.0, FILM)], ids=["pinhole", "thin"])
+def test_depth_is_measured_along_the_axis_from_the_film(camera: Any) -> None:
+    """A wall across the axis 3 m from the film has depth 3 everywhere, wherever the camera looks."""
+    wall = {"point_m": [5.0, 1.0, 0.0], "normal": [1, 0, 0], "material": "m"}
+    pose = {"position_m": [2.0, 1.0, 0.0], "look_at_m": [9.0, 1.0, 0.0]}
+    made = scene(pose, materials={"m": diffuse(0.5, 0.5, 0.5)}, planes=[wall])
+    depth = render(made, camera, **SIZE, samples=4).layers.depth
+    assert depth == pytest.approx(np.full((24, 36), 3.0), rel=1e-5)
+
+
+def test_depth_is_infinite_where_nothing_is_and_the_mean_of_what_is() -> None:
+    """A floor below a pinhole: at height y on the film the floor is at height / tan, and above the horizon nothing."""
+    floor = {"point_m": [0, -1, 0], "normal": [0, 1, 0], "material": "m"}
+    made = scene(GREY, materials={"m": diffuse(0.5, 0.5, 0.5)}, planes=[floor])
+    found = render(made, Pinhole(20.0, FILM), **SIZE, samples=256).layers
+    assert np.all(np.isinf(found.depth[:12])) and np.all(np.isfinite(found.depth[12:]))
+    assert not found.blocked.any()
+    # The image distance is the focal length; the pinhole lies that far in front of the film.
+    for row in (14, 18, 23):
+        low, high = (row - 12) / 20, (row - 11) / 20
+        mean = np.log(high / low) / (high - low)
+        assert found.depth[row].mean() == pytest.approx(mean, abs=0.025 + 0.01 * mean)
+
+
+def test_blocked_is_the_share_of_camera_rays_that_do_not_pass() -> None:
+    found = render(scene(GREY, environment=WHITE), Coin(400.0, FILM), **SIZE, samples=64).layers
+    # Half of the coin weighs 0: nothing passes there either.
+    assert found.blocked == pytest.approx(np.full((24, 36), 0.5), abs=1e-6)
+
+
+def some_job(width: int, height: int, samples: int = 40) -> Job:
+    made, camera = scene(GREY, environment=WHITE), Pinhole(4000.0, FILM)
+    return Job(made, camera, PixelGrid(width, height, FILM), samples, 0, 2, FilmSettings())
+
+
+def test_a_picture_on_its_way_is_divided_by_what_each_tile_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.render.film.BATCH", 16 * 100)
+    job = some_job(36, 24)
+    assert (job.tiling.tiles, job.tiling.passes) == (9, 3)
+    for tile, passes in ((0, 3), (1, 1), (8, 2)):
+        for part in range(passes):
+            job.film.add(tile, job.render_tile(job.camera, tile, part)[0])
+    rgb, layers = develop(job)
+    samples = np.repeat([40, 16, 0, 0, 0, 0, 0, 0, 32], 100)[: 36 * 24].reshape(24, 36)
+    assert np.array_equal(layers.samples, samples)
+    assert rgb == pytest.approx(np.repeat(samples[..., None] > 0, 3, axis=-1).astype(float), rel=1e-4)
+    assert np.all(np.isinf(layers.variance[samples == 0])) and not layers.blocked.any()
+
+
+def peak_bytes(act: Any) -> int:
+    tracemalloc.start()
+    try:
+        act()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_worker_holds_a_tile_and_the_picture_156_bytes_a_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.render.film.BATCH", 16 * 256)
+    small, large = some_job(48, 32), some_job(960, 640)
+    assert large.film.sums.nbytes == 960 * 640 * 8 * COLUMNS
+    tiles = [peak_bytes(lambda job=job: job.render_tile(job.camera, 3, 1)) for job in (small, large)]
+    assert tiles[1] < 1.05 * tiles[0]
+    monkeypatch.setattr("neurolens.render.film.CHUNK_BYTES", 1 << 20)
+    assert peak_bytes(lambda: develop(large)) < (BYTES_A_PIXEL - 8 * COLUMNS) * 960 * 640
+
+
+def test_previews_come_while_the_render_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So many samples take longer than the first preview, which is white where there is anything."""
+    monkeypatch.setattr("neurolens.render.film.BATCH", 16 * 100)
+    shown: list[Any] = []
+    watch = Watch(preview=shown.append, preview_s=0, stop=lambda: len(shown) > 1)
+    made = scene(GREY, environment=WHITE)
+    found = render(made, Pinhole(4000.0, FILM), **SIZE, samples=100_000, watch=watch)
+    assert not found.stats["complete"] and found.layers.samples.max() < 100_000
+    for preview in (*shown, found.rgb):
+        lit = preview > 0
+        assert lit.any() and preview[lit] == pytest.approx(np.ones(np.count_nonzero(lit)), rel=1e-4)
+
+
+def test_a_preview_that_cannot_be_written_is_told_once_and_the_render_goes_on(tmp_path: Path) -> None:
+    told: list[str] = []
+
+    def fails(_: Any) -> None:
+        raise PermissionError(13, "Permission denied", "p.png")
+
+    watch = Watch(preview=fails, preview_s=0, note=told.append)
+    made = scene(environment=WHITE)
+    found = render(made, Pinhole(50.0, FILM), width=90, height=60, samples=64, threads=1, watch=watch)
+    assert found.stats["complete"] and told == ["preview not written: p.png: Permission denied"]

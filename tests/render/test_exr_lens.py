@@ -1,7 +1,5 @@
 """The lens in the header of a picture, as another reader finds it, against rays and Fresnel's equations."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

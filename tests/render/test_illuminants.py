@@ -1,7 +1,5 @@
 """Lights of known spectra and colour spaces: closed forms, chromaticities and matrices of the standards, mistakes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

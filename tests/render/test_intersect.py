@@ -1,7 +1,5 @@
 """Shapes against brute force in float64."""
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

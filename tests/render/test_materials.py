@@ -1,7 +1,5 @@
 """Scattering: energy, densities, Snell and Fresnel."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

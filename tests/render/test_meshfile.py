@@ -1,7 +1,5 @@
 """Mesh files and the materials of OBJ files: what is in them arrives, and each mistake is one clear error."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from typing import Any

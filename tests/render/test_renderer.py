@@ -1,7 +1,5 @@
 """Whole renders: exposure, orientation, the same numbers for everybody, errors."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

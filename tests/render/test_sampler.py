@@ -1,7 +1,5 @@
 """Random numbers: the right sequence, stratified in every pixel, the same whoever asks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

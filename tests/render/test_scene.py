@@ -1,7 +1,5 @@
 """Scene files: the shipped ones, pictures and solids in them, and one clear error for each mistake."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The clear sky against its paper's equations, written out anew, and against measured daylight."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Wavelengths drawn by importance, and four of them a path: exact densities, the same mean, less noise."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The contract of models, of every kind and in every written form: held against the float64 model, inside and out."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Domains and ray pairs: uniform, repeatable, apart, and saved so that nothing wrong comes back."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

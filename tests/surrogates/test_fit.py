@@ -1,7 +1,5 @@
 """Settings of a fit, what is refused, cores of several parts, and what each part of a fit is worth."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,24 +1,30 @@
-"""Boundaries: rims, missed surfaces and total reflection, in lenses where rays really end in each way."""
+"""Boundaries where rays end in each way, and poor data: a good model, or one clear refusal."""
 
-from __future__ import annotations
-
+import math
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from lens_models import gated
+from vignetting_oracle import vignetting_errors
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import read_lens
-from neurolens.surrogates.domain import domain_of, sample_domain
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.surrogates.cores import InvariantPolynomial
+from neurolens.surrogates.domain import SPARSE, Domain, domain_of, lit_share, sample_domain, sample_lit
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.gates import boundary_rays, choose_gates, gate_reach, gate_values
+from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
+from neurolens.surrogates.fits.polynomial import fit_polynomial
+from neurolens.surrogates.gates import GateFit, boundary_rays, choose_gates, gate_reach, gate_values
+from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import Gate, LensModel
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, reached, trace_pairs
+from neurolens.surrogates.targets import targets_of
 
 LENSES = Path(__file__).parents[2] / "lenses"
 
@@ -121,3 +127,188 @@ def test_only_rays_that_refract_all_the_way_choose_rims() -> None:
     lost = pairs.edge.select(slice(0, 500))
     wild = replace(lost, cross_x=lost.cross_x + 1e6 * ~reached(lost))
     assert {g.reason for g in choose_gates(pairs.lens, wild)} <= {st.MISSED, st.TOTAL_REFLECTION}
+
+
+RAYS = PairSettings(train=4000, held_out=100, rim=4000)
+
+
+@cache
+def lens(name: str = "laikin_double_gauss_50") -> Lens:
+    return read_lens(LENSES / f"{name}.toml").at()
+
+
+@cache
+def narrow() -> tuple[Lens, Domain]:
+    """A double Gauss whose film is many times wider than what it lights: under 1% of the disc passes."""
+    return lens(), domain_of(lens(), film_radius_mm=180.0)
+
+
+def fitted(lens: Lens, domain: Domain, terms: int = 40, rays: PairSettings = RAYS) -> LensModel:
+    return fit_model(prepare(make_pairs(lens, domain, rays)), ModelSettings("ols", terms=terms, planes=False))
+
+
+def test_where_little_passes_rays_are_drawn_where_it_does() -> None:
+    """The share that passes is known all the same, and no passing ray lies outside the boxes."""
+    lens, domain = narrow()
+    assert lit_share(domain) < SPARSE
+    drawn, stands_for = sample_lit(domain, 60_000, seed=3)
+    found = (trace_pairs(lens, drawn, domain.pupil_z_mm).status == st.PASSED).sum() / stands_for
+    everywhere = trace_pairs(lens, sample_domain(domain, 400_000, seed=4), domain.pupil_z_mm)
+    share = float((everywhere.status == st.PASSED).double().mean())
+    assert share < 0.012
+    assert float(found) == pytest.approx(share, rel=0.06)  # 4 sigma of some 4000 passing rays
+
+
+def test_rays_of_the_boxes_pass_uniformly() -> None:
+    """The same distribution over film and pupil as that of the passing rays of the whole domain."""
+    lens, domain = narrow()
+    samples = []
+    for rays in (sample_lit(domain, 60_000, 3)[0], sample_domain(domain, 400_000, 4)):
+        inputs = rays.select(trace_pairs(lens, rays, domain.pupil_z_mm).status == st.PASSED)
+        along = inputs.film_x * inputs.pupil_x + inputs.film_y * inputs.pupil_y
+        samples.append([torch.hypot(inputs.film_x, inputs.film_y), torch.hypot(inputs.pupil_x, inputs.pupil_y), along])
+    for a, b in zip(*samples, strict=True):
+        points = torch.quantile(torch.cat([a, b]), torch.linspace(0.05, 0.95, 19, dtype=torch.float64))
+        apart = max(abs(float((a < p).double().mean() - (b < p).double().mean())) for p in points)
+        assert apart < 1.95 * math.sqrt(1 / len(a) + 1 / len(b))  # Kolmogorov and Smirnov, one in a thousand
+
+
+@pytest.mark.slow
+def test_a_lens_where_almost_no_ray_passes() -> None:
+    lens, domain = narrow()
+    found = vignetting_errors(lens, domain, fitted(lens, domain).predict, count=400_000)
+    assert found["passing_share"] < 0.012
+    assert found["false_pass"] < 0.005 and found["false_block"] < 0.005
+
+
+@pytest.mark.slow
+def test_a_tiny_rim_far_in_front() -> None:
+    surfaces = (replace(lens().surfaces[0], diameter_mm=4.0), *lens().surfaces[1:])
+    small = replace(lens(), surfaces=surfaces)
+    domain = domain_of(small)
+    found = vignetting_errors(small, domain, fitted(small, domain).predict, count=200_000)
+    assert found["false_pass"] < 0.003 and found["false_block"] < 0.003
+
+
+def test_a_hole_without_glass() -> None:
+    """Only a stop: rays go straight on."""
+    hole = Lens("hole", "test", (Surface(math.inf, 50.0, 4.0, stop=True),), 2.5)
+    domain = domain_of(hole, film_radius_mm=10.0)
+    model = fitted(hole, domain, terms=24)
+    assert model.gates == ()
+    found = vignetting_errors(hole, domain, model.predict, count=50_000)
+    assert found["false_pass"] == found["false_block"] == 0
+    rays = sample_domain(domain, 1000, 1)
+    said, exact = model.predict(rays).rays, trace_pairs(hole, rays, 0.0).scene
+    assert torch.allclose(said.x, exact.x, atol=1e-9)
+    assert torch.allclose(said.dx, exact.dx, atol=1e-6)
+
+
+@pytest.mark.parametrize(("rays", "named"), [((30, 10, 400), "train"), ((400, 10, 3), "rim")])
+def test_too_few_rays_are_refused(rays: tuple[int, int, int], named: str) -> None:
+    with pytest.raises(InputError, match=named):
+        fitted(lens(), domain_of(lens()), rays=PairSettings(*rays))
+
+
+@pytest.mark.parametrize("name", ["isshiki_fisheye_10", "edmund_asphere_30"])
+def test_the_pupil_plane_keeps_the_disc_small_and_loses_no_light(name: str) -> None:
+    """A pupil that walks with the film point: once 0.8% and 32% of the disc passed."""
+    domain = domain_of(lens(name))
+    bounds = domain.bounds
+    rays = sample_domain(domain, 40_000, 1)
+    passed = trace_pairs(lens(name), rays, domain.pupil_z_mm).status == st.PASSED
+    assert float(passed.double().mean()) > 0.25
+    # What passes lies well within the disc: nothing is cut off at its edge.
+    reach = torch.hypot(rays.pupil_x, rays.pupil_y)[passed].max()
+    assert float(reach) <= 1.0005 * bounds.disc_mm < domain.pupil_radius_mm
+
+
+def test_gates_block_far_rays_of_which_no_value_is_known() -> None:
+    """A gate that falls again beyond where it was fitted: rays there are blocked all the same, and its root stays."""
+    x, far = torch.linspace(-1, 1.2, 400, dtype=torch.float64), torch.linspace(3, 4, 50, dtype=torch.float64)
+    features, beyond = (torch.stack([t**k for k in range(6)]) for t in (x, far))
+    value, nothing = x - 1 - 0.6 * (x - 1) ** 2, torch.zeros((1, 50), dtype=torch.float64)
+    fit = GateFit(features, value[None], 1 / torch.sqrt(1 + (value / 0.03) ** 2)[None])
+    assert (fit.coefficients()[0] @ beyond < 0).all()
+    fit.block(beyond, nothing, torch.zeros((1, 50), dtype=torch.bool))
+    gate = fit.coefficients()[0]
+    assert (gate @ beyond > 0).all()
+    near = (x > 0.95) & (x < 1.05)
+    assert ((gate @ features - value)[near].abs() < 5e-3).all()
+    # One that is known not to block them is left alone.
+    known = GateFit(features, value[None], torch.ones((1, 400), dtype=torch.float64))
+    known.block(beyond, nothing - 1, torch.ones((1, 50), dtype=torch.bool))
+    assert (known.coefficients()[0] @ beyond < 0).all()
+
+
+def test_gates_of_dependent_features() -> None:
+    """Twice the same feature: finite, and as good as once."""
+    x = torch.linspace(-1, 1, 100, dtype=torch.float64)
+    features = torch.stack([torch.ones_like(x), x, x])
+    found = GateFit(features, (2 * x - 1)[None], torch.ones((1, 100), dtype=torch.float64)).coefficients()
+    assert torch.allclose(found @ features, (2 * x - 1)[None], atol=1e-9)
+
+
+# ---- rays that cannot tell all terms apart ----
+
+
+@cache
+def prepared() -> Prepared:
+    lens = read_lens(LENSES / "brendel_tessar_100.toml")
+    return prepare(make_pairs(lens, domain_of(lens), PairSettings(3000, 3000, 3000)))
+
+
+def like(column: str, value: float) -> PairSet:
+    """Rays of the domain with one input column (or two, for the film) replaced, exactly traced; those that pass."""
+    pairs = prepared().pairs
+    rays = sample_domain(pairs.domain, 4000, seed=3)
+    new = {"film_x": value, "film_y": value} if column == "film" else {column: value}
+    rays = replace(rays, **{k: torch.full_like(rays.film_x, v) for k, v in new.items()})
+    found = trace_pairs(pairs.lens, rays, pairs.domain.pupil_z_mm)
+    return found.select(found.status == 0)
+
+
+POOR = {
+    "one ray many times": lambda: [prepared().pairs.train.select(torch.zeros(500, dtype=torch.long))],
+    # Five choices: what 30 terms do between five rays is chance, 1e-7 to 2e-3 mm in float32.
+    "five rays many times": lambda: [prepared().pairs.train.select(5 * k + torch.arange(500) % 5) for k in range(5)],
+    "one wavelength": lambda: [like("wavelength_nm", 550.0)],
+    "the axis": lambda: [like("film", 0.0)],
+    "one meridian": lambda: [like("film_x", 0.0)],
+    "hardly more rays than terms": lambda: [prepared().pairs.train.select(slice(0, 31))],
+}
+
+
+@pytest.mark.parametrize("method", ["ols", "omp", "adaptive", "dense"])
+@pytest.mark.parametrize("kind", POOR)
+def test_poor_data_are_fitted_as_far_as_they_tell(kind: str, method: str) -> None:
+    """Finite, sound in float32, and right on the rays that there were."""
+    off_mm = []
+    for train in POOR[kind]():
+        pairs = replace(prepared().pairs, train=train)
+        settings = ModelSettings(method, terms=30, degree=4, growth=1)  # type: ignore[arg-type]
+        core = fit_polynomial(replace(prepared(), pairs=pairs), settings)
+        assert isinstance(core, InvariantPolynomial)
+        assert np.isfinite(core.ab).all() and np.isfinite(core.scalars).all()
+        targets = targets_of(pairs.lens, prepared().encoding, train)
+        in_float32 = core(LightField(*(c.float() for c in targets.field)))[0].double()
+        off_mm.append(float((in_float32 - targets.vectors)[:2].square().sum(1).mean().sqrt()))
+    assert np.median(off_mm) < 1e-3
+
+
+def test_the_axis_ray_alone() -> None:
+    rays = sample_domain(prepared().pairs.domain, 64, seed=3)
+    zero = torch.zeros_like(rays.film_x)
+    rays = replace(rays, film_x=zero, film_y=zero, pupil_x=zero, pupil_y=zero)
+    train = trace_pairs(prepared().pairs.lens, rays, prepared().pairs.domain.pupil_z_mm)
+    pairs = replace(prepared().pairs, train=train)
+    core = fit_polynomial(replace(prepared(), pairs=pairs), ModelSettings(terms=10, degree=3))
+    vectors, _ = core(prepared().encoding(rays))
+    assert float(vectors[:2].abs().max()) < 1e-9
+
+
+@pytest.mark.parametrize("rays", [1, 10, 30])
+def test_fewer_rays_than_terms_are_refused(rays: int) -> None:
+    pairs = replace(prepared().pairs, train=prepared().pairs.train.select(slice(0, rays)))
+    with pytest.raises(InputError, match="train.*more training rays than the 30 terms"):
+        fit_polynomial(replace(prepared(), pairs=pairs), ModelSettings(terms=30))

@@ -1,7 +1,5 @@
 """Derivatives of models and inverse maps: against finite differences, the exact lens, and étendue; or they say no."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """The coordinates that surrogates see, what symmetry and free space promise of them, and their planes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Lenses with cylinders: two planes of symmetry, held exactly, in torch and in the exported graph."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Polynomial and first-order surrogates of small lenses: errors, exact symmetry, stops, boundaries, bad input."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

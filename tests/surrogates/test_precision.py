@@ -1,7 +1,5 @@
 """Networks stored in float16 and int8: what the file holds, what it computes, and what the loader still refuses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

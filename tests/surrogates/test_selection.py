@@ -1,7 +1,5 @@
 """Choosing terms: the sweep against plain least squares, and what each rule promises."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

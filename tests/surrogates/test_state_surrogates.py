@@ -1,7 +1,5 @@
 """Models of many states: nodes, what lies between them, the graph's state input, and states out of range."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What exported files hold: the card, the coefficients, source code; what is refused when damaged."""
 
-from __future__ import annotations
-
 import base64
 import json
 import math
@@ -19,7 +17,7 @@ import onnx
 import onnxruntime
 import pytest
 from lens_models import edited
-from writers import compiled, rays_of, written_rays
+from writers import COLUMNS, compiled, glsl_rays, rays_of, written_rays
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
@@ -31,12 +29,13 @@ from neurolens.graph.program import SCENE_RAY
 from neurolens.graph.scalars import lower
 from neurolens.modelfile import MODEL_KEY
 from neurolens.modelfile.graph import graph_of
+from neurolens.modelfile.onnxfile import read_checked
 from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.assemble import ALL, RAY_ONLY, Parts
 from neurolens.surrogates.card import card_of, card_to_json
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.source import export_file, export_source, fused_program, identifier
+from neurolens.surrogates.source import export_file, export_source, fused_program, identifier, program_of_states
 from neurolens.surrogates.specialise import Fix, fixed_models
 from neurolens.surrogates.stored import load_fitted
 
@@ -61,6 +60,28 @@ def test_card_is_strict_json_and_says_what_the_model_is(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="errors"):
         export_onnx(model, tmp_path / "bad.onnx", {"rms_um": math.inf})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_state_mixes_the_numbers_of_its_nodes_in_glsl_too() -> None:
+    file = MODELS / "nikon_zoom_80_200-range.states-64.onnx"
+    data, card = read_checked(file)
+    program = program_of_states(file, data, card)
+    for known in card["states"]["reference"][1:2]:  # between nodes
+        columns = (*COLUMNS, "film_z_mm", "stop_radius_mm")
+        numbers = [*known["rays"], known["film_z_mm"][0], known["stop_radius_mm"]]
+        rays = {name: np.float32(value) for name, value in zip(columns, numbers, strict=True)}
+        passed = np.array(known["status"]) == st.PASSED
+        for found in (
+            program.evaluate(rays | {"zoom_mm": known["state"][0]}),
+            glsl_rays(program, rays, 0, known["state"]),
+        ):
+            np.testing.assert_array_equal(found["status"], known["status"])
+            for name, wanted in zip(SCENE_RAY, np.array(known["scene_ray"]), strict=True):
+                np.testing.assert_allclose(found[name][passed], wanted[passed], atol=1e-3 if "mm" in name else 1e-5)
+    (axis,) = card["states"]["axes"]
+    fewer = card | {"states": card["states"] | {"axes": [axis | {"degree": 2}]}}
+    with pytest.raises(ModelError, match="do not follow the state"):
+        program_of_states(file, data, fewer)
 
 
 def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
@@ -214,8 +235,6 @@ def test_a_file_without_its_coefficients_is_written_as_the_same_function(tmp_pat
     assert written.signature == whole.signature
     head, other = (f.read_text(encoding="utf-8").partition("#ifndef")[0] for f in (written.path, whole.path))
     assert head == other
-    with pytest.raises(ModelError, match="many states"):
-        export_file(MODELS / "nikon_zoom_70_200-range.states-64.onnx", tmp_path / "zoom.h", "c")
     rays = {**rays_of(model, 2000, seed=3), "film_z_mm": model.domain.film_z_mm[0], "stop_radius_mm": 5.0}
     found = compiled(lower(graph_of(file, file.read_bytes()))).rays(rays)
     wanted = written_rays("onnx", "invariants", rays)

@@ -1,11 +1,9 @@
 """Models in every form: torch in float32, ONNX by onnxruntime, C compiled, GLSL by a software OpenGL."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -18,7 +16,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.evaluate.candidates import CompiledSource
-from neurolens.graph.c import Signature
+from neurolens.graph.c import Signature, literal
 from neurolens.graph.compiler import find_compiler
 from neurolens.graph.glsl import write_glsl
 from neurolens.graph.program import SCENE_RAY, Program
@@ -89,10 +87,11 @@ def compiled(program: Program) -> CompiledSource:
     return CompiledSource(program, ("-std=c99", "-O1", "-march=native", "-Wall", "-Wextra", "-Werror"))
 
 
-def shader(program: Program, head: str, band: int = 0) -> str:
+def shader(program: Program, head: str, band: int = 0, state: Sequence[float] = ()) -> str:
     """A compute shader that runs the function on every column of buffer 0: rows in the order of the signature."""
     s = Signature.of(program, "lens")
     given = [f"rays[{k}u * n + i]" for k in range(len(s.inputs))] + ([str(band)] if s.bands > 1 else [])
+    given += [f"lens_at({', '.join(map(literal, state))})"] if s.state else []
     given += [*(f"o[{k}]" for k in range(len(s.outputs))), "code"]
     return (
         head
@@ -107,14 +106,14 @@ def shader(program: Program, head: str, band: int = 0) -> str:
     )
 
 
-def glsl_rays(program: Program, rays: Mapping[str, object], band: int = 0) -> Rows:
+def glsl_rays(program: Program, rays: Mapping[str, object], band: int = 0, state: Sequence[float] = ()) -> Rows:
     """Results by name; skips where there is no software OpenGL."""
     s = Signature.of(program, "lens")
     count = len(rays["film_x_mm"])  # type: ignore[arg-type]
     with tempfile.TemporaryDirectory() as folder:
         text, given, out = (Path(folder) / name for name in ("lens.comp", "in.npy", "out.npy"))
         np.save(given, np.stack([np.broadcast_to(np.float32(rays[i]), count) for i in s.inputs]))
-        text.write_text(shader(program, HEADS["430"], band))
+        text.write_text(shader(program, HEADS["430"], band, state))
         command = [sys.executable, RUNNER, text, given, out, str(len(s.outputs) + 1)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode == 3:

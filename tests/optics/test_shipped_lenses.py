@@ -1,7 +1,5 @@
 """Every lens that ships does what its source says or says why not; the check of a lens names known mistakes."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,0 +1,99 @@
+"""Programs as Open Shading Language: one camera shader of Blender's Cycles.
+
+A shader calls no functions of others, has no structs and no literals with a suffix. What it reads of the renderer is
+text of the caller; everything between these numbers and the outputs is the program.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from neurolens.graph.c import Writer, literal
+from neurolens.graph.program import Program, Step
+
+_LOOKUP = "{table}[{width} * clamp(int({index}), 0, {cells} - 1) + {place}]"
+_SUFFIX = re.compile(r"(\d\.?(?:e[+-]\d+)?)f\b")
+_KINDS = {"position": "point", "throughput": "color"}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number that the user of a shader turns.
+
+    Attributes:
+        name, label, help: what code and users call it, and what it does. default: an int makes it one.
+        low, high: of the slider. widget: "boolean", or "mapper" with `options` (NAME:NUMBER|...).
+    """
+
+    name: str
+    label: str
+    help: str
+    default: float
+    low: float = 0.0
+    high: float = 1.0
+    widget: str = ""
+    options: str = ""
+
+    def text(self) -> str:
+        """Its declaration."""
+        kind = "int" if isinstance(self.default, int) else "float"
+        told = [f'string label = "{self.label}"', f'string help = "{self.help}"']
+        if self.widget:
+            told.append(f'string widget = "{self.widget}"')
+        else:
+            told += [f"{kind} {key} = {_number(value, kind)}" for key, value in (("min", self.low), ("max", self.high))]
+        told += [f'string options = "{self.options}"'] * bool(self.options)
+        return f"{kind} {self.name} = {_number(self.default, kind)}\n        [[ {', '.join(told)} ]]"
+
+
+def write_osl(
+    program: Program,
+    name: str,
+    comment: Sequence[str],
+    parameters: Sequence[Parameter],
+    frame: str,
+    outputs: Sequence[str],
+) -> str:
+    """The text of a shader.
+
+    Args:
+        comment: lines of its head. parameters: of the user.
+        frame: statements that set a float for each input of the program.
+        outputs: of three rows each, NAME_0 to NAME_2 of the program.
+    """
+    lines = "\n".join(f" * {line}".rstrip() for line in comment).replace("*/", "* /")
+    writer = _Writer(program, "sqrt", lookup=_LOOKUP, name=name)
+    head = [f"{p.text()}" for p in parameters]
+    head += [f"output {_KINDS.get(o, 'vector')} {o} = 0.0" for o in outputs]
+    tables = ""
+    for table, numbers in program.own_tables.items():
+        values = ", ".join(_plain(literal(v)) for v in numbers.reshape(-1))
+        tables += f"    float {name}_{table}[{numbers.size}] = {{{values}}};\n"
+    steps = [(k, program.steps[k]) for k in program.live() if program.steps[k].kind != "input"]
+    body = "\n".join(f"    float t{k} = {_plain(writer.step(step))};" for k, step in steps)
+    results = ""
+    for o in outputs:
+        rows = (_plain(writer.value(program.outputs[f"{o}_{k}"].argument)) for k in range(3))
+        results += f"    {o} = {_KINDS.get(o, 'vector')}({', '.join(rows)});\n"
+    parts = ",\n    ".join(head)
+    return f"/*\n{lines}\n */\nshader {name}(\n    {parts})\n{{\n{tables}{frame}{body}\n{results}}}\n"
+
+
+class _Writer(Writer):
+    """Largest and smallest as functions: a choice would be a branch."""
+
+    def step(self, step: Step) -> str:
+        if step.kind in ("max", "min"):
+            return "{}({}, {})".format(step.kind, *(self.value(a) for a in step.arguments))
+        return super().step(step)
+
+
+def _plain(text: str) -> str:
+    """C's literals without the suffix."""
+    return _SUFFIX.sub(r"\1", text)
+
+
+def _number(value: float, kind: str) -> str:
+    return str(int(value)) if kind == "int" else repr(float(value))

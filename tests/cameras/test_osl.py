@@ -1,0 +1,229 @@
+"""Cameras written as shaders: their graph against the camera of the same model, and the text."""
+
+import json
+import math
+import re
+from functools import cache
+
+import numpy as np
+import pytest
+from camera_helpers import FILM, GAUSS, ROOT
+
+from neurolens.cameras import osl
+from neurolens.cameras.model import OnnxCamera
+from neurolens.cameras.onnxlens import load_model
+from neurolens.cameras.pupil_arcs import unit_disc
+from neurolens.cameras.pupil_arcs_fit import passing
+from neurolens.cli import main
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph
+from neurolens.graph.scalars import lower
+from neurolens.optics.apertures import Aperture
+
+MODEL = ROOT / "models" / f"{GAUSS.stem}.ols-36.onnx"
+FAR = 1e9
+
+
+@cache
+def written() -> osl.OslCamera:
+    return osl.model_camera(load_model(MODEL), None, lambda share: None)
+
+
+@cache
+def graph() -> Graph:
+    return osl.osl_graph(written())
+
+
+def inputs(film: np.ndarray, square: np.ndarray, **changed: float) -> dict[str, np.ndarray]:
+    """Of the graph, for film points [2, N] in mm, as the shader's frame makes them."""
+    call = {"f_number": 1.8, "asked_m": 2.0, "roundness": 0.0, "rotation": 0.0, "count": 0, "in_colour": 1, "shaded": 1}
+    call |= {"as_lens": 0, "at_pupil": 0, "warned": 0, "pixel_x": 1 / 360, "pixel_y": 1 / 240}
+    call |= {"sensor_x_mm": FILM[0], "sensor_y_mm": FILM[1]} | changed
+    half = math.pi / max(call["count"], 3)
+    first = math.radians(call.pop("rotation")) + half
+    call |= {
+        "half_cos": math.cos(half),
+        "half_sin": math.sin(half),
+        "edge_cos": math.cos(first),
+        "edge_sin": math.sin(first),
+    }
+    raster = 0.5 - film / np.array(FILM)[:, None]
+    rows = {"raster_x": raster[:1], "raster_y": raster[1:], "first": square[:1], "second": square[1:]}
+    return rows | {name: np.array([[float(value)]]) for name, value in call.items()}
+
+
+def shot(film: tuple[float, float], count: int = 30_000, **changed: float) -> dict[str, np.ndarray]:
+    square = np.random.default_rng(1).random((2, count))
+    return evaluate(graph(), inputs(np.repeat(np.array(film)[:, None], count, 1), square, **changed))
+
+
+def test_disc_is_filled_evenly() -> None:
+    g = Graph()
+    g.outputs["disc"] = unit_disc(g.input("square", 2))
+    side = (np.arange(256) + 0.5) / 256
+    square = np.stack(np.meshgrid(side, side)).reshape(2, -1)
+    disc = evaluate(g, {"square": square})["disc"]
+    radius = np.hypot(*disc)
+    assert radius.max() <= 1 + 1e-7
+    np.testing.assert_allclose([(radius <= r).mean() for r in (0.25, 0.5, 0.75)], [0.0625, 0.25, 0.5625], atol=1e-6)
+    np.testing.assert_allclose([(disc[0] * disc[1]).mean(), (disc[0] ** 2 - disc[1] ** 2).mean()], 0, atol=1e-5)
+
+
+@pytest.mark.parametrize("f_number, focus_m", [(1.8, 2.0), (4.0, math.inf), (11.0, 0.8)])
+def test_light_of_film_points_is_that_of_the_camera_of_the_model(f_number: float, focus_m: float) -> None:
+    camera = OnnxCamera(load_model(MODEL), film_mm=FILM, focus_m=focus_m, f_number=f_number)
+    rng = np.random.default_rng(2)
+    for point in ((0.0, 0.0), (8.0, -6.0), (-16.0, 9.0)):
+        square = rng.random((2, 30_000)).astype(np.float32)
+        film = np.repeat(np.array(point, np.float32)[:, None], square.shape[1], 1)
+        nm = rng.uniform(400, 700, square.shape[1]).astype(np.float32)
+        wanted = camera.sample(film, square, nm).weight.mean(dtype=np.float64)
+        found = shot(point, f_number=f_number, asked_m=min(focus_m, FAR))["throughput"].mean()
+        assert found == pytest.approx(wanted, rel=0.008)
+
+
+def test_rays_are_those_of_the_model_in_the_frame_of_cycles() -> None:
+    camera = OnnxCamera(load_model(MODEL), film_mm=FILM, focus_m=2.0, f_number=1.8)
+    found = shot((10.0, 5.0), in_colour=0)
+    passed = found["throughput"][0] > 0
+    start, way = (found[name][:, passed].mean(1) for name in ("position", "direction"))
+    rng = np.random.default_rng(3)
+    film = np.repeat(np.array([[10.0], [5.0]], np.float32), 30_000, 1)
+    rays = camera.sample(film, rng.random((2, 30_000)).astype(np.float32), np.full(30_000, 587.56, np.float32))
+    lit = rays.weight > 0
+    np.testing.assert_allclose(start * [1, 1, -1], rays.origin_m[:, lit].mean(1), atol=3e-4)
+    np.testing.assert_allclose(way * [1, 1, -1], rays.direction[:, lit].mean(1), atol=2e-3)
+    np.testing.assert_allclose(np.linalg.norm(found["direction"], axis=0), 1, atol=1e-4)
+
+
+def test_at_least_95_percent_of_rays_pass() -> None:
+    shares = passing(written().sight, written().arcs)
+    assert min(shares.values()) >= 0.95
+
+
+def test_from_the_entrance_pupil_chief_rays_start_at_the_camera() -> None:
+    found = shot((4.0, 0.0), f_number=100.0, at_pupil=1, in_colour=0)
+    passed = found["throughput"][0] > 0
+    start, way = (found[name][:, passed] for name in ("position", "direction"))
+    across = start[0] - start[2] * way[0] / way[2]  # where rays cross the plane of the camera
+    assert abs(across.mean()) < 5e-5
+
+
+def test_derivatives_are_those_of_neighbouring_pixels() -> None:
+    rng = np.random.default_rng(4)
+    square, film = rng.random((2, 4000)), (rng.random((2, 4000)) - 0.5) * np.array([[28.0], [18.0]])
+    found = evaluate(graph(), inputs(film, square, f_number=8.0, in_colour=0))
+    wanted = {}
+    for axis, pixel in (("x", 1 / 360), ("y", 1 / 240)):
+        # The ray through the same point of the pupil: to first order the pupil's own motion cancels in the mean.
+        film_step = np.array([[pixel * FILM[0]], [0.0]]) if axis == "x" else np.array([[0.0], [pixel * FILM[1]]])
+        pupil = evaluate(written().arcs.graph, arcs_inputs(film, square))["pupil_mm"]
+        ends = [lens_ray(film + sign * film_step, pupil) for sign in (-0.5, 0.5)]
+        wanted[axis] = (ends[0] - ends[1]) * np.array([1, 1, -1])[:, None]
+    passed = found["throughput"][0] > 0
+    for axis, change in wanted.items():
+        error = np.linalg.norm(found[f"dDd{axis}"] - change, axis=0) / np.linalg.norm(change, axis=0)
+        assert np.sqrt(np.mean(error[passed] ** 2)) < 0.05
+
+
+def arcs_inputs(film: np.ndarray, square: np.ndarray) -> dict[str, np.ndarray]:
+    sight = written().sight
+    stop = written().f_number * sight.stop_radius_mm / 8.0
+    z = evaluate(written().film, {"focus_m": np.array([[2.0]]), "stop_radius_mm": np.array([[stop]])})["film_z_mm"]
+    nm = np.full((1, film.shape[1]), 587.5618)
+    return {
+        "film_mm": film,
+        "square": square,
+        "film_z_mm": z,
+        "stop_radius_mm": np.array([[stop]]),
+        "wavelength_nm": nm,
+    }
+
+
+def lens_ray(film: np.ndarray, pupil: np.ndarray) -> np.ndarray:
+    given = arcs_inputs(film, pupil)
+    rays = np.concatenate([film, pupil, given["wavelength_nm"]])
+    call = {name: given[name] for name in ("film_z_mm", "stop_radius_mm")}
+    return evaluate(written().sight.graph, {"rays": rays, **call})["scene_ray"][3:]
+
+
+def test_colour_weights_are_white_and_never_negative() -> None:
+    g = Graph()
+    _, g.outputs["colour"] = osl._light(written(), g.input("first"), g.input("in_colour", per_call=True))
+    low_bits = (np.arange(1 << 20) + 0.5)[None] / (1 << 20)
+    colour = evaluate(g, {"first": low_bits, "in_colour": np.ones((1, 1))})["colour"]
+    assert colour.min() >= 0
+    np.testing.assert_allclose(colour.mean(1), 1, atol=1e-3)
+    np.testing.assert_allclose(colour[:, :256].mean(1), 1, atol=0.01)  # all over the spectrum within 1 / 4096
+
+
+def test_nothing_beyond_the_domain_unless_a_warning_is_asked_for() -> None:
+    for changed, film in (({"asked_m": 0.3}, (0.0, 0.0)), ({}, (17.9, 13.0))):
+        assert not shot(film, 100, **changed)["throughput"].any()
+        told = shot(film, 100, warned=1, **changed)
+        np.testing.assert_array_equal(told["throughput"], np.repeat([[1.0], [0.0], [1.0]], 100, 1))
+    assert shot((0.0, 0.0), 100, warned=1)["throughput"].any()
+
+
+@pytest.mark.parametrize("blades, roundness, rotation", [(5, 0.0, 20.0), (7, 0.4, 0.0), (16, 0.0, 5.0)])
+def test_blades_are_those_of_apertures(blades: int, roundness: float, rotation: float) -> None:
+    g = Graph()
+    call = osl._Call(g, written())
+    g.outputs["open"] = osl._opened(g, call, g.input("stop_xy_mm", 2))
+    at_stop = np.random.default_rng(5).uniform(-1, 1, (2, 20_000)) * written().sight.stop_radius_mm
+    at_stop = at_stop[:, np.hypot(*at_stop) <= written().sight.stop_radius_mm]
+    given = inputs(at_stop, at_stop, count=blades, roundness=roundness, rotation=rotation, f_number=1.0)
+    found = evaluate(g, given | {"stop_xy_mm": at_stop})["open"][0] > 0
+    radius = written().sight.stop_radius_mm
+    np.testing.assert_array_equal(found, Aperture(blades, rotation, roundness).inside(*at_stop, radius))
+
+
+def test_exposure_as_the_lens_falls_with_the_stop() -> None:
+    wide, narrow = (shot((0.0, 0.0), as_lens=1, f_number=n)["throughput"].mean() for n in (2.8, 5.6))
+    assert wide / narrow == pytest.approx(4, rel=0.03)
+    assert 0.2 < wide < (1.81 / 2.8) ** 2  # glass takes some
+
+
+def test_without_vignetting_the_corner_is_as_bright_as_the_middle() -> None:
+    corner = shot((15.0, 9.0), shaded=0)["throughput"].mean()
+    assert 0.93 < corner < 1.01
+
+
+def test_the_program_gives_what_the_graph_gives() -> None:
+    square = np.random.default_rng(6).random((2, 500))
+    film = np.repeat([[6.0], [-3.0]], 500, 1)
+    given = inputs(film, square)
+    rows = {name: value[0] for name, value in given.items()}
+    found, wanted = lower(graph()).evaluate(rows), evaluate(graph(), given)
+    same = (wanted["throughput"][0] > 0) == (found["throughput_0"] > 0)
+    assert same.mean() > 0.99
+    for name, tolerance in (("position", 2e-6), ("direction", 2e-6)):
+        for k in range(3):
+            np.testing.assert_allclose(found[f"{name}_{k}"], wanted[name][k], atol=tolerance)
+
+
+def test_the_text_is_osl() -> None:
+    text, operations = osl.write_camera(written(), "gauss", ["a comment */ that tries to end"])
+    assert operations < 1600
+    code = text.split("*/", 1)[1]
+    assert not re.search(r"\d\.?(e[+-]\d+)?f\b", code) and "#include" not in code and "struct" not in code
+    declared = re.findall(r"^    float (t\d+) = ", code, re.M)
+    assert len(declared) == len(set(declared)) > 300
+    for output in osl.OUTPUTS:
+        assert re.search(rf"^    {output} = (point|vector|color)\(", code, re.M)
+    known = {*declared, *re.findall(r"\b(\w+) = ", code)}
+    used = set(re.findall(r"\bt\d+\b", code))
+    assert used <= known
+
+
+def test_command_line_writes_a_shader_and_refuses_what_is_its_input(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(osl, "model_camera", lambda *given: written())
+    out = tmp_path / "lens.osl"
+    assert main(["export", str(MODEL), "--to", "osl", "-o", str(out), "--name", "gauss", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["function"] == "gauss" and told["inputs"][:2] == ["f_number", "focus_m"]
+    assert min(told["passing"].values()) >= 0.95 and "shader gauss(" in out.read_text(encoding="utf-8")
+    for wrong in (["--focus", "2"], ["--fix", "stop=4"], ["--camera"], ["--name", "color"], ["--name", "shader"]):
+        other = tmp_path / "other.osl"
+        assert main(["export", str(MODEL), "--to", "osl", "-o", str(other), *wrong]) == 2
+        assert "neurolens" in capsys.readouterr().err and not other.exists()
