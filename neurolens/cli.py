@@ -64,7 +64,22 @@ def build_parser() -> Parser:
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    commands = lens, analyse, glass, convert, train, models, evaluate, export, render, stmap, flare, mitsuba, blender, bench
+    commands = (
+        lens,
+        analyse,
+        glass,
+        convert,
+        train,
+        models,
+        evaluate,
+        export,
+        render,
+        stmap,
+        flare,
+        mitsuba,
+        blender,
+        bench,
+    )
     for command in commands:
         command.add_parser(subparsers)
     return parser

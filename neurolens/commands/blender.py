@@ -31,10 +31,14 @@ that was there. In Blender, "Read Lenses Again" in the panel shows it."""
 
 def add_parser(subparsers: Any) -> None:
     """Add the command to the command line."""
-    parser = subparsers.add_parser("blender", help="the extension for Blender, and lenses in it", description=_DESCRIPTION)
+    parser = subparsers.add_parser(
+        "blender", help="the extension for Blender, and lenses in it", description=_DESCRIPTION
+    )
     actions = parser.add_subparsers(metavar="ACTION", required=True, parser_class=Parser)
     build = actions.add_parser("build", help="pack the extension as a zip", description=_BUILD)
-    build.add_argument("-o", "--out", metavar="OUT.zip", type=Path, default=Path("neurolens.zip"), help="default: %(default)s")
+    build.add_argument(
+        "-o", "--out", metavar="OUT.zip", type=Path, default=Path("neurolens.zip"), help="default: %(default)s"
+    )
     build.add_argument("--models", metavar="DIR", type=Path, default=Path("models"), help="default: %(default)s")
     build.add_argument(
         "--lens", metavar="NAME", action="append", default=[],

@@ -68,7 +68,7 @@ def key_of(file: Path) -> str:
 
 
 def library(folder: Path, lenses: Path, chosen: Sequence[str]) -> Iterator[tuple[list[Path], Path | None]]:
-    """Of every lens of a folder of models, the best polynomial and the best network, and its lens file, if there is one.
+    """Of every lens of a folder of models, the best polynomial, the best network, and its lens file, if it has one.
 
     Args:
         folder: of models. lenses: of lens files. chosen: names of lenses, all where empty.

@@ -148,7 +148,7 @@ def _wavelengths(text: str) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class _Frame:
-    """One frame: its number in file names ("" for a single one), focus, camera, and fields by the name of their maps."""
+    """One frame: its number in file names ("" for a single one), focus, camera, and fields by their maps' names."""
 
     number: str
     focus_m: float

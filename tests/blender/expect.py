@@ -1,6 +1,6 @@
 """What Blender must show, by neurolens's exact lenses: python tests/blender/expect.py FOLDER.
 
-Blender's Python cannot run neurolens. This writes shots.json, numbers for test_optics.py, and the shaders that it names.
+Blender's Python cannot run neurolens. This writes shots.json, numbers for test_optics.py, and the shaders named there.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import numpy as np
 from measure import crop_at, measures
 
 from neurolens.base.progress import Progress
-from neurolens.commands.blender_lenses import form_of
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.sampling import stratified
+from neurolens.commands.blender_lenses import form_of
 
 _SIDE = 512  # rays of a point: this squared
 _LIGHT_NM = (400.0, 700.0)
@@ -101,9 +101,7 @@ def scene_point(made: Camera, film_mm: Sequence[float], away_m: float) -> Any:
     return start + (-along + math.sqrt(along**2 + away_m**2 - start @ start)) * way
 
 
-def point_shot(
-    name: str, picture: Picture, made: Camera, point_m: Any, radius_m: float
-) -> dict[str, Any]:
+def point_shot(name: str, picture: Picture, made: Camera, point_m: Any, radius_m: float) -> dict[str, Any]:
     """A sphere of light, the crop that it fills and its measures there."""
     square, wavelength = stratified(_SIDE, _LIGHT_NM)
     rng = np.random.default_rng(3)
@@ -148,7 +146,7 @@ def bokeh(lens: Lens) -> list[dict[str, Any]]:
         if f_number == 1.83:
             places += [("off axis", (9.0, 4.0)), ("off axis", (-16.0, -8.0)), ("off axis", (0.0, 9.0))]
         for name, film in places:
-            found.append(point_shot(name, picture, made, scene_point(made, film, 1.2), 2e-4))
+            found.append(point_shot(name, picture, made, scene_point(made, film, 1.2), 2e-3 / f_number))
     return found
 
 
@@ -189,7 +187,13 @@ def main(folder: Path) -> None:
     shots = []
     with progress.stage("what exact lenses show") as report:
         for number, (make, name) in enumerate(
-            [(grid, "rectilinear"), (grid, "fisheye"), (grid, "anamorphic"), (bokeh, "rectilinear"), (pull, "rectilinear")]
+            [
+                (grid, "rectilinear"),
+                (grid, "fisheye"),
+                (grid, "anamorphic"),
+                (bokeh, "rectilinear"),
+                (pull, "rectilinear"),
+            ]
         ):
             shots += make(LENSES[name])
             report((number + 1) / 6)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
-LIT = 0.05  # of the mean of the brighter half: what is darker is no part of a disc
 
 
 def crop_at(centre_px: tuple[float, float], half_px: int) -> tuple[int, int, int, int]:
@@ -18,7 +18,9 @@ def crop_at(centre_px: tuple[float, float], half_px: int) -> tuple[int, int, int
 
 
 def measures(picture: Array, corner_px: tuple[int, int]) -> dict[str, Any]:
-    """Centroids of the channels (px from the picture's lower left corner), area (px) and axes of what is lit.
+    """Centroids of all light and of the channels (px from the picture's lower left corner), and its second moments.
+
+    Area (px) and ratio of the axes are those of the evenly lit ellipse of the same moments.
 
     Args:
         picture: [H, W, 3], the lowest row first.
@@ -30,11 +32,9 @@ def measures(picture: Array, corner_px: tuple[int, int]) -> dict[str, Any]:
         [float((c * x).sum() / c.sum()) + corner_px[0], float((c * y).sum() / c.sum()) + corner_px[1]]
         for c in (light, *np.moveaxis(picture, 2, 0))
     ]
-    mean = (light * light).sum() / light.sum()
-    lit = light > LIT * mean
-    place = np.stack([x[lit], y[lit]])
-    spread = np.cov(place) if place.shape[1] > 2 else np.eye(2)
-    minor, major = np.sqrt(np.maximum(np.linalg.eigvalsh(spread), 0))
     share = light / light.sum()
-    wide = float(np.sqrt((share * ((x - (share * x).sum()) ** 2 + (y - (share * y).sum()) ** 2)).sum()))
-    return {"centroid_px": centroid, "area_px": float(lit.sum()), "axes": float(minor / major), "rms_px": wide}
+    aside = x - (share * x).sum(), y - (share * y).sum()
+    spread = np.array([[(share * a * b).sum() for a in aside] for b in aside])
+    minor, major = np.sqrt(np.linalg.eigvalsh(spread))
+    area, wide = 4 * math.pi * minor * major, math.hypot(minor, major)
+    return {"centroid_px": centroid, "area_px": area, "axes": float(minor / major), "rms_px": wide}

@@ -84,7 +84,9 @@ def test_lenses_that_cannot_be_shaders_are_left_out_and_said(place: Path, capsys
     assert json.loads(told)["lenses"] == {"absorbs": ["ols-36"]} and ABSORBS in said
 
 
-def test_bad_input_is_one_line(place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_input_is_one_line(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     models, out = place / "models", place / "n.zip"
     assert "--lens" in failed(capsys, "build", "-o", out, "--models", models, "--lens", "nothing")
     assert "a folder of models" in failed(capsys, "build", "-o", out, "--models", place / "none")
