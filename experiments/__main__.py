@@ -33,6 +33,7 @@ NAMES = {
     "refine-spacing": ("refine_spacing", "a spacing refined by gradients through the tracer"),
     "gallery": ("gallery.run", "what real lenses do: figures and numbers"),
     "fuzz": ("fuzz", "hostile files and command lines: one clear line each, in bounded time and memory"),
+    "photons": ("photons", "flare by photons, as in Keshmirian 2008"),
     "flare": ("flare_speed", "ghosts: nanoseconds a ray, compiled and path by path"),
     "optiland": ("compare_optiland", "speed of the exact tracer beside Optiland"),
 }

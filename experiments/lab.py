@@ -184,17 +184,13 @@ class Goal:
         reached = self.measured >= self.wanted if self.at_least else self.measured <= self.wanted
         return "reached" if reached else "missed"
 
-    @property
-    def bound(self) -> str:
-        return "at least" if self.at_least else "at most"
-
     def to_dict(self) -> Row:
         return asdict(self) | {"verdict": self.verdict}
 
 
 def goal_table(heading: str, goals: Iterable[Goal]) -> str:
     """Goals as a table, and whether they are reached."""
-    wanted = Column("wanted", lambda g: f"{g.bound} {g.wanted:g}")
+    wanted = Column("wanted", lambda g: f"at {'least' if g.at_least else 'most'} {g.wanted:g}")
     return table([Column(heading, "text"), wanted, *columns(("measured", "measured", ".3g"), ("", "verdict"))], goals)
 
 

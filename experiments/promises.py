@@ -91,29 +91,28 @@ def read_index(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def bench_models(folder: Path, only: str, threads: int, rounds: int, save: Callable[[Outcome], str]) -> Outcome:
-    """Race the models of an index, lens by lens; `save` what there is after each.
+def bench_models(args: argparse.Namespace, save: Callable[[Outcome], str]) -> Outcome:
+    """Race the models of the index in `args.models`, lens by lens; `save` what there is after each.
 
-    Without `only`, those of which the index promises a speed-up.
+    Without --only, those of which the index promises a speed-up.
     """
-    groups: dict[tuple[Any, ...], list[Row]] = {}
+    folder, only, groups = args.models, args.only, dict[tuple[Any, ...], list[Row]]()
     for row in read_index(folder):
         if only in row["file"] and (only or row.get("promised_speedup") is not None):
             groups.setdefault((row["lens_file"], row.get("configuration"), row.get("efl_mm")), []).append(row)
     if not groups:
         raise InputError(folder / "index.json", "models", "(none)", f"models with {only!r} in the file's name")
     outcome = Outcome()
-    for (lens_file, configuration, efl_mm), rows in groups.items():
-        state = " ".join([Path(lens_file).stem, *([str(configuration)] if configuration else [])])
-        _say(f"{state}: compiling and timing, {len(rows)} models ...")
+    for (lens_file, configuration, efl_mm), report in lab.stages(groups, _state, args.quiet, 60.0):
+        rows = groups[lens_file, configuration, efl_mm]
         lens = read_lens(lab.ROOT / lens_file).at(zoom=configuration, focal_length_mm=efl_mm)
         models = {row["file"]: load_model(folder / row["file"], lens.sha256) for row in rows}
         domain = Domain.from_dict(next(iter(models.values())).card["domain"])
         lens = lens.with_stop_radius(domain.stop_radius_mm)
         made = [model_candidate(name, model, domain.stop_radius_mm) for name, model in models.items()]
         candidates = [*exact_candidates(lens, domain), *made, *ideal_cameras(lens, domain)]
-        timed = race(candidates, domain, threads=threads, rounds=rounds)
-        outcome.rows += table_rows(state, timed)
+        timed = race(candidates, domain, threads=args.threads, rounds=args.rounds, report=report)
+        outcome.rows += table_rows(_state((lens_file, configuration)), timed)
         hold_to_promises(rows, timed, outcome)
         save(outcome)
     return outcome
@@ -139,8 +138,9 @@ def hold_to_promises(rows: Sequence[dict[str, Any]], timed: Race, outcome: Outco
             outcome.missed.append(f"{row['file']}: {best:.3g} times the compiled exact tracer, promised {promised:g}")
 
 
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+def _state(group: tuple[Any, ...]) -> str:
+    """Words for the lens and the state of a group of models."""
+    return " ".join([Path(group[0]).stem, *([str(group[1])] if group[1] else [])])
 
 
 def report_outcome(outcome: Outcome) -> int:
@@ -164,7 +164,7 @@ TRACER_MRAY_S = {"eager": 6.0, "compiled": 20.0}  # one core, float32, 12 refrac
 RENDER_MPATH_S = 1.0  # the room, depth 3, two cores
 
 
-def check_floors(rounds: int = 20) -> list[Floor]:
+def check_floors(rounds: int) -> list[Floor]:
     """Measure all of them; the best of the rounds counts, as a busy machine only ever slows."""
     lens = read_lens(LENS).at()
     domain = domain_of(lens)
@@ -269,9 +269,8 @@ def run(args: argparse.Namespace) -> int:
         floors = [{**asdict(f), "verdict": f.verdict} for f in outcome.floors]
         return lab.write_results(args.out, "bench", text, {"rows": outcome.rows, "floors": floors})
 
-    outcome = bench_models(args.models, args.only, args.threads, args.rounds, save)
+    outcome = bench_models(args, save)
     if not args.only:
-        _say("floors of the tracer and the renderer ...")
         outcome.floors = check_floors(args.rounds)
     print(save(outcome))
     return report_outcome(outcome)

@@ -56,6 +56,7 @@ def build_parser() -> Parser:
         lens,
         mitsuba,
         models,
+        projection,
         render,
         stmap,
         train,
@@ -64,23 +65,8 @@ def build_parser() -> Parser:
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    commands = (
-        lens,
-        analyse,
-        glass,
-        convert,
-        train,
-        models,
-        evaluate,
-        export,
-        render,
-        stmap,
-        flare,
-        mitsuba,
-        blender,
-        bench,
-    )
-    for command in commands:
+    read = lens, analyse, glass, convert, stmap, projection
+    for command in (*read, train, models, evaluate, export, render, flare, mitsuba, blender, bench):
         command.add_parser(subparsers)
     return parser
 

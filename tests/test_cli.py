@@ -28,7 +28,10 @@ GAUSS, SINGLET, PHONE, ZOOM, TESSAR = (
         "brendel_tessar_100",
     )
 )
-COMMANDS = ("lens", "analyse", "glass", "convert", "train", "models", "evaluate", "export", "render", "stmap")
+COMMANDS = (
+    *("lens", "analyse", "glass", "convert", "train", "models", "evaluate", "export", "render"),
+    *("stmap", "projection"),
+)
 
 
 @pytest.mark.parametrize("command", [[], *([c] for c in COMMANDS)])

@@ -24,12 +24,11 @@ from neurolens import __version__
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.progress import Report
+from neurolens.cameras import build
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
 from neurolens.cameras.exact import ExactCamera, FusedExactCamera
 from neurolens.cameras.fused import FusedCamera
-from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.vignetting import Vignetted
 from neurolens.evaluate.image import Image
 from neurolens.evaluate.measure import fit_and_measure, known_record
@@ -297,16 +296,17 @@ def surrogate_camera(shot: Shot, surrogate: Surrogate | None, kind: type[OnnxCam
     )
 
 
-def thin_camera(shot: Shot, surrogate: Surrogate | None) -> Camera:
-    """A thin lens of the same focal length, f-number and focus, its film moved as the panel asks."""
-    return ThinLens(
-        float(first_order(shot.lens).efl_mm),
-        shot.f_number,
-        shot.focus_m,
-        shot.film_mm,
-        aperture=shot.lens.aperture,
-        film_offset_mm=shot.panel.film_offset_mm,
-    )
+def ideal_camera(kind: str, shot: Shot, surrogate: Surrogate | None) -> Camera:
+    """A thin lens ("thin:") or a hole ("pinhole:") that shows the plane in focus at the lens's size.
+
+    As `thin:LENS.toml` of `render`; the film of the thin lens is moved as the panel asks.
+    """
+    offset = shot.panel.film_offset_mm
+    lens = replace(shot.lens, film_z_mm=float(shot.lens.film_z_mm or 0) - offset)
+    return build.ideal_as(kind, lens, build.Shot(shot.film_mm, shot.focus_m, film_offset_mm=offset))
+
+
+thin_camera = partial(ideal_camera, "thin:")
 
 
 # Columns that an effect may ask for. A camera is made of the shot and of the surrogate, None where no column needs one.
@@ -314,7 +314,7 @@ CAMERAS: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
     "exact": exact_camera,
     "surrogate": surrogate_camera,
     "thin": thin_camera,
-    "pinhole": lambda shot, _: Pinhole(float(first_order(shot.lens).efl_mm), shot.film_mm, shot.f_number),
+    "pinhole": partial(ideal_camera, "pinhole:"),
     "post": lambda shot, surrogate: PostProcessed(thin_camera(shot, surrogate), exact_camera(shot, surrogate)),
 }
 # The same as compiled code: many times as fast, but not for every lens, nor on every machine.

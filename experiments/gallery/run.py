@@ -213,9 +213,10 @@ _HEAD = """\
 # What real lenses do
 
 Small scenes after the figures of two theses (Steinert 2009, Willi 2021), each through the exact lens, a surrogate of it
-and a thin lens of the same focal length and f-number; the last column is the difference of surrogate and exact in
-luminance, the same random numbers in both. Below each figure stands what is measured of the effect. Axes are
-millimetres of film, pictures upright. Made by `python -m experiments gallery`; one effect by the command beside it.
+and a thin lens with its pupil that shows the plane in focus at the same size; the last column is the difference of
+surrogate and exact in luminance, the same random numbers in both. Below each figure stands what is measured of the
+effect. Axes are millimetres of film, pictures upright. Made by `python -m experiments gallery`; one effect by the
+command beside it.
 """
 
 

@@ -29,11 +29,17 @@ _EDGE = 1e-7
 
 
 class Pattern(NamedTuple):
-    """Pupil points, each [P], as shares of the stop's radius."""
+    """Pupil points, each [P].
 
-    tangential: Tensor  # in the meridional plane of the field, positive on the side on which its image lies
-    sagittal: Tensor  # across it
-    weight: Tensor  # share of the stop's area that a point stands for; sums to 1 (0 for the points of a fan)
+    Attributes:
+        tangential, sagittal: shares of the stop's radius, in the meridional plane of the field (positive on the side
+            on which its image lies) and across it.
+        weight: share of the stop's area that a point stands for; sums to 1 (0 for the points of a fan).
+    """
+
+    tangential: Tensor
+    sagittal: Tensor
+    weight: Tensor
 
 
 def hexapolar(rings: int) -> Pattern:
@@ -216,21 +222,31 @@ class Bundle:
 
     Tangential coordinates, of the stop and of the film, grow towards the side on which the image lies (the negative
     side of the scene's `axis`); sagittal ones along the other transverse axis.
+
+    Attributes:
+        start: before the front surface, travelling to the film.
+        film: on the film plane.
+        tangential_mm, sagittal_mm: film points relative to the chief ray of the first wavelength.
+        status: of the trace with all rims and the stop; rays that could not be aimed count as missing surface 0.
+        weight: energy of each ray: beam area in mm^2 (distant object) or solid angle in sr; 0 where it is blocked.
+        open_weight: the same without the rims.
+        path_mm: optical path from the wavefront (or object point) to the film.
+        chief_height_mm: [F], image height of the chief ray of the first wavelength, positive.
     """
 
     scene: Scene
     field_deg: tuple[float, ...]
     wavelength_nm: tuple[float, ...]
     pattern: Pattern
-    start: Rays  # before the front surface, travelling to the film
-    film: Rays  # on the film plane
-    tangential_mm: Tensor  # film points relative to the chief ray of the first wavelength
-    sagittal_mm: Tensor  # the same
-    status: Tensor  # of the trace with all rims and the stop; rays that could not be aimed count as missing surface 0
-    weight: Tensor  # energy of each ray: beam area in mm^2 (distant object) or solid angle in sr; 0 where it is blocked
-    open_weight: Tensor  # the same without the rims
-    path_mm: Tensor  # optical path from the wavefront (or object point) to the film
-    chief_height_mm: Tensor  # [F], image height of the chief ray of the first wavelength, positive
+    start: Rays
+    film: Rays
+    tangential_mm: Tensor
+    sagittal_mm: Tensor
+    status: Tensor
+    weight: Tensor
+    open_weight: Tensor
+    path_mm: Tensor
+    chief_height_mm: Tensor
 
     @property
     def passed(self) -> Tensor:

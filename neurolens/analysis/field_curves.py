@@ -29,15 +29,24 @@ _VISIBLE_NM = (380.0, 780.0)
 
 @dataclass(frozen=True)
 class Colour(Result):
-    """Colour of a lens; the film's place counts as zero focus, shifts positive away from the lens."""
+    """Colour of a lens; the film's place counts as zero focus, shifts positive away from the lens.
 
-    spectrum_nm: Array  # [L], 380 to 780
-    zone: Array  # [3] shares of the stop's radius: paraxial, half of the area, edge
-    focus_shift_mm: Array  # [L, 3] where rays of each zone cross the axis; NaN where a rim blocks them
-    field_deg: Array  # [F], of the chief ray of the first line
-    height_mm: Array  # [F], of the same
-    line_nm: Array  # [W]; the first is the reference
-    lateral_um: Array  # [F, W] image height less that of the reference
+    Attributes:
+        spectrum_nm: [L], 380 to 780.
+        zone: [3] shares of the stop's radius: paraxial, half of the area, edge.
+        focus_shift_mm: [L, 3] where rays of each zone cross the axis; NaN where a rim blocks them.
+        field_deg, height_mm: [F], of the chief ray of the first line.
+        line_nm: [W]; the first is the reference.
+        lateral_um: [F, W] image height less that of the reference.
+    """
+
+    spectrum_nm: Array
+    zone: Array
+    focus_shift_mm: Array
+    field_deg: Array
+    height_mm: Array
+    line_nm: Array
+    lateral_um: Array
 
 
 def colour(
@@ -70,15 +79,22 @@ _CLOSE = 1e-3  # stop radii; differences are central, so that the error is of th
 
 @dataclass(frozen=True)
 class Curvature(Result):
-    """Foci over F fields from the axis to the edge, one wavelength."""
+    """Foci over F fields from the axis to the edge, one wavelength.
+
+    Attributes:
+        field_deg, height_mm: [F] of the chief ray.
+        tangential_mm, sagittal_mm: [F] along the axis from the film, positive away from the lens.
+        petzval_mm: [F] the Petzval surface at these heights, drawn through the sagittal focus on the axis.
+        petzval_radius_mm: its radius, positive when its centre lies towards +z; inf when flat; NaN with cylinders.
+    """
 
     wavelength_nm: float
-    field_deg: Array  # [F] of the chief ray
-    height_mm: Array  # [F] of the chief ray
-    tangential_mm: Array  # [F] along the axis from the film, positive away from the lens
-    sagittal_mm: Array  # [F] the same
-    petzval_mm: Array  # [F] the Petzval surface at these heights, drawn through the sagittal focus on the axis
-    petzval_radius_mm: float  # its radius, positive when its centre lies towards +z; inf when flat; NaN with cylinders
+    field_deg: Array
+    height_mm: Array
+    tangential_mm: Array
+    sagittal_mm: Array
+    petzval_mm: Array
+    petzval_radius_mm: float
 
 
 def curvature(
@@ -124,17 +140,25 @@ _SMALL_DEG = 1e-3  # the field whose image height gives the scale
 
 @dataclass(frozen=True)
 class Distortion(Result):
-    """Distortion over F fields from the axis to the edge."""
+    """Distortion over F fields from the axis to the edge.
+
+    Attributes:
+        field_deg, height_mm: [F] of the chief ray.
+        scale_mm: image height per radian at the axis: the focal length for a distant object.
+        error_percent: projection to [F], 100 (height / ideal - 1); 0 on the axis, NaN where the projection ends.
+        best: the projection of least root mean square error over the whole field.
+        reference: rectilinear below 60 degrees of half field, `best` from there on.
+        edge_percent: error of `reference` at the edge of the field.
+    """
 
     wavelength_nm: float
-    field_deg: Array  # [F] of the chief ray
-    height_mm: Array  # [F] of the chief ray
-    scale_mm: float  # image height per radian at the axis: the focal length for a distant object
-    # Projection to [F], 100 (height / ideal - 1); 0 on the axis, NaN where the projection ends.
+    field_deg: Array
+    height_mm: Array
+    scale_mm: float
     error_percent: dict[str, Array]
-    best: str  # the projection of least root mean square error over the whole field
-    reference: str  # rectilinear below 60 degrees of half field, `best` from there on
-    edge_percent: float  # error of `reference` at the edge of the field
+    best: str
+    reference: str
+    edge_percent: float
 
 
 def distortion(
@@ -174,15 +198,23 @@ _MARGIN = 0.08  # margin of the grid around the bundle, as film points beside th
 
 @dataclass(frozen=True)
 class Illumination(Result):
-    """Light over F fields from the axis to the edge, one wavelength, glass without losses."""
+    """Light over F fields from the axis to the edge, one wavelength, glass without losses.
+
+    Attributes:
+        field_deg, height_mm: [F] of the chief ray.
+        relative: [F] film irradiance over that on the axis.
+        unvignetted: [F] the same without rims: natural falloff, pupil growth and distortion.
+        passed: [F] share of the stop's light that no rim takes.
+        cos4: [F] cos^4 of the field angle, 0 from 90 degrees on.
+    """
 
     wavelength_nm: float
-    field_deg: Array  # [F] of the chief ray
-    height_mm: Array  # [F] of the chief ray
-    relative: Array  # [F] film irradiance over that on the axis
-    unvignetted: Array  # [F] the same without rims: natural falloff, pupil growth and distortion
-    passed: Array  # [F] share of the stop's light that no rim takes
-    cos4: Array  # [F] cos^4 of the field angle, 0 from 90 degrees on
+    field_deg: Array
+    height_mm: Array
+    relative: Array
+    unvignetted: Array
+    passed: Array
+    cos4: Array
 
 
 def illumination(scene: Scene, *, fields: int = 21, n: int = 80) -> Illumination:

@@ -59,24 +59,37 @@ _SEARCH = 121  # fields tried for the edge of the film
 
 @dataclass(frozen=True)
 class ChiefRays:
-    """Chief rays of F fields, traced without rims."""
+    """Chief rays of F fields, traced without rims.
 
-    start: Rays  # [F] just before the front surface, travelling to the film
-    exists: Tensor  # [F] bool; False where no ray of this field meets the middle of the stop
-    height_mm: Tensor  # [F] image height, positive
-    film: Rays  # [F] rays on the film
+    Attributes:
+        start: [F] just before the front surface, travelling to the film.
+        exists: [F] bool; False where no ray of this field meets the middle of the stop.
+        height_mm: [F] image height, positive.
+        film: [F] rays on the film.
+    """
+
+    start: Rays
+    exists: Tensor
+    height_mm: Tensor
+    film: Rays
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A lens in a state, with its object."""
+    """A lens in a state, with its object.
 
-    lens: Lens  # placed by `Lens.at`; where it is not, the table's last thickness places the film
-    # Distance from the film to the object, inf allowed. An object of a lens of less than 60 degrees half field is a
-    # plane across the axis; of a wider one a sphere about the entrance pupil.
+    Attributes:
+        lens: placed by `Lens.at`; where it is not, the table's last thickness places the film.
+        focus_m: distance from the film to the object, inf allowed. An object of a lens of less than 60 degrees half
+            field is a plane across the axis; of a wider one a sphere about the entrance pupil.
+        axis: transverse axis of the meridional plane; matters for anamorphic lenses only.
+        rims: False opens every rim but the stop's (of aspheres a little, for they end soon after it).
+    """
+
+    lens: Lens
     focus_m: float = math.inf
-    axis: Axis = "y"  # transverse axis of the meridional plane; matters for anamorphic lenses only
-    rims: bool = True  # False opens every rim but the stop's (of aspheres a little, for they end soon after it)
+    axis: Axis = "y"
+    rims: bool = True
 
     @property
     def film_z_mm(self) -> float:

@@ -29,14 +29,20 @@ _AIR = 1.01  # a medium of a smaller index is drawn as air
 
 @dataclass(frozen=True)
 class Section:
-    """One surface in section, lens frame, mm."""
+    """One surface in section, lens frame, mm.
+
+    Attributes:
+        radius_mm: inf for a plane.
+        n_after: index of the medium behind it.
+        profile: [M, 2] of (z, height) from rim to rim of what is no sphere, else None.
+    """
 
     z_mm: float
-    radius_mm: float  # inf for a plane
+    radius_mm: float
     semi_diameter_mm: float
-    n_after: float  # index of the medium behind it
+    n_after: float
     stop: bool = False
-    profile: Array | None = None  # [M, 2] of (z, height) from rim to rim of what is no sphere, else None
+    profile: Array | None = None
 
     def arc(self) -> Array:
         """[M, 2] of (z, height) from rim to rim.
@@ -66,6 +72,9 @@ class Line:
 class Layout(Result):
     """The section of a lens, scene to film; lens frame, mm.
 
+    Attributes:
+        height: transverse axis of the section, "x" or "y".
+
     Raises:
         InputError: a surface whose semi-diameter is not positive and finite.
     """
@@ -74,7 +83,7 @@ class Layout(Result):
     rays: tuple[Line, ...]
     film_z_mm: float
     film_half_height_mm: float
-    height: str  # transverse axis of the section, "x" or "y"
+    height: str
     title: str
     subtitle: str
 

@@ -27,16 +27,24 @@ class Seidel(Result):
 
     As wavefront aberrations at the edge of pupil and field: W040 = S1/8, W131 = S2/2, W222 = S3/2, W220 = (S3 + S4)/4,
     W311 = S5/2; of colour, F against C: C1/2 and C2.
+
+    Attributes:
+        surfaces: [S, 7], one row per surface; columns as in `NAMES`.
+        total: [7].
+        image_height_mm: the paraxial image height that the sums are for.
+        lagrange_mm: H, the Lagrange invariant.
+        petzval_radius_mm: of the Petzval surface, positive when its centre lies towards +z.
+        odd_powers: surfaces whose r^3 or r terms are left out: they have no third-order theory.
     """
 
     wavelength_nm: float
-    image_height_mm: float  # the paraxial image height that the sums are for
-    lagrange_mm: float  # H, the Lagrange invariant
-    petzval_radius_mm: float  # of the Petzval surface, positive when its centre lies towards +z
-    surfaces: Array  # [S, 7], one row per surface; columns as in `NAMES`
-    total: Array  # [7]
+    image_height_mm: float
+    lagrange_mm: float
+    petzval_radius_mm: float
+    surfaces: Array
+    total: Array
     names: tuple[str, ...]
-    odd_powers: tuple[int, ...]  # surfaces whose r^3 or r terms are left out: they have no third-order theory
+    odd_powers: tuple[int, ...]
 
 
 def seidel(scene: Scene, *, wavelength_nm: float = LINE_D_NM, image_height_mm: float | None = None) -> Seidel:

@@ -21,25 +21,38 @@ _ZONES = 101  # heights in the stop tried for the outermost ray that passes, and
 
 @dataclass(frozen=True)
 class Spots(Result):
-    """Spots of F fields, W wavelengths, P rays; shifts of the film are positive away from the lens."""
+    """Spots of F fields, W wavelengths, P rays; shifts of the film are positive away from the lens.
 
-    field_deg: Array  # [F], of the chief ray of the first wavelength
+    Attributes:
+        field_deg, height_mm: [F], of the chief ray of the first wavelength.
+        tangential_um, sagittal_um: [F, W, P] relative to that chief ray, NaN where blocked.
+        slope_tangential, slope_sagittal: [F, W, P], for spots at another focus.
+        rms_um: [F] root mean square distance from the centroid, over all wavelengths, weighted by energy.
+        geometric_um: [F] the largest distance from the centroid; NaN, as all sizes, where no ray passes.
+        rms_by_wavelength_um: [F, W], each from its own centroid.
+        passed: [F] share of the stop's light that no rim takes.
+        airy_um: radius of the first dark ring on the axis, 1.22 lambda N with the working f-number.
+        shift_mm, through_focus_um: [K] and [F, K], RMS radius with the film moved.
+        best_shift_mm, best_rms_um: [F], where each field's RMS radius is least; NaN where rays stay parallel.
+    """
+
+    field_deg: Array
     wavelength_nm: Array
-    height_mm: Array  # [F], of the same
-    tangential_um: Array  # [F, W, P] relative to that chief ray, NaN where blocked
-    sagittal_um: Array  # [F, W, P], the same
-    slope_tangential: Array  # [F, W, P], for spots at another focus
-    slope_sagittal: Array  # [F, W, P], the same
-    rms_um: Array  # [F] root mean square distance from the centroid, over all wavelengths, weighted by energy
-    geometric_um: Array  # [F] the largest distance from the centroid; NaN, as all sizes, where no ray passes
-    rms_by_wavelength_um: Array  # [F, W], each from its own centroid
-    passed: Array  # [F] share of the stop's light that no rim takes
+    height_mm: Array
+    tangential_um: Array
+    sagittal_um: Array
+    slope_tangential: Array
+    slope_sagittal: Array
+    rms_um: Array
+    geometric_um: Array
+    rms_by_wavelength_um: Array
+    passed: Array
     working_f_number: float
-    airy_um: float  # radius of the first dark ring on the axis, 1.22 lambda N with the working f-number
-    shift_mm: Array  # [K], of the film
-    through_focus_um: Array  # [F, K], RMS radius with the film moved
-    best_shift_mm: Array  # [F], where each field's RMS radius is least; NaN where rays stay parallel
-    best_rms_um: Array  # [F], the RMS radius there
+    airy_um: float
+    shift_mm: Array
+    through_focus_um: Array
+    best_shift_mm: Array
+    best_rms_um: Array
 
 
 def spots(
@@ -131,14 +144,21 @@ def _span(best: Tensor, f_number: float, wavelength_nm: float) -> Array:
 
 @dataclass(frozen=True)
 class Fans(Result):
-    """Fans of F fields, W wavelengths and n pupil points, from the first wavelength's chief ray; NaN where blocked."""
+    """Fans of F fields, W wavelengths and n pupil points.
+
+    Attributes:
+        pupil: [n] share of the stop's radius, -1 to 1.
+        tangential_um: [F, W, n], aberration in the meridional plane of the rays along it.
+        sagittal_um: [F, W, n], aberration across the meridional plane of the rays along the other line.
+            Both from the chief ray of the first wavelength; NaN where a rim blocks.
+    """
 
     field_deg: Array
     wavelength_nm: Array
     height_mm: Array
-    pupil: Array  # [n] share of the stop's radius, -1 to 1
-    tangential_um: Array  # [F, W, n], aberration in the meridional plane of the rays along it
-    sagittal_um: Array  # [F, W, n], aberration across the meridional plane of the rays along the other line
+    pupil: Array
+    tangential_um: Array
+    sagittal_um: Array
 
 
 def fans(
@@ -159,17 +179,25 @@ def fans(
 
 @dataclass(frozen=True)
 class Mtf(Result):
-    """MTF of F fields at K frequencies."""
+    """MTF of F fields at K frequencies.
+
+    Attributes:
+        frequency_per_mm: [K] cycles per mm on the film.
+        tangential: [F, K], contrast of lines across the meridional plane (blur along it counts).
+        sagittal: [F, K], contrast of lines along it.
+        diffraction_limit: [K], of a perfect lens of the same working f-number on the axis, first wavelength.
+        shift_mm: how far from the film, positive away from the lens.
+    """
 
     field_deg: Array
     height_mm: Array
     wavelength_nm: Array
-    frequency_per_mm: Array  # [K] cycles per mm on the film
-    tangential: Array  # [F, K], contrast of lines across the meridional plane (blur along it counts)
-    sagittal: Array  # [F, K], contrast of lines along it
-    diffraction_limit: Array  # [K], of a perfect lens of the same working f-number on the axis, first wavelength
+    frequency_per_mm: Array
+    tangential: Array
+    sagittal: Array
+    diffraction_limit: Array
     working_f_number: float
-    shift_mm: float  # how far from the film, positive away from the lens
+    shift_mm: float
 
 
 def mtf(

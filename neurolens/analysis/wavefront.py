@@ -45,19 +45,28 @@ _HELD = 0.98  # share of the geometric spot's energy that the window holds
 
 @dataclass(frozen=True)
 class Psf(Result):
-    """Point spread of F fields; images are indexed [tangential, sagittal], centred on the spot's centroid."""
+    """Point spread of F fields; images are indexed [tangential, sagittal], centred on the spot's centroid.
+
+    Attributes:
+        half_width_um: [F], from the centre of the image to its edge; NaN without light.
+        geometric: [F, 49, 49] share of all wavelengths' energy in each square; what lies outside is missing; NaN
+            without light.
+        diffraction: [F, 97, 97] at the first wavelength, 1 at the peak of the same pupil without aberrations; NaN where
+            the aberrations are too large for it (then diffraction is negligible against `geometric`) or almost
+            no light arrives.
+        strehl: [F], greatest value of `diffraction`.
+        pupil_points: [F], points across the pupil that the diffraction image needs; 0 without light.
+        airy_um: radius of the first dark ring on the axis.
+    """
 
     field_deg: Array
     wavelength_nm: Array
-    half_width_um: Array  # [F], from the centre of the image to its edge; NaN without light
-    # [F, 49, 49] share of all wavelengths' energy in each square; what lies outside is missing; NaN without light.
+    half_width_um: Array
     geometric: Array
-    # [F, 97, 97] at the first wavelength, 1 at the peak of the same pupil without aberrations; NaN where the
-    # aberrations are too large for it (then diffraction is negligible against `geometric`) or almost no light arrives.
     diffraction: Array
-    strehl: Array  # [F], greatest value of `diffraction`
-    pupil_points: Array  # [F], points across the pupil that the diffraction image needs; 0 without light
-    airy_um: float  # radius of the first dark ring on the axis
+    strehl: Array
+    pupil_points: Array
+    airy_um: float
 
 
 def psf(scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] = DEFAULT_NM) -> Psf:

@@ -120,31 +120,25 @@ def _camera(spec: str, shot: Shot, progress: Progress | None) -> Camera:
 
 
 def _ideal(kind: str, shot: Shot) -> Camera:
+    fisheye, point = kind in FISHEYES, kind != "thin"
     _refuse(kind, "zoom", shot.zoom, "left out: only a lens file has zoom states")
     _refuse(kind, "focus", "internal" if shot.focus == "internal" else None, "left out: only lens files have groups")
-    if kind in FISHEYES:
-        return _fisheye(kind, shot)
-    _refuse(kind, "field_deg", shot.field_deg, "left out: set efl_mm")
-    focal = _EFL_MM if shot.efl_mm is None else shot.efl_mm
-    if kind == "thin":
-        f_number = shot.f_number or _THIN_F_NUMBER
+    _refuse(kind, "field_deg", None if fisheye else shot.field_deg, "left out: set efl_mm")
+    if not point:
+        focal, f_number = _EFL_MM if shot.efl_mm is None else shot.efl_mm, shot.f_number or _THIN_F_NUMBER
         moved = shot.film_offset_mm
         return ThinLens(focal, f_number, shot.focus_m, shot.film_mm, aperture=shot.aperture, film_offset_mm=moved)
     _refuse(kind, "film_offset_mm", shot.film_offset_mm or None, "left out: set efl_mm")
-    _refuse(kind, "aperture", shot.aperture and shot.aperture.settings(), "left out: this pinhole is a point")
-    return Pinhole(focal, shot.film_mm, shot.f_number or _PINHOLE_F_NUMBER)
-
-
-def _fisheye(kind: str, shot: Shot) -> Camera:
-    _refuse(kind, "film_offset_mm", shot.film_offset_mm or None, "left out: set efl_mm")
     _refuse(kind, "aperture", shot.aperture and shot.aperture.settings(), "left out: this camera is a point")
+    f_number = shot.f_number or _PINHOLE_F_NUMBER
+    if not fisheye:
+        return Pinhole(_EFL_MM if shot.efl_mm is None else shot.efl_mm, shot.film_mm, f_number)
     projection = kind.removeprefix("fisheye-")
     focal = _FISHEYE_EFL_MM if shot.efl_mm is None else shot.efl_mm
     if shot.field_deg is not None:
         _refuse(kind, "efl_mm", shot.efl_mm, "left out: the field sets it")
         edge = float(PROJECTIONS[projection].radius(np.array(check_field(projection, shot.field_deg))))
         focal = min(shot.film_mm) / 2 / edge
-    f_number = shot.f_number or _PINHOLE_F_NUMBER
     return Fisheye(projection, focal, shot.film_mm, field_deg=shot.field_deg, f_number=f_number)
 
 

@@ -1,7 +1,7 @@
 """Lens cameras as graphs: from film point, two random numbers and wavelength to the ray, its weight and its status.
 
-What stands around a lens is written here, and in `pupil_outline`, once: onnxruntime and compiled cameras run it whole,
-together with the graph of their lens; cameras whose lens is a function (a trace) have its two halves evaluated.
+What stands around a lens is written here, and in `pupil_outline`, once: onnxruntime and compiled cameras run it whole
+(`fused.whole_camera`) with the graph of their lens; cameras whose lens is a function (a trace) evaluate its two halves.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 from functools import lru_cache
 
 from neurolens.base import status as st
-from neurolens.cameras.pupil_outline import pupil_graph
 from neurolens.graph.derive import derivative
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import FILM_X_Y
@@ -22,40 +21,6 @@ _NO_AREA = 1e-30
 # Outputs of a lens's graph with derivatives by the film point.
 D_FILM = tuple(derivative("scene_ray", by) for by in FILM_X_Y)
 _METRES = [1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0]
-
-
-def camera_graph(
-    lens: Graph,
-    segments: int,
-    wavelengths: int,
-    aperture: Aperture | None = None,
-    stopped: int = 0,
-    pupil_too: bool = False,
-) -> Graph:
-    """The graph of a camera with the graph of its lens inside.
-
-    Args:
-        lens: inputs `rays` [5] (film and pupil point, wavelength), `film_z_mm` and `stop_radius_mm`; outputs
-            `scene_ray` [6], `transmittance`, `status`, `stop_xy_mm` [2] for an aperture, else to be handed on, and
-            derivatives of `scene_ray`, which the camera has, too.
-        segments, wavelengths: of the outline; see `pupil_graph`.
-        aperture, stopped: see `weight_graph`.
-        pupil_too: whether the outputs of `pupil_graph` are outputs, too.
-
-    Inputs: those of `pupil_graph` and `weight_graph`. Outputs: those of `weight_graph`.
-    """
-    g = Graph()
-    pupil = g.inline(pupil_graph(segments, wavelengths), {})
-    film, wavelength = g.input("film_mm", 2), g.input("wavelength_nm")
-    found = g.inline(lens, {"rays": g.concat(film, pupil["pupil_mm"], wavelength)})
-    derivatives = tuple(name for name in found if "_by_" in name)
-    given = {"film_mm": film, **pupil, **found, "lens_status": found["status"]}
-    g.outputs = g.inline(weight_graph(derivatives, aperture, stopped), given)
-    if aperture is None and "stop_xy_mm" in found:
-        g.outputs["stop_xy_mm"] = found["stop_xy_mm"]
-    if pupil_too:
-        g.outputs |= pupil
-    return g
 
 
 @lru_cache(maxsize=16)

@@ -129,7 +129,7 @@ class Camera(Protocol):
 
 
 class DifferentialCamera(Camera, Protocol):
-    """A camera that knows its ray differentials; all cameras of this package do."""
+    """What all cameras of this package know besides; `Vignetted` but for `natural`."""
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `sample`, with the differentials of the rays.
@@ -138,10 +138,6 @@ class DifferentialCamera(Camera, Protocol):
             InputError: an exported model without derivatives.
         """
         ...
-
-
-class LightCamera(Camera, Protocol):
-    """A camera that finds the film points of scene points; all cameras of this package do."""
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Film points for scene points [3, N] in m (camera frame), pupil samples [2, N] and wavelengths [N] in nm.
@@ -153,10 +149,6 @@ class LightCamera(Camera, Protocol):
             InputError: an exported model without the inverse map of scene rays beside it.
         """
         ...
-
-
-class NaturalCamera(Camera, Protocol):
-    """A camera that tells natural vignetting from the rest; all cameras of this package do but `Vignetted`."""
 
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
         """The part [N] of the weights of `sample` that is the cos^4 law (of a fisheye projection, its own law).

@@ -36,13 +36,7 @@ from neurolens.optics.glass import LINE_D_NM, absorption_of
 from neurolens.optics.paraxial import chief_reach_mm, first_order
 from neurolens.optics.prescription import Focus, Lens
 from neurolens.optics.pupil_methods import RadialPupil
-from neurolens.optics.pupils import (
-    PupilBounds,
-    camera_rays,
-    passes_at_any_azimuth,
-    pupil_bounds,
-    pupil_plane_z_mm,
-)
+from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
 from neurolens.optics.trace import Rays, film_derivatives, trace, trace_differentials
 from neurolens.optics.tracegraph import exact_graph
 
@@ -67,13 +61,10 @@ class ExactCamera:
 
     Args:
         lens: in the zoom state wanted.
-        film_mm: width and height of the film.
-        focus_m: distance from film to the object in focus; inf allowed.
-        f_number: None keeps the lens's stop.
+        film_mm, focus_m, film_offset_mm: as of `build.Shot`. f_number: None keeps the lens's stop.
         wavelength_nm: range of the wavelengths; the d line stands in for a lens without known dispersion.
         dtype: precision of the trace.
         focus: how the lens is focused; see `Lens.at`. After "internal" the film, too, moves to the least spot.
-        film_offset_mm: moves the film away from the lens (negative: towards it) after focusing.
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
         pupil: how the pupil is sampled, one of `PUPILS`. All give the same picture in expectation; fewer
@@ -167,13 +158,8 @@ class ExactCamera:
         # Light starts a millimetre before the surface, so that this is still ahead; nonsense misses it.
         rays = np.nan_to_num(np.concatenate([aim.position + aim.direction, -aim.direction]), posinf=0, neginf=0)
         with torch.no_grad():
-            done = trace(
-                self.lens,
-                Rays(*torch.from_numpy(rays).to(self._dtype)),
-                torch.from_numpy(np.ascontiguousarray(wavelength_nm)).to(self._dtype),
-                towards="film",
-                transmittance=True,
-            )
+            *light, wavelength = _tensors(self._dtype, *rays, wavelength_nm)
+            done = trace(self.lens, Rays(*light), wavelength, towards="film", transmittance=True)
         assert done.transmittance is not None
         x, y, z, dx, dy, dz, through = (c.double().numpy() for c in (*done.rays, done.transmittance))
         origin = 1e-3 * (aim.position - [[0], [0], [film_z]])
@@ -192,7 +178,8 @@ class ExactCamera:
         check_bare(self.lens)
         waves = self.wavelength_nm or (LINE_D_NM, LINE_D_NM)
         graph = exact_graph(self.lens, self._pupil_z_mm, waves)
-        return LensGraph(graph, float(self.lens.stop_radius_mm), self.lens.aperture, self.lens.stop_index)
+        stopped = st.blocked(self.lens.stop_index, st.RIM)
+        return LensGraph(graph, float(self.lens.stop_radius_mm), self.lens.aperture, stopped)
 
     def for_worker(self) -> ExactCamera:
         """This camera, in a render worker. A forked process must not enter torch's thread pool: it never returns."""
@@ -215,9 +202,7 @@ class ExactCamera:
             return outline_of(table, self._passes, wavelength_nm, detail, lambda share: report(0.2 + 0.8 * share))
 
     def _scene(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SceneRays:
-        fx, fy, px, py, wavelength = (
-            torch.from_numpy(np.ascontiguousarray(a)).to(self._dtype) for a in (*film, *pupil, wavelength_nm)
-        )
+        fx, fy, px, py, wavelength = _tensors(self._dtype, *film, *pupil, wavelength_nm)
         rays = camera_rays(fx, fy, self._film_z_mm, px, py, self._pupil_z_mm)
         with torch.no_grad():
             done = trace(self.lens, rays, wavelength, transmittance=True)
@@ -226,9 +211,7 @@ class ExactCamera:
         return SceneRays(scene, done.transmittance.to(torch.float32).numpy(), done.status.numpy())
 
     def _with_differentials(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SceneRays:
-        fx, fy, px, py, wavelength = (
-            torch.from_numpy(np.ascontiguousarray(a)).double() for a in (*film, *pupil, wavelength_nm)
-        )
+        fx, fy, px, py, wavelength = _tensors(torch.float64, *film, *pupil, wavelength_nm)
         rays = camera_rays(fx, fy, self._film_z_mm, px, py, self._pupil_z_mm)
         gap = self._film_z_mm - self._pupil_z_mm
         distance = torch.sqrt((fx - px) ** 2 + (fy - py) ** 2 + gap * gap)
@@ -238,10 +221,14 @@ class ExactCamera:
 
     def _passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
         """Whether light passes from film points (r, 0) through pupil points; see `passes_at_any_azimuth`."""
-        r, u, v = (torch.from_numpy(np.ascontiguousarray(a)).to(self._dtype) for a in (film[0], *pupil))
+        r, u, v = _tensors(self._dtype, film[0], *pupil)
         with torch.no_grad():
             film_z, pupil_z = self._film_z_mm, self._pupil_z_mm
             return passes_at_any_azimuth(self.lens, r, film_z, u, v, pupil_z, wavelength_nm, self.film_mm).numpy()
+
+
+def _tensors(dtype: torch.dtype, *arrays: NDArray[Any]) -> list[torch.Tensor]:
+    return [torch.from_numpy(np.ascontiguousarray(a)).to(dtype) for a in arrays]
 
 
 class FusedExactCamera(Compiled, ExactCamera):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.cameragraph import D_FILM, camera_graph
+from neurolens.cameras.cameragraph import D_FILM, weight_graph
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FloatArray
 from neurolens.cameras.lens_film import LensFilm, camera_rays
 from neurolens.cameras.model import ModelScene, OnnxCamera
@@ -37,34 +37,43 @@ class LensGraph(NamedTuple):
     """The graph of a lens with what its camera's graph takes from it.
 
     Attributes:
-        graph: of the lens. stop_radius_mm: of its round stop.
+        graph: inputs `rays` [5] (film and pupil point, wavelength), `film_z_mm` and `stop_radius_mm`; outputs
+            `scene_ray` [6], `transmittance`, `status`, `stop_xy_mm` [2], and any derivatives of `scene_ray`.
+        stop_radius_mm: of its round stop.
         aperture: the shape of the opening, tested on the rays' crossings with the stop; None is round.
-        stop_surface: of the lens, for the status of rays that the shape blocks.
+        stopped: status of rays that the shape blocks.
     """
 
     graph: Graph
     stop_radius_mm: float
     aperture: Aperture | None = None
-    stop_surface: int = 0
+    stopped: int = 0
 
     @property
     def blades(self) -> Aperture | None:
         """The opening where it is no mask: a mask's table is too large for compiled loops."""
         return None if self.aperture is None or self.aperture.mask is not None else self.aperture
 
-    @property
-    def stopped(self) -> int:
-        """Status of rays that the shape blocks."""
-        return st.blocked(self.stop_surface, st.RIM)
-
 
 def whole_camera(film: LensFilm, lens: LensGraph, pupil_too: bool = False) -> tuple[Graph, dict[str, float]]:
-    """The graph of a camera and its numbers of the call; see `cameragraph.camera_graph`."""
-    outline, graph = film.outline, lens.graph
-    needed = {name: value for name, value in graph.outputs.items() if name != "stop_xy_mm" or lens.aperture is not None}
-    shape = outline.x.shape[2] - 1, len(outline.x)
-    numbers = outline.numbers | film.numbers | {"stop_radius_mm": lens.stop_radius_mm}
-    return camera_graph(pruned(graph, needed), *shape, lens.blades, lens.stopped, pupil_too), numbers
+    """The graph of a camera with the graph of its lens inside, and its numbers of the call.
+
+    Inputs: those of `pupil_graph` and `weight_graph`. Outputs: those of `weight_graph`, derivatives of the ray that the
+    lens's graph has, of a mask `stop_xy_mm`, and with `pupil_too` the outputs of `pupil_graph`.
+    """
+    wanted = {k: v for k, v in lens.graph.outputs.items() if k != "stop_xy_mm" or lens.aperture is not None}
+    g = Graph()
+    pupil = g.inline(film.outline.graph, {})
+    film_mm, wavelength = g.input("film_mm", 2), g.input("wavelength_nm")
+    found = g.inline(pruned(lens.graph, wanted), {"rays": g.concat(film_mm, pupil["pupil_mm"], wavelength)})
+    derivatives = tuple(name for name in found if "_by_" in name)
+    given = {"film_mm": film_mm, **pupil, **found, "lens_status": found["status"]}
+    g.outputs = g.inline(weight_graph(derivatives, lens.blades, lens.stopped), given)
+    if lens.blades is None and "stop_xy_mm" in found:
+        g.outputs["stop_xy_mm"] = found["stop_xy_mm"]
+    if pupil_too:
+        g.outputs |= pupil
+    return g, film.outline.numbers | film.numbers | {"stop_radius_mm": lens.stop_radius_mm}
 
 
 class FusedFilm:
@@ -168,7 +177,7 @@ def lens_graph(camera: OnnxCamera) -> LensGraph:
     model, scene = camera.model, camera.film.scene
     assert isinstance(scene, ModelScene)
     graph = graph_of(model.path, model.data, model.state if model.axes else ())
-    return LensGraph(graph, scene.stop_radius_mm, scene.aperture, int(model.card["lens"].get("stop_surface", 0)))
+    return LensGraph(graph, scene.stop_radius_mm, scene.aperture, scene.stop_status)
 
 
 class FusedCamera(Compiled, OnnxCamera):

@@ -67,11 +67,7 @@ class LensFilm:
     """
 
     def __init__(
-        self,
-        outline: PupilOutline | None,
-        film_z_mm: float,
-        wavelength_nm: tuple[float, float],
-        scene: SceneFunction,
+        self, outline: PupilOutline | None, film_z_mm: float, wavelength_nm: tuple[float, float], scene: SceneFunction
     ) -> None:
         if outline is None:
             raise InputError("camera", "f_number, focus_m", "(no ray passes)", "a lens that light can pass")

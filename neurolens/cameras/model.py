@@ -23,9 +23,8 @@ from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.onnxmaps import InverseRays, OnnxDerivatives, OnnxInverse, load_inverse
 from neurolens.cameras.onnxsession import joined, open_session, run_batches
 from neurolens.cameras.pupil_boxes import PupilTable
-from neurolens.cameras.pupil_outline import pupil_graph
 from neurolens.cameras.pupil_search import outline_of
-from neurolens.cameras.sampling import arrived, check_film, positive
+from neurolens.cameras.sampling import arrived, check_film, common_light, positive
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.modelfile import DOMAIN_SLACK
@@ -52,16 +51,12 @@ class OnnxCamera:
     Args:
         model: see `load_model`.
         film_mm: width and height of the film. What lies beyond the model's film radius stays dark.
-        focus_m: distance from film to the object in focus; inf allowed. It moves the film, or the groups of a model
-            that knows internal focus.
-        f_number: None takes the model's widest stop, and so does one up to 2% below it (an engraved f/1.8 may be 1.83).
-        aperture: shape of the stop's opening; None is round.
-        zoom: of a model of a zoom's whole range: a focal length in mm, or the name of a state of the source; None
-            leaves it at `model.state`.
+        focus_m, f_number, aperture, film_offset_mm: as of `build.Shot`; an f-number up to 2% below the model's widest
+            stop means that (an engraved f/1.8 may be 1.83). Focusing moves the groups of a model that knows them.
+        zoom: of a model of a zoom's whole range, as of `Shot`; None leaves it at `model.state`.
         wavelength_nm: range of the light, which sets the exposure and the best focus; None takes the model's own.
         focus: "best" places the film where the model's rays from the axis make the least spot, as `Lens.at` does for
             the lens; "paraxial" in the paraxial image. "internal" is as "best": groups move where a model knows them.
-        film_offset_mm: moves the film away from the lens (negative: towards it) after focusing.
 
     Raises:
         InputError: a focus, stop or zoom position outside the model's domain.
@@ -99,9 +94,7 @@ class OnnxCamera:
         # A model for one wavelength of a dispersive lens knows that wavelength only; without dispersion any will do.
         self.wavelength_nm = (low, high) if lens["dispersive"] else None
         # Glass takes more of some wavelengths than of others: exposure is for those that the light has.
-        light = (low, high) if wavelength_nm is None else wavelength_nm
-        used = (min(max(low, light[0]), high), max(min(high, light[1]), low))
-        self._light_nm = used
+        self._light_nm = used = common_light((low, high), wavelength_nm or (low, high))
         stop = _stop_radius(model, f_number)
         start = ModelScene(model, _paraxial_film_z(model, self.focus_m), stop, aperture)
         best = start.film_z_mm if focus == "paraxial" else best_focus_z_mm(start, self.focus_m, used)
@@ -205,7 +198,7 @@ class OnnxFilm:
         assert isinstance(scene, ModelScene) and film.pupil is outline
         self._path, aperture = model.path, scene.aperture
         before = Graph()
-        found = before.inline(pupil_graph(outline.x.shape[2] - 1, len(outline.x)), {})
+        found = before.inline(outline.graph, {})
         rays = before.concat(before.input("film_mm", 2), found["pupil_mm"], before.input("wavelength_nm"))
         before.outputs = {"rays": rays, **found}
         numbers: dict[str, Any] = outline.numbers | film.numbers | {"stop_radius_mm": scene.stop_radius_mm}
@@ -224,7 +217,7 @@ class OnnxFilm:
     def sample(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `LensFilm.sample`."""
         rays = {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None]}
-        done = run_batches(self._path, self._session, tuple(_OUTPUTS), rays, {}, 3 * RAYS_A_CALL // 2)
+        done = run_batches(self._path, self._session, tuple(_OUTPUTS), rays, {}, RAYS_A_CALL)
         return camera_rays({name: np.atleast_2d(values) for name, values in zip(_OUTPUTS, done, strict=True)})
 
 

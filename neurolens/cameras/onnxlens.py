@@ -14,7 +14,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.onnxsession import open_session, run_batches
-from neurolens.modelfile.cardcheck import check_card
+from neurolens.modelfile.cardcheck import check_card, tolerances
 from neurolens.modelfile.onnxfile import read_checked, without_outputs
 from neurolens.modelfile.states import STATE, axes_of, card_at, default_state, state_numbers
 
@@ -50,7 +50,7 @@ class OnnxLens:
 
     Attributes:
         card: see `neurolens.surrogates.card`; its lens and domain are those of `state`.
-        path: of the file.
+        path, data: of the file.
         axes: what the model's state is made of (zoom in mm, focus in 1/m); none for a model of one state.
         state: a number for every axis.
     """
@@ -58,7 +58,7 @@ class OnnxLens:
     def __init__(self, path: Path, data: bytes, card: dict[str, Any], threads: int) -> None:
         self.path, self.card, self.threads = path, card, threads
         self.axes, self.state = axes_of(card), default_state(card)
-        self._data = data
+        self.data = data
         self._session = open_session(
             path,
             without_outputs(data, frozenset(DERIVATIVES)),
@@ -78,25 +78,9 @@ class OnnxLens:
             other.card, other.state = card_at(self.card, self.axes, state), tuple(float(v) for v in state)
         return other
 
-    @property
-    def data(self) -> bytes:
-        """The file."""
-        return self._data
-
-    @property
-    def pupil_z_mm(self) -> float:
-        """Plane of the pupil points at this state."""
-        return float(self.card["domain"]["pupil_z_mm"])
-
-    @property
-    def film_z_mm(self) -> tuple[float, float]:
-        """Film planes at this state, of the farthest focus first."""
-        near, far = self.card["domain"]["film_z_mm"]
-        return float(near), float(far)
-
     def reopened(self) -> OnnxLens:
         """The same model with a session of its own, for another process or thread."""
-        other = OnnxLens(self.path, self._data, self.card, self.threads)
+        other = OnnxLens(self.path, self.data, self.card, self.threads)
         other.state = self.state
         return other
 
@@ -213,19 +197,6 @@ def _check_reference(model: OnnxLens) -> None:
         _check_rays(model.at(*reference["state"]), reference)
 
 
-def _tolerances(model: OnnxLens, rounding: dict[str, Any]) -> tuple[Any, ...]:
-    """Ten times what float32 may cost, more where the card says that it costs this model more; changed weights show."""
-    mm = 1e-5 * max(1.0, abs(float(model.card["lens"]["efl_mm"])))
-    least = {"position_mm": mm, "direction": 1e-5, "transmittance": 1e-5, "stop_mm": mm}
-    try:
-        position, direction, power, stop = found = [max(v, float(rounding.get(k, 0.0))) for k, v in least.items()]
-        if not np.isfinite(found).all():
-            raise ValueError("not finite")
-    except (AttributeError, TypeError, ValueError) as error:
-        raise ModelError(f"{model.path}: card: reference.rounding: {type(error).__name__}: {error}") from error
-    return [[position]] * 3 + [[direction]] * 3, power, stop, 0
-
-
 @np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused
 def _check_rays(model: OnnxLens, reference: Any) -> None:
     try:
@@ -241,8 +212,12 @@ def _check_rays(model: OnnxLens, reference: Any) -> None:
         raise ModelError(
             f"{model.path}: reference rays: got status {found.status.tolist()}, expected {wanted[3].tolist()}"
         )
-    tolerances = _tolerances(model, reference.get("rounding") or {})
-    for name, a, b, tolerance in zip(LensRays._fields, found, wanted, tolerances, strict=True):
+    try:
+        position, direction, power, stop = tolerances(model.card, reference).values()
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ModelError(f"{model.path}: card: reference.rounding: {type(error).__name__}: {error}") from error
+    allowed = [[position]] * 3 + [[direction]] * 3, power, stop, 0
+    for name, a, b, tolerance in zip(LensRays._fields, found, wanted, allowed, strict=True):
         off = np.abs(a[..., passed] - b[..., passed])
         if not (off <= np.asarray(tolerance)).all():  # NaN fails
             raise ModelError(

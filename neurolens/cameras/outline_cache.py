@@ -22,15 +22,7 @@ import numpy as np
 import torch
 
 from neurolens import optics
-from neurolens.base.files import (
-    atomic_path,
-    cache_folder,
-    fingerprint_of,
-    keep_newest,
-    seal,
-    sealed_bytes,
-    sha256_of,
-)
+from neurolens.base.files import atomic_path, cache_folder, fingerprint_of, keep_newest, seal, sealed_bytes, sha256_of
 from neurolens.cameras.pupil_outline import PupilOutline, wavelength_between
 from neurolens.optics.glass import LINE_D_NM, index_of
 from neurolens.optics.prescription import Lens

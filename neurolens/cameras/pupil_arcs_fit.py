@@ -42,7 +42,7 @@ class Sight:
     """A lens whose pupil is sought.
 
     Attributes:
-        graph: of the lens; see `cameragraph.camera_graph`. table: boxes that hold what passes.
+        graph: of the lens; see `fused.LensGraph`. table: boxes that hold what passes.
         film_z_mm, wavelength_nm: ranges. stop_radius_mm: the widest. stop_surface: for the status of its rays.
         anamorphic: whether it matters on which side of the film a point lies: the arcs then hold what passes of any.
     """

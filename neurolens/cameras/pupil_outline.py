@@ -48,7 +48,7 @@ class PupilOutline:
     def sample(
         self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Points that fill the polygons of film points evenly; see `pupil_graph`.
+        """Points that fill the polygons of film points evenly, by `graph`.
 
         Args:
             film_mm: [2, N].
@@ -61,9 +61,14 @@ class PupilOutline:
         """
         given = {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None], "outline": self.table}
         given |= {name: np.array([[value]], np.float32) for name, value in self.numbers.items()}
-        found = evaluate(pupil_graph(self.x.shape[2] - 1, len(self.x)), given)
+        found = evaluate(self.graph, given)
         area = found["area_mm2"][0]
         return found["pupil_mm"], np.where(area > 0, area, np.float32(0))
+
+    @property
+    def graph(self) -> Graph:
+        """The outline's `pupil_graph`."""
+        return pupil_graph(self.x.shape[2] - 1, len(self.x))
 
     def radii(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
         """Film radii in mm of (fractional) rows."""

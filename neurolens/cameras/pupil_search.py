@@ -26,8 +26,7 @@ from neurolens.cameras.pupil_boxes import (
 )
 from neurolens.cameras.pupil_outline import PupilOutline, wavelength_between
 
-# Directions in which the first outline is sought; steps outwards, and halvings of the step that crosses the boundary.
-_DIRECTIONS, _STEPS, _COARSE, _FINE = 33, 24, 5, 12
+_DIRECTIONS = 33  # in which the first outline is sought
 # Where between rows, along an edge and between the two wavelengths the interpolated outline is checked; at which
 # multiples of it; and how far vertices are pushed beyond what was found: a hair, against rounding.
 _BETWEEN_ROWS, _ALONG_EDGE = (0.0, 0.5), (0.0, 0.3, 0.5, 0.7)
@@ -54,9 +53,9 @@ class Detail(NamedTuple):
     rows: int = 65
     segments: int = 32
     wavelengths: tuple[float, ...] = (0.0, 0.4, 0.75, 1.0)
-    steps: int = _STEPS
-    coarse: int = _COARSE
-    fine: int = _FINE
+    steps: int = 24
+    coarse: int = 5
+    fine: int = 12
     reach: float = math.inf
     tighten: bool = True
 

@@ -95,6 +95,12 @@ def ahead(depth: NDArray[np.float64]) -> NDArray[np.int32]:
     return np.where(depth > 0, st.PASSED, behind).astype(np.int32)
 
 
+def common_light(known_nm: tuple[float, float], light_nm: tuple[float, float]) -> tuple[float, float]:
+    """The part of a range of light that a lens knows; where they have none in common, its own end that is nearest."""
+    low, high = known_nm
+    return min(max(low, light_nm[0]), high), max(min(high, light_nm[1]), low)
+
+
 def positive(field: str, value: float, *, infinite: bool = False) -> float:
     """`value` as a float above 0, finite unless `infinite` is allowed.
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
-from neurolens.cameras.sampling import stratified
+from neurolens.cameras.sampling import common_light, stratified
 
 Vignetting = Literal["both", "natural", "optical", "none"]
 VIGNETTINGS: tuple[str, ...] = get_args(Vignetting)
@@ -93,11 +93,7 @@ class _Table:
     """V, N and O of a camera on a polar grid of film points [R, A]; radii grow closer towards the end of the light."""
 
     def __init__(self, camera: Any, wavelength_nm: tuple[float, float]) -> None:
-        accepted = camera.wavelength_nm or wavelength_nm
-        self.light = (
-            min(max(accepted[0], wavelength_nm[0]), accepted[1]),
-            max(min(accepted[1], wavelength_nm[1]), accepted[0]),
-        )
+        self.light = common_light(camera.wavelength_nm or wavelength_nm, wavelength_nm)
         self.end = self._end_of_light(camera)
         rows, azimuths, side = _ROUND if self._is_round(camera) else _OTHER
         radius = self.end * (1 - (1 - np.arange(rows) / (rows - 1)) ** 2)
@@ -188,9 +184,6 @@ class _Table:
         """Whether V is the same at some azimuths, none of which is another's mirror image."""
         angle = np.arange(_TRIED_AZIMUTHS) * 0.83
         value = self._means(
-            camera,
-            np.repeat(self.end * np.array(_TRIED_AT), angle.size),
-            np.tile(angle, len(_TRIED_AT)),
-            _OTHER[2],
+            camera, np.repeat(self.end * np.array(_TRIED_AT), angle.size), np.tile(angle, len(_TRIED_AT)), _OTHER[2]
         )[0].reshape(-1, angle.size)
         return bool((np.ptp(value, axis=1) <= _UNEVEN * value.max()).all())

@@ -160,14 +160,8 @@ def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras 
     text = _HEAD.format(comment=lines, name=name, guard=f"{macro}_H", macro=macro)
     live = program.live()
     kinds = [p.steps[k].kind for p in (program, *extras.functions.values()) for k in p.live()]
-    if "sqrt" in kinds:
-        text += _SQRT.format(name=name, macro=macro)
-    if any(program.steps[k].kind == "clamp" for k in live):
-        text += _CLAMP.format(name=name, macro=macro)
-    if any(program.steps[k].kind == "floor" for k in live):
-        text += "#include <math.h>\n"
-    if any(program.steps[k].kind == "lookup" for k in live):
-        text += _CELL.format(name=name, macro=macro)
+    for kind, helper in {"sqrt": _SQRT, "clamp": _CLAMP, "floor": "#include <math.h>\n", "lookup": _CELL}.items():
+        text += helper.format(name=name, macro=macro) if kind in kinds else ""
     for table in dict.fromkeys(program.steps[k].name for k in live if program.steps[k].kind == "lookup"):
         if table in program.own_tables:
             text += _numbers(f"{name}_{table}", program.own_tables[table])

@@ -2,10 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from neurolens.graph.ir import Graph, Node, Value
+
+# Any row of these needs all rows of their inputs, but of the rows that an affine adds.
+_WHOLE = frozenset(("affine", "polynomial", "quadratic", "first_failure", "lookup"))
+
+
+def _needed(graph: Graph, node: Node, rows: Collection[int]) -> Iterator[tuple[int, Collection[int]]]:
+    """Numbers of the inputs that these rows of a node need, each with its rows needed, in the order of `rows`."""
+    if node.kind == "take":
+        yield node.inputs[0], [node.static[r] for r in rows]
+    elif node.kind == "concat":
+        start = 0
+        for k in node.inputs:
+            end = start + graph.nodes[k].rows
+            if mine := [r - start for r in rows if start <= r < end]:
+                yield k, mine
+            start = end
+    else:
+        whole = len(node.inputs) - (node.kind == "affine" and node.static[1]) if node.kind in _WHOLE else 0
+        for place, k in enumerate(node.inputs):
+            yield k, range(graph.nodes[k].rows) if place < whole else rows
 
 
 def live_rows(graph: Graph, outputs: Mapping[str, Value]) -> dict[int, set[int]]:
@@ -19,33 +39,8 @@ def live_rows(graph: Graph, outputs: Mapping[str, Value]) -> dict[int, set[int]]
     for value in outputs.values():
         ask(value.number, range(value.rows))
     for number in range(len(graph.nodes) - 1, -1, -1):
-        if number not in needed:
-            continue
-        node, rows = graph.nodes[number], needed[number]
-        if node.kind == "take":
-            ask(node.inputs[0], (node.static[r] for r in rows))
-        elif node.kind == "concat":
-            start = 0
-            for k in node.inputs:
-                end = start + graph.nodes[k].rows
-                mine = [r - start for r in rows if start <= r < end]
-                if mine:
-                    ask(k, mine)
-                start = end
-        elif node.kind == "lookup":
-            for k in node.inputs:
-                ask(k, range(graph.nodes[k].rows))
-        elif node.kind in ("affine", "polynomial", "quadratic", "first_failure"):
-            for k in node.inputs[:1] if node.kind == "affine" else node.inputs:
-                ask(k, range(graph.nodes[k].rows))
-            if node.kind == "affine":
-                moving, added = node.static
-                if moving:
-                    ask(node.inputs[1], [0])
-                if added:
-                    ask(node.inputs[-1], rows)
-        else:
-            for k in node.inputs:
+        if number in needed:
+            for k, rows in _needed(graph, graph.nodes[number], needed[number]):
                 ask(k, rows)
     return needed
 
@@ -58,7 +53,7 @@ def pruned(graph: Graph, outputs: Mapping[str, Value] | None = None) -> Graph:
     place: dict[int, Value] = {}  # a node's value among the new ones
     kept: dict[int, list[int]] = {}  # the old rows that it holds, in order
 
-    def rows_of(number: int, rows: Sequence[int]) -> Value:
+    def rows_of(number: int, rows: Collection[int]) -> Value:
         """New value of old rows; a single row stands for any."""
         known = kept[number]
         if graph.nodes[number].rows == 1:
@@ -73,48 +68,27 @@ def pruned(graph: Graph, outputs: Mapping[str, Value] | None = None) -> Graph:
             place[number], kept[number] = found.like(node, ()), every
             continue
         kept[number] = rows
+        inputs = [rows_of(k, wanted_rows) for k, wanted_rows in _needed(graph, node, rows)]
         if node.kind == "constant":
             place[number] = found.constant(node.arrays[0][rows])
         elif node.kind == "take":
-            place[number] = rows_of(node.inputs[0], [node.static[r] for r in rows])
+            place[number] = inputs[0]
         elif node.kind == "concat":
-            parts, start = [], 0
-            for k in node.inputs:
-                mine = [r - start for r in rows if start <= r < start + graph.nodes[k].rows]
-                parts += [rows_of(k, mine)] if mine else []
-                start += graph.nodes[k].rows
-            place[number] = found.concat(*parts)
+            place[number] = found.concat(*inputs)
         else:
-            place[number] = _kept_rows(found, graph, node, rows, rows_of)
+            place[number] = _kept_rows(found, node, rows, inputs)
     found.outputs = {name: rows_of(v.number, range(v.rows)) for name, v in wanted.items()}
     return found
 
 
-def _kept_rows(found: Graph, graph: Graph, node: Node, rows: list[int], rows_of: Any) -> Value:
+def _kept_rows(found: Graph, node: Node, rows: list[int], inputs: list[Value]) -> Value:
     """A node that computes, for these of its rows."""
-
-    def whole(k: int) -> Value:
-        value: Value = rows_of(k, range(graph.nodes[k].rows))
-        return value
-
-    if node.kind in ("affine", "quadratic", "polynomial"):
-        added = node.kind == "affine" and node.static[1]
-        inputs = [whole(k) for k in node.inputs[: -1 if added else None]]
-        arrays = [a[rows] for a in node.arrays] if node.kind != "polynomial" else [node.arrays[0], node.arrays[1][rows]]
-        static = node.static
-        if added:
-            inputs.append(rows_of(node.inputs[-1], rows))
-        if node.kind == "quadratic":
-            static = tuple(node.static[r] for r in rows)
-        return found.add(node.kind, inputs, len(rows), arrays=arrays, static=static)
-    if node.kind == "lookup":
-        static = tuple(node.static[r] for r in rows)
-        return found.add(node.kind, [whole(k) for k in node.inputs], len(rows), static=static, per_call=False)
-    if node.kind == "first_failure":
-        return found.add(node.kind, [whole(k) for k in node.inputs], 1, static=node.static)
-    arrays = [a[rows] if node.kind == "between" else a for a in node.arrays]
-    inputs = [rows_of(k, rows) for k in node.inputs]
-    return found.add(node.kind, inputs, len(rows), arrays=arrays, static=node.static)
+    cut = {"affine": 0, "quadratic": 0, "between": 0, "polynomial": 1}.get(node.kind, len(node.arrays))
+    arrays = [a if k < cut else a[rows] for k, a in enumerate(node.arrays)]
+    by_row = node.kind in ("quadratic", "lookup")
+    static = tuple(node.static[r] for r in rows) if by_row else node.static
+    per_call = False if node.kind == "lookup" else None
+    return found.add(node.kind, inputs, len(rows), arrays=arrays, static=static, per_call=per_call)
 
 
 def same_structure(graphs: Sequence[Graph]) -> bool:

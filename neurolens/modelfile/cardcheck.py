@@ -118,6 +118,22 @@ def check_card(file: Any, card: Mapping[str, Any]) -> None:
         raise ModelError(f"{file}: card: states: {type(error).__name__}: {error}") from error
 
 
+def tolerances(card: Mapping[str, Any], reference: Mapping[str, Any]) -> dict[str, float]:
+    """How far reference rays may be off: ten times what float32 may cost, more where they say that it costs more.
+
+    Position and stop crossing in mm, direction and transmittance; changed weights show.
+
+    Raises:
+        AttributeError, TypeError, ValueError: no finite numbers.
+    """
+    mm, rounding = 1e-5 * max(1.0, abs(float(card["lens"]["efl_mm"]))), reference.get("rounding") or {}
+    least = {"position_mm": mm, "direction": 1e-5, "transmittance": 1e-5, "stop_mm": mm}
+    found = {name: max(value, float(rounding.get(name, 0.0))) for name, value in least.items()}
+    if not all(map(math.isfinite, found.values())):
+        raise ValueError("not finite")
+    return found
+
+
 @np.errstate(over="ignore")
 def pupil_rows(bounds: Mapping[str, Any]) -> NDArray[np.float32]:
     """[3, R] low, high, half of the boxes in a card's bounds.

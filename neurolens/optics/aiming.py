@@ -29,11 +29,17 @@ _ZOOM, _ROUNDS = 17, 9  # each round narrows the bracket 16 times: to the last d
 
 
 class Bundle(NamedTuple):
-    """Rays from infinity to points of the stop."""
+    """Rays from infinity to points of the stop.
 
-    rays: Rays  # [F * H], just before the front surface, travelling to the film; field by field
-    reached: Tensor  # [F, H] bool; where False the ray is that of the widest field from which this point is reached
-    field_rad: Tensor  # [F, H], angle of the ray to the axis in front of the lens
+    Attributes:
+        rays: [F * H], just before the front surface, travelling to the film; field by field.
+        reached: [F, H] bool; where False the ray is that of the widest field from which this point is reached.
+        field_rad: [F, H], angle of the ray to the axis in front of the lens.
+    """
+
+    rays: Rays
+    reached: Tensor
+    field_rad: Tensor
 
 
 def without_rims(lens: Lens) -> Lens:

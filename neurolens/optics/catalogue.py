@@ -28,15 +28,21 @@ LINE_C_NM = 656.2725
 
 @dataclass(frozen=True, eq=False)  # compared by identity: the catalogue has one object per glass
 class Glass:
-    """Dispersion and absorption of one optical material."""
+    """Dispersion and absorption of one optical material.
+
+    Attributes:
+        maker, name: as in the catalogue.
+        form: "sellmeier", n^2 = 1 + sum of B L^2 / (L^2 - C), or "power", n^2 = sum of a_p L^p; L in um.
+        coefficients: B, C (um^2), B, C, ... of Sellmeier's form; a_4, a_2, a_0, a_-2, a_-4, ... of the other.
+        range_um: wavelengths from and to which the source states the formula for.
+        absorption: (wavelength in nm, Napierian absorption in 1/mm) at increasing wavelengths; empty where unknown.
+    """
 
     maker: str
-    name: str  # as in the catalogue
-    form: str  # "sellmeier", n^2 = 1 + sum of B L^2 / (L^2 - C), or "power", n^2 = sum of a_p L^p; L in um
-    # B, C (um^2), B, C, ... of Sellmeier's form; a_4, a_2, a_0, a_-2, a_-4, ... of the other.
+    name: str
+    form: str
     coefficients: tuple[float, ...]
-    range_um: tuple[float, float]  # wavelengths from and to which the source states the formula for
-    # (wavelength in nm, Napierian absorption in 1/mm) at increasing wavelengths; empty where unknown.
+    range_um: tuple[float, float]
     absorption: tuple[tuple[float, float], ...] = ()
 
     def __str__(self) -> str:

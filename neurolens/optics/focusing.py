@@ -393,14 +393,23 @@ def _moments(
 
 @dataclass(frozen=True)
 class Breath:
-    """A lens at one focus distance, to first order (distortion is left out)."""
+    """A lens at one focus distance, to first order (distortion is left out).
 
-    focus_m: float  # from object to film
-    efl_mm: float  # focal length of the groups in this state
-    magnification: float  # image over object height, negative for an inverted image; 0 at infinity
-    field_deg: float  # full field of view across the image circle, seen from the entrance pupil
-    film_z_mm: float  # film plane, lens frame
-    working_f_number: float  # 1 / (2 tan theta') of the paraxial marginal ray
+    Attributes:
+        focus_m: from object to film.
+        efl_mm: focal length of the groups in this state.
+        magnification: image over object height, negative for an inverted image; 0 at infinity.
+        field_deg: full field of view across the image circle, seen from the entrance pupil.
+        film_z_mm: film plane, lens frame.
+        working_f_number: 1 / (2 tan theta') of the paraxial marginal ray.
+    """
+
+    focus_m: float
+    efl_mm: float
+    magnification: float
+    field_deg: float
+    film_z_mm: float
+    working_f_number: float
 
 
 def breathing(lens: Lens, focus_m: Sequence[float], focus: Focus = "paraxial") -> list[Breath]:

@@ -36,13 +36,20 @@ _TINY_MM = 1e-3
 
 @dataclass(frozen=True)
 class Check:
-    """One figure of a lens, computed and stated."""
+    """One figure of a lens, computed and stated.
 
-    quantity: str  # name with its unit
-    computed: float | None  # None if unknown, as the next
+    Attributes:
+        quantity: name with its unit.
+        computed, stated: None if unknown.
+        doubt: why the figure casts doubt on the table, a clause; empty where it does not.
+        state: zoom or focus state of the file, empty for the table itself.
+    """
+
+    quantity: str
+    computed: float | None
     stated: float | None = None
-    doubt: str = ""  # why the figure casts doubt on the table, a clause; empty where it does not
-    state: str = ""  # zoom or focus state of the file, empty for the table itself
+    doubt: str = ""
+    state: str = ""
 
 
 def check_lens(lens: Lens) -> list[Check]:

@@ -91,11 +91,15 @@ CONFIGURATION_KEYS = (
 
 @dataclass(frozen=True)
 class Table:
-    """One table of a file, read strictly."""
+    """One table of a file, read strictly.
+
+    Attributes:
+        where: goes in front of the key in errors, with its separator: "surface 3, ".
+    """
 
     data: Mapping[str, Any]
     file: str
-    where: str = ""  # goes in front of the key in errors, with its separator: "surface 3, "
+    where: str = ""
 
     def __contains__(self, key: str) -> bool:
         return key in self.data

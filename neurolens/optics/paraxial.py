@@ -16,19 +16,29 @@ Meridian = Literal["x", "y"]
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """First-order data of a lens in air, lens frame, mm."""
+    """First-order data of a lens in air, lens frame, mm.
 
-    efl_mm: float  # effective focal length (negative for a diverging lens)
-    back_focus_mm: float  # last vertex to rear focal point
+    Attributes:
+        efl_mm: effective focal length (negative for a diverging lens).
+        back_focus_mm: last vertex to rear focal point.
+        rear_focal_z_mm, front_focal_z_mm: focal points on the axis.
+        rear_principal_z_mm, front_principal_z_mm: H' and H.
+        entrance_pupil_z_mm, entrance_pupil_diameter_mm: paraxial image of the stop seen from the scene.
+        exit_pupil_z_mm, exit_pupil_diameter_mm: seen from the film; z is infinite for an image-telecentric lens.
+        f_number: efl / entrance-pupil diameter; infinite for a closed stop.
+    """
+
+    efl_mm: float
+    back_focus_mm: float
     rear_focal_z_mm: float
     front_focal_z_mm: float
-    rear_principal_z_mm: float  # H'
-    front_principal_z_mm: float  # H
-    entrance_pupil_z_mm: float  # paraxial image of the stop seen from the scene
+    rear_principal_z_mm: float
+    front_principal_z_mm: float
+    entrance_pupil_z_mm: float
     entrance_pupil_diameter_mm: float
-    exit_pupil_z_mm: float  # seen from the film; infinite for an image-telecentric lens
+    exit_pupil_z_mm: float
     exit_pupil_diameter_mm: float
-    f_number: float  # efl / entrance-pupil diameter; infinite for a closed stop
+    f_number: float
 
 
 @dataclass(frozen=True)

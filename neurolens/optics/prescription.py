@@ -19,39 +19,55 @@ Focus = Literal["best", "paraxial", "internal"]
 
 @dataclass(frozen=True)
 class Coating:
-    """Thin films on one surface."""
+    """Thin films on one surface.
 
-    name: str  # of the design, for people and files
-    layers: tuple[tuple[float, float], ...]  # (refractive index, thickness in nm), from the scene's side to the film's
+    Attributes:
+        name: of the design, for people and files.
+        layers: (refractive index, thickness in nm), from the scene's side to the film's.
+    """
+
+    name: str
+    layers: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
 class Surface:
     """One surface. Lengths in mm, lens frame.
 
+    Attributes:
+        radius_mm: positive when the centre of curvature lies towards the film; `inf` for a plane.
+        thickness_mm: axial distance to the next surface (for the last one: to the film as tabled).
+        diameter_mm: full clear diameter of the rim; of the opening, for the stop.
+        n_d: refractive index at 587.56 nm of the medium after the surface.
+        V_d: Abbe number of that medium; None where unknown (constant index) or air.
+        material: name of the glass in the source, for people only.
+        stop: whether this row is the aperture stop.
+        conic: Schwarzschild's K (0 sphere, -1 paraboloid): c r^2 / (1 + sqrt(1 - (1 + K) c^2 r^2)).
+        asphere: (power, coefficient) pairs, sorted by power, added to the conic: sum of A_p r^p, A_p in mm^(1 - p).
+            Odd powers and p = 2 (which adds 2 A_2 to the curvature at the vertex) are allowed.
+        cylinder: None, or the transverse axis, "x" or "y", along which a cylinder is curved (straight along the other).
+        glass: name in the glass catalogue (`neurolens.optics.catalogue`); its dispersion rules over n_d and V_d.
+        absorption_per_mm: Napierian absorption of the medium after the surface at every wavelength (a grey filter),
+            added to that of the glass.
+        coating: the thin films on the surface, None where bare.
+
     `radius_mm`, `thickness_mm`, `n_d`, `conic` and the coefficients of `asphere` may be 0-d tensors where gradients
     with respect to them are wanted.
     """
 
-    radius_mm: Any  # positive when the centre of curvature lies towards the film; `inf` for a plane
-    thickness_mm: Any  # axial distance to the next surface (for the last one: to the film as tabled)
-    diameter_mm: float  # full clear diameter of the rim; of the opening, for the stop
-    n_d: Any = 1.0  # refractive index at 587.56 nm of the medium after the surface
-    V_d: float | None = None  # Abbe number of that medium; None where unknown (constant index) or air
-    material: str | None = None  # name of the glass in the source, for people only
-    stop: bool = False  # whether this row is the aperture stop
-    conic: Any = 0.0  # Schwarzschild's K (0 sphere, -1 paraboloid): c r^2 / (1 + sqrt(1 - (1 + K) c^2 r^2))
-    # (power, coefficient) pairs, sorted by power, added to the conic: sum of A_p r^p, A_p in mm^(1 - p). Odd powers and
-    # p = 2 (which adds 2 A_2 to the curvature at the vertex) are allowed.
+    radius_mm: Any
+    thickness_mm: Any
+    diameter_mm: float
+    n_d: Any = 1.0
+    V_d: float | None = None
+    material: str | None = None
+    stop: bool = False
+    conic: Any = 0.0
     asphere: tuple[tuple[int, Any], ...] = ()
-    # None, or the transverse axis, "x" or "y", along which a cylinder is curved (straight along the other).
     cylinder: str | None = None
-    # Name in the glass catalogue (`neurolens.optics.catalogue`); its dispersion rules over n_d and V_d.
     glass: str | None = None
-    # Napierian absorption of the medium after the surface at every wavelength (a grey filter), added to that of the
-    # glass.
     absorption_per_mm: float = 0.0
-    coating: Coating | None = None  # the thin films on the surface, None where bare
+    coating: Coating | None = None
 
     @property
     def curvature(self) -> Any:
@@ -88,28 +104,40 @@ class Configuration:
 
 @dataclass(frozen=True)
 class Lens:
-    """A prescription with the film's place; immutable, `at` returns a new lens."""
+    """A prescription with the film's place; immutable, `at` returns a new lens.
 
-    name: str  # cited in the lens file, as are source, designer and notes
+    Attributes:
+        name, designer, source, notes: as cited in the lens file.
+        rims: whether the rim diameters are the source's own or "estimated" by somebody.
+        f_number: nominal, of the source; the stop's own diameter rules the trace.
+        stated_efl_mm: focal length as the source states it, to check the computed one against; of an anamorphic lens in
+            the y-z plane, and `stated_efl_x_mm` in the x-z plane. None if not stated.
+        image_radius_mm: radius of the image circle, None where only the field is known.
+        half_field_deg: half field of view, None where unknown.
+        film_z_mm: film plane in the lens frame; None until `at` has focused the lens: the table's thickness rules.
+        configurations: zoom and focus states of the source.
+        path: the file it was read from, for error messages.
+        aperture: shape of the stop's opening inside its rim, None where round.
+        derived: description of what is not from the source (a zoom between its states).
+        infinity_mm: thicknesses at infinity focus, by surface index, of the groups that `at` has moved to focus.
+    """
+
+    name: str
     source: str
     surfaces: tuple[Surface, ...]
-    f_number: float  # nominal, of the source; the stop's own diameter rules the trace
-    image_radius_mm: float | None = None  # radius of the image circle, None where only the field is known
-    half_field_deg: float | None = None  # half field of view, None where unknown
+    f_number: float
+    image_radius_mm: float | None = None
+    half_field_deg: float | None = None
     designer: str = ""
     notes: str = ""
-    rims: str = "source"  # whether the rim diameters are the source's own or "estimated" by somebody
-    # Film plane in the lens frame; None until `at` has focused the lens: the table's thickness rules.
+    rims: str = "source"
     film_z_mm: float | None = None
-    configurations: tuple[Configuration, ...] = ()  # zoom and focus states of the source
-    path: str = "lens"  # the file it was read from, for error messages
-    # Focal length as the source states it, to check the computed one against; of an anamorphic lens in the y-z plane,
-    # and `stated_efl_x_mm` in the x-z plane. None if not stated.
+    configurations: tuple[Configuration, ...] = ()
+    path: str = "lens"
     stated_efl_mm: float | None = None
     stated_efl_x_mm: float | None = None
-    aperture: Aperture | None = None  # shape of the stop's opening inside its rim, None where round
-    derived: str = ""  # description of what is not from the source (a zoom between its states)
-    # Thicknesses at infinity focus, by surface index, of the groups that `at` has moved to focus.
+    aperture: Aperture | None = None
+    derived: str = ""
     infinity_mm: tuple[tuple[int, Any], ...] = ()
 
     @property

@@ -33,13 +33,21 @@ Passes = Callable[[Array, Array], NDArray[np.bool_]]
 
 @dataclass(frozen=True)
 class RadialPupil:
-    """Boxes or ellipses on a plane, one for each interval of the film radius."""
+    """Boxes or ellipses on a plane, one for each interval of the film radius.
 
-    pupil_z_mm: float  # the plane, lens frame
-    film_radius_mm: float  # outer end of the last of R equal intervals
-    centre: Array  # [R] mm, for a film point on +x: on the x axis
-    along: Array  # [R] mm, half width, negative where no ray was found
-    across: Array  # [R] mm, the same
+    Attributes:
+        pupil_z_mm: the plane, lens frame.
+        film_radius_mm: outer end of the last of R equal intervals.
+        centre, along, across: [R] mm, for a film point on +x: centre on the x axis, half widths; negative where no ray
+            was found.
+        shape: "box" or "ellipse".
+    """
+
+    pupil_z_mm: float
+    film_radius_mm: float
+    centre: Array
+    along: Array
+    across: Array
     shape: Literal["box", "ellipse"]
 
     def sample(self, film_mm: Array, square: Array, wavelength_nm: object = None) -> tuple[Array, Array]:

@@ -221,14 +221,20 @@ class PupilBounds:
 
     For a film point at radius r along +x, passing rays lie within `low` <= u <= `high` along +x and |v| <= `half`
     across.
+
+    Attributes:
+        pupil_z_mm: the plane.
+        film_radius_mm: radius of the last row; the first row is the axis.
+        low_mm, high_mm, half_mm: one value per film radius; an empty row (low > high) where no ray passes.
+        disc_mm: radius of the axial disc that holds all passing rays.
     """
 
-    pupil_z_mm: float  # the plane
-    film_radius_mm: float  # radius of the last row; the first row is the axis
-    low_mm: tuple[float, ...]  # one value per film radius; an empty row (low > high) where no ray passes
+    pupil_z_mm: float
+    film_radius_mm: float
+    low_mm: tuple[float, ...]
     high_mm: tuple[float, ...]
     half_mm: tuple[float, ...]
-    disc_mm: float  # radius of the axial disc that holds all passing rays
+    disc_mm: float
 
     @property
     def lit_radius_mm(self) -> float:

@@ -25,6 +25,7 @@ from neurolens.optics.aiming import without_rims
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, pupil_bounds, pupil_plane_z_mm
+from neurolens.optics.sag import same_medium
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
@@ -38,19 +39,27 @@ _LATTICE = (48, 24)
 
 @dataclass(frozen=True)
 class FilmLight:
-    """Light on the film at radii [F]; 0 where it is dark, and all factors too."""
+    """Light on the film at radii [F]; 0 where it is dark, and all factors too.
 
-    radius_mm: Array  # of the film points
-    irradiance: Array  # over the radiance of uniform surroundings, in sr; with transmittance
-    area_mm2: Array  # effective aperture: area of the pupil plane through which rays pass
-    # The factors, see the module: natural and aperture over their values on the axis, the others as shares there too.
+    Attributes:
+        radius_mm: of the film points.
+        irradiance: over the radiance of uniform surroundings, in sr; with transmittance.
+        area_mm2: effective aperture: area of the pupil plane through which rays pass.
+        natural, aperture, optical, mechanical, transmittance: see the module; natural and aperture over their values on
+            the axis, the others as shares there too.
+        cos4: mean of cos^4 of the angle on the film's side. distance_mm: Z, of the pupil plane from the film.
+    """
+
+    radius_mm: Array
+    irradiance: Array
+    area_mm2: Array
     natural: Array
     aperture: Array
     optical: Array
     mechanical: Array
     transmittance: Array
-    cos4: Array  # mean of cos^4 of the angle on the film's side
-    distance_mm: float  # Z, of the pupil plane from the film
+    cos4: Array
+    distance_mm: float
 
     @property
     def relative(self) -> Array:
@@ -122,9 +131,7 @@ def _check(lens: Lens, radius: Array) -> None:
 
 def _rings(lens: Lens) -> set[int]:
     """Rows that bend nothing and are not the stop: hoods and other rings."""
-    air = (1.0, None, None)
-    media = [air, *((float(s.n_d), s.V_d, s.glass) for s in lens.surfaces)]
-    return {k for k, s in enumerate(lens.surfaces) if not s.stop and media[k] == media[k + 1]}
+    return {k for k, s in enumerate(lens.surfaces) if not s.stop and same_medium(lens.surfaces, k)}
 
 
 class _Search:

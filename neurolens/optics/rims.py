@@ -30,23 +30,36 @@ _ROUNDS = 12  # rims of aspheres settle in 2 to 4
 
 @dataclass(frozen=True)
 class RimRule:
-    """How rims are derived."""
+    """How rims are derived.
 
-    vignetting: float = 0.5  # share of the stop's height that is kept at the edge of the field, above 0, at most 1
-    clear_edge: float = 0.01  # what a rim is wider than the rays need, relative to its diameter
-    half_field_deg: float | None = None  # edge of the field; None: that of the lens or of its image circle
+    Attributes:
+        vignetting: share of the stop's height that is kept at the edge of the field, above 0, at most 1.
+        clear_edge: what a rim is wider than the rays need, relative to its diameter.
+        half_field_deg: edge of the field; None: that of the lens or of its image circle.
+    """
+
+    vignetting: float = 0.5
+    clear_edge: float = 0.01
+    half_field_deg: float | None = None
 
 
 @dataclass(frozen=True)
 class Rim:
-    """One row of the result; full diameters in mm."""
+    """One row of the result; full diameters in mm.
+
+    Attributes:
+        tabled_mm: of the lens as it was given.
+        axis_mm, field_mm: what the beam of the axis and those of the field need, before the clear edge.
+        derived_mm: the diameter taken.
+        trimmed: whether a neighbour left less room than the rays need.
+    """
 
     surface: int
-    tabled_mm: float  # of the lens as it was given
-    axis_mm: float  # what the beam of the axis needs, before the clear edge
-    field_mm: float  # what those of the field need
-    derived_mm: float  # the diameter taken
-    trimmed: bool = False  # whether a neighbour left less room than the rays need
+    tabled_mm: float
+    axis_mm: float
+    field_mm: float
+    derived_mm: float
+    trimmed: bool = False
 
 
 def derive_rims(lens: Lens, rule: RimRule | None = None) -> tuple[Lens, list[Rim]]:

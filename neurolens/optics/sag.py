@@ -206,7 +206,7 @@ def _narrowest(before: Surface, after: Surface, axis_gap_mm: float) -> tuple[flo
 
 def neighbours(surfaces: Sequence[Surface]) -> Iterator[tuple[int, int, float]]:
     """Pairs of surfaces that may collide, a stop that bends nothing aside, with the distance of their vertices."""
-    idle = [s.stop and _same_medium(surfaces, k) for k, s in enumerate(surfaces)]
+    idle = [s.stop and same_medium(surfaces, k) for k, s in enumerate(surfaces)]
     for k in range(len(surfaces) - 1):
         if not idle[k] and not idle[k + 1]:
             yield k, k + 1, surfaces[k].thickness_mm
@@ -215,9 +215,8 @@ def neighbours(surfaces: Sequence[Surface]) -> Iterator[tuple[int, int, float]]:
             yield k - 1, k + 1, surfaces[k - 1].thickness_mm + surfaces[k].thickness_mm
 
 
-def _same_medium(surfaces: Sequence[Surface], k: int) -> bool:
-    after = surfaces[k]
-    if not k:
-        return after.n_d == 1
-    before = surfaces[k - 1]
-    return (before.n_d, before.V_d, before.glass) == (after.n_d, after.V_d, after.glass)
+def same_medium(surfaces: Sequence[Surface], k: int) -> bool:
+    """Whether the medium is the same before and behind surface k; air lies before the first."""
+    air = (1.0, None, None)
+    before, after = ((s.n_d, s.V_d, s.glass) for s in (surfaces[k - 1], surfaces[k]))
+    return (before if k else air) == after

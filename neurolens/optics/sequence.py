@@ -37,13 +37,19 @@ Steps = Sequence[tuple[int, Action]]
 
 
 class Followed(NamedTuple):
-    """What following a sequence gives."""
+    """What following a sequence gives.
 
-    rays: Rays  # point on the last surface and unit direction after it, lens frame, mm; along the axis for lost rays
-    status: Tensor  # [N] int32 as in `trace`: the surface and the reason that ended a ray first
-    # [N], of unpolarised light, what surfaces transmit or reflect and glass does not absorb.
+    Attributes:
+        rays: point on the last surface and unit direction after it, lens frame, mm; along the axis for lost rays.
+        status: [N] int32 as in `trace`: the surface and the reason that ended a ray first.
+        power: [N], of unpolarised light, what surfaces transmit or reflect and glass does not absorb.
+        points: x, y, z of the meeting points of every step, lens frame, mm.
+    """
+
+    rays: Rays
+    status: Tensor
     power: Tensor
-    points: tuple[tuple[Tensor, Tensor, Tensor], ...]  # x, y, z of the meeting points of every step, lens frame, mm
+    points: tuple[tuple[Tensor, Tensor, Tensor], ...]
 
 
 def ghost(count: int, first: int, second: int) -> list[tuple[int, Action]]:

@@ -45,16 +45,21 @@ class Crossing(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """What tracing gives."""
+    """What tracing gives.
 
-    # Point on the last surface met (lens frame, mm) and unit direction after it. Rays that missed a surface or were
-    # totally reflected are replaced by a finite ray along the axis; those that only a rim stops go on.
+    Attributes:
+        rays: point on the last surface met (lens frame, mm) and unit direction after it. Rays that missed a surface or
+            were totally reflected are replaced by a finite ray along the axis; those that only a rim stops go on.
+        status: [N] int32, see `neurolens.base.status`.
+        transmittance: [N], power of unpolarised light that arrives: of surfaces and absorption; None unless requested.
+        crossings: surface index to `Crossing`, for the recorded surfaces.
+        path: the rays on and after every surface, in the order of travel, or empty if not requested.
+    """
+
     rays: Rays
-    status: Tensor  # [N] int32, see `neurolens.base.status`
-    # [N], power of unpolarised light that arrives: of surfaces and absorption; None unless requested.
+    status: Tensor
     transmittance: Tensor | None
-    crossings: dict[int, Crossing]  # surface index to `Crossing`, for the recorded surfaces
-    # The rays on and after every surface, in the order of travel, or empty if not requested.
+    crossings: dict[int, Crossing]
     path: tuple[Rays, ...] = ()
 
 
@@ -273,11 +278,15 @@ def _fill(whole: Any, part: Any, at: slice) -> None:
 
 
 class Differentials(NamedTuple):
-    """A traced ray and its derivatives."""
+    """A traced ray and its derivatives.
 
-    traced: Traced  # as `trace` gives it
-    # For every parameter, the derivatives of the resulting ray: x, y, z (mm per unit of it) and direction, each [N]; 0
-    # for rays that do not go on. Points move on the last surface.
+    Attributes:
+        traced: as `trace` gives it.
+        derivatives: for every parameter, the derivatives of the resulting ray: x, y, z (mm per unit of it) and
+            direction, each [N]; 0 for rays that do not go on. Points move on the last surface.
+    """
+
+    traced: Traced
     derivatives: tuple[Rays, ...]
 
 

@@ -23,16 +23,25 @@ Vector = Sequence[Tensor]  # x, y, z, each [N], lens frame
 
 
 class Step(NamedTuple):
-    """What one surface does to N rays."""
+    """What one surface does to N rays.
 
-    normal: Vector  # x, y, z of the unit normal where the rays meet the surface, of either sign, each [N]
-    before: Vector  # unit directions, x, y, z each [N]
+    Attributes:
+        normal: x, y, z of the unit normal where the rays meet the surface, of either sign, each [N].
+        before, after: unit directions, x, y, z each [N].
+        n_before, n_after: indices (number or [N]) in front of the surface and beyond it as the light meets them.
+        layers: coating, (refractive index, thickness in nm) from the scene's side; empty where bare.
+        sense: +1 for light towards the film, -1 towards the scene: the order in which it meets the layers.
+        reflected: whether the rays are reflected there (ghosts) rather than transmitted.
+    """
+
+    normal: Vector
+    before: Vector
     after: Vector
-    n_before: Any  # index (number or [N]) in front of the surface as the light meets it
-    n_after: Any  # beyond it
-    layers: Layers = ()  # coating, (refractive index, thickness in nm) from the scene's side; empty where bare
-    sense: int = 1  # +1 for light towards the film, -1 towards the scene: the order in which it meets the layers
-    reflected: bool = False  # whether the rays are reflected there (ghosts) rather than transmitted
+    n_before: Any
+    n_after: Any
+    layers: Layers = ()
+    sense: int = 1
+    reflected: bool = False
 
 
 def step_at(

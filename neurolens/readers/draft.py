@@ -12,22 +12,31 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_SURFACES, check_states
 from neurolens.optics.prescription import Configuration, Lens, Surface
+from neurolens.optics.sag import same_medium
 from neurolens.readers.assemble import UNKNOWN, finish, first_order, smaller_stop, with_rims
 from neurolens.readers.source import UNITS_MM, Line, warn
 
 
 @dataclass(frozen=True)
 class Given:
-    """Values from the user that the file does not give."""
+    """Values from the user that the file does not give.
 
-    name: str | None = None  # for the lens file; else the title in the file
-    source: str | None = None  # for the lens file; else "FORMAT file NAME"
-    f_number: float | None = None  # nominal f-number, for a file that states none
-    units: str | None = None  # of a file without units: "mm", "cm", "in" or "m"
-    half_field_deg: float | None = None  # edge of the field, for rims that have to be derived
-    # Of a plain table: its second column is the distance from the surface before (Kolb's tables of 1995).
+    Attributes:
+        name, source: for the lens file; else the title in the file, and "FORMAT file NAME".
+        f_number: nominal f-number, for a file that states none.
+        units: of a file without units: "mm", "cm", "in" or "m".
+        half_field_deg: edge of the field, for rims that have to be derived.
+        gap_before: of a plain table: its second column is the distance from the surface before (Kolb's tables of 1995).
+        semi_diameters: of a plain table: its last column holds radii of the rims.
+    """
+
+    name: str | None = None
+    source: str | None = None
+    f_number: float | None = None
+    units: str | None = None
+    half_field_deg: float | None = None
     gap_before: bool = False
-    semi_diameters: bool = False  # of a plain table: its last column holds radii of the rims
+    semi_diameters: bool = False
 
 
 INFINITE = 1e9  # in any unit; programs write 1e10 or more for an object at infinity
@@ -61,42 +70,61 @@ class Block:
 
 @dataclass(frozen=True)
 class Row:
-    """One surface in the file's unit."""
+    """One surface in the file's unit.
 
-    surface: Surface  # its diameter may be `assemble.UNKNOWN`
-    aperture: bool = False  # whether the file sets a clear aperture on it, so that even a plane in air cuts the beam
+    Attributes:
+        surface: its diameter may be `assemble.UNKNOWN`.
+        aperture: whether the file sets a clear aperture on it, so that even a plane in air cuts the beam.
+    """
+
+    surface: Surface
+    aperture: bool = False
 
 
 @dataclass(frozen=True)
 class State:
-    """A zoom or focus state, in the file's unit; None: as in the table."""
+    """A zoom or focus state, in the file's unit; None: as in the table.
+
+    Attributes:
+        thickness: by row number of the draft.
+        pupil, f_number, stop_diameter: any one of them sizes the stop.
+        object_distance: object to the first row of the draft; `inf` at infinity.
+        film_given: whether the last thickness stands; else it becomes the paraxial back focus of the state.
+    """
 
     name: str
-    thickness: dict[int, float] = field(default_factory=dict)  # by row number of the draft
-    pupil: float | None = None  # any one of pupil, f-number and diameter sizes the stop
+    thickness: dict[int, float] = field(default_factory=dict)
+    pupil: float | None = None
     f_number: float | None = None
     stop_diameter: float | None = None
-    object_distance: float = math.inf  # object to the first row of the draft; `inf` at infinity
-    film_given: bool = True  # whether the last thickness stands; else it becomes the paraxial back focus of the state
+    object_distance: float = math.inf
+    film_given: bool = True
 
 
 @dataclass
 class Draft:
-    """All data found by a reader; readers of text files fill it line by line. Lengths in the file's unit."""
+    """All data found by a reader; readers of text files fill it line by line. Lengths in the file's unit.
+
+    Attributes:
+        kind: name of the format, for the source line.
+        notes: lines of text.
+        pupil, f_number: if given, they size the stop; else its diameter does.
+        unit: "mm", "cm", "in", "m", or None if unknown.
+    """
 
     file: str
-    kind: str  # name of the format, for the source line
+    kind: str
     rows: tuple[Row, ...] = ()
     name: str = ""
-    notes: list[str] = field(default_factory=list)  # lines of text
+    notes: list[str] = field(default_factory=list)
     states: tuple[State, ...] = ()
-    pupil: float | None = None  # if given, or the f-number, it sizes the stop; else its diameter does
+    pupil: float | None = None
     f_number: float | None = None
     image_radius: float | None = None
     half_field_deg: float | None = None
     object_distance: float = math.inf
     film_given: bool = True
-    unit: str | None = None  # "mm", "cm", "in", "m", or None if unknown
+    unit: str | None = None
     rims: str = "source"
 
 
@@ -220,7 +248,6 @@ def _without_dummies(draft: Draft) -> Draft:
 
 
 def _is_dummy(draft: Draft, k: int) -> bool:
-    s, row = draft.rows[k].surface, draft.rows[k]
-    before = draft.rows[k - 1].surface if k else Surface(math.inf, 0.0, 1.0)
-    same = (s.n_d, s.V_d, s.glass) == (before.n_d, before.V_d, before.glass)
-    return same and math.isinf(s.radius_mm) and not s.stop and not s.asphere and not row.aperture
+    s = draft.rows[k].surface
+    flat = math.isinf(s.radius_mm) and not s.stop and not s.asphere and not draft.rows[k].aperture
+    return flat and same_medium([row.surface for row in draft.rows], k)

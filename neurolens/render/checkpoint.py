@@ -162,6 +162,11 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
         raise
     except FileNotFoundError:
         raise InputError(path, "file", "(missing)", "a checkpoint of this render") from None
+    except OSError as error:
+        if error.filename is not None:  # it cannot be opened
+            raise
+        why = f"damaged: {error.strerror}"  # a place before its beginning, as a damaged directory asks for
+        raise InputError(path, "file", f"({why})", f"a whole checkpoint of a render, {_AGAIN}") from None
     # RuntimeError: deep JSON, and features of zip that are never written here.
     except (zipfile.BadZipFile, ValueError, KeyError, TypeError, AttributeError, EOFError, RuntimeError) as error:
         why = str(error) or type(error).__name__

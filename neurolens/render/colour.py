@@ -41,13 +41,17 @@ def adaptation(xyz_from: ArrayLike, xyz_to: ArrayLike) -> Matrix:
 
 @dataclass(frozen=True)
 class ColourSpace:
-    """A linear RGB space."""
+    """A linear RGB space.
 
-    name: str  # for display and the command line
-    interop_id: str  # value of the attribute colorInteropID of an EXR
-    # Chromaticities (x, y) of red, green and blue.
+    Attributes:
+        name: for display and the command line. interop_id: value of the attribute colorInteropID of an EXR.
+        primaries: chromaticities (x, y) of red, green and blue. white: of (1, 1, 1).
+    """
+
+    name: str
+    interop_id: str
     primaries: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-    white: tuple[float, float]  # of (1, 1, 1)
+    white: tuple[float, float]
 
     @property
     def to_xyz(self) -> Matrix:

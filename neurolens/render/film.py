@@ -96,12 +96,15 @@ class Tiling:
     """How a render is cut: tiles of consecutive pixels, passes of consecutive samples.
 
     A function of the picture alone. What a worker holds at a time depends on a tile, not on the picture.
+
+    Attributes:
+        pixels, samples: of the picture. tile: pixels per tile. step: samples per pass; the last pass may have fewer.
     """
 
-    pixels: int  # of the picture
-    samples: int  # of the picture
-    tile: int  # pixels per tile
-    step: int  # samples per pass; the last pass may have fewer
+    pixels: int
+    samples: int
+    tile: int
+    step: int
 
     @classmethod
     def of(cls, pixels: int, samples: int) -> Tiling:

@@ -29,15 +29,23 @@ SPECULAR = np.float32(np.inf)  # density of a direction that has no choice
 
 @dataclass
 class Paths:
-    """The paths still alive."""
+    """The paths still alive.
 
-    origin: FloatArray  # [3, N] of their rays
-    direction: FloatArray  # [3, N] of their rays
-    throughput: FloatArray  # [lanes, N], of the wavelengths of a path, the hero first
-    bins: Index  # [N] wavelength bin, of the hero
-    slot: Index  # [N] place in the batch
-    density: FloatArray  # [N] per solid angle with which the ray's direction was chosen
-    alone: NDArray[np.bool_]  # [N] whether the other lanes have left the hero, bent another way
+    Attributes:
+        origin, direction: [3, N] of their rays. throughput: [lanes, N], of the wavelengths of a path, the hero first.
+        bins: [N] wavelength bin, of the hero.
+        slot: [N] place in the batch.
+        density: [N] per solid angle with which the ray's direction was chosen.
+        alone: [N] whether the other lanes have left the hero, bent another way.
+    """
+
+    origin: FloatArray
+    direction: FloatArray
+    throughput: FloatArray
+    bins: Index
+    slot: Index
+    density: FloatArray
+    alone: NDArray[np.bool_]
 
     def take(self, rows: Index) -> Paths:
         """Some of the paths."""

@@ -25,16 +25,20 @@ Aimed = tuple[FloatArray, FloatArray, FloatArray]  # direction [3, N], distance 
 
 @dataclass(frozen=True)
 class LightSamples:
-    """Directions to points on lights."""
+    """Directions to points on lights.
 
-    direction: FloatArray  # [3, N] unit vectors
-    distance: FloatArray  # [N] m, to the light's surface, inf to the sky
-    light: Numbers  # [N] its number
-    # [N] 1 / density per solid angle, choice of the light included; 0 where the light shows its back, and for lights
-    # without size, which no scattered ray finds.
+    Attributes:
+        direction: [3, N] unit vectors. distance: [N] m, to the light's surface, inf to the sky. light: [N] its number.
+        inverse_pdf: [N] 1 / density per solid angle, choice of the light included; 0 where the light shows its back,
+            and for lights without size, which no scattered ray finds.
+        scale: [N] factor of the light's emission: the same, and for lights without size the irradiance of
+            intensity 1 over the probability of the choice.
+    """
+
+    direction: FloatArray
+    distance: FloatArray
+    light: Numbers
     inverse_pdf: FloatArray
-    # [N] factor of the light's emission: the same, and for lights without size the irradiance of intensity 1 over the
-    # probability of the choice.
     scale: FloatArray
 
 

@@ -40,13 +40,17 @@ _GREY: Vector = (0.8, 0.8, 0.8)  # of a material that says nothing
 
 @dataclass(frozen=True)
 class TriangleSet:
-    """A mesh as read."""
+    """A mesh as read.
 
-    vertices: NDArray[np.float64]  # [V, 3] float64 m
-    faces: NDArray[np.int64]  # [T, 3] counted from 0
-    # [V, 2] texture coordinates, from the lower left corner of a picture, or None.
+    Attributes:
+        vertices: [V, 3] float64 m. faces: [T, 3] counted from 0. uv: [V, 2] texture coordinates, from the lower left
+            corner of a picture, or None. normals: [V, 3] unit vectors to interpolate, or None.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
     uv: NDArray[np.float64] | None = None
-    normals: NDArray[np.float64] | None = None  # [V, 3] unit vectors to interpolate, or None
+    normals: NDArray[np.float64] | None = None
 
 
 class Used(NamedTuple):

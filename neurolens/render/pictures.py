@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ LARGEST_PICTURE, LARGEST_ENVIRONMENT, LARGEST_FILM = 8192, 4096, 1 << 16  # pixe
 MOST_PIXELS = 1 << 26  # of all textures of a scene: 0.8 GB
 _MOST_VALUES, _LARGEST_FILE = 1 << 28, 1 << 28  # of an OpenEXR file; bytes of any other
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "TGA", "WEBP")  # of Pillow's, which would ask other programs for some
+_TYPES = (np.uint32, np.float16, np.float32)  # by the numbers of pixel types in OpenEXR files
 _DEPTH = "Z"  # the name of depth in other programs
 
 
@@ -148,7 +150,7 @@ def read_exr(path: str | Path) -> tuple[FloatArray, dict[str, Any]]:
     Raises:
         InputError: missing, no OpenEXR file, truncated, or without channels R, G and B.
     """
-    planes, text = _read_channels(Path(path))
+    planes, text = _read_channels(Path(path), wanted=_COLOURS)
     picture = _colours(planes, path, "channels")
     try:
         return picture, json.loads(text)
@@ -169,29 +171,37 @@ def _colours(planes: Mapping[str, FloatArray], file: str | Path, field: str) -> 
 
 
 def _read_channels(
-    path: Path, place: tuple[str | Path, str] | None = None, most: int = LARGEST_FILM
+    path: Path,
+    place: tuple[str | Path, str] | None = None,
+    most: int = LARGEST_FILM,
+    wanted: Sequence[str] = (),
 ) -> tuple[dict[str, FloatArray], str]:
-    """All channels as float32, and the text of our metadata.
+    """Channels as float32, and the text of our metadata.
 
-    The library reads every channel, so that a file is refused where they are too large together.
+    The values of all that are read are bounded together.
 
     Args:
         place: file and field that name the picture, if there are others than the picture itself. most: pixels per side.
+        wanted: the channels, where the file has these; else all.
     """
     file, field = place or (path, "file")
     name = str(path) if place else "(missing)"
     try:
         open_regular(path).close()
-        values = 0
         with _silent(), OpenEXR.File(str(path), header_only=True) as header:
-            for part in header.parts:
-                low, high = part.header["dataWindow"]
-                size = [int(high[k]) - int(low[k]) + 1 for k in range(2)]
-                if max(size) > most:
-                    raise InputError(file, field, name, f"a picture of at most {most} pixels per side")
-                values += size[0] * size[1] * len(part.header["channels"])
+            parts = [dict(part.header) for part in header.parts]
+            sizes = [[int(v) + 1 - int(u) for u, v in zip(*part["dataWindow"], strict=True)] for part in parts]
+        if max(map(max, sizes)) > most:
+            raise InputError(file, field, name, f"a picture of at most {most} pixels per side")
+        kept = {c.name for c in parts[0]["channels"] if (c.xSampling, c.ySampling) == (1, 1)}.issuperset(wanted)
+        some = bool(wanted) and kept and len(parts[0]["channels"]) > len(wanted)
+        values = sum(w * h * len(part["channels"]) for (w, h), part in zip(sizes, parts, strict=True))
+        if some:
+            values = math.prod(sizes[0]) * len(wanted)
         if values > _MOST_VALUES:
-            raise InputError(file, field, f"({values} values in all channels)", f"at most {_MOST_VALUES}")
+            raise InputError(file, field, f"({values} values in its channels)", f"at most {_MOST_VALUES}")
+        if some:
+            return _some_channels(path, wanted, sizes[0]), parts[0].get(METADATA_KEY, "{}")
         with _silent(), OpenEXR.File(str(path), separate_channels=True) as whole:
             part = whole.parts[0]
             planes = {name: np.array(channel.pixels, np.float32) for name, channel in part.channels.items()}
@@ -202,6 +212,19 @@ def _read_channels(
         raise InputError(file, field, name, f"an OpenEXR file that exists ({error.strerror})") from None
     except Exception as error:  # the library raises bare RuntimeError, ValueError and its own
         raise InputError(file, field, name if place else f"({error})", f"a whole OpenEXR file ({error})") from None
+
+
+def _some_channels(path: Path, names: Sequence[str], size: Sequence[int]) -> dict[str, FloatArray]:
+    """Some channels of the first part, of width and height: `OpenEXR.File` would read all."""
+    with _silent():
+        found = OpenEXR.InputFile(str(path))
+        try:
+            types = [_TYPES[found.header()["channels"][name].type.v] for name in names]
+            planes = found.channels(names)
+        finally:
+            found.close()
+    shaped = (np.frombuffer(p, t).reshape(size[::-1]) for p, t in zip(planes, types, strict=True))
+    return {name: np.array(plane, np.float32) for name, plane in zip(names, shaped, strict=True)}
 
 
 @contextmanager
@@ -284,7 +307,7 @@ def read_environment(scene: Path, field: str, path: Path, scale: float = 1.0) ->
             finite or brighter than an emission may be, and black all over.
     """
     if path.suffix.lower() == ".exr":
-        picture = _colours(_read_channels(path, (scene, field), LARGEST_ENVIRONMENT)[0], scene, field)
+        picture = _colours(_read_channels(path, (scene, field), LARGEST_ENVIRONMENT, _COLOURS)[0], scene, field)
     else:
         picture = read_picture(scene, field, path, LARGEST_ENVIRONMENT)
     height, width = picture.shape[:2]

@@ -29,19 +29,26 @@ _MOST_SAMPLES = 1 << 20
 
 @dataclass(frozen=True)
 class Watch:
-    """Previews, checkpoints and early end of a long render."""
+    """Previews, checkpoints and early end of a long render.
 
-    # Called with the picture so far, [H, W, 3] linear sRGB, at most every `preview_s` seconds.
+    Attributes:
+        preview: called with the picture so far, [H, W, 3] linear sRGB, at most every `preview_s` seconds.
+        checkpoint: file that the render is kept in every `checkpoint_s` seconds, when it is stopped and when it fails,
+            and that it goes on from where it exists. Once written it stays until the caller, who then has the picture,
+            removes it.
+        restart: ignore an existing checkpoint.
+        keep: write the checkpoint of a render that is complete, too, to add samples later.
+        stop: polled; True ends the render with the present samples.
+        note: called with a line on failures that do not end the render, such as a preview that could not be written.
+    """
+
     preview: Callable[[FloatArray], None] | None = None
     preview_s: float = 5.0
-    # File that the render is kept in every `checkpoint_s` seconds, when it is stopped and when it fails, and that it
-    # goes on from where it exists. Once written it stays until the caller, who then has the picture, removes it.
     checkpoint: Path | None = None
     checkpoint_s: float = 30.0
-    restart: bool = False  # ignore an existing checkpoint
-    keep: bool = False  # write the checkpoint of a render that is complete, too, to add samples later
-    stop: Callable[[], bool] = lambda: False  # polled; True ends the render with the present samples
-    # Called with a line on failures that do not end the render, such as a preview that could not be written.
+    restart: bool = False
+    keep: bool = False
+    stop: Callable[[], bool] = lambda: False
     note: Callable[[str], None] = lambda _: None
 
 
@@ -121,17 +128,22 @@ class Keeper:
 
 @dataclass(frozen=True)
 class RenderResult:
-    """A picture and how it was made."""
+    """A picture and how it was made.
 
-    rgb: FloatArray  # [H, W, 3] float32 linear sRGB; a uniform environment of radiance 1 gives 1 on the axis
-    # JSON-able; settings, complete, samples_done (mean a pixel), seconds, paths, mpaths_per_s, passed_fraction,
-    # thread_seconds (summed over the workers), camera_thread_seconds (of these, in the camera), camera_fraction (their
-    # ratio), dropped_samples (not finite; they count as black). Seconds and dropped samples count those before a
-    # checkpoint, too.
+    Attributes:
+        rgb: [H, W, 3] float32 linear sRGB; a uniform environment of radiance 1 gives 1 on the axis.
+        stats: JSON-able; settings, complete, samples_done (mean a pixel), seconds, paths, mpaths_per_s,
+            passed_fraction, thread_seconds (summed over the workers), camera_thread_seconds (of these, in the camera),
+            camera_fraction (their ratio), dropped_samples (not finite; they count as black). Seconds and dropped
+            samples count those before a checkpoint, too.
+        layers: additional channels.
+        save: writes the watch's checkpoint, for use if the picture cannot be written; raises OSError or
+            NeurolensError. None without a watch that names one.
+    """
+
+    rgb: FloatArray
     stats: dict[str, Any]
-    layers: Layers  # additional channels
-    # Writes the watch's checkpoint, for use if the picture cannot be written; raises OSError or NeurolensError. None
-    # without a watch that names one.
+    layers: Layers
     save: Callable[[], None] | None = None
 
 

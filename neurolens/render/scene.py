@@ -30,26 +30,34 @@ _WALLS = ("left", "right", "floor", "ceiling", "far", "near")
 
 @dataclass(frozen=True)
 class CameraSettings(Checked):
-    """Place, film and picture of the camera; the camera itself is chosen by the caller of `render`."""
+    """Place, film and picture of the camera; the camera itself is chosen by the caller of `render`.
 
-    position_m: Vector  # film-plane centre
-    look_at_m: Vector  # a point on the optical axis
-    focus_m: float  # distance from film to the object in focus
-    up: Vector = (0.0, 1.0, 0.0)  # points to the picture's top
-    f_number: float | None = None  # None leaves it to the lens
-    # Shape of the stop's opening, see `optics.apertures`; the mask is a picture beside the scene. Without any of the
-    # four the lens's own, else round.
+    Attributes:
+        position_m: film-plane centre. look_at_m: a point on the optical axis. up: points to the picture's top.
+        focus_m: distance from film to the object in focus. f_number: None leaves it to the lens.
+        blades, blade_rotation_deg, blade_curvature, aperture_mask: shape of the stop's opening, see
+            `optics.apertures`; the mask is a picture beside the scene. Without them the lens's own, else round.
+        film_width_mm, film_height_mm: the part of the film that is used.
+        wavelengths_nm: range of light. width, height: picture in pixels. samples: a pixel.
+        max_depth: number of surfaces along a path at which light is scattered.
+    """
+
+    position_m: Vector
+    look_at_m: Vector
+    focus_m: float
+    up: Vector = (0.0, 1.0, 0.0)
+    f_number: float | None = None
     blades: int | None = None
     blade_rotation_deg: float | None = None
     blade_curvature: float | None = None
     aperture_mask: Path | None = None
-    film_width_mm: float = 36.0  # the part of the film that is used
+    film_width_mm: float = 36.0
     film_height_mm: float = 20.25
-    wavelengths_nm: tuple[float, float] = (400.0, 700.0)  # range of light
-    width: int = 320  # of the picture in pixels
+    wavelengths_nm: tuple[float, float] = (400.0, 700.0)
+    width: int = 320
     height: int = 180
-    samples: int = 64  # a pixel
-    max_depth: int = 6  # number of surfaces along a path at which light is scattered
+    samples: int = 64
+    max_depth: int = 6
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,16 +97,24 @@ class SceneSettings:
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene with all it needs."""
+    """A scene with all it needs.
 
-    name: str  # the file's name without ending
-    settings: SceneSettings  # the tables of the file
-    images: dict[str, FloatArray]  # linear RGB [H, W, 3] of each image texture
-    triangles: tuple[TriangleSet, ...]  # one a mesh
-    aperture: Aperture | None = None  # shape of the stop's opening, None if not given
-    illuminants: dict[str, Spectrum] = field(default_factory=dict)  # measured spectra by name
-    reflectances: dict[str, Spectrum] = field(default_factory=dict)  # measured spectra by name
-    environment: FloatArray | None = None  # linear RGB [H, W, 3] of the environment's picture, if it has one
+    Attributes:
+        name: the file's name without ending. settings: the tables of the file.
+        images: linear RGB [H, W, 3] of each image texture. triangles: one a mesh.
+        aperture: shape of the stop's opening, None if not given.
+        illuminants, reflectances: measured spectra by name.
+        environment: linear RGB [H, W, 3] of the environment's picture, if it has one.
+    """
+
+    name: str
+    settings: SceneSettings
+    images: dict[str, FloatArray]
+    triangles: tuple[TriangleSet, ...]
+    aperture: Aperture | None = None
+    illuminants: dict[str, Spectrum] = field(default_factory=dict)
+    reflectances: dict[str, Spectrum] = field(default_factory=dict)
+    environment: FloatArray | None = None
 
 
 def load_scene(path: str | Path) -> Scene:

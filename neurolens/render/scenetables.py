@@ -391,10 +391,17 @@ class Environment(Checked):
 
 @dataclass(frozen=True)
 class Sky(Checked):
-    """A clear sky with its sun (Preetham, Shirley and Smits 1999); black below the horizon."""
+    """A clear sky with its sun (Preetham, Shirley and Smits 1999); black below the horizon.
 
-    sun_elevation_deg: float  # of the sun above the horizon
-    sun_azimuth_deg: float = 0.0  # from -z over +x
-    turbidity: float = 3.0  # haze; 2 is very clear, 3 clear, 6 hazy, 10 very hazy
-    sun: bool = True  # whether the sun's disc shines as well
-    white_kcd_per_m2: float = 20.0  # luminance that counts as emission 1. A white surface in the sun has some 30
+    Attributes:
+        sun_elevation_deg: of the sun above the horizon. sun_azimuth_deg: from -z over +x.
+        turbidity: haze; 2 is very clear, 3 clear, 6 hazy, 10 very hazy.
+        sun: whether the sun's disc shines as well.
+        white_kcd_per_m2: luminance that counts as emission 1. A white surface in the sun has some 30.
+    """
+
+    sun_elevation_deg: float
+    sun_azimuth_deg: float = 0.0
+    turbidity: float = 3.0
+    sun: bool = True
+    white_kcd_per_m2: float = 20.0

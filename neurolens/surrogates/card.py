@@ -143,11 +143,11 @@ def reference_rays(model: LensModel, passing: int = 24, others: int = 4) -> dict
     float32 may cost: of position and stop crossing in mm, of direction and transmittance; eight times what it costs
     the reference evaluator on these rays.
     """
-    rays, out, clear = _clear_rays(model, 20_000)
-    if not bool((clear & (out.status == st.PASSED)).any()):  # few rays of the domain pass
-        rays, out, clear = _clear_rays(model, 600_000)
-    if not bool((clear & (out.status == st.PASSED)).any()):  # and near the boundaries of a domain far wider
-        rays, out, clear = _clear_rays(model, 600_000, least=0.001)
+    # Of some domains few rays pass, and of some that are far wider all of those near the boundaries.
+    for count, least in ((20_000, 0.01), (600_000, 0.01), (600_000, 0.001)):
+        rays, out, clear = _clear_rays(model, count, least)
+        if bool((clear & (out.status == st.PASSED)).any()):
+            break
     picked = [
         torch.nonzero(clear & (out.status == s))[: passing if s == st.PASSED else others, 0]
         for s in out.status.unique()
@@ -155,7 +155,7 @@ def reference_rays(model: LensModel, passing: int = 24, others: int = 4) -> dict
     index = torch.cat(picked)
     inputs = rays.select(index)
     columns = {
-        "rays": torch.stack([inputs.film_x, inputs.film_y, inputs.pupil_x, inputs.pupil_y, inputs.wavelength_nm]),
+        "rays": inputs.rows,
         "film_z_mm": inputs.film_z,
         "scene_ray": torch.stack([c[index] for c in out.rays]),
         "transmittance": out.transmittance[index],
@@ -171,7 +171,7 @@ def reference_rays(model: LensModel, passing: int = 24, others: int = 4) -> dict
     }
 
 
-def _clear_rays(model: LensModel, count: int, least: float = 0.01) -> tuple[FilmRays, Prediction, Tensor]:
+def _clear_rays(model: LensModel, count: int, least: float) -> tuple[FilmRays, Prediction, Tensor]:
     """Rays of the domain, what the float64 model makes of them, and which of them are clear of every boundary."""
     rays = _float32(sample_domain(model.domain, count, seed=11))
     with torch.no_grad():

@@ -92,6 +92,11 @@ class FilmRays:
     def __len__(self) -> int:
         return self.film_x.shape[0]
 
+    @property
+    def rows(self) -> Tensor:
+        """[5, N] as graphs take them: all but the film plane."""
+        return torch.stack([self.film_x, self.film_y, self.pupil_x, self.pupil_y, self.wavelength_nm])
+
     def select(self, index: Tensor | slice) -> FilmRays:
         return FilmRays(*(c[index] for c in self.columns()))
 

@@ -65,10 +65,11 @@ def export_onnx(
     metadata = {CARD_KEY: card_to_json(card_of(model, errors or {}))}
     if storable(model.core):
         metadata[MODEL_KEY] = model_to_text(model)
-    return _write(path, write_onnx(graph, metadata, shapes=shapes))
+    return write_file(path, write_onnx(graph, metadata, shapes=shapes))
 
 
-def _write(path: str | Path, proto: Any) -> Path:
+def write_file(path: str | Path, proto: Any) -> Path:
+    """Write an ONNX model, whole or not at all."""
     target = Path(path)
     with atomic_path(target) as temporary:
         temporary.write_bytes(proto.SerializeToString())
@@ -130,7 +131,7 @@ def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, An
         }
         graph = build(inverse, ONNX, largest_angle(model))
         proto = write_onnx(graph, {CARD_KEY: card_to_json({**card, "inverse": known})})
-        written.append(_write(base.with_name(f"{base.name}.{name}.onnx"), proto))
+        written.append(write_file(base.with_name(f"{base.name}.{name}.onnx"), proto))
     return written[0], written[1]
 
 
@@ -151,7 +152,7 @@ def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | 
     angle = max(largest_angle(node, 8192) for node in model.nodes)
     graphs = [model_graph(node, angle, ONNX) for node in model.nodes]
     metadata = {CARD_KEY: card_to_json(state_card(model, errors or {}))}
-    return _write(path, write_onnx(graphs, metadata, mixing_of(model.axes)))
+    return write_file(path, write_onnx(graphs, metadata, mixing_of(model.axes)))
 
 
 def mixing_of(axes: Sequence[Axis]) -> Mixing:

@@ -127,10 +127,6 @@ def _teaching(model: LensModel, pairs: RayPairs) -> tuple[FilmRays, Tensor]:
     return sets.inputs.select(order), weight[order]
 
 
-def _variables(field: LightField, z: Tensor, mirror: bool) -> Tensor:
-    return torch.cat([field.mirror_invariants() if mirror else field.invariants(), z[None]])
-
-
 def fit_guess(
     field: LightField, z: Tensor, outputs: Tensor, weight: Tensor, *, mirror: bool, terms: int, degree: int
 ) -> Guess:
@@ -177,5 +173,5 @@ def _candidates(degree: int, mirror: bool, dispersive: bool, moves: bool) -> Exp
 def _columns(field: LightField, z: Tensor, exponents: Exponents, mirror: bool, part: slice) -> Tensor:
     """[2 M, 2, n] candidate columns m a and m b."""
     f = LightField(field.p[:, part], field.u[:, part], field.w[part])
-    m = monomials(_variables(f, z[part], mirror), exponents)[:, None]
+    m = monomials(torch.cat([f.invariants(mirror), z[None, part]]), exponents)[:, None]
     return torch.cat([m * f.p, m * f.u])

@@ -14,12 +14,15 @@ keeps its two planes of symmetry only: then x (and y likewise) of every vector i
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from neurolens.optics.glass import inverse_square_um
+from neurolens.surrogates.cores import MIRROR, ROUND
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.pairs import PairSet
 
@@ -35,16 +38,11 @@ class LightField(NamedTuple):
         """Rays."""
         return self.w.shape[0]
 
-    def invariants(self) -> Tensor:
-        """[4, N]: rho, sigma, tau, w."""
-        p, u = self.p, self.u
-        return torch.stack([p[0] * p[0] + p[1] * p[1], p[0] * u[0] + p[1] * u[1], u[0] * u[0] + u[1] * u[1], self.w])
-
-    def mirror_invariants(self) -> Tensor:
-        """[7, N]: p_x^2, p_x u_x, u_x^2, the same of y, w."""
-        p, u = self.p, self.u
-        rows = [c for i in (0, 1) for c in (p[i] * p[i], p[i] * u[i], u[i] * u[i])]
-        return torch.stack([*rows, self.w])
+    def invariants(self, mirror: bool = False) -> Tensor:
+        """[4, N]: rho, sigma, tau, w; of two mirrors [7, N]: p_x^2, p_x u_x, u_x^2, the same of y, w."""
+        rows = (*self.p, *self.u)
+        sums = (reduce(add, (rows[i] * rows[j] for i, j in form)) for form in (MIRROR if mirror else ROUND))
+        return torch.stack([*sums, self.w])
 
 
 @dataclass(frozen=True)

@@ -145,9 +145,8 @@ class LensModel:
         return Derivatives(prediction_of(out, len(rays)), *parts)
 
     def _inputs(self, rays: FilmRays, stop_radius_mm: float | None) -> dict[str, Tensor]:
-        columns = torch.stack([rays.film_x, rays.film_y, rays.pupil_x, rays.pupil_y, rays.wavelength_nm])
-        radius = columns.new_full((1, 1), self.checked_radius_mm(stop_radius_mm))
-        return {"rays": columns, "film_z_mm": rays.film_z[None], "stop_radius_mm": radius}
+        radius = rays.film_z.new_full((1, 1), self.checked_radius_mm(stop_radius_mm))
+        return {"rays": rays.rows, "film_z_mm": rays.film_z[None], "stop_radius_mm": radius}
 
     def checked_radius_mm(self, stop_radius_mm: float | None) -> float:
         """The stop radius asked for, or the domain's. Raises InputError: a stop wider than the model was fitted for."""

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from onnx import ModelProto, NodeProto, TensorProto, checker, helper, numpy_helper
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.surrogates.card import card_to_json
+from neurolens.surrogates.export import write_file
 
 Precision = Literal["float16", "int8"]
 
@@ -71,10 +71,7 @@ def store_weights(
     graph.initializer.extend(kept)
     checker.check_model(proto, full_check=True)
     _write_card(proto, precision, errors or {})
-    path = Path(target)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(proto.SerializeToString())
-    return path
+    return write_file(target, proto)
 
 
 def _stored(name: str, value: NDArray[np.float32], precision: Precision) -> tuple[list[NodeProto], list[TensorProto]]:

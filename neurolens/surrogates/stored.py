@@ -23,6 +23,7 @@ from torch import Tensor
 from neurolens.base.errors import InputError, ModelError
 from neurolens.base.tomlfile import check_tree
 from neurolens.modelfile import MODEL_KEY
+from neurolens.modelfile.cardcheck import tolerances
 from neurolens.modelfile.onnxfile import card_in, read_metadata
 from neurolens.optics.prescription import Coating, Lens, Surface
 from neurolens.surrogates.cores import (
@@ -242,10 +243,7 @@ def _check(file: Path, model: LensModel, card: dict[str, Any]) -> None:
     wanted = torch.tensor(reference["scene_ray"], dtype=torch.float64)
     passed = torch.tensor(reference["status"]) == 0
     off = (torch.stack(list(out.rays)) - wanted).abs()[:, passed]
-    # The coefficients are rounded to float32, which costs some models more; the card says how much.
-    rounding = reference.get("rounding") or {}
-    position = max(1e-5 * max(1.0, abs(float(card["lens"]["efl_mm"]))), float(rounding.get("position_mm", 0.0)))
-    direction = max(1e-5, float(rounding.get("direction", 0.0)))
-    limit = torch.tensor([[position]] * 3 + [[direction]] * 3, dtype=torch.float64)
+    allowed = tolerances(card, reference)  # the coefficients are rounded to float32
+    limit = torch.tensor([[allowed["position_mm"]]] * 3 + [[allowed["direction"]]] * 3, dtype=torch.float64)
     if out.status.tolist() != reference["status"] or not bool((off <= limit).all()):
         raise ModelError(f"{file}: its coefficients do not give the reference rays of its card: they are damaged")

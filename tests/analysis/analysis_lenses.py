@@ -1,25 +1,19 @@
 """Lenses whose behaviour is known in closed form, and the library's for everything else."""
 
 import math
-import warnings
 from dataclasses import replace
-from pathlib import Path
+
+from shipped import tabled
 
 from neurolens.analysis.fields import Scene
-from neurolens.base.errors import NeurolensWarning
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 
 INF = math.inf
-ROOT = Path(__file__).parents[2]
 
 
 def library(name: str, **state: float) -> Scene:
     """A lens of the library in a state, looking at what it is focused on."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NeurolensWarning)
-        lens = read_lens(ROOT / "lenses" / f"{name}.toml").at(**state)
-    return Scene(lens, state.get("focus_m", INF))
+    return Scene(tabled(name).at(**state), state.get("focus_m", INF))
 
 
 def scene(rows: list[Surface], half_field_deg: float = 10.0, focus_m: float = INF) -> Scene:

@@ -9,16 +9,14 @@ import camera_helpers
 import lens_models
 import numpy as np
 import pytest
-from camera_helpers import at, film_rays, jittered
+from camera_helpers import at, film_rays, film_value, jittered
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import OUTLINE, PUPILS, ExactCamera, pupil_named
-from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.lens_film import LensFilm
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.vignetting import VIGNETTINGS
 from neurolens.commands import arguments
 from neurolens.optics.paraxial import film_z_mm, first_order
@@ -32,35 +30,14 @@ def camera(kind: str, focus_m: float = 2.0, f_number: float | None = None) -> Ca
         return lens_models.exact_camera(focus_m, f_number)
     if kind == "exact, own bounds":
         return ExactCamera(lens_models.lens(), film_mm=FILM, focus_m=focus_m, f_number=f_number)
-    if kind == "thin":
-        return ThinLens(50.0, f_number or 1.8, focus_m, FILM)
-    if kind == "pinhole":
-        return Pinhole(50.0, FILM)
     return OnnxCamera(load_model(lens_models.exported(kind)), film_mm=FILM, focus_m=focus_m, f_number=f_number)
-
-
-def repeat(point: tuple[float, float], count: int) -> np.ndarray:
-    return np.repeat(np.array(point, np.float32)[:, None], count, axis=1)
-
-
-def stratified(side: int, seed: int = 0) -> np.ndarray:
-    jitter = np.random.default_rng(seed).random((2, side, side))
-    cells = np.stack(np.meshgrid(np.arange(side), np.arange(side)))
-    return ((cells + jitter) / side).reshape(2, -1).astype(np.float32)
-
-
-def film_mean(camera: Camera, point: tuple[float, float], side: int = 128) -> float:
-    square = stratified(side)
-    wavelength = np.linspace(400, 700, side * side, dtype=np.float32)
-    rng = np.random.default_rng(1)
-    return float(camera.sample(repeat(point, side * side), square, rng.permutation(wavelength)).weight.mean())
 
 
 @pytest.mark.parametrize("f_number", [None, 8.0])
 def test_white_surroundings_off_the_axis_do_not_depend_on_where_the_pupil_is_sampled(f_number: float | None) -> None:
     """Bounds of the whole domain, bounds of this shot, and the model's: three ways to the same irradiance."""
     means = [
-        film_mean(camera(k, 2.0, f_number), (15.0, 8.0), 192) for k in ("exact", "exact, own bounds", "invariants")
+        film_value(camera(k, 2.0, f_number), (15.0, 8.0), 192) for k in ("exact", "exact, own bounds", "invariants")
     ]
     assert 0.2 < means[0] < 0.95
     assert means == pytest.approx([means[0]] * 3, rel=0.005)
@@ -90,8 +67,8 @@ def test_model_and_exact_lens_send_the_same_rays(focus_m: float) -> None:
 @pytest.mark.parametrize("point", [(0.0, 0.0), (8.0, -5.0)])
 def test_rays_of_a_film_point_meet_at_the_focus_distance(kind: str, point: tuple[float, float]) -> None:
     focus_m = 2.0
-    square = stratified(48)
-    rays = camera(kind, focus_m, 8.0).sample(repeat(point, 48 * 48), square, np.full(48 * 48, 587.6, np.float32))
+    square = jittered(48)[0]
+    rays = camera(kind, focus_m, 8.0).sample(at(point, 48 * 48), square, np.full(48 * 48, 587.6, np.float32))
     passed = rays.status == 0
     along = (-focus_m - rays.origin_m[2]) / rays.direction[2]
     met = (rays.origin_m + along * rays.direction)[:2, passed]
@@ -106,8 +83,8 @@ def test_rays_of_a_film_point_meet_at_the_focus_distance(kind: str, point: tuple
 def test_exact_camera_in_double_precision_agrees() -> None:
     lens = lens_models.lens()
     bounds = lens_models.domain().bounds
-    square, wavelength = stratified(40), np.full(1600, 550, np.float32)
-    film = repeat((12.0, 3.0), 1600)
+    square, wavelength = jittered(40)[0], np.full(1600, 550, np.float32)
+    film = at((12.0, 3.0), 1600)
     double = ExactCamera(lens, film_mm=FILM, focus_m=2.0, bounds=bounds, dtype="float64").sample(
         film, square, wavelength
     )
@@ -126,7 +103,7 @@ def test_fisheye_sees_beyond_75_degrees() -> None:
     model = camera("fisheye", math.inf)
     radius = 0.98 * lens_models.domain("muller_fisheye_100").film_radius_mm
     for lens in (exact, model):
-        rays = lens.sample(repeat((radius, 0.0), 1024), stratified(32), np.full(1024, 587.6, np.float32))
+        rays = lens.sample(at((radius, 0.0), 1024), jittered(32)[0], np.full(1024, 587.6, np.float32))
         passed = rays.status == 0
         angle = np.degrees(np.arctan2(np.hypot(*rays.direction[:2, passed]), -rays.direction[2, passed]))
         assert angle.mean() > 70
@@ -145,13 +122,13 @@ def test_anamorphic_outlines_lose_no_light_between_the_azimuths_they_are_sought_
     exact = ExactCamera(lens, film_mm=film_mm, focus_m=3.0)
     outline, side = exact.film.outline, 64
     wide = replace(outline, x=np.float32(1.5) * outline.x, y=np.float32(1.5) * outline.y)
-    square = stratified(side)
+    square = jittered(side)[0]
     beyond = np.abs(2 * square - 1).max(0) > 1 / 1.5
     for azimuth in (2.5, 17.0, 33.0, 36.87, 38.5, 62.5, 88.0):
         c, s = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
         edge = min(film_mm[0] / 2 / c, film_mm[1] / 2 / s)
         for share in (0.3, 0.85, 0.995):
-            film = repeat((share * edge * c, share * edge * s), side * side)
+            film = at((share * edge * c, share * edge * s), side * side)
             waves = np.full(side * side, 480, np.float32)
             points, area = wide.sample(film, square, waves)
             light = area * (exact.film.scene(film, points, waves).status == 0)

@@ -247,7 +247,7 @@ def test_a_second_run_takes_the_model_that_is_there(tmp_path: Path) -> None:
 def test_a_training_that_was_interrupted_is_taken_up_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The next run of the same command ends with the very same weights."""
     monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
-    settings, data = ModelSettings("mlp", units=10, layers=2, steps=40), lens_models.prepared()
+    settings, data = ModelSettings("mlp", units=6, layers=1, steps=20), lens_models.prepared()
 
     def interrupt(share: float) -> None:
         if share > 0.3:

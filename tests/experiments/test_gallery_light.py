@@ -155,6 +155,17 @@ def test_blur_of_near_and_far_signs_is_first_order_when_stopped_down() -> None:
     assert ratio == pytest.approx(scale(thin, 1.0) / scale(thin, 2.0), rel=0.01)
 
 
+@pytest.mark.parametrize(("name", "panel"), [("depth-of-field", 5), ("series-focal-length", 0), ("pinhole", 0)])
+def test_the_ideal_cameras_of_a_panel_are_framed_as_its_lens(name: str, panel: int) -> None:
+    """What is in focus has one size in all columns."""
+    chosen = read_effect(GALLERY / f"{name}.toml").panel[panel]
+    shot = shot_of(chosen, load_scene(chosen.scene))
+    exact, thin, hole = (CAMERAS[column](shot, None) for column in ("exact", "thin", "pinhole"))
+    assert isinstance(thin, ThinLens) and isinstance(hole, Pinhole)
+    assert scale(thin, shot.focus_m) == pytest.approx(scale(exact, shot.focus_m), rel=2e-3)
+    assert hole.settings["efl_mm"] == pytest.approx(thin.image_distance_mm, rel=1e-9)
+
+
 def test_open_blur_of_lens_and_surrogate_agree_and_leave_first_order() -> None:
     """A shipped model, focused at 1.5 m: wide open its blur in focus is what the thin lens does not have."""
     film = (24.0, 16.0)

@@ -218,6 +218,7 @@ WRONG: dict[str, Callable[[Path], Any]] = {
     "half": lambda p: p.write_bytes(p.read_bytes()[: p.stat().st_size // 2]),
     "end missing": lambda p: p.write_bytes(p.read_bytes()[:-30]),
     "one bit of the sums": lambda p: p.write_bytes(flipped(p.read_bytes(), p.stat().st_size // 2)),
+    "a directory far away": lambda p: p.write_bytes(p.read_bytes()[:-3] + b"\x7f" + p.read_bytes()[-2:]),
     "compressed": lambda p: rewritten(p, lambda _: None, zipfile.ZIP_DEFLATED),
     "a member more": lambda p: rewritten(p, lambda m: m.update(x=b"")),
     "a member less": lambda p: rewritten(p, lambda m: m.pop("done.npy")),

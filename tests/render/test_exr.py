@@ -16,6 +16,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
+from neurolens.render import pictures
 from neurolens.render.film import BYTES_A_PIXEL, COLUMNS, PixelGrid
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.job import Job, develop
@@ -23,6 +24,27 @@ from neurolens.render.pictures import read_exr, read_layers, write_exr, write_pn
 from neurolens.render.renderer import Watch, render
 
 PICTURE = np.random.default_rng(0).random((5, 7, 3), np.float32) * 10
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+def test_of_many_channels_only_the_colours_are_read(
+    parts: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of every type, with a window that does not begin at 0; the bound counts what is read."""
+    random, path = np.random.default_rng(2), tmp_path / "a.exr"
+    channels = {f"layer{k:03}": np.zeros((6, 9), np.float32) for k in range(150)}
+    channels |= {"R": random.random((6, 9), np.float32), "G": random.random((6, 9)).astype(np.float16)}
+    channels["B"] = random.integers(0, 9, (6, 9)).astype(np.uint32)
+    header = {"type": OpenEXR.scanlineimage, "dataWindow": ((3, 4), (11, 9))}
+    OpenEXR.File([OpenEXR.Part(header | {"name": f"part{k}"}, dict(channels)) for k in range(parts)]).write(str(path))
+    monkeypatch.setattr(pictures, "_MOST_VALUES", 3 * 6 * 9)
+    picture, _ = read_exr(path)
+    assert picture.dtype == np.float32
+    np.testing.assert_array_equal(picture, np.stack([channels[c].astype(np.float32) for c in "RGB"], -1))
+    damaged = path.read_bytes()
+    path.write_bytes(damaged[: len(damaged) * 2 // 3])
+    with pytest.raises(InputError, match="a whole OpenEXR file"):
+        read_exr(path)
 
 
 @pytest.mark.parametrize(

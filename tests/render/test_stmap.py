@@ -138,8 +138,8 @@ def test_a_render_undistorted_by_the_map_is_the_pinholes(tmp_path: Path) -> None
     plates = plates_of([field], WIDE, FILM)
     undistort = undistort_map(field, plates)
     pictures = [
-        read_through(render(scene, lens, width=WIDE[0], height=WIDE[1], samples=64, threads=1).rgb[..., 1], undistort),
-        render(scene, make_camera(f"pinhole:{GAUSS}", shot), width=WIDE[0], height=WIDE[1], samples=64, threads=1).rgb[
+        read_through(render(scene, lens, width=WIDE[0], height=WIDE[1], samples=32, threads=1).rgb[..., 1], undistort),
+        render(scene, make_camera(f"pinhole:{GAUSS}", shot), width=WIDE[0], height=WIDE[1], samples=32, threads=1).rgb[
             ..., 1
         ],
     ]

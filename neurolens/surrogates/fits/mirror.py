@@ -1,14 +1,13 @@
 """Polynomials of lenses with cylinders, which keep two planes of symmetry: fitted component by component.
 
 The x of a vector is odd in (p_x, u_x) and even in (p_y, u_y), the y the other way about. Terms of x are p_x or u_x
-times a monomial of `LightField.mirror_invariants` without p_x u_x (p_x (p_x u_x) is p_x^2 u_x, which is there), and
+times a monomial of `LightField.invariants` without p_x u_x (p_x (p_x u_x) is p_x^2 u_x, which is there), and
 with p_y u_y at most once (its square is p_y^2 u_y^2): so every term stands once.
 """
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -27,17 +26,10 @@ METHODS = ("omp", "ols")  # and networks (`mlp`)
 _CHUNK, _MOST_CANDIDATES = 4096, 2500
 
 
-@dataclass(frozen=True)
-class _Terms:
-    """Candidate terms of one component: monomials [M, 7], each times p (first M columns) and times u (M more)."""
-
-    exponents: Exponents
-    axis: int
-
-    def columns(self, field: LightField) -> Tensor:
-        """[2 M, N]."""
-        m = monomials(field.mirror_invariants(), self.exponents)
-        return torch.cat([m * field.p[self.axis], m * field.u[self.axis]])
+def _columns(exponents: Exponents, axis: int, field: LightField) -> Tensor:
+    """[2 M, N] terms of one component: monomials [M, 7], each times p (first M columns) and times u (M more)."""
+    m = monomials(field.invariants(mirror=True), exponents)
+    return torch.cat([m * field.p[axis], m * field.u[axis]])
 
 
 def mirror_exponents(degree: int, axis: int, *, dispersive: bool = True) -> Exponents:
@@ -83,21 +75,21 @@ def fit_mirror(data: Prepared, method: str, terms: int, degree: int) -> MirrorPo
     sides = []  # of every column chosen, whether it is one of u
     for axis in (0, 1):
         candidates = _candidates(degree, axis, dispersive=dispersive)
-        sweep = Sweep(*_normal_equations(candidates, train.field, outputs[:, axis]))
+        sweep = Sweep(*_normal_equations(candidates, axis, train.field, outputs[:, axis]))
         forward(sweep, terms // 2, "ols" if method == "ols" else "omp")
         if method == "ols":
             replace_terms(sweep)
-        chosen, count = np.array(sorted(sweep.chosen)), len(candidates.exponents)
-        supports.append(candidates.exponents[chosen % count])
+        chosen, count = np.array(sorted(sweep.chosen)), len(candidates)
+        supports.append(candidates[chosen % count])
         sides.append((chosen >= count).astype(int))
     exponents, places = united([*supports, _scalar_terms(dispersive=dispersive)])
-    features = monomials(train.field.mirror_invariants(), exponents)
+    features = monomials(train.field.invariants(mirror=True), exponents)
     ab = torch.zeros((3, 2, 2, len(exponents)), dtype=torch.float64)
     for axis, (side, place) in enumerate(zip(sides, places, strict=False)):
         vectors = torch.stack([train.field.p[axis], train.field.u[axis]])
         ab[:2, side, axis, place] = solve(features[place] * vectors[side], train.vectors[:2, axis])
     ab[STOP] = _fit_stop(data, exponents)
-    scalars = solve_scalars(data, lambda field: monomials(field.mirror_invariants(), exponents))
+    scalars = solve_scalars(data, lambda field: monomials(field.invariants(mirror=True), exponents))
     return MirrorPolynomial(exponents, ab.numpy(), scalars.numpy())
 
 
@@ -109,24 +101,23 @@ def _scalar_terms(*, dispersive: bool) -> Exponents:
     return np.array([*plain, *(e + w * k for e in units[:6] for k in range(3 if dispersive else 1))])
 
 
-def _candidates(degree: int, axis: int, *, dispersive: bool) -> _Terms:
+def _candidates(degree: int, axis: int, *, dispersive: bool) -> Exponents:
     while True:
         exponents = mirror_exponents(degree, axis, dispersive=dispersive)
         if 2 * len(exponents) <= _MOST_CANDIDATES or degree == 0:
-            return _Terms(exponents, axis)
+            return exponents
         degree -= 1
 
 
-def _normal_equations(terms: _Terms, field: LightField, outputs: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _normal_equations(
+    exponents: Exponents, axis: int, field: LightField, outputs: Tensor
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gram matrix [2 M, 2 M], products with the outputs [R, N], and the outputs' squared norms [R]."""
-    size = 2 * len(terms.exponents)
-    gram, moments = (
-        torch.zeros((size, size), dtype=torch.float64),
-        torch.zeros((size, len(outputs)), dtype=torch.float64),
-    )
+    size = 2 * len(exponents)
+    gram, moments = (torch.zeros((size, count), dtype=torch.float64) for count in (size, len(outputs)))
     for start in range(0, outputs.shape[1], _CHUNK):
         part = slice(start, start + _CHUNK)
-        columns = terms.columns(LightField(*(c[..., part] for c in field)))
+        columns = _columns(exponents, axis, LightField(*(c[..., part] for c in field)))
         gram += columns @ columns.T
         moments += columns @ outputs[:, part].T
     return gram.numpy(), moments.numpy(), (outputs**2).sum(1).numpy()
@@ -136,5 +127,5 @@ def _fit_stop(data: Prepared, exponents: Exponents) -> Tensor:
     """[2, 2, M]: A and B, of x and y, of the stop crossing in stop radii, from rays on both sides of rims."""
     crossing, weight = stop_crossing(data)
     field = data.boundary_field
-    found = [solve(_Terms(exponents, axis).columns(field), crossing[axis][None], weight)[0] for axis in (0, 1)]
+    found = [solve(_columns(exponents, axis, field), crossing[axis][None], weight)[0] for axis in (0, 1)]
     return torch.stack([row.reshape(2, -1) for row in found], 1)

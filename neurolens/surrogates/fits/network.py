@@ -113,11 +113,11 @@ def _part(data: Prepared, pairs: PairSet, base: InvariantPolynomial | None) -> t
     if base is not None:
         known, known_scalars = base(field)
         vectors, scalars = vectors - known, scalars - known_scalars
-    if data.encoding.mirror:  # x and y of each vector by themselves
+    mirror, p, u = data.encoding.mirror, field.p[None], field.u[None]
+    if mirror:  # x and y of each vector by themselves
         p, u = (torch.cat([v] * 3)[:, None] for v in (field.p, field.u))
         vectors, weights = vectors.reshape(6, 1, -1), weights.repeat_interleave(2, 0)
-        return field.mirror_invariants(), p, u, vectors, weights, scalars, scalar_weights
-    return field.invariants(), field.p[None], field.u[None], vectors, weights, scalars, scalar_weights
+    return field.invariants(mirror), p, u, vectors, weights, scalars, scalar_weights
 
 
 @dataclass

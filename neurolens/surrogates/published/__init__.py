@@ -62,13 +62,7 @@ PUBLISHED: dict[str, PublishedMethod] = {
         "Graphics Forum 36(8); here 24,000 steps of 128 rays a network",
         (
             ModelSettings(
-                "neurolens2017",
-                "neurolens2017-128x3",
-                "raw",
-                partitions=2,
-                units=128,
-                layers=3,
-                steps=24_000,
+                "neurolens2017", "neurolens2017-128x3", "raw", partitions=2, units=128, layers=3, steps=24_000
             ),
         ),
     ),

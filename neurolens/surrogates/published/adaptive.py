@@ -134,9 +134,7 @@ def _where_to_cut(data: RawData, cell: _Node, invariants: Tensor) -> tuple[int, 
     best, found = float("inf"), (0, 0.0)
     for variable in _COORDINATES:
         threshold = float(invariants[variable][cell.inside].median())
-        error = 0.0
-        for half in _halves(data, cell, invariants, variable, threshold):
-            error += half.error
+        error = sum(half.error for half in _halves(data, cell, invariants, variable, threshold))
         if error < best:
             best, found = error, (variable, threshold)
     return found

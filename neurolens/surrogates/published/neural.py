@@ -89,15 +89,6 @@ def _ring(inputs: Value, networks: tuple[Layers, ...]) -> Value:
     return total
 
 
-@dataclass(frozen=True)
-class _Rays:
-    """Training rays in float32: inputs [5, N], values [7, N], and whether each passes [N] (1 or 0)."""
-
-    inputs: Tensor
-    values: Tensor
-    passes: Tensor
-
-
 def fit_averaged(
     data: RawData, settings: ModelSettings, progress: Callable[[float], None] | None = None
 ) -> tuple[Averaged, tuple[Gate, ...]]:
@@ -112,20 +103,20 @@ def fit_averaged(
     if count < settings.partitions * _FEWEST_RAYS:
         most = max(1, count // _FEWEST_RAYS)
         raise InputError("fit", "partitions", settings.partitions, f"1 to {most} rings for {count} training rays")
-    rays = _training_rays(data)
-    rho = rays.inputs[0] ** 2 + rays.inputs[1] ** 2
+    inputs, values = _training_rays(data)
+    rho = inputs[0] ** 2 + inputs[1] ** 2
     shares = torch.arange(1, settings.partitions) / settings.partitions
-    edges = tuple(float(e) for e in torch.quantile(rho[rays.passes > 0], shares))
+    edges = tuple(float(e) for e in torch.quantile(rho[values[6] > 0], shares))
     ends = (-math.inf, *edges, math.inf)
     rings: list[tuple[Layers, ...]] = []
     total = settings.partitions * NETWORKS
     for low, high in zip(ends, ends[1:], strict=False):
         within = (rho > low - _MARGIN) & (rho <= high + _MARGIN)
-        ring = _Rays(rays.inputs[:, within], rays.values[:, within], rays.passes[within])
+        ring = inputs[:, within], values[:, within]
         networks: list[Layers] = []
         for _ in range(NETWORKS):
             done = len(rings) * NETWORKS + len(networks)
-            networks.append(_train(ring, settings, settings.seed + done))
+            networks.append(_train(*ring, settings, settings.seed + done))
             if progress:
                 progress((done + 1) / total)
         rings.append(tuple(networks))
@@ -134,8 +125,9 @@ def fit_averaged(
     return Averaged(edges, tuple(rings)), (gate,)
 
 
-def _training_rays(data: RawData) -> _Rays:
-    """The training rays, and blocked rays drawn over the domain."""
+def _training_rays(data: RawData) -> tuple[Tensor, Tensor]:
+    """Inputs [5, N] and values [7, N], the last whether a ray passes (1 or 0), in float32: the training rays, and
+    blocked rays drawn over the domain."""
     pairs, scale = data.pairs, scales_of(data.pairs.lens)
     drawn = trace_pairs(
         pairs.lens, sample_domain(pairs.domain, _BLOCKED_RAYS, pairs.settings.seed + 2_000_003), pairs.domain.pupil_z_mm
@@ -154,24 +146,24 @@ def _training_rays(data: RawData) -> _Rays:
     sets = ((pairs.train, True), (blocked, False))
     inputs = torch.cat([data.variables(rays) for rays, _ in sets], 1)
     outputs = torch.cat([values(rays, passes) for rays, passes in sets], 1)
-    return _Rays(inputs.float(), outputs.float(), outputs[6].float())
+    return inputs.float(), outputs.float()
 
 
-def _train(rays: _Rays, settings: ModelSettings, seed: int) -> Layers:
+def _train(inputs: Tensor, values: Tensor, settings: ModelSettings, seed: int) -> Layers:
     generator = torch.Generator().manual_seed(seed)
     widths = [5, *[settings.units] * settings.layers, 7]
     weights: list[Tensor] = []
     for fan_in, fan_out in zip(widths, widths[1:], strict=False):
         weights.append(torch.randn(fan_out, fan_in, generator=generator) * math.sqrt(2 / fan_in))
         weights.append(torch.zeros(fan_out))
-    passing = rays.values[:, rays.passes > 0]
+    passing = values[:, values[6] > 0]
     mean, spread = passing.mean(1), passing.std(1).clamp_min(1e-6)
     mean[6], spread[6] = 0.5, 0.5
-    wanted = ((rays.values - mean[:, None]) / spread[:, None]).T
+    wanted = ((values - mean[:, None]) / spread[:, None]).T
     # Blocked rays count for the flag alone.
     counts = torch.ones_like(wanted)
-    counts[:, :6] = rays.passes[:, None]
-    inputs = rays.inputs.T.contiguous()
+    counts[:, :6] = values[6][:, None]
+    inputs = inputs.T.contiguous()
     for weight in weights:
         weight.requires_grad_(True)
     adam = torch.optim.Adam(weights, lr=RATE)

@@ -1,0 +1,184 @@
+"""Projections of vision programs: OpenCV's own functions, closed forms, there and back, derivatives, folds, files."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neurolens.analysis.projections import NAMES, Projection, fit, inverse_polynomial, residual
+from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.field import Field, field_of
+from neurolens.commands import projection as command
+from tests.command_line import failure, run_json
+
+ROOT = Path(__file__).parents[2]
+GAUSS = ROOT / "models" / "laikin_double_gauss_50.ols-60.onnx"
+FISHEYE = ROOT / "models" / "isshiki_fisheye_10.ols-64.onnx"
+SIZE, FILM = (1920, 1080), (36.0, 20.25)
+PICTURE = ("--size", "1920x1080", "--film", "36x20.25", "--quiet")
+# One of each kind, as strong as lenses are, and its widest angle in rad.
+EXAMPLES = {
+    "opencv": ((1400.0, 1380.0), (-0.21, 0.06, 1e-3, -5e-4, -0.008), 0.7),
+    "opencv-rational": ((1400.0, 1400.0), (0.5, -0.1, 0.0, 0.0, 0.01, 0.72, 0.05, 0.01), 0.7),
+    "kannala-brandt": ((560.0, 560.0), (-0.02, 0.002, -4e-4, 2e-5), 2.0),
+    "f-theta": ((0.98, 1.0), (540.0, 3.0, -9.0, 2.0, -0.4), 1.8),
+    "table": ((1.0, 1.0), tuple(500 * 2 * math.sin(1.9 * k / 400) for k in range(201)), 1.9),
+    "two-axis": ((1000.0, 2000.0), tuple(0.3 * (-1) ** k / (k + 2) for k in range(18)), 0.5),
+}
+
+
+def example(kind: str) -> Projection:
+    focal, coefficients, widest = EXAMPLES[kind]
+    return Projection(kind, SIZE, focal, coefficients, widest)
+
+
+def rays(widest: float, count: int = 400) -> torch.Tensor:
+    """Unit directions over a field, the axis among them."""
+    rng = np.random.default_rng(3)
+    angle, turn = widest * np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
+    angle[0] = 0
+    found = [np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)]
+    return torch.from_numpy(np.stack(found, 1))
+
+
+def field_of_camera(spec: str | Path, **shot: float) -> Field:
+    return field_of(make_camera(spec, Shot(film_mm=FILM, focus_m=math.inf, **shot)), math.inf, "equidistant")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", NAMES)
+def test_there_and_back_and_derivatives(kind: str) -> None:
+    found = example(kind)
+    direction = rays(0.95 * found.widest_rad).reshape(20, 20, 3)
+    pixel = found.project(3 * direction)  # of any length
+    assert pixel.shape == (20, 20, 2) and torch.allclose(pixel, found.project(direction))
+    back = found.unproject(pixel)
+    assert float((back - direction).abs().max()) < 1e-9 and back.shape == (20, 20, 3)
+    assert float((found.project(back) - pixel).abs().max()) < 1e-3
+    single = found.project(found.unproject(pixel.float()))
+    assert single.dtype == torch.float32 and float((single - pixel).abs().max()) < 0.02
+    step, jacobian = 1e-6, found.jacobian(direction)
+    assert jacobian.shape == (20, 20, 2, 3) and bool(torch.isfinite(jacobian).all())
+    for k, axis in enumerate(torch.eye(3, dtype=torch.float64)):
+        by_differences = (found.project(direction + step * axis) - found.project(direction - step * axis)) / (2 * step)
+        off = (jacobian[..., k] - by_differences).abs().amax(-1)
+        # A table's derivative jumps at its knots.
+        assert float(off.quantile(0.97)) < 1e-3 * float(jacobian.abs().max())
+    x = torch.linalg.vecdot(jacobian, direction[..., None, :])
+    assert float(x.abs().max()) < 1e-6 * float(jacobian.abs().max())  # length changes no pixel
+    centre = found.project(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    assert centre.tolist() == pytest.approx([959.5, 539.5])
+
+
+@pytest.mark.parametrize("kind", ["opencv", "opencv-rational", "kannala-brandt"])
+def test_opencv_projects_to_the_same_pixels(kind: str, tmp_path: Path) -> None:
+    """Its own functions, with the numbers that its FileStorage reads from our file."""
+    cv2 = pytest.importorskip("cv2", reason="opencv-python-headless (extra dev) is not installed")
+    found = example(kind)
+    direction = rays(min(found.widest_rad, 1.5)).numpy()
+    path = tmp_path / "camera.yaml"
+    path.write_text(command._file_storage(found, 0.25))
+    stored = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    matrix, numbers = (stored.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients"))
+    assert (stored.getNode("image_width").real(), stored.getNode("avg_reprojection_error").real()) == (1920, 0.25)
+    zero, fisheye = np.zeros(3), kind == "kannala-brandt"
+    points = (direction / direction[:, 2:])[:, None]
+    pixel = (cv2.fisheye.projectPoints if fisheye else cv2.projectPoints)(points, zero, zero, matrix, numbers)[0]
+    assert np.abs(pixel[:, 0] - found.project(torch.from_numpy(direction)).numpy()).max() < 1e-6
+
+
+def test_coefficients_are_found_again() -> None:
+    for kind in ("opencv", "kannala-brandt", "f-theta", "two-axis"):
+        known = example(kind)
+        # A lens centred on its axis has none of these.
+        names = dict(known.named) | {"p1": 0.0, "p2": 0.0}
+        known = Projection(kind, SIZE, known.focal_px, tuple(names[n] for n in NAMES[kind]), known.widest_rad)
+        direction = rays(known.widest_rad, 900)
+        start = (1010.0, 1990.0) if kind != "f-theta" else (0.98 * 530.0, 530.0)
+        found = fit(kind, direction.numpy(), known.project(direction).numpy(), SIZE, start)
+        assert residual(found, direction.numpy(), known.project(direction).numpy()).worst_px < 1e-5
+        assert found.coefficients == pytest.approx(known.coefficients, rel=1e-3, abs=1e-5)
+        assert found.focal_px == pytest.approx(known.focal_px)
+
+
+def test_closed_forms_of_ideal_cameras() -> None:
+    """Equidistant is t, equisolid 2 sin(t / 2) = t (1 - t^2 / 24 + t^4 / 1920 - ...), a pinhole has no distortion."""
+    pixel = FILM[0] / SIZE[0]
+    for spec, kind, focal, expected in (
+        ("fisheye-equidistant", "kannala-brandt", 14.0, {"k1": 0.0, "k2": 0.0}),
+        ("fisheye-equidistant", "f-theta", 14.0, {"a1": 14.0 / pixel, "a2": 0.0}),
+        ("fisheye-equisolid", "kannala-brandt", 14.0, {"k1": -1 / 24, "k2": 1 / 1920}),
+        ("pinhole", "opencv", 50.0, {"k1": 0.0, "k2": 0.0}),
+    ):
+        field = field_of_camera(spec)
+        points = command.shown(field, SIZE, FILM)
+        found = fit(kind, *points, SIZE, (focal / pixel, focal / pixel))
+        left = residual(found, *command.shown(field, SIZE, FILM, (40, 30)))
+        assert left.worst_px < 2e-3 and left.sound
+        least = 0.01 if kind == "f-theta" else 2e-4  # pixels, or a share
+        assert {k: found.named[k] for k in expected} == pytest.approx(expected, abs=least, rel=1e-4)
+        if kind != "f-theta":
+            assert found.focal_px == pytest.approx((focal / pixel, focal / pixel), rel=1e-5)
+
+
+def test_a_projection_that_turns_back_says_so_and_gives_no_ray_beyond() -> None:
+    """r (1 - r^2 / 2) rises to r = sqrt(2 / 3)."""
+    found = Projection("opencv", SIZE, (1000.0, 1000.0), (-0.5, 0.0, 0.0, 0.0, 0.0), 0.8)
+    fold = math.atan(math.sqrt(2 / 3))
+    assert found.fold_rad == pytest.approx(fold, abs=1e-3)
+    top = 1000 * math.sqrt(2 / 3) * 2 / 3
+    inside, outside = (torch.tensor([[959.5 + share * top, 539.5]], dtype=torch.float64) for share in (0.99, 1.01))
+    assert not found.unproject(inside).isnan().any() and found.unproject(outside).isnan().all()
+    beyond = rays(1.2).numpy()
+    left = residual(found, beyond, found.project(torch.from_numpy(beyond)).numpy())
+    assert not left.sound and left.fold_deg == pytest.approx(math.degrees(fold), abs=0.1)
+    assert found.project(torch.tensor([0.0, 0.1, -1.0])).isnan().all()
+
+
+def test_f_theta_goes_both_ways() -> None:
+    found = fit("f-theta", *command.shown(field_of_camera("fisheye-stereographic"), SIZE, FILM), SIZE, (746.7, 746.7))
+    angle = np.linspace(0, found.widest_rad, 50)
+    radius = sum(a * angle ** (k + 1) for k, a in enumerate(found.coefficients))
+    back = sum(b * radius ** (k + 1) for k, b in enumerate(inverse_polynomial(found)))
+    assert np.abs(back - angle).max() < 2e-4
+
+
+def test_the_command_fits_a_lens_and_writes_what_programs_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("neurolens.cameras.field._ROUND", (129, 1))
+    told = run_json(capsys, "projection", GAUSS, *PICTURE, "--model", "opencv", "-o", tmp_path / "a")
+    assert told["rms_px"] < 0.02 and told["worst_px"] < 0.1 and told["turns_back_at_deg"] is None
+    assert -0.3 < told["coefficients"]["k1"] < -0.2 and told["focal_px"][0] == told["focal_px"][1]
+    assert len(told["by_field"]) == 5 and told["centre_px"] == [959.5, 539.5]
+    block = json.loads((tmp_path / "a.json").read_text())
+    assert block["camera_model"] == "OPENCV" and (block["cx"], block["cy"], block["w"]) == (960.0, 540.0, 1920)
+    assert {"fl_x", "fl_y", "k1", "k2", "k3", "p1", "p2", "h", "frames"} <= set(block)
+    assert "camera_matrix: !!opencv-matrix" in (tmp_path / "a.yaml").read_text()
+    kinds = {"kannala-brandt": 0.5, "f-theta": 0.5, "table": 0.05}  # pixels RMS of 10 mm, 220 degrees
+    for kind, most in kinds.items():
+        told = run_json(capsys, "projection", FISHEYE, *PICTURE, "--model", kind, "-o", tmp_path / kind)
+        assert told["rms_px"] < most and told["field_deg"] > 95
+    assert json.loads((tmp_path / "kannala-brandt.json").read_text())["camera_model"] == "OPENCV_FISHEYE"
+    theta = json.loads((tmp_path / "f-theta.json").read_text())
+    assert len(theta["angle_to_pixeldist_poly"]) == len(theta["pixeldist_to_angle_poly"]) == 6
+    assert theta["linear_cde"] == [1.0, 0.0, 0.0] and theta["principal_point"] == [959.5, 539.5]
+    assert len(json.loads((tmp_path / "table.json").read_text())["radius_px"]) > 100
+
+
+def test_bad_input_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for camera, change, words in (
+        (FISHEYE, ("--model", "opencv"), "a field up to 85 degrees"),
+        (GAUSS, ("--model", "pinhole"), "--model"),
+        (GAUSS, ("--model", "opencv", "-o", tmp_path / "none" / "a"), "a folder that exists"),
+        (GAUSS, ("--model", "opencv", "--size", "1920x1920"), "shape of the film"),
+    ):
+        assert words in failure(capsys, "projection", camera, *PICTURE, *change)
+    assert command.MODELS == tuple(NAMES) and not list(tmp_path.iterdir())
+    with pytest.raises(ValueError, match="two-axis"):
+        direction = rays(0.3)
+        fit("table", direction.numpy(), direction[:, :2].numpy() * 500 + 700, SIZE, (500.0, 1000.0))
