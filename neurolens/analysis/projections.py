@@ -48,7 +48,7 @@ _TINY = 1e-24  # square of the sine below which the axis begins
 _KNOTS = 1025  # of tables
 _ON_AXIS = 1e-6  # rad
 _NOT_FOLDED = 179.0, 89.9  # degrees to which a fold is looked for, about the lens and on the plane
-_STEPS, _TRUST = 25, 0.5  # of Newton's method on the plane; longest step
+_STEPS, _TRUST, _CONVERGED = 25, 0.5, 1e-14  # of Newton's method on the plane; its longest and shortest step
 _FITTED = 60  # steps of Levenberg and Marquardt
 _MISSED_PX = 1e-3  # of a direction found for a pixel
 _BINS = 5  # fields of a report
@@ -170,6 +170,8 @@ class Projection:
             det = ax * by - ay * bx
             det = torch.where(det.abs() > 1e-12, det, 1.0)
             dx, dy = (by * (u - a) - ay * (v - b)) / det, (ax * (v - b) - bx * (u - a)) / det
+            if not bool((dx.abs() + dy.abs() > _CONVERGED).any()):
+                break
             short = (_TRUST / torch.sqrt(dx * dx + dy * dy).clamp_min(_TRUST)).nan_to_num(0.0)
             x, y = x + short * dx, y + short * dy
         folded = torch.sqrt(x * x + y * y) > math.tan(self.fold_rad)

@@ -180,8 +180,9 @@ def _block(found: Projection) -> dict[str, Any]:
 def _text(data: dict[str, Any], left: Residual) -> str:
     numbers = ", ".join(f"{k} {number(v, 6)}" for k, v in data["coefficients"].items())
     focal, centre = (" x ".join(number(v, 7) for v in data[k]) for k in ("focal_px", "centre_px"))
+    radii = f"scale {focal}" if data["model"] in ("f-theta", "table") else f"focal length {focal}"
     lines = [
-        f"{data['camera']}, {data['model']}: focal length {focal}, centre {centre} pixels",
+        f"{data['camera']}, {data['model']}: {radii}, centre {centre} pixels",
         *([numbers] if numbers else []),
         f"leaves {left.rms_px:.3g} pixels RMS, at most {left.worst_px:.3g} (at {left.worst_at_deg:.3g} degrees)",
         table(

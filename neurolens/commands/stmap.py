@@ -285,6 +285,6 @@ def _text(data: dict[str, Any]) -> str:
         f"{worst['there_and_back_px']:.2g}",
     ]
     if first["parallax"]:
-        told = [f"{p['px']:.2g} pixels at {number(p['distance_m'], 3)} m" for p in first["parallax"]]
-        lines.append(f"parallax of the pupil, worst of the picture: {', '.join(told)}")
+        told = [f"{p['px']:.2g} pixels at {number(p['distance_m'], 3)}" for p in first["parallax"]]
+        lines.append(f"parallax of the pupil, worst of the picture, by metres from the film: {', '.join(told)}")
     return "\n".join([*lines, *data["files"]])
