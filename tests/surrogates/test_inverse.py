@@ -161,8 +161,9 @@ def test_nothing_makes_it_diverge() -> None:
         columns = [c.to(dtype) for c in (mixed[:, 0], base.film_y, base.film_z, mixed[:, 1], mixed[:, 2])]
         starts = [inv.through_stop(*columns, base.wavelength_nm.to(dtype), steps=n) for n in (0, 3, 30)]
         for before, after in pairwise(starts):
-            # Below the rounding of what it is the difference of, a residual is none: processors round differently there.
-            assert bool((after.residual <= before.residual.clamp(min=torch.finfo(dtype).eps)).all())
+            # To the rounding of what a residual is the difference of, which is not the same on every processor.
+            rounding = 16 * torch.finfo(dtype).eps * (1 + before.residual)
+            assert bool((after.residual <= before.residual + rounding).all())
         wild = (mixed.abs() > 100).any(1) | ~torch.isfinite(mixed).all(1)
         assert not bool((starts[1].prediction.status == st.PASSED)[wild].any())
         ray = Rays(*(mixed[:, i].to(dtype) for i in (0, 1, 2, 1, 2, 0)))
