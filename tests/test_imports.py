@@ -39,6 +39,7 @@ PARTS = {
     "blender": set(),
     "commands": {
         *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare"),
+        "blender",
         "evaluate",
     },
     "cli": {"commands"},
