@@ -224,8 +224,9 @@ def _check_samples(path: Path, samples: int, tiling: Tiling, done: NDArray[np.in
 
 def _check_sums(sums: NDArray[np.float64]) -> None:
     """No render has others: samples that are not finite are dropped, and emission is bounded."""
-    colours = sums[:, RGB]
-    if not (sums.min() > -math.inf and sums.max() < math.inf and max(-colours.min(), colours.max()) <= _BRIGHTEST):
+    for columns, most in ((sums[:, RGB], _BRIGHTEST), (sums, _BRIGHTEST**2)):  # squares of luminance are the largest
+        if columns.min() >= -most and columns.max() <= most:
+            continue
         raise ValueError("impossible sums")
 
 
