@@ -40,8 +40,9 @@ test: $(INSTALLED)
 	$(MAKE) --no-print-directory lint
 
 # Blender as a module wants Python 3.11 and numpy 1: an environment of its own.
-test-blender: $(BLENDER_INSTALLED)
-	$(BLENDER_VENV)/bin/python -m pytest -q --confcutdir=tests/blender tests/blender
+test-blender: $(BLENDER_INSTALLED) $(INSTALLED)
+	PYTHONPATH=. $(BIN)/python tests/blender/expect.py build/blender
+	NEUROLENS_BLENDER_SHOTS=build/blender $(BLENDER_VENV)/bin/python -m pytest -q --confcutdir=tests/blender tests/blender
 
 bench: $(INSTALLED)
 	$(BIN)/python -m experiments trace

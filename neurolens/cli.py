@@ -47,6 +47,7 @@ def build_parser() -> Parser:
     from neurolens.commands import (
         analyse,
         bench,
+        blender,
         convert,
         evaluate,
         export,
@@ -65,7 +66,7 @@ def build_parser() -> Parser:
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     read = lens, analyse, glass, convert, stmap, projection
-    for command in (*read, train, models, evaluate, export, render, flare, mitsuba, bench):
+    for command in (*read, train, models, evaluate, export, render, flare, mitsuba, blender, bench):
         command.add_parser(subparsers)
     return parser
 

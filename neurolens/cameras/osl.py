@@ -45,6 +45,8 @@ _LEAST_M, _FAR_M = 1e-3, 1e-4  # Blender's focus distance below this means that 
 _LOW_BITS = 4096.0  # of a random number: what lies below 1 / 4096 of it
 _QUADRATURE = 64  # points a side of the exposure on the axis
 _NEAR = 0.999  # of the near limit: rounding
+# Cycles takes the mean size of derivatives, for the footprint of a pixel: their errors by output, and of all of them.
+_DERIVATIVES, _WORST = 0.03, 0.05
 _BESIDE = 0.01  # of the film radius: near the axis
 Report = Callable[[float], object]
 _FRAME = """\
@@ -252,7 +254,7 @@ def _samples(camera: OslCamera, count: int = 4096) -> dict[str, NDArray[np.float
 
 
 def _with_derivatives(camera: OslCamera) -> Graph:
-    found = with_low_order_derivatives(camera.sight.graph, _samples(camera))
+    found = with_low_order_derivatives(camera.sight.graph, _samples(camera), _DERIVATIVES, _WORST)
     return with_film_derivatives(camera.sight.graph) if found is None else found.graph
 
 

@@ -26,7 +26,7 @@ _HAIR = 1e-18  # mm
 # Gauss's nodes and weights over a disc, along a diameter.
 _NODES = ((-(0.5**0.5), 0.25), (0.0, 0.5), (0.5**0.5, 0.25))
 _TIP = 1e-7  # of 1 - X^2, near the ends of an arc
-RADIUS = 5  # powers of the film radius
+RADIUS = 4  # powers of the film radius
 
 
 @dataclass(frozen=True)

@@ -148,11 +148,12 @@ def _wavelengths(text: str) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class _Frame:
-    """One frame: its number in file names ("" for a single one), focus, and fields by the name of their maps."""
+    """One frame: its number in file names ("" for a single one), focus, camera, and fields by their maps' names."""
 
     number: str
     focus_m: float
     camera: str
+    settings: dict[str, Any]
     fields: dict[str, Field]
 
 
@@ -199,11 +200,12 @@ def _traced(args: argparse.Namespace, text: str, progress: Progress) -> _Frame:
         )
         for name, nm in {"": None, **wavelengths}.items()
     }  # fmt: skip
-    return _Frame(text, shot.focus_m, camera.name, fields)
+    return _Frame(text, shot.focus_m, camera.name, camera.settings, fields)
 
 
 def _written(args: argparse.Namespace, frame: _Frame, plates: Plates, report: Callable[[float], None]) -> list[str]:
     """Write the maps of one frame; their names."""
+    from neurolens.render.exr_attributes import standard_attributes
     from neurolens.render.pictures import write_data_exr
     from neurolens.render.stmap import illumination_map, redistort_map, undistort_map
 
@@ -211,12 +213,13 @@ def _written(args: argparse.Namespace, frame: _Frame, plates: Plates, report: Ca
     jobs = [(kind, name, makers[kind]) for name in frame.fields for kind in makers]
     jobs.append(("illumination", "", illumination_map))
     files = []
+    header = standard_attributes(frame.settings, frame=int(frame.number) if frame.number else None)
     for k, (kind, name, make) in enumerate(jobs):
         field = frame.fields[name]
         planes = make(field, plates, _part(report, 2 * k, 2 * len(jobs)))
         words = [args.out.name, kind, *([name] if name else []), *([frame.number] if frame.number else []), "exr"]
         path = args.out.with_name(".".join(words))
-        write_data_exr(path, planes, _about(args, frame, plates, kind, field))
+        write_data_exr(path, planes, _about(args, frame, plates, kind, field), header)
         files.append(str(path))
         report((k + 1) / len(jobs))
     return files

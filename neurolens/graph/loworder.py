@@ -50,11 +50,14 @@ def with_film_derivatives(graph: Graph) -> Graph:
     return with_derivatives(graph, ["scene_ray"], [("rays", row) for row in range(len(FILM_X_Y))])
 
 
-def with_low_order_derivatives(graph: Graph, samples: Mapping[str, NDArray[np.float32]]) -> LowOrder | None:
+def with_low_order_derivatives(
+    graph: Graph, samples: Mapping[str, NDArray[np.float32]], enough: float = _STOP, worst: float = WORST
+) -> LowOrder | None:
     """Fit the derivatives of a lens's graph by orthogonal matching pursuit, each until it is good enough.
 
     Args:
         samples: inputs of rays that cover those it will be asked for, [rows, N] or, of the call, [rows, 1].
+        enough, worst: see `_STOP` and `WORST`.
 
     Returns None where low orders do not do: a lens too strong, or too few rays that pass.
     """
@@ -71,10 +74,10 @@ def with_low_order_derivatives(graph: Graph, samples: Mapping[str, NDArray[np.fl
     wanted = _matrices(exact, passed)
     weights = np.zeros((6, 2, len(monomials)))
     for group in _GROUPS:
-        enough = _STOP * float(np.sqrt(np.mean(np.square(wanted[group]))))
+        good = enough * float(np.sqrt(np.mean(np.square(wanted[group]))))
         for row in range(group.start, group.stop):
             for by in range(2):
-                chosen, values = _pursue(products, wanted[row, by], enough)
+                chosen, values = _pursue(products, wanted[row, by], good)
                 weights[row, by, chosen] = values
     used = weights.any((0, 1))
     exponents = np.array([np.bincount(m, minlength=len(columns)) for m in monomials], np.int64)[used]
@@ -82,7 +85,7 @@ def with_low_order_derivatives(graph: Graph, samples: Mapping[str, NDArray[np.fl
     found.outputs |= dict(zip(_NAMES, found.split(rows, (6, 6)), strict=True))
     fitted = _matrices(evaluate(found, samples), passed)  # in float32, as it will be used
     error = max(_error(fitted[group], wanted[group]) for group in _GROUPS)
-    return LowOrder(found, error, int(np.count_nonzero(weights))) if error <= WORST else None
+    return LowOrder(found, error, int(np.count_nonzero(weights))) if error <= worst else None
 
 
 def _matrices(results: Mapping[str, NDArray[np.float32]], passed: NDArray[np.bool_]) -> Array:

@@ -82,11 +82,14 @@ def write_osl(
 
 
 class _Writer(Writer):
-    """Largest and smallest as functions: a choice would be a branch."""
+    """Choices as functions: otherwise they are branches, which cost a tenth of a whole camera."""
 
     def step(self, step: Step) -> str:
         if step.kind in ("max", "min"):
             return "{}({}, {})".format(step.kind, *(self.value(a) for a in step.arguments))
+        if step.kind == "select":
+            low, high, then, otherwise = (self.value(a) for a in step.arguments)
+            return f"select({otherwise}, {then}, {low} <= {high})"
         return super().step(step)
 
 

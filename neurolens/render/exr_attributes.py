@@ -27,13 +27,13 @@ _STATE = {
 
 
 def standard_attributes(
-    settings: Mapping[str, Any], width: int, height: int, frame: int | None = None
+    settings: Mapping[str, Any], width: int | None = None, height: int | None = None, frame: int | None = None
 ) -> dict[str, Any]:
     """Header values of a picture, of the types that the OpenEXR library wants.
 
     Args:
         settings: of the camera, as `Camera.settings` has them.
-        width, height: of the picture, in pixels.
+        width, height: of the picture, in pixels; None where pixels are no part of the film, as in maps.
         frame: number of the picture in a sequence.
     """
     found: dict[str, Any] = {
@@ -42,7 +42,7 @@ def standard_attributes(
         "cameraFirmwareVersion": __version__,
         "imageCounter": frame,
         **_lens(settings),
-        **_film(settings, width, height),
+        **({} if width is None or height is None else _film(settings, width, height)),
     }
     return {name: value for name, value in found.items() if value is not None and not _empty(value)}
 

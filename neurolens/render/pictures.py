@@ -96,8 +96,13 @@ def write_exr(
     _write_part(path, header, channels)
 
 
-def write_data_exr(path: Path, channels: Mapping[str, FloatArray], metadata: Mapping[str, Any]) -> None:
-    """Write channels [H, W] float32 that are no colours as OpenEXR, atomically; `metadata` as in `write_exr`.
+def write_data_exr(
+    path: Path,
+    channels: Mapping[str, FloatArray],
+    metadata: Mapping[str, Any],
+    attributes: Mapping[str, Any] | None = None,
+) -> None:
+    """Write channels [H, W] float32 that are no colours, atomically; `metadata` and `attributes` as in `write_exr`.
 
     Raises:
         InputError, OSError: as `write_exr`.
@@ -107,6 +112,7 @@ def write_data_exr(path: Path, channels: Mapping[str, FloatArray], metadata: Map
         "type": OpenEXR.scanlineimage,
         "colorInteropID": "data",
         METADATA_KEY: json.dumps(metadata, allow_nan=False),
+        **(attributes or {}),
     }
     _write_part(path, header, {name: np.ascontiguousarray(plane) for name, plane in channels.items()})
 

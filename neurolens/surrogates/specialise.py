@@ -72,10 +72,10 @@ def _narrowed(model: LensModel, fix: Fix) -> LensModel:
     return replace(model, domain=domain, lens=lens, settings=settings)
 
 
-def without_idle_gates(models: tuple[LensModel, ...]) -> tuple[LensModel, ...]:
+def without_idle_gates(models: tuple[LensModel, ...], share: float = IDLE_SHARE) -> tuple[LensModel, ...]:
     """The models without the gates that block (next to) nothing that the others and the stop let through.
 
-    Which surface a status names may change with that: the first of those left.
+    Which surface a status names may change with that: the first of those left. `share`: see `IDLE_SHARE`.
     """
     left = list(range(len(models[0].gates)))
     sole = [_blocked(m) for m in models]  # [1 + G, N] of each, the stop first
@@ -86,7 +86,7 @@ def without_idle_gates(models: tuple[LensModel, ...]) -> tuple[LensModel, ...]:
             for g, each in zip(left, others, strict=True)
         ]
         least = min(range(len(left)), key=lambda i: counts[i])
-        if counts[least] > IDLE_SHARE * sum(b.shape[1] for b in sole):
+        if counts[least] > share * sum(b.shape[1] for b in sole):
             break
         del left[least]
     if len(left) == len(models[0].gates):

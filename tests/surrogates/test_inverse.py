@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 
 import lens_models
 import numpy as np
@@ -159,9 +160,10 @@ def test_nothing_makes_it_diverge() -> None:
     for dtype in (torch.float64, torch.float32):
         columns = [c.to(dtype) for c in (mixed[:, 0], base.film_y, base.film_z, mixed[:, 1], mixed[:, 2])]
         starts = [inv.through_stop(*columns, base.wavelength_nm.to(dtype), steps=n) for n in (0, 3, 30)]
-        assert bool(
-            (starts[1].residual <= starts[0].residual).all() and (starts[2].residual <= starts[1].residual).all()
-        )
+        for before, after in pairwise(starts):
+            # To the rounding of what a residual is the difference of, which is not the same on every processor.
+            rounding = 16 * torch.finfo(dtype).eps * (1 + before.residual)
+            assert bool((after.residual <= before.residual + rounding).all())
         wild = (mixed.abs() > 100).any(1) | ~torch.isfinite(mixed).all(1)
         assert not bool((starts[1].prediction.status == st.PASSED)[wild].any())
         ray = Rays(*(mixed[:, i].to(dtype) for i in (0, 1, 2, 1, 2, 0)))

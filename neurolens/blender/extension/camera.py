@@ -46,14 +46,15 @@ def applied(camera: Any) -> bool:
 def setting_of(scene: Any, found: Any) -> Setting:
     """What the scene asks of a lens on this camera object."""
     camera, render = found.data, scene.render
-    focus = focus_m(found) if camera.dof.use_dof else None
-    custom = camera.cycles_custom
-    f_number = float(custom["f_number"]) if applied(camera) and "f_number" in custom else None
+    custom = camera.cycles_custom if applied(camera) else {}
+    f_number = float(custom["f_number"]) if "f_number" in custom else None
+    own = float(custom["focus_m"]) if "focus_m" in custom else 0.0  # of the shader; above 0 it rules
+    focus = own if own > 0 else focus_m(found) if camera.dof.use_dof else None
     return Setting(
         sensor_mm=sensor_mm(camera, render),
         pixels=max(1, round(render.resolution_x * render.resolution_percentage / 100)),
         focus_m=focus,
-        focus_object="" if camera.dof.focus_object is None else camera.dof.focus_object.name,
+        focus_object="" if own > 0 or camera.dof.focus_object is None else camera.dof.focus_object.name,
         f_number=f_number,
         unit_m=scene.unit_settings.scale_length if scene.unit_settings.system != "NONE" else 1.0,
         on_gpu=_on_other_gpu(scene),

@@ -166,7 +166,7 @@ def refusals(variant: Variant, setting: Setting) -> list[str]:
         fitting = fitting_width_mm(variant, setting)
         found.append(
             f"The sensor, {width:.4g} x {height:.4g} mm, is larger than the lens's picture of {circle:.4g} mm: "
-            f"make it at most {fitting:.4g} mm wide, or fit the sensor"
+            f"make it at most {fitting:.2f} mm wide, or fit the sensor"
         )
     if too_near(variant, setting):
         what = f"The focus object {setting.focus_object!r}" if setting.focus_object else "The focus distance"
@@ -193,7 +193,7 @@ def notes(variant: Variant, setting: Setting) -> list[str]:
     if setting.f_number is not None and setting.f_number * NOMINAL < variant.f_number:
         found.append(f"The lens opens to f/{variant.f_number:.3g}: f/{setting.f_number:.3g} is that")
     if setting.focus_m is None:
-        found.append("Depth of field is off: Cycles does not say where the focus is")
+        found.append("Depth of field is off: the lens is focused at infinity")
     if setting.unit_m != 1.0:
         found.append(f"A unit of this scene is {setting.unit_m:g} m; the lens takes it for 1 m")
     if setting.on_gpu:

@@ -11,7 +11,7 @@ import bpy.utils.previews
 from . import camera as on_camera
 from .library import KINDS, LensError, LensFacts, error_px, notes, read_library, refusals, refused
 
-_FIRST = ("f_number", "focus", "film_shift", "zoom")  # of the settings, before the others
+_FIRST = ("f_number", "focus_m")  # of the settings, before the others
 
 
 class Library:

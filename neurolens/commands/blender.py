@@ -1,0 +1,113 @@
+"""`neurolens blender`: the extension for Blender, packed with lenses, and lenses of your own in it."""
+
+from __future__ import annotations
+
+import argparse
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.base.files import check_writable
+from neurolens.base.progress import Progress
+from neurolens.commands.arguments import Parser, add_json, check_folder, check_suffix
+from neurolens.commands.output import answer
+
+_DESCRIPTION = """\
+Real lenses as cameras of Blender's Cycles (4.5 and later): an extension with a panel at the
+camera's data, where a lens is put on with one click and taken off with one."""
+_BUILD = """\
+Pack the extension with a folder of models: of each lens the best polynomial, the best network and,
+where its lens file is beside the models' folder in lenses/, the exact lens, every surface traced.
+A lens whose glass absorbs or is coated has no exact form.
+
+Install it in Blender: Edit > Preferences > Get Extensions > Install from Disk."""
+_ADD = """\
+Put a model (.onnx) or a lens file (.toml) into the extension: into the user folder of an installed
+one (the newest Blender of this machine that has it), or into a zip. A form of a lens replaces the one
+that was there. In Blender, "Read Lenses Again" in the panel shows it."""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser(
+        "blender", help="the extension for Blender, and lenses in it", description=_DESCRIPTION
+    )
+    actions = parser.add_subparsers(metavar="ACTION", required=True, parser_class=Parser)
+    build = actions.add_parser("build", help="pack the extension as a zip", description=_BUILD)
+    build.add_argument(
+        "-o", "--out", metavar="OUT.zip", type=Path, default=Path("neurolens.zip"), help="default: %(default)s"
+    )
+    build.add_argument("--models", metavar="DIR", type=Path, default=Path("models"), help="default: %(default)s")
+    build.add_argument(
+        "--lens", metavar="NAME", action="append", default=[],
+        help="only this lens, repeatable: NAME of NAME.ols-64.onnx (default: all)",
+    )  # fmt: skip
+    build.add_argument("--no-exact", action="store_true", help="leave exact lenses out")
+    add_json(build, quiet=True)
+    build.set_defaults(run=run_build, kept="no zip was written")
+    add = actions.add_parser("add", help="put a lens into the extension", description=_ADD)
+    add.add_argument("file", metavar="FILE", type=Path, help="model (.onnx) or lens file (.toml)")
+    add.add_argument("--to", metavar="ZIP|DIR", type=Path, help="a packed extension, or a user folder of one")
+    add.add_argument("--zoom", metavar="STATE", help="state of a zoom, by name or focal length in mm")
+    add_json(add, quiet=True)
+    add.set_defaults(run=run_add, kept="nothing was added")
+
+
+def run_build(args: argparse.Namespace) -> int:
+    """Pack the extension."""
+    check_suffix(args.out, "--out", (".zip",))
+    check_folder(args.out, "--out")
+    check_writable(args.out)
+    if not args.models.is_dir():
+        raise InputError("neurolens blender build", "--models", str(args.models), "a folder of models that exists")
+    from neurolens.blender.pack import write_pack
+    from neurolens.commands.blender_lenses import form_of, library, packed_of
+    from neurolens.optics.lensfile import read_lens
+
+    began, packed, left = time.perf_counter(), [], {}
+    places = list(library(args.models, args.models.parent / "lenses", args.lens))
+    if not places:
+        raise InputError("neurolens blender build", "--models", str(args.models), "a folder with models (.onnx)")
+    with Progress(quiet=args.quiet).stage("shaders") as report:
+        for number, (files, lens_file) in enumerate(places):
+            lens = None if lens_file is None else read_lens(lens_file)
+            found = packed_of(files, lens=lens, quiet=True)
+            if lens_file is not None and not args.no_exact:
+                try:
+                    found.forms.append(form_of(lens_file, quiet=True))
+                except NeurolensError as error:
+                    left[lens_file.stem] = str(error)
+            packed.append(found)
+            report((number + 1) / len(places))
+    for why in left.values():
+        warnings.warn(f"left out: {why}", NeurolensWarning, stacklevel=2)
+    write_pack(args.out, packed)
+    data = {
+        "file": str(args.out),
+        "bytes": args.out.stat().st_size,
+        "lenses": {p.lens_id: [f.model or f.kind for f in p.forms] for p in packed},
+        "left_out": left,
+        "seconds": time.perf_counter() - began,
+    }
+    return answer(args, data, lambda: f"{args.out}: {len(packed)} lenses, {sum(len(p.forms) for p in packed)} shaders")
+
+
+def run_add(args: argparse.Namespace) -> int:
+    """Add a lens."""
+    from neurolens.blender.pack import add_to_folder, add_to_zip, user_folders
+    from neurolens.commands.blender_lenses import packed_of
+
+    to = args.to
+    if to is None:
+        to = next(iter(user_folders()), None)
+    if to is None:
+        expected = "--to, a zip or a folder: no Blender of this machine has the extension installed"
+        raise InputError("neurolens blender add", "--to", "(missing)", expected)
+    if not args.file.is_file():
+        raise InputError(args.file, "file", "(missing)", "a model (.onnx) or a lens file (.toml)")
+    lens = packed_of([args.file], zoom=args.zoom, quiet=args.quiet)
+    (add_to_zip if to.suffix == ".zip" else add_to_folder)(to, lens)
+    data = {"lens": lens.lens_id, "to": str(to), "forms": [f.model or f.kind for f in lens.forms]}
+    return answer(args, data, lambda: f"{lens.name} ({', '.join(data['forms'])}) is in {to}")

@@ -1,0 +1,105 @@
+"""`neurolens blender build` and `add`: what goes into the zip; shaders stand in, for they take their time."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from neurolens.base.errors import InputError
+from neurolens.cli import main
+from neurolens.commands import blender_lenses
+from neurolens.commands.blender_lenses import thumbnail
+from neurolens.commands.export_osl import Shader
+from neurolens.optics.lensfile import read_lens
+
+LENS = "laikin_double_gauss_50"
+ABSORBS = "its glass absorbs"
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of three models and their lens file, and shaders that cost nothing."""
+
+    def written(file: Path, *, zoom: str | None = None, name: str | None = None, quiet: bool = False) -> Shader:
+        if file.stem == "absorbs":
+            raise InputError(file, "surface 0", ABSORBS, "a bare lens")
+        return Shader("camera", f"shader of {file.name}, {zoom}", 1, (), {}, 21.6, 1.8, 0.7)
+
+    monkeypatch.setattr(blender_lenses, "shader_of", written)
+    for folder in ("models", "lenses"):
+        (tmp_path / folder).mkdir()
+    for model in (f"{LENS}.ols-36", f"{LENS}.ols-60", f"{LENS}.mlp-10x1"):
+        shutil.copy(f"models/{model}.onnx", tmp_path / "models")
+    shutil.copy(f"lenses/{LENS}.toml", tmp_path / "lenses")
+    return tmp_path
+
+
+def failed(capsys: pytest.CaptureFixture[str], *args: object) -> str:
+    """The line of a command that must fail."""
+    assert main(["blender", *map(str, args)]) == 2
+    out, err = capsys.readouterr()
+    assert not out and err.count("\n") == 1
+    return err
+
+
+def test_zip_holds_the_best_of_each_kind_and_takes_more(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = place / "n.zip"
+    assert main(["blender", "build", "-o", str(out), "--models", str(place / "models"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["lenses"] == {LENS: ["ols-60", "mlp-10x1", "exact"]} and told["bytes"] == out.stat().st_size
+    shutil.copy(place / "lenses" / f"{LENS}.toml", place / "own.toml")
+    assert main(["blender", "add", str(place / "own.toml"), "--to", str(out), "--quiet"]) == 0
+    with zipfile.ZipFile(out) as packed:
+        names, facts = set(packed.namelist()), json.loads(packed.read("lenses.json"))
+        picture = packed.read(f"thumbnails/{LENS}.png")
+    assert {f"shaders/{LENS}.{form}.osl" for form in ("ols-60", "mlp-10x1", "exact")} < names
+    assert {"__init__.py", "blender_manifest.toml", "shaders/own.exact.osl"} < names
+    entry = next(e for e in facts["lenses"] if e["id"] == LENS)
+    assert (entry["year"], entry["name"]) == (1995, "Double Gauss 50 mm f/1.8") and entry["efl_mm"] == pytest.approx(
+        49.64, abs=0.01
+    )
+    polynomial, network, exact = entry["variants"]
+    assert polynomial["kind"] == "polynomial" and polynomial["rms_um"] == pytest.approx(0.171, abs=1e-3)
+    assert network["kind"] == "network" and exact["rms_um"] is None and exact["nearest_m"] == 0.7
+    assert picture.startswith(b"\x89PNG") and picture[16:24] == bytes([0, 0, 1, 0] * 2)
+
+
+def test_lenses_that_cannot_be_shaders_are_left_out_and_said(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copy(place / "models" / f"{LENS}.ols-36.onnx", place / "models" / "absorbs.ols-36.onnx")
+    for form in ("lenses/absorbs.toml",):
+        shutil.copy(place / "lenses" / f"{LENS}.toml", place / form)
+    given = ["build", "-o", str(place / "n.zip"), "--models", str(place / "models")]
+    shader_of = blender_lenses.shader_of
+
+    def only_files(file: Path, **options: object) -> Shader:
+        return shader_of(place / "x.onnx" if file.suffix == ".onnx" else file, **options)
+
+    blender_lenses.shader_of = only_files  # undone with the fixture's
+    assert main(["blender", *given, "--lens", "absorbs", "--json"]) == 0
+    told, said = capsys.readouterr()
+    assert json.loads(told)["lenses"] == {"absorbs": ["ols-36"]} and ABSORBS in said
+
+
+def test_bad_input_is_one_line(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    models, out = place / "models", place / "n.zip"
+    assert "--lens" in failed(capsys, "build", "-o", out, "--models", models, "--lens", "nothing")
+    assert "a folder of models" in failed(capsys, "build", "-o", out, "--models", place / "none")
+    assert ".zip" in failed(capsys, "build", "-o", place / "n.tar", "--models", models)
+    assert "a folder with models" in failed(capsys, "build", "-o", out, "--models", place / "lenses")
+    monkeypatch.setenv("BLENDER_USER_RESOURCES", str(place / "nobody"))
+    assert "no Blender of this machine" in failed(capsys, "add", models / f"{LENS}.ols-36.onnx")
+    assert "(missing)" in failed(capsys, "add", place / "no.onnx", "--to", place / "user")
+    (place / "a.txt").write_text("x")
+    assert "a model (.onnx) or a lens file" in failed(capsys, "add", place / "a.txt", "--to", place / "user")
+    assert not out.exists() and not (place / "user").exists()
+
+
+def test_thumbnails_show_the_lens() -> None:
+    first, second = (thumbnail(read_lens(f"lenses/{n}.toml")) for n in (LENS, "horimoto_fisheye_16"))
+    assert first is not None and second is not None and first != second

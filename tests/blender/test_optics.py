@@ -1,0 +1,191 @@
+"""Lenses in Cycles against neurolens's exact ones: places, colours, discs, focus, stop and the white card."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy", reason="Blender as a module (bpy) is not installed: make test-blender runs these")
+
+from measure import measures  # noqa: E402
+
+FOLDER = os.environ.get("NEUROLENS_BLENDER_SHOTS")
+pytestmark = pytest.mark.skipif(FOLDER is None, reason="no numbers of tests/blender/expect.py: make test-blender")
+SHOTS = [] if FOLDER is None else json.loads((Path(FOLDER) / "shots.json").read_text(encoding="utf-8"))
+_SAMPLES = 3e6  # of a crop
+
+
+def named(name: str, lens: str | None = None) -> list[dict[str, Any]]:
+    found = [s for s in SHOTS if s["name"] == name and lens in (None, s["lens"])]
+    assert found
+    return found
+
+
+class Studio:
+    """A dark scene with one sphere of light, and a camera at the origin that looks along -z."""
+
+    def __init__(self, folder: Path) -> None:
+        bpy.ops.wm.read_homefile(app_template="", use_factory_startup=True)
+        self.folder, self.scene = folder, bpy.context.scene
+        for found in list(bpy.data.objects):
+            if found.type != "CAMERA":
+                bpy.data.objects.remove(found)
+        self.camera = self.scene.camera
+        self.camera.matrix_world.identity()
+        self.camera.data.clip_start = 1e-4
+        mesh = bpy.data.meshes.new("light")
+        import bmesh
+
+        ball = bmesh.new()
+        bmesh.ops.create_uvsphere(ball, u_segments=64, v_segments=32, radius=1.0)
+        ball.to_mesh(mesh)
+        ball.free()
+        self.light = bpy.data.objects.new("light", mesh)
+        self.scene.collection.objects.link(self.light)
+        glow = bpy.data.materials.new("glow")
+        mesh.materials.append(glow)
+        nodes = glow.node_tree.nodes
+        nodes.clear()
+        emission, out = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
+        glow.node_tree.links.new(emission.outputs[0], out.inputs["Surface"])
+        self.world = self.scene.world.node_tree.nodes["Background"].inputs["Color"]
+        self.world.default_value = (0, 0, 0, 1)
+        self.scene.render.engine = "CYCLES"
+        cycles = self.scene.cycles
+        cycles.shading_system, cycles.max_bounces, cycles.pixel_filter_type = True, 0, "BOX"
+        cycles.use_denoising = cycles.use_adaptive_sampling = False
+        settings = self.scene.render.image_settings
+        settings.file_format, settings.color_depth = "OPEN_EXR", "32"
+
+    def set(self, shot: dict[str, Any]) -> None:
+        """Lens, sensor, size and settings of a shot."""
+        data, render = self.camera.data, self.scene.render
+        text = bpy.data.texts.get(shot["lens"])
+        if text is None:
+            text = bpy.data.texts.new(shot["lens"])
+            text.from_string((Path(str(FOLDER)) / f"{shot['lens']}.osl").read_text(encoding="utf-8"))
+        if data.custom_shader != text:
+            from cycles.osl import update_custom_camera_shader
+
+            data.type, data.custom_mode, data.custom_shader = "CUSTOM", "INTERNAL", text
+            assert update_custom_camera_shader(data, print)
+        data.sensor_width = shot["film_mm"][0]
+        for name, value in shot["custom"].items():
+            data.cycles_custom[name] = value
+        data.dof.use_dof = True
+        data.update_tag()
+        render.resolution_x, render.resolution_y = shot["width"], shot["height"]
+        if "point_m" in shot:
+            self.light.location, self.light.scale = shot["point_m"], [shot["radius_m"]] * 3
+
+    def picture(self, shot: dict[str, Any], samples: int | None = None) -> Any:
+        """[H, W, 3] of a shot's crop, the lowest row first."""
+        self.set(shot)
+        render = self.scene.render
+        left, bottom, right, top = shot.get("crop", (0, 0, shot["width"], shot["height"]))
+        render.use_border = render.use_crop_to_border = "crop" in shot
+        # Blender cuts off what is left over a whole pixel.
+        render.border_min_x, render.border_max_x = ((edge + 0.25) / shot["width"] for edge in (left, right))
+        render.border_min_y, render.border_max_y = ((edge + 0.25) / shot["height"] for edge in (bottom, top))
+        shape = top - bottom, right - left
+        self.scene.cycles.samples = samples or int(min(max(_SAMPLES / math.prod(shape), 32), 4096))
+        render.filepath = str(self.folder / "shot.exr")
+        bpy.ops.render.render(write_still=True)
+        image = bpy.data.images.load(render.filepath)
+        found = np.empty(image.size[0] * image.size[1] * 4, np.float32)
+        image.pixels.foreach_get(found)
+        size = image.size[1], image.size[0]
+        bpy.data.images.remove(image)
+        assert size == shape
+        return found.reshape(*shape, 4)[..., :3].astype(float)
+
+    def measured(self, shot: dict[str, Any]) -> dict[str, Any]:
+        return measures(self.picture(shot), shot["crop"][:2])
+
+
+@pytest.fixture(scope="module")
+def studio(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
+    yield Studio(tmp_path_factory.mktemp("renders"))
+
+
+@pytest.mark.parametrize("lens", ["rectilinear", "fisheye", "anamorphic"])
+def test_points_lie_where_the_exact_lens_has_them(studio: Studio, lens: str) -> None:
+    off, fringe = [], []
+    for shot in named("grid", lens):
+        seen, wanted = (np.array(m["centroid_px"]) for m in (studio.measured(shot), shot["found"]))
+        off.append(np.hypot(*(seen[0] - wanted[0])))
+        pitch_um = 1e3 * shot["film_mm"][0] / shot["width"]
+        fringe.append(pitch_um * np.hypot(*((seen[1] - seen[3]) - (wanted[1] - wanted[3]))))
+    print(lens, "off (px)", np.round(off, 3), "lateral colour off (um)", np.round(fringe, 2))
+    assert max(off) < 0.1
+    assert max(fringe) < 1.0
+
+
+def test_lateral_colour_is_there_to_be_measured() -> None:
+    reds, blues = (np.array([s["found"]["centroid_px"][k] for s in named("grid", "rectilinear")]) for k in (1, 3))
+    assert np.hypot(*(reds - blues).T).max() > 0.15  # px of 18.75 um
+
+
+@pytest.mark.parametrize("name", ["stop", "off axis"])
+def test_discs_have_the_size_and_shape_of_the_exact_lens(studio: Studio, name: str) -> None:
+    areas, axes = [], []
+    for shot in named(name):
+        seen = studio.measured(shot)
+        areas.append(seen["area_px"] / shot["found"]["area_px"] - 1)
+        axes.append(seen["axes"] - shot["found"]["axes"])
+    print(name, "areas", np.round(areas, 4), "axes", np.round(axes, 4))
+    assert max(map(abs, areas)) < 0.02
+    assert max(map(abs, axes)) < 0.02
+
+
+def test_cats_eyes_are_there_to_be_measured() -> None:
+    assert min(s["found"]["axes"] for s in named("off axis")) < 0.75
+    areas = [s["found"]["area_px"] for s in named("stop")]
+    assert areas[0] / areas[-1] == pytest.approx((11 / 1.83) ** 2, rel=0.1)
+
+
+def test_focus_is_pulled_by_keyframes(studio: Studio) -> None:
+    shots = named("pull")
+    studio.set(shots[0])
+    data = studio.camera.data
+    for shot in shots:
+        data.cycles_custom["focus_m"] = shot["custom"]["focus_m"]
+        data.keyframe_insert('cycles_custom["focus_m"]', frame=shot["frame"])
+    wide = []
+    try:
+        for shot in shots:
+            studio.scene.frame_set(shot["frame"])
+            kept = {**shot, "custom": {k: v for k, v in shot["custom"].items() if k != "focus_m"}}
+            wide.append(studio.measured(kept)["rms_px"] / shot["found"]["rms_px"] - 1)
+    finally:
+        data.animation_data_clear()
+    print("blur over the exact lens's", np.round(wide, 4))
+    assert max(map(abs, wide)) < 0.03
+
+
+@pytest.mark.parametrize("lens", ["rectilinear", "anamorphic"])
+def test_white_card_is_that_of_the_exact_lens(studio: Studio, lens: str) -> None:
+    [shot] = named("card", lens)
+    studio.world.default_value, studio.light.hide_render = (1, 1, 1, 1), True
+    try:
+        picture = studio.picture(shot, 2048).mean(2)
+    finally:
+        studio.world.default_value, studio.light.hide_render = (0, 0, 0, 1), False
+    wanted = np.array(shot["found"])
+    rows, columns = wanted.shape
+    seen = picture.reshape(rows, picture.shape[0] // rows, columns, -1).mean((1, 3))
+    print(lens, "white card over the exact lens's, largest", np.abs(seen / wanted - 1).max(), "darkest", wanted.min())
+    assert np.abs(seen / wanted - 1).max() < 0.01
+
+
+def test_exact_shader_shows_what_the_model_does(studio: Studio) -> None:
+    for shot in named("grid", "rectilinear")[:3]:
+        seen, wanted = (np.array(m["centroid_px"]) for m in (studio.measured({**shot, "lens": "exact"}), shot["found"]))
+        assert np.hypot(*(seen[0] - wanted[0])) < 0.1
