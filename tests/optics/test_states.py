@@ -266,6 +266,34 @@ def test_no_plane_near_by_has_a_smaller_spot(name: str, focus_m: float) -> None:
     assert spot(z) < min(spot(z - step), spot(z + step))
 
 
+@pytest.mark.parametrize(
+    ("name", "focus_m"),
+    [("phone_lens_6", math.inf), ("phone_lens_6", 1.5), ("schneider_anamorphic_31", math.inf),
+     ("cooke_anamorphic_42", math.inf), ("cooke_anamorphic_42", 1.5), ("panavision_anamorphic_zoom_21", 1.5)],
+)  # fmt: skip
+def test_best_focus_is_the_least_spot_of_two_hundred_films(name: str, focus_m: float) -> None:
+    """Of other rays: a sunflower of points on a disc wider than the pupils of both meridians; films 1 um apart."""
+    lens, count = tabled(name), 8000
+    z = best_focus_z_mm(lens, focus_m, (LINE_D_NM, LINE_D_NM))
+    data = [first_order(lens, meridian=m) for m in ("y", "x")]
+    k = torch.arange(count, dtype=torch.float64) + 0.5
+    radius = 0.65 * max(d.entrance_pupil_diameter_mm for d in data) * torch.sqrt(k / count)
+    turn = k * math.pi * (3 - math.sqrt(5))
+    x, y = radius * torch.cos(turn), radius * torch.sin(turn)
+    source = data[0].entrance_pupil_z_mm - z + 1000 * focus_m  # to the entrance pupil
+    far = math.isinf(focus_m)
+    way = torch.stack([0 * x, 0 * x, 1 + 0 * x] if far else [x / source, y / source, 1 + 0 * x])
+    ahead = 60.0 + data[0].entrance_pupil_z_mm
+    start = torch.stack([x, y, data[0].entrance_pupil_z_mm + 0 * x]) - ahead * way
+    out = trace(lens, Rays(*start, *(way / way.norm(dim=0))), towards="film")
+    r = Rays(*(c[out.status == 0] for c in out.rays))
+    assert len(r.x) > 2000
+    films = z + torch.linspace(-0.1, 0.1, 201, dtype=torch.float64)[:, None] + 3e-4
+    x, y = (c + (films - r.z) * d / r.dz for c, d in ((r.x, r.dx), (r.y, r.dy)))
+    least = films[int((x * x + y * y).mean(1).argmin()), 0]
+    assert float(least) == pytest.approx(z, abs=1e-3)
+
+
 def test_best_focus_weighs_colours_as_the_eye_does() -> None:
     lens = tabled("thorlabs_lb1471_biconvex_50").at(f_number=16)
     blue, green, red = (best_focus_z_mm(lens, wavelength_nm=(nm, nm)) for nm in (450.0, 555.0, 650.0))
