@@ -3,7 +3,7 @@
 base <- graph <- modelfile <- optics <- surrogates <- evaluate <- commands <- cli
                               optics <- analysis   <- evaluate
                  modelfile <- cameras <- render    <- evaluate
-                              optics, render <- flare <- evaluate
+                              analysis, render <- flare <- evaluate
                                          render    <- mitsuba  <- evaluate
 """
 
@@ -32,7 +32,7 @@ PARTS = {
     "cameras": {"graph", "modelfile"},
     "render": {"cameras"},
     "mitsuba": {"cameras", "render"},
-    "flare": {"graph", "optics", "render"},
+    "flare": {"graph", "optics", "analysis", "render"},
     "evaluate": {
         *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare")
     },

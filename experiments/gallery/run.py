@@ -42,6 +42,7 @@ from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
 
 SCHEMA = 1
+_CAMERAS = 2  # counts changes of what a column's camera is: figures of earlier ones are made again
 
 
 def run_effect(
@@ -108,7 +109,7 @@ def check(effect: Effect) -> None:
 def fingerprint_of(effect: Effect, samples: int | None) -> str:
     """A hash of everything that a figure depends on: files and pictures named, settings, versions, samples."""
     fits = [asdict(panel.fit) for panel in effect.panel]  # where the file says nothing, the defaults of this version
-    found = hashlib.sha256(json.dumps([SCHEMA, versions(), samples, fits], sort_keys=True).encode())
+    found = hashlib.sha256(json.dumps([SCHEMA, _CAMERAS, versions(), samples, fits], sort_keys=True).encode())
     for file in [effect.path, *(file for panel in effect.panel for file in panel.files())]:
         found.update(file.read_bytes())
     for scene in dict.fromkeys(panel.scene for panel in effect.panel):

@@ -26,6 +26,7 @@ from neurolens.commands.render import film_size
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
+    from neurolens.flare.ghosts import Pair
     from neurolens.flare.picture import Ghost, Light
     from neurolens.optics.prescription import Lens
 
@@ -40,7 +41,7 @@ white card of radiance 1 is 1 on the axis. With --photons light goes on by chanc
 any number of reflections, smoothed by a kernel. Needs the extra "train" (torch) and a C compiler."""
 _EPILOG = """\
 examples:
-  neurolens flare laikin_double_gauss_50 --light 15,8
+  neurolens flare laikin_double_gauss_50 --light 15,8 --path g08-06 path.png
   neurolens flare laikin_double_gauss_50 --light 15,8,0.01 --coating quarter-wave --blades 6 --f-number 8 -o flare.exr
   neurolens flare lenses/ogawa_zoom_70_200.toml --zoom 100 --light -12,3,1/0.8/0.5 --layers 8 -o flare.exr"""
 _SHOWN = 12  # ghosts of the table
@@ -62,6 +63,12 @@ def add_parser(subparsers: Any) -> None:
         help="of every surface between glass and air that the lens file leaves bare: quarter-wave, v-coat, broadband",
     )  # fmt: skip
     parser.add_argument("-o", "--out", metavar="OUT.exr", type=Path, help="picture (default: only the table)")
+    parser.add_argument(
+        "--path",
+        metavar=("GHOST", "OUT"),
+        nargs=2,
+        help="draw the rays of one ghost of the first light (PNG, PDF, SVG)",
+    )
     parser.add_argument("--film", metavar="WxH", type=film_size, default=(36.0, 24.0), help="in mm (default: 36x24)")
     parser.add_argument(
         "--width", metavar="PX", type=whole(1, 16384), default=960, help="of the picture (default: 960)"
@@ -102,6 +109,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("neurolens flare", "--layers", args.layers, "0 with --photons, which know no single ghosts")
     if args.out is not None:
         check_suffix(args.out, "--out", (".exr",))
+    if args.path is not None:
+        check_suffix(Path(args.path[1]), "--path", (".png", ".pdf", ".svg"))
     args.focus = float("inf") if args.focus is None else args.focus
     lens = state_of(args, read_lens(lens_path(args.file, "flare")))
     lens = lens if args.coating is None else coated(lens, args.coating)
@@ -110,6 +119,9 @@ def run(args: argparse.Namespace) -> int:
     rows = [ghost_table(tracer, light, 550.0) for light in lights]
     found = {"lens": lens.name, "pairs": len(tracer.pairs), "lights": [plain(asdict(light)) for light in lights]}
     found |= {"ghosts": [[_about(ghost) for ghost in of_light] for of_light in rows]}
+    if args.path is not None:
+        _draw(lens, args.path[0], Path(args.path[1]), lights[0], tracer.pairs)
+        found["path"] = args.path[1]
     if args.out is not None:
         found["out"] = str(args.out)
         _write(args, tracer, lens, lights, rows, found)
@@ -147,6 +159,18 @@ def _write(
     metadata = {"neurolens": __version__, "flare": {**about, "settings": plain(settings)}}
     header = standard_attributes(placed_settings(lens, args.film, args.focus), raster.width, raster.height)
     write_exr(args.out, picture.sum(0), metadata=metadata, layers=layers if args.layers else None, attributes=header)
+
+
+def _draw(lens: Lens, name: str, out: Path, light: Light, pairs: tuple[Pair, ...]) -> None:
+    from neurolens.analysis.layout import lens_layout
+    from neurolens.flare.picture import ghost_layout
+
+    pair = next((p for p in pairs if p.name == name), None)
+    if pair is None:
+        raise InputError(
+            "neurolens flare", "--path", name, f"a ghost of this lens, as {pairs[0].name}" if pairs else ""
+        )
+    lens_layout(ghost_layout(lens, pair, light), out)
 
 
 def _light(text: str) -> Light:

@@ -10,18 +10,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from neurolens.analysis.fields import Scene
+from neurolens.analysis.layout import Layout, Line, layout_profile
 from neurolens.base.errors import InputError
+from neurolens.base.status import PASSED
 from neurolens.flare.ghosts import GhostTracer, Pair
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.stack import Floats
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import sag_mm
+from neurolens.optics.sequence import follow, ghost
 from neurolens.optics.trace import Rays, trace
 from neurolens.render.spectrum import SpectralRange
 
@@ -168,6 +172,38 @@ def ghost_table(tracer: GhostTracer, light: Light, wavelength_nm: float, count: 
         energy = float(share.sum() / image) if image > 0 else math.inf
         rows.append(Ghost(pair, energy, (float(centre[0]), float(centre[1])), size, float(lit.mean())))
     return sorted(rows, key=lambda ghost: -ghost.energy)
+
+
+def ghost_layout(lens: Lens, pair: Pair, light: Light, lines: int = 9) -> Layout:
+    """The lens with rays of one ghost in the plane through the axis, of light as far off the axis as `light`.
+
+    At most so many rays, evenly chosen of those that arrive.
+
+    Raises:
+        InputError: none does.
+    """
+    front = lens.surfaces[0].semi_diameter_mm
+    off = math.acos(min(-float(light.towards[2]), 1.0))
+    height = torch.linspace(-1.2 * front, 1.2 * front, 4001, dtype=torch.float64)
+    zero, before = torch.zeros_like(height), -0.4 * front
+    rays = Rays(zero, height + before * math.tan(-off), zero + before, zero, zero - math.sin(off), zero + math.cos(off))
+    found = follow(lens, rays, ghost(len(lens.surfaces), *pair))
+    arriving = torch.nonzero(found.status == PASSED)[:, 0]
+    if not len(arriving):
+        raise InputError(
+            lens.path, "ghost", pair.name, f"one of which light {math.degrees(off):.3g} degrees off arrives"
+        )
+    chosen = arriving[torch.linspace(0, len(arriving) - 1, min(lines, len(arriving))).long()]
+    scene = Scene(lens, math.inf)
+    way = (scene.film_z_mm - found.rays.z) / found.rays.dz
+    places = [(rays.z, rays.y), *((z, y) for _, y, z in found.points)]
+    places.append((found.rays.z + way * found.rays.dz, found.rays.y + way * found.rays.dy))
+    label = f"{pair.name}, {len(arriving) / len(height):.0%} of the height"
+    drawn = tuple(Line(np.array([[float(z[k]), float(y[k])] for z, y in places]), label, 0) for k in chosen)
+    subtitle = (
+        f"light {math.degrees(off):.3g} degrees off the axis, reflected at surface {pair.second}, then {pair.first}"
+    )
+    return replace(layout_profile(scene), rays=drawn, subtitle=subtitle)
 
 
 @dataclass(frozen=True)

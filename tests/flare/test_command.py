@@ -16,6 +16,10 @@ def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert main(["flare", "laikin_double_gauss_50", "--light", "15,8"]) == 0
     said = capsys.readouterr().out
     assert "66 pairs" in said and "g12-11" in said
+    drawn = tmp_path / "path.svg"
+    assert main(["flare", "laikin_double_gauss_50", "--light", "15,8", "--path", "g08-06", str(drawn)]) == 0
+    assert drawn.read_text().startswith("<?xml")
+    capsys.readouterr()
     small = ["--width", "48", "--samples", "4096", "--wavelengths", "3", "--layers", "2", "--json"]
     assert main(["flare", "laikin_double_gauss_50", "--light", "15,8,0.5/0.4/0.3", "-o", str(out), *small]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -52,6 +56,8 @@ def test_photons_paint_the_ghosts(tmp_path: Path) -> None:
         (["--light", "1,2", "--photons", "9", "--layers", "2", "-o", "x.exr"], "--layers"),
         (["--light", "0,0", "-o", "x.png"], ".exr"),
         (["--light", "0,0", "--coating", "velvet"], "velvet"),
+        (["--light", "0,0", "--path", "g99-01", "x.png"], "g99-01"),
+        (["--light", "0,0", "--path", "g08-06", "x.gif"], "--path"),
     ],
 )
 def test_bad_words(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,7 +12,15 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.flare.ghosts import GhostTracer, Pair, coated, ghost_pairs
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import Light, Raster, axis_irradiance, ghost_picture, ghost_table, light_rays
+from neurolens.flare.picture import (
+    Light,
+    Raster,
+    axis_irradiance,
+    ghost_layout,
+    ghost_picture,
+    ghost_table,
+    light_rays,
+)
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
@@ -262,3 +270,17 @@ def test_photons_are_absorbed_as_beer_says() -> None:
     assert nothing.cast == 0 and nothing.film_xy_mm.shape == (2, 0)
     with pytest.raises(InputError, match="most_reflections"):
         PhotonTracer(grey).trace(rays, 550.0, most_reflections=-1)
+
+
+def test_the_picture_of_a_path_goes_from_the_light_to_the_film() -> None:
+    """A ray of a plate's ghost, drawn: forward, back, forward; ends on the film as the closed form says."""
+    lens = plate()
+    layout = ghost_layout(lens, Pair(0, 1), Light(10.0, 0.0))
+    inside, outside = math.tan(math.asin(math.sin(math.radians(10)) / 1.5)), math.tan(math.radians(10))
+    for line in layout.rays:
+        z, y = line.points.T
+        assert z[1:] == pytest.approx([0, 4, 0, 4, 10, 20])
+        assert y[1] - y[-1] == pytest.approx(16 * outside + 12 * inside)
+    assert len(layout.rays) == 9
+    with pytest.raises(InputError, match="arrives"):
+        ghost_layout(lens, Pair(0, 1), Light(80.0, 0.0))
