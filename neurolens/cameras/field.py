@@ -38,7 +38,7 @@ _PUPIL = 6, 24  # rings of pupil samples, and samples of a ring
 _RAYS = 1 << 17  # at once
 _ROUND, _OTHER = (513, 1), (97, 64)  # radii and azimuths of the tables
 _BEYOND = 1.02  # radius of the film's corner over that of the light: as lenses are engraved
-_FINER = 4  # rings and azimuths of the map back, over those of the map there
+_FINER = 64, 4  # rings (and azimuths) of the map back over those of the map there, of round cameras and of others
 _EDGE = 16  # points on each side of the film
 _TRIED, _AZIMUTHS, _UNEVEN = (0.4, 0.7, 0.95), 7, 3e-6  # where roundness is tried; of the radius
 _HALVINGS = 24
@@ -223,7 +223,7 @@ class Polar:
         end: radius of the last ring, mm; beyond it the map goes on straight along the radius.
         ratio: [R, A] complex, at equal steps of radius (from 0) and azimuth (from +x); A is 1 where the map is round.
         slope: [A] complex, derivative along the radius at the last ring.
-        shift: what is added everywhere.
+        shift: what is added everywhere, of cameras that are not round.
     """
 
     end: float
@@ -235,7 +235,7 @@ class Polar:
     def of(cls, end: float, place: Complex) -> Polar:
         """Of where the points of the rings go, [R, A]; the first ring is the centre."""
         rings, turn = place.shape[0], turns(place.shape[1])
-        shift = complex(place[0].mean())
+        shift = complex(place[0].mean()) if len(turn) > 1 else 0j  # of a round camera it is rounding
         radius = np.linspace(0, end, rings)[:, None]
         ratio = np.ones_like(place)
         ratio[1:] = (place[1:] - shift) / (radius[1:] * turn)
@@ -286,18 +286,18 @@ class Field:
     """A camera's picture and its undistorted one.
 
     Attributes:
-        to_ideal, to_picture: undistorted place of a picture point and back, both x + i y in mm.
+        ideal, picture: undistorted place of a picture point and back, both x + i y in mm.
         frame, target: see the module.
         end_mm: radius of the tables: the film's corner, or where the light ends.
         field_deg: widest angle to the axis of light that arrives within it.
-        light: [R, A] on the rings of `to_ideal`, over that on the axis.
+        light: [R, A] on the rings of `ideal`, over that on the axis.
         parallax_mm: by how much undistorted places of points at other distances (m from the film) are wrong, the worst
             of the film's edge.
         spectrum: wavelengths in nm and weights.
     """
 
-    to_ideal: Polar
-    to_picture: Polar
+    ideal: Polar
+    picture: Polar
     frame: Frame
     target: str
     end_mm: float
@@ -305,17 +305,6 @@ class Field:
     light: Array
     parallax_mm: dict[float, float]
     spectrum: Spectrum
-
-    def ideal(self, point: Complex) -> Complex:
-        """Undistorted places of picture points, mm."""
-        return self.to_ideal(point)
-
-    def picture(self, place: Complex) -> Complex:
-        """Picture points of undistorted places, mm."""
-        point = self.to_picture(place)
-        if self.light.shape[1] > 1:  # its tables are coarse: a step makes one nearly the inverse of the other
-            point = np.where(np.abs(point) < self.end_mm, point + (place - self.to_ideal(point)), point)
-        return point
 
     def lit(self, point: Complex) -> NDArray[np.bool_]:
         """Whether light arrives at picture points."""
@@ -384,13 +373,12 @@ def field_of(
     if not rising.all():
         fold = end * (int(np.argmin(rising)) + 1) / (rings - 1)
         raise InputError(camera.name, "film_mm", camera.film_mm, f"no picture beyond {fold:.4g} mm, where it folds")
-    to_ideal, light = Polar.of(end, place), found.light.reshape(rings, azimuths)
+    ideal, light = Polar.of(end, place), found.light.reshape(rings, azimuths)
     others = [] if math.isinf(distance) else [d for d in (math.inf, 2 * distance, distance / 2) if d > 2 * nearest]
     moved = {d: np.abs(at(edge / _BEYOND, d)[0] - edge_place) for d in others}
     parallax = {d: float(np.nanmax(m, initial=0.0)) for d, m in moved.items()}
-    to_picture = _inverted(to_ideal)
     light = light / light[0].mean()
-    return Field(to_ideal, to_picture, frame, target, end, widest, light, parallax, spectrum)
+    return Field(ideal, _inverted(ideal), frame, target, end, widest, light, parallax, spectrum)
 
 
 def _film_edge(film_mm: tuple[float, float]) -> Complex:
@@ -441,11 +429,14 @@ def _filled(place: Complex) -> Complex:
 
 def _inverted(forward: Polar) -> Polar:
     """The map back, by Newton's method from rings to where they come from."""
-    rings, azimuths = (_FINER * n - (_FINER - 1) * (n == 1) for n in forward.ratio.shape)
+    rings, azimuths = forward.ratio.shape
+    finer = _FINER[azimuths > 1]
+    rings, azimuths = finer * (rings - 1) + 1, finer * azimuths if azimuths > 1 else 1
     turn = turns(azimuths)
     radius = np.linspace(0, forward.end, rings)
-    mean = np.abs(forward(radius[:, None] * turn) - forward.shift).mean(1)
-    goal = np.linspace(0, mean[-1], rings)[:, None] * turn
+    reach = np.abs(forward(radius[:, None] * turn))
+    mean, end = reach.mean(1), float(reach[-1].max())
+    goal = np.linspace(0, end, rings)[:, None] * turn
     point = np.interp(np.abs(goal), mean, radius) * turn
     small = 1e-6 * forward.end
     for _ in range(_STEPS):
@@ -454,4 +445,4 @@ def _inverted(forward: Polar) -> Polar:
         det = ax.real * ay.imag - ax.imag * ay.real
         step = (wrong.real * ay.imag - wrong.imag * ay.real) + 1j * (wrong.imag * ax.real - wrong.real * ax.imag)
         point = point - step / det
-    return Polar.of(float(mean[-1]), point)
+    return Polar.of(end, point)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.cameras.cameragraph import D_FILM, weight_graph
-from neurolens.cameras.focus_function import Focusing, film_function
+from neurolens.cameras.focus_function import FOCUS, SMALLEST, Focusing, film_function
 from neurolens.cameras.lens_state import squeeze_of
 from neurolens.cameras.model import ModelScene
 from neurolens.cameras.onnxlens import OnnxLens
@@ -34,6 +34,7 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
 from neurolens.graph.loworder import with_film_derivatives, with_low_order_derivatives
 from neurolens.graph.osl import Parameter, write_osl
+from neurolens.graph.program import STOP_RADIUS
 from neurolens.graph.scalars import lower
 from neurolens.modelfile.graph import graph_of
 from neurolens.optics.film_plane import LINE_D_NM
@@ -41,13 +42,15 @@ from neurolens.optics.film_plane import LINE_D_NM
 Array = NDArray[np.float64]
 OUTPUTS = ("position", "direction", "throughput", "dPdx", "dPdy", "dDdx", "dDdy")
 MAX_BLADES = 16
-_LEAST_M, _FAR_M = 1e-3, 1e-4  # Blender's focus distance below this means that depth of field is off
+_FAR_M = 1e-4  # Blender's focus distance below this means that depth of field is off
 _LOW_BITS = 4096.0  # of a random number: what lies below 1 / 4096 of it
 _QUADRATURE = 64  # points a side of the exposure on the axis
 _NEAR = 0.999  # of the near limit: rounding
 # Cycles takes the mean size of derivatives, for the footprint of a pixel: their errors by output, and of all of them.
 _DERIVATIVES, _WORST = 0.03, 0.05
+_ACROSS, _FILM_POWERS = 16, 7  # distances and stops at which the film is placed, and powers of each
 _BESIDE = 0.01  # of the film radius: near the axis
+_LIGHT_NM = (400.0, 700.0)  # colours beyond would spread fringes that no eye and no film sees
 Report = Callable[[float], object]
 _FRAME = """\
     point raster = camera_shader_raster_position();
@@ -73,20 +76,25 @@ class OslCamera:
     """What a shader is made of.
 
     Attributes:
-        sight: the lens. arcs: its pupil. film: its position `film_z_mm` by `focus_m` and
-            `stop_radius_mm`. near_m: nearest distance, inf where the film does not focus.
+        sight: the lens. arcs: its pupil. film: its position
+            (mm) by powers of stop and focus, see `_film`. near_m: nearest distance, inf where the film does not focus.
         f_number: of the widest stop. efl_mm: focal length.
         entrance_mm: z of the entrance pupil, lens frame.
     """
 
     sight: Sight
     arcs: PupilArcs
-    film: Graph
+    film: Array
     near_m: float
     f_number: float
     efl_mm: float
     entrance_mm: float
     pupil_z_mm: float
+
+    @property
+    def nearest_m(self) -> float:
+        """The distance that vergences are shares of."""
+        return self.near_m if math.isfinite(self.near_m) else 1.0
 
 
 def parameters(camera: OslCamera) -> list[Parameter]:
@@ -173,8 +181,8 @@ class _Call:
         self.film_z = g.constant(camera.sight.film_z_mm[0])
         for _ in range(2):  # distances are from the film there
             distance = away + (self.film_z - camera.entrance_mm) * at_pupil * 1e-3
-            given = {"focus_m": distance.maximum(_LEAST_M), "stop_radius_mm": self.stop}
-            self.film_z = g.inline(camera.film, given)["film_z_mm"]
+            vergence = (camera.nearest_m / distance).clip(0.0, 1.0)
+            self.film_z = _in_turn(g, camera.film, self.stop * (1 / widest), vergence)
         moves = math.isfinite(camera.near_m)
         self.focused = g.constant(camera.near_m * _NEAR if moves else 0.0) <= distance
         # Of the ray in the camera's frame, turned: from the film, or from the entrance pupil.
@@ -187,13 +195,24 @@ class _Call:
         """The numbers of `weight_graph`."""
         g, camera = self.g, self.camera
         per_distance = 1.0 / (self.film_z - camera.pupil_z_mm)
-        powers, weights = _exposure(camera)
-        variables = g.concat(self.stop * (1 / camera.sight.stop_radius_mm), _place(camera, self.film_z))
         share = self.stop * (1 / camera.sight.stop_radius_mm)
-        own = g.polynomial(powers, weights[None], variables) * share * share
+        own = _in_turn(g, _exposure(camera), share, _place(camera, self.film_z)) * share * share
         nominal = math.pi / (4 * camera.f_number**2)
         exposure = g.select(self.number("as_lens") <= 0.5, own, nominal)
         return {"per_distance": per_distance, "scale": per_distance * per_distance / exposure}
+
+
+def _in_turn(g: Graph, weights: Array, first: Value, then: Value) -> Value:
+    """A polynomial in two numbers of the call, weights [N, M] of powers of the one and the other.
+
+    Shaders are compiled when the stop is known, and often before the focus is: it comes last.
+    """
+    total: Value | None = None
+    for row in weights.T[::-1]:
+        part = g.series(first, row)
+        total = part if total is None else total * then + part
+    assert total is not None
+    return total
 
 
 def _place(camera: OslCamera, film_z: Value) -> Value:
@@ -258,8 +277,8 @@ def _with_derivatives(camera: OslCamera) -> Graph:
     return with_film_derivatives(camera.sight.graph) if found is None else found.graph
 
 
-def _exposure(camera: OslCamera) -> tuple[NDArray[np.int64], Array]:
-    """Exposure on the axis over the square of the stop's share, as powers and weights of that share and the place."""
+def _exposure(camera: OslCamera) -> Array:
+    """Exposure on the axis over the square of the stop's share, by powers [N, M] of that share and the place."""
     sight = camera.sight
     square, nanometres = stratified(_QUADRATURE, sight.wavelength_nm)
     low, high = sight.film_z_mm
@@ -284,9 +303,26 @@ def _exposure(camera: OslCamera) -> tuple[NDArray[np.int64], Array]:
             weight = evaluate(weight_graph(), given | lens | {"lens_status": lens["status"]})["weight"]
             rows.append((share, (z - camera.arcs.film_z_mm[0]) / camera.arcs.film_z_mm[1]))
             values.append(float(np.mean(weight, dtype=np.float64)) / share**2)
-    powers = np.array([(i, j) for i in range(4) for j in range(len(places))])
-    a = np.stack([[s**i * p**j for i, j in powers] for s, p in rows])
-    return powers, np.linalg.lstsq(a, np.array(values), rcond=None)[0]
+    return _powers(np.array(rows), np.array(values), (4, len(places)))
+
+
+def _powers(at: Array, values: Array, shape: tuple[int, int]) -> Array:
+    """Least squares weights [N, M] of powers of two numbers, at places [K, 2] with values [K]."""
+    a = np.stack([at[:, 0] ** i * at[:, 1] ** j for i in range(shape[0]) for j in range(shape[1])], axis=1)
+    return np.asarray(np.linalg.lstsq(a, values, rcond=None)[0]).reshape(shape)
+
+
+def _film(focusing: Focusing) -> Array:
+    """Best focus (mm) by powers of the stop's share and of the nearest distance over the distance."""
+    function = film_function([focusing])
+    moves = math.isfinite(focusing.nearest_m)
+    side = (1 - np.cos(np.pi * (np.arange(_ACROSS) + 0.5) / _ACROSS)) / 2
+    share, vergence = (a.ravel() for a in np.meshgrid(SMALLEST + (1 - SMALLEST) * side, side if moves else [0.0]))
+    nearest = focusing.nearest_m if moves else 1.0
+    call = {FOCUS: nearest / np.maximum(vergence, 1e-9), STOP_RADIUS: share * focusing.stop_radius_mm}
+    z = evaluate(function.graph, {name: value[None] for name, value in call.items()})["film_z_mm"][0]
+    z = np.broadcast_to(z, share.shape)
+    return _powers(np.stack([share, vergence], 1), z, (_FILM_POWERS, _FILM_POWERS if moves else 1))
 
 
 def model_camera(model: OnnxLens, graph: Graph | None, report: Report) -> OslCamera:
@@ -297,18 +333,24 @@ def model_camera(model: OnnxLens, graph: Graph | None, report: Report) -> OslCam
     """
     lens, d = model.card["lens"], model.card["domain"]
     low, high = d["film_z_mm"]
-    short, long = d["wavelength_nm"]
+    short, long = _light_of(*map(float, d["wavelength_nm"]))
     stop = float(d["stop_radius_mm"])
     if graph is None:
         graph = graph_of(model.path, model.data, model.state if model.axes else ())
     height = _BESIDE * float(d["film_radius_mm"])
-    squeeze = squeeze_of(ModelScene(model, float(low), stop), height, (float(short), float(long)))
+    squeeze = squeeze_of(ModelScene(model, float(low), stop), height, (short, long))
     sight = Sight(
-        graph, PupilTable.of(d["bounds"]), (float(low), float(high)), (float(short), float(long)), stop,
+        graph, PupilTable.of(d["bounds"]), (float(low), float(high)), (short, long), stop,
         int(lens.get("stop_surface", 0)), squeeze != 1.0,
     )  # fmt: skip
     focusing = model_focusing(model, model.state if model.axes else ())
     return osl_camera(sight, focusing, lens["f_number"] * lens["stop_radius_mm"] / stop, lens["efl_mm"], report)
+
+
+def _light_of(short_nm: float, long_nm: float) -> tuple[float, float]:
+    """Of the wavelengths of a model those that pictures are made of; all where it is of others."""
+    short, long = max(short_nm, _LIGHT_NM[0]), min(long_nm, _LIGHT_NM[1])
+    return (short, long) if short < long else (short_nm, long_nm)
 
 
 def osl_camera(sight: Sight, focusing: Focusing, f_number: float, efl_mm: float, report: Report) -> OslCamera:
@@ -318,9 +360,8 @@ def osl_camera(sight: Sight, focusing: Focusing, f_number: float, efl_mm: float,
         InputError: no ray passes.
     """
     arcs = fit_arcs(sight, report)
-    film = film_function([focusing])
     plane = sight.table.pupil_z_mm
-    return OslCamera(sight, arcs, film.graph, focusing.nearest_m, f_number, efl_mm, _entrance_mm(sight), plane)
+    return OslCamera(sight, arcs, _film(focusing), focusing.nearest_m, f_number, efl_mm, _entrance_mm(sight), plane)
 
 
 def _entrance_mm(sight: Sight) -> float:

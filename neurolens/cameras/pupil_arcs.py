@@ -113,10 +113,16 @@ class PupilArcs:
         own = self.exponents[:, 3] == wave
         for power in range(self.exponents[own, 0].max(), -1, -1):
             here = own & (self.exponents[:, 0] == power)
-            term = g.polynomial(self.exponents[here, 1:3], numbers[:, here], call)
+            term = self._of_call(g, self.exponents[here, 1:3], numbers[:, here], call)
             rows = term if rows is None else rows * radius + term
         assert rows is not None
         return rows
+
+    def _of_call(self, g: Graph, exponents: NDArray[np.int64], numbers: Array, call: Value) -> Value:
+        """Rows of polynomials in the stop and, to first order, film position: the stop is known before the focus is."""
+        moves = exponents[:, 1] == 1
+        still, moved = (g.polynomial(exponents[part, :1], numbers[:, part], call[0]) for part in (~moves, moves))
+        return still + moved * call[1] if moves.any() else still
 
     @cached_property
     def checked(self) -> Graph:

@@ -26,7 +26,7 @@ from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, fingerprint_of
 from neurolens.cameras.contract import Camera
-from neurolens.render.film import CHUNK_BYTES, Film, Tiling
+from neurolens.render.film import CHUNK_BYTES, RGB, Film, Tiling
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.job import Job
 from neurolens.render.mesh import tracer
@@ -39,6 +39,7 @@ _FORMAT = 3
 _ABOUT, _SUMS, _DONE = "about.json", "sums.npy", "done.npy"
 SPENT = ("seconds", "camera_thread_seconds", "thread_seconds")
 _LARGEST_ABOUT = 8 << 20
+_BRIGHTEST = 1e37  # sum of a pixel, which float32 shall hold after the white balance, too
 _LONGEST = 80  # characters of a value in a message
 _AGAIN = "or --restart to begin again"
 
@@ -156,6 +157,7 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
             _fill(archive, members[_DONE], done)
             _check_samples(path, about["samples"], film.tiling, done)
             _fill(archive, members[_SUMS], film.sums)
+            _check_sums(film.sums)
             film.done[:] = done
             return {name: float(value) for name, value in about["spent"].items()}
     except InputError:
@@ -218,6 +220,14 @@ def _check_samples(path: Path, samples: int, tiling: Tiling, done: NDArray[np.in
         raise InputError(path, "samples", most, f"{tiling.samples} at most, as asked now: ask for more, {_AGAIN}")
     expected = f"a multiple of {tiling.step}, which alone can be raised to {tiling.samples}; give the same, {_AGAIN}"
     raise InputError(path, "samples", samples, expected)
+
+
+def _check_sums(sums: NDArray[np.float64]) -> None:
+    """No render has others: samples that are not finite are dropped, and emission is bounded."""
+    for columns, most in ((sums[:, RGB], _BRIGHTEST), (sums, _BRIGHTEST**2)):  # squares of luminance are the largest
+        if columns.min() >= -most and columns.max() <= most:
+            continue
+        raise ValueError("impossible sums")
 
 
 def _header(array: NDArray[Any]) -> bytes:

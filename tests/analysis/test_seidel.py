@@ -1,7 +1,9 @@
 """Seidel sums against closed forms of thin lenses (Welford 1986, 12.2), stop shifts, and exact rays."""
 
+import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -179,6 +181,24 @@ def _slope(given: Scene) -> float:
 def _paraxial_shift(given: Scene) -> float:
     close = bundle(given.open, [0.0], [D], points([1e-2], [0.0]))
     return float(-close.tangential_mm / close.slopes[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "oracle"),
+    [
+        ("laikin_double_gauss_50", "laikin_double_gauss_50_f1.8"),
+        ("ogawa_zoom_70_200", "ogawa_canon_70_200_us5537259"),
+    ],
+)
+def test_scale_and_pupil_of_real_rays_are_the_oracle_s(name: str, oracle: str) -> None:
+    """The focal length that rays see near the axis, and the entrance pupil at which chief rays aim."""
+    path = Path(__file__).parents[3] / "shared" / "data" / "oracle" / f"{oracle}.json"
+    if not path.exists():
+        pytest.skip("../shared/data/oracle is not here")
+    given, wanted = library(name), json.loads(path.read_text())["first_order"]
+    assert distortion(given, edge_deg=1.0, fields=2).scale_mm == pytest.approx(wanted["efl"], rel=1e-6)
+    chief = given.chief_rays([1e-3]).start
+    assert float(chief.z - chief.y / chief.dy * chief.dz) == pytest.approx(wanted["enp_z"], rel=1e-6)
 
 
 def test_coddington_along_the_chief_ray() -> None:

@@ -129,7 +129,7 @@ def test_derivatives_are_those_of_neighbouring_pixels() -> None:
 def arcs_inputs(film: np.ndarray, square: np.ndarray) -> dict[str, np.ndarray]:
     sight = written().sight
     stop = written().f_number * sight.stop_radius_mm / 8.0
-    z = evaluate(written().film, {"focus_m": np.array([[2.0]]), "stop_radius_mm": np.array([[stop]])})["film_z_mm"]
+    z = film_z(2.0, stop)
     nm = np.full((1, film.shape[1]), 587.5618)
     return {
         "film_mm": film,
@@ -138,6 +138,18 @@ def arcs_inputs(film: np.ndarray, square: np.ndarray) -> dict[str, np.ndarray]:
         "stop_radius_mm": np.array([[stop]]),
         "wavelength_nm": nm,
     }
+
+
+def film_z(focus_m: float, stop_mm: float) -> np.ndarray:
+    share, vergence = stop_mm / written().sight.stop_radius_mm, written().near_m / focus_m
+    return np.array([[np.polynomial.polynomial.polyval2d(share, vergence, written().film)]])
+
+
+def test_film_is_where_the_camera_of_the_model_has_it() -> None:
+    for f_number, focus_m in ((1.8, math.inf), (2.8, 1.0), (5.6, 0.7), (11.0, 3.0)):
+        camera = OnnxCamera(load_model(MODEL), film_mm=FILM, focus_m=focus_m, f_number=f_number)
+        stop = camera.settings["stop_radius_mm"]
+        assert float(film_z(focus_m, stop)[0, 0]) == pytest.approx(camera.film.film_z_mm, abs=2e-3)
 
 
 def lens_ray(film: np.ndarray, pupil: np.ndarray) -> np.ndarray:

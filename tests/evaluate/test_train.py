@@ -3,6 +3,9 @@
 import json
 import math
 import os
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,8 +24,7 @@ from neurolens.evaluate.measure import fit_and_measure
 from neurolens.evaluate.train import run_experiment
 from neurolens.evaluate.train_states import fit_and_measure_states, state_settings
 from neurolens.surrogates.cores import Network
-from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.fits import checkpoint
+from neurolens.surrogates.fit import ModelSettings, prepare
 from neurolens.surrogates.pairs import make_pairs
 from neurolens.surrogates.states_fit import StateSettings
 from neurolens.surrogates.stored import load_fitted
@@ -244,22 +246,41 @@ def test_a_second_run_takes_the_model_that_is_there(tmp_path: Path) -> None:
     assert CASES[0].name in text and "80.09" in text
 
 
-def test_a_training_that_was_interrupted_is_taken_up_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The next run of the same command ends with the very same weights."""
-    monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
-    settings, data = ModelSettings("mlp", units=6, layers=1, steps=20), lens_models.prepared()
+KILLED = """
+import os, signal, sys
+from neurolens.cli import main
+from neurolens.surrogates.fits.checkpoint import Checkpoint
+saved, save = [], Checkpoint.save
+def save_and_die(self, state, arrays, *, now=False):
+    save(self, state, arrays, now=True)
+    saved.append(state)
+    if len(saved) == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+Checkpoint.save = save_and_die
+main(sys.argv[1:])
+"""
 
-    def interrupt(share: float) -> None:
-        if share > 0.3:
-            raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        fit_and_measure(data, settings, tmp_path, 2000, interrupt)
-    file = tmp_path / f"{settings.label}.training.npz"
-    with np.load(file) as left:
-        assert b'"ended": false' in left["header"].tobytes()
-    made = load_fitted(fit_and_measure(data, settings, tmp_path, 2000, lambda share: None).file).core
-    whole = fit_model(data, settings).core
-    assert isinstance(made, Network) and isinstance(whole, Network) and not file.exists()
-    for a, b in zip((*made.hidden, made.output), (*whole.hidden, whole.output), strict=True):
-        assert all(np.array_equal(x.astype(np.float32), y.astype(np.float32)) for x, y in zip(a, b, strict=True))
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")
+def test_a_training_that_was_killed_is_taken_up_again(tmp_path: Path) -> None:
+    """The same command once more ends with the very bytes of a run that nothing stopped, but for the time it took."""
+
+    def command(name: str) -> list[str]:
+        network = 'model=[{method="mlp",units=6,layers=1,steps=20}]'
+        return ["train", "--lens", SINGLET, "--out", str(tmp_path / name), *QUICK, "--set", network]
+
+    process = subprocess.run([sys.executable, "-c", KILLED, *command("killed")], capture_output=True, text=True)
+    assert process.returncode == -signal.SIGKILL, process.stderr
+    (left,) = (tmp_path / "killed").rglob("*.training.npz")
+    with np.load(left) as held:
+        assert b'"ended": false' in held["header"].tobytes()
+    assert main(command("killed")) == main(command("whole")) == 0
+    assert not left.exists()
+
+    def made(name: str) -> tuple[dict, list[bytes]]:
+        (file,) = (tmp_path / name).rglob("*.onnx")
+        card, core = load_model(file).card, load_fitted(file).core
+        assert isinstance(core, Network) and card["fit"].pop("seconds") > 0
+        return card, [numbers.tobytes() for layer in (*core.hidden, core.output) for numbers in layer]
+
+    assert made("killed") == made("whole")

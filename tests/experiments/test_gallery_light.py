@@ -260,6 +260,22 @@ def test_the_disc_of_a_thin_lens_has_its_closed_form(place: str) -> None:
     assert found.axes_mm == pytest.approx((0.99 * expected, 0.99 * expected), rel=3e-3)
 
 
+@pytest.mark.parametrize("place", ["far", "edge"])
+def test_the_disc_found_backwards_is_that_of_light_traced_forwards(place: str) -> None:
+    """Of the exact camera: its film points of a light's rays, and the film points whose rays find the light."""
+    taken, side = taken_by("exact"), 200
+    middle = ((np.arange(side) + 0.5) / side).astype(np.float32)
+    pupil = np.stack([a.ravel() for a in np.meshgrid(middle, middle)])
+    light = np.array(bokeh.light_towards(taken, 0.93 if place == "edge" else 0, FAR_M), np.float32)
+    out = taken.to_film(np.repeat(light[:, None], side**2, axis=1), pupil, np.full(side**2, 550, np.float32))
+    lit = out.status == st.PASSED
+    forwards = LightDisc(out.film_mm[:, lit].astype(float), out.weight[lit].astype(float) / side**2)
+    backwards = disc("exact", "round", place)
+    assert backwards.centre_mm == pytest.approx(forwards.centre_mm, abs=5e-3)
+    assert backwards.axes_mm == pytest.approx(forwards.axes_mm, rel=5e-3)
+    assert backwards.total == pytest.approx(forwards.total, rel=0.01)
+
+
 @pytest.mark.parametrize("kind", ["exact", "surrogate"])
 def test_rims_cut_cats_eyes_across_the_radius(kind: str) -> None:
     """Narrower, smaller and darker the nearer to the corner, long across the radius; a thin lens has none."""
@@ -300,6 +316,13 @@ def test_a_disc_has_the_corners_of_the_stop_and_its_area_passes(kind: str, stop:
     assert depth > 0.03 > 3 * bokeh.outline_waves(disc(kind, "round", "far"))[1]
     area = shape(stop).area_share  # type: ignore[union-attr]
     assert bokeh.passage(taken_by(kind, stop)) == pytest.approx(area, abs=0.003 if kind == "thin" else 0.025)
+
+
+def test_fifty_blades_are_round_and_masks_open_the_shares_that_the_page_gives() -> None:
+    assert bokeh.passage(taken_by("thin", "50")) == pytest.approx(math.sin(math.pi / 25) * 25 / math.pi, abs=3e-3)
+    assert bokeh.outline_waves(disc("thin", "50", "far"))[1] < 0.01
+    for name, share in (("star", 0.452), ("heart", 0.470)):
+        assert shape(name).area_share == pytest.approx(share, abs=2e-3)  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("kind", ["surrogate", "thin"])

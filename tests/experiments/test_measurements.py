@@ -54,6 +54,18 @@ def test_rows_of_an_earlier_run_are_kept_or_refused(tmp_path: Path) -> None:
             kept()
 
 
+@pytest.mark.parametrize("name", ["vignetting", "inverse", "zoom"])
+def test_results_of_another_kind_are_not_written_over(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)  # one makes a folder of models first
+    file = tmp_path / f"{name}.json"
+    for text in ("half a fi", "3", '[{"lens": "other"}]'):
+        file.write_text(text)
+        assert main([name, "--quiet", "--out", str(tmp_path)]) == 2
+        assert f"rows of experiments {name}" in capsys.readouterr().err and file.read_text() == text
+
+
 def test_goals_cannot_be_missed_unseen() -> None:
     made = [lab.Goal("a", 5.0, v, at_least=at_least) for at_least in (True, False) for v in (4.9, 5.0, 5.1, None)]
     reached, missed = "reached", "missed"

@@ -205,7 +205,7 @@ def test_shut_and_impossible_pinholes() -> None:
 
 STAR = np.array([[0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 1, 0, 1, 0]])
 SHAPES = [
-    *(Aperture(n) for n in (3, 4, 5, 6, 9, 50)),
+    *(Aperture(n, 13.0) for n in (3, 4, 5, 6, 8, 9, 50)),
     *(Aperture(7, 20.0, c) for c in (0.25, 0.5, 1.0)),
     *(Aperture(mask=STAR), Aperture(mask=STAR, rotation_deg=30.0), Aperture(mask=np.ones((3, 8)))),
 ]
@@ -225,7 +225,7 @@ def square_of_points(side: int) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("shape", SHAPES, ids=name)
 def test_counted_points_agree_with_the_area(shape: Aperture) -> None:
     """Of straight blades that is n / (2 pi) sin(2 pi / n) of the circle: 75.7% for five, 82.7% for six."""
-    x, y = square_of_points(1201)
+    x, y = square_of_points(1501)
     share = shape.inside(2.5 * x, 2.5 * y, 2.5).sum() / (x * x + y * y <= 1).sum()
     straight = bool(shape.blades) and not shape.curvature
     assert share == pytest.approx(shape.area_share, abs=1e-3 if straight else 2e-3)

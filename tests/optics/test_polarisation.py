@@ -15,7 +15,9 @@ from neurolens.optics.coatings import Layers, powers, transmittance
 from neurolens.optics.transmission import Step, pass_surface, power, unpolarised
 
 ROOT = Path(__file__).parents[2]
+SHARED = ROOT.parent / "shared" / "data" / "oracle"
 OWN = json.loads((ROOT / "tests" / "data" / "fresnel_paths.json").read_text())["lenses"]
+WHOLE = ("full_double_gauss_n1691", "full_tessar", "full_even_asphere_50mm")
 LAM_NM = 587.5618
 FILMS: Layers = ((1.38, 100.0), (2.1, 120.0), (1.7, 80.0))
 
@@ -84,6 +86,24 @@ def check(lens: dict[str, Any]) -> None:
 @pytest.mark.parametrize("lens", OWN, ids=lambda lens: lens["name"])
 def test_own_reference_paths(lens: dict[str, Any]):
     check(lens)
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_reference_paths_of_the_whole_set(name: str):
+    if not (SHARED / "fresnel_sequential.json").exists():
+        pytest.skip("../shared/data/oracle is not here; a selection of it is tested above")
+    data = json.loads((SHARED / f"{name}.json").read_text())
+    paths = {r["label"]: r for r in data["rays"]}
+    known = {"direction": "d", "exact": "T_unpolarised_exact", "product": "T_product_of_unpolarised_averages"}
+    known["s_p"] = "T_per_surface_s_p"
+    rays = [
+        {ours: r[theirs] for ours, theirs in known.items()}
+        | {"points": paths[r["label"]]["points"], "directions": paths[r["label"]]["dirs"]}
+        for r in json.loads((SHARED / "fresnel_sequential.json").read_text())["rays"]
+        if r["lens"] == name
+    ]
+    assert len(rays) > 40
+    check({"prescription": data["prescription"], "rays": rays})
 
 
 # Paths made by hand: N rays through surfaces of given normals.

@@ -94,6 +94,8 @@ def test_f_theta_onto_a_plane_is_a_tangent_and_its_overscan_holds_every_pixel() 
     radius = np.hypot((s - 0.5) * film[0], (t - 0.5) * film[1])
     expected = 0.5 + (s - 0.5) * 960 / plates.undistorted[0] * focal * np.tan(radius / focal) / radius
     assert np.abs(there["R"] - expected).max() * plates.undistorted[0] < 0.01
+    steep = traced("fisheye-equidistant", (36.0, 20.25), efl_mm=14.2)
+    assert 83 < steep.field_deg < 85 and worst_px(steep, plates_of([steep], (960, 540), (36.0, 20.25)))[1] < 0.01
     # There and back by the maps themselves: what the one reads, read through the other.
     again = read_through(np.stack([back["R"], back["G"]], -1), there)
     assert np.abs((again - np.stack([s, t], -1)) * (960, 540)).max() < 0.01
