@@ -39,7 +39,8 @@ test: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile --durations=10
 	$(MAKE) --no-print-directory lint
 
-# Blender as a module wants Python 3.11 and numpy 1: an environment of its own.
+# Blender as a module wants Python 3.11 and numpy 1: an environment of its own. On Debian without a desktop it also needs
+# libxkbcommon0 libsm6 libxi6 libxxf86vm1 libxfixes3 libgl1 libegl1.
 test-blender: $(BLENDER_INSTALLED) $(INSTALLED)
 	PYTHONPATH=. $(BIN)/python tests/blender/expect.py build/blender
 	NEUROLENS_BLENDER_SHOTS=build/blender $(BLENDER_VENV)/bin/python -m pytest -q --confcutdir=tests/blender tests/blender

@@ -50,6 +50,7 @@ _NEAR = 0.999  # of the near limit: rounding
 _DERIVATIVES, _WORST = 0.03, 0.05
 _ACROSS, _FILM_POWERS = 16, 7  # distances and stops at which the film is placed, and powers of each
 _BESIDE = 0.01  # of the film radius: near the axis
+_LIGHT_NM = (400.0, 700.0)  # colours beyond would spread fringes that no eye and no film sees
 Report = Callable[[float], object]
 _FRAME = """\
     point raster = camera_shader_raster_position();
@@ -332,18 +333,24 @@ def model_camera(model: OnnxLens, graph: Graph | None, report: Report) -> OslCam
     """
     lens, d = model.card["lens"], model.card["domain"]
     low, high = d["film_z_mm"]
-    short, long = d["wavelength_nm"]
+    short, long = _light_of(*map(float, d["wavelength_nm"]))
     stop = float(d["stop_radius_mm"])
     if graph is None:
         graph = graph_of(model.path, model.data, model.state if model.axes else ())
     height = _BESIDE * float(d["film_radius_mm"])
-    squeeze = squeeze_of(ModelScene(model, float(low), stop), height, (float(short), float(long)))
+    squeeze = squeeze_of(ModelScene(model, float(low), stop), height, (short, long))
     sight = Sight(
-        graph, PupilTable.of(d["bounds"]), (float(low), float(high)), (float(short), float(long)), stop,
+        graph, PupilTable.of(d["bounds"]), (float(low), float(high)), (short, long), stop,
         int(lens.get("stop_surface", 0)), squeeze != 1.0,
     )  # fmt: skip
     focusing = model_focusing(model, model.state if model.axes else ())
     return osl_camera(sight, focusing, lens["f_number"] * lens["stop_radius_mm"] / stop, lens["efl_mm"], report)
+
+
+def _light_of(short_nm: float, long_nm: float) -> tuple[float, float]:
+    """Of the wavelengths of a model those that pictures are made of; all where it is of others."""
+    short, long = max(short_nm, _LIGHT_NM[0]), min(long_nm, _LIGHT_NM[1])
+    return (short, long) if short < long else (short_nm, long_nm)
 
 
 def osl_camera(sight: Sight, focusing: Focusing, f_number: float, efl_mm: float, report: Report) -> OslCamera:

@@ -9,12 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from neurolens.base.errors import InputError
-from neurolens.cli import main
-from neurolens.commands import blender_lenses
-from neurolens.commands.blender_lenses import thumbnail
-from neurolens.commands.export_osl import Shader
-from neurolens.optics.lensfile import read_lens
+pytest.importorskip("onnxruntime", reason="neurolens is not installed in Blender's environment")
+
+from neurolens.base.errors import InputError  # noqa: E402
+from neurolens.cli import main  # noqa: E402
+from neurolens.commands import blender_lenses  # noqa: E402
+from neurolens.commands.blender_lenses import thumbnail  # noqa: E402
+from neurolens.commands.export_osl import Shader  # noqa: E402
+from neurolens.optics.lensfile import read_lens  # noqa: E402
 
 LENS = "laikin_double_gauss_50"
 ABSORBS = "its glass absorbs"
