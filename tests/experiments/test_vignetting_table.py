@@ -1,5 +1,6 @@
 """Vignetting of fitted models against the exact lens, and random numbers through an exported one."""
 
+import json
 from pathlib import Path
 
 import lens_models
@@ -8,7 +9,8 @@ import pytest
 import torch
 from vignetting_oracle import vignetting_errors
 
-from experiments import outside
+from experiments import outside, vignetting
+from experiments.__main__ import main
 from experiments.vignetting import DOMAINS, OPENINGS, opening_errors, passing
 from neurolens.base import status as st
 from neurolens.cameras.onnxlens import load_model
@@ -63,6 +65,19 @@ def test_cats_eyes_have_the_same_shape(fisheye: LensModel, share: float) -> None
     for exact, said in passing(fisheye.lens, fisheye, FilmRays(x, y, z, u, v, wave)).values():
         assert exact.sum() > 50
         assert (exact ^ said).sum() <= 0.004 * exact.sum() + 2
+
+
+def test_rows_of_lenses_that_are_not_chosen_stay(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = {"domain": "infinity", "failed": "not round"}
+    monkeypatch.setattr(vignetting, "measure", lambda file, domain, rays: row | {"lens": file.stem})
+    (tmp_path / "vignetting.json").write_text(json.dumps([row | {"lens": "other"}]))
+    command = ["vignetting", "--only", "petzval", "--domain", "infinity", "--quiet", "--out", str(tmp_path)]
+    assert main(command) == 0 and "petzval_portrait_100: not round" in capsys.readouterr().out
+    rows = json.loads((tmp_path / "vignetting.json").read_text())
+    assert [r["lens"] for r in rows] == ["other", "petzval_portrait_100"]
+    assert "other: not round" in (tmp_path / "vignetting.md").read_text()
 
 
 def test_broken_promises_are_counted() -> None:
