@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from neurolens.base.config import apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, check_writable
-from neurolens.base.progress import Progress
+from neurolens.base.progress import Progress, duration
 
 
 def test_files_are_whole_or_as_before(tmp_path: Path) -> None:
@@ -295,3 +295,8 @@ def test_any_fraction_is_taken_and_quiet_prints_nothing() -> None:
     with progress.stage("fit") as report:
         report(0.5)
     assert stream.getvalue() == ""
+
+
+def test_durations_read_well() -> None:
+    said = {0: "0.0 s", -1: "0.0 s", 0.44: "0.4 s", 9.96: "10 s", 59.7: "1 min 00 s", 185: "3 min 05 s"}
+    assert {seconds: duration(seconds) for seconds in said} == said

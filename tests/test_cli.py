@@ -247,6 +247,15 @@ def test_a_width_alone_is_enough(scene: Path, tmp_path: Path, capsys: pytest.Cap
     assert (data["width"], data["height"]) == (4, 3)
 
 
+def test_a_render_repeats_with_its_seed(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pictures, out = [], tmp_path / "a.exr"
+    for seed in (3, 3, 4):
+        args = ("render", scene, "--camera", "thin", "--width", 16, "--seed", seed, "-o", out, "--quiet")
+        assert run_json(capsys, *args)["height"] == 9
+        pictures.append(read_exr(out)[0])
+    assert (pictures[0] == pictures[1]).all() and (pictures[0] != pictures[2]).any()
+
+
 # Signals and missing packages
 
 

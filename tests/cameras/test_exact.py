@@ -43,6 +43,26 @@ def test_white_surroundings_off_the_axis_do_not_depend_on_where_the_pupil_is_sam
     assert means == pytest.approx([means[0]] * 3, rel=0.005)
 
 
+@pytest.mark.parametrize("f_number", [None, 8.0])
+@pytest.mark.parametrize("kind", ["exact", "exact, own bounds", "invariants", "network"])
+def test_white_surroundings_give_one_on_the_axis(kind: str, f_number: float | None) -> None:
+    assert film_value(camera(kind, 2.0, f_number), (0.0, 0.0)) == pytest.approx(1, abs=0.004)
+
+
+@pytest.mark.parametrize("kind", ["exact", "invariants"])
+def test_falloff_is_that_of_the_cosine_before_the_rims_cut(kind: str) -> None:
+    """Far stopped down the pupil is a point: near cos^4 of the film-side angle; wide open the rims take more."""
+    data, height, closed = first_order(lens_models.lens()), 10.0, camera(kind, math.inf, 16.0)
+    cos2 = 1 / (1 + (height / (data.rear_focal_z_mm - data.exit_pupil_z_mm)) ** 2)
+    assert film_value(closed, (height, 0.0)) == pytest.approx(cos2**2, rel=0.08)
+    assert film_value(camera(kind, math.inf), (18.0, 0.0)) < 0.8 * film_value(closed, (18.0, 0.0))
+
+
+def test_light_is_the_same_at_any_azimuth() -> None:
+    light = [film_value(camera("exact"), (15 * math.cos(a), 15 * math.sin(a))) for a in (0, 1, 4)]
+    assert np.ptp(light) < 2e-3 * light[0]
+
+
 @pytest.mark.parametrize("focus_m", [math.inf, 1.0])
 def test_model_and_exact_lens_send_the_same_rays(focus_m: float) -> None:
     rng = np.random.default_rng(3)
@@ -100,6 +120,7 @@ def test_fisheye_sees_beyond_75_degrees() -> None:
         focus_m=math.inf,
         bounds=lens_models.domain("muller_fisheye_100").bounds,
     )
+    assert len(exact.film.outline.wavelength_nm) == 1  # no dispersion is known
     model = camera("fisheye", math.inf)
     radius = 0.98 * lens_models.domain("muller_fisheye_100").film_radius_mm
     for lens in (exact, model):

@@ -103,6 +103,10 @@ def test_rays_are_whole_wherever_they_pass(kind: str) -> None:
     passed = rays.status == st.PASSED
     assert np.linalg.norm(rays.direction[:, passed], axis=0) == pytest.approx(1, abs=1e-5)
     assert (rays.weight[passed] > 0).all() and (rays.weight[~passed] == 0).all()
+    if kind not in FISHEYES:  # left in the scene is right on the film, and all of it lies before the camera
+        assert (rays.direction[2, passed] < 0).all() and (rays.origin_m[2, passed] < 0).all()
+        far = passed & (np.abs(film).min(0) > 6)
+        assert (rays.direction[:, far][:2] * film[:, far] < 0).all() and far.sum() > 500
     for numbers in (rays.origin_m, rays.direction, rays.weight):
         assert np.isfinite(numbers).all() and numbers.dtype == np.float32
     assert rays.status.dtype == np.int32

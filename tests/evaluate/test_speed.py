@@ -1,6 +1,7 @@
 """The timing harness: what it reports, never how fast. Thresholds belong to `make bench`."""
 
 import math
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.candidates import camera_candidate, exact_candidates
 from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, race
 from neurolens.optics.lensfile import read_lens
+from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of
 
 LENSES = Path(__file__).parents[2] / "lenses"
@@ -36,6 +38,21 @@ def test_a_race_of_cameras_and_the_eager_tracer(domain: Domain) -> None:
     assert there is not None and back is not None
     assert there["min"] * back["min"] == pytest.approx(1)
     assert result.speedup("thin", "thin") == {"min": 1.0, "median": 1.0}
+
+
+def test_every_batch_covers_the_same_rays_and_threads_come_back_after_an_error(domain: Domain) -> None:
+    done, before = Counter[int](), torch.get_num_threads()
+
+    def prepare(rays: FilmRays) -> Call:
+        done[len(rays)] += len(rays)
+        return lambda: None
+
+    race([Candidate("idle", prepare, (4096, 16384))], domain, rounds=1)
+    assert done[4096] == done[16384] > 0
+    with pytest.raises(RuntimeError), pinned_threads():
+        assert torch.get_num_threads() == 1
+        raise RuntimeError
+    assert torch.get_num_threads() == before
 
 
 def test_ratios_are_taken_within_rounds() -> None:

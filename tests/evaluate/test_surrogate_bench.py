@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from neurolens.base.progress import Progress
 from neurolens.cli import main
 from neurolens.evaluate import methods as surrogate_bench
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
-from neurolens.evaluate.methods import Bench, BenchSettings, Row, run_bench
+from neurolens.evaluate.methods import Bench, BenchSettings, Row, all_rows, chosen_rows, run_bench
 from neurolens.evaluate.methods_page import lens_page, write_lens
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
@@ -68,6 +69,31 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def records_of(folder: Path) -> dict[str, dict[str, Any]]:
     return {f.stem: json.loads(f.read_text()) for f in (folder / "records" / TRIPLET).iterdir()}
+
+
+def test_the_command_leaves_tables_plots_and_its_configuration(made: Path) -> None:
+    assert "| ols-12 | 1 |" in (made / "summary.md").read_text()
+    config = json.loads((made / "config.json").read_text())
+    assert config["seed"] == 1 and config["settings"]["pairs"]["train"] == 2000 and config["versions"]["torch"]
+    assert {f.name for f in made.glob("*.*")} == {"config.json", "summary.md", f"{TRIPLET}.md", f"{TRIPLET}.png"}
+
+
+def test_rows_by_name_group_and_method() -> None:
+    rows = all_rows()
+    assert len({r.name for r in rows}) == len(rows) and {"thin", "ols-64", "mlp-32x2"} <= {r.name for r in rows}
+    assert {r.group for r in chosen_rows([])} == {"paraxial", "published", "ours"}
+    assert [r.name for r in chosen_rows(["ols-64", "thin", "ols-64"])] == ["ols-64", "thin"]
+    assert {r.settings.method for r in chosen_rows(["schrade"])} == {"schrade"}
+    assert all(re.search(r" 20\d\d, ", r.source) for r in rows if r.group == "published")
+
+
+def test_stored_weights_are_rows_of_their_own(tmp_path: Path) -> None:
+    network = ModelSettings("mlp", units=6, layers=1, steps=20)
+    settings = replace(SETTINGS, pairs=PairSettings(2000, 1000, 2000), vignetting_rays=20_000)
+    rows = Row("net", "ours", network), Row("net-int8", "ours", network, weights="int8")
+    whole, small = run(bench_of(tmp_path, settings=settings), *rows)
+    assert small["rms_um"] > 2 * whole["rms_um"] and small["bytes"] != whole["bytes"]
+    assert small["fingerprint"] != whole["fingerprint"]
 
 
 def test_one_record_a_method_with_every_figure(made: Path) -> None:

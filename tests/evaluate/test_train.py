@@ -25,6 +25,7 @@ from neurolens.evaluate.train import run_experiment
 from neurolens.evaluate.train_states import fit_and_measure_states, state_settings
 from neurolens.surrogates.cores import Network
 from neurolens.surrogates.fit import ModelSettings, prepare
+from neurolens.surrogates.fits import checkpoint
 from neurolens.surrogates.pairs import make_pairs
 from neurolens.surrogates.states_fit import StateSettings
 from neurolens.surrogates.stored import load_fitted
@@ -262,7 +263,7 @@ main(sys.argv[1:])
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")
-def test_a_training_that_was_killed_is_taken_up_again(tmp_path: Path) -> None:
+def test_a_training_that_was_killed_is_taken_up_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same command once more ends with the very bytes of a run that nothing stopped, but for the time it took."""
 
     def command(name: str) -> list[str]:
@@ -274,8 +275,10 @@ def test_a_training_that_was_killed_is_taken_up_again(tmp_path: Path) -> None:
     (left,) = (tmp_path / "killed").rglob("*.training.npz")
     with np.load(left) as held:
         assert b'"ended": false' in held["header"].tobytes()
+    taken_up, load = [], checkpoint.Checkpoint.load
+    monkeypatch.setattr(checkpoint.Checkpoint, "load", lambda self: taken_up.append(load(self)) or taken_up[-1])
     assert main(command("killed")) == main(command("whole")) == 0
-    assert not left.exists()
+    assert taken_up[0] is not None and taken_up[-1] is None and not left.exists()
 
     def made(name: str) -> tuple[dict, list[bytes]]:
         (file,) = (tmp_path / name).rglob("*.onnx")

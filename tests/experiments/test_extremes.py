@@ -1,5 +1,6 @@
 """The table of numerics: what it may never show, on every case with few rays; its reference against closed forms."""
 
+import json
 import math
 from dataclasses import replace
 from itertools import takewhile
@@ -10,6 +11,8 @@ import pytest
 import torch
 
 from experiments import extreme_cases as cases
+from experiments import extremes
+from experiments.__main__ import main
 from experiments.extremes import failures, measure, trace_reference
 from neurolens.base import status as st
 from neurolens.optics.prescription import Lens, Surface
@@ -37,9 +40,14 @@ def test_the_whole_library_once() -> None:
     assert max(r.relative for r in rows) < 1e-5
 
 
-def test_a_status_that_is_wrong_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A tracer that loses float32 rays in the middle of the lens is caught."""
-    from experiments import extremes
+@pytest.mark.parametrize(("change", "told"), [({"not_finite": 2}, "finite"), ({"exact_status": 1}, "50")])
+def test_what_never_may_be_is_told(change: dict[str, int], told: str) -> None:
+    good = replace(measure(ALL[0], exact_rays=1), within=3)
+    assert failures([good]) == [] and told in failures([replace(good, **change)])[0]  # type: ignore[arg-type]
+
+
+def test_a_status_that_is_wrong_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tracer that loses float32 rays in the middle of the lens is caught, and the command fails."""
 
     def broken(lens: Lens, rays: object, *args: object, **options: object) -> object:
         out = trace(lens, rays, *args, **options)  # type: ignore[arg-type]
@@ -48,7 +56,11 @@ def test_a_status_that_is_wrong_is_noticed(monkeypatch: pytest.MonkeyPatch) -> N
             lost[:5] = st.blocked(0, st.MISSED)
         return out._replace(status=lost)
 
+    monkeypatch.setattr(extremes, "all_cases", lambda count: [next(cases.near_equal_indices(count))])
+    command = ["extremes", "--rays", "100", "--out", str(tmp_path), "--quiet"]
+    assert main(command) == 0 and "FAILED" not in (tmp_path / "extremes.md").read_text()
     monkeypatch.setattr(extremes, "trace", broken)
+    assert main(command) == 1 and json.loads((tmp_path / "extremes.json").read_text())[0]["beyond"] == 5
     row = measure(next(cases.near_equal_indices(COUNT)))
     assert row.beyond == 5 and "away from any edge" in failures([row])[0]
 
@@ -96,6 +108,3 @@ def test_reference_names_what_ends_a_ray() -> None:
     assert ends == [st.PASSED, st.blocked(0, st.RIM), st.blocked(0, st.MISSED)]
     plate = Lens("plate", "", (Surface(math.inf, 1.0, 100.0, stop=True),), 1.0)
     assert trace_reference(plate, [0, 0, -1, 1, 0, 1], [1.6, 1.0], "film").status == st.blocked(0, st.TOTAL_REFLECTION)
-
-
-# ---- the commands ----

@@ -101,6 +101,12 @@ def test_what_changed_is_made_again(tmp_path: Path, library: Library, made: dict
     assert made["order"] == ["one", "three", "two"] and len(files(tmp_path)) == 4
 
 
+def test_a_broken_index_is_made_anew(tmp_path: Path, library: Library, made: dict[str, Any]) -> None:
+    (tmp_path / "index.json").write_text('{"models": [{"file": "two.ols-6.onnx", "lens_file": "a"}]}')
+    make_models.make_models(library, library.entry, tmp_path, QUIET)
+    assert made["order"] == ["two", "one", "three"] and len(files(tmp_path)) == 4
+
+
 def test_a_lens_that_cannot_be_done_is_said_and_the_others_go_on(
     tmp_path: Path, library: Library, made: dict[str, Any]
 ) -> None:
@@ -129,7 +135,8 @@ def test_an_entry_is_fitted_checked_and_timed(tmp_path: Path) -> None:
     (tmp_path / "list.toml").write_text(
         "compile_exact = false\n[pairs]\ntrain = 3000\nheld_out = 3000\nrim = 3000\n"
         f'[[entry]]\nlens = {{ file = "{LENSES}/cooke_triplet_50.toml" }}\n'
-        "models = [{ terms = 20, degree = 5, planes = false }]\n"
+        "models = [{ terms = 12, degree = 4, planes = false }, { terms = 20, degree = 5, planes = false }]\n"
+        "best = true\n"
     )
     command = ["models", "--list", str(tmp_path / "list.toml"), "--out", str(tmp_path / "out"), "--quiet"]
     assert main(command) == 0

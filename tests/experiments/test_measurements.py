@@ -1,5 +1,6 @@
 """Measurements: goals that cannot be missed unseen, kept rows, promises, pupils, benches on known times."""
 
+import argparse
 import math
 from dataclasses import replace
 from functools import cache, partial
@@ -11,16 +12,19 @@ import numpy as np
 import pytest
 import torch
 
-from experiments import lab
+from experiments import inverse, lab
 from experiments import pupils as passage
 from experiments.__main__ import main
 from experiments.fused_speed import ray_candidate
 from experiments.mitsuba_speed import Row, Settings, film_mm, record
 from experiments.promises import Floor, Outcome, hold_to_promises, read_index, report_outcome, table_rows
 from experiments.pupils import CASES, TABLE_5_3
-from experiments.render_times import shapes
+from experiments.render_times import EXACT_C, PINHOLE, THIN, Size, Subject, Timed, shapes
+from experiments.render_times import FUSED_MODELS as MODELS
+from experiments.render_times_page import Found, goals
 from experiments.trace_speed import (
     ASPHERIC_SURFACES,
+    LENSES,
     MAIN,
     film_rays,
     launched,
@@ -40,6 +44,8 @@ from neurolens.optics.trace import trace
 from neurolens.optics.tracegraph import exact_graph
 from neurolens.surrogates.assemble import RAY_ONLY
 from neurolens.surrogates.domain import sample_domain
+
+MODEL = MODELS[0]
 
 
 def test_rows_of_an_earlier_run_are_kept_or_refused(tmp_path: Path) -> None:
@@ -77,8 +83,37 @@ def test_goals_cannot_be_missed_unseen() -> None:
 def test_a_measurement_knows_no_other_options(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["nonsense"])
-    assert main(["pupils", "--only", "nobody", "--quiet"]) == 2
-    assert "--only" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "told"),
+    [
+        (["pupils", "--only", "nobody"], "--only"),
+        (["trace", "--quick", "--only", "zeiss"], "laikin"),
+        (["vignetting", "--only", "nobody"], "--only"),
+        (["equal-time", "--scene", "nowhere.toml"], "nowhere.toml"),
+        (["models", "--list", "no.toml"], "no.toml"),
+        (["gallery", "comma"], "did you mean 'coma'"),
+    ],
+)
+def test_what_is_not_there_is_one_line_and_leaves_no_folder(
+    command: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*command, "--quiet", "--out", str(tmp_path / "out")]) == 2
+    shown = capsys.readouterr().err.strip()
+    assert told in shown and "\n" not in shown and not (tmp_path / "out").exists()
+
+
+def test_results_go_to_the_kept_folder_only_when_asked() -> None:
+    parser = argparse.ArgumentParser()
+    lab.out(lab.RESULTS / "gallery")(parser)
+    wanted = {"": lab.ROOT / "runs" / "results" / "gallery", "--commit": lab.RESULTS / "gallery", "--out=x": Path("x")}
+    assert {given: parser.parse_args(given.split()).out for given in wanted} == wanted
+
+
+def test_a_child_that_fails_says_why() -> None:
+    with pytest.raises(lab.Unmeasured, match="missing 1 required positional argument"):
+        lab.in_child(lab.look_up, "alone")
 
 
 def test_areas_of_the_shapes() -> None:
@@ -176,6 +211,18 @@ def test_pixel_of_table_5_3() -> None:
         assert later / area == pytest.approx(1, rel=0.1)
 
 
+@pytest.mark.slow
+def test_inverse_maps_of_a_tame_lens_are_found_and_counted() -> None:
+    found = inverse.measure_lens(lab.LENSES / "cooke_triplet_50.toml", rays=1000, uniform=300, terms=24)
+    for ours in found["ours"].values():
+        assert ours["stop"]["converged"] == ours["scene"]["converged"] == 1
+    uniform, missed = found["uniform"], list(found["published"]["scene"]["missed"].values())
+    assert sum(uniform[k] for k in ("passed", "blocked", "outside", "unsolved")) == pytest.approx(1)
+    assert uniform["missed"] <= uniform["unsolved"] and missed == sorted(missed, reverse=True)  # by steps
+    text = inverse.page([found, {"lens": "other", "refused": "a reason"}])
+    assert "cooke_triplet_50" in text and "a reason" in text
+
+
 SETTINGS = Settings(size=100, samples=4, threads=2, repeats=3)
 
 
@@ -200,6 +247,46 @@ def test_figures_of_known_times_and_pictures() -> None:
 
 def test_the_film_sees_what_a_field_of_90_degrees_does() -> None:
     assert film_mm({"sensor": {"fov": 90}}) == pytest.approx((100, 100))  # 50 mm behind the hole
+
+
+def test_the_first_picture_is_kept_apart_and_white_is_taken_out() -> None:
+    made = Row("name", "RGB", "pinhole", lambda seed: np.full((2, 2, 3), seed, np.float32), np.float32(0.5))  # type: ignore[arg-type]
+    for seed in range(3):
+        made.run(seed)
+    assert len(made.seconds) == 2 and made.first_s > 0 and [p.mean() for p in made.pictures] == [2, 4]
+
+
+def test_lenses_have_the_refractions_that_the_table_says() -> None:
+    lenses = {count: lens_of(count) for count in LENSES}
+    # The anamorphic zoom's table leaves its last plane to the reader.
+    assert all(lens.refractions in (count, count - 1) for count, lens in lenses.items())
+    assert lenses[MAIN].refractions == MAIN and sum(s.cylinder is not None for s in lenses[57].surfaces) > 2
+    rays, wavelength = launched(lenses[MAIN], film_rays(lenses[MAIN], 1000), torch.float32)
+    assert {c.dtype for c in (*rays, wavelength)} == {torch.float32} and all(c.is_contiguous() for c in rays)
+    assert 400 <= wavelength.min() < 410 and 690 < wavelength.max() <= 700
+
+
+def test_goals_are_held_to_the_best_rounds() -> None:
+    """A pinhole render of 2 s, a thin lens that takes 0.2 s of its own, a lens of ten refractions."""
+
+    def verdicts(surrogate_s: float, moves_s: float, exact_s: float) -> dict[str, str]:
+        found, timed = Found(Size()), {PINHOLE: (2.0, 0.05), THIN: (2.2, 0.2), EXACT_C: (exact_s, 0.5)}
+        for kind, (seconds, camera_s) in (timed | {MODEL: (2.3, surrogate_s)}).items():
+            subject = Subject(kind, None if kind in (PINHOLE, THIN) else 10, kind)
+            found.subjects.append(subject)
+            found.rows.append(Timed(subject, "cheap", False, [seconds, 3 * seconds], [camera_s, 3 * camera_s]))
+        found.rows.append(Timed(subject, "cheap", True, [2.3, 2.3], [moves_s, 3 * moves_s]))
+        return {g.text: g.verdict for g in goals(found)}
+
+    texts = (
+        f"{MODEL}: camera above the thin lens's, of the cheap pinhole render",
+        f"{MODEL}: what differentials add to the camera, in the cheap render",
+        f"{EXACT_C}: overhead a refraction, of the cheap pinhole render",
+    )
+    # 5% of 2 s above 0.2 s; 30% above the camera; 10% of 2 s for each of ten refractions.
+    met, missed = verdicts(0.299, 0.299 * 1.29, 3.99), verdicts(0.301, 0.301 * 1.31, 4.01)
+    assert {met[t] for t in texts} == {"reached"} and {missed[t] for t in texts} == {"missed"}
+    assert met[texts[0].replace("cheap", "dear")] == "not measured"
 
 
 def test_two_aspheres_change_the_rays_and_little_else() -> None:

@@ -1,5 +1,6 @@
 """Vignetting of fitted models against the exact lens, and random numbers through an exported one."""
 
+import json
 from pathlib import Path
 
 import lens_models
@@ -8,7 +9,8 @@ import pytest
 import torch
 from vignetting_oracle import vignetting_errors
 
-from experiments import outside
+from experiments import outside, vignetting
+from experiments.__main__ import main
 from experiments.vignetting import DOMAINS, OPENINGS, opening_errors, passing
 from neurolens.base import status as st
 from neurolens.cameras.onnxlens import load_model
@@ -63,6 +65,23 @@ def test_cats_eyes_have_the_same_shape(fisheye: LensModel, share: float) -> None
     for exact, said in passing(fisheye.lens, fisheye, FilmRays(x, y, z, u, v, wave)).values():
         assert exact.sum() > 50
         assert (exact ^ said).sum() <= 0.004 * exact.sum() + 2
+
+
+def test_rows_of_lenses_that_are_not_chosen_stay(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    openings = {name: {"false_pass": 0.001, "false_block": None} for name in OPENINGS}
+    good = {"passing_share": 0.5, "gates": 3, "monomials": 24, "seconds": 1.0, "openings": openings}
+    good["illumination"] = {"max_difference": 0.0125}
+    monkeypatch.setattr(vignetting, "measure", lambda file, domain, _: good | {"lens": file.stem, "domain": domain})
+    (tmp_path / "vignetting.json").write_text('[{"lens": "other", "domain": "infinity", "failed": "not round"}]')
+    command = ["vignetting", "--only", "petzval", "--domain", "infinity", "--quiet", "--out", str(tmp_path)]
+    assert main(command) == 0
+    rows = json.loads((tmp_path / "vignetting.json").read_text())
+    assert [r["lens"] for r in rows] == ["other", "petzval_portrait_100"]
+    page = (tmp_path / "vignetting.md").read_text()
+    assert "other: not round" in page and page.strip() == capsys.readouterr().out.strip()
+    assert "| petzval_portrait_100 | 0.100 / - | " in page and "| 1.250 | 50% | 3 | 24 | 1.0 |" in page
 
 
 def test_broken_promises_are_counted() -> None:

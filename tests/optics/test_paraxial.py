@@ -23,7 +23,10 @@ def thick(r1: float, r2: float, t: float, n: float, gap: float = 0.0) -> Lens:
 
 @pytest.mark.parametrize(
     ("r1", "r2", "t", "n"),
-    [(50, -50, 5, 1.5), (30, 60, 8, 1.9), (INF, -40, 3, 1.6), (40, INF, 3, 1.6), (-60, 45, 2, 1.7), (20, -20, 40, 1.5)],
+    [
+        *((50, -50, 5, 1.5), (30, 60, 8, 1.9), (INF, -40, 3, 1.6), (40, INF, 3, 1.6), (-60, 45, 2, 1.7)),
+        *((20, -20, 40, 1.5), (50, -80, 1e-3, 1.6), (50, -80, 1e-6, 1.6)),
+    ],
 )
 def test_lensmaker_with_thickness(r1: float, r2: float, t: float, n: float) -> None:
     data = first_order(thick(r1, r2, t, n))

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from neurolens.optics.focusing import (
     film_range_mm,
     focus_states,
     infinity_states,
+    monotone,
     nearest_focus_m,
 )
 from neurolens.optics.glass import LINE_D_NM
@@ -101,6 +103,16 @@ def test_the_film_of_a_zoom_stays_where_the_states_have_it() -> None:
         assert min(map(back_mm, states)) - 1e-6 <= back_mm(zoomed) <= max(map(back_mm, states)) + 1e-6
         assert min(s.film_z_mm or 0 for s in states) - 1e-6 <= (zoomed.film_z_mm or 0) + 0.0
         assert (zoomed.film_z_mm or 0) <= max(s.film_z_mm or 0 for s in states) + 1e-6
+
+
+def test_interpolated_values_stay_between_their_neighbours_and_keep_what_is_stated() -> None:
+    x, rows = [0.0, 1.0, 1.5, 4.0], [[0.0, 5.0], [1.0, 2.0], [1.1, 2.0], [3.0, 9.0]]
+    assert [monotone(x, rows, place) for place in x] == rows
+    for i, t in product(range(3), (0.1, 0.5, 0.9)):
+        found = monotone(x, rows, x[i] + t * (x[i + 1] - x[i]))
+        for value, *ends in zip(found, rows[i], rows[i + 1], strict=True):
+            assert min(ends) - 1e-12 <= value <= max(ends) + 1e-12
+    assert monotone([0.0, 2.0], [[1.0], [5.0]], 0.5) == pytest.approx([2.0])
 
 
 def test_gaps_move_smoothly_through_a_state() -> None:

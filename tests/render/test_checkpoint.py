@@ -17,7 +17,7 @@ from render_helpers import FILM, PINHOLE, SIZE, THIN, WHITE, diffuse, files_of_a
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.ideal import ThinLens
-from neurolens.render.checkpoint import SPENT, write_checkpoint
+from neurolens.render.checkpoint import SPENT, digest, write_checkpoint
 from neurolens.render.film import Film, Tiling
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import RenderResult, Watch, render
@@ -143,6 +143,17 @@ def test_a_checkpoint_of_another_render_is_refused_and_what_differs_is_named(tmp
             kept_render(part, **change)
         assert str(refused.value).startswith(str(part)) and "--restart" in str(refused.value)
     assert part.read_bytes() == before
+
+
+def test_the_digest_of_a_scene_sees_every_part_and_nothing_else() -> None:
+    assert digest(lit_scene()) == digest(lit_scene()) != digest(lit_scene(0.7000001))
+    differ: list[tuple[Any, Any]] = [
+        *((("ab", "c"), ("a", "bc")), ((1, (2, 3)), (1, 2, 3)), ({"a": None}, {}), (1, "1")),
+        *((np.zeros(2), np.zeros((2, 1))), (np.zeros(1, np.float32), np.zeros(1, np.int32))),
+    ]
+    assert all(digest(a) != digest(b) for a, b in differ)
+    turned = np.arange(6).reshape(2, 3).T
+    assert digest({"a": turned, "b": 2}) == digest({"b": 2, "a": np.ascontiguousarray(turned)})
 
 
 class Spoilt(ThinLens):

@@ -19,7 +19,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
-from neurolens.evaluate.check import check_states, space_of_card
+from neurolens.evaluate.check import check_states, random_states, space_of_card
 from neurolens.evaluate.rays import ray_errors
 from neurolens.modelfile.axes import Axis, product, weights
 from neurolens.optics.film_plane import colours
@@ -132,6 +132,13 @@ def test_axes_of_lens_files() -> None:
         zoom_axis(lens_models.lens())
     with pytest.raises(InputError, match="focus"):
         focus_axis(lens_models.lens())
+
+
+def test_states_to_check_at_are_one_in_each_part_of_every_range() -> None:
+    states = random_states((ZOOM, FOCUS), 10, seed=4)
+    assert states == random_states((ZOOM, FOCUS), 10, seed=4) != random_states((ZOOM, FOCUS), 10, seed=5)
+    for k, (low, high) in enumerate(axis.range for axis in (ZOOM, FOCUS)):
+        assert sorted(int(10 * (s[k] - low) / (high - low)) for s in states) == list(range(10))
 
 
 def test_a_model_of_internal_focus_is_focused_as_its_lens_is(tmp_path: Path) -> None:
