@@ -3,7 +3,7 @@
 import math
 import subprocess
 import sys
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,9 @@ from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.exact import ExactCamera, FusedExactCamera
 from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.graph import compiler, loworder
+from neurolens.graph import compiler
 from neurolens.graph.ir import Graph
+from neurolens.graph.loworder import with_low_order_derivatives
 from neurolens.modelfile.graph import graph_of
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
@@ -158,7 +159,7 @@ def test_differentials_of_a_model_come_as_near_to_those_of_its_graph_as_the_came
 
 
 def test_differentials_that_no_low_order_meets_are_those_of_the_graph(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loworder, "WORST", 0.0)
+    monkeypatch.setattr(fused_module, "with_low_order_derivatives", partial(with_low_order_derivatives, worst=0.0))
     plain, _ = pair()
     fused = FusedCamera(load_model(model_file()), film_mm=FILM, focus_m=2.0)
     given = numbers(5000, seed=5)
