@@ -21,7 +21,7 @@ from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.graph import compiler
 from neurolens.graph.ir import Graph
-from neurolens.graph.loworder import with_low_order_derivatives
+from neurolens.graph.loworder import WORST, with_low_order_derivatives
 from neurolens.modelfile.graph import graph_of
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
@@ -153,7 +153,7 @@ def test_differentials_of_a_model_come_as_near_to_those_of_its_graph_as_the_came
         share = np.sqrt(np.square(a - b).sum(axis=(0, 1)) / np.square(b).sum(axis=(0, 1)))
         worst = max(worst, float(np.sqrt(np.mean(share**2))))
     assert fused.differentials_error is not None
-    assert 0.001 < fused.differentials_error < loworder.WORST and worst < 1.2 * fused.differentials_error
+    assert 0.001 < fused.differentials_error < WORST and worst < 1.2 * fused.differentials_error
     dark = found.status != st.PASSED
     assert dark.any() and not found.differentials.direction[..., dark].any()
 
