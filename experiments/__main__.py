@@ -27,6 +27,7 @@ NAMES = {
     "equal-time": ("equal_time_page", "error over render time of every camera"),
     "render": ("render_times_page", "render time by camera and scene"),
     "mitsuba": ("mitsuba_speed", "speed of the renderer beside Mitsuba 3"),
+    "osl": ("osl_speed", "cameras in Blender's Cycles: shaders of models beside its own"),
     "promises": ("promises", "models against the speed that their index promises"),
     "white-cards": ("white_cards", "light on the film, by integral and rendered four ways"),
     "spectral-noise": ("spectral_noise", "noise of the ways to sample wavelengths"),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from experiments import inverse, lab
+from experiments import inverse, lab, osl_speed
 from experiments import pupils as passage
 from experiments.__main__ import main
 from experiments.fused_speed import ray_candidate
@@ -351,3 +351,34 @@ def test_without_a_compiler_or_coefficients_there_is_no_candidate(
     assert fused_candidate("x", model, model.domain) is None
     with pytest.raises(Unavailable, match="a C compiler"):
         CompiledSource(lower(exact_graph(lens_models.lens(), 0.0, (400.0, 700.0))))
+
+
+def test_cameras_in_blender_are_timed_without_what_it_takes_to_begin(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    thin, model = osl_speed.THIN, osl_speed.POLYNOMIAL
+    stage = osl_speed.Stage((100, 100), 100, 2, (thin, model), thin)
+    times = {thin: {"full": [1.2, 1.1], "tiny": [0.1, 0.2]}, model: {"full": [2.3, 2.8], "tiny": [0.5, 0.3]}}
+    rows = osl_speed.rows_of("sky", stage, times, {model: 900})
+    assert [(r.camera, r.operations) for r in rows] == [(thin, None), (model, 900)]
+    assert [r.ns_min for r in rows] == pytest.approx([1000, 2000]) and rows[1].over_median == pytest.approx(
+        2.1591, 1e-4
+    )
+    met = osl_speed.goals(rows)
+    assert met[0].measured == pytest.approx(2.0) and met[0].verdict == "missed"
+    assert {g.verdict for g in met[1:]} == {"not measured"}
+    times[thin]["full"] = [0.1, 1.0]
+    with pytest.raises(lab.Unmeasured, match="too few"):
+        osl_speed.rows_of("sky", stage, times, {})
+    assert main(["osl", "--quiet", "--blender-python", str(tmp_path / "python"), "--out", str(tmp_path)]) == 2
+    assert "make test-blender" in capsys.readouterr().err
+
+
+def test_blender_that_fails_says_why(tmp_path: Path) -> None:
+    python = tmp_path / "python"
+    python.write_text("#!/bin/sh\necho share 0.5\necho no module bpy >&2\nexit 1\n", encoding="utf-8")
+    python.chmod(0o755)
+    told: list[float] = []
+    with pytest.raises(lab.Unmeasured, match="no module bpy"):
+        osl_speed.race(python, {}, {}, lambda share, left=None: told.append(share))
+    assert told == [0.5]

@@ -1,0 +1,224 @@
+"""Nanoseconds of CPU a camera ray in Blender's Cycles: its own cameras, and shaders of ours.
+
+In turn in one run of Blender, one thread: the built-in camera without and with depth of field, a thin lens written in
+OSL, a polynomial and a network of a 50 mm double Gauss as shaders, and exact lenses, every surface traced, of 12 and of
+33 refractions. First with nothing but a white sky, where a ray costs little beside the camera; then a scene of meshes
+and lamps. Blender's Python is a process of its own: what it takes to begin is measured by pictures of a few rays, and
+taken off. Writes osl_speed.md and osl_speed.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from experiments import lab, osl_in_blender
+from neurolens.base.errors import InputError
+from neurolens.base.progress import Progress, Report
+
+PYTHON = lab.ROOT / ".venv-blender" / "bin" / "python"
+_GAUSS = "laikin_double_gauss_50"
+BUILT_IN, DEPTH, THIN = "built-in", "built-in, depth of field", "thin lens in OSL"
+POLYNOMIAL, NETWORK, EXACT, EXACT_LONG = "ols-36", "mlp-16x2", "exact, 12 refractions", "exact, 33 refractions"
+SHADERS = {
+    POLYNOMIAL: lab.MODELS / f"{_GAUSS}.ols-36.onnx",
+    NETWORK: lab.MODELS / f"{_GAUSS}.mlp-16x2.onnx",
+    EXACT: lab.LENSES / f"{_GAUSS}.toml",
+    EXACT_LONG: lab.LENSES / "ogawa_zoom_70_200.toml",
+}
+_FOCAL_MM = 50.0
+# The least that a camera in OSL does: a point of a disc by concentric squares, a ray through the point in focus, and
+# the derivatives that Cycles would otherwise take itself.
+THIN_LENS = """\
+shader thin_lens(float focal_mm = 50.0, float f_number = 1.8,
+    output point position = 0.0, output vector direction = 0.0, output color throughput = 1.0,
+    output vector dPdx = 0.0, output vector dPdy = 0.0, output vector dDdx = 0.0, output vector dDdy = 0.0)
+{
+    point raster = camera_shader_raster_position(), pair = camera_shader_random_sample();
+    vector right = Dx(raster), up = Dy(raster), sensor = vector(36.0, 24.0, 0.0);
+    float focus_m = 1.0;
+    getattribute("cam:sensor_size", sensor);
+    getattribute("cam:focal_distance", focus_m);
+    float a = 2.0 * pair[0] - 1.0, b = 2.0 * pair[1] - 1.0, reach = b, turn = 0.0;
+    if (a * a > b * b) {
+        reach = a;
+        turn = M_PI_4 * (b / a);
+    } else if (b != 0.0)
+        turn = M_PI_2 - M_PI_4 * (a / b);
+    reach *= 0.0005 * focal_mm / f_number;
+    position = point(reach * cos(turn), reach * sin(turn), 0.0);
+    float x = focus_m * sensor[0] / focal_mm, y = focus_m * sensor[1] / focal_mm;
+    vector way = vector((raster[0] - 0.5) * x, (raster[1] - 0.5) * y, focus_m) - vector(position);
+    float nearer = 1.0 / length(way);
+    direction = way * nearer;
+    vector by_x = vector(right[0] * x * nearer, 0.0, 0.0), by_y = vector(0.0, up[1] * y * nearer, 0.0);
+    dDdx = by_x - direction * dot(direction, by_x);
+    dDdy = by_y - direction * dot(direction, by_y);
+}
+"""
+
+OPTIONS = [
+    lab.option("--blender-python", metavar="PATH", type=Path, default=PYTHON,
+               help=f"a Python that has bpy (default: {PYTHON.relative_to(lab.ROOT)}, by make test-blender)"),
+    lab.count("rounds", 15, "of the white sky (default: 15)"),
+    lab.count("scene-rounds", 5, "of the scene (default: 5)"),
+    lab.out(),
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Row:
+    """A camera in a scene: ns of CPU a ray, least and median; what a picture takes before its first ray; the least over
+    the least of the scene's base, and the median of that ratio in the turns."""
+
+    scene: str
+    camera: str
+    operations: int | None
+    begin_ms: float
+    ns_min: float
+    ns_median: float
+    over: float
+    over_median: float
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A scene: pixels, samples, rounds, its cameras, and the one that they are divided by."""
+
+    size: tuple[int, int]
+    samples: int
+    rounds: int
+    cameras: tuple[str, ...]
+    base: str
+
+    @property
+    def rays(self) -> int:
+        return self.size[0] * self.size[1] * self.samples
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the shaders, race them, write the tables; 1 where a goal is missed."""
+    if not args.blender_python.is_file():
+        expected = "a Python with Blender as a module (bpy), which make test-blender sets up"
+        raise InputError("experiments osl", "--blender-python", str(args.blender_python), expected)
+    lab.quiet_glasses()
+    stages = {
+        "sky": Stage((128, 96), 32, args.rounds, (BUILT_IN, DEPTH, THIN, *SHADERS), THIN),
+        "real": Stage((192, 128), 64, args.scene_rounds, (BUILT_IN, DEPTH, THIN, POLYNOMIAL, NETWORK), DEPTH),
+    }
+    texts, operations = _shaders(args.quiet)
+    with Progress({"race in Blender": 120.0}, quiet=args.quiet).stage("race in Blender") as report:
+        told = race(args.blender_python, texts, stages, report)
+    rows = [row for name, stage in stages.items() for row in rows_of(name, stage, told["scenes"][name], operations)]
+    met = goals(rows)
+    data = {"machine": lab.machine(), "blender": told["blender"], "rows": [asdict(r) for r in rows]}
+    data |= {"goals": [g.to_dict() for g in met]}
+    print(lab.write_results(args.out, "osl_speed", _page(told["blender"], stages, rows, met), data))
+    return int(any(g.verdict == "missed" for g in met))
+
+
+def _shaders(quiet: bool) -> tuple[dict[str, str | None], dict[str, int]]:
+    """Texts by camera, None for Blender's own, and the operations of ours."""
+    from neurolens.commands.export_osl import shader_of
+
+    made = {name: shader_of(file, quiet=quiet) for name, file in SHADERS.items()}
+    own: dict[str, str | None] = {BUILT_IN: None, DEPTH: None, THIN: THIN_LENS}
+    return own | {k: s.text for k, s in made.items()}, {k: s.operations for k, s in made.items()}
+
+
+def race(python: Path, texts: Mapping[str, str | None], stages: Mapping[str, Stage], report: Report) -> lab.Row:
+    """What `osl_in_blender` finds.
+
+    Raises:
+        Unmeasured: Blender's Python fails.
+    """
+    cameras = [
+        {"name": name, "focal_mm": _FOCAL_MM, "depth_of_field": name != BUILT_IN, "shader": text}
+        for name, text in texts.items()
+    ]
+    with tempfile.TemporaryDirectory(prefix="neurolens-osl-") as folder:
+        plan, result, said = (Path(folder) / name for name in ("plan.json", "result.json", "stderr"))
+        scenes = {name: asdict(stage) for name, stage in stages.items()}
+        plan.write_text(json.dumps({"cameras": cameras, "scenes": scenes}), encoding="utf-8")
+        command = [str(python), osl_in_blender.__file__, str(plan), str(result)]
+        user = {"BLENDER_USER_RESOURCES": folder, "PYTHONPATH": ""}
+        with said.open("w") as errors, subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=errors, text=True, env=os.environ | user
+        ) as child:  # fmt: skip
+            for line in child.stdout or ():
+                if line.startswith("share "):
+                    report(float(line.split()[1]))
+        if child.returncode != 0:
+            last = said.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
+            raise lab.Unmeasured(f"{python}: {''.join(last) or child.returncode}")
+        found: lab.Row = json.loads(result.read_text(encoding="utf-8"))
+        return found
+
+
+def rows_of(scene: str, stage: Stage, times: Mapping[str, Any], operations: Mapping[str, int]) -> list[Row]:
+    """Of the seconds of full and of tiny pictures, by camera.
+
+    Raises:
+        Unmeasured: rays take no longer than beginning does.
+    """
+    begin = {name: min(t["tiny"]) for name, t in times.items()}
+    ns = {name: [1e9 * (s - begin[name]) / stage.rays for s in t["full"]] for name, t in times.items()}
+    base = ns[stage.base]
+    if min(map(min, ns.values())) <= 0:
+        raise lab.Unmeasured("what Blender takes to begin hides the rays: the machine is too busy, or they are too few")
+    return [
+        Row(
+            scene, name, operations.get(name), 1e3 * begin[name], min(own), statistics.median(own),
+            min(own) / min(base), statistics.median(a / b for a, b in zip(own, base, strict=True)),
+        )
+        for name, own in ns.items()
+    ]  # fmt: skip
+
+
+def goals(rows: Sequence[Row]) -> list[lab.Goal]:
+    """By the least times."""
+    ns = {(r.scene, r.camera): r.ns_min for r in rows}
+
+    def ratio(text: str, wanted: float, over: tuple[str, str], under: tuple[str, str], least: bool = False) -> lab.Goal:
+        return lab.Goal(text, wanted, ns[over] / ns[under] if over in ns and under in ns else None, least)
+
+    model, thin = ("sky", POLYNOMIAL), ("sky", THIN)
+    slow = [ratio(f"scene: {m} over Cycles's depth of field", 1.05, ("real", m), ("real", DEPTH))
+            for m in (POLYNOMIAL, NETWORK)]  # fmt: skip
+    return [
+        ratio(f"{POLYNOMIAL} over the thin lens in OSL", 1.3, model, thin),
+        ratio(f"{NETWORK} over the thin lens in OSL", 1.6, ("sky", NETWORK), thin),
+        ratio(f"{EXACT} over {POLYNOMIAL}", 5.0, ("sky", EXACT), model, True),
+        ratio(f"{EXACT_LONG} over {POLYNOMIAL}", 12.0, ("sky", EXACT_LONG), model, True),
+        *slow,
+    ]
+
+
+_COLUMNS = lab.columns(
+    ("camera", "camera"),
+    ("operations", "operations"),
+    ("ns a ray, min", "ns_min", ".0f"),
+    ("median", "ns_median", ".0f"),
+    ("over the base, min", "over", ".2f"),
+    ("median of turns", "over_median", ".2f"),
+    ("to begin, ms", "begin_ms", ".0f"),
+)
+_HEADINGS = {"sky": "A white sky", "real": "Meshes and lamps"}
+_NOTE = "A few of a hundred rays of a real lens end in it and cost no more: at f/1.8, by our shaders, 3 to 4."
+
+
+def _page(blender: str, stages: Mapping[str, Stage], rows: Sequence[Row], met: Sequence[lab.Goal]) -> str:
+    parts = []
+    for name, s in stages.items():
+        told = f"{s.size[0]} x {s.size[1]} pixels, {s.samples} samples, {s.rounds} rounds; the base: {s.base}."
+        parts += [f"## {_HEADINGS[name]}", told, lab.table(_COLUMNS, [r for r in rows if r.scene == name], "–")]
+    head = f"Blender {blender}; {lab.machine_line()}"
+    return lab.page("# Cameras in Cycles", __doc__ or "", head, *parts, _NOTE, lab.goal_table("Goal", met))
