@@ -78,6 +78,18 @@ _CLAMP = """
     return a.f;
 }}
 """
+# By masks, of which compilers make vectors where the choice is the same for all rays.
+_PICK = """
+{macro}_INLINE float {name}_pick(float truth, float x, float y)
+{{
+    union {{ float f; unsigned u; }} a, b;
+    const unsigned mask = 0u - (unsigned)(int)truth;
+    a.f = x;
+    b.f = y;
+    a.u = (a.u & mask) | (b.u & ~mask);
+    return a.f;
+}}
+"""
 # A cell of a table, whatever the index is: NaN is above nothing.
 _CELL = """
 {macro}_INLINE int {name}_cell(float index, int cells)
@@ -160,7 +172,8 @@ def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras 
     text = _HEAD.format(comment=lines, name=name, guard=f"{macro}_H", macro=macro)
     live = program.live()
     kinds = [p.steps[k].kind for p in (program, *extras.functions.values()) for k in p.live()]
-    for kind, helper in {"sqrt": _SQRT, "clamp": _CLAMP, "floor": "#include <math.h>\n", "lookup": _CELL}.items():
+    helpers = {"sqrt": _SQRT, "clamp": _CLAMP, "pick": _PICK, "floor": "#include <math.h>\n", "lookup": _CELL}
+    for kind, helper in helpers.items():
         text += helper.format(name=name, macro=macro) if kind in kinds else ""
     for table in dict.fromkeys(program.steps[k].name for k in live if program.steps[k].kind == "lookup"):
         if table in program.own_tables:
@@ -308,16 +321,17 @@ def write_blocks(program: Program, name: str) -> str:
     groups of the table's columns are padded to `padded_columns`. A table of the program's own is NAME_table, of
     NAME_table_cells.
     """
-    before, lookups, after = program.around_lookups()
-    whole, first, last = (
-        Signature.of(p, f"{name}{part}") for p, part in ((program, ""), (before, "_before"), (after, "_after"))
-    )
+    once, rest = program.of_the_call()
+    before, lookups, after = rest.around_lookups()
+    parts = ((program, ""), (once, "_once"), (before, "_before"), (after, "_after"))
+    whole, same, first, last = (Signature.of(p, f"{name}{part}") for p, part in parts)
     step = lookups[0]
     columns, weights = step.columns, len(step.arguments) - step.indices
     groups, own = weights // step.indices, program.own_tables.get(step.name)
     made = [*first.outputs, *(f"column_{c}" for c in range(columns))]
     places = {row: f"in[{k}] + at" for k, row in enumerate(whole.per_ray)}
     places |= {number: f"call[{k}]" for k, number in enumerate(whole.per_call)}
+    places |= {number: f"once.{number}" for number in same.outputs}
     places |= {row: f"made[{k}]" for k, row in enumerate(made)}
     width = padded_columns(columns)
     row = width * groups
@@ -330,6 +344,8 @@ def write_blocks(program: Program, name: str) -> str:
     )
     loops = _BLOCKS.format(
         name=name,
+        known=f"const {same.name}_ray once = {same.name}({', '.join(places[n] for n in same.inputs)});"
+        * bool(same.outputs),
         block=BLOCK,
         made=len(made),
         columns=columns,
@@ -341,7 +357,8 @@ def write_blocks(program: Program, name: str) -> str:
         out="".join(f", out[{k}] + at" for k in range(len(whole.outputs))),
         looked=made.index("column_0"),
     )
-    text = write_c(before, first.name, ["Before the lookups."]) + write_c(after, last.name, ["After them."])
+    text = write_c(once, same.name, ["Of the call."]) if same.outputs else ""
+    text += write_c(before, first.name, ["Before the lookups."]) + write_c(after, last.name, ["After them."])
     if own is not None:
         padded = np.pad(own.reshape(len(own), groups, columns), ((0, 0), (0, 0), (0, width - columns)))
         text += f"enum {{ {name}_table_cells = {len(own)} }};\n"
@@ -356,6 +373,7 @@ void {name}(
     int *status)
 {{
     float made[{made}][{block}], sums[{block}][{width}];
+    {known}
     for (size_t at = 0; at < count; at += {block}) {{
         const size_t n = count - at < {block} ? count - at : {block};
         {name}_before_rays(n, {first});
@@ -424,6 +442,8 @@ class Writer:
         if step.kind == "clamp":
             x, limit = given
             return f"{self.clamp}({x}, {limit})" if self.clamp else f"max(min({x}, {limit}), -{limit})"
+        if step.kind == "pick":
+            return f"{self.name}_pick({', '.join(given)})"
         if step.kind == "neg":
             return f"-({given[0]})"
         if step.kind == "lookup":

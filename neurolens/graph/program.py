@@ -17,12 +17,12 @@ from neurolens.base.errors import InputError
 from neurolens.base.status import OUTSIDE_DOMAIN
 
 # select(a, b, x, y) is x where a <= b, else y; so NaN in a or b gives y. clamp(x, limit) is x within -limit and limit,
-# at the one on its side beyond; NaN becomes one of the two (not in GLSL). Its limit is a number above 0. lookup(indices
-# ..., weights ...) is the sum of each weight times its group's column of a table, in the cells at the indices
-# (`Graph.lookup`).
+# at the one on its side beyond; NaN becomes one of the two (not in GLSL). Its limit is a number above 0. pick(t, x, y),
+# which only `of_the_call` makes, is x where t is 1, y where it is 0, bit by bit. lookup(indices ..., weights ...) is
+# the sum of each weight times its group's column of a table, in the cells at the indices (`Graph.lookup`).
 KINDS = {
     "neg": 1, "add": 2, "sub": 2, "mul": 2, "div": 2, "sqrt": 1, "floor": 1, "max": 2, "min": 2, "clamp": 2, "fma": 3,
-    "select": 4,
+    "select": 4, "pick": 3,
 }  # fmt: skip
 
 # Names of the rows of what a lens is given and gives: millimetres and nanometres, lens frame.
@@ -125,6 +125,7 @@ _FOLDED: dict[str, Callable[..., Any]] = {
     "clamp": lambda x, limit: np.where(np.abs(x) < limit, x, np.copysign(limit, x)),
     "fma": lambda a, b, c: a * b + c,
     "select": lambda a, b, x, y: np.where(a <= b, x, y),
+    "pick": lambda t, x, y: np.where(t > 0, x, y),
 }
 
 
@@ -328,6 +329,49 @@ class Program:
             for name, e in self.outputs.items()
         }
         return before, lookups, after
+
+    def of_the_call(self) -> tuple[Program, Program]:
+        """What is the same for all rays of a call, with outputs `once_K`, and the rest, which takes these as inputs.
+
+        Compilers make no vectors of loops that choose by what does not change in them: such choices are `pick` there.
+        """
+        live, same = self.live(), set[int]()
+
+        def of_call(arguments: Sequence[Argument]) -> bool:
+            return all(not isinstance(a, int) or a in same for a in arguments)
+
+        for k in live:
+            step = self.steps[k]
+            if step.per_call if step.kind == "input" else step.kind != "lookup" and of_call(step.arguments):
+                same.add(k)
+        once = replace(self, steps=list(self.steps), outputs={}, _known=dict(self._known))
+        rest, place = Program(self.tables, own_tables=self.own_tables), dict[int, Expr]()
+
+        def known(expr: Expr) -> Expr:
+            """A value of the call, as an input of the rest."""
+            name = f"once_{expr.argument}"
+            once.outputs[name] = expr
+            return rest.input(name, per_call=True)
+
+        def moved(argument: Argument) -> Argument:
+            if not isinstance(argument, int):
+                return argument
+            if argument not in place:
+                place[argument] = known(Expr(once, argument))
+            return place[argument].argument
+
+        for k in live:
+            step = self.steps[k]
+            if step.kind == "input":
+                place[k] = rest._append(step)
+            elif k not in same and step.kind == "select" and of_call(step.arguments[:2]):
+                low, high = (Expr(once, a) for a in step.arguments[:2])
+                truth = known(once.select(low, high, 1.0, 0.0)).argument
+                place[k] = rest._append(replace(step, kind="pick", arguments=(truth, *map(moved, step.arguments[2:]))))
+            elif k not in same:
+                place[k] = rest._append(replace(step, arguments=tuple(map(moved, step.arguments))))
+        rest.outputs = {name: Expr(rest, moved(e.argument)) for name, e in self.outputs.items()}
+        return once, rest
 
     def count(self) -> dict[str, int]:
         """Operations by kind: the floor of the work."""
