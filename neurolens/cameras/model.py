@@ -96,8 +96,9 @@ class OnnxCamera:
         # Glass takes more of some wavelengths than of others: exposure is for those that the light has.
         self._light_nm = used = common_light((low, high), wavelength_nm or (low, high))
         stop = _stop_radius(model, f_number)
-        start = ModelScene(model, _paraxial_film_z(model, self.focus_m), stop, aperture)
-        best = start.film_z_mm if focus == "paraxial" else best_focus_z_mm(start, self.focus_m, used)
+        paraxial, (near, far) = _paraxial_film_z(model, self.focus_m), domain["film_z_mm"]
+        start = ModelScene(model, min(max(paraxial, near), far), stop, aperture)
+        best = paraxial if focus == "paraxial" else best_focus_z_mm(start, self.focus_m, used)
         film_z = _film_z(model, best, film_offset_mm, lens["f_number"] * lens["stop_radius_mm"] / stop)
         scene = replace(start, film_z_mm=film_z)
         round_stop = replace(scene, aperture=None)
@@ -381,15 +382,17 @@ def _axial_pupil(domain: dict[str, Any], stop_radius_mm: float) -> FloatArray:
 
 
 def _paraxial_film_z(model: OnnxLens, focus_m: float) -> float:
-    """The film in the paraxial image, within the model's domain."""
+    """The film in the paraxial image of a focus within the model's domain, whose films may lie beside it."""
     lens, (near, far) = model.card["lens"], model.card["domain"]["film_z_mm"]
     if any(a.name == "focus" for a in model.axes):
         return float(lens["film_z_mm"])  # its groups have moved
     planes = lens["front_principal_z_mm"], lens["rear_principal_z_mm"]
     z = film_plane.film_z_mm(lens["efl_mm"], *planes, focus_m)
-    if not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
+    # A domain may hold the film of best focus alone: a millimetre from the paraxial one, of a singlet.
+    least, most = sorted(float(v) for v in model.card["domain"]["focus_m"])
+    if not (near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK or least <= focus_m <= most):
         raise InputError(model.path, "focus_m", focus_m, f"a focus within the model's domain, {_limits(model)}")
-    return min(max(z, near), far)
+    return z
 
 
 def _film_z(model: OnnxLens, best_mm: float, offset_mm: float, f_number: float) -> float:

@@ -441,6 +441,18 @@ def test_a_film_range_that_ends_before_best_focus_is_said_and_held(path: Path) -
         OnnxCamera(older, film_mm=(36.0, 24.0), focus_m=2.0)
 
 
+def test_films_of_a_domain_may_lie_beside_the_paraxial_image(path: Path) -> None:
+    """A model of one focus whose films are all nearer to the lens: best focus lies there, or an offset leads there."""
+    model = load_model(path)
+    paraxial, far = film_z_mm(lens_models.lens(), 2.0), film_z_mm(lens_models.lens(), 2.0) - 0.1
+    model.card["domain"] |= {"film_z_mm": [far - 1, far], "focus_m": [2.0, 2.0]}
+    assert OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=2.0).settings["film_z_mm"] < far
+    moved = OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=2.0, focus="paraxial", film_offset_mm=-0.5)
+    assert moved.settings["film_z_mm"] == pytest.approx(paraxial - 0.5)
+    with pytest.raises(InputError, match="focus_m"):
+        OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=3.0e3)
+
+
 def test_film_beyond_the_model_is_dark(model: OnnxLens) -> None:
     camera = OnnxCamera(model, film_mm=(60.0, 60.0), focus_m=2.0)
     film = np.array([[25.0, 0.0, np.nan], [25.0, 0.0, 1.0]], np.float32)
