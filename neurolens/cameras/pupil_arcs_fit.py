@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from typing import Any
 
@@ -73,7 +74,12 @@ class Sight:
         wide = np.broadcast_to(nanometres, (1, count))
         given = {"rays": np.concatenate([film, pupil, wide]).astype(np.float32)}
         given |= {"film_z_mm": _call(film_z), "stop_radius_mm": _call(stop)}
-        return np.broadcast_to(evaluate(self.graph, given)["status"][0], count)
+        return np.broadcast_to(evaluate(self._asked, given)["status"][0], count)
+
+    @cached_property
+    def _asked(self) -> Graph:
+        """The graph of the status alone."""
+        return replace(self.graph, outputs={"status": self.graph.outputs["status"]})
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import check_writable
-from neurolens.base.progress import Progress
+from neurolens.base.progress import Progress, Report
 from neurolens.commands.arguments import Parser, add_json, check_folder, check_suffix
 from neurolens.commands.output import answer
 
@@ -21,6 +22,8 @@ _BUILD = """\
 Pack the extension with a folder of models: of each lens the best polynomial, the best network and,
 where its lens file is beside the models' folder in lenses/, the exact lens, every surface traced.
 A lens whose glass absorbs or is coated has no exact form.
+
+Finished lenses are kept: a build that was stopped goes on where it was, and a second one is quick.
 
 Install it in Blender: Edit > Preferences > Get Extensions > Install from Disk."""
 _ADD = """\
@@ -46,7 +49,7 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     build.add_argument("--no-exact", action="store_true", help="leave exact lenses out")
     add_json(build, quiet=True)
-    build.set_defaults(run=run_build, kept="no zip was written")
+    build.set_defaults(run=run_build, kept="no zip was written; finished shaders are kept for the next run")
     add = actions.add_parser("add", help="put a lens into the extension", description=_ADD)
     add.add_argument("file", metavar="FILE", type=Path, help="model (.onnx) or lens file (.toml)")
     add.add_argument("--to", metavar="ZIP|DIR", type=Path, help="a packed extension, or a user folder of one")
@@ -73,7 +76,8 @@ def run_build(args: argparse.Namespace) -> int:
     with Progress(quiet=args.quiet).stage("shaders") as report:
         for number, (files, lens_file) in enumerate(places):
             lens = None if lens_file is None else read_lens(lens_file)
-            found = packed_of(files, lens=lens, quiet=True)
+            models = partial(_within, report, number / len(places), (0.5 if lens_file else 1.0) / len(places))
+            found = packed_of(files, lens=lens, quiet=True, report=models)
             if lens_file is not None and not args.no_exact:
                 try:
                     found.forms.append(form_of(lens_file, quiet=True))
@@ -92,6 +96,10 @@ def run_build(args: argparse.Namespace) -> int:
         "seconds": time.perf_counter() - began,
     }
     return answer(args, data, lambda: f"{args.out}: {len(packed)} lenses, {sum(len(p.forms) for p in packed)} shaders")
+
+
+def _within(report: Report, begun: float, part: float, share: float) -> None:
+    report(begun + part * share)
 
 
 def run_add(args: argparse.Namespace) -> int:

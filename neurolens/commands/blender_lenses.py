@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
 from neurolens.blender.pack import Form, PackedLens
+from neurolens.commands.blender_kept import kept_form
 from neurolens.commands.export_osl import shader_of
 
 if TYPE_CHECKING:
@@ -20,13 +21,17 @@ _NETWORK = "mlp"
 
 
 def form_of(file: Path, *, zoom: str | None = None, quiet: bool = False) -> Form:
-    """The shader of a model (.onnx) or of a lens file (.toml), with its facts.
+    """The shader of a model (.onnx) or of a lens file (.toml), with its facts; kept between runs.
 
     Raises:
         InputError: neither; a lens that cannot be a shader. ModelError: a broken model.
     """
     if file.suffix not in (".onnx", ".toml"):
         raise InputError(file, "file", file.suffix or "(no suffix)", "a model (.onnx) or a lens file (.toml)")
+    return kept_form(file, zoom, lambda: _made_form(file, zoom, quiet))
+
+
+def _made_form(file: Path, zoom: str | None, quiet: bool) -> Form:
     shader = shader_of(file, zoom=zoom, quiet=quiet)
     kind, model, error, poor = "exact", "", None, []
     if file.suffix == ".onnx":
@@ -40,13 +45,23 @@ def form_of(file: Path, *, zoom: str | None = None, quiet: bool = False) -> Form
     )  # fmt: skip
 
 
-def packed_of(files: Sequence[Path], *, lens: Lens | None = None, zoom: str | None = None, quiet: bool) -> PackedLens:
+def packed_of(
+    files: Sequence[Path],
+    *,
+    lens: Lens | None = None,
+    zoom: str | None = None,
+    quiet: bool,
+    report: Callable[[float], object] = lambda share: None,
+) -> PackedLens:
     """A lens of the menu from files of one lens; `lens` is its prescription, for the thumbnail, where it is at hand.
 
     Raises:
         InputError: as `form_of`.
     """
-    forms = [form_of(file, zoom=zoom, quiet=quiet) for file in files]
+    forms = []
+    for file in files:
+        forms.append(form_of(file, zoom=zoom, quiet=quiet))
+        report(len(forms) / len(files))
     first = files[0]
     if first.suffix == ".onnx":
         card = _card(first)["lens"]

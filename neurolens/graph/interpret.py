@@ -7,6 +7,7 @@ import operator
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +31,32 @@ def evaluate(graph: Graph, inputs: Mapping[str, Rows]) -> dict[str, Rows]:
     """
     first = next(iter(inputs.values()), None)
     space = _Space(first)
-    live = live_rows(graph, graph.outputs)
     known: dict[int, Rows] = {}
     with np.errstate(all="ignore"):
-        for number, node in enumerate(graph.nodes):
-            if number in live:
-                given = [known[k] for k in node.inputs]
-                known[number] = inputs[node.name] if node.name else _value(space, node, given)
+        for number, done in _plan(graph):
+            node = graph.nodes[number]
+            known[number] = inputs[node.name] if node.name else _value(space, node, [known[k] for k in node.inputs])
+            for k in done:  # their memory serves the next
+                del known[k]
     return {name: known[v.number] for name, v in graph.outputs.items()}
+
+
+_PLANS: WeakKeyDictionary[Graph, tuple[tuple[int, ...], list[tuple[int, list[int]]]]] = WeakKeyDictionary()
+
+
+def _plan(graph: Graph) -> list[tuple[int, list[int]]]:
+    """Nodes that the outputs need, in order, each with those that nothing after it needs; kept while a graph stays."""
+    wanted = (len(graph.nodes), *(v.number for v in graph.outputs.values()))
+    kept = _PLANS.get(graph)
+    if kept is None or kept[0] != wanted:
+        live = live_rows(graph, graph.outputs)
+        last = {k: number for number in sorted(live) for k in (number, *graph.nodes[number].inputs)}
+        done: dict[int, list[int]] = {number: [] for number in sorted(live)}
+        for k, number in last.items():
+            if k not in wanted[1:]:
+                done[number].append(k)
+        kept = _PLANS[graph] = wanted, list(done.items())
+    return kept[1]
 
 
 def _value(space: _Space, node: Node, given: list[Rows]) -> Rows:

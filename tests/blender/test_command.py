@@ -6,6 +6,7 @@ import json
 import shutil
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -32,6 +33,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         return Shader("camera", f"shader of {file.name}, {zoom}", 1, (), {}, 21.6, 1.8, 0.7)
 
     monkeypatch.setattr(blender_lenses, "shader_of", written)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # what stands in must not stay
     for folder in ("models", "lenses"):
         (tmp_path / folder).mkdir()
     for model in (f"{LENS}.ols-36", f"{LENS}.ols-60", f"{LENS}.mlp-10x1"):
@@ -100,6 +102,32 @@ def test_bad_input_is_one_line(
     (place / "a.txt").write_text("x")
     assert "a model (.onnx) or a lens file" in failed(capsys, "add", place / "a.txt", "--to", place / "user")
     assert not out.exists() and not (place / "user").exists()
+
+
+def test_a_second_build_makes_no_shader_again(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = ["blender", "build", "--models", str(place / "models"), "--quiet", "-o"]
+    stand_in, asked = blender_lenses.shader_of, []
+
+    def counted(file: Path, **options: Any) -> Shader:
+        asked.append(file.suffix)
+        if stops and file.suffix == ".toml":
+            raise KeyboardInterrupt
+        return stand_in(file, **options)
+
+    monkeypatch.setattr(blender_lenses, "shader_of", counted)
+    stops = True
+    assert main([*given, str(place / "a.zip")]) == 130 and not (place / "a.zip").exists()
+    stops = False
+    for name in ("a.zip", "b.zip"):
+        assert main([*given, str(place / name)]) == 0
+    assert asked == [".onnx", ".onnx", ".toml", ".toml"]
+    assert (place / "a.zip").read_bytes() == (place / "b.zip").read_bytes()
+    with (place / "lenses" / f"{LENS}.toml").open("a", encoding="utf-8") as lens_file:
+        lens_file.write("# another file\n")
+    assert main([*given, str(place / "c.zip")]) == 0 and asked[4:] == [".toml"]
+    for kept in (place / "cache" / "neurolens").glob("*.form"):
+        kept.write_bytes(kept.read_bytes()[:-40])
+    assert main([*given, str(place / "d.zip")]) == 0 and asked[5:] == [".onnx", ".onnx", ".toml"]
 
 
 def test_thumbnails_show_the_lens() -> None:

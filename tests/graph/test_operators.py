@@ -2,6 +2,7 @@
 
 import ctypes
 import shutil
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -283,3 +284,37 @@ def test_what_is_the_same_for_all_rays_is_done_once() -> None:
     assert "pick" in {s.kind for s in rays_only} and known
     for step in rays_only:  # nothing is left that no ray changes
         assert any(isinstance(a, int) and not rest.steps[a].per_call for a in step.arguments)
+
+
+def test_an_output_added_later_is_found_and_what_others_need_is_kept() -> None:
+    g = Graph()
+    x = g.input("x")
+    twice = x + x
+    g.outputs["first"] = twice * twice
+    given = {"x": np.array([[1.0, 3.0]])}
+    assert evaluate(g, given)["first"].tolist() == [[4.0, 36.0]]
+    g.outputs["second"] = twice  # of nodes that are there
+    assert evaluate(g, given)["second"].tolist() == [[2.0, 6.0]]
+    g.outputs["x"] = x
+    g.outputs["first"] = x + 1.0
+    found = evaluate(g, given)
+    assert {name: rows.tolist() for name, rows in found.items()} == {
+        "first": [[2.0, 4.0]], "second": [[2.0, 6.0]], "x": [[1.0, 3.0]],
+    }  # fmt: skip
+
+
+def test_memory_of_what_no_later_node_needs_is_given_back() -> None:
+    g = Graph()
+    value = g.input("x")
+    for _ in range(200):
+        value = value.sqrt() + 1.0
+    g.outputs["end"] = value
+    given = {"x": np.ones((1, 20_000))}
+    evaluate(g, given)
+    tracemalloc.start()
+    try:
+        evaluate(g, given)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 6 * given["x"].nbytes
