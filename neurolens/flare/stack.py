@@ -15,7 +15,8 @@ from neurolens.graph.compiler import load_compiled
 from neurolens.graph.ir import Graph
 from neurolens.graph.scalars import lower
 from neurolens.optics import glass
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.prescription import Lens
+from neurolens.optics.sag import same_medium
 from neurolens.optics.shapes import is_plain
 
 Floats = NDArray[np.float32]
@@ -114,13 +115,8 @@ def entering(rays: Floats) -> Floats:
 
 def reflects(lens: Lens, k: int) -> bool:
     """Whether surface k reflects any light: the medium changes there, or it is coated."""
-    s = lens.surfaces[k]
-    before = lens.surfaces[k - 1] if k else None
-    return bool(s.coating and s.coating.layers) or _medium(before) != _medium(s)
-
-
-def _medium(s: Surface | None) -> tuple[object, ...]:
-    return (None, 1.0, None) if s is None else (s.glass, 1.0 if s.glass else float(s.n_d), s.V_d)
+    coating = lens.surfaces[k].coating
+    return bool(coating and coating.layers) or not same_medium(lens.surfaces, k)
 
 
 def _function(graph: Graph, name: str, run: str, taken: str, given: str, numbers: str) -> str:
