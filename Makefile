@@ -2,7 +2,8 @@
 #
 #   make demo     train, evaluate and render the quickstart (4 CPU minutes after installing)
 #   make test     tests, then lint, format and types
-#   make test-blender   the extension in Blender 5.0, in .venv-blender (Python 3.11; about 400 MB, once)
+#   make test-blender   the extension in Blender 5.0, in .venv-blender (Python 3.11; about 400 MB, once);
+#                       BLENDER=4.5.0 or 5.2.3 for another (from 5.1 on it needs Python 3.13)
 #   make bench    the tracer's speed, then models against it; fails when a promised ratio is lost
 #   make models   fit again every model of models/
 #   make gallery  what real lenses do: render and measure every effect
@@ -17,9 +18,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
-BLENDER_VENV := .venv-blender
+BLENDER ?= 5.0.0
+BLENDER_VENV := .venv-blender$(if $(filter 5.0.0,$(BLENDER)),,-$(BLENDER))
 BLENDER_INSTALLED := $(BLENDER_VENV)/.installed
-BLENDER_PACKAGES := bpy==5.0.0 numpy==1.26.4 pytest==9.2.0
+BLENDER_PYTHON := $(if $(filter 4.% 5.0.%,$(BLENDER)),3.11,3.13)
+BLENDER_PACKAGES := bpy==$(BLENDER) numpy$(if $(filter 3.11,$(BLENDER_PYTHON)),==1.26.4) pytest==9.2.0
 
 # Versions come from constraints.txt alone; a slow mirror should not fail the build.
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -39,7 +42,7 @@ test: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile --durations=10
 	$(MAKE) --no-print-directory lint
 
-# Blender as a module wants Python 3.11 and numpy 1: an environment of its own. On Debian without a desktop it also needs
+# Blender as a module wants one Python and, to 5.0, numpy 1: an environment of its own. On Debian without a desktop it also needs
 # libxkbcommon0 libsm6 libxi6 libxxf86vm1 libxfixes3 libgl1 libegl1.
 test-blender: $(BLENDER_INSTALLED) $(INSTALLED)
 	PYTHONPATH=. $(BIN)/python tests/blender/expect.py build/blender
@@ -65,7 +68,7 @@ format: $(INSTALLED)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) $(BLENDER_VENV) .pytest_cache .mypy_cache .ruff_cache build *.egg-info
+	rm -rf $(VENV) .venv-blender* .pytest_cache .mypy_cache .ruff_cache build *.egg-info
 
 # torch goes first, by itself, at the tested version: it brings setuptools, which then builds the project without fetching anything unpinned.
 $(INSTALLED): pyproject.toml constraints.txt
@@ -85,11 +88,11 @@ $(INSTALLED): pyproject.toml constraints.txt
 
 $(BLENDER_INSTALLED): Makefile
 	@set -e; found=; \
-	for candidate in "$(PYTHON)" python3.11 python3; do \
-	    if "$$candidate" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null; then found=$$candidate; break; fi; \
+	for candidate in "$(PYTHON)" python$(BLENDER_PYTHON) python3; do \
+	    if "$$candidate" -c 'import sys; sys.exit("%d.%d" % sys.version_info[:2] != "$(BLENDER_PYTHON)")' 2>/dev/null; then found=$$candidate; break; fi; \
 	done; \
 	if [ -z "$$found" ]; then \
-	    echo "Blender 5.0 as a module needs Python 3.11: try make test-blender PYTHON=/path/to/python3.11" >&2; exit 1; \
+	    echo "Blender $(BLENDER) as a module needs Python $(BLENDER_PYTHON): try make test-blender PYTHON=/path/to/python$(BLENDER_PYTHON)" >&2; exit 1; \
 	fi; \
 	echo "Setting up $(BLENDER_VENV) with $$found (once; Blender is large)"; \
 	"$$found" -m venv $(BLENDER_VENV)

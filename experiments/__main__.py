@@ -28,6 +28,7 @@ NAMES = {
     "render": ("render_times_page", "render time by camera and scene"),
     "mitsuba": ("mitsuba_speed", "speed of the renderer beside Mitsuba 3"),
     "osl": ("osl_speed", "cameras in Blender's Cycles: shaders of models beside its own"),
+    "osl-pictures": ("osl_pictures", "lenses in Cycles beside its own depth of field"),
     "promises": ("promises", "models against the speed that their index promises"),
     "white-cards": ("white_cards", "light on the film, by integral and rendered four ways"),
     "spectral-noise": ("spectral_noise", "noise of the ways to sample wavelengths"),
@@ -35,7 +36,12 @@ NAMES = {
     "gallery": ("gallery.run", "what real lenses do: figures and numbers"),
     "fuzz": ("fuzz", "hostile files and command lines: one clear line each, in bounded time and memory"),
     "photons": ("photons", "flare by photons, as in Keshmirian 2008"),
+    "glare": ("glare", "contrast that veiling glare takes; ways to sample light that turns round"),
+    "starburst": ("starburst", "stars by diffraction: shapes, checks, Keller's cones beside"),
     "flare": ("flare_speed", "ghosts: nanoseconds a ray, compiled and path by path"),
+    "flare-gallery": ("flare_gallery", "pictures of flare: suns, headlights, coatings, stops, an animation"),
+    "ghosts": ("ghosts", "ghosts drawn in several ways: error and time a picture"),
+    "coatings": ("coatings", "what flare loses by one-layer coatings and dropped aspheres"),
     "optiland": ("compare_optiland", "speed of the exact tracer beside Optiland"),
 }
 _DESCRIPTION = """\

@@ -1,36 +1,53 @@
 """Nanoseconds a ghost ray: all ghosts of a lens as compiled steps, beside path by path in torch.
 
 A ghost ray is one ray of one pair of surfaces at one wavelength, whether it arrives or is lost on the way; a light 12
-degrees off the axis, the widest stop, one thread, float32, compiling not counted. Both ways run in turn in one process.
-Writes flare_speed.md and flare_speed.json.
+degrees off the axis, the widest stop, one thread, float32, compiling not counted. Both ways run in turn in one process,
+by processor time, which other work on the machine lengthens little. Writes flare_speed.md and flare_speed.json.
+
+With --flaresim, the public CPU tracer of that name (github.com/space55/blackhole-rt, folder flaresim, MIT) runs in turn
+with ours on the first lens: its own flags (-O3 -march=native -ffast-math, link-time optimisation, OpenMP with one
+thread), bare surfaces, all pairs, its three wavelengths, one light on a picture of 128 x 72 pixels, no bloom and no
+blur. Of its runs counts what they take beyond a run of few rays: no reading and writing, but its splatting. It is built
+with `cmake -B build flaresim && cmake --build build`, needs OpenEXR, and is never part of this project.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import os
+import re
 import statistics
+import subprocess
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
+import numpy as np
 import torch
 
 from experiments import lab
+from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.flare.ghosts import GhostTracer
-from neurolens.flare.picture import Light, light_rays
+from neurolens.flare.lights import Light, light_rays
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens
 from neurolens.optics.sequence import follow, ghost
 from neurolens.optics.trace import Rays
+from neurolens.render.pictures import write_exr
 
 LENSES = ("laikin_double_gauss_50", "brendel_tessar_100", "ikemori_retrofocus_14", "ogawa_zoom_70_200", "phone_lens_6")
-GOAL_NS = 57.0  # a tenth of what the public CPU tracer takes on one quiet core (10 surfaces, all pairs)
+GOAL_NS = 57.0  # a tenth of what the public CPU tracer was said to take on one quiet core (10 surfaces, all pairs)
 _RAYS, _NM, _PATHS = 2048, 550.0, 12  # of torch, a ghost takes as long as any other of as many surfaces
+_ANGLE_DEG, _GRID, _FEW = 12.0, 224, 16  # rays of flaresim across the front
 
 OPTIONS = [
     lab.option("--only", metavar="TEXT", default="", help="lenses whose name holds this text"),
     lab.count("rounds", 15, "default: 15"),
+    lab.option("--flaresim", metavar="BINARY", type=Path, help="the public tracer, built; left out where not given"),
     lab.out(),
 ]
 
@@ -56,6 +73,18 @@ class Row:
         return self.torch_min / self.compiled_min
 
 
+@dataclass(frozen=True)
+class Public:
+    """A tracer in the race with the public one: ns a ghost ray, minimum and median."""
+
+    tracer: str
+    ghosts: int
+    rays: int
+    arriving: float
+    ns_min: float
+    ns_median: float
+
+
 def run(args: argparse.Namespace) -> int:
     """Time the lenses, write the tables; 1 where the goal is missed."""
     lab.quiet_glasses()
@@ -67,8 +96,14 @@ def run(args: argparse.Namespace) -> int:
             rows.append(_row(name, args.rounds, report))
     main = [r.compiled_min for r in rows if r.lens == LENSES[0]]
     goal = lab.Goal(f"ns a ghost ray, {LENSES[0]}", GOAL_NS, main[0] if main else None)
-    text = lab.page("# Ghosts", __doc__ or "", lab.table(_COLUMNS, rows), lab.goal_table("Goal", [goal]))
+    beside = [] if args.flaresim is None else _beside(args.flaresim, max(3, args.rounds // 3), progress)
+    other = "flaresim was not given (--flaresim): not measured beside ours."
+    if beside:
+        goal_now = lab.Goal(f"times as fast as {beside[0].tracer}", 10.0, beside[0].ns_min / beside[1].ns_min, True)
+        other = lab.page(lab.table(_PUBLIC, beside), lab.goal_table("Goal", [goal_now]))
+    text = lab.page("# Ghosts", __doc__ or "", lab.table(_COLUMNS, rows), lab.goal_table("Goal", [goal]), other)
     told = {"machine": lab.machine(), "rounds": args.rounds, "rows": [asdict(r) for r in rows]}
+    told["beside"] = [asdict(r) for r in beside]
     print(lab.write_results(args.out, "flare_speed", text, told))
     return int(bool(main) and main[0] > GOAL_NS)
 
@@ -76,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
 def _row(name: str, rounds: int, report: Callable[[float], None]) -> Row:
     lens = read_lens(lab.LENSES / f"{name}.toml").at(focus_m=math.inf)
     tracer = GhostTracer(lens)
-    rays, _ = light_rays(lens, Light(12.0, 0.0), 0, _RAYS)
+    rays, _ = light_rays(lens, Light(_ANGLE_DEG, 0.0), 0, _RAYS)
     given = Rays(*torch.from_numpy(rays).float())
     paths = [ghost(len(lens.surfaces), *pair) for pair in tracer.pairs]
     some = paths[:: max(1, len(paths) // _PATHS)]
@@ -93,10 +128,10 @@ def _row(name: str, rounds: int, report: Callable[[float], None]) -> Row:
     times: dict[Callable[[], int], list[float]] = {compiled: [], by_path: []}
     for n in range(rounds + 1):
         for call, found in times.items():
-            began = time.perf_counter()
+            began = time.process_time()
             rays_done = call()
             if n:  # the first compiles, and warms caches
-                found.append(1e9 * (time.perf_counter() - began) / rays_done)
+                found.append(1e9 * (time.process_time() - began) / rays_done)
         report(n / rounds)
     arriving = tracer.trace(rays, _NM).worst <= 1
     own = [len(lens.surfaces) - 1 - pair.first for pair in tracer.pairs]
@@ -114,6 +149,83 @@ def _row(name: str, rounds: int, report: Callable[[float], None]) -> Row:
     )
 
 
+def _beside(binary: Path, rounds: int, progress: Progress) -> list[Public]:
+    """flaresim and our tracer on the first lens, in turn.
+
+    Raises:
+        InputError: no such program, or one that ends otherwise than flaresim does.
+    """
+    lens = read_lens(lab.LENSES / f"{LENSES[0]}.toml").at(focus_m=math.inf)
+    tracer = GhostTracer(lens)
+    rays, _ = light_rays(lens, Light(_ANGLE_DEG, 0.0), 0, 1 << 15)
+    arriving = float((tracer.trace(rays, _NM).worst <= 1).mean())
+    theirs: list[tuple[float, ...]] = []
+    ours: list[float] = []
+    with progress.stage("flaresim") as report, tempfile.TemporaryDirectory() as folder:
+        _write_inputs(lens, Path(folder))
+        for n in range(rounds):
+            few, many = (_flaresim(binary, Path(folder), grid) for grid in (_FEW, _GRID))
+            theirs.append(tuple(a - b for a, b in zip(many, few, strict=True)))
+            for _ in range(20):
+                began = time.process_time()
+                found = tracer.trace(rays[:, :_RAYS], _NM)
+                ours.append(1e9 * (time.process_time() - began) / found.worst.size)
+            report((n + 1) / rounds)
+    ns = [1e9 * seconds / count for seconds, count, _ in theirs]
+    _, count, hits = theirs[0]
+    git = ["git", "-C", str(binary.resolve().parent), "log", "-1", "--format=%h of %cs"]
+    version = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
+    return [
+        Public(f"flaresim ({version})", len(tracer.pairs), int(count), hits / count, min(ns), statistics.median(ns)),
+        Public("ours", len(tracer.pairs), found.worst.size, arriving, min(ours), statistics.median(ours)),
+    ]
+
+
+def _write_inputs(lens: Lens, folder: Path) -> None:
+    """The lens and one light as flaresim reads them."""
+    rows = []
+    for s in lens.surfaces:
+        shape = "stop" if s.stop else f"{0.0 if math.isinf(s.radius_mm) else s.radius_mm:g}"
+        rows.append(f"  {shape} {s.thickness_mm:g} {s.n_d:g} {s.V_d or 0.0:g} {s.semi_diameter_mm:g} 0")
+    head = f"name: {lens.name}\nfocal_length: {lens.stated_efl_mm:g}\n\nsurfaces:\n"
+    (folder / "ours.lens").write_text(head + "\n".join(rows) + "\n")
+    picture, half_deg = np.zeros((72, 128, 3)), 20.0
+    picture[36, int(64 * (1 + math.tan(math.radians(_ANGLE_DEG)) / math.tan(math.radians(half_deg))))] = 100.0
+    write_exr(folder / "light.exr", picture)
+    settings = {"input": "light.exr", "output": "out.exr", "lens": "ours.lens", "fov": 2 * half_deg}
+    settings |= {"min_ghost": 0, "downsample": 1, "ghost_normalize": 0, "ghost_blur": 0, "bloom_strength": 0}
+    (folder / "flaresim.conf").write_text("".join(f"{key} = {value}\n" for key, value in settings.items()))
+
+
+def _flaresim(binary: Path, folder: Path, grid: int) -> tuple[float, int, int]:
+    """Processor seconds, ghost rays, and those that arrive, of a run.
+
+    Raises:
+        InputError: as `_beside`; not all pairs are traced.
+    """
+    import resource  # of POSIX
+
+    began = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+    try:
+        command = [str(binary.resolve()), "flaresim.conf", "--rays", str(grid)]
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)
+        total = re.search(r"rendering total: .* \((\d+)/(\d+) rays", done.stdout)
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise InputError(binary, "--flaresim", f"({error})", "the program of flaresim") from error
+    if total is None:
+        raise InputError(binary, "--flaresim", "(other output)", "the program of flaresim, which tells its rays")
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - began, int(total[2]), int(total[1])
+
+
+_PUBLIC = lab.columns(
+    ("beside each other", "tracer"),
+    ("ghosts", "ghosts"),
+    ("ghost rays", "rays"),
+    ("that arrive", "arriving", ".1%"),
+    ("ns min", "ns_min", ".1f"),
+    ("median", "ns_median", ".1f"),
+)
 _COLUMNS = lab.columns(
     ("lens", "lens"),
     ("surfaces", "surfaces"),

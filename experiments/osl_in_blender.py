@@ -1,4 +1,4 @@
-"""The race of `osl_speed`, in Blender's own Python, which has neither neurolens nor torch: PLAN.json RESULT.json.
+"""What `osl_speed` and `osl_pictures` ask of Blender's own Python, which has no neurolens: PLAN.json RESULT.json.
 
 The plan holds `cameras`, each with `name`, `focal_mm`, `depth_of_field` and `shader`, the text of one in OSL or null
 for the camera that Blender has, and `scenes` by name, each with `size` (pixels), `samples`, `rounds` and names of
@@ -18,13 +18,15 @@ from typing import Any
 
 FOCUS_M, F_NUMBER = 2.0, 1.8
 _TINY = (8, 8, 1)  # pixels and samples
+_LIGHTS = ((1.0, 0.62, 0.25), (0.3, 0.75, 1.0), (1.0, 0.2, 0.25), (0.45, 1.0, 0.4), (1.0, 0.85, 0.6))
 
 
 def main(plan_file: str, result_file: str) -> None:
     """Run the plan; prints the share that is done, and what is wrong with a shader."""
     bpy = _blender()
     plan, found = json.loads(Path(plan_file).read_text(encoding="utf-8")), {}
-    total = sum((s["rounds"] + 1) * len(s["cameras"]) for s in plan["scenes"].values())
+    shots = plan.get("shots", [])
+    total = sum((s["rounds"] + 1) * len(s["cameras"]) for s in plan["scenes"].values()) + len(shots)
     done = 0
     for name, wanted in plan["scenes"].items():
         scene = _scene(bpy, name == "real")
@@ -41,7 +43,14 @@ def main(plan_file: str, result_file: str) -> None:
                 done += 1
                 print(f"\nshare {done / total:.4f}", flush=True)
         found[name] = times
-    Path(result_file).write_text(json.dumps({"blender": bpy.app.version_string, "scenes": found}), encoding="utf-8")
+    seconds = {}
+    scene = _evening(bpy) if shots else None
+    for shot in shots:
+        seconds[shot["name"]] = _shoot(bpy, scene, shot)
+        done += 1
+        print(f"\nshare {done / total:.4f}", flush=True)
+    result = {"blender": bpy.app.version_string, "scenes": found, "shots": seconds}
+    Path(result_file).write_text(json.dumps(result), encoding="utf-8")
 
 
 def _blender() -> Any:
@@ -61,7 +70,7 @@ def _scene(bpy: Any, real: bool) -> Any:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.render.engine, cycles = "CYCLES", scene.cycles
-    cycles.device, cycles.shading_system = "CPU", True
+    cycles.device = "CPU"
     cycles.use_adaptive_sampling = cycles.use_denoising = False
     cycles.max_bounces = 4
     scene.render.threads_mode, scene.render.threads = "FIXED", 1
@@ -82,15 +91,86 @@ def _furnish(bpy: Any) -> None:
         bpy.ops.mesh.primitive_monkey_add(size=0.4, location=place, rotation=(0.0, 0.4 * k, 0.0))
         bpy.ops.object.modifier_add(type="SUBSURF")
         bpy.context.object.modifiers[0].render_levels = 1
-        paint = bpy.data.materials.new(f"paint {k}")
-        paint.use_nodes = True
-        inputs = paint.node_tree.nodes["Principled BSDF"].inputs
-        inputs["Base Color"].default_value = (0.2 + 0.1 * k, 0.5, 0.9 - 0.1 * k, 1.0)
-        inputs["Roughness"].default_value = 0.1 + 0.1 * k
-        bpy.context.object.data.materials.append(paint)
+        _paint(bpy, (0.2 + 0.1 * k, 0.5, 0.9 - 0.1 * k), 0.1 + 0.1 * k)
     for place, watts in (((2, 3, 0), 150), ((-3, 2, -2), 100), ((0, 4, -5), 200)):
         bpy.ops.object.light_add(type="AREA", radius=1.0, location=place, rotation=(-math.pi / 2, 0, 0))
         bpy.context.object.data.energy = watts
+
+
+def _paint(bpy: Any, colour: Any, roughness: float = 0.5, glow: float = 0.0) -> Any:
+    """Give the newest object a material; one that glows is seen, and lights nothing."""
+    paint = bpy.data.materials.new("paint")
+    paint.use_nodes = True
+    inputs = paint.node_tree.nodes["Principled BSDF"].inputs
+    inputs["Base Color"].default_value = (*colour, 1.0)
+    inputs["Roughness"].default_value = roughness
+    inputs["Emission Color"].default_value, inputs["Emission Strength"].default_value = (*colour, 1.0), glow
+    paint.cycles.emission_sampling = "NONE"
+    bpy.context.object.data.materials.append(paint)
+    return paint
+
+
+def _evening(bpy: Any) -> Any:
+    """A head between balls on a chequered floor, the subject at the origin; strings of coloured lights behind it."""
+    scene = _scene(bpy, False)
+    scene.cycles.max_bounces = 3
+    scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.012, 0.018, 0.04, 1.0)
+    bpy.ops.mesh.primitive_plane_add(size=60, location=(0, -0.12, -20), rotation=(-math.pi / 2, 0, 0))
+    paint = _paint(bpy, (0.3, 0.3, 0.3), 0.4)
+    tiles = paint.node_tree.nodes.new("ShaderNodeTexChecker")
+    place = paint.node_tree.nodes.new("ShaderNodeTexCoord")
+    paint.node_tree.links.new(place.outputs["Object"], tiles.inputs["Vector"])
+    paint.node_tree.links.new(tiles.outputs["Color"], paint.node_tree.nodes["Principled BSDF"].inputs["Base Color"])
+    tiles.inputs["Scale"].default_value = 8.0
+    tiles.inputs["Color1"].default_value, tiles.inputs["Color2"].default_value = (
+        (0.5, 0.45, 0.38, 1),
+        (0.05, 0.05, 0.06, 1),
+    )
+    bpy.ops.mesh.primitive_monkey_add(size=0.2, location=(0, -0.02, 0), rotation=(-math.pi / 2, 0.35, 0.0))
+    bpy.ops.object.modifier_add(type="SUBSURF")
+    bpy.context.object.modifiers[0].render_levels = 2
+    bpy.ops.object.shade_smooth()
+    _paint(bpy, (0.75, 0.28, 0.1), 0.3)
+    blue, green, yellow, red = (0.05, 0.3, 0.6), (0.1, 0.5, 0.2), (0.8, 0.6, 0.1), (0.6, 0.1, 0.2)
+    balls = ((-0.2, -0.25, 0.07, blue), (0.22, -0.5, 0.09, green), (0.13, 0.12, 0.035, yellow), (-0.6, -1.2, 0.12, red))
+    for x, z, radius, colour in balls:
+        bpy.ops.mesh.primitive_uv_sphere_add(radius=radius, location=(x, radius - 0.12, z), segments=48, ring_count=24)
+        bpy.ops.object.shade_smooth()
+        _paint(bpy, colour, 0.15)
+    bulbs = []
+    for colour in _LIGHTS:
+        bpy.ops.mesh.primitive_uv_sphere_add(radius=0.025, location=(0, 0, 100), segments=16, ring_count=8)
+        _paint(bpy, colour, glow=9.0)
+        bulbs.append(bpy.context.object.data)
+    for row in range(12):
+        for k in range(41):
+            bulb = bpy.data.objects.new("bulb", bulbs[(2 * k + row) % len(bulbs)])
+            hang = 0.1 * math.cos(2 * math.pi * k / 5.5 + row)
+            bulb.location = 0.32 * (k - 20) + 0.1 * (row % 3), 0.02 + 0.3 * row + hang, -4.0 - 0.7 * ((k + row) % 3)
+            bulb.visible_diffuse = bulb.visible_glossy = False  # its reflections would be noise
+            scene.collection.objects.link(bulb)
+    for place, watts, size in (((1.2, 1.6, 1.0), 28, 0.8), ((-1.5, 0.8, 0.3), 8, 0.5), ((0.2, 1.2, -1.2), 10, 0.5)):
+        bpy.ops.object.light_add(type="AREA", radius=size, location=place)
+        lamp = bpy.context.object
+        lamp.data.energy = watts
+        lamp.rotation_euler = (-lamp.location).to_track_quat("-Z", "Y").to_euler()
+    return scene
+
+
+def _shoot(bpy: Any, scene: Any, shot: dict[str, Any]) -> float:
+    """Seconds of CPU of a picture, which is written."""
+    scene.camera = camera = _camera(bpy, scene, shot["camera"])
+    camera.location = (0.0, 0.02, shot["focus_m"])
+    camera.data.dof.focus_distance, camera.data.dof.aperture_ratio = shot["focus_m"], shot["aperture_ratio"]
+    if shot["fisheye"]:
+        camera.data.type = "PANO"
+        panorama = camera.data if hasattr(camera.data, "panorama_type") else camera.data.cycles  # to Blender 4.5
+        panorama.panorama_type = "FISHEYE_EQUISOLID"
+        panorama.fisheye_lens, panorama.fisheye_fov = camera.data.lens, math.pi
+    render = scene.render
+    render.pixel_aspect_x, render.pixel_aspect_y = 1.0, shot["pixel_aspect"]
+    render.filepath, render.image_settings.file_format = shot["file"], "PNG"
+    return _render(bpy, scene, (*shot["size"], shot["samples"]), write_still=True)
 
 
 def _camera(bpy: Any, scene: Any, wanted: dict[str, Any]) -> Any:
@@ -98,8 +178,9 @@ def _camera(bpy: Any, scene: Any, wanted: dict[str, Any]) -> Any:
     data = bpy.data.cameras.new(wanted["name"])
     camera = bpy.data.objects.new(wanted["name"], data)
     scene.collection.objects.link(camera)
-    data.lens, data.sensor_width, data.clip_start = wanted["focal_mm"], 36.0, 1e-3
-    data.dof.use_dof, data.dof.focus_distance, data.dof.aperture_fstop = wanted["depth_of_field"], FOCUS_M, F_NUMBER
+    data.lens, data.sensor_width, data.clip_start = wanted["focal_mm"], wanted.get("sensor_mm", 36.0), 1e-3
+    data.dof.use_dof, data.dof.focus_distance = wanted["depth_of_field"], FOCUS_M
+    data.dof.aperture_fstop = wanted.get("f_number", F_NUMBER)
     if wanted["shader"] is not None:
         from cycles.osl import update_custom_camera_shader
 
@@ -111,12 +192,12 @@ def _camera(bpy: Any, scene: Any, wanted: dict[str, Any]) -> Any:
     return camera
 
 
-def _render(bpy: Any, scene: Any, size: tuple[int, int, int]) -> float:
+def _render(bpy: Any, scene: Any, size: tuple[int, int, int], write_still: bool = False) -> float:
     """Seconds of CPU of a picture."""
     scene.render.resolution_x, scene.render.resolution_y, scene.cycles.samples = size
     scene.render.resolution_percentage = 100
     began = time.process_time()
-    bpy.ops.render.render()
+    bpy.ops.render.render(write_still=write_still)
     return time.process_time() - began
 
 

@@ -65,9 +65,12 @@ shader thin_lens(float focal_mm = 50.0, float f_number = 1.8,
 }
 """
 
+BLENDER = lab.option(
+    "--blender-python", metavar="PATH", type=Path, default=PYTHON,
+    help=f"a Python that has bpy (default: {PYTHON.relative_to(lab.ROOT)}, by make test-blender)",
+)  # fmt: skip
 OPTIONS = [
-    lab.option("--blender-python", metavar="PATH", type=Path, default=PYTHON,
-               help=f"a Python that has bpy (default: {PYTHON.relative_to(lab.ROOT)}, by make test-blender)"),
+    BLENDER,
     lab.count("rounds", 15, "of the white sky (default: 15)"),
     lab.count("scene-rounds", 5, "of the scene (default: 5)"),
     lab.out(),
@@ -106,9 +109,7 @@ class Stage:
 
 def run(args: argparse.Namespace) -> int:
     """Write the shaders, race them, write the tables; 1 where a goal is missed."""
-    if not args.blender_python.is_file():
-        expected = "a Python with Blender as a module (bpy), which make test-blender sets up"
-        raise InputError("experiments osl", "--blender-python", str(args.blender_python), expected)
+    python = checked_python(args.blender_python, "osl")
     lab.quiet_glasses()
     stages = {
         "sky": Stage((128, 96), 32, args.rounds, (BUILT_IN, DEPTH, THIN, *SHADERS), THIN),
@@ -116,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
     }
     texts, operations = _shaders(args.quiet)
     with Progress({"race in Blender": 120.0}, quiet=args.quiet).stage("race in Blender") as report:
-        told = race(args.blender_python, texts, stages, report)
+        told = race(python, texts, stages, report)
     rows = [row for name, stage in stages.items() for row in rows_of(name, stage, told["scenes"][name], operations)]
     met = goals(rows)
     data = {"machine": lab.machine(), "blender": told["blender"], "rows": [asdict(r) for r in rows]}
@@ -144,18 +145,42 @@ def race(python: Path, texts: Mapping[str, str | None], stages: Mapping[str, Sta
         {"name": name, "focal_mm": _FOCAL_MM, "depth_of_field": name != BUILT_IN, "shader": text}
         for name, text in texts.items()
     ]
+    return in_blender(python, {"cameras": cameras, "scenes": {n: asdict(stage) for n, stage in stages.items()}}, report)
+
+
+def checked_python(path: Path, measurement: str) -> Path:
+    """The Python of --blender-python.
+
+    Raises:
+        InputError: there is none.
+    """
+    if path.is_file():
+        return path
+    expected = "a Python with Blender as a module (bpy), which make test-blender sets up"
+    raise InputError(f"experiments {measurement}", "--blender-python", str(path), expected)
+
+
+def in_blender(python: Path, plan: lab.Row, report: Report) -> lab.Row:
+    """What `osl_in_blender` finds by its plan.
+
+    Raises:
+        Unmeasured: Blender's Python fails.
+    """
     with tempfile.TemporaryDirectory(prefix="neurolens-osl-") as folder:
-        plan, result, said = (Path(folder) / name for name in ("plan.json", "result.json", "stderr"))
-        scenes = {name: asdict(stage) for name, stage in stages.items()}
-        plan.write_text(json.dumps({"cameras": cameras, "scenes": scenes}), encoding="utf-8")
-        command = [str(python), osl_in_blender.__file__, str(plan), str(result)]
+        planned, result, said = (Path(folder) / name for name in ("plan.json", "result.json", "stderr"))
+        planned.write_text(json.dumps(plan), encoding="utf-8")
+        command = [str(python), osl_in_blender.__file__, str(planned), str(result)]
         user = {"BLENDER_USER_RESOURCES": folder, "PYTHONPATH": ""}
         with said.open("w") as errors, subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=errors, text=True, env=os.environ | user
         ) as child:  # fmt: skip
-            for line in child.stdout or ():
-                if line.startswith("share "):
-                    report(float(line.split()[1]))
+            try:
+                for line in child.stdout or ():
+                    if line.startswith("share "):
+                        report(float(line.split()[1]))
+            except BaseException:
+                child.kill()  # or leaving the block would wait for it
+                raise
         if child.returncode != 0:
             last = said.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
             raise lab.Unmeasured(f"{python}: {''.join(last) or child.returncode}")

@@ -38,14 +38,15 @@ LENSES = {
 CARD = "Müller fisheye 14 mm f/4"
 FACTORS = ("relative", "natural", "aperture", "optical", "mechanical", "transmittance", "area_mm2")
 WAYS = {"none": "flat", "natural": "cos4", "optical": "aperture", "both": "both"}  # --vignetting to `white_card`'s
-LIT_MM = 18.83  # where the light of the card's lens ends
+LIT_MM = 18.74  # where the light of the card's lens ends, in best focus
 PLACES = {"centre": 0.0, "half the lit radius": 0.5, "nine tenths": 0.9, "98%": 0.98}
 
 
 def light_of(name: str, radius_mm: Any) -> FilmLight:
-    """Of one of `LENSES`."""
+    """Of one of `LENSES`, its film where cameras place it: in best focus."""
     stem, mm, f_number = LENSES[name]
-    return film_light(read_lens(lab.LENSES / f"{stem}.toml").at(focal_length_mm=mm, f_number=f_number), radius_mm)
+    lens = read_lens(lab.LENSES / f"{stem}.toml")
+    return film_light(lens.at(focal_length_mm=mm, f_number=f_number, focus_m=math.inf, focus="best"), radius_mm)
 
 
 def rendered(samples: int, threads: int, out: Path, report: lab.Report) -> str:

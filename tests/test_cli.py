@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from command_line import described, failure, run_json
 
-from neurolens.cli import main
+from neurolens.cli import build_parser, main
 from neurolens.render.pictures import read_exr
 
 ROOT = Path(__file__).parents[1]
@@ -39,6 +39,20 @@ def test_every_command_has_help(command: list[str], capsys: pytest.CaptureFixtur
     with pytest.raises(SystemExit, match="^0$"):
         main([*command, "--help"])
     assert "examples:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("given", "name"), [("cooke_triplet_50", "cooke_triplet_50.toml"), ("thin", "thin"), ("no_lens", "no_lens")]
+)
+def test_a_camera_may_be_a_lens_of_the_project_by_name(given: str, name: str) -> None:
+    size = ["--size", "36x24", "--film", "36x24"]
+    for command in (
+        ["stmap", given, *size, "-o", "a"],
+        ["projection", given, *size, "--model", "opencv"],
+        ["render", "a.toml", "--camera", given, "--film", "36x24", "-o", "a.exr"],
+    ):
+        found = Path(build_parser().parse_args(command).camera)
+        assert found.name == name and found.is_file() == (given != name)
 
 
 # Bad input
@@ -290,8 +304,9 @@ def test_what_ends_a_training_says_what_is_kept(
 def test_what_is_said_after_a_terminal_was_closed_goes_nowhere() -> None:
     ours, theirs = os.openpty()
     code = (
-        "import fcntl, sys, termios, time\n"
+        "import fcntl, signal, sys, termios, time\n"
         "from neurolens.base.signals import handled\n"
+        "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"  # nohup's children ignore it
         "asked = []\n"
         "with handled(asked.append):\n"
         "    fcntl.ioctl(1, termios.TIOCSCTTY, 0)\n"

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -66,8 +65,11 @@ def test_a_signal_in_mid_render_loses_nothing(
     out, part = tmp_path / "a.exr", tmp_path / "a.exr.part"
     arguments = ["render", scene.name, "--camera", "thin", "-o", out.name, "--quiet", "--checkpoint-every", "0.05"]
     command = [sys.executable, "-m", "neurolens", *arguments, "--samples", "100000"]
-    # Tests in the background of a shell ignore SIGINT, and would hand that on.
-    default = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+
+    def default() -> None:  # tests in the background of a shell, or under nohup, ignore some, and would hand that on
+        for ignored in (signal.SIGINT, signal.SIGHUP):
+            signal.signal(ignored, signal.SIG_DFL)
+
     process = subprocess.Popen(
         command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=default
     )
@@ -90,7 +92,8 @@ def test_a_signal_in_mid_render_loses_nothing(
             rf"neurolens: interrupted; a\.exr holds {count}; the same command resumes from a\.exr\.part", said
         )
         samples = read_layers(out)["samples"]
-        assert samples.max() >= 16 and samples.max() - samples.min() <= 16
+        # While one worker is in a tile the other goes on to that tile: those before it may be two passes ahead.
+        assert samples.max() >= 16 and samples.max() - samples.min() <= 32
         assert not read_exr(out)[1]["render"]["complete"] and out.with_suffix(".png").exists()
     # So many samples that there is more to do, and not so many that it takes long.
     with np.load(part, allow_pickle=False) as kept:

@@ -3,7 +3,7 @@
 base <- graph <- modelfile <- optics <- surrogates <- evaluate <- commands <- cli
                               optics <- analysis   <- evaluate
                  modelfile <- cameras <- render    <- evaluate
-                              analysis, render <- flare <- evaluate
+                  surrogates, analysis, render <- flare <- evaluate
                                          render    <- mitsuba  <- evaluate
 """
 
@@ -32,7 +32,7 @@ PARTS = {
     "cameras": {"graph", "modelfile"},
     "render": {"cameras"},
     "mitsuba": {"cameras", "render"},
-    "flare": {"graph", "optics", "analysis", "render"},
+    "flare": {"graph", "modelfile", "optics", "analysis", "surrogates", "cameras", "render"},
     "evaluate": {
         *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare")
     },

@@ -62,8 +62,8 @@ def save(figure: Any, path: str | Path) -> Path:
 
 def heading(figure: Any, title: str, subtitle: str) -> None:
     """Title of a figure with a lighter line below it, both to the left; they keep their room."""
-    lines = subtitle.count("\n")
-    figure.suptitle(f"{title}\n\n" + "\n" * lines, x=0.01, ha="left", fontsize=12, fontweight="bold")
+    below = "\n\n" + "\n" * subtitle.count("\n") if subtitle else ""
+    figure.suptitle(title + below, x=0.01, ha="left", fontsize=12, fontweight="bold")
     figure.text(0.01, 1 - 0.36 / figure.get_figheight(), subtitle, ha="left", va="top", fontsize=9, color="#555b63")
 
 

@@ -284,14 +284,14 @@ def placed_settings(lens: Lens, film_mm: tuple[float, float], focus_m: float) ->
     }
 
 
-def check_bare(lens: Lens) -> None:
+def check_bare(lens: Lens, instead: str = "without fused: it is traced with them") -> None:
     """Refuse, by an InputError, coatings and glass that absorbs: their graph follows neither."""
     for k, s in enumerate(lens.surfaces):
         coated = s.coating is not None and bool(s.coating.layers)
         absorbs = (s.glass is not None or s.absorption_per_mm) and absorption_of(s, LINE_D_NM) is not None
         if coated or absorbs:
             found = "(a coating)" if coated else "(glass that absorbs)"
-            raise InputError(lens.path, f"surface {k}", found, "a bare, clear lens for a C tracer: leave out fused:")
+            raise InputError(lens.path, f"surface {k}", found, f"a bare, clear lens to compile ({instead})")
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ def number_of(axes: Sequence[Axis], nodes: Sequence[float], rule: str = "") -> f
     if (values == values[0]).all():
         return float(values[0])
     powers = {"square": 2.0, "reciprocal": -1.0}
-    g, row = _followed(axes, values[:, None] ** powers.get(rule, 1.0))
+    g, row = followed_rows(axes, values[:, None] ** powers.get(rule, 1.0))
     g.outputs["value"] = row.sqrt() if rule == "square" else 1.0 / row if rule == "reciprocal" else row
     return lower(g)
 
@@ -121,7 +121,7 @@ def film_function(
     return min(found, key=lambda f: f.error_mm)
 
 
-def _followed(axes: Sequence[Axis], nodes: ArrayLike) -> tuple[Graph, Value]:
+def followed_rows(axes: Sequence[Axis], nodes: ArrayLike) -> tuple[Graph, Value]:
     """A graph of the state's numbers, and in it numbers [nodes, n] that follow it, n rows; constants of no axes."""
     g, values = Graph(), np.asarray(nodes, np.float64)
     if not axes:
@@ -150,7 +150,7 @@ def _fitted(
     basis = np.prod(np.stack([x.ravel(), y.ravel()], -1)[:, None] ** exponents, -1)
     terms = np.linalg.lstsq(basis, placed.reshape(len(nodes), -1).T, rcond=None)[0].T
     ends = [(1 / node.nearest_m, node.stop_radius_mm, *(node.film_z_mm or ())) for node in nodes]
-    g, numbers = _followed(axes, np.concatenate([terms, ends], 1))
+    g, numbers = followed_rows(axes, np.concatenate([terms, ends], 1))
     count = len(exponents)
     near, stop, *film = (numbers[count + k] for k in range(len(ends[0])))
     rows = [((1.0 / g.input(FOCUS)) / near).clip(0.0, 1.0) * 2.0 - 1.0] if moved else []

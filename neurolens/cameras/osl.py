@@ -5,53 +5,63 @@ focus of the lens. Inputs of the shader (`PARAMETERS`) are numbers when the rend
 them alone costs nothing then. Besides them it reads, of Blender's camera, the sensor's size (with its fit and the
 picture's aspect), shift and, where `focus_m` is 0, the distance of depth of field.
 
+Of a lens in several states (zoom, internal focus) every number of the camera follows the state, mixed from cameras at
+the nodes of its axes as a model's own numbers are: the zoom is an input, internal focus the distance in focus.
+
 One of the two random numbers tells the wavelength by its low bits, which leaves both as even as they were. Its colour
 weights are Bernstein's polynomials of second order: never negative, of mean 1 each.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
+from neurolens.base.progress import Report
+from neurolens.cameras.blades import MAX_BLADES, Blades
 from neurolens.cameras.cameragraph import D_FILM, weight_graph
-from neurolens.cameras.focus_function import FOCUS, SMALLEST, Focusing, film_function
+from neurolens.cameras.focus_function import FOCUS, SMALLEST, Focusing, film_function, followed_rows
 from neurolens.cameras.lens_state import squeeze_of
 from neurolens.cameras.model import ModelScene
 from neurolens.cameras.onnxlens import OnnxLens
 from neurolens.cameras.pupil_arcs import PupilArcs
-from neurolens.cameras.pupil_arcs_fit import Sight, fit_arcs
+from neurolens.cameras.pupil_arcs_fit import Sight, fit_arcs, passing
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.sampling import stratified
 from neurolens.cameras.source import model_focusing
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
-from neurolens.graph.loworder import with_film_derivatives, with_low_order_derivatives
+from neurolens.graph.loworder import low_orders, with_film_derivatives
 from neurolens.graph.osl import Parameter, write_osl
-from neurolens.graph.program import STOP_RADIUS
+from neurolens.graph.program import STOP_RADIUS, Mixture, Program
 from neurolens.graph.scalars import lower
+from neurolens.modelfile.axes import Axis, product, weights
 from neurolens.modelfile.graph import graph_of
+from neurolens.modelfile.stategraph import state_graph, state_names
+from neurolens.modelfile.states import STATE
 from neurolens.optics.film_plane import LINE_D_NM
 
 Array = NDArray[np.float64]
 OUTPUTS = ("position", "direction", "throughput", "dPdx", "dPdy", "dDdx", "dDdy")
-MAX_BLADES = 16
 _FAR_M = 1e-4  # Blender's focus distance below this means that depth of field is off
 _LOW_BITS = 4096.0  # of a random number: what lies below 1 / 4096 of it
+_NEARLY, _EDGES = 0.99, 0.75  # of rays beyond this share of the stop's radius: their places at the stop are known
+_LEAST = 1.7e-3  # of the stop's radius, by which blades are widened; no other number of a graph, which would share it
 _QUADRATURE = 64  # points a side of the exposure on the axis
 _NEAR = 0.999  # of the near limit: rounding
-# Cycles takes the mean size of derivatives, for the footprint of a pixel: their errors by output, and of all of them.
+# Errors of derivatives by output, and of all of them.
 _DERIVATIVES, _WORST = 0.03, 0.05
 _ACROSS, _FILM_POWERS = 16, 7  # distances and stops at which the film is placed, and powers of each
 _BESIDE = 0.01  # of the film radius: near the axis
 _LIGHT_NM = (400.0, 700.0)  # colours beyond would spread fringes that no eye and no film sees
-Report = Callable[[float], object]
+FOCUS_AXIS = "focus"
 _FRAME = """\
     point raster = camera_shader_raster_position();
     vector pixel_right = Dx(raster), pixel_up = Dy(raster);
@@ -71,25 +81,42 @@ _FRAME = """\
 """
 
 
+class Seen(NamedTuple):
+    """A lens in one state: its rays, how it is focused, f-number of its widest stop and focal length (mm)."""
+
+    sight: Sight
+    focusing: Focusing
+    f_number: float
+    efl_mm: float
+
+
 @dataclass(frozen=True)
 class OslCamera:
-    """What a shader is made of.
+    """What a shader of a lens in one state is made of.
 
     Attributes:
-        sight: the lens. arcs: its pupil. film: its position
+        sight: the lens. lens: its graph with derivatives by the film point. arcs: its pupil. film: its position
             (mm) by powers of stop and focus, see `_film`. near_m: nearest distance, inf where the film does not focus.
+            limit_m: nearer than that nothing is in focus; 0 where nothing moves.
         f_number: of the widest stop. efl_mm: focal length.
-        entrance_mm: z of the entrance pupil, lens frame.
+        entrance_mm: z of the entrance pupil, lens frame. stop_image: see `_stop_image`.
     """
 
     sight: Sight
+    lens: Graph
     arcs: PupilArcs
     film: Array
     near_m: float
+    limit_m: float
     f_number: float
     efl_mm: float
     entrance_mm: float
-    pupil_z_mm: float
+    stop_image: tuple[float, float]
+
+    @property
+    def pupil_z_mm(self) -> float:
+        """Of the plane of pupil points."""
+        return self.sight.table.pupil_z_mm
 
     @property
     def nearest_m(self) -> float:
@@ -97,14 +124,57 @@ class OslCamera:
         return self.near_m if math.isfinite(self.near_m) else 1.0
 
 
-def parameters(camera: OslCamera) -> list[Parameter]:
-    """The inputs that a user turns, in order: f_number, focus_m, blades, roundness, rotation, exposure, vignetting,
-    dispersion, origin, warn."""
-    widest = float(f"{camera.f_number:.4g}")
+@dataclass(frozen=True)
+class OslLens:
+    """A lens as its shader has it.
+
+    Attributes:
+        nodes: in each state of `product(axes)`; the one of a lens without axes.
+        between: weights of the nodes, and the lens in states between them.
+    """
+
+    nodes: list[OslCamera]
+    axes: tuple[Axis, ...] = ()
+    between: Sequence[tuple[Array, Sight]] = ()
+
+    @property
+    def near_m(self) -> tuple[float, float]:
+        """The nearest distance in focus, of the state that focuses nearest and of that which does least; 0: fixed."""
+        own = [c.limit_m for c in self.nodes]
+        return min(own), max(own)
+
+    @property
+    def f_number(self) -> float:
+        """The widest of all states."""
+        return min(c.f_number for c in self.nodes)
+
+    @property
+    def film_radius_mm(self) -> float:
+        """Of the picture that all states fill."""
+        return min(c.arcs.film_radius_mm for c in self.nodes)
+
+    def passing(self) -> dict[float, float]:
+        """Share of the samples that pass, in the worst state, by shares of the widest stop."""
+        first, *others = (c.arcs for c in self.nodes)
+        seen = [(np.eye(len(self.nodes))[k], c.sight) for k, c in enumerate(self.nodes)]
+        found = [passing(sight, first.mixed(others, weights)) for weights, sight in [*seen, *self.between]]
+        return {share: min(f[share] for f in found) for share in found[0]}
+
+
+def parameters(lens: OslLens) -> list[Parameter]:
+    """The inputs that a user turns, in order: f_number, focus_m, zoom_mm of a zoom's range, blades, roundness,
+    rotation, exposure, vignetting, dispersion, origin, warn."""
+    widest = float(f"{lens.f_number:.4g}")
+    zoom = []
+    for axis, name in zip(lens.axes, state_names(lens.axes), strict=True):
+        low, high = (float(f"{v:.6g}") for v in axis.range)
+        if axis.name != FOCUS_AXIS:
+            zoom.append(Parameter(name, "Zoom (mm)", "Focal length at infinity focus", low, low, high))
     return [
         Parameter("f_number", "F-number", "Stop; below the widest it is the widest", widest, 0.1, 1000.0),
         Parameter("focus_m", "Focus (m)", "Distance in focus from the camera; 0 takes that of depth of field, infinity "
                   "where that is off", 0.0, 0.0, 1e6),
+        *zoom,
         Parameter("blades", "Blades", f"Of the stop, 3 to {MAX_BLADES}; 0 is round", 0, 0, MAX_BLADES),
         Parameter("roundness", "Roundness", "Of the blades: 0 straight, 1 round", 0.0),
         Parameter("rotation", "Rotation", "Of the blades in degrees", 0.0, -360.0, 360.0),
@@ -119,10 +189,37 @@ def parameters(camera: OslCamera) -> list[Parameter]:
     ]  # fmt: skip
 
 
-def write_camera(camera: OslCamera, name: str, comment: list[str]) -> tuple[str, int]:
-    """The text of a camera's shader, and the operations of one ray."""
-    program = lower(osl_graph(camera))
-    return write_osl(program, name, comment, parameters(camera), _FRAME, OUTPUTS), sum(program.count().values())
+def write_camera(lens: OslLens, name: str, comment: list[str]) -> tuple[str, int]:
+    """The text of a camera's shader, and the operations of one ray through a round stop: compilers know the blades."""
+    text = write_osl(osl_program(lens), name, comment, parameters(lens), _FRAME, OUTPUTS)
+    return text, sum(osl_program(lens, {"count": 0.0}).count().values())
+
+
+def osl_program(lens: OslLens, fixed: Mapping[str, float] | None = None) -> Program:
+    """The camera as a program, some inputs numbers; inputs as of `osl_graph`, and `zoom_mm` of a zoom's range."""
+    program = lower([osl_graph(camera) for camera in lens.nodes], fixed)
+    program.mixture = _mixture(lens) if lens.axes else None
+    return program
+
+
+def _mixture(lens: OslLens) -> Mixture:
+    """How the nodes are mixed; internal focus stands where the camera is focused."""
+    focus = [a for a in lens.axes if a.name == FOCUS_AXIS]
+    others = tuple(a for a in lens.axes if a.name != FOCUS_AXIS)
+    far = lens.nodes[:: len(focus[0].nodes)] if focus else lens.nodes  # the last axis goes fastest
+    g, rows = followed_rows(others, [[c.sight.film_z_mm[0] - c.entrance_mm] for c in far])
+    state = [g.input(name, per_call=True).clip(*a.range) for a, name in zip(others, state_names(others), strict=True)]
+    if focus:
+        away, at_pupil = (g.input(name, per_call=True) for name in ("asked_m", "at_pupil"))
+        vergence = 1.0 / (_away(away) + rows * at_pupil * 1e-3)
+        state.append(vergence.clip(*focus[0].range))
+    graph, transform = state_graph(lens.axes)
+    g.outputs = g.inline(graph, {STATE: g.concat(*state)})
+    return Mixture(lower(g), transform)
+
+
+def _away(asked_m: Value) -> Value:
+    return asked_m.graph.select(asked_m <= _FAR_M, 1e9, asked_m)
 
 
 def osl_graph(camera: OslCamera) -> Graph:
@@ -134,16 +231,16 @@ def osl_graph(camera: OslCamera) -> Graph:
     film = (raster - 0.5) * -call.sensor
     nanometres, colour = _light(camera, square[0], call.number("in_colour"))
     per_call = {"film_z_mm": call.film_z, "stop_radius_mm": call.stop}
-    pupil = g.inline(camera.arcs.graph, {"film_mm": film, "square": square, "wavelength_nm": nanometres, **per_call})
+    sampler = camera.arcs.sampler(Blades, *camera.stop_image)
+    pupil = g.inline(sampler, {"film_mm": film, "square": square, "wavelength_nm": nanometres, **per_call})
     rays = g.concat(film, pupil["pupil_mm"], nanometres)
-    found = g.inline(_with_derivatives(camera), {"rays": rays, **per_call})
+    found = g.inline(camera.lens, {"rays": rays, **per_call})
     given = {"film_mm": film, **pupil, **found, "lens_status": found["status"], **per_call, **call.weighting()}
     done = g.inline(weight_graph(D_FILM), given)
     shaded = done["weight"]
     even = g.select(done["status"] <= float(st.PASSED), pupil["area_mm2"] / pupil["mean_area_mm2"], 0.0)
     weight = g.select(call.number("shaded") <= 0.5, even, shaded)
-    opened = _opened(g, call, found["stop_xy_mm"])
-    weight = g.select(opened, weight, 0.0)
+    weight = g.select(Blades(g).opened(found["stop_xy_mm"] * (1.0 / call.stop)), weight, 0.0)
     known = (g.square(film) <= camera.arcs.film_radius_mm**2) & call.focused
     warned = g.select(known, 0.0, call.number("warned"))
     _set_outputs(g, camera, call, film, done, colour * g.select(known, weight, 0.0), warned)
@@ -177,14 +274,13 @@ class _Call:
         widest = camera.sight.stop_radius_mm
         self.stop = (camera.f_number * widest / self.number("f_number")).minimum(widest)
         at_pupil, asked = self.number("at_pupil"), self.number("asked_m")
-        away = g.select(asked <= _FAR_M, 1e9, asked)
+        away = _away(asked)
         self.film_z = g.constant(camera.sight.film_z_mm[0])
-        for _ in range(2):  # distances are from the film there
+        for film in (_rough(camera.film), camera.film):  # distances are from the film there
             distance = away + (self.film_z - camera.entrance_mm) * at_pupil * 1e-3
             vergence = (camera.nearest_m / distance).clip(0.0, 1.0)
-            self.film_z = _in_turn(g, camera.film, self.stop * (1 / widest), vergence)
-        moves = math.isfinite(camera.near_m)
-        self.focused = g.constant(camera.near_m * _NEAR if moves else 0.0) <= distance
+            self.film_z = _in_turn(g, film, self.stop * (1 / widest), vergence)
+        self.focused = g.constant(camera.limit_m * _NEAR) <= distance
         # Of the ray in the camera's frame, turned: from the film, or from the entrance pupil.
         self.shift_m = (camera.entrance_mm - self.film_z) * at_pupil * 1e-3
 
@@ -200,6 +296,14 @@ class _Call:
         nominal = math.pi / (4 * camera.f_number**2)
         exposure = g.select(self.number("as_lens") <= 0.5, own, nominal)
         return {"per_distance": per_distance, "scale": per_distance * per_distance / exposure}
+
+
+def _rough(film: Array) -> Array:
+    """Of low order: a tenth of a millimetre of film moves the focus by a micrometre."""
+    vergence, powers = np.linspace(0, 1, 2 * _FILM_POWERS), np.polynomial.polynomial
+    order = min(2, film.shape[1] - 1)
+    widest = powers.polyval2d(np.ones_like(vergence), vergence, film)
+    return np.asarray(powers.polyfit(vergence, widest, order), np.float64)[None]
 
 
 def _in_turn(g: Graph, weights: Array, first: Value, then: Value) -> Value:
@@ -233,30 +337,10 @@ def _light(camera: OslCamera, random: Value, in_colour: Value) -> tuple[Value, V
     return nanometres, g.select(grey, 1.0, colour)
 
 
-def _opened(g: Graph, call: _Call, stop_xy: Value) -> Value:
-    """Whether rays go through the blades; see `Aperture.opening`. Edges of fewer blades repeat."""
-    point = stop_xy * (1.0 / call.stop)
-    cos, sin, blades = call.number("half_cos"), call.number("half_sin"), call.number("count")
-    step_cos, step_sin = cos * cos - sin * sin, cos * sin * 2.0
-    edge = call.number("edge_cos"), call.number("edge_sin")
-    along = None
-    for _ in range(MAX_BLADES):
-        here = point[0] * edge[0] + point[1] * edge[1]
-        along = here if along is None else along.maximum(here)
-        edge = edge[0] * step_cos - edge[1] * step_sin, edge[0] * step_sin + edge[1] * step_cos
-    assert along is not None
-    rise = call.number("roundness") * (1.0 - cos)
-    curvature = rise * 2.0 / (sin * sin + rise * rise)
-    middle = cos + rise
-    limit = middle - curvature * 0.5 * (middle * middle + g.square(point))
-    inside = (along * (1.0 - curvature * middle)) <= limit
-    return g.select(blades <= 2.5, 1.0, g.select(inside, 1.0, 0.0))
-
-
-def _samples(camera: OslCamera, count: int = 4096) -> dict[str, NDArray[np.float32]]:
-    """Rays through the arcs, as inputs of the lens's graph."""
-    rng, sight = np.random.default_rng(0), camera.sight
-    angle, radius = 2 * np.pi * rng.random(count), 0.99 * camera.arcs.film_radius_mm * np.sqrt(rng.random(count))
+def _samples(sight: Sight, arcs: PupilArcs, count: int = 4096) -> dict[str, NDArray[np.float32]]:
+    """Rays through the arcs, as inputs of the lens's graph, and `at_stop` of the sampler."""
+    rng = np.random.default_rng(0)
+    angle, radius = 2 * np.pi * rng.random(count), 0.99 * arcs.film_radius_mm * np.sqrt(rng.random(count))
     film = radius * np.stack([np.cos(angle), np.sin(angle)])
     stop = (sight.stop_radius_mm * rng.uniform(0.2, 1, count))[None]
     given = {"film_mm": film, "square": rng.random((2, count)), "stop_radius_mm": stop}
@@ -264,17 +348,9 @@ def _samples(camera: OslCamera, count: int = 4096) -> dict[str, NDArray[np.float
         "film_z_mm": rng.uniform(*sight.film_z_mm, (1, count)),
         "wavelength_nm": rng.uniform(*sight.wavelength_nm, (1, count)),
     }
-    pupil = evaluate(camera.arcs.graph, given)["pupil_mm"]
-    rays = np.concatenate([film, pupil, given["wavelength_nm"]])
-    return {
-        k: v.astype(np.float32)
-        for k, v in {"rays": rays, "film_z_mm": given["film_z_mm"], "stop_radius_mm": stop}.items()
-    }
-
-
-def _with_derivatives(camera: OslCamera) -> Graph:
-    found = with_low_order_derivatives(camera.sight.graph, _samples(camera), _DERIVATIVES, _WORST)
-    return with_film_derivatives(camera.sight.graph) if found is None else found.graph
+    pupil = evaluate(arcs.graph, given)
+    given |= {"rays": np.concatenate([film, pupil["pupil_mm"], given["wavelength_nm"]]), "at_stop": pupil["at_stop"]}
+    return {k: given[k].astype(np.float32) for k in ("rays", "film_z_mm", "stop_radius_mm", "at_stop")}
 
 
 def _exposure(camera: OslCamera) -> Array:
@@ -325,12 +401,27 @@ def _film(focusing: Focusing) -> Array:
     return _powers(np.stack([share, vergence], 1), z, (_FILM_POWERS, _FILM_POWERS if moves else 1))
 
 
-def model_camera(model: OnnxLens, graph: Graph | None, report: Report) -> OslCamera:
-    """Of an exported model in its state.
+def model_lens(model: OnnxLens, graph: Graph | None, report: Report, *, fixed: bool = False) -> OslLens:
+    """Of an exported model.
 
     Args:
-        graph: of the model; None reads it from its file.
+        graph: of a model of one state; None reads it from its file. fixed: in its state alone.
     """
+    if not model.axes or fixed:
+        return osl_lens([_seen(model, graph)], report)
+    axes = model.axes
+    between = [(weights(axes, state), _seen(model.at(*state), None).sight) for state in states_between(axes)]
+    return osl_lens([_seen(model.at(*state), None) for state in product(axes)], report, axes, between)
+
+
+def states_between(axes: Sequence[Axis]) -> list[tuple[float, ...]]:
+    """The middles between neighbouring nodes."""
+    places = [[(a + b) / 2 for a, b in zip(axis.nodes, axis.nodes[1:], strict=False)] for axis in axes]
+    return list(itertools.product(*places))
+
+
+def _seen(model: OnnxLens, graph: Graph | None) -> Seen:
+    """A model in its state."""
     lens, d = model.card["lens"], model.card["domain"]
     low, high = d["film_z_mm"]
     short, long = _light_of(*map(float, d["wavelength_nm"]))
@@ -344,7 +435,7 @@ def model_camera(model: OnnxLens, graph: Graph | None, report: Report) -> OslCam
         int(lens.get("stop_surface", 0)), squeeze != 1.0,
     )  # fmt: skip
     focusing = model_focusing(model, model.state if model.axes else ())
-    return osl_camera(sight, focusing, lens["f_number"] * lens["stop_radius_mm"] / stop, lens["efl_mm"], report)
+    return Seen(sight, focusing, lens["f_number"] * lens["stop_radius_mm"] / stop, lens["efl_mm"])
 
 
 def _light_of(short_nm: float, long_nm: float) -> tuple[float, float]:
@@ -353,15 +444,44 @@ def _light_of(short_nm: float, long_nm: float) -> tuple[float, float]:
     return (short, long) if short < long else (short_nm, long_nm)
 
 
-def osl_camera(sight: Sight, focusing: Focusing, f_number: float, efl_mm: float, report: Report) -> OslCamera:
-    """Of any lens: its graph, how it is focused, f-number of its widest stop and focal length.
+def osl_lens(
+    nodes: Sequence[Seen], report: Report, axes: tuple[Axis, ...] = (), between: Sequence[tuple[Array, Sight]] = ()
+) -> OslLens:
+    """Of any lens: what it is at each node of its axes, see `OslLens`.
 
     Raises:
         InputError: no ray passes.
     """
-    arcs = fit_arcs(sight, report)
-    plane = sight.table.pupil_z_mm
-    return OslCamera(sight, arcs, _film(focusing), focusing.nearest_m, f_number, efl_mm, _entrance_mm(sight), plane)
+    sights = [node.sight for node in nodes]
+    arcs = fit_arcs(sights, report, between)
+    samples = [_samples(*of_one) for of_one in zip(sights, arcs, strict=True)]
+    # Cycles takes the mean size of derivatives, for the footprint of a pixel.
+    fitted = low_orders([s.graph for s in sights], samples, _DERIVATIVES, _WORST)
+    graphs = [with_film_derivatives(s.graph) for s in sights] if fitted is None else [f.graph for f in fitted]
+    inside = next((1 / a.range[1] for a in axes if a.name == FOCUS_AXIS), 0.0)
+    cameras = []
+    for seen, graph, own in zip(nodes, graphs, arcs, strict=True):
+        near = seen.focusing.nearest_m
+        limit, entrance = near if math.isfinite(near) else inside, _entrance_mm(seen.sight)
+        film = _film(seen.focusing)
+        numbers = near, limit, seen.f_number, seen.efl_mm, entrance, _stop_image(seen.sight, own)
+        cameras.append(OslCamera(seen.sight, graph, own, film, *numbers))
+    return OslLens(cameras, axes, between)
+
+
+def _stop_image(sight: Sight, arcs: PupilArcs) -> tuple[float, float]:
+    """The stop in its image in the pupil, as the arcs have it: -1 where it is upside down, and by how much, in the
+    stop's radius, nearly no ray within an edge of blades seems to lie beyond it."""
+    given = _samples(sight, arcs)
+    seen = evaluate(sight.graph, given)
+    passed = np.broadcast_to(seen["status"][0] == st.PASSED, given["at_stop"].shape[1:])
+    place, true = ((v[0] + 1j * v[1])[passed] for v in (given["at_stop"], seen["stop_xy_mm"] / given["stop_radius_mm"]))
+    side = 1.0 if np.mean((place * true.conj()).real) > 0 else -1.0
+    place, true = (v[np.abs(true) > _EDGES] for v in (place, true))
+    # Edges near a place face its own direction, to within half a blade's angle.
+    facing = true / np.abs(true) * np.exp(1j * np.linspace(-1, 1, 5)[:, None] * np.pi / 5)
+    beyond = ((side * place - true) * facing.conj()).real.max(0)
+    return side, max(float(np.quantile(beyond, _NEARLY)), _LEAST)
 
 
 def _entrance_mm(sight: Sight) -> float:

@@ -12,13 +12,14 @@ at one stop and focus.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from neurolens.cameras.blades import Blades
 from neurolens.graph.ir import Graph, Value
 
 Array = NDArray[np.float64]
@@ -26,6 +27,7 @@ _HAIR = 1e-18  # mm
 # Gauss's nodes and weights over a disc, along a diameter.
 _NODES = ((-(0.5**0.5), 0.25), (0.0, 0.5), (0.5**0.5, 0.25))
 _TIP = 1e-7  # of 1 - X^2, near the ends of an arc
+_ROUNDS = 2  # of the share of a way that blades leave: it depends on the width of the pupil there
 RADIUS = 4  # powers of the film radius
 
 
@@ -34,58 +36,93 @@ class PupilArcs:
     """Arcs that hold the passing rays of film points, mm on the pupil plane.
 
     Attributes:
-        film_radius_mm: beyond it no light passes. film_z_mm, stop_radius_mm: middle and half range of film positions;
-            the widest stop. wave: middle and half range of (1000 / wavelength)^2.
-        numbers: [3, 4, M]: of the stop's image, and of rims on the film point's side and on the other, the low end, the
-            high end and two factors, as polynomials of the monomials `exponents` [M, 4] in film radius, stop, film
-            position and wavelength, scaled to 1. Rows of rims that never block hold everything.
-        passing: share of the points that pass, by stop.
+        film_radius_mm: beyond it no light passes. film_z_mm: middle and half range of film positions.
+        unit_mm, stop_radius_mm, wave: film radius, stop, middle and half range of (1000 / wavelength)^2 that `numbers`
+            are scaled to; the same in all states of a lens.
+        numbers: [A, 4, M]: of the stop's image, then of rims, the low end, the high end and two factors, as polynomials
+            of the monomials `exponents` [M, 4] in film radius, stop, film position and wavelength, scaled to 1.
+        sides: [A] of an arc: 1 of a rim that ends the light on the film point's side, -1 on the other, 0 on both; the
+            row of an end that it has not is 0.
     """
 
     film_radius_mm: float
+    unit_mm: float
     film_z_mm: tuple[float, float]
     stop_radius_mm: float
     wave: tuple[float, float]
     numbers: Array
     exponents: NDArray[np.int64]
-    used: tuple[bool, ...]
+    sides: tuple[int, ...]
 
-    def scaled(self, radius: Array, stop: float, film_z: float, nanometres: Array) -> Array:
+    def scaled(self, radius: Array, stop: ArrayLike, film_z: ArrayLike, nanometres: Array) -> Array:
         """[4, ...]: film radius, stop, film position and wavelength as the polynomials take them."""
         (middle, half), (mean, reach) = self.film_z_mm, self.wave
-        call = stop / self.stop_radius_mm, (film_z - middle) / half
-        parts = radius / self.film_radius_mm, *call, ((1000 / nanometres) ** 2 - mean) / reach
+        call = np.divide(stop, self.stop_radius_mm), np.subtract(film_z, middle) / half
+        parts = radius / self.unit_mm, *call, ((1000 / nanometres) ** 2 - mean) / reach
         return np.stack(np.broadcast_arrays(*parts))
 
     @cached_property
     def graph(self) -> Graph:
+        """`sampler` of a round stop."""
+        return self.sampler()
+
+    def sampler(self, blades: type[Blades] | None = None, side: float = 1.0, margin: float = 0.0) -> Graph:
         """The pupil point of a film point and a point of the unit square.
+
+        Args:
+            blades: takes points of the disc nearer to its middle, to where the stop's blades end: the stop's image in
+                the pupil is the arc of the stop, and is all but similar to it.
+            side: -1 where that image is upside down. margin: by which blades are widened, as that is not exact.
 
         Inputs: `film_mm`, `square` [2], `wavelength_nm`; of the call `film_z_mm`, `stop_radius_mm`.
         Outputs: `pupil_mm` [2], and
         `area_mm2`, the inverse of its density, 0 or less where nothing passes; points mean nothing there;
-        `mean_area_mm2`, its mean over the square.
+        `mean_area_mm2`, its mean over the square of a round stop;
+        `at_stop` [2], about where the ray crosses the stop, in units of its radius.
         """
         g = Graph()
         film, square = g.input("film_mm", 2), g.input("square", 2)
         radius = g.square(film).sqrt()
-        arcs = self._arcs(g, radius * (1 / self.film_radius_mm))
+        arcs = self._arcs(g, radius * (1 / self.unit_mm))
         disc = unit_disc(square)
         low, high = _ends(arcs)
-        half, along, across = (high - low) * 0.5, disc[0], disc[1]
-        left, right = along + 1.0, 1.0 - along
+        half, middle = (high - low) * 0.5, (low + high) * 0.5
+        turn = (film + [_HAIR, 0.0]) * (1.0 / (radius + _HAIR))
+        across = g.affine([[0.0, -1.0], [1.0, 0.0]], turn)
 
         # Written from the ends, so that rounding leaves no side negative.
         def stretch(left: Value, right: Value) -> Value:
-            rows = [arc.height(half * left + (low - arc.low), half * right + (arc.high - high)) for arc in arcs]
+            rows = [
+                arc.height(
+                    None if arc.low is None else half * left + (low - arc.low),
+                    None if arc.high is None else half * right + (arc.high - high),
+                )
+                for arc in arcs
+            ]
             return (_least(rows) / (left * right).maximum(_TIP)).maximum(0.0).sqrt()
 
-        here = stretch(left, right)
-        x, y = (low + high) * 0.5 + half * along, across * here
-        turn = (film + [_HAIR, 0.0]) * (1.0 / (radius + _HAIR))
+        def at_stop(x: Value, y: Value) -> Value:
+            stop = arcs[0]
+            assert stop.low is not None and stop.high is not None
+            reach, from_low = (stop.high - stop.low) * 0.5, x - stop.low
+            wide = (stop.first + stop.change * from_low).maximum(_TIP).sqrt()
+            return (turn * (from_low - reach) + across * (y / wide)) * (side / reach)
+
+        share = g.constant(1.0)
+        if blades is not None:
+            opening, start = blades(g), at_stop(middle, g.constant(0.0))
+            way = disc * (1.0 / (g.square(disc).sqrt() + _HAIR))
+            for _ in range(_ROUNDS):
+                x = way[0] * share
+                end = at_stop(middle + half * way[0], way[1] * stretch(1.0 + x, 1.0 - x))
+                share = opening.drawn(start, end - start, margin)
+            disc = disc * share
+        here = stretch(disc[0] + 1.0, 1.0 - disc[0])
+        x, y = middle + half * disc[0], disc[1] * here
         inside = radius <= self.film_radius_mm
-        g.outputs["pupil_mm"] = turn * x + g.affine([[0.0, -1.0], [1.0, 0.0]], turn) * y
-        g.outputs["area_mm2"] = g.select(inside, half * here * math.pi, 0.0)
+        g.outputs["pupil_mm"] = turn * x + across * y
+        g.outputs["at_stop"] = at_stop(x, y)
+        g.outputs["area_mm2"] = g.select(inside, half * here * (share * share * math.pi), 0.0)
         one = g.constant(1.0)
         nodes = [stretch(one * (1 + x), one * (1 - x)) * w for x, w in _NODES]
         g.outputs["mean_area_mm2"] = half * (nodes[0] + nodes[1] + nodes[2]) * math.pi
@@ -98,13 +135,14 @@ class PupilArcs:
         call = g.concat(stop * (1 / self.stop_radius_mm), (film_z - middle) * (1 / half))
         inverse = 1000.0 / g.input("wavelength_nm")
         arcs = []
-        for kind in np.flatnonzero(self.used):
-            rows = self._horner(g, self.numbers[kind], 0, radius, call)
-            if kind == 0:
-                rows = rows + self._horner(g, self.numbers[kind], 1, radius, call) * (
+        for side, numbers in zip(self.sides, self.numbers, strict=True):
+            rows = self._horner(g, numbers, 0, radius, call)
+            if numbers[:, self.exponents[:, 3] == 1].any():
+                rows = rows + self._horner(g, numbers, 1, radius, call) * (
                     inverse * inverse * (1 / reach) - mean / reach
                 )
-            arcs.append(Arc(*g.split(rows, (1, 1, 1, 1))))
+            low, high, first, change = g.split(rows, (1, 1, 1, 1))
+            arcs.append(Arc(None if side > 0 else low, None if side < 0 else high, first, change))
         return arcs
 
     def _horner(self, g: Graph, numbers: Array, wave: int, radius: Value, call: Value) -> Value:
@@ -124,30 +162,49 @@ class PupilArcs:
         still, moved = (g.polynomial(exponents[part, :1], numbers[:, part], call[0]) for part in (~moves, moves))
         return still + moved * call[1] if moves.any() else still
 
+    def mixed(self, others: Sequence[PupilArcs], weights: Array) -> PupilArcs:
+        """These arcs and others of the same lens, with these weights: those of a state between them."""
+        nodes = [self, *others]
+        middle, half = zip(*(a.film_z_mm for a in nodes), strict=True)
+        return replace(
+            self,
+            film_radius_mm=float(weights @ [a.film_radius_mm for a in nodes]),
+            film_z_mm=(float(weights @ middle), 1 / float(weights @ (1 / np.array(half)))),
+            numbers=np.tensordot(weights, [a.numbers for a in nodes], 1),
+        )
+
     @cached_property
     def checked(self) -> Graph:
         """Whether rays lie inside: inputs `film_mm`, `pupil_mm` [2] of film points on +x; outputs by arc."""
         g = Graph()
         pupil = g.input("pupil_mm", 2)
-        arcs = self._arcs(g, g.input("film_mm", 2)[0] * (1 / self.film_radius_mm))
-        rows = [(pupil[0] - arc.low, arc.high - pupil[0]) for arc in arcs]
-        g.outputs["left"], g.outputs["right"] = (g.concat(*side) for side in zip(*rows, strict=True))
+        arcs = self._arcs(g, g.input("film_mm", 2)[0] * (1 / self.unit_mm))
+        rows = [
+            (None if arc.low is None else pupil[0] - arc.low, None if arc.high is None else arc.high - pupil[0])
+            for arc in arcs
+        ]
+        for name, side in zip(("left", "right"), zip(*rows, strict=True), strict=True):
+            g.outputs[name] = g.concat(*(pupil[0] * 0.0 + 1.0 if v is None else v for v in side))
         g.outputs["height"] = g.concat(*(arc.height(*row) for arc, row in zip(arcs, rows, strict=True)))
         return g
 
 
 @dataclass(frozen=True)
 class Arc:
-    """y^2 = (x - low) (high - x) (first + (x - low) change), each one row."""
+    """y^2 = left right (first + left change), left and right the distances from its ends; of a rim, which has one end,
+    d (first + d change) at a distance d from that: every conic."""
 
-    low: Value
-    high: Value
+    low: Value | None
+    high: Value | None
     first: Value
     change: Value
 
-    def height(self, left: Value, right: Value) -> Value:
-        """y^2 at distances from the ends."""
-        return left * right * (self.first + self.change * left)
+    def height(self, left: Value | None, right: Value | None) -> Value:
+        """y^2 at distances from the ends that there are."""
+        away = right if left is None else left
+        assert away is not None
+        found = away * (self.first + self.change * away)
+        return found if left is None or right is None else right * found
 
 
 def unit_disc(square: Value) -> Value:
@@ -181,4 +238,5 @@ def _least(values: list[Value]) -> Value:
 
 
 def _ends(arcs: list[Arc]) -> tuple[Value, Value]:
-    return -_least([-arc.low for arc in arcs]), _least([arc.high for arc in arcs])
+    lows, highs = [-arc.low for arc in arcs if arc.low is not None], [arc.high for arc in arcs if arc.high is not None]
+    return -_least(lows), _least(highs)

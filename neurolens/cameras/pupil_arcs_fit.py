@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 from typing import Any
 
@@ -13,27 +13,30 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.base.progress import Report
 from neurolens.cameras.pupil_arcs import RADIUS, PupilArcs
-from neurolens.cameras.pupil_boxes import Passes, PupilTable
-from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.pupil_search import Detail, outline_of
+from neurolens.cameras.pupil_boxes import PupilTable, asking, end_of_light, frame_of
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 
 Array = NDArray[np.float64]
 Truths = NDArray[np.bool_]
 Rows = NDArray[np.floating[Any]]
-# Searches for the outline: stops as shares of the widest, how closely; powers of film radius, stop and film position.
-_STOPS, _DETAIL = (1.0, 0.75, 0.5, 0.25, 0.1), Detail(17, 16, (0.0, 0.5, 1.0), 20, 4, 8)
-_POWERS = [(i, j, k, 0) for i in range(RADIUS + 1) for j in range(3) for k in range(2) if j + k <= 2]
+# Where light ends is sought: stops as shares of the widest, film radii, ways; powers of film radius, stop and film
+# position.
+_STOPS, _ROWS, _ANGLES = (1.0, 0.75, 0.5, 0.25, 0.1), 17, np.linspace(0, np.pi, 17)
+_POWERS = [(i, j, 0, 0) for i in range(RADIUS + 1) for j in range(3)]
+_POWERS += [(i, j, 1, 0) for i in range(3) for j in range(2)]  # few: renderers may learn the focus late
 _POWERS += [(i, j, 0, 1) for i in range(4) for j in range(2)]  # the stop's image moves with the wavelength
-_SLACK = 1.01, 1.03, 1.08, 1.2  # of an outline, at which a ray is asked what blocks it
-_ROUNDS, _PUSH, _LOOSE = 40, 30.0, 1e-4  # of asymmetric least squares: weight of what lies outside, and of slack
-_MARGIN = 0.003  # of half the pupil
+_HALVINGS, _WIDER = 14, 1.15  # that place the end of the light; boxes of a stop over the last one's pupil
+_ROUNDS, _PUSH, _LOOSE = 40, 300.0, 1e-4  # of asymmetric least squares: weight of what lies outside, and of slack
+_MARGIN = 0.001  # of half the pupil
 _RIDGE = 1e-10
 _AZIMUTHS = 4  # of a quadrant, of anamorphic lenses
+_ENOUGH = 0.97  # of points, at the widest stop, that pass
 _FEWEST = 12  # vertices that rims of a side block
 _HELD = 0.9998  # of random rays that pass
+_RISE, _STEP, _STEPS = 1.03, 0.004, 12  # of arcs that do not hold them: in y^2, and of half the pupil along x
 _ASKED = 20_000
 _RAYS = 60_000  # random ones that must lie inside
 
@@ -66,6 +69,14 @@ class Sight:
             found += [(turn @ film, turn @ (pupil * [[1.0], [side]])) for side in (1.0, -1.0)]
         return found
 
+    def passes(self, film: Rows, pupil: Rows, nanometres: ArrayLike, film_z: ArrayLike, stop: ArrayLike) -> Truths:
+        """[...] whether rays pass at any of the azimuths asked about; points [2, ...]."""
+        shape, passed = film.shape[1:], np.zeros(film[0].size, bool)
+        wide = np.broadcast_to(nanometres, shape).ravel()
+        for f, p in self.turned(film.reshape(2, -1), pupil.reshape(2, -1)):
+            passed |= self.status(f, p, wide, film_z, stop) == st.PASSED
+        return passed.reshape(shape)
+
     def status(
         self, film: Rows, pupil: Rows, nanometres: ArrayLike, film_z: ArrayLike, stop: ArrayLike
     ) -> NDArray[Any]:
@@ -74,127 +85,171 @@ class Sight:
         wide = np.broadcast_to(nanometres, (1, count))
         given = {"rays": np.concatenate([film, pupil, wide]).astype(np.float32)}
         given |= {"film_z_mm": _call(film_z), "stop_radius_mm": _call(stop)}
-        return np.broadcast_to(evaluate(self._asked, given)["status"][0], count)
+        return np.broadcast_to(evaluate(self._status, given)["status"][0], count)
 
     @cached_property
-    def _asked(self) -> Graph:
+    def _status(self) -> Graph:
         """The graph of the status alone."""
         return replace(self.graph, outputs={"status": self.graph.outputs["status"]})
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Ways [N] from the middle of a pupil (centre, 0) to (centre + x, y) beyond it, at `angle` from the film point's
+    side; film radius, film position, stop and wavelength."""
+
+    film_mm: Array
+    centre: Array
+    x: Array
+    y: Array
+    film_z: Array
+    stop: Array
+    nm: Array
+    angle: Array
 
 
 @dataclass(frozen=True)
 class _Edge:
     """Vertices [N] of outlines: place in the frame of the film point, radius, stop and film position scaled to 1.
 
-    `kind`: 0 where the stop blocks, 1 and 2 rims on the film point's side and on the other. `first`, `last`:
-    the ends of every outline.
+    `side`: 0 where the stop blocks, 1 and -1 rims on the film point's side and on the other.
+    `first`, `last`: the ends of every outline.
     """
 
     x: Array
     y: Array
     scaled: Array
-    kind: NDArray[np.int64]
+    side: NDArray[np.int64]
     first: Truths
     last: Truths
 
 
-def fit_arcs(sight: Sight, report: Callable[[float], object] = lambda share: None) -> PupilArcs:
-    """The arcs of a lens: at least every ray found to pass lies inside.
+def fit_arcs(sights: Sequence[Sight], report: Report, between: Sequence[tuple[Array, Sight]] = ()) -> list[PupilArcs]:
+    """The arcs of a lens, in each of its states: at least every ray found to pass lies inside.
+
+    Args:
+        sights: the lens at each node of its state; one of a lens without. between: weights of these nodes and the lens
+            there: their mixture holds its rays, too.
+
+    Raises:
+        InputError: no ray passes.
+    """
+    places = []
+    for k, sight in enumerate(sights):
+        places.append(_places(sight, partial(_within, report, 0.6 * k / len(sights), 0.6 / len(sights))))
+    nodes = _empty(sights, [float(p.film_mm.max()) for p in places])
+    edges = [_edge(*of_one) for of_one in zip(sights, nodes, places, strict=True)]
+    blocked = {side: max(int((edge.side == side).sum()) for edge in edges) for side in (0, 1, -1)}
+    if blocked[0] < _FEWEST:
+        raise InputError("export", "stop", "(blocks nothing)", "a lens whose stop blocks light")
+    sides = tuple(side for side, vertices in blocked.items() if vertices >= _FEWEST)
+    seen = [*zip(np.eye(len(nodes)), sights, strict=True), *between]
+    for coloured in (False, True):
+        nodes = [
+            replace(a, sides=sides, numbers=_arcs(a, edge, sides, coloured))
+            for a, edge in zip(nodes, edges, strict=True)
+        ]
+        # Rims that move with the wavelength, as those of fisheyes do, cost time in a shader: only where it pays.
+        if min(passing(sight, a)[1.0] for sight, a in zip(sights, nodes, strict=True)) >= _ENOUGH:
+            break
+    return _widened(nodes, seen, partial(_within, report, 0.6, 0.4))
+
+
+def _empty(sights: Sequence[Sight], radii: Sequence[float]) -> list[PupilArcs]:
+    """What numbers of arcs are scaled by."""
+    long, short = ((1000 / w) ** 2 for w in reversed(sights[0].wavelength_nm))
+    wave = (long + short) / 2, max((short - long) / 2, 1e-9)
+    unit, stop, nothing = max(radii), max(s.stop_radius_mm for s in sights), np.zeros((0, 4, len(_POWERS)))
+    found = []
+    for radius, (low, high) in zip(radii, (s.film_z_mm for s in sights), strict=True):
+        place = (low + high) / 2, max((high - low) / 2, 1e-6)
+        found.append(PupilArcs(radius, unit, place, stop, wave, nothing, np.array(_POWERS), ()))
+    return found
+
+
+def _within(report: Report, begun: float, part: float, share: float) -> None:
+    report(begun + part * share)
+
+
+def _places(sight: Sight, report: Report) -> _Places:
+    """Where light ends, is sought: all over the film, at its ends and in its middle, from the widest stop down.
 
     Raises:
         InputError: no ray passes.
     """
     low, high = sight.film_z_mm
-    middle, half = (low + high) / 2, max((high - low) / 2, 1e-6)
-    places = (low, middle, high) if high > low else (middle,)
-    outlines = []
-    for k, (z, share) in enumerate(product(places, _STOPS)):
-        report(0.8 * k / len(places) / len(_STOPS))
-        stop = share * sight.stop_radius_mm
-        found = outline_of(sight.table, _passes(sight, z, stop), sight.wavelength_nm, _DETAIL)
-        if found is not None:
-            outlines.append((found, z, stop))
-    if not outlines:
+    ends = sight.wavelength_nm
+    found: list[list[Array]] = []
+    planes = (low, (low + high) / 2, high) if high > low else (low,)
+    for z in planes:
+        report(len(found) / len(planes) / len(_STOPS))
+        table, film_radius = sight.table, None
+        for stop in np.array(_STOPS) * sight.stop_radius_mm:
+            ask = asking(partial(sight.passes, film_z=z, stop=stop), ends)
+            film_radius = end_of_light(table, ask) if film_radius is None else film_radius
+            if film_radius is None:
+                break
+            radius = film_radius * (1 - 1e-6) * (1 - (1 - np.arange(_ROWS) / (_ROWS - 1)) ** 2)
+            frame = frame_of(table, radius, ask)
+            across = (frame.reach[:, None] * v[:, None] for v in frame.stretch)
+            x, y = (way * side for way, side in zip(across, (np.cos(_ANGLES), np.sin(_ANGLES)), strict=True))
+            shape = (len(ends), *x.shape)
+            rows = (radius[:, None], frame.centre[:, None], x, y, z, stop, np.reshape(ends, (-1, 1, 1)), _ANGLES)
+            found.append([np.broadcast_to(row, shape).ravel() for row in rows])
+            # The next stop's pupil lies within this one's.
+            around = frame.centre - _WIDER * frame.stretch[0], frame.centre + _WIDER * frame.stretch[0]
+            even = np.linspace(0, film_radius, _ROWS)
+            boxes = [np.interp(even, radius, row) for row in (*around, _WIDER * frame.stretch[1])]
+            table = replace(table, film_radius_mm=film_radius, rows=np.array(boxes, np.float32))
+    if not found:
         raise InputError("export", "pupil", "(no ray passes)", "a lens that light can pass")
-    radius = max(o.film_radius_mm for o, _, _ in outlines)
-    long, short = ((1000 / w) ** 2 for w in reversed(sight.wavelength_nm))
-    wave = (long + short) / 2, max((short - long) / 2, 1e-9)
-    arcs = PupilArcs(
-        radius,
-        (middle, half),
-        sight.stop_radius_mm,
-        wave,
-        np.zeros((3, 4, len(_POWERS))),
-        np.array(_POWERS),
-        (True,) * 3,
-    )
-    edge = _edges(sight, arcs, outlines)
-    arcs = replace(arcs, used=tuple(bool(n >= _FEWEST) for n in np.bincount(edge.kind, minlength=3)))
-    if not arcs.used[0]:
-        raise InputError("export", "stop", "(blocks nothing)", "a lens whose stop blocks light")
-    for kind in np.flatnonzero(arcs.used):
-        arcs.numbers[kind] = _arc(arcs, edge, int(kind))
-    return _widened(sight, arcs, report)
+    return _Places(*(np.concatenate(row) for row in zip(*found, strict=True)))
 
 
-def _passes(sight: Sight, film_z: float, stop: float) -> Passes:
-    def passes(film: Rows, pupil: Rows, nanometres: float) -> Truths:
-        passed = np.zeros(film.shape[1], bool)
-        for f, p in sight.turned(film, pupil):
-            passed |= sight.status(f, p, nanometres, film_z, stop) == st.PASSED
-        return passed
+def _edge(sight: Sight, arcs: PupilArcs, p: _Places) -> _Edge:
+    """Where light ends on the way from a centre, and what blocks the rays beyond."""
 
-    return passes
+    def asked(t: Array) -> tuple[Array, Array, Array, Array, Array]:
+        film, pupil = np.stack([p.film_mm, 0 * p.film_mm]), np.stack([p.centre + t * p.x, t * p.y])
+        return film, pupil, p.nm, p.film_z, p.stop
 
-
-def _edges(sight: Sight, arcs: PupilArcs, outlines: list[tuple[PupilOutline, float, float]]) -> _Edge:
-    """Vertices of outlines, and what blocks the rays beyond them."""
-    parts: list[list[NDArray[Any]]] = []
-    for outline, z, stop in outlines:
-        shape = outline.x.shape  # wavelengths, rows, vertices
-        centre = np.broadcast_to(outline.centre[:, None].astype(np.float64), shape)
-        radius = np.broadcast_to(outline.radii(np.arange(shape[1], dtype=np.float64))[:, None], shape)
-        nm = np.broadcast_to(np.array(outline.wavelength_nm)[:, None, None], shape)
-        first, last = np.zeros(shape, bool), np.zeros(shape, bool)
-        first[..., 0] = last[..., -1] = True
-        lit = np.broadcast_to(np.ptp(outline.x, axis=-1, keepdims=True) > 0, shape)
-        x, y, centre, radius, nm, first, last = (
-            a[lit] for a in (outline.x, outline.y, centre, radius, nm, first, last)
-        )
-        code = np.zeros(x.size)
-        for slack in _SLACK:
-            found = sight.status(np.stack([radius, 0 * radius]), np.stack([centre + slack * x, slack * y]), nm, z, stop)
-            code = np.where(code == 0, found, code)
-        kind = np.where(code == st.blocked(sight.stop_surface, st.RIM), 0, np.where(x > 0, 1, 2))
-        parts.append([centre + x, y, arcs.scaled(radius, stop, z, nm), kind, first, last])
-    return _Edge(*(np.concatenate(p, axis=-1) for p in zip(*parts, strict=True)))
+    low, high = np.zeros(p.x.size), np.ones(p.x.size)
+    lit = sight.passes(*asked(low))
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        inside = sight.passes(*asked(middle))
+        low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+    code = sight.status(*asked(high))
+    side = np.where(code == st.blocked(sight.stop_surface, st.RIM), 0, np.where(p.x > 0, 1, -1))
+    scaled = arcs.scaled(p.film_mm, p.stop, p.film_z, p.nm)
+    x, y, first, last = p.centre + low * p.x, low * p.y, p.angle == 0, p.angle == np.pi
+    return _Edge(x[lit], y[lit], scaled[:, lit], side[lit], first[lit], last[lit])
 
 
-def _arc(arcs: PupilArcs, edge: _Edge, kind: int) -> Array:
-    """[4, M]: the numbers of an arc."""
+def _arcs(arcs: PupilArcs, edge: _Edge, sides: Sequence[int], coloured: bool) -> Array:
+    """[A, 4, M]: the numbers of arcs of these sides; `coloured`: whether rims move with the wavelength."""
     monomials = np.prod(edge.scaled[:, None] ** arcs.exponents.T[:, :, None], axis=0)  # [M, N]
-    if kind:  # rims do not move with the stop, and little with the wavelength
-        still = arcs.exponents[:, [1, 3]].sum(1) == 0
-        monomials = monomials * still[:, None]
+    still = arcs.exponents[:, [1] if coloured else [1, 3]].sum(1) == 0  # rims do not move with the stop
+    return np.stack([_arc(arcs, edge, monomials * still[:, None] if side else monomials, side) for side in sides])
+
+
+def _arc(arcs: PupilArcs, edge: _Edge, monomials: Array, side: int) -> Array:
+    """[4, M]: the numbers of an arc."""
+    own = edge.side == side
     size = np.maximum(edge.scaled[1], 0.05)
-    own = edge.kind == kind
     numbers = np.zeros((4, len(monomials)))
     high, low = edge.first, edge.last
-    numbers[1] = _above(monomials[:, high], edge.x[high], own[high], size[high])
-    numbers[0] = -_above(monomials[:, low], -edge.x[low], own[low], size[low])
-    scale = float(np.ptp(edge.x)) / 2
-    if kind == 1:  # the other end is far away
-        numbers[0] = 0.0
-        numbers[0, 0] = edge.x.min() - 2 * scale
-    if kind == 2:
-        numbers[1] = 0.0
-        numbers[1, 0] = edge.x.max() + 2 * scale
-    numbers[0] -= _MARGIN * scale * _unit(arcs, kind)
-    numbers[1] += _MARGIN * scale * _unit(arcs, kind)
-    left, right = edge.x - numbers[0] @ monomials, numbers[1] @ monomials - edge.x
-    both = np.maximum(left, 1e-6) * np.maximum(right, 1e-6)
+    margin = _MARGIN * float(np.ptp(edge.x)) / 2 * _unit(arcs, side == 0)
+    both = np.ones_like(edge.x)
+    if side <= 0:
+        numbers[0] = -_above(monomials[:, low], -edge.x[low], own[low], size[low]) - margin
+        both *= (away := np.maximum(edge.x - numbers[0] @ monomials, 1e-6))
+    if side >= 0:
+        numbers[1] = _above(monomials[:, high], edge.x[high], own[high], size[high]) + margin
+        both *= (right := np.maximum(numbers[1] @ monomials - edge.x, 1e-6))
+        away = right if side else away
     white = monomials * (arcs.exponents[:, 3] == 0)[:, None]
-    rows = np.concatenate([white * both, white * both * left])
+    rows = np.concatenate([white * both, white * both * away])
     factors = _above(rows, edge.y**2, own, size**2)
     numbers[2:] = factors.reshape(2, -1)
     return numbers
@@ -204,9 +259,9 @@ def _call(value: ArrayLike) -> NDArray[np.float32]:
     return np.asarray(value, np.float32).reshape(1, -1)
 
 
-def _unit(arcs: PupilArcs, kind: int) -> Array:
+def _unit(arcs: PupilArcs, of_stop: bool) -> Array:
     """A margin that grows with the stop, for its own arc."""
-    return np.all(arcs.exponents == (0, 0 if kind else 1, 0, 0), axis=1).astype(np.float64)
+    return np.all(arcs.exponents == (0, int(of_stop), 0, 0), axis=1).astype(np.float64)
 
 
 def _above(rows: Array, wanted: Array, own: Truths, size: Array) -> Array:
@@ -252,31 +307,37 @@ def _random(sight: Sight, arcs: PupilArcs, seed: int) -> tuple[dict[str, Array],
     near = evaluate(arcs.graph, given)["pupil_mm"]
     middle = evaluate(arcs.graph, given | {"square": np.full((2, count), 0.5)})["pupil_mm"]
     pupil = np.where(rng.random(count) < 0.7, middle + 1.25 * (near - middle), pupil)
-    places = sight.turned(film, pupil)
-    passed = np.any([sight.status(f, p, nm, film_z, stop) == st.PASSED for f, p in places], axis=0)
+    passed = sight.passes(film, pupil, nm, film_z, stop)
     return {name: rows[:, passed] for name, rows in (given | {"pupil_mm": pupil}).items()}, stop[passed]
 
 
-def _widened(sight: Sight, arcs: PupilArcs, report: Callable[[float], object]) -> PupilArcs:
-    """The arcs, wide enough for random rays."""
-    for seed in range(2):
-        report(0.8 + 0.1 * seed)
+def _widened(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report: Report) -> list[PupilArcs]:
+    """The arcs, wide enough for random rays of the lens seen in states of these weights of nodes."""
+    numbers = np.stack([a.numbers for a in nodes])
+    for seed, (k, (weights, sight)) in product(range(2), enumerate(seen)):
+        report((seed + k / len(seen)) / 2)
+        own = weights == 1 if weights.max() == 1 else weights < np.inf  # between nodes, all are widened
+        mixed = nodes[0].mixed(nodes[1:], weights)
+        arcs = replace(mixed, numbers=np.tensordot(weights, numbers, 1))
         rays, stop = _random(sight, arcs, seed)
-        share = stop / sight.stop_radius_mm
-        kinds, numbers = np.flatnonzero(arcs.used), arcs.numbers.copy()
-        for by in ("left", "right"):
-            found = evaluate(arcs.checked, rays)[by]
-            for row, kind in zip(found, kinds, strict=True):
-                lack = -row / (share if kind == 0 else 1.0)
+        found = evaluate(arcs.checked, rays)
+        for end, (by, side) in enumerate((("left", -1), ("right", 1))):
+            for arc, row in enumerate(found[by]):
+                lack = -row / (1.0 if arc else stop / arcs.stop_radius_mm)
                 push = max(float(np.quantile(lack, _HELD)), 0.0)
-                numbers[kind, by == "right"] += (push if by == "right" else -push) * _unit(arcs, int(kind))
-        arcs = replace(arcs, numbers=numbers)
-        height = evaluate(arcs.checked, rays)["height"]
-        for row, kind in zip(height, kinds, strict=True):
-            ratio = rays["pupil_mm"][1] ** 2 / np.maximum(row, 1e-9)
-            numbers[kind, 2:] *= max(float(np.quantile(ratio, _HELD)), 1.0)
-        arcs = replace(arcs, numbers=numbers)
-    return arcs
+                numbers[own, arc, end] += side * push * _unit(arcs, arc == 0)
+        for _ in range(_STEPS):
+            height = evaluate(replace(mixed, numbers=np.tensordot(weights, numbers, 1)).checked, rays)["height"]
+            ratio = np.quantile(rays["pupil_mm"][1] ** 2 / np.maximum(height, 1e-9), _HELD, axis=1)
+            if ratio.max() <= _RISE:
+                break
+            # Near the ends of an arc no factor helps: it is made longer.
+            for arc, arc_side in enumerate(arcs.sides):
+                step = _STEP * float(np.abs(rays["pupil_mm"][1]).max()) * (ratio[arc] > _RISE)
+                numbers[own, arc, 0] -= step * _unit(arcs, arc == 0) * (arc_side <= 0)
+                numbers[own, arc, 1] += step * _unit(arcs, arc == 0) * (arc_side >= 0)
+        numbers[own, :, 2:] *= ratio.clip(1.0, _RISE)[:, None, None]
+    return [replace(a, numbers=own) for a, own in zip(nodes, numbers, strict=True)]
 
 
 def passing(sight: Sight, arcs: PupilArcs) -> dict[float, float]:

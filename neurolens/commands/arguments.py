@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
+import re
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from neurolens.optics.apertures import Aperture
     from neurolens.optics.prescription import Lens
 
+RANGE = "range"  # as a zoom position: all of them
 T = TypeVar("T")
 
 
@@ -26,6 +29,7 @@ class Parser(argparse.ArgumentParser):
         options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         # An abbreviation can become ambiguous when an option is added.
         super().__init__(allow_abbrev=False, **options)
+        self._negative_number_matcher = re.compile(r"-\.?\d")  # no option: -12,3 is a value, as -12 is
         self.intermixed = False  # True: options may stand before and between the arguments of a list
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
@@ -97,9 +101,9 @@ cameras:
 def add_camera(parser: argparse.ArgumentParser) -> None:
     """Add --camera, --film-offset, --pupil and --vignetting."""
     parser.add_argument(
-        "--camera", metavar="CAMERA", required=True,
-        help="lens file (.toml, traced exactly), model (.onnx), fused: before either, thick:LENS.toml, thin, "
-        "pinhole or fisheye-PROJECTION",
+        "--camera", metavar="CAMERA", required=True, type=named_camera,
+        help="lens file (.toml, or a name in lenses/: traced exactly), model (.onnx), fused: before either, "
+        "thick:LENS.toml, thin, pinhole or fisheye-PROJECTION",
     )  # fmt: skip
     parser.add_argument(
         "--film-offset", metavar="MM", type=between(-1e3, 1e3, "mm"), default=0.0,
@@ -248,6 +252,14 @@ def lens_path(name: str | Path, command: str) -> Path:
     if (folder / f"{path}.toml").is_file():
         return folder / f"{path}.toml"
     raise InputError(f"neurolens {command}", "LENS", str(name), f"a lens file, or a name in {folder}")
+
+
+def named_camera(text: str) -> str:
+    """Type of a camera's argument: a word that names a lens of lenses/ in the project stands for its file."""
+    with suppress(InputError):
+        if not set(text) & set(".:/\\") and (file := project_root() / "lenses" / f"{text}.toml").is_file():
+            return os.path.relpath(file) if file.is_relative_to(Path.cwd()) else str(file)
+    return text
 
 
 def add_glass(parser: argparse._ActionsContainer) -> None:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import os
 import time
 import warnings
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import check_writable
-from neurolens.base.progress import Progress, Report
-from neurolens.commands.arguments import Parser, add_json, check_folder, check_suffix
+from neurolens.base.progress import Progress
+from neurolens.commands.arguments import Parser, add_json, check_folder, check_suffix, whole
 from neurolens.commands.output import answer
 
 _DESCRIPTION = """\
@@ -21,7 +21,7 @@ camera's data, where a lens is put on with one click and taken off with one."""
 _BUILD = """\
 Pack the extension with a folder of models: of each lens the best polynomial, the best network and,
 where its lens file is beside the models' folder in lenses/, the exact lens, every surface traced.
-A lens whose glass absorbs or is coated has no exact form.
+A lens whose glass absorbs or is coated has no exact form; what cannot be a shader is left out and said.
 
 Finished lenses are kept: a build that was stopped goes on where it was, and a second one is quick.
 
@@ -48,12 +48,16 @@ def add_parser(subparsers: Any) -> None:
         help="only this lens, repeatable: NAME of NAME.ols-64.onnx (default: all)",
     )  # fmt: skip
     build.add_argument("--no-exact", action="store_true", help="leave exact lenses out")
+    build.add_argument(
+        "--jobs", metavar="N", type=whole(1, 64), default=min(8, os.cpu_count() or 1),
+        help="processes that make shaders, each of a core and 0.5 GB (default here: %(default)s)",
+    )  # fmt: skip
     add_json(build, quiet=True)
     build.set_defaults(run=run_build, kept="no zip was written; finished shaders are kept for the next run")
     add = actions.add_parser("add", help="put a lens into the extension", description=_ADD)
     add.add_argument("file", metavar="FILE", type=Path, help="model (.onnx) or lens file (.toml)")
     add.add_argument("--to", metavar="ZIP|DIR", type=Path, help="a packed extension, or a user folder of one")
-    add.add_argument("--zoom", metavar="STATE", help="state of a zoom, by name or focal length in mm")
+    add.add_argument("--zoom", metavar="STATE", help="state of a zoom, by name or focal length in mm; range: a setting")
     add_json(add, quiet=True)
     add.set_defaults(run=run_add, kept="nothing was added")
 
@@ -66,46 +70,44 @@ def run_build(args: argparse.Namespace) -> int:
     if not args.models.is_dir():
         raise InputError("neurolens blender build", "--models", str(args.models), "a folder of models that exists")
     from neurolens.blender.pack import write_pack
-    from neurolens.commands.blender_lenses import form_of, library, packed_of
+    from neurolens.commands.blender_lenses import forms_of, library, packed_of
     from neurolens.optics.lensfile import read_lens
 
-    began, packed, left = time.perf_counter(), [], {}
+    began, packed = time.perf_counter(), []
     places = list(library(args.models, args.models.parent / "lenses", args.lens))
     if not places:
         raise InputError("neurolens blender build", "--models", str(args.models), "a folder with models (.onnx)")
-    with Progress(quiet=args.quiet).stage("shaders") as report:
-        for number, (files, lens_file) in enumerate(places):
-            lens = None if lens_file is None else read_lens(lens_file)
-            models = partial(_within, report, number / len(places), (0.5 if lens_file else 1.0) / len(places))
-            found = packed_of(files, lens=lens, quiet=True, report=models)
-            if lens_file is not None and not args.no_exact:
-                try:
-                    found.forms.append(form_of(lens_file, quiet=True))
-                except NeurolensError as error:
-                    left[lens_file.stem] = str(error)
-            packed.append(found)
-            report((number + 1) / len(places))
+    exact = [] if args.no_exact else [lens_file for _, lens_file in places if lens_file is not None]
+    files = [*exact, *(file for models, _ in places for file in models)]  # exact lenses take longest, so they go first
+    progress = Progress(quiet=args.quiet)
+    with progress.stage("shaders") as report:
+        forms, left = forms_of(files, args.jobs, report)
+    with progress.stage("thumbnails") as report:
+        for models, lens_file in places:
+            own = [f for f in (*models, lens_file) if f is not None and f in forms]
+            if own:
+                lens = None if lens_file is None else read_lens(lens_file)
+                packed.append(packed_of(own, [forms[f] for f in own], lens=lens))
+            report(len(packed) / len(places))
     for why in left.values():
         warnings.warn(f"left out: {why}", NeurolensWarning, stacklevel=2)
+    if not packed:
+        raise InputError("neurolens blender build", "--models", str(args.models), "a folder with a model for a shader")
     write_pack(args.out, packed)
     data = {
         "file": str(args.out),
         "bytes": args.out.stat().st_size,
         "lenses": {p.lens_id: [f.model or f.kind for f in p.forms] for p in packed},
-        "left_out": left,
+        "left_out": {file.name: why for file, why in left.items()},
         "seconds": time.perf_counter() - began,
     }
     return answer(args, data, lambda: f"{args.out}: {len(packed)} lenses, {sum(len(p.forms) for p in packed)} shaders")
 
 
-def _within(report: Report, begun: float, part: float, share: float) -> None:
-    report(begun + part * share)
-
-
 def run_add(args: argparse.Namespace) -> int:
     """Add a lens."""
     from neurolens.blender.pack import add_to_folder, add_to_zip, user_folders
-    from neurolens.commands.blender_lenses import packed_of
+    from neurolens.commands.blender_lenses import form_of, packed_of
 
     to = args.to
     if to is None:
@@ -115,7 +117,8 @@ def run_add(args: argparse.Namespace) -> int:
         raise InputError("neurolens blender add", "--to", "(missing)", expected)
     if not args.file.is_file():
         raise InputError(args.file, "file", "(missing)", "a model (.onnx) or a lens file (.toml)")
-    lens = packed_of([args.file], zoom=args.zoom, quiet=args.quiet)
+    form = form_of(args.file, zoom=args.zoom, quiet=args.quiet)
+    lens = packed_of([args.file], [form], zoom=args.zoom)
     (add_to_zip if to.suffix == ".zip" else add_to_folder)(to, lens)
     data = {"lens": lens.lens_id, "to": str(to), "forms": [f.model or f.kind for f in lens.forms]}
     return answer(args, data, lambda: f"{lens.name} ({', '.join(data['forms'])}) is in {to}")

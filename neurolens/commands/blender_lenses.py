@@ -3,21 +3,33 @@
 from __future__ import annotations
 
 import io
+import math
+import multiprocessing
+import signal
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import InputError
+import numpy as np
+
+from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.signals import ASKING
 from neurolens.blender.pack import Form, PackedLens
+from neurolens.commands.arguments import RANGE
 from neurolens.commands.blender_kept import kept_form
 from neurolens.commands.export_osl import shader_of
+from neurolens.render.film import CONTEXT
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens
 
-_SIDE_IN, _DOTS = 2.56, 100  # of a thumbnail: 256 pixels
+_SIDE_IN, _DOTS, _MARGIN = 2.56, 100, 1.08  # of a thumbnail: 256 pixels; its side over the glass's
 _NETWORK = "mlp"
+Forms = dict[Path, Form]
 
 
 def form_of(file: Path, *, zoom: str | None = None, quiet: bool = False) -> Form:
@@ -39,29 +51,94 @@ def _made_form(file: Path, zoom: str | None, quiet: bool) -> Form:
         model, error = str(card["fit"]["method"]), float(card["errors"]["rms_um"])
         kind = "network" if _family(card).startswith(_NETWORK) else "polynomial"
         poor = list(card["errors"].get("poor") or ())
+    state = None if zoom == RANGE else zoom
+    notes = [*shader.notes, *([] if state is None else [f"The zoom stands at {state}"])]
+    if (squeeze := _squeeze(file, state)) != 1.0:
+        axis, aspect = ("Y", squeeze) if squeeze > 1 else ("X", 1 / squeeze)
+        side = "across" if squeeze > 1 else "in height"
+        notes.append(f"The picture is squeezed {aspect:.3g} times {side}: an Aspect {axis} of {aspect:.3g} undoes it")
     return Form(
-        kind, model, shader.text, error, shader.film_radius_mm, shader.f_number, shader.nearest_m, poor,
-        [] if zoom is None else [f"The zoom stands at {zoom}"],
+        kind, model, shader.text, error, shader.film_radius_mm, shader.f_number, shader.nearest_m, poor, notes
     )  # fmt: skip
 
 
-def packed_of(
-    files: Sequence[Path],
-    *,
-    lens: Lens | None = None,
-    zoom: str | None = None,
-    quiet: bool,
-    report: Callable[[float], object] = lambda share: None,
-) -> PackedLens:
-    """A lens of the menu from files of one lens; `lens` is its prescription, for the thumbnail, where it is at hand.
+def _squeeze(file: Path, zoom: str | None) -> float:
+    """See `cameras.lens_state`."""
+    if file.suffix == ".toml":
+        from neurolens.optics.lensfile import read_lens
+        from neurolens.optics.paraxial import first_order
+
+        lens = read_lens(file).at(zoom=zoom)
+        across = first_order(lens, meridian="x") if lens.anamorphic else first_order(lens)
+        return abs(float(first_order(lens).efl_mm / across.efl_mm))
+    from neurolens.cameras.build import Shot, make_camera
+
+    return float(make_camera(str(file), Shot((1.0, 1.0), math.inf, zoom=zoom)).settings["lens_state"]["squeeze"] or 1.0)
+
+
+def forms_of(files: Sequence[Path], jobs: int, report: Callable[[float], object]) -> tuple[Forms, dict[Path, str]]:
+    """Forms of many files, `jobs` at a time in processes of their own, and why others have none.
 
     Raises:
-        InputError: as `form_of`.
+        NeurolensError: a process ended by itself, as where memory is short.
     """
-    forms = []
-    for file in files:
-        forms.append(form_of(file, zoom=zoom, quiet=quiet))
-        report(len(forms) / len(files))
+    found: Forms = {}
+    left: dict[Path, str] = {}
+
+    def keep(file: Path, made: Form | str) -> None:
+        if isinstance(made, Form):
+            found[file] = made
+        else:
+            left[file] = made
+        report((len(found) + len(left)) / len(files))
+
+    if jobs == 1:
+        for file in files:
+            keep(file, _form_or_why(file))
+        return found, left
+    with ProcessPoolExecutor(jobs, CONTEXT, _begin_job) as pool:
+        waiting = {pool.submit(_form_or_why, file): file for file in files}
+        try:
+            for done in as_completed(waiting):
+                keep(waiting[done], done.result())
+        except BaseException as error:
+            for job in multiprocessing.active_children():
+                job.terminate()
+            pool.shutdown(cancel_futures=True)
+            if isinstance(error, BrokenProcessPool):
+                raise NeurolensError(
+                    f"one of {jobs} processes ended early: memory may be short, try --jobs 1"
+                ) from None
+            raise
+    return found, left
+
+
+def _begin_job() -> None:
+    """In a process: signals end it at once, as the main process ends it; one core is its own."""
+    for number in ASKING:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
+    if find_spec("torch") is not None:
+        import torch
+
+        torch.set_num_threads(1)
+
+
+def _form_or_why(file: Path) -> Form | str:
+    try:
+        return form_of(file, quiet=True)
+    except NeurolensError as error:
+        return str(error)
+
+
+def packed_of(
+    files: Sequence[Path], forms: Sequence[Form], *, lens: Lens | None = None, zoom: str | None = None
+) -> PackedLens:
+    """A lens of the menu from files of one lens and their forms.
+
+    Args:
+        lens: its prescription, for the thumbnail, where it is at hand.
+    """
     first = files[0]
     if first.suffix == ".onnx":
         card = _card(first)["lens"]
@@ -70,11 +147,11 @@ def packed_of(
         from neurolens.optics.lensfile import read_lens
         from neurolens.optics.paraxial import first_order
 
-        lens = read_lens(first).at(zoom=zoom)
+        lens = read_lens(first).at(zoom=None if zoom == RANGE else zoom)
         data = first_order(lens)
         name, efl, f_number, source = lens.name, data.efl_mm, data.f_number, lens.source
     picture = None if lens is None else thumbnail(lens)
-    return PackedLens(key_of(first), str(name), float(efl), float(f_number), source, picture, forms)
+    return PackedLens(key_of(first), str(name), float(efl), float(f_number), source, picture, list(forms))
 
 
 def key_of(file: Path) -> str:
@@ -121,7 +198,13 @@ def thumbnail(lens: Lens) -> bytes | None:
         figure = new_figure(_SIDE_IN, _SIDE_IN)
         figure.set_layout_engine("none")
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        draw_section(axes, layout_profile(Scene(lens.at(), axis="y")), lw=0.5)
+        layout = layout_profile(Scene(lens.at(), axis="y"))
+        layout = replace(layout, rays=tuple(ray for ray in layout.rays if ray.field != 1))  # of the axis and the edge
+        draw_section(axes, layout, lw=0.5)
+        arcs = np.concatenate([s.arc() for s in layout.surfaces])  # the glass fills the picture: menus show it small
+        z, height = (arcs.min(0) + arcs.max(0)) / 2, np.ptp(arcs, 0)
+        half = _MARGIN * max(height) / 2
+        axes.set(xlim=(z[0] - half, z[0] + half), ylim=(-half, half))
         axes.set_axis_off()
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=_DOTS, facecolor="white", metadata={"Software": None})

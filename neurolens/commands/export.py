@@ -28,7 +28,8 @@ arrays that compilers vectorise), a GLSL function, or an ONNX file. Domain guard
 transmittance and status codes are those of the model; the card is a comment at the top. Constants
 (planes, ranges) and the film's position for a focus stand beside it. Of a model of a zoom's whole range
 (or of internal focus) the state is an argument. A lens file gives the exact lens.
-OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades and more are its inputs.
+OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades and more are its inputs, and the
+zoom of a model of its range, or of a lens file with --zoom range. Lens files focus as they say groups move.
 With --camera, the whole camera for one focus and stop: film point and two random numbers in, weighted
 ray out, its pupil's outline as a table in the file (of GLSL, the data of a texture beside it).
 Needs the extra "train" (torch); without it C and GLSL are written from the graph in the file,
@@ -99,7 +100,7 @@ def add_parser(subparsers: Any) -> None:
     group.add_argument(
         "--zoom",
         metavar="STATE",
-        help="state of a zoom by name or focal length; of a lens file also range: an argument, not of a camera",
+        help="state of a zoom by name or focal length; of a lens file also range: an argument, of OSL an input",
     )
     add_json(parser)
     parser.set_defaults(run=run, kept="nothing is written")

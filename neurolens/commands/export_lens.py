@@ -17,6 +17,7 @@ from neurolens.base.progress import Progress
 from neurolens.cameras.exact import check_bare
 from neurolens.cameras.focus_function import Array, Focusing
 from neurolens.cameras.source import film_extras, followed, state_ranges
+from neurolens.commands.arguments import RANGE
 from neurolens.graph.c import Extras
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
@@ -31,7 +32,6 @@ from neurolens.optics.tracegraph import exact_graph
 from neurolens.surrogates.source import Written, checked_name, lines_of, write_program
 from neurolens.surrogates.states import zoom_axis
 
-RANGE = "range"  # as a zoom position: all of them
 _LIGHT_NM = (400.0, 700.0)
 _NEAR_EFL = 10.0  # nearest focus of the function of that, in focal lengths
 _GAP_MM, _MOST = 1e-4, 12  # error of interpolated gaps that is enough, and the highest degree tried for it
@@ -47,7 +47,7 @@ def write_lens(file: Path, args: argparse.Namespace) -> Written:
     axes: tuple[Axis, ...] = ()
     lines = []
     if args.zoom == RANGE:
-        axis, error_mm = gap_axis(lens)
+        axis, error_mm = gap_axis(zoom_axis(lens), lambda zoom_mm: lens.at(zoom=zoom_mm))
         axes, nodes = (axis,), [lens.at(zoom=v) for v in axis.nodes]
         lines.append(
             f"Argument state: NAME_at(zoom_mm) makes it, once for all rays, of the focal length at infinity focus, "
@@ -60,7 +60,7 @@ def write_lens(file: Path, args: argparse.Namespace) -> Written:
     if focus_states(lens):
         lines.append("Groups stand at infinity focus: the film focuses, for how groups move is no graph.")
     for node in nodes:
-        check_bare(node)
+        check_bare(node, "a model of the lens has them")
     planes = pupil_planes_mm(nodes, axes)
     program = lens_program(nodes, axes, planes)
     constants, functions = followed(axes, numbers(nodes, planes))
@@ -114,19 +114,22 @@ def lens_program(nodes: Sequence[Lens], axes: Sequence[Axis], planes_mm: Sequenc
     return program
 
 
-def gap_axis(lens: Lens) -> tuple[Axis, float]:
-    """The range of a zoom with nodes enough for its gaps, and their largest error in mm between nodes.
+def gap_axis(first: Axis, lens_at: Callable[[float], Lens]) -> tuple[Axis, float]:
+    """An axis with nodes enough for the gaps of the lens at its values, and their largest error in mm between nodes.
 
-    Raises:
-        InputError: a file with fewer than two zoom states.
+    Args:
+        first: the axis, of the least degree that is tried.
     """
-    first = zoom_axis(lens)
 
-    def places(zoom_mm: float) -> Array:
-        return np.array(lens.at(zoom=zoom_mm).vertices_mm[: len(lens.surfaces)])
+    def places(value: float) -> Array:
+        lens = lens_at(value)
+        return np.array(lens.vertices_mm[: len(lens.surfaces)])
 
-    turned = [(1 / a, 1 / b) for a, b in zip(first.knots, first.knots[1:], strict=False)]
-    known = [(v, places(v)) for a, b in turned for v in (1 / (a + (b - a) * share) for share in _BETWEEN)]
+    def turned(value: float) -> float:
+        return 1 / value if first.reciprocal else value
+
+    ends = [(turned(a), turned(b)) for a, b in zip(first.knots, first.knots[1:], strict=False)]
+    known = [(v, places(v)) for a, b in ends for v in (turned(a + (b - a) * share) for share in _BETWEEN)]
     for degree in range(first.degree, _MOST + 1):
         axis = replace(first, degree=degree)
         nodes = np.array([places(v) for v in axis.nodes])

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
 from neurolens.base.errors import InputError
-from neurolens.base.progress import Progress
+from neurolens.base.progress import Progress, Report
+from neurolens.commands.arguments import RANGE
 
 if TYPE_CHECKING:
-    from neurolens.cameras.osl import OslCamera, Report
+    from neurolens.cameras.osl import OslLens, Seen
     from neurolens.graph.ir import Graph
     from neurolens.optics.prescription import Lens
 
@@ -30,7 +31,7 @@ class Shader:
     Attributes:
         name: of the shader. text: its source. operations: of one ray. parameters: names of its inputs.
         passing: share of the rays that pass, by f-number. film_radius_mm, f_number, nearest_m: of the lens; the widest
-            stop, and the nearest object, None where the film does not focus.
+            stop, and the nearest object, None where the film does not focus. notes: sentences for the user.
     """
 
     name: str
@@ -41,68 +42,66 @@ class Shader:
     film_radius_mm: float
     f_number: float
     nearest_m: float | None
+    notes: tuple[str, ...] = ()
 
 
 def shader_of(file: Path, *, zoom: str | None = None, name: str | None = None, quiet: bool = False) -> Shader:
     """The shader of a model (.onnx) or of a lens file (.toml).
 
     Args:
-        zoom: state of a zoom by name or focal length. name: of the shader; None takes the lens's id.
+        zoom: state of a zoom by name or focal length; "range" makes it an input, as None does of a model of a range.
+        name: of the shader; None takes the lens's id.
 
     Raises:
         InputError: coatings or glass that absorbs in a lens file, a name that is no identifier, a lens that is too
             large for compilers.
     """
-    from neurolens.cameras.osl import parameters, write_camera
-    from neurolens.cameras.pupil_arcs_fit import passing
+    from neurolens.cameras.osl import FOCUS_AXIS, parameters, write_camera
     from neurolens.surrogates.source import OSL, checked_name, lines_of
 
     with Progress(quiet=quiet).stage(f"fit the pupil of {file.stem}") as report:
-        if file.suffix == ".toml":
-            from neurolens.optics.lensfile import read_lens
-
-            lens = read_lens(file).at(zoom=zoom)
-            own, camera = checked_name(OSL, lens.lens_id, name), exact_camera(lens, report)
-            told = [f"{lens.name}: every surface traced (bare), {lens.source} (sha256 {str(lens.sha256)[:16]})."]
-        else:
-            own, camera, told = _of_model(file, zoom, name, report)
-    shares = passing(camera.sight, camera.arcs)
-    passed = {f"{camera.f_number / share:.3g}": value for share, value in shares.items()}
-    near = f"from {camera.near_m:.4g} m" if math.isfinite(camera.near_m) else "fixed"
+        make = exact_lens if file.suffix == ".toml" else _of_model
+        lens_id, lens, told = make(file, zoom, report)
+    own = checked_name(OSL, lens_id, name)
+    passed = {f"{lens.f_number / share:.3g}": value for share, value in lens.passing().items()}
+    near, least = lens.near_m
+    focus = f"from {near:.4g} m" if near else "fixed"
     comment = [
         f"A camera for Blender's Cycles (4.5 and later), written by neurolens {__version__} from {file.name}.",
         *told,
-        f"Film radius {camera.arcs.film_radius_mm:.4g} mm, f/{camera.f_number:.3g}, focus {near}; rays that pass: "
+        f"Film radius {lens.film_radius_mm:.4g} mm, f/{lens.f_number:.3g}, focus {focus}; rays that pass: "
         + ", ".join(f"f/{n} {share:.1%}" for n, share in passed.items()) + ".",
         "Sensor size and shift are Blender's. Focus: focus_m, or where that is 0 the distance of depth of field.",
     ]  # fmt: skip
-    text, operations = write_camera(camera, own, lines_of(comment))
+    notes = []
+    for axis in lens.axes:
+        low, high = axis.range
+        if axis.name == FOCUS_AXIS:
+            notes.append("Groups move to focus: the picture breathes as the lens's does")
+        elif least > near:
+            notes.append(f"Nearest focus from {near:.3g} to {least:.3g} m over the zoom, {low:.4g} to {high:.4g} mm")
+    text, operations = write_camera(lens, own, lines_of([*comment, *(f"{n}." for n in notes)]))
     if operations > MAX_STEPS:
         raise InputError("export", "operations", operations, f"up to {MAX_STEPS}: a model of the lens is smaller")
     return Shader(
-        own, text, operations, tuple(p.name for p in parameters(camera)), passed, camera.arcs.film_radius_mm,
-        camera.f_number, camera.near_m if math.isfinite(camera.near_m) else None,
+        own, text, operations, tuple(p.name for p in parameters(lens)), passed, lens.film_radius_mm, lens.f_number,
+        near or None, tuple(notes),
     )  # fmt: skip
 
 
-def _of_model(file: Path, zoom: str | None, name: str | None, report: Report) -> tuple[str, OslCamera, list[str]]:
+def _of_model(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
     from neurolens.cameras.onnxlens import load_model
-    from neurolens.cameras.osl import model_camera
+    from neurolens.cameras.osl import model_lens
     from neurolens.modelfile.states import state_for
-    from neurolens.surrogates.source import OSL, checked_name
 
-    model = load_model(file)
-    if model.axes or zoom is not None:
+    model, fixed = load_model(file), zoom not in (None, RANGE)
+    if fixed or (zoom is not None and not model.axes):
         model = model.at(*state_for(model.path, model.axes, model.state, zoom, math.inf))
     lens, fit = model.card["lens"], model.card["fit"]
-    own = checked_name(OSL, str(lens["id"]), name)
     state = ", ".join(f"{a.name} {v:.5g}" for a, v in zip(model.axes, model.state, strict=True))
     told = [f"{lens['name']}: {fit['method']}, {lens['source']} (sha256 {lens['sha256'][:16]})."]
-    return (
-        own,
-        model_camera(model, _smallest(file, bool(model.axes)), report),
-        told + [f"State: {state}."] * bool(state),
-    )
+    made = model_lens(model, _smallest(file, bool(model.axes)), report, fixed=fixed)
+    return str(lens["id"]), made, told + [f"State: {state}."] * bool(state and fixed)
 
 
 def _smallest(file: Path, has_states: bool) -> Graph | None:
@@ -120,37 +119,86 @@ def _smallest(file: Path, has_states: bool) -> Graph | None:
     return model_graph(model, largest_angle(model), SCALARS)
 
 
-def exact_camera(lens: Lens, report: Report) -> OslCamera:
-    """Of a lens itself, every surface traced; focused by moving its film, down to ten focal lengths.
+def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
+    """Of a lens itself, every surface traced: its id, itself, and lines on it.
+
+    Focused as its file says groups move; of a file that does not say, by moving the film, to ten focal lengths.
+
+    Args:
+        zoom: as `shader_of`.
 
     Raises:
-        InputError: coatings or glass that absorbs.
+        InputError: coatings or glass that absorbs; a range of no zoom.
     """
     from neurolens.cameras.exact import check_bare
+    from neurolens.cameras.osl import osl_lens, states_between
+    from neurolens.commands.export_lens import gap_axis
+    from neurolens.modelfile.axes import product, weights
+    from neurolens.optics.focusing import focus_states
+    from neurolens.optics.lensfile import read_lens
+    from neurolens.optics.pupils import pupil_plane_z_mm
+    from neurolens.surrogates.states import StateSpace, axes_of
+
+    lens, state = read_lens(file), None if zoom == RANGE else zoom
+    ranged, internal = zoom == RANGE, bool(focus_states(lens))
+    check_bare(lens.at(zoom=state), "a model of the lens has them")
+    told = [f"{lens.name}: every surface traced (bare), {lens.source} (sha256 {str(lens.sha256)[:16]})."]
+    if not (ranged or internal):
+        at = lens.at(zoom=state)
+        return lens.lens_id, osl_lens([_traced(at, pupil_plane_z_mm(at))], report), told
+    space = StateSpace(lens, axes_of(lens, zoom=ranged, internal=internal, state=state), state)
+    if len(space.axes) == 1:
+        axis, error_mm = gap_axis(space.axes[0], lambda value: space.lens_at((value,)))
+        space = replace(space, axes=(axis,))
+        told.append(f"Between {len(axis.nodes)} states its gaps are within {1e3 * error_mm:.2g} um (measured).")
+    knots = tuple(replace(a, degree=1) for a in space.axes)
+    planes = [pupil_plane_z_mm(space.lens_at(s)) for s in product(knots)]
+
+    def seen(s: tuple[float, ...]) -> Seen:
+        plane, far = float(weights(knots, s) @ planes), space.lens_at((*s[:-1], 0.0)) if internal else None
+        return _traced(space.lens_at(s), plane, far, 1 / s[-1] if internal and s[-1] else math.inf)
+
+    nodes = [seen(s) for s in product(space.axes)]
+    between = [(weights(space.axes, s), seen(s).sight) for s in states_between(space.axes)]
+    return lens.lens_id, osl_lens(nodes, report, space.axes, between), told
+
+
+def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: float = math.inf) -> Seen:
+    """A lens in one state.
+
+    Args:
+        plane_mm: of its pupil points. far, inside_m: of groups that have moved, the lens at infinity focus, whose
+            picture's size holds, and the distance in focus.
+    """
     from neurolens.cameras.focus_function import Focusing
-    from neurolens.cameras.osl import osl_camera
+    from neurolens.cameras.osl import Seen
     from neurolens.cameras.pupil_arcs_fit import Sight
     from neurolens.cameras.pupil_boxes import PupilTable
-    from neurolens.optics.focusing import best_focus_of_stops_mm
+    from neurolens.optics.focusing import best_focus_of_stops_mm, film_range_mm
     from neurolens.optics.paraxial import film_z_mm, first_order
-    from neurolens.optics.pupils import image_radius_mm, pupil_bounds, pupil_plane_z_mm
+    from neurolens.optics.pupils import image_radius_mm, pupil_bounds
     from neurolens.optics.tracegraph import exact_graph
 
-    check_bare(lens)
-    data, plane, (radius, _) = first_order(lens), pupil_plane_z_mm(lens), image_radius_mm(lens)
+    data, (radius, _) = first_order(lens), image_radius_mm(far or lens)
     apart, efl = abs(float(data.rear_principal_z_mm - data.front_principal_z_mm)), float(data.efl_mm)
-    near = (_NEAR_EFL * abs(efl) + apart) / 1000
-    infinity, close = film_z_mm(lens, math.inf), film_z_mm(lens, near)
-    spare = _SPARE * abs(close - infinity)
-    places = min(infinity, close) - spare, max(infinity, close) + spare
-    bounds = pupil_bounds(lens, radius, places, LIGHT_NM, rows=17, points=96)
+    near = math.inf if far else (_NEAR_EFL * abs(efl) + apart) / 1000
+    if far:
+        places = film_range_mm(lens, inside_m, LIGHT_NM)
+    else:
+        infinity, close = film_z_mm(lens, math.inf), film_z_mm(lens, near)
+        spare = _SPARE * abs(close - infinity)
+        places = min(infinity, close) - spare, max(infinity, close) + spare
+    bounds = pupil_bounds(lens, radius, places, LIGHT_NM, rows=17, points=96, pupil_z_mm=plane_mm)
     stop = float(lens.stop_radius_mm)
 
-    def best(focus_m: float, stops_mm: Any) -> Any:
-        return best_focus_of_stops_mm(lens, focus_m, stops_mm, LIGHT_NM)
+    def paraxial(focus_m: float) -> float:
+        return float(lens.film_z_mm or 0.0) if far else film_z_mm(lens, focus_m)
 
-    table = PupilTable.of(asdict(bounds))
-    graph = exact_graph(lens, plane, LIGHT_NM)
-    sight = Sight(graph, table, places, LIGHT_NM, stop, lens.stop_index, lens.anamorphic)
-    focusing = Focusing(near, stop, lambda focus_m: film_z_mm(lens, focus_m), best, places)
-    return osl_camera(sight, focusing, float(data.f_number), efl, report)
+    def best(focus_m: float, stops_mm: Any) -> Any:
+        return best_focus_of_stops_mm(lens, inside_m if far else focus_m, stops_mm, LIGHT_NM)
+
+    graph = exact_graph(lens, plane_mm, LIGHT_NM)
+    sight = Sight(
+        graph, PupilTable.of(asdict(bounds)), places, LIGHT_NM, stop, lens.stop_index, lens.anamorphic
+    )  # fmt: skip
+    return Seen(sight, Focusing(near, stop, paraxial, best, places), float(data.f_number), efl)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neurolens import __version__
 from neurolens.base.errors import InputError
@@ -16,35 +17,73 @@ from neurolens.commands.arguments import (
     add_json,
     add_lens_state,
     between,
+    check_folder,
     check_suffix,
     lens_path,
     state_of,
     whole,
 )
+from neurolens.commands.flare_fit import add_fit, fitted, run_fit, stopped
+from neurolens.commands.flare_lights import add_lights
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.render import film_size
+from neurolens.commands.render_frames import add_frames, frames_of
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
-    from neurolens.flare.ghosts import Pair
-    from neurolens.flare.picture import Ghost, Light
+    from neurolens.commands.flare_lights import Sources
+    from neurolens.flare.ghostmodel import GhostModel
+    from neurolens.flare.lights import Light
+    from neurolens.flare.picture import Ghost, Ways
     from neurolens.optics.prescription import Lens
 
 _DESCRIPTION = """\
 Trace all ghosts of a lens exactly: light that two of its surfaces reflect on its way to the
 film, with Fresnel's or the coatings' reflectance, all rims and the stop's shape, spectrally.
-Prints the brightest by energy, place and size; with -o writes their picture as OpenEXR, to be
-added to a render of the same lens, film and focus: R, G and B are all ghosts, and each of the
-brightest --layers is one layer, NAME.R, .G, .B (g07-03: reflected at surface 7, then at 3,
-counted from 0 at the front), the rest is "rest". Values are those of `neurolens render`: a
-white card of radiance 1 is 1 on the axis. With --photons light goes on by chance instead, with
-any number of reflections, smoothed by a kernel. Needs the extra "train" (torch) and a C compiler."""
+Prints the brightest by energy, place and size (x, y on the film itself, which pictures show turned
+by 180 degrees: a light to the right is imaged at x < 0); with -o writes their picture as OpenEXR, to be
+added to a render of the same lens, film and focus: R, G and B are the sum of the layers
+ghosts.R, .G, .B, and so on. Of the ghosts each of the brightest --layers is one more layer
+(g07-03: reflected at surface 7, then at 3, counted from 0 at the front), the others are
+"rest". Values are those of `neurolens render`: a white card of radiance 1 is 1 on the axis.
+With --reflections 4, ghosts of four reflections are traced, too: the strongest, until 0.1% of
+all ghosts' light is left. With --photons light goes on by chance instead, with any number of
+reflections, smoothed by a kernel. With --glare, or anything that scatters, the layer glare has
+by such photons the light that is reflected more than twice or scatters, so that ghosts and
+glare are all. With --starburst the layer starburst has what diffraction sends aside, by the
+shape of the opening as each light sees it: streaks of blades. It is 0 at the image of the
+light itself, which a render has. Needs the extra "train" (torch) and a C compiler."""
 _EPILOG = """\
 examples:
   neurolens flare laikin_double_gauss_50 --light 15,8 --path g08-06 path.png
   neurolens flare laikin_double_gauss_50 --light 15,8,0.01 --coating quarter-wave --blades 6 --f-number 8 -o flare.exr
-  neurolens flare lenses/ogawa_zoom_70_200.toml --zoom 100 --light -12,3,1/0.8/0.5 --layers 8 -o flare.exr"""
-_SHOWN = 12  # ghosts of the table
+  neurolens flare lenses/ogawa_zoom_70_200.toml --zoom 100 --light -12,3,1/0.8/0.5 --layers 8 -o flare.exr
+  neurolens flare laikin_double_gauss_50 --light 15,8 --coating multi-layer --barrel 0.05 --dust 0.01 -o flare.exr
+  neurolens flare laikin_double_gauss_50 --light 15,8 --blades 7 --f-number 11 --starburst -o flare.exr
+  neurolens flare laikin_double_gauss_50 --fit ghosts.onnx; neurolens flare ghosts.onnx --light 15,8 -o flare.exr"""
+_COMMAND = "neurolens flare"
+_SHOWN, _SHOWN_LIGHTS, _KEPT = 12, 4, 64  # ghosts of a table and tables; ghosts of a light that files tell
+_FEWEST = 256  # rays of a table
+_RANKED_FRAMES = 16  # that tell which ghosts are brightest
+_FRAMES = (
+    "flare of these frames to OUT.0001.exr and so on, of lights by their keys in lists, the lens, and the camera of a "
+    "scene of --lights by --key; a frame that exists is kept"
+)
+_PREVIEW = {"width": 480, "wavelengths": 5, "photons": 1 << 16, "glare": 1 << 16}  # at most
+_PREVIEW_CELL = 24.0
+# Arguments that are numbers of `FlareSettings`, by its names.
+_NUMBERS = (
+    *("wavelengths", "cell_px", "photons", "most_reflections", "kernel_px", "glare", "fours", "starburst"),
+    *("seed", "threads"),
+)
+_GLARE = 1 << 18  # photons where anything scatters
+# Of `Scatter`: option, attribute, highest value, unit, help.
+_SCATTER = (
+    ("--barrel", "barrel", 1.0, "SHARE", "of light that the barrel reflects, its rings and the stop, a fifth glossily"),
+    ("--sensor", "sensor", 0.9, "SHARE", "of light that the film reflects, half of it as a mirror"),
+    ("--dust", "dust", 1.0, "SHARE", "of the front that is dusty: light scatters there, mean cosine 0.98"),
+    ("--haze", "haze_per_mm", 10.0, "PER_MM", "scattering in glass, inverse of the mean free path, mean cosine 0.9"),
+)
 
 
 def add_parser(subparsers: Any) -> None:
@@ -52,15 +91,14 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "flare", help="ghosts of lights: a table, and a picture with layers", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument("file", metavar="LENS", type=Path, help="lens file, or the name of one of lenses/")
     parser.add_argument(
-        "--light", metavar="AZ,EL[,E[,M]]", action="append", required=True, dest="lights",
-        help="degrees to the right of and above the axis, as the camera sees it, irradiance at the lens (radiance "
-        "times solid angle in sr; a number or R/G/B; default 1), and distance in metres (default inf); repeatable",
-    )  # fmt: skip
+        "file", metavar="LENS", type=Path, help="lens file, the name of one of lenses/, or fitted ghosts"
+    )
+    add_lights(parser)
     parser.add_argument(
         "--coating", metavar="NAME",
-        help="of every surface between glass and air that the lens file leaves bare: quarter-wave, v-coat, broadband",
+        help="of every surface between glass and air that the lens file leaves bare: single-layer (1940s to 60s), "
+        "three-layer (1970 on), multi-layer (today), quarter-wave, v-coat, broadband; of one: three-layer,s07=bare",
     )  # fmt: skip
     parser.add_argument("-o", "--out", metavar="OUT.exr", type=Path, help="picture (default: only the table)")
     parser.add_argument(
@@ -74,8 +112,8 @@ def add_parser(subparsers: Any) -> None:
         "--width", metavar="PX", type=whole(1, 16384), default=960, help="of the picture (default: 960)"
     )
     parser.add_argument(
-        "--samples", metavar="N", type=whole(1, 1 << 30), default=1 << 18,
-        help="rays a light and wavelength (default: 262144)",
+        "--cell", metavar="PX", type=between(1, 256, "pixels"), default=8.0, dest="cell_px",
+        help="size on film of the cells that a ghost is drawn by (default: 8; a quick look: 48)",
     )  # fmt: skip
     parser.add_argument(
         "--wavelengths", metavar="N", type=whole(1, 256), default=15, help="from 400 to 700 nm (default: 15)"
@@ -84,111 +122,247 @@ def add_parser(subparsers: Any) -> None:
         "--layers", metavar="N", type=whole(0, 64), default=0, help="brightest ghosts as layers (default: 0)"
     )
     parser.add_argument(
-        "--photons", metavar="N", type=whole(1, 1 << 30),
+        "--without",
+        metavar="LAYER",
+        action="append",
+        default=[],
+        help="layer that is not made: ghosts, glare, starburst; repeatable",
+    )
+    parser.add_argument(
+        "--photons", metavar="N", type=whole(1, 1 << 30), default=0,
         help="instead of all pairs, photons with up to --reflections by chance, N a light and wavelength",
     )  # fmt: skip
-    parser.add_argument("--reflections", metavar="N", type=whole(1, 1000), default=10, help="default: 10")
     parser.add_argument(
-        "--kernel", metavar="PX", type=between(0, 100, "pixels"), default=3.0,
-        help="radius of the kernel that smooths photons (default: 3)",
+        "--reflections", metavar="N", type=whole(1, 1000), dest="most_reflections",
+        help="of photons and glare at most (default: 10); of ghosts without them, 2 (the default) or 4",
+    )  # fmt: skip
+    parser.add_argument(
+        "--kernel", metavar="PX", type=between(0, 100, "pixels"), default=3.0, dest="kernel_px",
+        help="radius of the kernel that smooths photons, where they are dense (default: 3); 0 leaves them",
+    )  # fmt: skip
+    parser.add_argument(
+        "--glare", metavar="N", type=whole(0, 1 << 30), default=0,
+        help=f"photons a light and wavelength of the layer glare (default: {_GLARE} if anything scatters, else none)",
+    )  # fmt: skip
+    parser.add_argument("--starburst", action="store_true", help="the layer starburst; some seconds a light")
+    for option, name, most, unit, text in _SCATTER:
+        parser.add_argument(
+            option, metavar=unit, type=between(0, most, "a number"), default=0.0, dest=name, help=f"{text} (default: 0)"
+        )
+    parser.add_argument(
+        "--gain", metavar="NAME=X", action="append", default=[], type=_factor(1),
+        help="of a layer (ghosts), a ghost (g07-03) or all that a surface reflects (s07); repeatable, gains multiply",
+    )  # fmt: skip
+    parser.add_argument(
+        "--tint", metavar="NAME=R/G/B", action="append", default=[], type=_factor(3), help="the same, of each colour"
+    )
+    parser.add_argument(
+        "--preview", action="store_true",
+        help="at most 480 pixels wide, 5 wavelengths and 65536 photons a light and wavelength, --cell at least 24",
+    )  # fmt: skip
+    parser.add_argument(
+        "--seed", metavar="N", type=whole(0, 1 << 20), default=0,
+        help="of the chances of photons, the same in all frames; ghosts have none (default: 0)",
     )  # fmt: skip
     parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=2, help="default: 2")
+    add_fit(parser)
+    add_frames(parser, _FRAMES)
+    parser.add_argument("--restart", action="store_true", help="of --frames: make those that exist again")
     add_lens_state(parser, efl="as tabled", f_number="the widest")
     add_json(parser, quiet=True)
-    parser.set_defaults(run=run, kept="nothing is written")
+    parser.set_defaults(run=run, kept="nothing is written", position_m=None, look_at_m=None, frame=None)
+
+
+def _factor(size: int) -> Callable[[str], tuple[str, tuple[float, ...]]]:
+    """Type of --gain and --tint: a name and the factors of red, green and blue."""
+
+    def read(text: str) -> tuple[str, tuple[float, ...]]:
+        name, _, rest = text.partition("=")
+        try:
+            found = tuple(float(word) for word in rest.split("/"))
+        except ValueError:
+            found = ()
+        if len(found) != size or not all(0 <= v < math.inf for v in found):
+            raise argparse.ArgumentTypeError(
+                f"got {text!r}, expected NAME={'X' if size == 1 else 'R/G/B'}, of at least 0"
+            )
+        return name, found * (3 // size)
+
+    return read
 
 
 def run(args: argparse.Namespace) -> int:
     """Trace, print, write."""
-    from neurolens.flare.ghosts import GhostTracer, coated
-    from neurolens.flare.picture import ghost_table
+    from neurolens.commands.flare_lights import Sources
+    from neurolens.flare.ghosts import ghost_pairs
     from neurolens.optics.lensfile import read_lens
 
-    lights = [_light(text) for text in args.lights]
-    if args.photons and args.layers:
-        raise InputError("neurolens flare", "--layers", args.layers, "0 with --photons, which know no single ghosts")
-    if args.out is not None:
-        check_suffix(args.out, "--out", (".exr",))
+    args.glare = args.glare or _GLARE * any(getattr(args, name) > 0 for _, name, *_ in _SCATTER)
+    _check(args)
+    progress, began = Progress(quiet=args.quiet or args.json), time.perf_counter()
+    if args.preview:
+        vars(args).update({name: min(getattr(args, name), most) for name, most in _PREVIEW.items()})
+        args.cell_px = max(args.cell_px, _PREVIEW_CELL)
+        progress.note(f"preview: {args.width} pixels wide, {args.wavelengths} wavelengths, cells of {args.cell_px:g}")
+    states, model = list(_states(args)), fitted(args)
+    tabled = read_lens(lens_path(args.file, "flare")) if model is None else model.lens
+    if args.fit is not None:
+        return run_fit(args, None if model else _lens(states[0], tabled), model)
+    shots = _Shots(tabled, Sources(args), progress, model)
+    first = shots.at(states[0])
+    found = {"lens": first.lens.name, "pairs": len(ghost_pairs(first.lens)), **_told(first)}
     if args.path is not None:
-        check_suffix(Path(args.path[1]), "--path", (".png", ".pdf", ".svg"))
-    args.focus = float("inf") if args.focus is None else args.focus
-    lens = state_of(args, read_lens(lens_path(args.file, "flare")))
-    lens = lens if args.coating is None else coated(lens, args.coating)
-    began = time.perf_counter()
-    tracer = GhostTracer(lens)
-    rows = [ghost_table(tracer, light, 550.0) for light in lights]
-    found = {"lens": lens.name, "pairs": len(tracer.pairs), "lights": [plain(asdict(light)) for light in lights]}
-    found |= {"ghosts": [[_about(ghost) for ghost in of_light] for of_light in rows]}
-    if args.path is not None:
-        _draw(lens, args.path[0], Path(args.path[1]), lights[0], tracer.pairs)
+        _draw(first, args.path[0], Path(args.path[1]))
         found["path"] = args.path[1]
     if args.out is not None:
-        found["out"] = str(args.out)
-        _write(args, tracer, lens, lights, rows, found)
+        found["out"] = [str(state.out) for state in states]
+        _write_all(states, shots, progress)
     found["seconds"] = time.perf_counter() - began
-    return answer(args, found, lambda: _text(lens, lights, rows, found))
+    return answer(args, found, lambda: _text(first, found))
 
 
-def _write(
-    args: argparse.Namespace, tracer: Any, lens: Lens, lights: list[Light], rows: list[list[Ghost]], about: Any
-) -> None:
+def _check(args: argparse.Namespace) -> None:
+    if args.frames is None and args.key:
+        raise InputError(_COMMAND, "--key", args.key[0], "--frames beside it")
+    if args.frames is not None:
+        if args.out is None:
+            raise InputError(_COMMAND, "--frames", f"({len(args.frames)})", "-o beside it")
+        args.kept = "the frames that are there are kept: the same command goes on"
+    by_chance = args.photons or args.glare
+    args.fours = not by_chance and args.most_reflections == 4
+    if not by_chance and args.most_reflections not in (None, 2, 4):
+        raise InputError(_COMMAND, "--reflections", args.most_reflections, "2 or 4, or --photons or --glare beside it")
+    args.most_reflections = args.most_reflections or 10
+    if args.out is not None:
+        check_suffix(args.out, "--out", (".exr",))
+        check_folder(args.out, "--out")
+    if args.path is not None:
+        check_suffix(Path(args.path[1]), "--path", (".png", ".pdf", ".svg"))
+
+
+def _states(args: argparse.Namespace) -> Iterator[argparse.Namespace]:
+    """The arguments of each frame."""
+    frames = [(None, "", {})] if args.frames is None else frames_of(args, _COMMAND)
+    for frame, digits, values in frames:
+        state = argparse.Namespace(**vars(args) | values | {"frame": frame})
+        state.focus = math.inf if state.focus is None else state.focus
+        if frame is not None:
+            state.out = args.out.with_name(f"{args.out.stem}.{digits}{args.out.suffix}")
+        yield state
+
+
+class _Shot(NamedTuple):
+    """Lens, lights, the ghosts of each light, brightest first, which were looked for, and what stands for them."""
+
+    lens: Lens
+    lights: list[Light]
+    ghosts: list[list[Ghost]]
+    found: Ways
+    model: GhostModel | None
+
+
+class _Shots:
+    """What frames show; what they share is made once."""
+
+    def __init__(self, tabled: Lens, sources: Sources, progress: Progress, model: GhostModel | None) -> None:
+        self._tabled, self._sources, self._progress, self._model = tabled, sources, progress, model
+        self._lenses: dict[tuple[Any, ...], Lens] = {}
+        self._last: tuple[argparse.Namespace, _Shot] | None = None
+
+    def at(self, args: argparse.Namespace) -> _Shot:
+        """Of a frame."""
+        if self._last is None or self._last[0] is not args:
+            self._last = args, self._made(args)
+        return self._last[1]
+
+    def _made(self, args: argparse.Namespace) -> _Shot:
+        from neurolens.flare.ghosts import GhostTracer, ghost_pairs
+        from neurolens.flare.picture import RANKED, Ways, ghost_table, with_four
+
+        state = args.focus, args.f_number, args.zoom
+        if state not in self._lenses:
+            self._lenses[state] = _lens(args, self._tabled) if self._model is None else stopped(args, self._model).lens
+        lens = self._lenses[state]
+        lights = self._sources.at(args, lens, self._progress)
+        found = with_four(lens, lights) if args.fours else Ways(ghost_pairs(lens), 0, 0.0)
+        tracer, rays = GhostTracer(lens, found.ways), max(_FEWEST, RANKED // max(len(lights), 1))
+        model = None if self._model is None else stopped(args, self._model)
+        return _Shot(lens, lights, [ghost_table(tracer, light, 550.0, rays) for light in lights], found, model)
+
+
+def _lens(args: argparse.Namespace, tabled: Lens) -> Lens:
+    """The lens of a file in its state, coated."""
+    from neurolens.flare.ghosts import coated
+
+    lens = state_of(args, tabled)
+    return lens if args.coating is None else coated(lens, args.coating)
+
+
+def _write_all(states: list[argparse.Namespace], shots: _Shots, progress: Progress) -> None:
+    """The picture, or those of the frames that are missing."""
+    from neurolens.flare.layers import brightest
+
+    args = states[0]
+    single: tuple[str, ...] = ()
+    if args.layers:  # the same in all frames
+        some = [shots.at(state) for state in states[:: -(-len(states) // _RANKED_FRAMES)]]
+        single = brightest(
+            [light for s in some for light in s.lights], [g for s in some for g in s.ghosts], args.layers
+        )
+    if args.frames is None:
+        _write(args, shots.at(args), single, progress)
+        return
+    with progress.stage(f"{len(states)} frames") as report:
+        for number, state in enumerate(states):
+            if args.restart or not state.out.is_file():
+                _write(state, shots.at(state), single, Progress(quiet=True))
+            report((number + 1) / len(states))
+
+
+def _write(args: argparse.Namespace, shot: _Shot, single: tuple[str, ...], progress: Progress) -> None:
     from neurolens.cameras.exact import placed_settings
-    from neurolens.flare.photons import PhotonTracer
-    from neurolens.flare.picture import Raster, ghost_picture, photon_picture
+    from neurolens.flare.layers import FlareSettings, flare_layers, sum_of
+    from neurolens.flare.picture import Raster
+    from neurolens.flare.scatter import Scatter
     from neurolens.render.exr_attributes import standard_attributes
     from neurolens.render.pictures import write_exr
 
-    energy: dict[Any, float] = {}
-    for light, of_light in zip(lights, rows, strict=True):
-        for ghost in of_light:
-            energy[ghost.pair] = energy.get(ghost.pair, 0.0) + ghost.energy * sum(light.rgb)
-    top = sorted(energy, key=lambda pair: -energy[pair])[: args.layers]
-    layer_of = {pair: number for number, pair in enumerate(top)}
     raster = Raster(args.film, args.width, max(1, round(args.width * args.film[1] / args.film[0])))
-    options: dict[str, Any] = {"wavelengths": args.wavelengths, "threads": args.threads}
-    with Progress(quiet=args.quiet or args.json).stage("photons" if args.photons else "ghosts") as options["done"]:
-        if args.photons:
-            more = {"photons": args.photons, "most_reflections": args.reflections, "kernel_px": args.kernel}
-            picture = photon_picture(PhotonTracer(lens), lights, raster, **options, **more)[None]
-        else:
-            in_layers = [layer_of.get(pair, len(top)) for pair in tracer.pairs]
-            picture = ghost_picture(tracer, lights, raster, samples=args.samples, layers=in_layers, **options)
-    names = [*(pair.name for pair in top), "rest"]
-    layers = {f"{name}.{c}": picture[n, ..., k] for n, name in enumerate(names) for k, c in enumerate("RGB")}
-    settings = {k: v for k, v in vars(args).items() if isinstance(v, str | int | float | list | tuple | None)}
-    metadata = {"neurolens": __version__, "flare": {**about, "settings": plain(settings)}}
-    header = standard_attributes(placed_settings(lens, args.film, args.focus), raster.width, raster.height)
-    write_exr(args.out, picture.sum(0), metadata=metadata, layers=layers if args.layers else None, attributes=header)
+    numbers = {name: getattr(args, name) for name in _NUMBERS}
+    scatter = Scatter(**{name: getattr(args, name) for _, name, *_ in _SCATTER})
+    settings = FlareSettings(
+        **numbers,
+        scatter=scatter,
+        single=single,
+        without=tuple(args.without),
+        gains=(*args.gain, *args.tint),
+        model=shot.model,
+    )
+    found = flare_layers(shot.lens, shot.lights, raster, settings, progress)
+    layers = {f"{name}.{c}": picture[..., k] for name, picture in found.items() for k, c in enumerate("RGB")}
+    told = {k: v for k, v in vars(args).items() if isinstance(v, str | int | float | list | tuple | None)}
+    metadata = plain({"neurolens": __version__, "flare": {**_told(shot), "settings": told}})
+    camera = placed_settings(shot.lens, args.film, args.focus)
+    header = standard_attributes(camera, raster.width, raster.height, args.frame)
+    write_exr(args.out, sum_of(found, raster), metadata=metadata, layers=layers, attributes=header)
 
 
-def _draw(lens: Lens, name: str, out: Path, light: Light, pairs: tuple[Pair, ...]) -> None:
+def _draw(shot: _Shot, name: str, out: Path) -> None:
     from neurolens.analysis.layout import lens_layout
     from neurolens.flare.picture import ghost_layout
 
+    pairs = shot.found.ways
     pair = next((p for p in pairs if p.name == name), None)
-    if pair is None:
-        raise InputError(
-            "neurolens flare", "--path", name, f"a ghost of this lens, as {pairs[0].name}" if pairs else ""
-        )
-    lens_layout(ghost_layout(lens, pair, light), out)
+    if pair is None or not shot.lights:
+        expected = f"a ghost of this lens, as {pairs[0].name}, and a light" if pairs else "a lens with ghosts"
+        raise InputError(_COMMAND, "--path", name, expected)
+    lens_layout(ghost_layout(shot.lens, pair, shot.lights[0]), out)
 
 
-def _light(text: str) -> Light:
-    from neurolens.flare.picture import Light
-
-    words = text.split(",")
-    try:
-        angles = [float(word) for word in words[:2]]
-        rgb = [float(word) for word in (words[2] if len(words) > 2 else "1").split("/")]
-        distance = float(words[3]) if len(words) > 3 else math.inf
-    except ValueError:
-        angles, rgb, distance = [], [], math.inf
-    if len(angles) != 2 or len(words) > 4 or len(rgb) not in (1, 3):
-        raise InputError("neurolens flare", "--light", text, "AZ,EL[,E[,M]], numbers, E also as R/G/B")
-    try:
-        return Light(angles[0], angles[1], (rgb[0], rgb[-2 % len(rgb)], rgb[-1]), distance)
-    except InputError as error:
-        raise InputError("neurolens flare", "--light", text, error.expected) from None
+def _told(shot: _Shot) -> dict[str, Any]:
+    """Lights and their ghosts, for metadata and --json."""
+    ghosts = [[_about(ghost) for ghost in of_light[:_KEPT]] for of_light in shot.ghosts]
+    return {"lights": [plain(asdict(light)) for light in shot.lights], "ghosts": ghosts}
 
 
 def _about(ghost: Ghost) -> dict[str, Any]:
@@ -202,19 +376,30 @@ def _about(ghost: Ghost) -> dict[str, Any]:
     }
 
 
-def _text(lens: Lens, lights: list[Light], rows: list[list[Ghost]], about: dict[str, Any]) -> str:
-    parts = [f"{lens.name}: {about['pairs']} pairs of surfaces"]
+def _text(shot: _Shot, about: dict[str, Any]) -> str:
+    parts, fours = [f"{shot.lens.name}: {about['pairs']} pairs of surfaces"], len(shot.found.ways) - about["pairs"]
+    if shot.found.fours:
+        parts[0] += (
+            f", and {fours} of its {shot.found.fours} ghosts of four reflections: the others have "
+            f"{number(100 * shot.found.left)}% of all ghosts' light"
+        )
     head = ("ghost", "energy of the image's", "x mm", "y mm", "RMS radius mm", "rays that arrive %")
-    for light, of_light in zip(lights, rows, strict=True):
+    for light, of_light in zip(shot.lights[:_SHOWN_LIGHTS], shot.ghosts, strict=False):
         all_of = sum(ghost.energy for ghost in of_light)
+        often = sum(ghost.energy for ghost in of_light if len(ghost.pair.reflections) > 2)
         parts.append(
             f"light at {light.azimuth_deg:g}, {light.elevation_deg:g} deg: {len(of_light)} ghosts reach the film's "
-            f"plane, with {number(100 * all_of)}% of the image's light; the brightest at 550 nm:"
+            f"plane, with {number(100 * all_of)}% of the image's light"
+            + (f", {number(100 * often)}% by four reflections" if fours else "")
+            + "; the brightest at 550 nm:"
         )
         cells = [
             [g.pair.name, number(g.energy), *map(number, g.centre_mm), number(g.size_mm), number(100 * g.passed)]
             for g in of_light[:_SHOWN]
         ]
         parts.append(table(head, cells))
-    parts.append(f"{about.get('out', 'done')}: {about['seconds']:.1f} s")
+    if more := len(shot.lights[_SHOWN_LIGHTS:]):
+        parts.append(f"and {more} more lights")
+    files = about.get("out", ["done"])
+    parts.append(f"{files[0]}{f' to {files[-1]}' if len(files) > 1 else ''}: {about['seconds']:.1f} s")
     return "\n\n".join(parts)

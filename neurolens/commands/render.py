@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,10 +40,10 @@ from neurolens.render.film_settings import COLOUR_SPACE_NAMES, WAVELENGTH_MODES,
 
 if TYPE_CHECKING:
     from neurolens.cameras.build import Shot
-    from neurolens.cameras.contract import Camera
+    from neurolens.cameras.contract import Camera, FloatArray
     from neurolens.optics.apertures import Aperture
     from neurolens.render.renderer import RenderResult
-    from neurolens.render.scene import CameraSettings
+    from neurolens.render.scene import CameraSettings, Scene
 
 _DESCRIPTION = """\
 Path-trace a scene (experiments/scenes/*.toml) and write OpenEXR, linear sRGB or ACEScg, with
@@ -189,6 +190,7 @@ def _run_one(args: argparse.Namespace) -> int:
     camera = make_camera(args.camera, shot_of(settings, args, scene.aperture), progress)
     for note in (*camera.settings.get("notes", ()), *_pixel_notes(camera, width)):
         warn(note)
+    flare = _flare(scene, camera, (width, height), film, args, progress)
     with Stopping() as stopping, progress.stage(f"render {scene.name}, {camera.name}") as report:
         result = render(
             scene, camera, width=width, height=height, samples=args.samples, seed=args.seed,
@@ -197,7 +199,31 @@ def _run_one(args: argparse.Namespace) -> int:
         )  # fmt: skip
         if not result.stats["complete"]:
             raise Unfinished
-    return _deliver(args, files, result, camera, film, stopping)
+    return _deliver(args, files, result, camera, film, stopping, flare)
+
+
+def _flare(
+    scene: Scene,
+    camera: Camera,
+    size: tuple[int, int],
+    film: FilmSettings,
+    args: argparse.Namespace,
+    progress: Progress,
+) -> dict[str, FloatArray]:
+    """The layers of flare that a scene asks for."""
+    if scene.settings.flare is None:
+        return {}
+    lens = getattr(camera, "lens", None)
+    if lens is None:
+        warn(f"no flare of {camera.name}: that takes a lens file that is traced as it is")
+        return {}
+    from neurolens.flare.layers import scene_flare
+    from neurolens.flare.picture import Raster
+
+    try:
+        return scene_flare(scene, lens, Raster(camera.film_mm, *size), film.white_balance, args.threads, progress)
+    except InputError as error:
+        raise InputError(args.scene, f"[flare]: {error.file}, {error.field}", error.value, error.expected) from None
 
 
 def _pixel_notes(camera: Camera, width: int) -> list[str]:
@@ -208,7 +234,13 @@ def _pixel_notes(camera: Camera, width: int) -> list[str]:
 
 
 def _deliver(
-    args: argparse.Namespace, files: Files, result: RenderResult, camera: Camera, film: FilmSettings, stopping: Stopping
+    args: argparse.Namespace,
+    files: Files,
+    result: RenderResult,
+    camera: Camera,
+    film: FilmSettings,
+    stopping: Stopping,
+    flare: Mapping[str, FloatArray],
 ) -> int:
     """Write the pictures, complete or not, and print a summary; the exit code."""
     if stopping():
@@ -216,7 +248,7 @@ def _deliver(
     if not result.stats["paths"]:
         return stopping.say(args.kept)
     metadata = {"version": __version__, "scene": str(args.scene), "camera": plain(camera.settings)}
-    write_pictures(files, result, metadata, film, args)
+    write_pictures(files, result, metadata, film, args, flare)
     if dropped := result.stats["dropped_samples"]:
         warn(f"{dropped} of {result.stats['paths']} samples were not finite and count as black")
     if not result.stats["complete"]:

@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ from neurolens.commands.arguments import check_folder, check_suffix, positive
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
+    from neurolens.cameras.contract import FloatArray
     from neurolens.render.film_settings import FilmSettings
     from neurolens.render.renderer import RenderResult, Watch
 
@@ -141,14 +142,22 @@ def watch_of(args: argparse.Namespace, files: Files, stop: Callable[[], bool]) -
 
 
 def write_pictures(
-    files: Files, result: RenderResult, metadata: dict[str, Any], film: FilmSettings, args: argparse.Namespace
+    files: Files,
+    result: RenderResult,
+    metadata: dict[str, Any],
+    film: FilmSettings,
+    args: argparse.Namespace,
+    flare: Mapping[str, FloatArray],
 ) -> None:
     """Write EXR and PNG; if they cannot be written, the checkpoint.
+
+    Args:
+        flare: layers by name, [H, W, 3] linear sRGB, which are to be added.
 
     Raises:
         NeurolensError: they cannot be written; with the way to resume.
     """
-    from neurolens.render.colour import COLOUR_SPACES
+    from neurolens.render.colour import COLOUR_SPACES, SRGB, conversion
     from neurolens.render.exr_attributes import standard_attributes
     from neurolens.render.job import MEANING
     from neurolens.render.pictures import write_exr, write_png
@@ -156,9 +165,12 @@ def write_pictures(
     space = COLOUR_SPACES[film.colour_space]
     told = metadata | {"render": plain(result.stats)}
     told["colour"] = {"space": space.name, "white_xy": list(space.white), "adaptation": "Bradford"}
-    layers = {}
+    layers: dict[str, FloatArray] = {}
     if args.layers == "all" or not result.stats["complete"]:
         layers, told["layers"] = asdict(result.layers), MEANING
+    for name, picture in flare.items():
+        colour = picture @ conversion(SRGB, space).T.astype(picture.dtype)
+        layers |= {f"{name}.{c}": colour[..., k] for k, c in enumerate("RGB")}
     height, width = result.rgb.shape[:2]
     attributes = standard_attributes(metadata["camera"], width, height, args.frame)
     try:

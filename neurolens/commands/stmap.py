@@ -19,6 +19,7 @@ from neurolens.commands.arguments import (
     aperture_of,
     between,
     check_folder,
+    named_camera,
     positive,
 )
 from neurolens.commands.output import answer, number
@@ -100,7 +101,10 @@ def add_parser(subparsers: Any) -> None:
 
 def add_picture(parser: argparse.ArgumentParser) -> None:
     """Add the camera, --size and --film."""
-    parser.add_argument("camera", metavar="CAMERA", help="lens file, model or another camera, see below")
+    parser.add_argument(
+        "camera", metavar="CAMERA", type=named_camera,
+        help="lens file (or a name in lenses/), model or another camera, see below",
+    )  # fmt: skip
     parser.add_argument("--size", metavar="WxH", type=_pixels, required=True, help="of the lens's picture in pixels")
     parser.add_argument("--film", metavar="WxH", type=film_size, required=True, help="size of the film in mm")
 

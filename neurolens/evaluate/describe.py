@@ -75,7 +75,7 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
 
 def glass_table(lens: Lens) -> list[dict[str, Any]]:
     """The prescription row by row, every figure of it: n_d and V_d are the catalogue's where a glass rules; asphere is
-    {power: coefficient}; coating None or {name, layers: [[index, thickness in nm], ...]}.
+    {power: coefficient}; coating None or {name, layers: [[index, thickness in nm, V_d if known], ...]}.
     """
     return [
         {

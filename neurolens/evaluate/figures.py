@@ -49,7 +49,7 @@ def side_by_side(
     columns = math.ceil(len(pictures) / rows)
     wide = max(2.45, 7.6 / columns)
     with drawing(path, columns * wide + 1, rows * (each * wide * height / width + 1), title) as figure:
-        figure.set_layout_engine("compressed")  # for pictures, which keep their aspect
+        figure.set_layout_engine("compressed", h_pad=0.06)  # for pictures, which keep their aspect
         grid = figure.subplots(each * rows, columns, squeeze=False)
         for axes in grid.flat:
             axes.set_axis_off()

@@ -11,7 +11,6 @@ import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypedDict, TypeVar
 
@@ -90,6 +89,8 @@ class Results:
 
 def versions() -> dict[str, str]:
     """Versions of the packages that a result depends on."""
+    from importlib.metadata import PackageNotFoundError, version  # a third of the time of --help
+
     found = {"python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):

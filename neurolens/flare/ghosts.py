@@ -1,8 +1,9 @@
-"""Ghosts: light that two surfaces reflect on its way to the film, traced exactly, all pairs of a lens at once.
+"""Ghosts: light that two surfaces reflect on its way to the film, or four, traced exactly, all of a lens at once.
 
 Pairs share their way: light that comes to surface j is reflected there once for all ghosts of j, and what travels back
 to surface i once for all that are reflected there, too; only the last way, from i to the film, belongs to one ghost. So
-a lens of n surfaces takes n^3 / 3 steps for n^2 / 2 ghosts, where each by itself would take n^3. The steps are graphs
+a lens of n surfaces takes n^3 / 3 steps for n^2 / 2 ghosts, where each by itself would take n^3. With four reflections
+the last way is where two more begin. The steps are graphs
 (`flare.steps`), compiled once for a lens's kinds of surfaces; numbers of the call hold the rest, so that focus, zoom,
 stop and wavelength need no compiling. `optics.sequence.follow` is the truth in float64 for one path.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +25,8 @@ from neurolens.flare.steps import LOST, STATE
 from neurolens.optics.designs import design
 from neurolens.optics.prescription import Lens
 
+MOST_WAYS = 1 << 23
 _BLOCK = 512  # rays whose states, 32 bytes each before every surface, fit the second cache
-_NO_LAYERS = np.zeros(1, np.int32)
 
 
 class Pair(NamedTuple):
@@ -34,9 +36,36 @@ class Pair(NamedTuple):
     second: int
 
     @property
+    def reflections(self) -> tuple[int, ...]:
+        """The surfaces in the order in which light is reflected there."""
+        return self.second, self.first
+
+    @property
     def name(self) -> str:
         """Stable, for layers and tables."""
         return f"g{self.second:02d}-{self.first:02d}"
+
+
+class Four(NamedTuple):
+    """A ghost of four reflections, at these surfaces in this order: back, forward, back, forward."""
+
+    first: int
+    second: int
+    third: int
+    fourth: int
+
+    @property
+    def reflections(self) -> tuple[int, ...]:
+        """As of `Pair`."""
+        return tuple(self)
+
+    @property
+    def name(self) -> str:
+        """Stable, for layers and tables."""
+        return "g" + "-".join(f"{k:02d}" for k in self)
+
+
+Way = Pair | Four
 
 
 def ghost_pairs(lens: Lens, *, one_side: bool = False) -> tuple[Pair, ...]:
@@ -51,16 +80,25 @@ def ghost_pairs(lens: Lens, *, one_side: bool = False) -> tuple[Pair, ...]:
     return tuple(p for p in pairs if not one_side or (p.first > lens.stop_index) == (p.second > lens.stop_index))
 
 
-def coated(lens: Lens, name: str) -> Lens:
+def coated(lens: Lens, names: str) -> Lens:
     """The lens with a coating of `optics.designs` on each bare surface between glass and air.
 
+    Args:
+        names: a design, and for single surfaces others, which replace what they have: "three-layer,s07=bare".
+
     Raises:
-        InputError: an unknown name; media that the design cannot match.
+        InputError: an unknown name; a surface that there is not; media that the design cannot match.
     """
+    single = {place: name for place, is_one, name in (word.partition("=") for word in names.split(",")) if is_one}
+    rest = [word for word in names.split(",") if "=" not in word]
+    known = [f"s{k:02d}" for k in range(len(lens.surfaces))]
+    if len(rest) > 1 or not set(single) <= set(known):
+        raise InputError(lens.path, "coating", names, f"one design, and others as {known[0]}=NAME to {known[-1]}=NAME")
     rows, before = [], 1.0
     for k, s in enumerate(lens.surfaces):
         bare = not (s.coating and s.coating.layers) and reflects(lens, k) and 1.0 in (before, float(s.n_d))
-        coating = design(name, before, float(s.n_d), lens.path, f"surface {k}") if bare else s.coating
+        name = single.get(known[k], rest[0] if bare and rest else None)
+        coating = design(name, before, float(s.n_d), lens.path, f"surface {k}") if name is not None else s.coating
         rows.append(replace(s, coating=coating))
         before = float(s.n_d)
     return replace(lens, surfaces=tuple(rows))
@@ -70,185 +108,279 @@ class GhostRays(NamedTuple):
     """Where light of one wavelength arrives, by ghost.
 
     Attributes:
-        film_xy_mm: [P, 2, N] lens frame. power: [P, N], share of the ray's light, 0 where any rim stops it.
-        worst: [P, N], the largest r^2 / R^2 at any rim on the way: at most 1 where the ray arrives.
+        rows: [P, 4, N] film x and y (mm, lens frame), power and worst.
     """
 
-    film_xy_mm: Floats
-    power: Floats
-    worst: Floats
+    rows: Floats
+
+    @property
+    def film_xy_mm(self) -> Floats:
+        """[P, 2, N]."""
+        return self.rows[:, :2]
+
+    @property
+    def power(self) -> Floats:
+        """[P, N], share of the ray's light, 0 where any rim stops it."""
+        return self.rows[:, 2]
+
+    @property
+    def worst(self) -> Floats:
+        """[P, N], the largest r^2 / R^2 at any rim on the way: at most 1 where the ray arrives."""
+        return self.rows[:, 3]
+
+
+class GhostSums(NamedTuple):
+    """Light of ghosts at the film's plane, summed over rays.
+
+    Attributes:
+        sums: [P, 5], of power, power x, power y, power r^2 (mm, lens frame), and the number of rays that arrive.
+        dropped: power of ways that were not followed on, which bounds what all ghosts beyond would have brought.
+    """
+
+    sums: NDArray[np.float64]
+    dropped: float
+
+
+def four_reflections(lens: Lens) -> NDArray[np.int32]:
+    """Surfaces of all ghosts of four reflections, [P, 4], in the order of reflection.
+
+    Raises:
+        InputError: more ghosts than `MOST_WAYS`.
+    """
+    pairs = np.array([p.reflections for p in ghost_pairs(lens)], np.int32).reshape(-1, 2)
+    if int((pairs[:, :1].T > pairs[:, 1:]).sum()) > MOST_WAYS:
+        raise InputError(lens.path, "ghosts of four reflections", "(too many)", f"at most {MOST_WAYS}")
+    again = [pairs[pairs[:, 0] > first] for _, first in pairs]
+    before = np.repeat(pairs, [len(some) for some in again], 0)
+    return np.concatenate([before, np.concatenate([*again, pairs[:0]])], 1)
 
 
 class GhostTracer:
-    """All ghosts of a lens at its focus, zoom and stop, and the direct light, as compiled code in float32.
+    """Ghosts of a lens at its focus, zoom and stop, and the direct light, as compiled code in float32.
 
     Args:
         lens: its film must be placed (`Lens.at`).
-        pairs: the ghosts to follow; None takes all.
+        pairs: the ghosts to follow; None takes all of two reflections.
 
     Attributes:
-        pairs: of the lens, in the order of the results. stack: its compiled steps.
+        pairs: the ghosts, in the order of the results. stack: the lens's compiled steps.
 
     Raises:
-        InputError: no C compiler, or one that fails; a lens without film position; pairs that it has not.
+        InputError: no C compiler, or one that fails; a lens without film position; ghosts that it has not.
     """
 
-    def __init__(self, lens: Lens, pairs: Sequence[Pair] | None = None) -> None:
+    def __init__(self, lens: Lens, pairs: Sequence[Way] | None = None) -> None:
         self.lens = lens
-        known = ghost_pairs(lens)
-        self.pairs = known if pairs is None else tuple(pairs)
-        for pair in self.pairs:
-            if pair not in known:
-                raise InputError(lens.path, "ghost", pair.name, f"one of {len(known)} pairs of surfaces that reflect")
+        self.pairs: tuple[Way, ...] = ghost_pairs(lens) if pairs is None else tuple(pairs)
+        for way in self.pairs:
+            turns = way.reflections
+            sound = all(a < b if n % 2 else a > b for n, (a, b) in enumerate(pairwise(turns)))
+            if not sound or not all(0 <= k < len(lens.surfaces) and reflects(lens, k) for k in turns):
+                raise InputError(lens.path, "ghost", way.name, "surfaces that reflect, back and forward in turn")
         self.stack = Stack(lens, self._places())
-        driver = _DRIVER.format(block=_BLOCK, lost=LOST)
-        self._call, pointer = self.stack.compiled(driver, "ghosts"), ctypes.c_void_p
+        self._call, pointer = self.stack.compiled(_DRIVER.format(block=_BLOCK, lost=LOST), "ghosts"), ctypes.c_void_p
         whole, real = ctypes.c_int, ctypes.c_float
-        self._call.argtypes = [ctypes.c_size_t, whole, whole, whole, real, real, whole, whole, *[pointer] * 7]
+        self._call.argtypes = [ctypes.c_size_t, whole, whole, real, real, ctypes.c_double, *[pointer] * 7]
+        self._call.restype = ctypes.c_double
 
     def trace(self, rays: Floats, wavelength_nm: float, *, direct: bool = False) -> GhostRays:
-        """Follow light [6, N] (point in mm and unit direction towards the film, lens frame) along every pair.
+        """Follow light [6, N] (point in mm and unit direction towards the film, lens frame) along every ghost.
 
         Args:
             direct: whether the light that forms the image follows the ghosts, as if it were one more.
         """
-        out = np.zeros((len(self.pairs) + direct, 4, rays.shape[1]), np.float32)
-        self._run(rays, wavelength_nm, direct, out)
-        return GhostRays(out[:, :2], out[:, 2], out[:, 3])
+        return self.follow(self.start(rays), wavelength_nm, direct=direct)
 
-    def splat(
-        self, picture: Floats, rays: Floats, wavelength_nm: float, pixels_per_mm: float, layers: Sequence[int]
-    ) -> None:
-        """Add the power of rays to pictures [layers, H, W], upright (the film turned by 180 degrees) and centred.
+    def start(self, rays: Floats) -> Floats:
+        """What `follow` takes of rays [6, N], at any wavelength."""
+        return entering(rays)
+
+    def follow(
+        self,
+        start: Floats,
+        wavelength_nm: float,
+        *,
+        only: Sequence[Way] | None = None,
+        direct: bool = False,
+        reach: float = 1.0,
+    ) -> GhostRays:
+        """Follow rays of `start`.
 
         Args:
-            layers: of each pair, the picture that takes it.
+            only: these of the tracer's ghosts. direct: see `trace`.
+            reach: rays are followed while some of their block have a worst of at most this; else theirs is `LOST`.
         """
-        assert picture.flags.c_contiguous and picture.dtype == np.float32
-        raster = pixels_per_mm, picture.shape[2], picture.shape[1]
-        self._run(rays, wavelength_nm, False, picture, raster, np.array(layers, np.int32))
+        rows = self._rows(self.pairs if only is None else only, direct)
+        out = np.zeros((len(rows), 4, start.shape[1]), np.float32)
+        self._run(start, wavelength_nm, rows, out, reach=reach)
+        return GhostRays(out)
+
+    def follow_each(self, start: Floats, wavelengths_nm: Sequence[float], pair: Way, reach: float = 1.0) -> Floats:
+        """Rays of `start` along one ghost at several wavelengths, [W, 4, N], rows as of `GhostRays`."""
+        return np.concatenate([self.follow(start, nm, only=[pair], reach=reach).rows for nm in wavelengths_nm])
+
+    def sums(
+        self,
+        start: Floats,
+        wavelength_nm: float,
+        ways: NDArray[np.int32] | None = None,
+        *,
+        direct: bool = False,
+        least: float = 0.0,
+    ) -> GhostSums:
+        """The light of many ghosts at once, without that of single rays.
+
+        Args:
+            ways: [P, 4] surfaces that reflect (see `four_reflections`) as some of the tracer's ghosts do; None takes
+                the tracer's ghosts. direct: see `trace`.
+            least: ways on which less than this share of the light of a block of rays is left are not followed on.
+        """
+        rows = self._rows(self.pairs, direct) if ways is None else ways
+        sums = np.zeros((len(rows), 5))
+        return GhostSums(sums, self._run(start, wavelength_nm, rows, None, sums, least))
+
+    @staticmethod
+    def _rows(ways: Sequence[Way], direct: bool) -> NDArray[np.int32]:
+        """[P, 4] surfaces that reflect, -1 behind them; the direct light has none."""
+        turns = [way.reflections for way in ways] + [()] * direct
+        return np.array([turn + (-1,) * (4 - len(turn)) for turn in turns], np.int32).reshape(-1, 4)
 
     def _run(
         self,
-        rays: Floats,
+        start: Floats,
         wavelength_nm: float,
-        direct: bool,
-        out: Floats,
-        raster: tuple[float, int, int] = (0.0, 0, 0),
-        layers: NDArray[np.int32] = _NO_LAYERS,
-    ) -> None:
-        start, surfaces = entering(rays), len(self.lens.surfaces)
-        numbers, shift = self.stack.numbers(wavelength_nm)
-        index = np.full((surfaces, surfaces), -1, np.int32)
-        for number, pair in enumerate(self.pairs):
-            index[pair.second, pair.first] = number
-        room = np.empty((surfaces + 4) * STATE * _BLOCK, np.float32)
-        pointers = [a.ctypes.data for a in (start, self.stack.functions, numbers, index, layers, room, out)]
-        self._call(start.shape[1], surfaces, len(self.pairs), int(direct), shift, *raster, *pointers)
+        ways: NDArray[np.int32],
+        out: Floats | None,
+        sums: NDArray[np.float64] | None = None,
+        least: float = 0.0,
+        reach: float = 1.0,
+    ) -> float:
+        surfaces, (numbers, shift) = len(self.lens.surfaces), self.stack.numbers(wavelength_nm)
+        order = np.lexsort((-ways[:, 3], ways[:, 2], -ways[:, 1], ways[:, 0]))
+        ends = np.stack([np.full(len(ways), -1), order], 1)
+        rows = np.concatenate([ways[order], ends], 1).astype(np.int32)
+        levels = 1 + int((ways[:, ::2] >= 0).sum(1).max(initial=0))
+        room = np.empty(levels * (surfaces + 3) * STATE * _BLOCK, np.float32)
+        arrays = (start, self.stack.functions, numbers, rows, room, out, sums)
+        pointers = [None if a is None else a.ctypes.data for a in arrays]
+        dropped: float = self._call(start.shape[1], surfaces, len(ways), shift, reach, least, *pointers)
+        return dropped
 
     def _places(self) -> list[tuple[int, int]]:
-        """Surfaces and actions that the pairs need, in order; each kind of surface takes a second to compile."""
+        """Surfaces and actions that the ghosts need, in order; each kind of surface takes a second to compile."""
         needed = {(k, 0) for k in range(len(self.lens.surfaces))}
-        for first, second in self.pairs:
-            needed |= {(second, 2), (first, 3)} | {(k, 1) for k in range(first + 1, second)}
+        for turns in {way.reflections[k : k + 2] for way in self.pairs for k in (0, 2)} - {()}:
+            needed |= {(turns[0], 2), (turns[1], 3)} | {(k, 1) for k in range(turns[1] + 1, turns[0])}
         return sorted(needed)
 
 
-# A way ends where no ray is left on it. Ways: a pair each, then the direct light.
+# Ways to follow are rows of six numbers: up to four surfaces that reflect, -1 behind the last, and the way's own; they
+# are in the order in which `sweep` meets them: later surfaces first on the way back. A way ends where no ray is left on
+# it or, where its light is summed, where less than `least` is: nothing that comes of it can carry more.
 _DRIVER = """
-enum {{ BLOCK = {block}, ROOM = BLOCK * STATE }};
+enum {{ BLOCK = {block}, ROOM = BLOCK * STATE, ROW = 6, SUMS = 5 }};
 
-struct film {{
-    float shift, per_mm;
-    int width, height;
-    const int *layer;
-    float *out;
+struct job {{
+    struct lens lens;
+    size_t n, at, count;
+    float shift, reach, *out;
+    double least, dropped, *sums;
 }};
 
-static int left_after(struct lens lens, int k, int action, size_t n, const float *from, float *to)
+static int left_after(struct job *job, int k, int action, const float *from, float *to)
 {{
+    const float *const power = to + (STATE - 2) * BLOCK, *const worst = power + BLOCK;
     int left = 0;
-    go(lens, k, action, n, from, to, BLOCK);
-    for (size_t i = 0; i < n; i++)
-        left |= to[(STATE - 1) * BLOCK + i] <= 1.0f;
-    return left;
+    go(job->lens, k, action, job->n, from, to, BLOCK);
+    for (size_t i = 0; i < job->n; i++)
+        left |= worst[i] <= job->reach;
+    if (!left || !(job->least > 0.0)) return left;
+    float part[16] = {{ 0.0f }}, energy = 0.0f;
+    for (size_t i = 0; i < BLOCK; i += 16)
+        for (size_t k = 0; k < 16; k++)
+            part[k] += i + k < job->n && worst[i + k] <= 1.0f ? power[i + k] : 0.0f;
+    for (int i = 0; i < 16; i++)
+        energy += part[i];
+    if (energy >= job->least * job->n) return 1;
+    job->dropped += energy;
+    return 0;
 }}
 
-/* Light of a way at the film: kept ray by ray, or shared among the four pixels around its place. */
-static void arrive(size_t n, const float *from, struct film film, int way, size_t at, size_t count)
+/* Light of a way at the film: kept ray by ray, or its power, x, y, r^2 and number summed. */
+static void arrive(struct job *job, const float *from, int way)
 {{
-    float kept[4 * BLOCK], *const x = kept, *const y = kept + BLOCK, *const power = kept + 2 * BLOCK;
-    if (!film.width) {{
-        meet_film(n, from, BLOCK, film.shift, film.out + 4 * way * count + at, count);
+    if (!job->sums) {{
+        meet_film(job->n, from, BLOCK, job->shift, job->out + 4 * way * job->count + job->at, job->count);
         return;
     }}
-    meet_film(n, from, BLOCK, film.shift, kept, BLOCK);
-    float *const picture = film.out + (size_t)film.layer[way] * film.width * film.height;
-    for (size_t i = 0; i < n; i++) {{
-        const float u = 0.5f * film.width - 0.5f - x[i] * film.per_mm;
-        const float v = 0.5f * film.height - 0.5f + y[i] * film.per_mm;
-        if (!(power[i] > 0.0f && u > -1.0f && v > -1.0f && u < film.width && v < film.height)) continue;
-        const int left = (int)(u + 1.0f) - 1, top = (int)(v + 1.0f) - 1;
-        const float right = u - left, below = v - top;
-        for (int k = 0; k < 4; k++) {{
-            const int px = left + (k & 1), py = top + (k >> 1);
-            if (px >= 0 && py >= 0 && px < film.width && py < film.height)
-                picture[(size_t)py * film.width + px] +=
-                    power[i] * (k & 1 ? right : 1.0f - right) * (k >> 1 ? below : 1.0f - below);
+    float film[4 * BLOCK];
+    double *const sums = job->sums + SUMS * (size_t)way;
+    meet_film(job->n, from, BLOCK, job->shift, film, BLOCK);
+    for (size_t i = 0; i < job->n; i++) {{
+        const double x = film[i], y = film[BLOCK + i], power = film[2 * BLOCK + i];
+        if (!(power > 0.0)) continue;
+        sums[0] += power;
+        sums[1] += power * x;
+        sums[2] += power * y;
+        sums[3] += power * (x * x + y * y);
+        sums[4] += 1.0;
+    }}
+}}
+
+/* All ways of some rows, whose first 2 `level` reflections are the same, from `here`, before surface `first`. */
+static void sweep(struct job *job, int first, float *here, const int *rows, int count, int level, float *room)
+{{
+    const int surfaces = job->lens.surfaces, own = rows[2 * level] < 0 ? rows[ROW - 1] : -1;
+    float *const ahead = room, *back = room + (surfaces + 1) * ROOM, *spare = back + ROOM, *const deeper = spare + ROOM;
+    const int *const end = rows + count * ROW;
+    if (own >= 0) rows += ROW;
+    const int far = own >= 0 ? surfaces : end[2 * level - ROW];
+    int reached = first;
+    for (; reached < far; reached++) {{
+        float *const next = rows < end ? here + ROOM : here == back ? spare : back;
+        if (!left_after(job, reached, 0, here, next)) break;
+        here = next;
+    }}
+    if (own >= 0 && reached == surfaces) arrive(job, here, own);
+    while (rows < end && rows[2 * level] <= reached) {{
+        const int j = rows[2 * level];
+        const int *of_j = rows;
+        while (rows < end && rows[2 * level] == j)
+            rows += ROW;
+        int left = left_after(job, j, 2, ahead + j * ROOM, back);
+        for (int i = j - 1; left && of_j < rows; i--) {{
+            const int *const of_i = of_j;
+            while (of_j < rows && of_j[2 * level + 1] == i)
+                of_j += ROW;
+            const int more = of_i < of_j && of_j[2 * level + 2 - ROW] >= 0;
+            float *const there = deeper + (more ? i + 1 : 0) * ROOM;
+            if (of_i < of_j && left_after(job, i, 3, back, there))
+                sweep(job, i + 1, there, of_i, (int)(of_j - of_i) / ROW, level + 1, deeper);
+            left = of_j < rows && left_after(job, i, 1, back, spare);
+            float *const other = back;
+            back = spare;
+            spare = other;
         }}
     }}
 }}
 
-void ghosts(
-    size_t count, int surfaces, int pairs, int direct, float shift, float per_mm, int width, int height,
-    const float *start, const int *functions, const float *numbers, const int *index, const int *layer, float *room,
-    float *out)
+double ghosts(
+    size_t count, int surfaces, int ways, float shift, float reach, double least, const float *start,
+    const int *functions, const float *numbers, const int *rows, float *room, float *out, double *sums)
 {{
-    const struct lens lens = {{ surfaces, functions, numbers }};
-    const struct film film = {{ shift, per_mm, width, height, layer, out }};
-    for (size_t at = 0; at < count; at += BLOCK) {{
-        const size_t n = count - at < BLOCK ? count - at : BLOCK;
-        float *const ahead = room, *back = room + (surfaces + 1) * ROOM, *spare = back + ROOM, *again = spare + ROOM;
+    struct job job = {{ {{ surfaces, functions, numbers }}, 0, 0, count, shift, reach, out, least, 0.0, sums }};
+    for (; ways && job.at < count; job.at += BLOCK) {{
+        job.n = count - job.at < BLOCK ? count - job.at : BLOCK;
         for (int r = 0; r < STATE; r++)
-            for (size_t i = 0; i < n; i++)
-                ahead[r * BLOCK + i] = start[r * count + at + i];
-        for (int p = 0; !width && p < pairs + direct; p++)
-            for (size_t i = 0; i < n; i++) {{
-                out[(4 * p + 2) * count + at + i] = 0.0f;
-                out[(4 * p + 3) * count + at + i] = {lost}f;
+            for (size_t i = 0; i < job.n; i++)
+                room[r * BLOCK + i] = start[r * count + job.at + i];
+        for (int p = 0; !sums && p < ways; p++)
+            for (size_t i = 0; i < job.n; i++) {{
+                out[(4 * p + 2) * count + job.at + i] = 0.0f;
+                out[(4 * p + 3) * count + job.at + i] = {lost}f;
             }}
-        int reached = 0;
-        while (reached < surfaces) {{
-            float *const here = ahead + reached * ROOM;
-            if (!left_after(lens, reached, 0, n, here, here + ROOM)) break;
-            reached++;
-        }}
-        if (direct && reached == surfaces)
-            arrive(n, ahead + surfaces * ROOM, film, pairs, at, count);
-        for (int j = 1; j <= reached && j < surfaces; j++) {{
-            const int *const wanted = index + j * surfaces;
-            int lowest = j;
-            for (int i = j - 1; i >= 0; i--)
-                if (wanted[i] >= 0) lowest = i;
-            int left = lowest < j && left_after(lens, j, 2, n, ahead + j * ROOM, back);
-            for (int i = j - 1; left && i >= lowest; i--) {{
-                float *from = spare, *to = again;
-                if (wanted[i] >= 0 && left_after(lens, i, 3, n, back, spare)) {{
-                    int k = i + 1;
-                    for (; k < surfaces && left_after(lens, k, 0, n, from, to); k++) {{
-                        float *const other = from;
-                        from = to;
-                        to = other;
-                    }}
-                    if (k == surfaces)
-                        arrive(n, from, film, wanted[i], at, count);
-                }}
-                left = i > lowest && left_after(lens, i, 1, n, back, spare);
-                float *const other = back;
-                back = spare;
-                spare = other;
-            }}
-        }}
+        sweep(&job, 0, room, rows, ways, 0, room);
     }}
+    return job.dropped;
 }}
 """

@@ -1,16 +1,15 @@
-"""Flare in a picture: lights, the light they send into the lens, the ghosts' light on the film, and a table of ghosts.
+"""Flare in a picture: the light of ghosts and photons on the film, and a table of ghosts.
 
-Rays go through a disc across the light's way that holds the whole front surface, at the places of a low-discrepancy
-sequence that is the same every time: an animated light has no noise of its own. Values are those of a render: film
-irradiance over the irradiance that a white card of radiance 1 makes on the axis.
+Values are those of a render: film irradiance over the irradiance that a white card of radiance 1 makes on the axis.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -20,101 +19,30 @@ from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import Layout, Line, layout_profile
 from neurolens.base.errors import InputError
 from neurolens.base.status import PASSED
-from neurolens.flare.ghosts import GhostTracer, Pair
-from neurolens.flare.photons import PhotonTracer
+from neurolens.flare.area import Canvas
+from neurolens.flare.ghostmodel import GhostModel
+from neurolens.flare.ghosts import Four, GhostTracer, Way, four_reflections
+from neurolens.flare.grids import REACH, Grid, grids_of
+from neurolens.flare.lights import Light, disc, light_rays, rays_across
+from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
 from neurolens.flare.stack import Floats
 from neurolens.optics.prescription import Lens
-from neurolens.optics.sag import sag_mm
-from neurolens.optics.sequence import follow, ghost
+from neurolens.optics.sequence import follow, turning
 from neurolens.optics.trace import Rays, trace
 from neurolens.render.spectrum import SpectralRange
 
 RANKED = 4096  # rays that decide which ghosts are brightest
+LEFT, SOME, MANY = 1e-3, 64, 2000  # of `with_four`
+_PROBES = 512  # rays
 _AT_ONCE = 1 << 16  # rays of a call
+_ENOUGH = 200  # photons of a kernel: a noise of 8%
+_WAIT_S = 0.5  # between two reports
 _AXIS = 1 << 15  # rays of the exposure
-_PLASTIC = 1.32471795724474602596  # of the R2 sequence (Roberts 2018): x^3 = x + 1
+_GOLDEN = 0.6180339887498949
+_CANVASES = 1 << 28  # bytes of pictures under way, of a thread
 
-
-@dataclass(frozen=True)
-class Light:
-    """A light far away, or at a place.
-
-    Attributes:
-        azimuth_deg: to the right of the axis, seen by the camera; elevation_deg: above it.
-        rgb: linear sRGB irradiance that it makes at the lens across its way: radiance times solid angle in sr.
-        distance_m: from the front vertex; inf allowed.
-
-    Raises:
-        InputError: angles that do not come from the front (the light lies behind the lens), a distance that is not
-            positive, an irradiance that is negative.
-    """
-
-    azimuth_deg: float
-    elevation_deg: float
-    rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    distance_m: float = math.inf
-
-    def __post_init__(self) -> None:
-        if not (abs(self.elevation_deg) < 90 and math.isfinite(self.azimuth_deg) and self.towards[2] < 0):
-            found = (self.azimuth_deg, self.elevation_deg)
-            raise InputError("light", "azimuth, elevation", found, "angles within 90 degrees of the axis")
-        if not self.distance_m > 0:
-            raise InputError("light", "distance_m", self.distance_m, "a positive distance in metres, or inf")
-        if not all(0 <= v < math.inf for v in self.rgb):
-            raise InputError("light", "rgb", self.rgb, "three finite numbers of at least 0")
-
-    @property
-    def towards(self) -> NDArray[np.float64]:
-        """Unit vector from the lens to the light, lens frame."""
-        a, e = math.radians(self.azimuth_deg), math.radians(self.elevation_deg)
-        return np.array([math.sin(a) * math.cos(e), math.sin(e), -math.cos(a) * math.cos(e)])
-
-
-def light_rays(
-    lens: Lens, light: Light, first: int, count: int, shift: float = 0.0, jitter: float = 0.0
-) -> tuple[Floats, float]:
-    """Rays number `first` and following of a light, [6, count] lens frame, and the area in mm^2 that all N share: the
-    irradiance at the lens times area / N is the light of one of N rays. All carry the same: they are uniform across the
-    way of a light far away, and in solid angle from a near one.
-
-    Args:
-        shift: of the sequence, for each wavelength another. jitter: see `_disc`.
-    """
-    front = lens.surfaces[0]
-    depth = float(sag_mm(front, front.semi_diameter_mm, 0.0))
-    centre, radius = np.array([0.0, 0.0, depth / 2]), math.hypot(front.semi_diameter_mm, depth / 2)
-    ahead = light.towards
-    side = np.cross(ahead, [0.0, 1.0, 0.0] if abs(ahead[1]) < 0.9 else [1.0, 0.0, 0.0])
-    side /= np.linalg.norm(side)
-    across = np.stack([side, np.cross(side, ahead)], 1) @ _disc(first, count, shift, jitter)
-    if math.isinf(light.distance_m):
-        target = centre[:, None] + radius * across
-        return np.concatenate([target, np.broadcast_to(-ahead[:, None], target.shape)]), math.pi * radius**2
-    source = 1000 * light.distance_m * ahead
-    far = float(np.linalg.norm(source - centre))
-    if far <= 1.01 * radius:
-        expected = f"a light outside the lens, beyond {radius / 1000:.3g} m"
-        raise InputError("light", "distance_m", light.distance_m, expected)
-    # Uniform in solid angle over the cone that holds the sphere about the front surface.
-    solid = 1 - math.sqrt(1 - (radius / far) ** 2)
-    off = across * np.sqrt(solid * (2 - solid * (across**2).sum(0)))
-    towards = (centre - source) / far
-    off -= towards[:, None] * (towards @ off)
-    cos = 1 - solid * (across**2).sum(0)
-    sine = np.sqrt(np.maximum(1 - cos**2, 0)) / np.maximum(np.linalg.norm(off, axis=0), 1e-300)
-    direction = towards[:, None] * cos + off * sine
-    return np.concatenate([source[:, None] + direction * (far - radius), direction]), 2 * math.pi * solid * far**2
-
-
-def _disc(first: int, count: int, shift: float = 0.0, jitter: float = 0.0) -> NDArray[np.float64]:
-    """Points [2, count] of the unit disc, of equal shares: the R2 sequence from a number on, shifted.
-
-    `jitter` moves each by up to so much of the square's side: regular places make patterns in a picture.
-    """
-    n = np.arange(first, first + count) + 1.0
-    moved = jitter * np.random.default_rng([first, int(shift * 2**32)]).random((2, count))
-    u, v = (n / _PLASTIC + shift + moved[0]) % 1, (n / _PLASTIC**2 + 0.5 * shift + moved[1]) % 1
-    return np.sqrt(u) * np.stack([np.cos(2 * math.pi * v), np.sin(2 * math.pi * v)])
+_T = TypeVar("_T")
+_R = TypeVar("_R")
 
 
 def axis_irradiance(lens: Lens, wavelength_nm: float) -> float:
@@ -130,7 +58,7 @@ def axis_irradiance(lens: Lens, wavelength_nm: float) -> float:
         assert found.transmittance is not None
         return torch.where(found.status == 0, found.transmittance, 0.0).numpy()
 
-    coarse = _disc(0, _AXIS)
+    coarse = disc(0, _AXIS)
     widest = 1.0
     for _ in range(3):  # narrows to the cone that passes, and a little more
         lit = share(widest * coarse) > 0
@@ -148,7 +76,7 @@ class Ghost:
         passed: share of the rays at the front disc that arrive.
     """
 
-    pair: Pair
+    pair: Way
     energy: float
     centre_mm: tuple[float, float]
     size_mm: float
@@ -158,23 +86,54 @@ class Ghost:
 def ghost_table(tracer: GhostTracer, light: Light, wavelength_nm: float, count: int = RANKED) -> list[Ghost]:
     """The ghosts of a light at one wavelength that reach the film's plane at all, brightest first."""
     rays, _ = light_rays(tracer.lens, light, 0, count)
-    found = tracer.trace(rays, wavelength_nm, direct=True)
-    power = found.power.astype(np.float64)
-    image = power[-1].sum()
-    rows = []
-    for pair, xy, share in zip(tracer.pairs, found.film_xy_mm, power, strict=False):
-        if not share.sum() > 0:
-            continue
-        lit = share > 0
-        weight, place = share[lit] / share.sum(), xy[:, lit].astype(np.float64)
-        centre = place @ weight
-        size = math.sqrt(float(((place - centre[:, None]) ** 2).sum(0) @ weight))
-        energy = float(share.sum() / image) if image > 0 else math.inf
-        rows.append(Ghost(pair, energy, (float(centre[0]), float(centre[1])), size, float(lit.mean())))
+    sums = tracer.sums(tracer.start(rays), wavelength_nm, direct=True).sums
+    image, rows = sums[-1, 0], []
+    for way, (power, *moments, lit) in zip(tracer.pairs, sums.tolist(), strict=False):
+        if power > 0:
+            x, y, r2 = (moment / power for moment in moments)
+            size = math.sqrt(max(r2 - x * x - y * y, 0.0))
+            rows.append(Ghost(way, power / image if image > 0 else math.inf, (x, y), size, lit / count))
     return sorted(rows, key=lambda ghost: -ghost.energy)
 
 
-def ghost_layout(lens: Lens, pair: Pair, light: Light, lines: int = 9) -> Layout:
+class Ways(NamedTuple):
+    """Ghosts of two reflections, and the strongest of four.
+
+    Attributes:
+        ways: the ghosts. fours: how many of four reflections the lens has. left: share of all ghosts' light on the
+            film's plane that those of four reflections have which are not among the ways.
+    """
+
+    ways: tuple[Way, ...]
+    fours: int
+    left: float
+
+
+def with_four(lens: Lens, lights: Sequence[Light], wavelength_nm: float = 550.0) -> Ways:
+    """All ghosts of two reflections, and of four reflections so many of the strongest that little light is left.
+
+    That is `LEFT` of all ghosts' light; but at least `SOME` ghosts, and at most `MANY`.
+
+    Raises:
+        InputError: more ghosts than `ghosts.MOST_WAYS`.
+    """
+    tracer, fours = GhostTracer(lens), four_reflections(lens)
+    energy, twice = np.zeros(len(fours)), 0.0
+    for light in lights:
+        rays, area = light_rays(lens, light, 0, _PROBES)
+        start = tracer.start(rays)
+        twice += area * sum(light.rgb) * float(tracer.sums(start, wavelength_nm).sums[:, 0].sum())
+        energy += area * sum(light.rgb) * tracer.sums(start, wavelength_nm, fours).sums[:, 0]
+    order = np.argsort(-energy, kind="stable")
+    left = energy.sum() - np.cumsum(energy[order])
+    whole = twice + energy.sum()
+    kept = int(np.clip(np.count_nonzero(left > LEFT * whole) + 1, SOME, MANY))
+    kept = min(kept, int(np.count_nonzero(energy)))
+    chosen = tuple(Four(*row) for row in fours[order[:kept]].tolist())
+    return Ways(tracer.pairs + chosen, len(fours), float(left[kept - 1] / whole) if kept else 0.0)
+
+
+def ghost_layout(lens: Lens, pair: Way, light: Light, lines: int = 9) -> Layout:
     """The lens with rays of one ghost in the plane through the axis, of light as far off the axis as `light`.
 
     At most so many rays, evenly chosen of those that arrive.
@@ -187,7 +146,7 @@ def ghost_layout(lens: Lens, pair: Pair, light: Light, lines: int = 9) -> Layout
     height = torch.linspace(-1.2 * front, 1.2 * front, 4001, dtype=torch.float64)
     zero, before = torch.zeros_like(height), -0.4 * front
     rays = Rays(zero, height + before * math.tan(-off), zero + before, zero, zero - math.sin(off), zero + math.cos(off))
-    found = follow(lens, rays, ghost(len(lens.surfaces), *pair))
+    found = follow(lens, rays, turning(len(lens.surfaces), pair.reflections))
     arriving = torch.nonzero(found.status == PASSED)[:, 0]
     if not len(arriving):
         raise InputError(
@@ -200,9 +159,8 @@ def ghost_layout(lens: Lens, pair: Pair, light: Light, lines: int = 9) -> Layout
     places.append((found.rays.z + way * found.rays.dz, found.rays.y + way * found.rays.dy))
     label = f"{pair.name}, {len(arriving) / len(height):.0%} of the height"
     drawn = tuple(Line(np.array([[float(z[k]), float(y[k])] for z, y in places]), label, 0) for k in chosen)
-    subtitle = (
-        f"light {math.degrees(off):.3g} degrees off the axis, reflected at surface {pair.second}, then {pair.first}"
-    )
+    turns = ", then ".join(map(str, pair.reflections))
+    subtitle = f"light {math.degrees(off):.3g} degrees off the axis, reflected at surface {turns}"
     return replace(layout_profile(scene), rays=drawn, subtitle=subtitle)
 
 
@@ -220,32 +178,70 @@ class Raster:
 
 
 def ghost_picture(
-    tracer: GhostTracer,
+    tracer: GhostTracer | GhostModel,
     lights: Sequence[Light],
     raster: Raster,
     *,
     wavelength_nm: tuple[float, float] = (400.0, 700.0),
     wavelengths: int = 15,
-    samples: int = 1 << 18,
+    cell_px: float = 8.0,
     layers: Sequence[int] | None = None,
     threads: int = 2,
     done: Callable[[float], None] = lambda share: None,
 ) -> Floats:
-    """The ghosts of lights, [layers, H, W, 3] linear sRGB.
+    """The ghosts of lights, [layers, H, W, 3] linear sRGB, each drawn as the areas of a grid of rays (`flare.area`).
 
     Args:
-        wavelengths: of equal shares of the range. samples: rays of each light and wavelength.
+        wavelengths: of equal shares of the range. cell_px: size of a grid's cells on the film: see `grids_of`.
         layers: of each pair the layer that takes it; None puts all into one.
         done: told the share of the work that is done.
     """
-    given = [0] * len(tracer.pairs) if layers is None else list(layers)
-    count = max(given, default=0) + 1
+    lens, spectral = tracer.lens, SpectralRange(*wavelength_nm, bins=wavelengths)
+    layer = dict(zip(tracer.pairs, [0] * len(tracer.pairs) if layers is None else layers, strict=True))
+    middle = 0.5 * (spectral.low_nm + spectral.high_nm)
+    exposure = axis_irradiance(lens, middle)
+    half = raster.film_mm[0] / 2, raster.height / raster.per_mm / 2
+    grids = [grids_of(tracer, light, middle, half, cell_px / raster.per_mm) for light in lights]
+    # As many wavelengths at once as have room, of each layer and light: their rays start alike.
+    at_once = max(1, min(-(-wavelengths // threads), _CANVASES // (8 * raster.width * raster.height)))
+    tasks = [
+        (light, {pair: grid for pair, grid in of_light.items() if layer[pair] == number}, number, first)
+        for light, of_light in zip(lights, grids, strict=True)
+        for number in range(max(layer.values(), default=0) + 1)
+        for first in range(0, wavelengths, at_once)
+    ]
 
-    def splat(rays: Floats, nm: float, film: Floats, seed: int) -> None:
-        tracer.splat(film, rays, nm, raster.per_mm, given)
+    work = _Work(sum(len(some) for _, some, _, _ in tasks), done)
 
-    spectral = SpectralRange(*wavelength_nm, bins=wavelengths)
-    return _picture(tracer.lens, lights, raster, spectral, samples, (count, threads), splat, done)
+    def one(task: tuple[Light, dict[Way, Grid], int, int]) -> list[Canvas]:
+        light, some, _, first = task
+        bins = range(first, min(first + at_once, wavelengths))
+        canvases = [Canvas(raster.width, raster.height) for _ in bins]
+        for pair, grid in some.items():
+            if not work.step():
+                break
+            rays, area = rays_across(lens, light, grid.places)
+            start = tracer.start(rays)
+            each = tracer.follow_each(start, spectral.centres_nm[bins.start : bins.stop].tolist(), pair, REACH)
+            for found, canvas in zip(each, canvases, strict=True):
+                canvas.add(found, grid.columns, area * grid.cell, raster.per_mm)
+        return canvases
+
+    picture = np.zeros((1 + max(layer.values(), default=0), raster.height, raster.width, 3), np.float32)
+    for (light, _, number, first), canvases in work.results(one, tasks, threads):
+        for k, canvas in enumerate(canvases, first):
+            colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / wavelengths
+            canvas.onto(picture[number], colour * (raster.per_mm**2 / exposure))
+    return picture
+
+
+# Photons by what became of them; those of "ghosts" and "glare" are the flare.
+PARTS: dict[str, Callable[[Photons], NDArray[np.bool_]]] = {
+    "image": lambda found: (found.reflections == 0) & (found.scattered == 0),
+    "ghosts": lambda found: (found.reflections > 0) & ~found.glare,
+    "glare": lambda found: found.glare,
+    "flare": lambda found: (found.reflections > 0) | (found.scattered > 0),
+}
 
 
 def photon_picture(
@@ -253,29 +249,43 @@ def photon_picture(
     lights: Sequence[Light],
     raster: Raster,
     *,
+    part: str = "flare",
     wavelength_nm: tuple[float, float] = (400.0, 700.0),
     wavelengths: int = 15,
     photons: int = 1 << 20,
     most_reflections: int = 10,
     kernel_px: float = 3.0,
+    seed: int = 0,
     threads: int = 2,
     done: Callable[[float], None] = lambda share: None,
 ) -> Floats:
-    """The photons of lights that were reflected at least once, [H, W, 3] linear sRGB, by density estimation.
+    """The photons of lights on the film, [H, W, 3] linear sRGB, by density estimation.
 
     Args:
-        photons: of each light and wavelength. kernel_px: radius of the kernel (Epanechnikov's, 2 / pi (1 - r^2)).
+        part: of `PARTS`: those that were reflected or scattered ("flare"), at most twice reflected alone ("ghosts"),
+            more often or scattered ("glare"), or neither ("image").
+        photons: of each light and wavelength. kernel_px: radius of the narrowest kernel: see `_smoothed`.
     """
+    # Of glare, light that surfaces alone reflect turns round by choice, and what scatters goes as it does.
+    choices = (False, True)[: 1 + tracer.scatter.on] if part == "glare" else (None,)
 
-    def splat(rays: Floats, nm: float, film: Floats, seed: int) -> None:
-        found = tracer.trace(rays, nm, most_reflections=most_reflections, seed=seed)
-        x, y = found.film_xy_mm[:, found.reflections > 0] * raster.per_mm
+    def splat(rays: Floats, nm: float, film: Floats, chances: int) -> None:
         edges = (np.arange(raster.height + 1) - raster.height / 2, np.arange(raster.width + 1) - raster.width / 2)
-        film[0] += np.histogram2d(y, -x, bins=edges)[0]
+        for scatters in choices:
+            boost = tracer.turning(nm, LEVELS - 1) if scatters is False else 1.0
+            found = tracer.trace(rays, nm, most_reflections=most_reflections, seed=chances, boost=boost)
+            which = PARTS[part](found)
+            if scatters is not None:
+                which &= (found.scattered > 0) == scatters
+            x, y = found.film_xy_mm[:, which] * raster.per_mm
+            # A film that sends light back is exposed by what it keeps.
+            weight = found.weight[which] / (1 - tracer.scatter.sensor)
+            for power in (1, 2):
+                film[power - 1] += np.histogram2d(y, -x, bins=edges, weights=weight**power)[0]
 
     spectral = SpectralRange(*wavelength_nm, bins=wavelengths)
-    picture = _picture(tracer.lens, lights, raster, spectral, photons, (1, threads), splat, done)[0]
-    return _smoothed(picture, kernel_px)
+    picture, sums = _picture(tracer.lens, lights, raster, spectral, photons, (threads, seed), splat, done)
+    return _smoothed(picture, sums, kernel_px) if kernel_px > 0 else picture
 
 
 def _picture(
@@ -284,41 +294,94 @@ def _picture(
     raster: Raster,
     spectral: SpectralRange,
     samples: int,
-    layers_threads: tuple[int, int],
+    threads_seed: tuple[int, int],
     splat: Callable[[Floats, float, Floats, int], None],
     done: Callable[[float], None],
-) -> Floats:
-    """Film [layers, H, W, 3] of rays of every light and bin of the spectrum, which `splat` adds to [layers, H, W]."""
-    (layers, threads), bins = layers_threads, spectral.bins
+) -> tuple[Floats, Floats]:
+    """Film [H, W, 3] of rays of every light and bin of the spectrum, of which `splat` adds the sums of weights and of
+    their squares to [2, H, W]; and these sums of all, each light and bin as bright as it is."""
+    (threads, seed), bins = threads_seed, spectral.bins
     exposure = axis_irradiance(lens, 0.5 * (spectral.low_nm + spectral.high_nm))
+    firsts = range(0, samples, _AT_ONCE)
     tasks = [(number, light, k) for number, light in enumerate(lights) for k in range(bins)]
+    work = _Work(len(tasks) * len(firsts), done)
 
     def one(task: tuple[int, Light, int]) -> tuple[Floats, NDArray[np.float64]]:
         number, light, k = task
-        film = np.zeros((layers, raster.height, raster.width), np.float32)
+        film = np.zeros((2, raster.height, raster.width), np.float32)
         area = 0.0
-        for first in range(0, samples, _AT_ONCE):
-            rays, area = light_rays(lens, light, first, min(_AT_ONCE, samples - first), k / bins, samples**-0.5)
+        shift = k / bins + seed * _GOLDEN % 1
+        for first in firsts:
+            if not work.step():
+                break
+            rays, area = light_rays(lens, light, first, min(_AT_ONCE, samples - first), shift % 1, samples**-0.5)
             # A seed of its own, the same for any number of threads.
-            splat(rays, float(spectral.centres_nm[k]), film, (number * bins + k) * samples + first)
+            chances = (seed << 44) + (number * bins + k) * samples + first
+            splat(rays, float(spectral.centres_nm[k]), film, chances % (1 << 64))
         colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / bins
         return film, colour * (area * raster.per_mm**2 / samples / exposure)
 
-    picture = np.zeros((layers, raster.height, raster.width, 3), np.float32)
-    with ThreadPoolExecutor(threads) as pool:
-        for number, (film, colour) in enumerate(pool.map(one, tasks)):
-            picture += film[..., None] * colour.astype(np.float32)
-            done((number + 1) / len(tasks))
-    return picture
+    picture = np.zeros((raster.height, raster.width, 3), np.float32)
+    sums = np.zeros((2, raster.height, raster.width), np.float32)
+    for _, (film, colour) in work.results(one, tasks, threads):
+        picture += film[0, ..., None] * colour.astype(np.float32)
+        sums += film * (np.abs(colour).max() ** np.array([1, 2], np.float32))[:, None, None]
+    return picture, sums
 
 
-def _smoothed(picture: Floats, radius: float) -> Floats:
-    """A picture [H, W, 3] under a kernel that keeps its sum; light goes over the edges as if dark surrounded it."""
-    reach = math.ceil(radius)
+class _Work:
+    """Steps of work in threads: how many of them are done is told while they go on; they end soon when that fails."""
+
+    def __init__(self, steps: int, done: Callable[[float], None]) -> None:
+        self._steps, self._done, self._count, self._stopping = max(steps, 1), done, 0, False
+
+    def step(self) -> bool:
+        """Count a step; whether to go on."""
+        self._count += 1
+        return not self._stopping
+
+    def results(self, one: Callable[[_T], _R], tasks: Sequence[_T], threads: int) -> Iterator[tuple[_T, _R]]:
+        """Each task with its result, in order; so many at a time, and no more."""
+        with ThreadPoolExecutor(threads) as pool:
+            try:
+                for begin in range(0, len(tasks), threads):
+                    some = tasks[begin : begin + threads]
+                    for task, future in zip(some, [pool.submit(one, task) for task in some], strict=True):
+                        while not wait([future], _WAIT_S).done:
+                            self._done(min(self._count / self._steps, 1.0))
+                        yield task, future.result()
+                    self._done(min(self._count / self._steps, 1.0))
+            finally:
+                self._stopping = True
+
+
+def _smoothed(picture: Floats, sums: Floats, radius: float) -> Floats:
+    """A picture [H, W, 3] whose pixels' light is spread by kernels that keep its sum, mirrored at the edges.
+
+    Each by the narrowest kernel of radius r, 2 r, ... that holds `_ENOUGH` photons of equal weight, or is as little
+    noisy by their `sums` of weights and of squares, [2, H, W], with a soft step to the next; by none much wider than an
+    eighth of the picture's shorter side. Epanechnikov's, 2 / pi (1 - r^2) in units of its radius.
+    """
+    found, left, last = np.zeros_like(picture), np.ones(picture.shape[:2], np.float32), False
+    while not last:
+        weight, square = np.moveaxis(_spread(np.moveaxis(sums, 0, 2), radius), 2, 0)
+        last = 8 * radius > min(picture.shape[:2])
+        # n photons of equal weight have a sum of squares of n times the kernel's mean square, 4 / (3 pi r^2).
+        enough = 0.75 * math.pi * radius**2 * weight**2 / np.maximum(square, 1e-30) / _ENOUGH
+        share = np.ones_like(left) if last else (enough - 0.5).clip(0, 1)
+        found += _spread(picture * (left * share)[..., None], radius)
+        left, radius = left * (1 - share), 2 * radius
+    return np.maximum(found, 0)  # light of one wavelength has less than none of some colours
+
+
+def _spread(picture: Floats, radius: float) -> Floats:
+    """A picture [H, W, C] under one kernel."""
+    reach = min(math.ceil(radius), *picture.shape[:2])
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    kernel = np.maximum(1 - (x * x + y * y) / max(radius, 1e-9) ** 2, 0)
+    kernel = np.maximum(1 - (x * x + y * y) / radius**2, 0)
     kernel[reach, reach] = 1
-    size = [n + 2 * reach for n in picture.shape[:2]]
-    whole = np.fft.rfft2(picture, size, axes=(0, 1)) * np.fft.rfft2(kernel / kernel.sum(), size)[..., None]
-    kept = np.fft.irfft2(whole, size, axes=(0, 1))[reach : size[0] - reach, reach : size[1] - reach]
-    return np.maximum(kept, 0).astype(np.float32)
+    padded = np.pad(picture, ((reach, reach), (reach, reach), (0, 0)), mode="symmetric")
+    size = [n + 2 * reach for n in padded.shape[:2]]
+    whole = np.fft.rfft2(padded, size, axes=(0, 1)) * np.fft.rfft2(kernel / kernel.sum(), size)[..., None]
+    kept = np.fft.irfft2(whole, size, axes=(0, 1))[2 * reach :, 2 * reach :]
+    return kept[: picture.shape[0], : picture.shape[1]].astype(np.float32)

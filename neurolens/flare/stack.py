@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.flare.steps import CALL, DEGREE, STATE, Action, Kind, film_graph, reflectance_fit, seen, step_graph
+from neurolens.flare.steps import (
+    CALL,
+    FIGURE,
+    PLAIN,
+    STATE,
+    Action,
+    Kind,
+    Shape,
+    figure_numbers,
+    film_graph,
+    reflectance_fit,
+    step_graph,
+)
 from neurolens.graph.c import Signature, write_c
 from neurolens.graph.compiler import load_compiled
 from neurolens.graph.ir import Graph
@@ -18,12 +31,13 @@ from neurolens.optics import glass
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import same_medium
 from neurolens.optics.shapes import is_plain
+from neurolens.optics.tracegraph import figure_of
 
 Floats = NDArray[np.float32]
-WIDTH = len(CALL) + DEGREE + 1
 # What a step may do, by its place: refract light that goes to the film (0) or back (1), reflect it (2, 3).
 ACTIONS: tuple[tuple[Action, int], ...] = (("T", 1), ("T", -1), ("R", 1), ("R", -1))
 Place = tuple[int, int]  # surface and action
+NONE: Mapping[str, Graph] = {}
 
 
 class Stack:
@@ -45,60 +59,84 @@ class Stack:
         if lens.film_z_mm is None:
             raise InputError(lens.path, "film_z_mm", None, "a focused lens (Lens.at)")
         self.lens, self.fit_error = lens, 0.0
+        # An asphere's polynomial goes as high as the highest of its sort: they share functions.
+        self._figures = {k: figure_of(s) for k, s in enumerate(lens.surfaces) if not is_plain(s)}
+        figures = self._figures.values()
+        most = {even: max([0, *(len(f.terms) for f in figures if f.even == even)]) for even in (True, False)}
+        self._terms = {k: most[f.even] if f.terms else 0 for k, f in self._figures.items()}
+        self.width = PLAIN + len(FIGURE) + max(most.values())
         kinds = {place: self._kind(*place) for place in sorted(places)}
         self._kinds = tuple(dict.fromkeys(kinds.values()))
         self.functions = np.full((len(lens.surfaces), len(ACTIONS)), -1, np.int32)
         for place, kind in kinds.items():
             self.functions[place] = self._kinds.index(kind)
 
-    def compiled(self, driver: str, name: str) -> ctypes._NamedFuncPointer:
+    def compiled(self, driver: str, name: str, more: Mapping[str, Graph] = NONE) -> ctypes._NamedFuncPointer:
         """A C function `name` of a text that goes through the steps: see `_HEAD` for what it finds.
+
+        Args:
+            more: graphs that it finds as run_NAME, with the input `row`, numbers `call` and the output `event`.
 
         Raises:
             InputError: no C compiler, or one that fails.
         """
         text = ""
         for number, kind in enumerate(self._kinds):
-            text += _function(step_graph(kind), f"step_{number}", f"run_{number}", "state", "after", "call")
-        text += _function(film_graph(), "film", "run_film", "state", "film", "shift_mm")
+            text += function_text(step_graph(kind), f"step_{number}", f"run_{number}", "state", "after", "call")
+        text += function_text(film_graph(), "film", "run_film", "state", "film", "shift_mm")
+        for called, graph in more.items():
+            text += function_text(graph, called, f"run_{called}", "row", "event", "call")
         runs = ", ".join(f"run_{number}" for number in range(len(self._kinds)))
-        head = _HEAD.format(runs=runs, state=STATE, width=WIDTH, actions=len(ACTIONS))
+        head = _HEAD.format(runs=runs, state=STATE, width=self.width, actions=len(ACTIONS))
         call: ctypes._NamedFuncPointer = getattr(load_compiled(text + head + driver), name)
         call.restype = None
         return call
 
     def _kind(self, k: int, which: int) -> Kind:
-        lens, s, (action, sense) = self.lens, self.lens.surfaces[k], ACTIONS[which]
+        lens, s, f = self.lens, self.lens.surfaces[k], self._figures.get(k)
         return Kind(
-            action,
-            None if is_plain(s) else seen(s, sense > 0),
+            ACTIONS[which][0],
+            None if f is None else Shape(self._terms[k], f.even, f.steps, f.bent),
             reflects(lens, k),
             bool(s.coating and s.coating.layers),
             any(t.glass is not None or t.absorption_per_mm for t in lens.surfaces),
             lens.aperture if s.stop else None,
         )
 
+    @lru_cache(maxsize=64)  # noqa: B019  it keeps a few stacks, which are small
     def numbers(self, wavelength_nm: float) -> tuple[Floats, float]:
-        """Numbers of the call [surfaces, actions, WIDTH] at a wavelength, and the last step's shift to the film."""
+        """Numbers of the call [surfaces, actions, width] at a wavelength, and the last step's shift to the film."""
         lens, z = self.lens, [float(v) for v in self.lens.vertices_mm]
         n = [1.0, *(float(glass.index_of(s, wavelength_nm)) for s in lens.surfaces)]
         a = [0.0, *(float(glass.absorption_of(s, wavelength_nm) or 0.0) for s in lens.surfaces)]
-        found = np.zeros((len(lens.surfaces), len(ACTIONS), WIDTH), np.float32)
+        found = np.zeros((len(lens.surfaces), len(ACTIONS), self.width), np.float32)
         for k, s in enumerate(lens.surfaces):
             for which, (_, sense) in enumerate(ACTIONS):
                 before, after = (k, k + 1) if sense > 0 else (k + 1, k)
                 # The ray comes in the frame of the surface before; at the front and the rear in its own.
                 gap = sense * (z[k] - z[k - sense]) if 0 <= k - sense < len(lens.surfaces) else 0.0
-                curvature = -sense * float(s.curvature) if is_plain(s) else 0.0
+                curvature = -sense * float(s.curvature)
                 step = (n[after] - n[before]) * (n[after] + n[before])
                 row = (gap, curvature, 1 / s.semi_diameter_mm**2, n[before], n[after], step, a[before])
                 found[k, which, : len(CALL)] = row
-                if s.coating and s.coating.layers:
+                if k in self._figures:
+                    figure = figure_numbers(self._figures[k], -sense)
+                    found[k, which, PLAIN : PLAIN + len(figure)] = figure
+                if s.coating and s.coating.layers and ACTIONS[which][0] == "R":
+                    found[k, which, len(CALL) : PLAIN] = found[k, which - 2, len(CALL) : PLAIN]
+                elif s.coating and s.coating.layers:
                     fit, error = reflectance_fit(s.coating.layers, n[before], n[after], wavelength_nm, sense)
-                    found[k, which, len(CALL) :] = fit
+                    found[k, which, len(CALL) : PLAIN] = fit
                     self.fit_error = max(self.fit_error, error)
         assert lens.film_z_mm is not None
         return found, float(lens.film_z_mm) - z[len(lens.surfaces) - 1]
+
+    def reflectance(self, wavelength_nm: float) -> NDArray[np.float64]:
+        """Of every surface at normal incidence, towards the film, [surfaces]."""
+        numbers = self.numbers(wavelength_nm)[0][:, 0].astype(np.float64)
+        n1, n2 = numbers[:, CALL.index("n_before")], numbers[:, CALL.index("n_after")]
+        coated = [bool(s.coating and s.coating.layers) for s in self.lens.surfaces]
+        return np.where(coated, numbers[:, len(CALL)].clip(1e-9, 1), ((n1 - n2) / (n1 + n2)) ** 2)
 
 
 def entering(rays: Floats) -> Floats:
@@ -119,7 +157,7 @@ def reflects(lens: Lens, k: int) -> bool:
     return bool(coating and coating.layers) or not same_medium(lens.surfaces, k)
 
 
-def _function(graph: Graph, name: str, run: str, taken: str, given: str, numbers: str) -> str:
+def function_text(graph: Graph, name: str, run: str, taken: str, given: str, numbers: str) -> str:
     """A graph in C, and `run`: the same on pointers to rows, in the order of `flare.steps`."""
     program = lower(graph).in_order_of_need()
     s = Signature.of(program, name)

@@ -1,17 +1,16 @@
 """One surface as a graph, refracting or reflecting: the step that ghosts are traced by, on compiled code.
 
 Light always travels towards -z here: in a frame that is mirrored (z reversed) while it goes to the film. So one step
-serves both ways, and `tracegraph` has its intersections. A sphere or plane is a number of the call; any other surface
-is its own function. Fresnel's reflectance is written without the difference of nearly equal roots, which float32 would
-lose where glasses are cemented; a coating's is a polynomial in the cosine on the side of the lower index, fitted to its
-transfer matrices at one wavelength.
+serves both ways, and `tracegraph` has its intersections. The figure of a surface is numbers of the call, as its media
+are: surfaces of one kind share a function. Fresnel's reflectance is written without the difference of nearly equal
+roots, which float32 would lose where glasses are cemented; a coating's is a polynomial in the cosine on the side of the
+lower index, fitted to its transfer matrices at one wavelength.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -19,16 +18,26 @@ import torch
 from neurolens.graph.ir import Graph, Value
 from neurolens.optics import coatings
 from neurolens.optics.apertures import Aperture
-from neurolens.optics.prescription import Surface
-from neurolens.optics.tracegraph import meet_plain, meet_shape
+from neurolens.optics.tracegraph import Figure, meet_plain, meet_shape
 
 Action = Literal["T", "R"]
 STATE = 8  # rows: x, y, z (mm, this step's frame), direction, power, largest r^2 over the rim's so far
 LOST = 1e30  # of that ratio: the ray meets no surface, or is totally reflected where it should go on
 CALL = ("shift_mm", "curvature", "per_rim2", "n_before", "n_after", "n_step", "absorbed_per_mm")
 DEGREE = 10  # of a coating's reflectance
+FIGURE = ("stretch", "start_c", "start_cz", "last_step_mm")  # then the terms of the polynomial; as `tracegraph.Figure`
+PLAIN = len(CALL) + DEGREE + 1  # numbers of the call of a sphere
 _TINY = 1e-30
 _FAINT = 2e-4  # reflectance that no ghost is seen by
+
+
+class Shape(NamedTuple):
+    """What a function knows of a `tracegraph.Figure`; its numbers are those of the call."""
+
+    terms: int = 0
+    even: bool = True
+    steps: int = 0
+    bent: tuple[bool, bool] = (True, True)
 
 
 class Kind(NamedTuple):
@@ -36,15 +45,14 @@ class Kind(NamedTuple):
 
     Attributes:
         action: "T" refracted or "R" reflected.
-        surface: None for spheres and planes, whose curvature is a number of the call; else the surface, whose figures
-            are constants, seen by light that travels towards -z.
+        shape: None for spheres and planes; else what a figure has that is no number of the call: see `Shape`.
         bends: whether the media differ. coated: whether the reflectance is a polynomial of the call.
         absorbs: whether the medium before the surface takes light.
         aperture: the shape of the stop's opening, tested there; None is round.
     """
 
     action: Action
-    surface: Surface | None = None
+    shape: Shape | None = None
     bends: bool = True
     coated: bool = False
     absorbs: bool = False
@@ -54,15 +62,17 @@ class Kind(NamedTuple):
 def step_graph(kind: Kind) -> Graph:
     """Input `state` [8] and numbers of the call `call`; output `state` [8] after the surface, in the next step's frame.
 
-    The order of `call` is `CALL`, then the coefficients of a coating's reflectance, lowest first.
+    The order of `call` is `CALL`, then the coefficients of a coating's reflectance, lowest first, then `FIGURE` and the
+    terms of the polynomial, as many as the shape has.
     """
-    g = Graph()
-    state, call = g.input("state", STATE), g.input("call", len(CALL) + (DEGREE + 1), per_call=True)
+    g, shape = Graph(), kind.shape
+    count = PLAIN + (0 if shape is None else len(FIGURE) + shape.terms)
+    state, call = g.input("state", STATE), g.input("call", count, per_call=True)
     shift, curvature, per_rim2, n1, n2, n_step, absorbed = (call[k] for k in range(len(CALL)))
     d, power, worst = state[3:6], state[6], state[7]
     x = g.concat(state[0:2], state[2] + shift)
     nearest = d * -g.dot(x, d) + x
-    met = meet_plain(nearest, d, curvature) if kind.surface is None else meet_shape(nearest, d, kind.surface)
+    met = meet_plain(nearest, d, curvature) if shape is None else meet_shape(nearest, d, _figure(shape, call))
     point, q = met.point, met.cosine
     normal = met.normal
     if normal is None:
@@ -89,8 +99,7 @@ def step_graph(kind: Kind) -> Graph:
         d = d + normal * (q * 2.0)
         point, d = point * [1.0, 1.0, -1.0], d * [1.0, 1.0, -1.0]
     if kind.aperture is not None:
-        opened = kind.aperture.opening(g, point[0:2], 1.0 / per_rim2.sqrt())
-        ratio2 = g.select(opened, ratio2, LOST)
+        ratio2 = kind.aperture.rim(g, point[0:2], 1.0 / per_rim2.sqrt(), LOST)
     on = ratio2 <= LOST  # false for NaN
     for low, high in tests:
         on = on & (low <= high)
@@ -135,7 +144,7 @@ def _coated(g: Graph, call: Value, cos_i: Value, cos_t: Value, n_step: Value) ->
 
 
 def reflectance_fit(
-    layers: Sequence[tuple[float, float]], n_before: float, n_after: float, wavelength_nm: float, sense: int
+    layers: coatings.Layers, n_before: float, n_after: float, wavelength_nm: float, sense: int
 ) -> tuple[list[float], float]:
     """Coefficients of a coating's reflectance in 1 - c (c on the side of the lower index), and the largest error.
 
@@ -152,14 +161,11 @@ def reflectance_fit(
     return fit.convert(kind=np.polynomial.Polynomial).coef.tolist(), float(worst.max())
 
 
-def seen(surface: Surface, towards_film: bool) -> Surface:
-    """The figures of a surface in the frame in which the light travels towards -z; what passes light is left out."""
-    turn = -1.0 if towards_film else 1.0
-    return Surface(
-        turn * surface.radius_mm,
-        0.0,
-        surface.diameter_mm,
-        conic=surface.conic,
-        asphere=tuple((power, turn * a) for power, a in surface.asphere),
-        cylinder=surface.cylinder,
-    )
+def _figure(shape: Shape, call: Value) -> Figure:
+    stretch, c, cz, last_step, *terms = (call[PLAIN + k] for k in range(len(FIGURE) + shape.terms))
+    return Figure(call[CALL.index("curvature")], stretch, terms, (c, cz), last_step, *shape[1:])
+
+
+def figure_numbers(figure: Figure, turn: float) -> list[Any]:
+    """`FIGURE` and the terms as numbers, turned by -1.0 for light that travels towards +z in the lens frame."""
+    return [figure.stretch, *(turn * v for v in figure.start), figure.last_step, *(turn * v for v in figure.terms)]

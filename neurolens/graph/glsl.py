@@ -58,7 +58,8 @@ def write_glsl(program: Program, name: str, comment: Sequence[str], extras: Extr
     live = program.live()
     body = [f"    float t{k} = {writer.step(program.steps[k])};" for k in live if program.steps[k].kind != "input"]
     results = [f"    {o} = {writer.value(program.outputs[o].argument)};" for o in signature.outputs]
-    results.append(f"    status = int({writer.value(program.outputs['status'].argument)});")
+    status = program.outputs.get("status")
+    results += [] if status is None else [f"    status = int({writer.value(status.argument)});"]
     text = _HEAD.format(comment=lines) + "\n" * bool(extras.constants)
     text += "".join(f"const float {name.upper()}_{k.upper()} = {literal(v)};\n" for k, v in extras.constants.items())
     for key, function in extras.functions.items():
@@ -85,6 +86,6 @@ def write_glsl(program: Program, name: str, comment: Sequence[str], extras: Extr
         results.append(f"    if (band < 0 || band >= {signature.bands}) status = 1;")
     tables = [f"in highp sampler2D {t}" for t in signature.tables]
     arguments = [*(f"in float {i}" for i in signature.inputs), *tables, *band]
-    arguments += [*(f"out float {o}" for o in signature.outputs), "out int status"]
+    arguments += [*(f"out float {o}" for o in signature.outputs), *["out int status"] * (status is not None)]
     parameters = ",\n    ".join(arguments)
     return text + f"\nvoid {name}(\n    {parameters})\n{{\n" + "\n".join([*body, *results]) + "\n}\n"

@@ -6,7 +6,7 @@ Carried through a surrogate, derivatives double its work; as polynomials of some
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
@@ -61,31 +61,74 @@ def with_low_order_derivatives(
 
     Returns None where low orders do not do: a lens too strong, or too few rays that pass.
     """
-    exact = evaluate(with_film_derivatives(graph), samples)
-    passed = np.broadcast_to(exact["status"][0] == st.PASSED, samples["rays"].shape[1:])
-    if passed.sum() < _FEWEST:
+    found = low_orders([graph], [samples], enough, worst)
+    return None if found is None else found[0]
+
+
+def low_orders(
+    graphs: Sequence[Graph],
+    samples: Sequence[Mapping[str, NDArray[np.float32]]],
+    enough: float = _STOP,
+    worst: float = WORST,
+) -> list[LowOrder] | None:
+    """`with_low_order_derivatives` of a lens in several states: the terms are those of all, their weights of each."""
+    states = [_Fitted.of(graph, given) for graph, given in zip(graphs, samples, strict=True)]
+    if any(state is None for state in states):
         return None
-    found = Graph()
-    found.outputs = found.inline(graph, {})
-    columns, variables = _variables(found, samples["rays"].astype(np.float64)[:, passed])
-    monomials = _monomials(len(columns))
-    one = np.ones(int(passed.sum()))
-    products = np.stack([np.prod([one, *(columns[k] for k in m)], axis=0) for m in monomials])
-    wanted = _matrices(exact, passed)
-    weights = np.zeros((6, 2, len(monomials)))
+    known = [state for state in states if state is not None]
     for group in _GROUPS:
-        good = enough * float(np.sqrt(np.mean(np.square(wanted[group]))))
+        good = [enough * float(np.sqrt(np.mean(np.square(s.wanted[group])))) for s in known]
         for row in range(group.start, group.stop):
             for by in range(2):
-                chosen, values = _pursue(products, wanted[row, by], good)
-                weights[row, by, chosen] = values
-    used = weights.any((0, 1))
-    exponents = np.array([np.bincount(m, minlength=len(columns)) for m in monomials], np.int64)[used]
-    rows = found.polynomial(exponents, weights[..., used].transpose(1, 0, 2).reshape(12, -1), variables)
-    found.outputs |= dict(zip(_NAMES, found.split(rows, (6, 6)), strict=True))
-    fitted = _matrices(evaluate(found, samples), passed)  # in float32, as it will be used
-    error = max(_error(fitted[group], wanted[group]) for group in _GROUPS)
-    return LowOrder(found, error, int(np.count_nonzero(weights))) if error <= worst else None
+                chosen, values = _pursue([s.products for s in known], [s.wanted[row, by] for s in known], good)
+                for state, own in zip(known, values, strict=True):
+                    state.weights[row, by, chosen] = own
+    used = np.any([s.weights.any((0, 1)) for s in known], axis=0)
+    found = [s.finished(used) for s in known]
+    return found if max(f.error for f in found) <= worst else None
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """A lens in one state while it is fitted: monomials [M, N] of the rays that pass, derivatives [6, 2, N] wanted,
+    and weights [6, 2, M]."""
+
+    graph: Graph
+    samples: Mapping[str, NDArray[np.float32]]
+    passed: NDArray[np.bool_]
+    variables: Value
+    monomials: list[Monomial]
+    products: Array
+    wanted: Array
+    weights: Array
+
+    @staticmethod
+    def of(graph: Graph, samples: Mapping[str, NDArray[np.float32]]) -> _Fitted | None:
+        """None where too few rays pass."""
+        exact = evaluate(with_film_derivatives(graph), samples)
+        passed = np.broadcast_to(exact["status"][0] == st.PASSED, samples["rays"].shape[1:])
+        passed = passed & np.isfinite(_matrices(exact, np.ones_like(passed))).all((0, 1))  # float32 has no root of 0
+        if passed.sum() < _FEWEST:
+            return None
+        found = Graph()
+        found.outputs = found.inline(graph, {})
+        columns, variables = _variables(found, samples["rays"].astype(np.float64)[:, passed])
+        monomials = _monomials(len(columns))
+        one = np.ones(int(passed.sum()))
+        products = np.stack([np.prod([one, *(columns[k] for k in m)], axis=0) for m in monomials])
+        weights = np.zeros((6, 2, len(monomials)))
+        return _Fitted(found, samples, passed, variables, monomials, products, _matrices(exact, passed), weights)
+
+    def finished(self, used: NDArray[np.bool_]) -> LowOrder:
+        """The graph with its derivatives, of the monomials that any state uses."""
+        count = self.variables.rows
+        exponents = np.array([np.bincount(m, minlength=count) for m in self.monomials], np.int64)[used]
+        weights = self.weights[..., used].transpose(1, 0, 2).reshape(12, -1)
+        rows = self.graph.polynomial(exponents, weights, self.variables)
+        self.graph.outputs |= dict(zip(_NAMES, self.graph.split(rows, (6, 6)), strict=True))
+        fitted = _matrices(evaluate(self.graph, self.samples), self.passed)  # in float32, as it will be used
+        error = max(_error(fitted[group], self.wanted[group]) for group in _GROUPS)
+        return LowOrder(self.graph, error, int(np.count_nonzero(self.weights)))
 
 
 def _matrices(results: Mapping[str, NDArray[np.float32]], passed: NDArray[np.bool_]) -> Array:
@@ -117,19 +160,25 @@ def _monomials(count: int) -> list[Monomial]:
     return points + [(*m, 4) for m in points if len(m) <= _DEGREE_WAVE and count > 4]
 
 
-def _pursue(columns: Array, wanted: Array, good: float) -> tuple[list[int], Array]:
-    """Rows of `columns` [M, N] and their weights, whose sum comes within `good` (RMS) of `wanted` [N].
+def _pursue(columns: Sequence[Array], wanted: Sequence[Array], good: Sequence[float]) -> tuple[list[int], list[Array]]:
+    """Rows of `columns` [M, N] of each state, and their weights there, whose sum comes within `good` (RMS) of `wanted`
+    [N] in all.
 
     A plain pursuit of a few dozen columns: those of `surrogates.fits` need torch, and a render with a model does not.
     """
-    size = np.maximum(np.linalg.norm(columns, axis=1), 1e-30)
+    sizes = [np.maximum(np.linalg.norm(c, axis=1), 1e-30) for c in columns]
+    scales = [max(float(np.linalg.norm(w)), 1e-30) for w in wanted]
     chosen: list[int] = []
-    weights, left = np.zeros(0), wanted
-    while len(chosen) < _MOST_TERMS and np.sqrt(np.mean(left**2)) > good:
-        gain = np.abs(columns @ left) / size
+    weights, left = [np.zeros(0) for _ in columns], list(wanted)
+    while len(chosen) < _MOST_TERMS and any(np.sqrt(np.mean(v**2)) > g for v, g in zip(left, good, strict=True)):
+        gain = sum((c @ v / size / scale) ** 2 for c, v, size, scale in zip(columns, left, sizes, scales, strict=True))
+        gain = np.asarray(gain)
         gain[chosen] = 0
         chosen.append(int(gain.argmax()))
-        part = columns[chosen] / size[chosen, None]
-        weights = np.linalg.lstsq(part.T, wanted, rcond=None)[0] / size[chosen]
-        left = wanted - weights @ columns[chosen]
+        parts = [c[chosen] / size[chosen, None] for c, size in zip(columns, sizes, strict=True)]
+        weights = [
+            np.linalg.lstsq(part.T, w, rcond=None)[0] / size[chosen]
+            for part, w, size in zip(parts, wanted, sizes, strict=True)
+        ]
+        left = [w - own @ c[chosen] for w, own, c in zip(wanted, weights, columns, strict=True)]
     return chosen, weights

@@ -10,8 +10,10 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from neurolens.graph.c import Writer, literal
-from neurolens.graph.program import Program, Step
+import numpy as np
+
+from neurolens.graph.c import Writer, literal, steps_of
+from neurolens.graph.program import Mixture, Program, Step
 
 _LOOKUP = "{table}[{width} * clamp(int({index}), 0, {cells} - 1) + {place}]"
 _SUFFIX = re.compile(r"(\d\.?(?:e[+-]\d+)?)f\b")
@@ -62,9 +64,11 @@ def write_osl(
         comment: lines of its head. parameters: of the user.
         frame: statements that set a float for each input of the program.
         outputs: of three rows each, NAME_0 to NAME_2 of the program.
+
+    A state's numbers are mixed in the shader, which costs nothing where the renderer knows the state when it compiles.
     """
     lines = "\n".join(f" * {line}".rstrip() for line in comment).replace("*/", "* /")
-    writer = _Writer(program, "sqrt", lookup=_LOOKUP, name=name)
+    writer = _Writer(program, "sqrt", place="c{}", lookup=_LOOKUP, name=name)
     head = [f"{p.text()}" for p in parameters]
     head += [f"output {_KINDS.get(o, 'vector')} {o} = 0.0" for o in outputs]
     tables = ""
@@ -78,7 +82,20 @@ def write_osl(
         rows = (_plain(writer.value(program.outputs[f"{o}_{k}"].argument)) for k in range(3))
         results += f"    {o} = {_KINDS.get(o, 'vector')}({', '.join(rows)});\n"
     parts = ",\n    ".join(head)
-    return f"/*\n{lines}\n */\nshader {name}(\n    {parts})\n{{\n{tables}{frame}{body}\n{results}}}\n"
+    mixed = "" if program.mixture is None else _mixed(program.mixture, writer)
+    return f"/*\n{lines}\n */\nshader {name}(\n    {parts})\n{{\n{tables}{frame}{mixed}{body}\n{results}}}\n"
+
+
+def _mixed(mixture: Mixture, writer: Writer) -> str:
+    """The state's features `s0` ..., and of them the coefficients `c0` ... that differ between tables."""
+    made = _Writer(mixture.program, "sqrt")
+    names = [made.value(e.argument) for key, e in mixture.program.outputs.items() if key != "inside"]
+    text = "\n".join(f"    {line.strip()}" for line in steps_of(made, "float"))
+    rows = np.array(writer.table, np.float64) @ mixture.transform.T
+    for k, row in enumerate(rows):
+        terms = (f"{literal(v)} * {name}" for v, name in zip(row, names, strict=True) if v)
+        text += f"\n    float c{k} = {' + '.join(terms) or '0.0'};"
+    return re.sub(r"\bt(\d+)\b", r"s\1", _plain(text)) + "\n"
 
 
 class _Writer(Writer):

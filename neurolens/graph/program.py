@@ -34,6 +34,9 @@ TRANSMITTANCE, STOP, STATUS = "transmittance", ("stop_x_mm", "stop_y_mm"), "stat
 _ROWS = {"rays": (*RAY, WAVELENGTH), "film_mm": FILM_X_Y, "scene_ray": SCENE_RAY, "stop_xy_mm": STOP}
 # Of what a camera is given and gives: points of the unit square, and rays in metres.
 _ROWS |= {"square": ("u", "v"), "pupil_mm": RAY[2:], "ray": ("x_m", "y_m", "z_m", "dx", "dy", "dz")}
+# Of what a ghost is given, light at the front, and gives, light at the film.
+ENTERING, ARRIVING = ("dx", "dy", "x_mm", "y_mm", WAVELENGTH), ("film_x_mm", "film_y_mm", "power", "worst")
+_ROWS |= {"entering": ENTERING, "arriving": ARRIVING}
 
 # tanh x = x P(x^2) / Q(x^2) on [-9.02, 9.02], beyond which float32 has 1: the rational function of these degrees of
 # least relative error (2.1e-8), by reweighted least squares. Evaluated in float32 the error is at most 3.1e-7.
@@ -390,7 +393,9 @@ class Program:
         def value(argument: Argument) -> NDArray[np.float32]:
             if not isinstance(argument, tuple):
                 return found[argument]
-            return np.asarray(np.float32(argument[table] if weights is None else weights @ argument))
+            if weights is None or all(v == argument[0] for v in argument):  # which no rounding moves
+                return np.asarray(np.float32(argument[table]))
+            return np.asarray(np.float32(weights @ argument))
 
         with np.errstate(all="ignore"):
             for k in self.live():

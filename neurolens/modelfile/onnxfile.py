@@ -67,8 +67,11 @@ def read_metadata(path: str | Path) -> tuple[bytes, Fields, dict[str, str]]:
     return data, model, metadata
 
 
-def card_in(file: Any, metadata: dict[str, str]) -> dict[str, Any]:
+def card_in(file: Any, metadata: dict[str, str], expected: str = CARD_KIND) -> dict[str, Any]:
     """The card in a file's metadata.
+
+    Args:
+        expected: its kind.
 
     Raises:
         ModelError: none, one of more than `MAX_CARD` characters, that is not strict JSON, or of another kind or schema.
@@ -83,8 +86,8 @@ def card_in(file: Any, metadata: dict[str, str]) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise ModelError(f"{file}: the card is not strict JSON ({error})") from error
     kind = card.get("kind") if isinstance(card, dict) else None
-    if kind != CARD_KIND:
-        raise ModelError(f"{file}: card: kind: got {kind!r}, expected {CARD_KIND!r}")
+    if kind != expected:
+        raise ModelError(f"{file}: card: kind: got {kind!r}, expected {expected!r}")
     if card.get("schema") != CARD_SCHEMA:
         raise ModelError(f"{file}: card: schema: got {card.get('schema')!r}, expected {CARD_SCHEMA}")
     return card

@@ -117,9 +117,9 @@ class Aperture:
         u (1 - k e) <= e - k (e^2 + x^2 + y^2) / 2, with u the distance along that line; k = 0 is the half plane.
         """
         point = xy / radius
-        squared, turn = g.square(point), math.radians(self.rotation_deg)
-        within = squared <= 1.0
+        within = g.square(point) <= 1.0
         if self.mask is not None:
+            turn = math.radians(self.rotation_deg)
             height, width = self.mask.shape
             scale = max(height, width) / 2
             cos, sin = math.cos(turn) * scale, math.sin(turn) * scale
@@ -131,16 +131,36 @@ class Aperture:
         assert self.blades is not None
         if self.curvature == 1:
             return within
+        along, limit = self._edges(g, point)
+        return within & (along <= limit)
+
+    def rim(self, g: Graph, xy: Value, radius: Value, shut: float) -> Value:
+        """What r^2 / R^2 is of a round stop: at most 1 in the opening, and continuous across the edges of blades.
+
+        The arguments are those of `opening`; `shut`: the value where a mask passes no light.
+        """
+        point = xy / radius
+        if self.mask is not None:
+            return g.select(self.opening(g, xy, radius), g.square(point), shut)
+        if self.curvature == 1:
+            return g.square(point)
+        along, limit = self._edges(g, point)
+        return g.square(point).maximum(along - limit + 1.0)
+
+    def _edges(self, g: Graph, point: Value) -> tuple[Value, Value]:
+        """A point lies within the blades' edges where the first is at most the second."""
+        assert self.blades is not None
         half = math.pi / self.blades
         rise = self.curvature * (1 - math.cos(half))
         curvature = 2 * rise / (math.sin(half) ** 2 + rise * rise)
         edge = math.cos(half) + rise
-        scale, angles = 1 - curvature * edge, turn + (2 * np.arange(self.blades) + 1) * half
+        scale, turn = 1 - curvature * edge, math.radians(self.rotation_deg)
+        angles = turn + (2 * np.arange(self.blades) + 1) * half
         along = g.affine(scale * np.stack([np.cos(angles), np.sin(angles)], 1), point)
         while along.rows > 1:  # the largest of all
             part = (along.rows + 1) // 2
             along = along[:part].maximum(along[along.rows - part :])
-        return within & (along <= (edge - curvature / 2 * edge * edge) - squared * (curvature / 2))
+        return along, (edge - curvature / 2 * edge * edge) - g.square(point) * (curvature / 2)
 
     @cached_property
     def _graph(self) -> Graph:

@@ -6,10 +6,11 @@ wave is followed by its magnetic field, so that nothing is divided by a cosine t
 exp(-i omega t). Sources: Born and Wolf, Principles of Optics, 1.6.2; Macleod, Thin-Film Optical Filters, chapters 2, 3.
 
 Throughout: `cos_i` [N] is the cosine of incidence in [0, 1]; `n_before` and `n_after` (number or [N]) are the indices
-of the media as the light meets them; `layers` are (refractive index, thickness in nm) from the scene's side, as in
-`prescription.Coating`; `sense` is +1 for light towards the film and -1 for light towards the scene; `wavelength_nm`
-(in vacuum) is a number or [N]. Results are [N] in the dtype of `cos_i`, differentiable, also with respect to layers
-given as 0-d tensors, and never NaN: beyond the critical angle, and for a cosine that is NaN, T = 0 and R = 1.
+of the media as the light meets them; `layers` are (refractive index, thickness in nm) from the scene's side, or (n_d,
+thickness in nm, V_d), as in `prescription.Coating`; `sense` is +1 for light towards the film and -1 for light towards
+the scene; `wavelength_nm` (in vacuum) is a number or [N]. Results are [N] in the dtype of `cos_i`, differentiable, also
+with respect to layers given as 0-d tensors, and never NaN: beyond the critical angle, and for a cosine that is NaN,
+T = 0 and R = 1.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-Layers = Sequence[tuple[Any, Any]]
+from neurolens.optics.glass import index_at
+
+Layers = Sequence[tuple[Any, ...]]
 
 # Below this square of the phase in a layer, sine and cosine are summed as series, whose derivatives keep their digits.
 SMALL_PHASE2 = 1e-2
@@ -152,7 +155,8 @@ def _responses(
     s: tuple[Any, ...] = (1.0, 0.0, 0.0, 1.0)
     p = s
     fade: Any = 1.0
-    for index, thickness_nm in layers if sense > 0 else reversed(layers):
+    for n_d, thickness_nm, *V_d in layers if sense > 0 else reversed(layers):
+        index = index_at(n_d, V_d[0], wavelength_nm) if V_d else n_d
         index2 = index * index
         layer_q2 = q0_2 + (index - n_before) * (index + n_before)
         if not phase_beyond and _always_propagates(index, n_before, n_after):

@@ -32,8 +32,8 @@ The format, complete; keys marked optional may be left out:
       { radius_mm = 20.0, thickness_mm = 3.0, diameter_mm = 12.0, glass = "N-BK7", asphere = { 4 = 1e-6 } },
     ]
 
-    [[coating]]                 # optional: layers are [refractive index, thickness in nm] from the scene's side
-    name = "mine"
+    [[coating]]                 # optional: layers are [refractive index, thickness in nm] from the scene's side, or
+    name = "mine"               # [n_d, thickness, V_d] of films that disperse
     layers = [[1.38, 99.6]]
 
     [aperture]                  # optional: blades of the stop, whose diameter is then that of the circle round them
@@ -72,6 +72,7 @@ SCHEMA = 1
 MAX_SURFACES = 500
 MAX_TERMS = 1000  # aspheric coefficients of all surfaces: each costs every ray a step, and lenses have at most 400
 MAX_LAYERS = 200
+FILM_KEYS = ("index", "thickness_nm", "V_d")
 MAX_POWER = 40
 LARGEST = 1e15  # of any figure but a radius
 MAX_INDEX = 4.5  # germanium, the densest lens material there is, has 4.0
@@ -342,10 +343,10 @@ def _coatings(table: Table) -> dict[str, Coating]:
             raise one.error("layers", rows, f"1 to {MAX_LAYERS} layers such as [1.38, 99.6]")
         layers = []
         for n, row in enumerate(rows):
-            if not isinstance(row, list) or len(row) != 2:
-                raise one.error("layers", row, "[refractive index, thickness in nm]")
-            film = Table({"index": row[0], "thickness_nm": row[1]}, table.file, f"{one.where}layer {n}, ")
-            layers.append((film.number("index", above=0), film.number("thickness_nm", above=0)))
+            if not isinstance(row, list) or len(row) not in (2, 3):
+                raise one.error("layers", row, "[refractive index, thickness in nm], or with V_d behind them")
+            film = Table(dict(zip(FILM_KEYS, row, strict=False)), table.file, f"{one.where}layer {n}, ")
+            layers.append(tuple(film.number(key, above=0) for key in film.data))
         found[name] = Coating(name, tuple(layers))
     return found
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.tomlfile import format_value
+from neurolens.optics.designs import is_design
 from neurolens.optics.lensfile import SCHEMA
 from neurolens.optics.prescription import Lens, Surface
 
@@ -47,7 +48,7 @@ def format_lens(lens: Lens) -> str:
     if notes:
         lines.append(f"notes = {_wrapped(notes)}")
     text = "\n".join(lines) + "\n\n" + ROWS_COMMENT + "surfaces = [\n" + _rows(lens) + "]\n"
-    for name, layers in {s.coating.name: s.coating.layers for s in lens.surfaces if s.coating}.items():
+    for name, layers in _stacks(lens).items():
         text += f"\n[[coating]]\nname = {format_value(name)}\nlayers = {format_value(layers)}\n"
     text += _aperture(lens)
     for c in lens.configurations:
@@ -57,6 +58,16 @@ def format_lens(lens: Lens) -> str:
             text += "" if value is None else f"{key} = {format_value(float(value))}\n"
         text += f"thickness_mm = {format_value({str(k): float(t) for k, t in c.thickness_mm})}\n"
     return text
+
+
+def _stacks(lens: Lens) -> dict[str, tuple[tuple[float, ...], ...]]:
+    """Layers by name of the coatings that are no designs: those follow from their name and the glass they are on."""
+    found, before = {}, 1.0
+    for s in lens.surfaces:
+        if s.coating and not is_design(s.coating, before, float(s.n_d)):
+            found[s.coating.name] = s.coating.layers
+        before = float(s.n_d)
+    return found
 
 
 def _aperture(lens: Lens) -> str:

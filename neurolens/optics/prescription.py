@@ -23,11 +23,12 @@ class Coating:
 
     Attributes:
         name: of the design, for people and files.
-        layers: (refractive index, thickness in nm), from the scene's side to the film's.
+        layers: (refractive index, thickness in nm), from the scene's side to the film's; films that disperse have
+            their Abbe number, too, and the index is then n_d (dispersion as of glasses: `glass.index_at`).
     """
 
     name: str
-    layers: tuple[tuple[float, float], ...]
+    layers: tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -304,7 +305,7 @@ def _figures(s: Surface) -> list[Any]:
         "cylinder": s.cylinder,
         "glass": s.glass,
         "absorption_per_mm": float(s.absorption_per_mm),
-        "coating": s.coating and [[float(n), float(nm)] for n, nm in s.coating.layers],
+        "coating": s.coating and [[float(v) for v in layer] for layer in s.coating.layers],
     }
     more = {key: value for key, value in more.items() if value}
     return [*row, more] if more else row

@@ -60,10 +60,17 @@ def ghost(count: int, first: int, second: int) -> list[tuple[int, Action]]:
     """
     if not 0 <= first < second < count:
         raise InputError("ghost", "first, second", (first, second), f"0 <= first < second < {count}")
-    there: list[tuple[int, Action]] = [(k, "T") for k in range(second)]
-    back: list[tuple[int, Action]] = [(k, "T") for k in range(second - 1, first, -1)]
-    again: list[tuple[int, Action]] = [(k, "T") for k in range(first + 1, count)]
-    return [*there, (second, "R"), *back, (first, "R"), *again]
+    return turning(count, (second, first))
+
+
+def turning(count: int, reflections: Sequence[int]) -> list[tuple[int, Action]]:
+    """The steps of light from the front to the film of `count` surfaces, reflected at some of them in this order."""
+    steps: list[tuple[int, Action]] = []
+    at, sense = 0, 1
+    for k in reflections:
+        steps += [*((between, "T") for between in range(at, k, sense)), (k, "R")]
+        at, sense = k - sense, -sense
+    return [*steps, *((k, "T") for k in range(at, count))]
 
 
 def follow(

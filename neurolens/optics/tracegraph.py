@@ -7,6 +7,7 @@ tracing after Feder, J. Opt. Soc. Am. 41 (1951); conics, cylinders and aspheres 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from neurolens.optics.shapes import LAST_STEP, STEEPEST, is_plain, start_of
 # The index is a polynomial in 1 / lambda^2 that holds it to float32's last bit.
 _INDEX = 3e-8
 _TINY = 1e-30  # least value under a root
+Number = float | Value
 Test = tuple[Value, Value]  # passed where the first is at most the second
 
 
@@ -67,7 +69,7 @@ class _Tracing:
     def _surface(self, k: int, s: Surface) -> None:
         g, d = self.graph, self.d
         nearest = d * -g.dot(self.x, d) + self.x  # of the ray's points, to the vertex
-        met = meet_plain(nearest, d, float(s.curvature)) if is_plain(s) else meet_shape(nearest, d, s)
+        met = meet_plain(nearest, d, float(s.curvature)) if is_plain(s) else meet_shape(nearest, d, figure_of(s))
         self.x = met.point
         self.tests += [(test, st.blocked(k, st.MISSED)) for test in met.tests]
         if s.stop:
@@ -149,24 +151,60 @@ def meet_plain(m: Value, d: Value, c: float | Value) -> _Meeting:
     return _Meeting(d * way + m, q, [_above(q2)])
 
 
-def meet_shape(m: Value, d: Value, surface: Surface) -> _Meeting:
+class Figure(NamedTuple):
+    """A conic, cylinder or asphere; lengths in mm, as numbers or as values of the call.
+
+    Attributes:
+        curvature, stretch: c and 1 + K of the conic. terms: A_p of h^(p - 2), lowest first; empty without a polynomial.
+        start: c and c (1 + K) of the conic that the iteration starts from. last_step: how long its last step may be.
+        even: whether the terms are those of even powers alone. steps: of the iteration.
+        bent: whether along x and y.
+    """
+
+    curvature: Number
+    stretch: Number
+    terms: Sequence[Number] = ()
+    start: tuple[Number, Number] = (0.0, 0.0)
+    last_step: Number = 0.0
+    even: bool = True
+    steps: int = 0
+    bent: tuple[bool, bool] = (True, True)
+
+
+def figure_of(surface: Surface) -> Figure:
+    """The figure of a surface that is no sphere and no plane."""
+    conic = Figure(float(surface.curvature), 1 + float(surface.conic))
+    bent = surface.cylinder != "y", surface.cylinder != "x"
+    if not surface.asphere:
+        return conic._replace(bent=bent)
+    powers = {n: float(a) for n, a in surface.asphere}
+    even = all(n % 2 == 0 for n in powers)
+    terms = tuple(powers.get(n, 0.0) for n in range(2, max(powers) + 1, 2 if even else 1))
+    start, steps = start_of(surface)
+    return conic._replace(
+        terms=terms, start=start, last_step=LAST_STEP * surface.semi_diameter_mm, even=even, steps=steps, bent=bent
+    )
+
+
+def meet_shape(m: Value, d: Value, figure: Figure) -> _Meeting:
     """Meet a surface that is no sphere and no plane, as `meet_plain`."""
-    w = (float(surface.cylinder != "y"), float(surface.cylinder != "x"))
-    if surface.asphere:
-        return _meet_asphere(m, d, surface, w)
-    c = float(surface.curvature)
-    kind = (c * w[0], c * w[1], c * (1 + float(surface.conic)))
-    q2, denominator, way = _meet_quadric(m, d, kind)
+    if figure.terms:
+        return _meet_asphere(m, d, figure)
+    g, c, bent = m.graph, figure.curvature, figure.bent
+    cz = c * figure.stretch
+    q2, denominator, way = _meet_quadric(m, d, (c, cz), bent)
     point = d * way + m
-    normal = point * [-v for v in kind] + [0.0, 0.0, 1.0]
-    scale = 1.0 / m.graph.square(normal).sqrt()
+    across = [point[k] * -c if bent[k] else g.constant(0.0) for k in (0, 1)]
+    normal = g.concat(*across, point[2] * -cz + 1.0)
+    scale = 1.0 / g.square(normal).sqrt()
     tests = [_above(q2), _above(denominator * denominator), _above(normal[2])]
     return _Meeting(point, q2.sqrt() * scale, tests, normal * scale)
 
 
-def _meet_quadric(m: Value, d: Value, kind: tuple[float, float, float]) -> tuple[Value, Value, Value]:
-    """Meet cx x^2 + cy y^2 + cz z^2 = 2 z: discriminant, what the way is divided by, and the way from m."""
-    a, b, f = (_weighted(*pair, kind) for pair in ((d, d), (m, d), (m, m)))
+def _meet_quadric(m: Value, d: Value, kind: tuple[Number, Number], bent: tuple[bool, bool]) -> tuple[Value, ...]:
+    """Meet c h^2 + cz z^2 = 2 z: discriminant, what the way is divided by, and the way from m."""
+    c, cz = kind
+    a, b, f = (_across(p, q, bent) * c + p[2] * q[2] * cz for p, q in ((d, d), (m, d), (m, m)))
     b, f = b - d[2], m[2] * -2.0 + f
     q2 = b * b + -(a * f)
     q, towards = q2.maximum(0.0).sqrt(), b <= 0.0
@@ -176,69 +214,67 @@ def _meet_quadric(m: Value, d: Value, kind: tuple[float, float, float]) -> tuple
     return q2, denominator, numerator / denominator
 
 
-def _weighted(a: Value, b: Value, weights: tuple[float, ...]) -> Value:
-    """Sum of the products of the rows of a and b, each times its weight."""
-    g, used = a.graph, [k for k, weight in enumerate(weights) if weight]
-    if not used:
-        return g.constant(0.0)
-    both = g.concat(a[used] * [weights[k] for k in used], b[used])
-    return g.quadratic(both, [tuple((k, len(used) + k) for k in reversed(range(len(used))))])
+def _across(a: Value, b: Value, bent: tuple[bool, bool]) -> Value:
+    """The scalar product of what a and b have along the axes that are bent."""
+    rows = [k for k in (0, 1) if bent[k]]
+    return a.graph.dot(a[rows], b[rows])
 
 
-def _meet_asphere(m: Value, d: Value, surface: Surface, w: tuple[float, float]) -> _Meeting:
+def _meet_asphere(m: Value, d: Value, figure: Figure) -> _Meeting:
     """From the conic that fits best, by the steps of `shapes`, of which the last decides whether they converged."""
-    g = m.graph
-    (c, cz), steps = start_of(surface)
-    _, _, way = _meet_quadric(m, d, (c * w[0], c * w[1], cz))
-    for _ in range(steps - 1):
+    g, bent = m.graph, figure.bent
+    _, _, way = _meet_quadric(m, d, figure.start, bent)
+    for _ in range(figure.steps - 1):
         at = d * way + m
-        sag, slope, turn = _sag(surface, w, at)
-        along = _weighted(at, d, w)
+        sag, slope, turn = _sag(figure, at)
+        along = _across(at, d, bent)
         rate = slope * along + -d[2]
-        bend = along * along * turn + slope * _weighted(d, d, w)
+        bend = along * along * turn + slope * _across(d, d, bent)
         lack = (sag - at[2]) * 2.0
         root = (rate * rate + -(bend * lack)).maximum(_TINY).sqrt()
         way = way + lack / -(root + rate)
     at = d * way + m
-    sag, slope, _ = _sag(surface, w, at)
-    step = (at[2] - sag) / (slope * _weighted(at, d, w) + -d[2])
+    sag, slope, _ = _sag(figure, at)
+    step = (at[2] - sag) / (slope * _across(at, d, bent) + -d[2])
     point = d * step + at
-    _, slope, _ = _sag(surface, w, point)
-    normal = point[0:2] * [-w[0], -w[1]] * slope
+    _, slope, _ = _sag(figure, point)
+    normal = point[0:2] * [-float(v) for v in bent] * slope
     scale = 1.0 / g.quadratic(normal, [((0, 0), (1, 1))], [1.0]).sqrt()
     cosine = -((normal[0] * d[0] + (normal[1] * d[1] + d[2])) * scale)
     tests = [
-        (step.abs(), g.constant(LAST_STEP * surface.semi_diameter_mm)),
+        (step.abs(), g.value(figure.last_step)),
         _above(cosine),
-        (g.constant(STEEPEST), _cos2(surface, _weighted(point, point, w))),
+        (g.constant(STEEPEST), _cos2(figure, _across(point, point, bent))),
     ]
     return _Meeting(point, cosine, tests, g.concat(normal * scale, scale))
 
 
-def _sag(surface: Surface, w: tuple[float, float], at: Value) -> tuple[Value, Value, Value]:
+def _sag(figure: Figure, at: Value) -> tuple[Value, Value, Value]:
     """Depth, d sag / d h over h, and the change of this by h over h of the conic alone."""
-    h2 = _weighted(at, at, w)
-    sag, slope = (_polynomial(surface, h2, order) for order in (0, 1))
-    c = float(surface.curvature)
-    if not c:
+    h2 = _across(at, at, figure.bent)
+    sag, slope = (_polynomial(figure, h2, order) for order in (0, 1))
+    c = figure.curvature
+    if not isinstance(c, Value) and not c:
         return sag * h2, slope, at.graph.constant(0.0)
-    cos = _cos2(surface, h2).maximum(STEEPEST).sqrt()
+    cos = _cos2(figure, h2).maximum(STEEPEST).sqrt()
     both = c / (cos * cos + cos)  # one division for c / (1 + cos) and c / cos
     inverse = both * cos + both
-    turn = inverse * inverse * inverse * (1 + float(surface.conic))
+    turn = inverse * inverse * inverse * figure.stretch
     return (both * cos + sag) * h2, inverse + slope, turn
 
 
-def _cos2(surface: Surface, h2: Value) -> Value:
-    c = float(surface.curvature)
-    return h2 * (-(1 + float(surface.conic)) * c * c) + 1.0
+def _cos2(figure: Figure, h2: Value) -> Value:
+    return h2 * -(figure.stretch * figure.curvature * figure.curvature) + 1.0
 
 
-def _polynomial(surface: Surface, h2: Value, order: int) -> Value:
+def _polynomial(figure: Figure, h2: Value, order: int) -> Value:
     """sum A_p h^(p - 2) (order 0) or sum p A_p h^(p - 2) (order 1), in h^2 or, where odd powers occur, in h."""
-    powers = {n: float(a) for n, a in surface.asphere}
-    even = all(n % 2 == 0 for n in powers)
-    h, down = (h2, 2) if even else (h2.maximum(_TINY).sqrt(), 1)
-    count = (max(powers) - 2) // down + 1
-    terms = [powers.get(2 + down * k, 0.0) * (2 + down * k) ** order for k in range(count)]
-    return h.graph.series(h, terms)
+    h, down = (h2, 2) if figure.even else (h2.maximum(_TINY).sqrt(), 1)
+    terms = [a * float((2 + down * k) ** order) for k, a in enumerate(figure.terms)]
+    numbers = [a for a in terms if not isinstance(a, Value)]
+    if len(numbers) == len(terms):
+        return h.graph.series(h, numbers)
+    total = h.graph.value(terms[-1])
+    for a in reversed(terms[:-1]):
+        total = total * h + a
+    return total

@@ -29,7 +29,7 @@ class Step(NamedTuple):
         normal: x, y, z of the unit normal where the rays meet the surface, of either sign, each [N].
         before, after: unit directions, x, y, z each [N].
         n_before, n_after: indices (number or [N]) in front of the surface and beyond it as the light meets them.
-        layers: coating, (refractive index, thickness in nm) from the scene's side; empty where bare.
+        layers: coating, as in `prescription.Coating`; empty where bare.
         sense: +1 for light towards the film, -1 towards the scene: the order in which it meets the layers.
         reflected: whether the rays are reflected there (ghosts) rather than transmitted.
     """

@@ -71,14 +71,14 @@ class PixelGrid:
         return points
 
 
-def check_memory(width: int, height: int) -> None:
-    """Refuse (InputError) a picture whose film alone would fill the machine, before memory is allocated."""
+def check_memory(width: int, height: int, bytes_a_pixel: int = BYTES_A_PIXEL) -> None:
+    """Refuse (InputError) a picture that alone would fill the machine, before memory is allocated."""
     try:
         most = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):
         return  # not known on this system
-    if width * height * BYTES_A_PIXEL > most:
-        expected = f"at most {most // BYTES_A_PIXEL} pixels: each takes {BYTES_A_PIXEL} bytes, of {most / 1e9:.3g} GB"
+    if width * height * bytes_a_pixel > most:
+        expected = f"at most {most // bytes_a_pixel} pixels: each takes {bytes_a_pixel} bytes, of {most / 1e9:.3g} GB"
         raise InputError("picture", "width x height", (width, height), expected)
 
 

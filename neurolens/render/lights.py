@@ -117,6 +117,12 @@ class Lights:
         density *= self.probability.take(light)
         return density
 
+    def each(self, point: FloatArray, square: FloatArray) -> Iterator[Aimed]:
+        """As `LightGroup.sample` from points [3, N] to all lights, one after another."""
+        for _, group in self._groups:
+            for number in range(group.count):
+                yield group.sample(np.full(point.shape[1], number), point, square)
+
     def _by_group(self, light: Numbers) -> Iterator[tuple[LightGroup, Numbers, Numbers]]:
         """The groups that lights [N] belong to, the places of theirs, and their numbers in the group."""
         for first, group in self._groups:

@@ -74,6 +74,7 @@ class SceneSettings:
 
     camera: CameraSettings
     film: FilmSettings = FilmSettings()
+    flare: tables.Flare | None = None
     illuminants: dict[str, MeasuredSpectrum] | None = None
     environment: tables.Environment = tables.Environment(colour=BLACK)
     sky: tables.Sky | None = None

@@ -80,13 +80,18 @@ def model_to_text(model: LensModel) -> str:
         raise InputError("export", "core", type(model.core).__name__, f"one of {', '.join(CORES)}")
     data = {
         "schema": SCHEMA,
-        "lens": _packed_lens(model.lens),
+        "lens": packed_lens(model.lens),
         "encoding": asdict(model.encoding),
         "scales": asdict(model.scales),
         "gates": [[g.surface, g.reason] for g in model.gates],
         "direction": model.direction,
-        "core": _pack(model.core),
+        "core": pack(model.core),
     }
+    return deflated(data)
+
+
+def deflated(data: dict[str, Any]) -> str:
+    """JSON as an entry of metadata."""
     text = json.dumps(data, separators=(",", ":")).encode()
     return base64.b64encode(zlib.compress(text, 9)).decode()
 
@@ -111,17 +116,17 @@ def load_fitted(path: str | Path) -> LensModel:
             "earlier version, then export it again"
         )
     try:
-        data = json.loads(_inflated(metadata[MODEL_KEY]))
+        data = json.loads(inflated(metadata[MODEL_KEY]))
         check_tree(data, "coefficients")
         if data["schema"] != SCHEMA:
             raise ModelError(f"{file}: coefficients: schema: got {data['schema']!r}, expected {SCHEMA}")
         model = LensModel(
-            lens=_lens(data["lens"]),
+            lens=unpacked_lens(data["lens"]),
             domain=Domain.from_dict(card["domain"]),
             encoding=_numbers(Encoding, data["encoding"]),
             scales=_numbers(Scales, data["scales"]),
             gates=tuple(Gate(int(k), int(r)) for k, r in data["gates"]),
-            core=_core(data["core"]),
+            core=unpack(data["core"]),
             method=str(card["fit"]["method"]),
             settings=dict(card["fit"]["settings"]),
             fit_s=float(card["fit"]["seconds"]),
@@ -135,7 +140,8 @@ def load_fitted(path: str | Path) -> LensModel:
     return model
 
 
-def _inflated(text: str) -> bytes:
+def inflated(text: str) -> bytes:
+    """The JSON of `deflated`. Raises ValueError: damaged, or too long."""
     unpacker = zlib.decompressobj()
     try:
         found = unpacker.decompress(base64.b64decode(text, validate=True), _MAX_TEXT)
@@ -146,7 +152,8 @@ def _inflated(text: str) -> bytes:
     return found
 
 
-def _pack(value: Any) -> Any:
+def pack(value: Any) -> Any:
+    """Arrays, tuples and cores as JSON has them: floats in float32, integers in bytes."""
     if isinstance(value, np.ndarray) and value.dtype.kind == "f":
         return {"f4": base64.b64encode(value.astype("<f4").tobytes()).decode(), "shape": list(value.shape)}
     if isinstance(value, np.ndarray):
@@ -154,23 +161,23 @@ def _pack(value: Any) -> Any:
             raise InputError("export", "exponents", "(a negative or larger one)", f"terms of degree 0 to {_MAX_DEGREE}")
         return {"u1": base64.b64encode(value.astype("u1").tobytes()).decode(), "shape": list(value.shape)}
     if isinstance(value, tuple):
-        return [_pack(v) for v in value]
+        return [pack(v) for v in value]
     if type(value) in _NAMES:
-        return {"kind": _NAMES[type(value)], **{f.name: _pack(getattr(value, f.name)) for f in fields(value)}}
+        return {"kind": _NAMES[type(value)], **{f.name: pack(getattr(value, f.name)) for f in fields(value)}}
     return value
 
 
-def _core(packed: Any, depth: int = 0) -> Any:
-    """What `_pack` packed."""
+def unpack(packed: Any, depth: int = 0) -> Any:
+    """What `pack` packed."""
     if depth > _MAX_DEPTH:
         raise ValueError("cores nested too deep")
     if isinstance(packed, list):
-        return tuple(_core(v, depth + 1) for v in packed)
+        return tuple(unpack(v, depth + 1) for v in packed)
     if not isinstance(packed, dict):
         return packed
     if "kind" in packed:
         kind = CORES[packed["kind"]]
-        return kind(**{f.name: _core(packed[f.name], depth + 1) for f in fields(kind) if f.name in packed})
+        return kind(**{f.name: unpack(packed[f.name], depth + 1) for f in fields(kind) if f.name in packed})
     if max(packed["shape"], default=0) > _MAX_ROWS:
         raise ValueError(f"an array of shape {packed['shape']}, expected at most {_MAX_ROWS} rows")
     form = "f4" if "f4" in packed else "u1"
@@ -189,7 +196,7 @@ def _numbers(kind: Any, packed: dict[str, Any]) -> Any:
     return kind(**{key: None if value is None else float(value) for key, value in packed.items()})
 
 
-def _packed_lens(lens: Lens) -> dict[str, Any]:
+def packed_lens(lens: Lens) -> dict[str, Any]:
     """What stands in a prescription but for its other states and notes; numbers as they are, infinity as a word."""
     rows = []
     for surface in lens.surfaces:
@@ -214,7 +221,8 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _lens(packed: dict[str, Any]) -> Lens:
+def unpacked_lens(packed: dict[str, Any]) -> Lens:
+    """What `packed_lens` packed."""
     surfaces = []
     for row in packed["surfaces"]:
         known = {f.name: row[f.name] for f in fields(Surface) if f.name in row}
@@ -224,7 +232,7 @@ def _lens(packed: dict[str, Any]) -> Lens:
             known["asphere"] = tuple((int(p), float(a)) for p, a in known["asphere"])
         if known.get("coating"):
             name, layers = known["coating"]
-            known["coating"] = Coating(str(name), tuple((float(n), float(nm)) for n, nm in layers))
+            known["coating"] = Coating(str(name), tuple(tuple(float(v) for v in layer) for layer in layers))
         surfaces.append(Surface(**known))
     return Lens(surfaces=tuple(surfaces), **{k: packed[k] for k in _LENS})
 

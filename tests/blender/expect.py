@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from measure import crop_at, measures
@@ -39,12 +39,14 @@ class Lens:
     shader: str
     film_mm: tuple[float, float]
 
-    def camera(self, focus_m: float, f_number: float) -> Camera:
+    def camera(self, focus_m: float, f_number: float, zoom_mm: float | None = None) -> Camera:
         """The exact one."""
-        return make_camera(self.exact, Shot(self.film_mm, focus_m, f_number))
+        how: Literal["best", "internal"] = "internal" if self.name == "inside" else "best"
+        return make_camera(self.exact, Shot(self.film_mm, focus_m, f_number, zoom=zoom_mm, focus=how))
 
 
 _GAUSS = "lenses/laikin_double_gauss_50.toml"
+_ZOOM = "models/nikon_zoom_80_200-range.states-64.onnx"
 LENSES = {
     lens.name: lens
     for lens in (
@@ -52,6 +54,8 @@ LENSES = {
         Lens("fisheye", "lenses/horimoto_fisheye_16.toml", "models/horimoto_fisheye_16.mlp-16x2.onnx", (36.0, 24.0)),
         Lens("anamorphic", "lenses/cooke_anamorphic_42.toml", "models/cooke_anamorphic_42.mlp-16x2.onnx", (23.0, 13.0)),
         Lens("exact", _GAUSS, _GAUSS, (36.0, 20.25)),
+        Lens("zoom", "lenses/nikon_zoom_80_200.toml", _ZOOM, (36.0, 20.25)),
+        Lens("inside", "lenses/sony_sonnar_55.toml", "lenses/sony_sonnar_55.toml", (36.0, 20.25)),
     )
 }
 
@@ -122,17 +126,19 @@ def point_shot(name: str, picture: Picture, made: Camera, point_m: Any, radius_m
     return shot | {"crop": crop, "found": measures(np.stack(planes, 2), crop[:2])}
 
 
-def grid(lens: Lens) -> list[dict[str, Any]]:
+def grid(lens: Lens, zoom_mm: float | None = None, focus_m: float = 2.0) -> list[dict[str, Any]]:
     """Points all over the picture, at f/8 and in focus."""
-    picture = Picture(lens, 1920, 2.0, 8.0)
-    made = lens.camera(2.0, 8.0)
+    picture = Picture(lens, 1920, focus_m, 8.0)
+    made = lens.camera(focus_m, 8.0, zoom_mm)
     efl = float(made.settings["efl_mm"])
     found = []
     for v in (-0.46, 0.0, 0.25):
         for u in (-0.47, 0.0, 0.3):
             film = (u * lens.film_mm[0], v * lens.film_mm[1])
-            radius = _SPHERE_PX * picture.pitch_mm * 2.0 / efl
-            found.append(point_shot("grid", picture, made, scene_point(made, film, 2.0), radius))
+            radius = _SPHERE_PX * picture.pitch_mm * focus_m / efl
+            shot = point_shot("grid", picture, made, scene_point(made, film, focus_m), radius)
+            shot["custom"] |= {} if zoom_mm is None else {"zoom_mm": zoom_mm}
+            found.append(shot)
     return found
 
 
@@ -196,7 +202,10 @@ def main(folder: Path) -> None:
             ]
         ):
             shots += make(LENSES[name])
-            report((number + 1) / 6)
+            report((number + 1) / 8)
+        for zoom_mm in (96.0, 170.0):
+            shots += grid(LENSES["zoom"], zoom_mm, 4.0)
+        shots += grid(LENSES["inside"])
         shots += [white_card(LENSES["rectilinear"], 1.83), white_card(LENSES["anamorphic"], 2.8)]
     (folder / "shots.json").write_text(json.dumps(shots, indent=1), encoding="utf-8")
 

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
 import shutil
+import signal
+import time
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -18,6 +22,7 @@ from neurolens.commands import blender_lenses  # noqa: E402
 from neurolens.commands.blender_lenses import thumbnail  # noqa: E402
 from neurolens.commands.export_osl import Shader  # noqa: E402
 from neurolens.optics.lensfile import read_lens  # noqa: E402
+from neurolens.render.film import FORKS  # noqa: E402
 
 LENS = "laikin_double_gauss_50"
 ABSORBS = "its glass absorbs"
@@ -105,7 +110,7 @@ def test_bad_input_is_one_line(
 
 
 def test_a_second_build_makes_no_shader_again(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = ["blender", "build", "--models", str(place / "models"), "--quiet", "-o"]
+    given = ["blender", "build", "--models", str(place / "models"), "--jobs", "1", "--quiet", "-o"]
     stand_in, asked = blender_lenses.shader_of, []
 
     def counted(file: Path, **options: Any) -> Shader:
@@ -120,14 +125,58 @@ def test_a_second_build_makes_no_shader_again(place: Path, monkeypatch: pytest.M
     stops = False
     for name in ("a.zip", "b.zip"):
         assert main([*given, str(place / name)]) == 0
-    assert asked == [".onnx", ".onnx", ".toml", ".toml"]
+    assert asked == [".toml", ".toml", ".onnx", ".onnx"]
     assert (place / "a.zip").read_bytes() == (place / "b.zip").read_bytes()
     with (place / "lenses" / f"{LENS}.toml").open("a", encoding="utf-8") as lens_file:
         lens_file.write("# another file\n")
     assert main([*given, str(place / "c.zip")]) == 0 and asked[4:] == [".toml"]
     for kept in (place / "cache" / "neurolens").glob("*.form"):
         kept.write_bytes(kept.read_bytes()[:-40])
-    assert main([*given, str(place / "d.zip")]) == 0 and asked[5:] == [".onnx", ".onnx", ".toml"]
+    assert main([*given, str(place / "d.zip")]) == 0 and asked[5:] == [".toml", ".onnx", ".onnx"]
+
+
+@pytest.mark.skipif(not FORKS, reason="stand-ins reach forked processes alone")
+def test_processes_make_the_same_zip_and_end_together(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = ["blender", "build", "--models", str(place / "models"), "--quiet", "-o"]
+    stand_in = blender_lenses.shader_of
+
+    def dies() -> None:
+        os._exit(9)
+
+    def interrupts() -> None:
+        os.kill(os.getppid(), signal.SIGINT)
+        time.sleep(300)
+
+    def made(file: Path, **options: Any) -> Shader:
+        if file.suffix == ".toml" and deeds:
+            deeds[0]()
+        return stand_in(file, **options)
+
+    monkeypatch.setattr(blender_lenses, "shader_of", made)
+    deeds = [dies]
+    assert main([*given, str(place / "a.zip"), "--jobs", "2"]) == 2
+    assert "one of 2 processes ended early" in capsys.readouterr().err
+    deeds = [interrupts]
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background of a shell ignore it
+    try:
+        assert main([*given, str(place / "a.zip"), "--jobs", "2"]) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert not multiprocessing.active_children() and not (place / "a.zip").exists()
+    deeds = []
+    for name, jobs in (("a.zip", "2"), ("b.zip", "1")):
+        assert main([*given, str(place / name), "--jobs", jobs]) == 0
+    assert (place / "a.zip").read_bytes() == (place / "b.zip").read_bytes()
+
+
+def test_a_squeezed_picture_is_said_of_its_lens(place: Path) -> None:
+    name = "cooke_anamorphic_42"  # focal lengths of 42.47 and 21.47 mm
+    for file in (f"models/{name}.mlp-16x2.onnx", f"lenses/{name}.toml"):
+        [note] = blender_lenses.form_of(Path(file)).notes
+        assert "squeezed 1.98 times across" in note and "Aspect Y of 1.98" in note
+    assert blender_lenses.form_of(place / "models" / f"{LENS}.ols-36.onnx").notes == []
 
 
 def test_thumbnails_show_the_lens() -> None:

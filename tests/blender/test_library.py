@@ -121,7 +121,7 @@ def test_refusals_and_notes_are_sentences() -> None:
         variant(rms_um=25.0, poor=("pixels",), notes=("no coatings",)),
         setting(f_number=1.2, focus_m=None, unit_m=0.01, on_gpu=True),
     )
-    assert len(said) == 7 and said[0] == "The lens opens to f/1.8: f/1.2 is that" and said[-1] == "no coatings"
+    assert len(said) == 7 and said[0] == "The lens opens to f/1.8: f/1.2 renders as that" and said[-1] == "no coatings"
     assert "2.5 pixels" in said[4]
     assert library.refusals(variant(nearest_m=None), setting(focus_m=0.01)) == []
     assert library.refusals(variant(), setting(focus_m=math.inf)) == []

@@ -9,29 +9,46 @@ import numpy as np
 import pytest
 from camera_helpers import FILM, GAUSS, ROOT
 
-from neurolens.cameras import osl
+from neurolens.cameras import osl, pupil_arcs_fit
+from neurolens.cameras.blades import Blades
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.pupil_arcs import unit_disc
-from neurolens.cameras.pupil_arcs_fit import passing
 from neurolens.cli import main
+from neurolens.commands.export_osl import exact_lens
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.scalars import lower
 from neurolens.optics.apertures import Aperture
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.paraxial import first_order
 
 MODEL = ROOT / "models" / f"{GAUSS.stem}.ols-36.onnx"
 FAR = 1e9
 
 
 @cache
+def lens() -> osl.OslLens:
+    return osl.model_lens(load_model(MODEL), None, lambda share: None)
+
+
 def written() -> osl.OslCamera:
-    return osl.model_camera(load_model(MODEL), None, lambda share: None)
+    return lens().nodes[0]
 
 
 @cache
 def graph() -> Graph:
     return osl.osl_graph(written())
+
+
+@pytest.fixture
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pupils of several states found quickly, and wide."""
+    monkeypatch.setattr(pupil_arcs_fit, "_STOPS", (1.0, 0.6, 0.3))
+    monkeypatch.setattr(pupil_arcs_fit, "_ROWS", 7)
+    monkeypatch.setattr(osl, "_ACROSS", 8)
+    monkeypatch.setattr(pupil_arcs_fit, "_RAYS", 6000)
+    monkeypatch.setattr(osl, "states_between", lambda axes: [])
 
 
 def inputs(film: np.ndarray, square: np.ndarray, **changed: float) -> dict[str, np.ndarray]:
@@ -96,9 +113,55 @@ def test_rays_are_those_of_the_model_in_the_frame_of_cycles() -> None:
     np.testing.assert_allclose(np.linalg.norm(found["direction"], axis=0), 1, atol=1e-4)
 
 
+def test_zoom_is_an_input(coarse: None) -> None:
+    file = ROOT / "models" / "nikon_zoom_80_200-range.states-64.onnx"
+    made = osl.model_lens(load_model(file), None, lambda share: None)
+    program = osl.osl_program(made)
+    assert made.near_m[0] < 1.3 < 2.5 < made.near_m[1]
+    rng = np.random.default_rng(8)
+    film, square = np.repeat([[9.0], [-5.0]], 16_000, 1), rng.random((2, 16_000))
+    for zoom_mm in (96.0, 170.0):
+        given = inputs(film, square, f_number=4.0, asked_m=5.0, in_colour=0)
+        rows = {name: value[0] for name, value in given.items()}
+        found = program.evaluate(rows | {"zoom_mm": np.float32(zoom_mm)})
+        camera = OnnxCamera(load_model(file).at(zoom_mm), film_mm=FILM, focus_m=5.0, f_number=4.0)
+        rays = camera.sample(film.astype(np.float32), square.astype(np.float32), np.full(16_000, 587.56, np.float32))
+        lit, passed = rays.weight > 0, found["throughput_0"] > 0
+        assert passed.mean() > 0.5
+        for name, wanted, within in (("position", rays.origin_m, 5e-4), ("direction", rays.direction, 1e-4)):
+            mean = np.array([np.mean(found[f"{name}_{k}"][passed]) for k in range(3)]) * [1, 1, -1]
+            np.testing.assert_allclose(mean, wanted[:, lit].mean(1), atol=within)
+        assert np.mean(found["throughput_0"]) == pytest.approx(rays.weight.mean(dtype=np.float64), rel=0.02)
+
+
+def test_groups_of_a_lens_file_move_where_the_camera_is_focused(coarse: None) -> None:
+    file = ROOT / "lenses" / "tajima_retrofocus_24.toml"
+    _, made, _ = exact_lens(file, None, lambda share: None)
+    assert made.near_m == pytest.approx((0.3, 0.3), rel=1e-6)
+    program, focus_m = osl.osl_program(made), 0.45
+    square = np.random.default_rng(9).random((2, 3000))
+    film = np.repeat([[7.0], [10.0]], 3000, 1)
+    rows = inputs(film, square, f_number=4.0, asked_m=focus_m, in_colour=0)
+    given = {name: value[0] if value.size > 1 else value.item() for name, value in rows.items()}
+    found = program.evaluate(given)
+    passed = found["throughput_0"] > 0
+    assert passed.mean() > 0.5
+    start, way = (np.array([found[f"{name}_{k}"][passed] for k in range(3)]) for name in ("position", "direction"))
+    # All rays of a film point meet where the lens, its groups moved, has the point's image.
+    lens = read_lens(file).at(focus="internal", focus_m=focus_m)
+    data = first_order(lens)
+    away = (focus_m * 1e3 + data.front_principal_z_mm - lens.film_z_mm) / 1e3  # from the front principal plane
+    plane = start + (focus_m - start[2]) / way[2] * way
+    scale = np.linalg.norm(plane.mean(1)[:2]) / np.linalg.norm(film[:, 0] * 1e-3)
+    first = away / ((lens.film_z_mm - data.rear_principal_z_mm) / 1e3)
+    assert scale == pytest.approx(first, rel=0.03)  # its distortion
+    assert np.sqrt(np.mean((plane - plane.mean(1)[:, None]) ** 2)) < 2e-4
+    near = program.evaluate(given | {"asked_m": 0.28})
+    assert not near["throughput_0"].any()
+
+
 def test_at_least_95_percent_of_rays_pass() -> None:
-    shares = passing(written().sight, written().arcs)
-    assert min(shares.values()) >= 0.95
+    assert min(lens().passing().values()) >= 0.95
 
 
 def test_from_the_entrance_pupil_chief_rays_start_at_the_camera() -> None:
@@ -180,14 +243,50 @@ def test_nothing_beyond_the_domain_unless_a_warning_is_asked_for() -> None:
 @pytest.mark.parametrize("blades, roundness, rotation", [(5, 0.0, 20.0), (7, 0.4, 0.0), (16, 0.0, 5.0)])
 def test_blades_are_those_of_apertures(blades: int, roundness: float, rotation: float) -> None:
     g = Graph()
-    call = osl._Call(g, written())
-    g.outputs["open"] = osl._opened(g, call, g.input("stop_xy_mm", 2))
+    g.outputs["open"] = Blades(g).opened(g.input("stop_xy_mm", 2) * (1 / written().sight.stop_radius_mm))
     at_stop = np.random.default_rng(5).uniform(-1, 1, (2, 20_000)) * written().sight.stop_radius_mm
     at_stop = at_stop[:, np.hypot(*at_stop) <= written().sight.stop_radius_mm]
     given = inputs(at_stop, at_stop, count=blades, roundness=roundness, rotation=rotation, f_number=1.0)
     found = evaluate(g, given | {"stop_xy_mm": at_stop})["open"][0] > 0
     radius = written().sight.stop_radius_mm
     np.testing.assert_array_equal(found, Aperture(blades, rotation, roundness).inside(*at_stop, radius))
+
+
+@pytest.mark.parametrize("blades, roundness, rotation", [(5, 0.0, 20.0), (6, 0.5, 0.0), (9, 0.0, 11.0)])
+def test_samples_fill_the_blades(blades: int, roundness: float, rotation: float) -> None:
+    shape = {"count": blades, "roundness": roundness, "rotation": rotation}
+    aperture, rng = Aperture(blades, rotation, roundness), np.random.default_rng(7)
+    film = (rng.random((2, 20_000)) - 0.5) * np.array([[30.0], [20.0]])
+    square = rng.random((2, 20_000))
+    for f_number in (1.8, 4.0, 8.0):
+        round_stop, bladed = (
+            evaluate(graph(), inputs(film, square, f_number=f_number, in_colour=0, **more))["throughput"][0]
+            for more in ({}, shape)
+        )
+        assert (bladed > 0).mean() > 0.95 * (round_stop > 0).mean()
+        # Against samples of the round stop of which the blades' are kept: light and its spread over the stop.
+        found, kept = stop_light(f_number, shape, film, square), stop_light(f_number, {}, film, square)
+        inside = aperture.inside(*kept[0], 1.0)
+        assert found[1].mean() == pytest.approx(kept[1][inside].sum() / kept[1].size, rel=0.015)
+        for moment in (lambda p: p[0] ** 2, lambda p: p[1] ** 2, lambda p: p[0] ** 3 - 3 * p[0] * p[1] ** 2):
+            pair = [np.average(moment(p), weights=w) for p, w in (found, (kept[0][:, inside], kept[1][inside]))]
+            assert pair[0] == pytest.approx(pair[1], abs=0.008)
+
+
+def stop_light(f_number: float, shape: dict[str, float], film: np.ndarray, square: np.ndarray) -> tuple:
+    """Where rays cross the stop, in units of its radius, and their weights."""
+    given = inputs(film, square, f_number=f_number, in_colour=0, **shape)
+    stop = min(written().f_number / f_number, 1.0) * written().sight.stop_radius_mm
+    z = film_z(2.0, stop)
+    call = {"film_z_mm": z, "stop_radius_mm": np.array([[stop]])}
+    sampler = written().arcs.sampler(Blades, *written().stop_image)
+    nm = np.full((1, film.shape[1]), 587.5618)
+    names = ("count", "roundness", "half_cos", "half_sin", "edge_cos", "edge_sin")
+    own = {"film_mm": film, "square": square, "wavelength_nm": nm} | call | {name: given[name] for name in names}
+    pupil = evaluate(sampler, own)
+    rays = np.concatenate([film, pupil["pupil_mm"], nm])
+    at_stop = evaluate(written().sight.graph, {"rays": rays, **call})["stop_xy_mm"] / stop
+    return at_stop, evaluate(graph(), given)["throughput"][0]
 
 
 def test_exposure_as_the_lens_falls_with_the_stop() -> None:
@@ -215,7 +314,7 @@ def test_the_program_gives_what_the_graph_gives() -> None:
 
 
 def test_the_text_is_osl() -> None:
-    text, operations = osl.write_camera(written(), "gauss", ["a comment */ that tries to end"])
+    text, operations = osl.write_camera(lens(), "gauss", ["a comment */ that tries to end"])
     assert operations < 1600
     code = text.split("*/", 1)[1]
     assert not re.search(r"\d\.?(e[+-]\d+)?f\b", code) and "#include" not in code and "struct" not in code
@@ -229,7 +328,7 @@ def test_the_text_is_osl() -> None:
 
 
 def test_command_line_writes_a_shader_and_refuses_what_is_its_input(tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(osl, "model_camera", lambda *given: written())
+    monkeypatch.setattr(osl, "model_lens", lambda *given, fixed: lens())
     out = tmp_path / "lens.osl"
     assert main(["export", str(MODEL), "--to", "osl", "-o", str(out), "--name", "gauss", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

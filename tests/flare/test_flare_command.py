@@ -1,6 +1,7 @@
 """`neurolens flare` on the command line."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,14 @@ import OpenEXR
 import pytest
 
 from neurolens.cli import main
-from neurolens.render.pictures import read_exr, read_layers
+from neurolens.flare.diffraction import starburst_picture
+from neurolens.flare.ghosts import GhostTracer
+from neurolens.flare.lights import Light, light_rays
+from neurolens.flare.picture import Raster
+from neurolens.optics.apertures import Aperture
+from neurolens.optics.lensfile import read_lens
+from neurolens.render.colour import COLOUR_SPACES, SRGB, conversion
+from neurolens.render.pictures import read_exr, read_layers, write_data_exr, write_exr
 
 
 def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -20,7 +28,7 @@ def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert main(["flare", "laikin_double_gauss_50", "--light", "15,8", "--path", "g08-06", str(drawn)]) == 0
     assert drawn.read_text().startswith("<?xml")
     capsys.readouterr()
-    small = ["--width", "48", "--samples", "4096", "--wavelengths", "3", "--layers", "2", "--json"]
+    small = ["--width", "48", "--cell", "20", "--wavelengths", "3", "--layers", "2", "--json"]
     assert main(["flare", "laikin_double_gauss_50", "--light", "15,8,0.5/0.4/0.3", "-o", str(out), *small]) == 0
     told = json.loads(capsys.readouterr().out)
     rgb, metadata = read_exr(out)
@@ -30,8 +38,9 @@ def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert rgb.shape == (32, 48, 3) and rgb.sum() > 0
     assert metadata["flare"]["ghosts"] == told["ghosts"]
     top = [g["name"] for g in told["ghosts"][0][:2]]
-    names = [f"{name}.{c}" for name in (*top, "rest") for c in "RGB"]
+    names = [f"{name}.{c}" for name in ("ghosts", *top, "rest") for c in "RGB"]
     assert set(layers) == set(names)
+    np.testing.assert_array_equal(layers["ghosts.R"], rgb[..., 0])
     np.testing.assert_allclose(sum(layers[f"{name}.R"] for name in (*top, "rest")), rgb[..., 0], rtol=1e-5, atol=1e-9)
 
 
@@ -39,11 +48,167 @@ def test_photons_paint_the_ghosts(tmp_path: Path) -> None:
     """The light of photons with two reflections at most is that of the ghosts, block by block, within its noise."""
     common = ["laikin_double_gauss_50", "--light", "12,5", "--width", "24", "--wavelengths", "2", "--quiet"]
     blocks = []
-    for words in (["--samples", "65536"], ["--photons", "400000", "--reflections", "2", "--kernel", "0"]):
+    for words in (["--cell", "2"], ["--photons", "400000", "--reflections", "2", "--kernel", "0"]):
         out = tmp_path / "one.exr"
         assert main(["flare", *common, *words, "-o", str(out)]) == 0
         blocks.append(read_exr(out)[0][..., 1].reshape(2, 8, 3, 8).sum((1, 3)))
     np.testing.assert_allclose(blocks[1], blocks[0], rtol=0.12)
+
+
+def test_starburst_is_a_layer(tmp_path: Path) -> None:
+    """What the module makes, added to the ghosts under its gain."""
+    out = tmp_path / "star.exr"
+    words = ["laikin_double_gauss_50", "--light", "4,2,3", "--f-number", "11", "--blades", "5", "--width", "48"]
+    few = ["--wavelengths", "2", "--cell", "20", "--quiet", "--starburst", "--gain", "starburst=2"]
+    assert main(["flare", *words, *few, "-o", str(out)]) == 0
+    layers, rgb = read_layers(out), read_exr(out)[0]
+    lens = read_lens("lenses/laikin_double_gauss_50.toml").with_aperture(Aperture(blades=5))
+    lens = lens.at(f_number=11.0, focus_m=math.inf, focus="best")
+    alone = starburst_picture(lens, [Light(4.0, 2.0, (3.0, 3.0, 3.0))], Raster((36, 24), 48, 32), wavelengths=2)
+    np.testing.assert_allclose(layers["starburst.G"], 2 * alone[..., 1], rtol=1e-4, atol=1e-6 * alone.max())
+    np.testing.assert_allclose(layers["ghosts.G"] + layers["starburst.G"], rgb[..., 1], rtol=1e-5)
+
+
+SMALL = ["cooke_triplet_50", "--width", "36", "--cell", "4", "--wavelengths", "2", "--quiet"]
+
+
+def test_frames_go_on_and_do_not_pop(tmp_path: Path) -> None:
+    """A light that crosses: the energy changes evenly; frames that are there are kept, one that is not comes back."""
+    lights, out = tmp_path / "lights.csv", tmp_path / "a.exr"
+    lights.write_text("light,frame,azimuth_deg,elevation_deg\nsun,1,-6,14\nsun,5,6,14.4\n")
+    words = ["flare", *SMALL, "--lights", str(lights), "--frames", "1:5", "--layers", "2", "-o", str(out)]
+    assert main(words) == 0
+    files = [tmp_path / f"a.{frame:04d}.exr" for frame in range(1, 6)]
+    assert sorted(tmp_path.glob("*.exr")) == files
+    energy = np.array([read_exr(file)[0][..., 1].sum() for file in files])
+    assert np.abs(np.diff(energy)).max() < 0.1 * energy.mean()
+    assert len({tuple(sorted(read_layers(file))) for file in files}) == 1
+    kept, before = files[1].stat().st_mtime_ns, files[3].read_bytes()
+    files[3].unlink()
+    assert main(words) == 0
+    assert files[1].stat().st_mtime_ns == kept and files[3].read_bytes() == before
+
+
+def test_noise_is_that_of_the_seed_in_every_frame(tmp_path: Path) -> None:
+    out = tmp_path / "a.exr"
+    words = ["flare", *SMALL, "--light", "7,4", "--photons", "20000", "-o", str(out)]
+    assert main([*words, "--frames", "1:2"]) == 0
+    assert main([*words, "--seed", "3"]) == 0
+    first, second, other = (read_exr(tmp_path / name)[0] for name in ("a.0001.exr", "a.0002.exr", "a.exr"))
+    assert first.any() and np.array_equal(first, second) and not np.array_equal(first, other)
+
+
+def test_lens_by_keys(tmp_path: Path) -> None:
+    out = tmp_path / "a.exr"
+    words = ["flare", *SMALL, "--light", "5,3", "-o", str(out)]
+    assert main([*words, "--frames", "0:2", "--key", "f-number=0:5.6,2:22.4"]) == 0
+    assert main([*words, "--f-number", "11.2"]) == 0
+    first, middle, alone = (read_exr(tmp_path / name)[0] for name in ("a.0000.exr", "a.0001.exr", "a.exr"))
+    assert not np.array_equal(first, middle)
+    np.testing.assert_allclose(middle, alone, rtol=1e-4, atol=1e-6 * alone.max())
+
+
+def test_gains_and_tints(tmp_path: Path) -> None:
+    """Of a ghost, of all that a surface reflects, of the layer; they multiply, and parts stay parts."""
+    found = []
+    gains = ["--gain", "s05=0.5", "--tint", "g05-03=1/0/2", "--gain", "ghosts=3"]
+    for words in ([], gains):
+        out = tmp_path / "a.exr"
+        assert main(["flare", *SMALL, "--light", "-10,5", "--layers", "15", *words, "-o", str(out)]) == 0
+        found.append(read_layers(out))
+    plain, changed = found
+    assert {"g05-03.R", "g04-03.R", "g05-01.G"} <= plain.keys() == changed.keys()
+    for name, before in plain.items():
+        if name.startswith(("g0", "rest")):
+            factor = 1.5 if "05" in name else 3.0
+            factor *= {"R": 1, "G": 0, "B": 2}[name[-1]] if name.startswith("g05-03") else 1
+            np.testing.assert_allclose(changed[name], factor * before, rtol=1e-6)
+    for c in "RGB":
+        parts = sum(v for name, v in changed.items() if name.endswith(c) and not name.startswith("ghosts"))
+        np.testing.assert_allclose(parts, changed[f"ghosts.{c}"], rtol=1e-5, atol=1e-9)
+
+
+def test_highlights_are_where_the_lens_images_lights(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The direction of a highlight is that of the light whose image, traced exactly, lies in its pixel."""
+    lens = read_lens("lenses/cooke_triplet_50.toml").at(focus_m=math.inf, f_number=8.0)
+    light = Light(12.0, -6.0)
+    rays, _ = light_rays(lens, light, 0, 4096)
+    arrived = GhostTracer(lens, []).trace(rays, 550.0, direct=True)
+    x, y = -arrived.film_xy_mm[0] @ arrived.power[0] / arrived.power[0].sum()
+    plate, file = np.zeros((240, 360, 3), np.float32), tmp_path / "plate.0007.exr"
+    plate[int(120 - 10 * y), int(180 + 10 * x)] = 50.0
+    write_exr(file, plate)
+    words = ["--image", str(tmp_path / "plate.####.exr"), "--f-number", "8", "--json"]
+    assert main(["flare", *SMALL, *words, "--frames", "7:7", "-o", str(tmp_path / "a.exr")]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["lights"]
+    pixel = math.degrees(0.1 / 50)
+    assert found["azimuth_deg"] == pytest.approx(light.azimuth_deg, abs=0.8 * pixel)
+    assert found["elevation_deg"] == pytest.approx(light.elevation_deg, abs=0.8 * pixel)
+    write_data_exr(file, {c: np.full((24, 36), np.nan, np.float32) for c in "RGB"}, {})
+    assert main(["flare", *SMALL, "--image", str(file)]) == 2
+    assert "finite" in capsys.readouterr().err
+
+
+SCENE = """
+points = [{ position_m = [-0.3, 1.3, 0.0], intensity = [2.0, 1.0, 0.5], illuminant = "2900 K" }]
+[camera]
+position_m = [0.0, 1.0, 2.0]
+look_at_m = [0.0, 1.0, 0.0]
+focus_m = 2.0
+film_width_mm = 36.0
+film_height_mm = 24.0
+width = 36
+height = 24
+samples = 1
+[film]
+white_balance = "2900 K"
+colour_space = "ACEScg"
+[flare]
+coating = "single-layer"
+bins = 3
+brightest = 2
+"""
+
+
+def test_renders_of_a_scene_have_its_flare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The layers of a render are those of the command by the scene's lights, in the render's colours."""
+    scene, out = tmp_path / "scene.toml", tmp_path / "a.exr"
+    scene.write_text(SCENE)
+    lens = "lenses/cooke_triplet_50.toml"
+    assert main(["render", str(scene), "--camera", lens, "-o", str(out), "--layers", "beauty", "--quiet"]) == 0
+    found = read_layers(out)
+    assert len(found) == 12 and not read_exr(out)[0].any()
+    words = ["--lights", str(scene), "--coating", "single-layer", "--focus", "2", "--wavelengths", "3"]
+    assert main(["flare", "cooke_triplet_50", *words, "--width", "36", "-o", str(out), "--quiet"]) == 0
+    ghosts = np.stack([found[f"ghosts.{c}"] for c in "RGB"], -1) @ conversion(COLOUR_SPACES["ACEScg"], SRGB).T
+    plain = read_exr(out)[0]
+    assert plain.any()
+    # One matrix, the white balance's, takes all pixels.
+    matrix, *_ = np.linalg.lstsq(plain.reshape(-1, 3).astype(float), ghosts.reshape(-1, 3), rcond=None)
+    np.testing.assert_allclose(plain @ matrix, ghosts, atol=1e-4 * ghosts.max())
+    assert main(["render", str(scene), "--camera", "pinhole", "-o", str(out), "--layers", "beauty"]) == 0
+    assert read_layers(out) == {} and "no flare of" in capsys.readouterr().err
+    for table, said in (('coating = "velvet"', "velvet"), ("bins = 0", "flare.bins"), ('without = ["x"]', "without"),
+                        ("speed = 2", "flare.speed")):  # fmt: skip
+        scene.write_text(SCENE.partition("[flare]")[0] + f"[flare]\n{table}\n")
+        assert main(["render", str(scene), "--camera", lens, "-o", str(out), "--quiet"]) == 2
+        assert said in capsys.readouterr().err
+
+
+def test_ghosts_and_glare_are_all(tmp_path: Path) -> None:
+    """Of the same seeds' photons; what scatters adds to the glare, and a share of the film is no share of the rest."""
+    common = ["laikin_double_gauss_50", "--light", "12,5", "--width", "24", "--wavelengths", "2", "--quiet"]
+    common += ["--kernel", "0", "--photons", "300000"]
+    sums, found = [], {}
+    for words in ([], ["--glare", "300000"], ["--glare", "300000", "--barrel", "0.5", "--sensor", "0.5", "--preview"]):
+        out = tmp_path / "one.exr"
+        assert main(["flare", *common, *words, "-o", str(out)]) == 0
+        found = read_layers(out)
+        assert set(found) == {f"{layer}.{c}" for layer in (["ghosts", "glare"] if words else ["ghosts"]) for c in "RGB"}
+        sums.append((float(found["ghosts.G"].sum()), float(found["glare.G"].sum()) if words else 0.0))
+    assert sum(sums[1]) == pytest.approx(sums[0][0], rel=0.02)
+    assert 0 < sums[1][1] < 0.2 * sums[1][0]
+    assert sums[2][1] > 2 * sums[1][1] and sums[2][0] == pytest.approx(sums[1][0], rel=0.1)
 
 
 @pytest.mark.parametrize(
@@ -53,9 +218,19 @@ def test_photons_paint_the_ghosts(tmp_path: Path) -> None:
         (["--light", "1"], "AZ,EL"),
         (["--light", "1,2,3/4"], "AZ,EL"),
         (["--light", "1,2,1,0"], "positive distance"),
-        (["--light", "1,2", "--photons", "9", "--layers", "2", "-o", "x.exr"], "--layers"),
+        (["--light", "1,2", "--photons", "9", "--layers", "2", "-o", "x.exr"], "single ghosts"),
+        (["--light", "1,2", "--without", "haze", "-o", "x.exr"], "layers of flare"),
         (["--light", "0,0", "-o", "x.png"], ".exr"),
         (["--light", "0,0", "--coating", "velvet"], "velvet"),
+        ([], "--light, --lights or --image"),
+        (["--light", "0,0", "--key", "focus=1:2"], "--frames"),
+        (["--light", "0,0", "--frames", "1:2"], "-o beside it"),
+        (["--light", "0,0", "-o", "x.exr", "--gain", "s99=2"], "of this lens"),
+        (["--light", "0,0", "-o", "x.exr", "--gain", "g01-00=2", "--photons", "9"], "single ghosts"),
+        (["--light", "0,0", "-o", "no/where.exr"], "folder that exists"),
+        (["--lights", "none.csv"], "that exists"),
+        (["--image", "none.exr"], "none.exr"),
+        (["--light", "0,0", "-o", "x.exr", "--width", "16384", "--film", "10x300", "--layers", "60"], "bytes"),
         (["--light", "0,0", "--path", "g99-01", "x.png"], "g99-01"),
         (["--light", "0,0", "--path", "g08-06", "x.gif"], "--path"),
     ],
@@ -63,3 +238,10 @@ def test_photons_paint_the_ghosts(tmp_path: Path) -> None:
 def test_bad_words(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["flare", "laikin_double_gauss_50", *words]) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["--barrel", "1.1"], ["--haze", "nan"], ["--sensor", "0.95"], ["--glare", "-1"]])
+def test_scatter_has_bounds(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["flare", "laikin_double_gauss_50", "--light", "0,0", *words])
+    assert words[0] in capsys.readouterr().err

@@ -11,16 +11,9 @@ import torch
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.flare.ghosts import GhostTracer, Pair, coated, ghost_pairs
+from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import (
-    Light,
-    Raster,
-    axis_irradiance,
-    ghost_layout,
-    ghost_picture,
-    ghost_table,
-    light_rays,
-)
+from neurolens.flare.picture import Raster, axis_irradiance, ghost_layout, ghost_picture, ghost_table
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
@@ -73,7 +66,7 @@ CASES = {
 def test_compiled_ghosts_are_the_exact_ones(case: str) -> None:
     lens = CASES[case]()
     pairs = ghost_pairs(lens)
-    tracer = GhostTracer(lens, pairs[:: max(1, len(pairs) // (3 if case == "aspheres" else 9))])
+    tracer = GhostTracer(lens, pairs[:: max(1, len(pairs) // 9)])
     rays, _ = light_rays(lens, Light(7.0, -4.0), 0, 3000)
     found = tracer.trace(rays, 480.0)
     arrived = 0
@@ -145,7 +138,7 @@ def test_a_picture_holds_the_light_that_falls_on_it() -> None:
     """A film that holds every ghost of a plate: the picture's sum is the rays' power, in every layer."""
     lens = plate()
     tracer, raster, light = GhostTracer(lens), Raster((60.0, 40.0), 120, 80), Light(5.0, 0.0, (2.0, 2.0, 2.0))
-    picture = ghost_picture(tracer, [light], raster, wavelengths=3, samples=4096, layers=[1], threads=1)
+    picture = ghost_picture(tracer, [light], raster, wavelengths=3, layers=[1], threads=1)
     assert picture.shape == (2, 80, 120, 3) and not picture[0].any()
     rays, area = light_rays(lens, light, 0, 4096)
     flux = 2 * area * tracer.trace(rays, 550.0).power[0].mean()
@@ -199,6 +192,9 @@ BAD = [
     (lambda: GhostTracer(replace(plate(), film_z_mm=None)), "focused"),
     (lambda: GhostTracer(plate()).trace(np.zeros((3, 4)), 550.0), r"\[6, N\]"),
     (lambda: coated(plate(), "velvet"), "velvet"),
+    (lambda: coated(plate(), "s03=bare"), "s00=NAME to s02=NAME"),
+    (lambda: coated(plate(), "s02=three-layer"), "two different media"),
+    (lambda: coated(plate(), "bare,three-layer"), "one design"),
 ]
 
 
@@ -206,6 +202,12 @@ BAD = [
 def test_refusals(call: object, word: str) -> None:
     with pytest.raises(InputError, match=word):
         call()  # type: ignore[operator]
+
+
+def test_coatings_of_single_surfaces() -> None:
+    found = [s.coating and s.coating.name for s in coated(plate(), "three-layer,s01=multi-layer 520").surfaces]
+    assert found == ["three-layer", "multi-layer 520", None]
+    assert [s.coating and s.coating.name for s in coated(plate(), "s00=bare").surfaces] == ["bare", None, None]
 
 
 def test_coatings_of_the_file_stay() -> None:

@@ -130,6 +130,11 @@ BAD_HEADS = [
     ("schema = 1", "schema = 1\ncoating = [{ name = 'a', layers = [[1.38]] }]", ["coating 0, layers", "[1.38]"]),
     (
         "schema = 1",
+        "schema = 1\ncoating = [{ name = 'a', layers = [[1.38, 90, 0]] }]",
+        ["coating 0, layer 0, V_d", "above 0"],
+    ),
+    (
+        "schema = 1",
         "schema = 1\ncoating = [{ name = 'a', layers = [[1.38, 0]] }]",
         ["coating 0, layer 0, thickness_nm"],
     ),
@@ -300,7 +305,7 @@ def test_a_focused_lens_keeps_its_film(tmp_path: Path) -> None:
 
 
 def test_every_kind_of_surface_comes_back(tmp_path: Path) -> None:
-    film = Coating("mine", ((1.38, 99.6), (2.1, 12.5)))
+    film = Coating("mine", ((1.38, 99.6), (2.1, 12.5, 22.0)))
     asphere = replace(PLATE, radius_mm=40.0, conic=-1.5, asphere=((3, -1e-5), (4, 1e-7)), coating=film)
     cylinder = replace(PLATE, radius_mm=-80.0, cylinder="x", conic=0.25)
     grey = replace(PLATE, absorption_per_mm=0.23)
@@ -312,6 +317,18 @@ def test_every_kind_of_surface_comes_back(tmp_path: Path) -> None:
         again = read_lens(tmp_path / "shapes.toml")
         assert replace(again, path=change.path) == change
         assert again.sha256 == change.sha256
+
+
+@pytest.mark.parametrize("name", ["bare", "broadband 500", "three-layer", "multi-layer"])
+def test_a_design_on_two_glasses_comes_back(tmp_path: Path, name: str) -> None:
+    """Its films differ by the glass: the name alone is written."""
+    text = GOOD
+    for n_d in ("n_d = 1.6,", "n_d = 1.5168,"):
+        text = text.replace(n_d, f'{n_d} coating = "{name}",')
+    lens = read_lens(write(tmp_path, text))
+    write_lens(lens, tmp_path / "again.toml")
+    assert read_lens(tmp_path / "again.toml").surfaces == lens.surfaces
+    assert sum(s.coating is not None for s in lens.surfaces) == 2
 
 
 @pytest.mark.parametrize(

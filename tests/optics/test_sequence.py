@@ -1,5 +1,6 @@
 """Ghost paths against 50-digit references, closed forms of a plate, and the plain trace."""
 
+import itertools
 import json
 import math
 from dataclasses import replace
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import test_oracle as oracle
+import tmm
 import torch
 
 from neurolens.base import status as st
@@ -16,6 +18,7 @@ from neurolens.base.errors import InputError
 from neurolens.flare.ghosts import GhostTracer, Pair
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Coating, Lens, Surface
+from neurolens.optics.sag import same_medium
 from neurolens.optics.sequence import Followed, backwards, follow, ghost
 from neurolens.optics.trace import Rays, trace
 
@@ -51,6 +54,64 @@ def test_own_selection(dtype: torch.dtype) -> None:
     lenses = {e["name"]: oracle.own(e).lens for e in oracle.OWN}
     passed = sum(compare(lenses[e["lens"]], e, dtype) for e in json.loads(DATA.read_text())["ghosts"])
     assert passed > 20
+
+
+FILMS = ((1.38, 99.6), (2.1, 131.0), (1.7, 80.9))
+
+
+def jones(lens: Lens, entry: dict[str, Any], row: dict[str, Any]) -> tuple[float, float]:
+    """Power of a coated ghost along points, by tmm's amplitudes: polarised, and averaged on the way."""
+    way = [np.array(row["o"]), *(np.array(p) for p in row["points"])]
+    ways = [(b - a) / np.linalg.norm(b - a) for a, b in itertools.pairwise(way)] + [np.array(row["dir"])]
+    n, ahead, whole, average, last = [1.0, *(float(s.n_d) for s in lens.surfaces)], True, np.eye(2), 1.0, None
+    steps = ghost(len(lens.surfaces), *entry["ghost"])
+    for (k, action), (before, after) in zip(steps, itertools.pairwise(ways), strict=True):
+        n1, n2 = (n[k], n[k + 1]) if ahead else (n[k + 1], n[k])
+        ahead ^= action == "R"
+        if n1 == n2:
+            continue
+        normal = after - before if action == "R" else n2 * after - n1 * before  # by the law of refraction
+        s = np.cross(before, normal)
+        s = s / np.linalg.norm(s) if np.linalg.norm(s) > 1e-7 else np.cross(before, [0.0, 1.0, 0.0])
+        if last is not None:
+            cos, sin = s @ last, s @ np.cross(before, last)
+            whole = np.array([[cos, sin], [-sin, cos]]) @ whole
+        cos_i, cos_t = (abs(normal @ d) / np.linalg.norm(normal) for d in (before, after))
+        films = FILMS if ahead ^ (action == "R") else FILMS[::-1]
+        stack, thick = [n1, *(v for v, _ in films), n2], [np.inf, *(t for _, t in films), np.inf]
+        found = [tmm.coh_tmm(pol, stack, thick, math.acos(min(cos_i, 1.0)), LINE_D_NM) for pol in "sp"]
+        average *= 0.5 * sum(f[action] for f in found)
+        share = math.sqrt(n2 * cos_t / (n1 * cos_i)) if action == "T" else 1.0
+        whole = np.diag([f[action.lower()] * share for f in found]) @ whole
+        last = s
+    return 0.5 * float((np.abs(whole) ** 2).sum()), average
+
+
+def test_coated_ghosts_polarised_and_averaged() -> None:
+    """The reference's points, to 1e-11 mm, and the power of Jones matrices along them."""
+    lenses, passed, differ = {e["name"]: oracle.own(e).lens for e in oracle.OWN}, 0, 0.0
+    for entry in json.loads(DATA.read_text())["ghosts"]:
+        lens = lenses[entry["lens"]]
+        bends = [not same_medium(lens.surfaces, k) for k in range(len(lens.surfaces))]
+        rows = (
+            replace(s, coating=Coating("films", FILMS) if b else None)
+            for s, b in zip(lens.surfaces, bends, strict=True)
+        )
+        lens = replace(lens, surfaces=tuple(rows))
+        given = [{**r, "origin": r["o"], "direction": r["d"]} for r in entry["rays"] if r["status"] == "ok"]
+        if not given:
+            continue
+        rays, steps = oracle.launched(given, torch.float64), ghost(len(lens.surfaces), *entry["ghost"])
+        exact, mean = (follow(lens, rays, steps, polarised=way) for way in (True, False))
+        for i, row in enumerate(given):
+            places = [[float(p[i]) for p in point] for point in exact.points]
+            np.testing.assert_allclose(places, row.get("points", places), rtol=0, atol=1e-11)
+            expected = jones(lens, entry, {**row, "points": places})
+            assert float(exact.power[i]) == pytest.approx(expected[0], rel=1e-9)
+            assert float(mean.power[i]) == pytest.approx(expected[1], rel=1e-9)
+            differ = max(differ, abs(expected[0] / expected[1] - 1))
+            passed += 1
+    assert passed > 20 and differ > 0.01, (passed, differ)
 
 
 def test_compiled_ghosts() -> None:

@@ -49,7 +49,8 @@ def setting_of(scene: Any, found: Any) -> Setting:
     custom = camera.cycles_custom if applied(camera) else {}
     f_number = float(custom["f_number"]) if "f_number" in custom else None
     own = float(custom["focus_m"]) if "focus_m" in custom else 0.0  # of the shader; above 0 it rules
-    focus = own if own > 0 else focus_m(found) if camera.dof.use_dof else None
+    off = applied(camera) and not camera.dof.use_dof  # putting a lens on switches it on
+    focus = own if own > 0 else None if off else focus_m(found)
     return Setting(
         sensor_mm=sensor_mm(camera, render),
         pixels=max(1, round(render.resolution_x * render.resolution_percentage / 100)),
@@ -142,7 +143,6 @@ def _set(scene: Any, camera: Any, lens: LensFacts, variant: Variant, source: str
     first = not applied(camera)
     opened = camera.dof.aperture_fstop if camera.dof.use_dof else None
     scene.render.engine = "CYCLES"
-    scene.cycles.shading_system = True
     if _on_other_gpu(scene):
         scene.cycles.device = "CPU"
     if width_mm is not None:
@@ -200,9 +200,7 @@ def _remembered(scene: Any, camera: Any) -> dict[str, Any]:
     kept["custom_shader"] = None if camera.custom_shader is None else camera.custom_shader.name
     kept["use_dof"] = camera.dof.use_dof
     kept["custom"] = {k: _plain(v) for k, v in camera.cycles_custom.items()}
-    cycles = scene.cycles
-    before = {"engine": scene.render.engine, "shading_system": cycles.shading_system, "device": cycles.device}
-    return {"camera": kept, "scene": before}
+    return {"camera": kept, "scene": {"engine": scene.render.engine, "device": scene.cycles.device}}
 
 
 def _plain(value: Any) -> Any:
@@ -241,8 +239,7 @@ def _put_back(scene: Any, camera: Any, memory: dict[str, Any]) -> None:
     for name, value in custom.items():
         camera.cycles_custom[name] = value
     if before := memory.get("scene"):
-        scene.cycles.device, scene.cycles.shading_system = before["device"], before["shading_system"]
-        scene.render.engine = before["engine"]
+        scene.cycles.device, scene.render.engine = before["device"], before["engine"]
     _drop(text)
 
 

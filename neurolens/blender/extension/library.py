@@ -160,9 +160,8 @@ def refused(version: tuple[int, ...], has_osl: bool = True) -> str | None:
 def refusals(variant: Variant, setting: Setting) -> list[str]:
     """Why a lens is not put on a camera."""
     found = []
-    diagonal, circle = math.hypot(*setting.sensor_mm), 2 * variant.film_radius_mm
-    if diagonal > BEYOND * circle:
-        width, height = setting.sensor_mm
+    if too_large(variant, setting):
+        (width, height), circle = setting.sensor_mm, 2 * variant.film_radius_mm
         fitting = fitting_width_mm(variant, setting)
         found.append(
             f"The sensor, {width:.4g} x {height:.4g} mm, is larger than the lens's picture of {circle:.4g} mm: "
@@ -172,6 +171,11 @@ def refusals(variant: Variant, setting: Setting) -> list[str]:
         what = f"The focus object {setting.focus_object!r}" if setting.focus_object else "The focus distance"
         found.append(f"{what} is {setting.focus_m:.4g} m away, nearer than the lens focuses: {variant.nearest_m:.4g} m")
     return found
+
+
+def too_large(variant: Variant, setting: Setting) -> bool:
+    """Whether the sensor is larger than the lens's picture."""
+    return math.hypot(*setting.sensor_mm) > BEYOND * 2 * variant.film_radius_mm
 
 
 def too_near(variant: Variant, setting: Setting) -> bool:
@@ -191,7 +195,7 @@ def notes(variant: Variant, setting: Setting) -> list[str]:
     """What else the user should know of a setting that works."""
     found = []
     if setting.f_number is not None and setting.f_number * NOMINAL < variant.f_number:
-        found.append(f"The lens opens to f/{variant.f_number:.3g}: f/{setting.f_number:.3g} is that")
+        found.append(f"The lens opens to f/{variant.f_number:.3g}: f/{setting.f_number:.3g} renders as that")
     if setting.focus_m is None:
         found.append("Depth of field is off: the lens is focused at infinity")
     if setting.unit_m != 1.0:

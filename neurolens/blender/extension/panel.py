@@ -9,9 +9,16 @@ import bpy
 import bpy.utils.previews
 
 from . import camera as on_camera
-from .library import KINDS, LensError, LensFacts, error_px, notes, read_library, refusals, refused
+from .library import KINDS, LensError, LensFacts, error_px, notes, read_library, refusals, refused, too_large
 
-_FIRST = ("f_number", "focus_m")  # of the settings, before the others
+_FIRST = ("f_number", "focus_m", "zoom_mm")  # of the settings, before the others
+_LABELS = {  # where Blender would show the name alone
+    "f_number": "F-Number",
+    "focus_m": "Focus (m)",
+    "zoom_mm": "Zoom (mm)",
+    "exposure": "Exposure: 0 Blender, 1 Lens",
+    "origin": "Origin: 0 Film, 1 Pupil",
+}
 
 
 class Library:
@@ -207,22 +214,24 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
         row = layout.row(align=True)
         for name in lens.variants:
             row.prop_enum(props, "kind", name)
-        if props.message:
-            _wrapped(layout, props.message, "ERROR")
         found = context.object if context.object is not None and context.object.type == "CAMERA" else None
-        if found is None or found.data != camera:
-            return
-        self._draw_scene(context, found, lens, kind)
+        if found is not None and found.data == camera:
+            self._draw_scene(context, found, lens, kind)
+        elif props.message:
+            _wrapped(layout, props.message, "ERROR")
 
     def _draw_scene(self, context: Any, found: Any, lens: LensFacts, kind: str) -> None:
         layout, camera = self.layout, found.data
         variant, setting = lens.variants[kind], on_camera.setting_of(context.scene, found)
-        wrong = refusals(variant, setting)
-        if not on_camera.applied(camera):
+        wrong, message = refusals(variant, setting), camera.neurolens.message
+        if message and message != "; ".join(wrong):
+            _wrapped(layout, message, "ERROR")
+        applied = on_camera.applied(camera)
+        if not applied:
             layout.operator("neurolens.apply", icon="CAMERA_DATA")
-            if wrong:
-                layout.operator("neurolens.apply", text="Fit Sensor and Put On").fit_sensor = True
-        else:
+        if too_large(variant, setting):
+            layout.operator("neurolens.apply", text="Fit Sensor and Put On").fit_sensor = True
+        if applied:
             layout.operator("neurolens.take_back", icon="LOOP_BACK")
             self._draw_settings(camera)
         layout.operator("neurolens.reload", icon="FILE_REFRESH")
@@ -242,7 +251,7 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
         distance.prop(camera.dof, "focus_distance")
         column.prop(camera, "sensor_width")
         for name in names:
-            column.prop(custom, f'["{name}"]')
+            column.prop(custom, f'["{name}"]', text=_LABELS.get(name, name.capitalize()))
 
 
 def _wrapped(layout: Any, text: str, icon: str, width: int = 60) -> None:

@@ -1,0 +1,218 @@
+"""Ghosts drawn in several ways: error against the converged picture, and milliseconds a picture.
+
+All draw the same light through a double Gauss, 960 x 540 pixels, by the areas of the cells of a pupil grid. Exact: rays
+traced through all surfaces, compiled, on grids as fine as each ghost is large and bright, or on one sparse grid for all
+(after Hullin et al. 2011); the same rays path by path in torch, whose picture is that of the compiled ones. Fitted: a
+polynomial a ghost; and of first order, two matrices a ghost (after Lee and Eisemann 2013), here with all the rims of
+the polynomial and a constant power. RMS on the film is of rays that both let through, of the ghosts that carry 99% of
+the light, weighted by light. Times are without compiling, fitting and the exposure of the lens. Writes ghosts.md,
+ghosts.json and ghosts.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from experiments import lab
+from neurolens.base.files import atomic_path
+from neurolens.base.progress import Progress
+from neurolens.evaluate.image import flip, flip_map
+from neurolens.flare import grids, picture
+from neurolens.flare.ghostfit import GhostSettings, first_order_ghosts, fit_ghosts
+from neurolens.flare.ghostmodel import GhostModel
+from neurolens.flare.ghosts import GhostTracer
+from neurolens.flare.lights import Light, light_rays, rays_across
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens
+from neurolens.optics.sequence import follow, ghost
+from neurolens.optics.trace import Rays
+
+LENS, LIGHT = "laikin_double_gauss_50", Light(15.0, 8.0)
+RASTER = picture.Raster((36.0, 20.25), 960, 540)
+WAVELENGTHS, _SPARSE, _NM = 15, 32, 550.0
+GOAL_UM, GOAL_ENERGY, GOAL_FLIP, GOAL_TORCH, GOAL_C, GOAL_MS = 20.0, 0.01, 0.03, 15.0, 4.0, 100.0
+
+OPTIONS = [lab.count("rounds", 5, "of which the best counts (default: 5)"), lab.out()]
+
+
+@dataclass(frozen=True)
+class Row:
+    """`rms_um`: None for exact rays. `energy`: of the picture over the converged one, less 1. `cpu_ms`: one thread;
+    `wall_ms`: two threads; None where it was not drawn so."""
+
+    way: str
+    cell_px: float
+    wavelengths: int
+    rms_um: float | None
+    energy: float
+    flip: float
+    cpu_ms: float
+    wall_ms: float | None
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, draw, write."""
+    lab.quiet_glasses()
+    torch.set_num_threads(1)
+    lens = read_lens(lab.LENSES / f"{LENS}.toml").at(focus_m=math.inf)
+    tracer, progress = GhostTracer(lens), Progress(quiet=args.quiet)
+    with progress.stage("fit") as report:
+        fitted = fit_ghosts(lens, GhostSettings(), report)
+        linear = first_order_ghosts(fitted)
+    with progress.stage("converged"):
+        reference = _drawn(tracer, 3.0, wavelengths=45)
+    exposure = picture.axis_irradiance(lens, _NM)
+    known = picture.axis_irradiance
+    picture.axis_irradiance = lambda lens, wavelength_nm: exposure  # of the lens alone
+    rows, shown = [], {"exact, converged": reference}
+    ways: list[tuple[str, Any, float, int]] = [
+        *(("exact, compiled", tracer, cell, WAVELENGTHS) for cell in (8.0, 32.0)),
+        ("exact, one sparse grid", tracer, 0.0, WAVELENGTHS),
+        *(("polynomials", fitted, cell, WAVELENGTHS) for cell in (8.0, 32.0)),
+        ("polynomials", fitted, 32.0, 8),
+        ("first order", linear, 32.0, WAVELENGTHS),
+    ]
+    try:
+        for name, model, cell, count in ways:
+            with progress.stage(f"{name}, {cell:g} px, {count} wavelengths"), _grid(cell):
+                found = _drawn(model, cell or 8.0, 1, count)
+                times = [_timed(model, cell or 8.0, threads, count, args.rounds) for threads in (1, 2)]
+            rms = None if model is tracer else _rms(tracer, model)
+            energy = float(found.sum(dtype=np.float64) / reference.sum(dtype=np.float64) - 1)
+            rows.append(Row(name, cell, count, rms, energy, flip(*_shown(found, reference)), times[0][0], times[1][1]))
+            shown[f"{name}, {f'cells of {cell:g} px, ' if cell else ''}{count} wavelengths"] = found
+    finally:
+        picture.axis_irradiance = known
+    exact = next(r for r in rows if r.cell_px == 32.0)
+    rows.append(replace(exact, way="exact, torch", cpu_ms=exact.cpu_ms + _torch_ms(lens, tracer, 32.0), wall_ms=None))
+    goals = _goals(rows)
+    about = f"{fitted.report['kept']} of {fitted.report['pairs']} ghosts are fitted, with "
+    about += f"{fitted.report['kept_energy']:.2%} of their light, in {fitted.report['seconds']:.0f} s."
+    text = lab.page(
+        "# Ghosts, drawn", __doc__ or "", about, lab.table(_COLUMNS, rows, "-"), lab.goal_table("Goal", goals)
+    )
+    told = {"machine": lab.machine(), "rounds": args.rounds, "rows": [asdict(r) for r in rows], "fit": fitted.report}
+    _draw(args.out, shown, reference)
+    print(lab.write_results(args.out, "ghosts", text, told))
+    return 0
+
+
+def _goals(rows: list[Row]) -> list[lab.Goal]:
+    exact, mine = (
+        next(r for r in rows if r.way == way and r.cell_px == 32.0) for way in ("exact, compiled", "polynomials")
+    )
+    slow = next(r for r in rows if r.way == "exact, torch")
+    return [
+        lab.Goal("RMS on the film, um", GOAL_UM, mine.rms_um),
+        lab.Goal("energy, off by", GOAL_ENERGY, abs(mine.energy)),
+        lab.Goal("FLIP", GOAL_FLIP, mine.flip),
+        lab.Goal("time over that of exact in torch", 1 / GOAL_TORCH, mine.cpu_ms / slow.cpu_ms),
+        lab.Goal("time over that of exact as C", 1 / GOAL_C, mine.cpu_ms / exact.cpu_ms),
+        lab.Goal("ms a picture, two cores", GOAL_MS, mine.wall_ms),
+    ]
+
+
+@contextmanager
+def _grid(cell: float) -> Iterator[None]:
+    """Grids of one size for all ghosts where no cell is given."""
+    kept = grids.FEWEST, grids.MOST
+    if not cell:
+        grids.FEWEST = grids.MOST = _SPARSE
+    try:
+        yield
+    finally:
+        grids.FEWEST, grids.MOST = kept
+
+
+def _drawn(model: Any, cell: float, threads: int = 1, wavelengths: int = WAVELENGTHS) -> Any:
+    return picture.ghost_picture(model, [LIGHT], RASTER, wavelengths=wavelengths, cell_px=cell, threads=threads)[0]
+
+
+def _timed(model: Any, cell: float, threads: int, wavelengths: int, rounds: int) -> tuple[float, float]:
+    """Best CPU and wall time in ms."""
+    cpu, wall = math.inf, math.inf
+    for _ in range(rounds):
+        began = time.process_time(), time.perf_counter()
+        _drawn(model, cell, threads, wavelengths)
+        cpu, wall = min(cpu, time.process_time() - began[0]), min(wall, time.perf_counter() - began[1])
+    return 1000 * cpu, 1000 * wall
+
+
+def _torch_ms(lens: Lens, tracer: GhostTracer, cell: float) -> float:
+    """CPU time that the rays of the grids take path by path, float32, less that of the compiled ones."""
+    half = RASTER.film_mm[0] / 2, RASTER.film_mm[1] / 2
+    slow = fast = 0.0
+    for pair, grid in grids.grids_of(tracer, LIGHT, _NM, half, cell / RASTER.per_mm).items():
+        rays, _ = rays_across(lens, LIGHT, grid.places)
+        given, start = Rays(*torch.from_numpy(rays).float()), tracer.start(rays)
+        a = time.process_time()
+        follow(lens, given, ghost(len(lens.surfaces), *pair), _NM)
+        b = time.process_time()
+        tracer.follow(start, _NM, only=[pair], reach=grids.REACH)
+        slow, fast = slow + b - a, fast + time.process_time() - b
+    return 1000 * WAVELENGTHS * (slow - fast)
+
+
+def _rms(tracer: GhostTracer, model: GhostModel) -> float:
+    """um, of the ghosts that carry 99% of this light."""
+    rays, _ = light_rays(tracer.lens, LIGHT, 0, 1 << 15)
+    start, again, half = tracer.start(rays), model.start(rays), np.array(RASTER.film_mm)[:, None] / 2
+    energy, sums = [], []
+    for pair in model.pairs:
+        exact, mine = (
+            of.follow_each(at, [_NM], pair)[0].astype(np.float64) for of, at in ((tracer, start), (model, again))
+        )
+        here = (exact[3] <= 1) & (np.abs(exact[:2]) < half).all(0)
+        both = here & (mine[3] <= 1)
+        off = ((mine[:2] - exact[:2])[:, both] ** 2).sum(0)
+        energy.append(float(exact[2, here].sum()))
+        sums.append((float((exact[2, both] * off).sum()), float(exact[2, both].sum())))
+    order = np.argsort(energy)[::-1]
+    most = order[: 1 + int(np.searchsorted(np.cumsum(np.array(energy)[order]), 0.99 * sum(energy)))]
+    off, light = np.array(sums)[most].sum(0)
+    return 1000 * math.sqrt(off / light)
+
+
+def _shown(found: Any, reference: Any) -> tuple[Any, Any]:
+    """As they are looked at: the 99.9th percentile of the converged one is white."""
+    white = float(np.quantile(reference, 0.999))
+    return np.clip(found / white, 0, 1), np.clip(reference / white, 0, 1)
+
+
+def _draw(out: Any, shown: dict[str, Any], reference: Any) -> None:
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, len(shown), figsize=(2.9 * len(shown), 3.9), layout="constrained", squeeze=False)
+    for (name, found), (top, below) in zip(shown.items(), axes.T, strict=True):
+        pair = _shown(found, reference)
+        top.imshow(pair[0] ** (1 / 2.2))
+        top.set_title(name, fontsize=7)
+        below.imshow(flip_map(*pair), cmap="magma", vmin=0, vmax=0.2)
+        below.set_title(f"FLIP {flip(*pair):.3f}", fontsize=7)
+        for axis in (top, below):
+            axis.set_axis_off()
+    out.mkdir(parents=True, exist_ok=True)
+    with atomic_path(out / "ghosts.png") as temporary:
+        figure.savefig(temporary, dpi=90, format="png")
+    plt.close(figure)
+
+
+_COLUMNS = lab.columns(
+    ("way", "way"),
+    ("cells, px", lambda r: r.cell_px or f"{_SPARSE} a side"),
+    ("wavelengths", "wavelengths"),
+    ("RMS um", "rms_um", ".1f"),
+    ("energy", "energy", "+.2%"),
+    ("FLIP", "flip", ".4f"),
+    ("CPU ms, one thread", "cpu_ms", ".0f"),
+    ("ms, two threads", "wall_ms", ".0f"),
+)

@@ -1,0 +1,104 @@
+"""Fitted ghosts of `neurolens flare`: --fit writes them, a file of them takes the place of a lens."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens.base.errors import InputError
+from neurolens.base.progress import Progress
+from neurolens.commands.arguments import aperture_of, between, check_suffix, given_options
+from neurolens.commands.output import answer, number, table
+
+if TYPE_CHECKING:
+    from neurolens.flare.ghostmodel import GhostModel
+    from neurolens.optics.prescription import Lens
+
+_COMMAND = "neurolens flare"
+_FREE = {"--f-number", "--blades", "--blade-rotation", "--blade-curvature"}
+_SHOWN = 12
+
+
+def add_fit(parser: argparse.ArgumentParser) -> None:
+    """Add --fit and what goes with it."""
+    group = parser.add_argument_group("fitted ghosts")
+    group.add_argument(
+        "--fit", metavar="OUT", type=Path,
+        help="fit polynomials to the ghosts, for lights in any direction and any smaller stop: OUT.onnx, which then "
+        "stands for the lens; of such a file OUT.h or OUT.glsl, a function a ghost",
+    )  # fmt: skip
+    group.add_argument(
+        "--angle", metavar="DEG", type=between(0.1, 89, "degrees"), default=35.0,
+        help="of --fit: largest angle between light and axis (default: 35)",
+    )  # fmt: skip
+    group.add_argument(
+        "--target-um", metavar="UM", type=between(0.01, 10_000, "micrometres"), default=10.0,
+        help="of --fit: RMS on the film at which a ghost's degree is high enough (default: 10)",
+    )  # fmt: skip
+
+
+def fitted(args: argparse.Namespace) -> GhostModel | None:
+    """The model where the file is one; None for a lens.
+
+    Raises:
+        InputError: options that would change what the model was fitted for. ModelError: as `read_ghosts`.
+    """
+    if args.file.suffix.lower() != ".onnx":
+        return None
+    from neurolens.flare.ghostfile import read_ghosts
+
+    other = [name for name in given_options(args) if name not in _FREE]
+    other += [f"--{name}" for name in ("coating", "photons", "glare", "frames", "starburst") if getattr(args, name)]
+    other += ["--reflections"] * args.fours
+    if other:
+        raise InputError(_COMMAND, other[0], args.file, "a lens: fitted ghosts have one state and two reflections")
+    return read_ghosts(args.file)
+
+
+def stopped(args: argparse.Namespace, model: GhostModel) -> GhostModel:
+    """The model at the f-number and with the blades asked for.
+
+    Raises:
+        InputError: a stop wider than that of the fit.
+    """
+    lens = model.lens.with_aperture(aperture_of(args))
+    return replace(model, lens=lens if args.f_number is None else lens.at(f_number=args.f_number))
+
+
+def run_fit(args: argparse.Namespace, lens: Lens | None, model: GhostModel | None) -> int:
+    """Fit and write a lens's ghosts, or write those of a model as source."""
+    from neurolens.flare.ghostfile import write_ghost_source, write_ghosts
+    from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
+
+    progress = Progress(quiet=args.quiet or args.json)
+    if model is not None:
+        check_suffix(args.fit, "--fit", (".h", ".glsl"))
+        write_ghost_source(model, args.fit)
+    else:
+        check_suffix(args.fit, "--fit", (".onnx",))
+        assert lens is not None
+        settings = GhostSettings(args.angle, film_radius_mm=math.hypot(*args.film) / 2, target_um=args.target_um)
+        with progress.stage("ghosts") as report:
+            model = fit_ghosts(lens, settings, report)
+        write_ghosts(model, args.fit)
+    found = {"lens": model.lens.name, "out": str(args.fit), **model.report}
+    return answer(args, found, lambda: _text(found))
+
+
+def _text(found: dict[str, Any]) -> str:
+    rows = [
+        [
+            r["ghost"], number(100 * r["energy"]), number(r["film_rms_um"]), number(100 * r["false_light"]),
+            number(100 * r["lost_light"]), str(r["degree"]), str(r["rims"]),
+        ]
+        for r in found["ghosts"][:_SHOWN]
+    ]  # fmt: skip
+    head = ("ghost", "energy %", "RMS um", "light too much %", "too little %", "degree", "rims")
+    return (
+        f"{found['lens']}: {found['kept']} of {found['pairs']} ghosts, with {number(100 * found['kept_energy'])}% of "
+        f"their light; {number(found['film_rms_um'])} um RMS on the film, by light; the brightest:\n\n"
+        f"{table(head, rows)}\n\n{found['out']}: fitted in {found['seconds']:.1f} s"
+    )

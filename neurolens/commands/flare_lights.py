@@ -1,0 +1,153 @@
+"""Lights of `neurolens flare`: from the command line, from lists over frames, of a scene, and of a picture."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens.base.errors import InputError
+from neurolens.base.progress import Progress
+from neurolens.commands.arguments import aperture_of, lens_path, positive, whole
+from neurolens.commands.render_files import warn
+
+if TYPE_CHECKING:
+    from neurolens.cameras.field import Field
+    from neurolens.flare.lights import Light
+    from neurolens.flare.sources import Kept, SceneLights
+    from neurolens.optics.prescription import Lens
+    from neurolens.render.scene import Scene
+
+_COMMAND = "neurolens flare"
+
+
+def add_lights(parser: argparse.ArgumentParser) -> None:
+    """Add --light, --lights and --image."""
+    group = parser.add_argument_group("lights, at least one; all of them together")
+    group.add_argument(
+        "--light", metavar="AZ,EL[,E[,M]]", action="append", default=[], dest="light",
+        help="degrees to the right of and above the axis, as the camera sees it, irradiance at the lens (radiance "
+        "times solid angle in sr; a number or R/G/B; default 1), and distance in metres (default inf); repeatable",
+    )  # fmt: skip
+    group.add_argument(
+        "--lights", metavar="FILE", type=Path, action="append", default=[],
+        help="a scene (.toml), whose shapes that shine, points, spots and sun the camera of the scene sees; or a list, "
+        "CSV or JSON, with azimuth_deg, elevation_deg, and where wanted light (a name), frame (keys), r, g, b, "
+        "distance_m; repeatable",
+    )  # fmt: skip
+    group.add_argument(
+        "--image", metavar="PLATE.exr", type=Path,
+        help="connected regions of this picture by the same lens, film and focus that reach --threshold, as lights far "
+        "away; # in its name stands for the frame's digits",
+    )  # fmt: skip
+    group.add_argument(
+        "--threshold", metavar="T", type=positive("a value of the picture"), default=2.0,
+        help="of --image: value of a colour, where a white card of radiance 1 is 1; pixels count in full from 2 T on, "
+        "so that none switches on at once (default: 2)",
+    )  # fmt: skip
+    group.add_argument(
+        "--most", metavar="N", type=whole(1, 10_000), default=32,
+        help="of --image and of a scene: the lights of the most energy; what is left out is said (default: 32)",
+    )  # fmt: skip
+
+
+class Sources:
+    """The lights of the command line; files are read once."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        from neurolens.flare.lights import read_lights
+        from neurolens.flare.sources import SceneLights
+        from neurolens.render.scene import load_scene
+
+        if not (args.light or args.lights or args.image):
+            raise InputError(_COMMAND, "--light", "(missing)", "--light, --lights or --image")
+        self._fixed = [_light(text) for text in args.light]
+        self._tracks = [t for path in args.lights if path.suffix.lower() != ".toml" for t in read_lights(path)]
+        scenes = [(path, load_scene(path)) for path in args.lights if path.suffix.lower() == ".toml"]
+        self._scenes: list[tuple[Path, Scene, SceneLights]] = [(p, scene, SceneLights(scene)) for p, scene in scenes]
+        self._fields: dict[tuple[Any, ...], Field] = {}
+
+    def at(self, args: argparse.Namespace, lens: Lens, progress: Progress) -> list[Light]:
+        """The lights at a frame, the lens and the scene's camera as `args` has them there."""
+        from neurolens.flare.sources import keep
+        from neurolens.render.scene import seen_from
+
+        there = [track.at(args.frame or 0) for track in self._tracks]
+        found = [*self._fixed, *(light for light in there if light is not None)]
+        if behind := len(self._fixed) + len(there) - len(found):
+            warn(f"{behind} lights of lists stand behind the lens{_at(args)}")
+        assert lens.film_z_mm is not None
+        for path, scene, lights in self._scenes:
+            seen = lights.seen(seen_from(scene, path, args.position_m, args.look_at_m), lens.film_z_mm)
+            found += _kept(keep(seen, args.most), path)
+        if args.image is not None:
+            found += self._of_picture(args, progress)
+        if not found:
+            warn(f"no light: the flare is black{_at(args)}")
+        return found
+
+    def _of_picture(self, args: argparse.Namespace, progress: Progress) -> list[Light]:
+        from neurolens.flare.sources import highlights
+        from neurolens.render.pictures import read_exr
+
+        path = picture_path(args)
+        picture, _ = read_exr(path)
+        shape = args.film[0] / args.film[1]
+        if abs(picture.shape[1] / picture.shape[0] / shape - 1) > 1.01 / min(picture.shape[:2]):
+            size = f"{picture.shape[1]} x {picture.shape[0]} pixels"
+            raise InputError(path, "shape", f"({size})", "the film's, {:g}x{:g}".format(*args.film))
+        try:
+            found = highlights(picture, self._field(args, progress), args.film, args.threshold, args.most)
+        except InputError as error:
+            raise InputError(path, error.field, error.value, error.expected) from None
+        return _kept(found, path)
+
+    def _field(self, args: argparse.Namespace, progress: Progress) -> Field:
+        from neurolens.cameras.build import Shot, make_camera
+        from neurolens.cameras.field import field_of
+
+        state = args.focus, args.f_number, args.zoom
+        if state not in self._fields:
+            shot = Shot(
+                film_mm=args.film, focus_m=args.focus, f_number=args.f_number, efl_mm=args.efl, zoom=args.zoom,
+                field_deg=args.field, focus=args.focusing, aperture=aperture_of(args),
+            )  # fmt: skip
+            camera = make_camera(str(lens_path(args.file, "flare")), shot, progress)
+            self._fields[state] = field_of(camera, args.focus, "equidistant")
+        return self._fields[state]
+
+
+def _kept(found: Kept, path: Path) -> list[Light]:
+    if found.dropped > 0:
+        warn(f"{path}: {len(found.lights)} of {found.of} lights; the others have {found.dropped:.2%} of the energy")
+    return found.lights
+
+
+def picture_path(args: argparse.Namespace) -> Path:
+    """The file of --image at a frame."""
+    frame = args.frame or 0
+    return Path(re.sub("#+", lambda found: f"{frame:0{len(found[0])}d}", str(args.image)))
+
+
+def _at(args: argparse.Namespace) -> str:
+    return "" if args.frame is None else f" at frame {args.frame}"
+
+
+def _light(text: str) -> Light:
+    from neurolens.flare.lights import Light
+
+    words = text.split(",")
+    try:
+        angles = [float(word) for word in words[:2]]
+        rgb = [float(word) for word in (words[2] if len(words) > 2 else "1").split("/")]
+        distance = float(words[3]) if len(words) > 3 else math.inf
+    except ValueError:
+        angles, rgb, distance = [], [], math.inf
+    if len(angles) != 2 or len(words) > 4 or len(rgb) not in (1, 3):
+        raise InputError(_COMMAND, "--light", text, "AZ,EL[,E[,M]], numbers, E also as R/G/B")
+    try:
+        return Light(angles[0], angles[1], (rgb[0], rgb[-2 % len(rgb)], rgb[-1]), distance)
+    except InputError as error:
+        raise InputError(_COMMAND, "--light", text, error.expected) from None

@@ -1,0 +1,355 @@
+"""Diffraction at the opening that a light has through the lens: its far field on the film, and the star about it.
+
+The field on the film is U(x, y) = 1/lambda times the integral of sqrt(e) exp(i k (W + L x + M y)) dL dM over the
+light's exit pupil (Debye; Born and Wolf, section 8.8), with e the light per area of direction cosines (L, M): |U|^2
+sums to the light that arrives.
+
+Near its centre the integral is summed over cells of the pupil. A picture is thousands of fringes wide, and pixels are
+wider than fringes: farther out, at a distance u, the mean over a pixel is had from the pupil's outline. With n dl its
+elements, |k u|^2 |U|^2 is the power spectrum of sqrt(e) n exp(i k W) dl (the divergence theorem), and the mean over a
+pixel that of pairs of elements less than about lambda / pixel apart. Between the streaks of straight edges this is
+right to some 5e-5 of the streaks.
+
+Out of focus u counts from where the rays of each element meet the film (Born and Wolf, section 8.9, the boundary
+diffraction wave at short wavelengths). Elements are summed in three groups by the direction of n. A pixel has light
+of those of which u lies along n, and no group holds both the near and the far edge of an image: of each group one u
+is enough, that of the element whose n is closest to it. A light's other wavelengths take the spectrum of its middle
+one, whose image is not theirs in fringes: at 400 and 700 nm the star close to an image 1 mm out of focus at f/8 is
+right to 8% in rings, but streaks of blades there are as wide as that image scaled by the wavelength.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError
+from neurolens.flare.exit_pupil import CELLS, Array, ExitPupil, coverage, exit_pupil, outline
+from neurolens.flare.lights import Light
+from neurolens.flare.picture import Raster, axis_irradiance
+from neurolens.flare.stack import Floats
+from neurolens.graph.compiler import load_compiled
+from neurolens.optics.prescription import Lens
+from neurolens.render.spectrum import SpectralRange
+
+_PER_CYCLE = 2.5  # cells a cycle of the field
+_NEAR, _FAR = 2.0, 4.0  # pixels from the centre between which the sum over cells gives way to the outline
+_SPECTRUM = 4096  # samples a side of the outline's power spectrum
+_STARTS = 1 << 15  # elements of the outline that pairs start at
+_GROUPS, _SAMPLES = 3, 64  # of elements out of focus; of each, those whose places are kept, for each of up to 8 lines
+
+
+def cells_needed(pupil: ExitPupil, reach_mm: float) -> int:
+    """Cells across the pupil, a power of two, that `far_field` takes at least for points so far out."""
+    cycles = 2 * float(pupil.half.max()) * (reach_mm + pupil.blur_mm) / (pupil.wavelength_nm * 1e-6)
+    return max(64, 1 << math.ceil(math.log2(_PER_CYCLE * cycles + 1)))
+
+
+def far_field(pupil: ExitPupil, lines: Sequence[Array], x_mm: Array, y_mm: Array) -> Array:
+    """Irradiance [Y, X] on the film, for 1 at the lens, at x and y from the pupil's centre, by the sum over cells.
+
+    Args:
+        lines: `outline` of the pupil, of whatever wavelength.
+
+    Raises:
+        InputError: points so far out, or such aberrations, that cells are too few.
+    """
+    wave = pupil.wavelength_nm * 1e-6
+    farthest = max(float(np.abs(x_mm).max()), float(np.abs(y_mm).max()))
+    cells = cells_needed(pupil, farthest)
+    if cells > CELLS:
+        raise InputError("diffraction", "x_mm, y_mm", farthest, f"fewer fringes: {CELLS} cells, not {cells}")
+    cells = min(2 * cells, CELLS)
+    share = (np.arange(cells) + 0.5) * 2 / cells - 1
+    field = coverage(lines, cells) * pupil.field((share, share))
+    size = 2 * pupil.half / cells
+    ways = []
+    for axis, place in ((0, x_mm), (1, y_mm)):
+        cosine = pupil.half[axis] * share
+        # Shares of cells are means over them: their transform is lower by a sinc.
+        ways.append(
+            size[axis] / np.sinc(size[axis] * np.maximum(np.abs(place) - pupil.blur_mm, 0) / wave)[:, None]
+            * np.exp(2j * math.pi / wave * np.outer(place, cosine))
+        )  # fmt: skip
+    first, second, field = (m.astype(np.complex64) for m in (*ways, field.T))
+    return np.asarray(np.abs(second @ field @ first.T / wave) ** 2)
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """The power spectrum of an outline, |sum of sqrt(e) n exp(i k W) dl|^2 in mm^2, smoothed.
+
+    Attributes:
+        values: [G, N, N], the parts of groups of elements, at multiples of `step` in x and y, counted round.
+        step: cycles per unit of cosine.
+        edges: [G] of [M, 4], some elements of each: x, y in mm from the centre where their rays meet the film, and n
+            of length 1. M = 0: all rays meet at the centre.
+    """
+
+    values: Floats
+    step: float
+    edges: Sequence[Array]
+
+    def irradiance(self, x_mm: Array, y_mm: Array, wavelength_nm: float) -> Array:
+        """Mean irradiance [Y, X] about points away from the image, for 1 at the lens."""
+        total = np.zeros((len(y_mm), len(x_mm)), np.float32)
+        for found, edges in zip(self.values, self.edges, strict=True):
+            for axis, place in ((0, x_mm), (1, y_mm)):
+                at = place * (1e6 / wavelength_nm / self.step)
+                first = np.floor(at).astype(int)
+                part = (at - first).astype(np.float32)
+                part = part[:, None] if axis == 0 else part
+                low, high = (found.take(first + k, axis, mode="wrap") for k in (0, 1))
+                found = low * (1 - part) + high * part
+            total += found.T / np.maximum(4 * math.pi**2 * _squares(edges, x_mm, y_mm), 1e-30)
+        return np.maximum(total, 0)
+
+
+def _squares(edges: Array, x_mm: Array, y_mm: Array) -> Floats:
+    """|u|^2 [Y, X] of points from those of elements (`Spectrum.edges`) that each has light of."""
+    found = np.empty((len(y_mm), len(x_mm)), np.float32)
+    given: list[Array] = [np.ascontiguousarray(a, np.float64) for a in (x_mm, y_mm, edges)]
+    call = load_compiled(_PAIRS).squares
+    call.argtypes, call.restype = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 4, None
+    call(len(x_mm), len(y_mm), len(edges), *(a.ctypes.data for a in (*given, found)))
+    return found
+
+
+def outline_spectrum(
+    pupil: ExitPupil, lines: Sequence[Array], shortest_nm: float, pixel_mm: float, reach_mm: float
+) -> Spectrum:
+    """The spectrum that holds film points up to `reach_mm` from the centre.
+
+    It is smoothed as by pixels (or as many samples allow) at the shortest wavelength: there by the fourth power of
+    sinc(x / 2), x in pixels, whose samples a pixel apart have always the same sum.
+    """
+    wave = shortest_nm * 1e-6
+    pixel = max(pixel_mm, 8 * reach_mm / _SPECTRUM)
+    reach = wave / pixel  # of pairs, in cosines
+    samples = 2 * math.ceil(4 * reach_mm / pixel)
+    place, normal = _elements(pupil, lines, 2 * reach / samples)
+    field = pupil.field(place / pupil.half[:, None])
+    # In focus, phases of neighbours are equal.
+    focused = pupil.blur_mm < pixel / 8
+    vector = normal * (np.abs(field) if focused else field)
+    order = np.argsort(place[0], kind="stable")
+    given = (place[:, order] / reach).copy(), np.ascontiguousarray(vector[:, order], np.complex64)
+    rank, every = np.argsort(order), math.ceil(len(order) / _STARTS)
+    call = load_compiled(_PAIRS).pairs
+    call.argtypes, call.restype = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 4, None
+    # What was laid down on the nearest nine lags is lower by the third power of a sinc.
+    raised = (np.sinc(np.fft.fftfreq(samples)) ** -3).astype(np.float32)
+    group = np.zeros(len(order), int) if focused else _groups(normal)
+    values, edges = np.empty((group.max() + 1, samples, samples), np.float32), []
+    for k, part in enumerate(values):
+        total = np.zeros((samples, samples), np.complex64)
+        starts = rank[::every][group[::every] == k].astype(np.int64)
+        call(len(order), len(starts), samples, *(a.ctypes.data for a in (starts, *given, total)))
+        power = torch.fft.ifft2(torch.from_numpy(total), norm="forward").real.numpy()
+        part[:] = power * (2 * len(order) / len(order[::every])) * raised * raised[:, None]
+        kept = np.nonzero(group == k)[0]
+        kept = kept[:: max(len(kept) // (_SAMPLES * min(len(lines), 8)), 1)][: 0 if focused else None]
+        way = normal[:, kept] / np.hypot(*normal[:, kept])
+        edges.append(np.concatenate([pupil.hits(place[:, kept] / pupil.half[:, None]), way]).T)
+    return Spectrum(values, 1 / (2 * reach), edges)
+
+
+def _groups(normal: Array) -> NDArray[np.int_]:
+    """Groups [N] of elements by the direction of n; their limits lie where fewest elements do, not along an edge."""
+    turn = np.arctan2(normal[1], normal[0]) * (_GROUPS / (2 * math.pi))
+    fewest = np.histogram(turn % 1, 60, (0, 1))[0].argmin()
+    found = np.floor(turn - (fewest + 0.5) / 60).astype(int) % _GROUPS
+    return np.asarray(np.unique(found, return_inverse=True)[1])
+
+
+def _elements(pupil: ExitPupil, lines: Sequence[Array], spacing: float) -> tuple[Array, Array]:
+    """Elements of outlines, equally long in each and at most so: cosines from the middle of the box, and n dl."""
+    places, normals = [], []
+    for line in lines:
+        ends = np.append(line, line[:, :1], 1) * pupil.half[:, None]
+        length = np.append(0.0, np.cumsum(np.hypot(*np.diff(ends))))
+        at = np.linspace(0, length[-1], 3 + int(length[-1] / spacing))
+        x, y = (np.interp(at, length, e) for e in ends)
+        places.append(np.stack([x[1:] + x[:-1], y[1:] + y[:-1]]) / 2)
+        normals.append(np.stack([np.diff(y), -np.diff(x)]))
+    return np.concatenate(places, 1), np.concatenate(normals, 1)
+
+
+def starburst_picture(
+    lens: Lens,
+    lights: Sequence[Light],
+    raster: Raster,
+    *,
+    wavelength_nm: tuple[float, float] = (400.0, 700.0),
+    wavelengths: int = 15,
+    threads: int = 2,
+    done: Callable[[float], None] = lambda share: None,
+) -> Floats:
+    """The stars of lights, [H, W, 3] linear sRGB: the light that diffraction takes out of their images.
+
+    It is 0 where rays make the image itself, and at the pixels next to that: there a render has the light, which keeps
+    its energy if the render's is less by what this layer would sum to on a film without edges. What is sent aside is
+    taken to pass the rear of the lens unhindered. Nothing comes of a light whose rays do not reach the film.
+
+    Args:
+        wavelengths: of equal shares of the range. done: told the share of the work that is done.
+    """
+    spectral = SpectralRange(*wavelength_nm, bins=wavelengths)
+    exposure = axis_irradiance(lens, 0.5 * (spectral.low_nm + spectral.high_nm)) if lights else 1.0
+    picture = np.zeros((raster.height, raster.width, 3), np.float32)
+    for number, light in enumerate(lights):
+        colours = spectral.response * spectral.spectrum(light.rgb) / (wavelengths * exposure)
+        for k, film in enumerate(_stars(lens, light, spectral.centres_nm, raster, threads)):
+            picture += film[..., None] * colours[:, k].astype(np.float32)
+            done((number + (k + 1) / wavelengths) / len(lights))
+        done((number + 1) / len(lights))
+    return picture
+
+
+def _stars(lens: Lens, light: Light, wavelengths_nm: Array, raster: Raster, threads: int) -> Iterator[Floats]:
+    """Of a light at each wavelength, irradiance [H, W] for 1 at the lens; nothing where none of it arrives."""
+    middle = exit_pupil(lens, light, float(wavelengths_nm.mean()))
+    lines = [] if middle is None else outline(middle)
+    if middle is None or not lines:
+        return
+    pixel = 1 / raster.per_mm
+    x = (raster.width / 2 - 0.5 - np.arange(raster.width)) * pixel
+    y = (np.arange(raster.height) + 0.5 - raster.height / 2) * pixel
+    reach = max(float(np.abs(p - c).max()) for p, c in zip((x, y), middle.centre_mm, strict=True))
+    far = outline_spectrum(middle, lines, float(wavelengths_nm.min()), pixel, reach + pixel)
+
+    def one(nm: float) -> Floats:
+        pupil = exit_pupil(lens, light, float(nm), middle)
+        if pupil is None:
+            return np.zeros((raster.height, raster.width), np.float32)
+        return star(pupil, lines, far, x - pupil.centre_mm[0], y - pupil.centre_mm[1], pixel)
+
+    with ThreadPoolExecutor(threads) as pool:
+        yield from pool.map(one, wavelengths_nm)
+
+
+def star(pupil: ExitPupil, lines: Sequence[Array], far: Spectrum, x: Array, y: Array, pixel_mm: float) -> Floats:
+    """Mean irradiance [Y, X] of pixels at x and y, mm from the pupil's centre, for 1 at the lens; 0 at the image itself
+    and next to it.
+
+    Args:
+        lines, far: outline and its spectrum, of whatever wavelength.
+    """
+    found = far.irradiance(x, y, pupil.wavelength_nm)
+    columns, rows = (np.nonzero(np.abs(p) < (_FAR + 0.5) * pixel_mm)[0] for p in (x, y))
+    few = cells_needed(pupil, (_FAR + 1) * pixel_mm) <= CELLS
+    if len(columns) and len(rows) and few and pupil.blur_mm < _NEAR * pixel_mm:
+        # Two samples a fringe.
+        parts = math.ceil(4 * pixel_mm * float(pupil.half.max()) / (pupil.wavelength_nm * 1e-6)) + 1
+        within = ((np.arange(parts) + 0.5) / parts - 0.5) * pixel_mm
+        fine = far_field(pupil, lines, *((p[k][:, None] + within).reshape(-1) for p, k in ((x, columns), (y, rows))))
+        near = fine.reshape(len(rows), parts, len(columns), parts).mean((1, 3))
+        out = np.clip((np.hypot(x[columns], y[rows][:, None]) / pixel_mm - _NEAR) / (_FAR - _NEAR), 0, 1)
+        block = np.ix_(rows, columns)
+        found[block] = near + out * out * (3 - 2 * out) * (found[block] - near)
+    found[_image(pupil, x, y, pixel_mm)] = 0
+    return found.astype(np.float32)
+
+
+def _image(pupil: ExitPupil, x: Array, y: Array, pixel_mm: float) -> NDArray[np.bool_]:
+    """Pixels [Y, X] that rays meet, and those next to them."""
+    reach = 1 + int(pupil.blur_mm / pixel_mm / 20)  # rays are farther apart in large images
+    met = np.zeros((len(y) + 2 * reach, len(x) + 2 * reach), bool)
+    columns, rows = (
+        np.rint((hit - p[0]) * (1 if p[-1] >= p[0] else -1) / pixel_mm).astype(int) + reach
+        for hit, p in zip(pupil.hits_mm, (x, y), strict=True)
+    )
+    within = (columns >= 0) & (columns < met.shape[1]) & (rows >= 0) & (rows < met.shape[0])
+    met[rows[within], columns[within]] = True
+    for _ in range(reach):
+        met = met[:-2] | met[1:-1] | met[2:]
+        met = met[:, :-2] | met[:, 1:-1] | met[:, 2:]
+    return met
+
+
+# Of each start and every element after it (sorted by x, in units of the greatest distance), the product under Parzen's
+# window, whose transform is the fourth power of a sinc, laid down on the nearest nine lags by quadratic B-splines. One
+# of each two opposite pairs, for the real part has both; and half of what meets itself. `squares` has |u|^2 of the
+# element whose n is closest to u, less what an element between it and the one beside it would have less.
+_PAIRS = """
+#include <math.h>
+#include <stdint.h>
+
+static inline float window(float t)
+{
+    return t < 0.5f ? 1.0f - 6.0f * t * t * (1.0f - t) : 2.0f * (1.0f - t) * (1.0f - t) * (1.0f - t);
+}
+
+static inline int64_t laid(float at, float *share)
+{
+    const float middle = floorf(at + 0.5f), t = at - middle;
+    share[0] = 0.5f * (0.5f - t) * (0.5f - t);
+    share[1] = 0.75f - t * t;
+    share[2] = 0.5f * (0.5f + t) * (0.5f + t);
+    return (int64_t)middle;
+}
+
+static inline double apart(const double *e, const double *f)
+{
+    return (e[0] - f[0]) * (e[0] - f[0]) + (e[1] - f[1]) * (e[1] - f[1]);
+}
+
+void squares(
+    int64_t width, int64_t height, int64_t count, const double *x, const double *y, const double *edge, float *found)
+{
+    const double *const last = edge + 4 * (count - 1);
+    for (int64_t p = 0; p < width * height; p++) {
+        const double q = x[p % width], r = y[p / width];
+        double least = 1.0, chosen = q * q + r * r;
+        for (const double *e = edge; e <= last; e += 4) {
+            const double a = q - e[0], b = r - e[1], whole = a * a + b * b, aside = a * e[3] - b * e[2];
+            if (aside * aside < least * whole) {
+                double gap = 0.9 * whole;
+                if (e > edge)
+                    gap = fmin(gap, apart(e, e - 4));
+                if (e < last)
+                    gap = fmin(gap, apart(e, e + 4));
+                least = aside * aside / whole;
+                chosen = whole - fmin(aside * aside, gap);
+            }
+        }
+        found[p] = (float)chosen;
+    }
+}
+
+void pairs(
+    int64_t count, int64_t starts, int64_t side, const int64_t *start, const double *place, const float *vector,
+    float *total)
+{
+    const double *const x = place, *const y = place + count;
+    const float *const u = vector, *const v = vector + 2 * count;
+    for (int64_t k = 0; k < starts; k++) {
+        const int64_t i = start[k];
+        const float a = u[2 * i], b = u[2 * i + 1], c = v[2 * i], d = v[2 * i + 1];
+        for (int64_t j = i; j < count && x[j] - x[i] < 1.0; j++) {
+            const float dx = (float)(x[j] - x[i]), dy = (float)(y[j] - y[i]);
+            if (fabsf(dy) >= 1.0f || dx >= 1.0f)
+                continue;
+            const float weight = window(dx) * window(fabsf(dy)) * (i == j ? 0.5f : 1.0f);
+            const float re = weight * (a * u[2 * j] + b * u[2 * j + 1] + c * v[2 * j] + d * v[2 * j + 1]);
+            const float im = weight * (a * u[2 * j + 1] - b * u[2 * j] + c * v[2 * j + 1] - d * v[2 * j]);
+            float across[3], along[3];
+            const int64_t column = laid(0.5f * dx * side, across) - 1, row = laid(0.5f * dy * side, along) - 1;
+            for (int p = 0; p < 3; p++)
+                for (int q = 0; q < 3; q++) {
+                    const float share = across[p] * along[q];
+                    float *const at = total + 2 * ((column + p + side) % side * side + (row + q + side) % side);
+                    at[0] += share * re;
+                    at[1] += share * im;
+                }
+        }
+    }
+}
+"""

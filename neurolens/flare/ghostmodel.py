@@ -1,0 +1,293 @@
+"""Ghosts as surrogates: where light of a direction that enters at a point of the front meets the film, and its power.
+
+Of every ghost the film point and the crossings with the rims that stop light are vectors A p + B u, and the power is a
+scalar, with A, B and the power polynomials in rho = p.p, sigma = p.u, tau = u.u and w: the form of the surrogates of
+images (`surrogates.cores`) with other inputs. p is the light's direction, u the point on the plane of the front vertex
+less its part that follows p. Stop and blades are tests on the crossings with the stop: they need no new fit.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError
+from neurolens.flare.ghosts import GhostRays, Pair, Way
+from neurolens.flare.stack import Floats, function_text
+from neurolens.flare.steps import LOST
+from neurolens.graph.compiler import load_compiled
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Exponents, Graph, Value
+from neurolens.optics.glass import inverse_square_um
+from neurolens.optics.prescription import Lens
+from neurolens.surrogates.cores import ROUND
+
+Array = NDArray[np.float64]
+_CALL = 6  # numbers of the call: p, what chief is of it (mm), 1 / scale, the stop's radius
+_FITTED = 1.5  # of u^2: beyond it polynomials mean nothing
+_SLACK = 1.02  # of the largest angle: rays of a near light differ
+
+
+@dataclass(frozen=True, eq=False)
+class GhostPolynomial:
+    """One ghost.
+
+    Attributes:
+        chief_mm: u = (place - chief_mm p) / scale_mm, for places [2] in mm on the plane z = 0. scale_mm: see there; the
+            ghost's light has |u| below 1.
+        surfaces: of each crossing the surface whose rim it is in units of.
+        exponents: [M, 4] of rho, sigma, tau, w.
+        ab: [1 + K, 2, M] coefficients of A and B of the film point (mm) and of the K crossings.
+        power: [M].
+    """
+
+    chief_mm: float
+    scale_mm: float
+    surfaces: tuple[int, ...]
+    exponents: Exponents
+    ab: Array
+    power: Array
+
+    @cached_property
+    def table(self) -> Array:
+        """[2 (1 + K) + 1, M]: A and B of each vector, then the power."""
+        return np.concatenate([self.ab.reshape(-1, len(self.power)), self.power[None]])
+
+    @cached_property
+    def places(self) -> tuple[Exponents, Array]:
+        """[L, 2] the exponents of sigma and tau, and [M, L] which of them each term has."""
+        rest, place = np.unique(self.exponents[:, 1:3], axis=0, return_inverse=True)
+        return rest, (place.reshape(-1, 1) == np.arange(len(rest))).astype(np.float64)
+
+    def fixed(self, rho: float, w: float) -> Array:
+        """The table [rows, L] of one direction and wavelength, over the first of `places`."""
+        known = rho ** self.exponents[:, 0].astype(np.float64) * w ** self.exponents[:, 3].astype(np.float64)
+        return np.asarray((self.table * known) @ self.places[1])
+
+
+@dataclass(frozen=True, eq=False)
+class GhostModel:
+    """Surrogates of a lens's ghosts, in the state that it has; takes the place of a `GhostTracer`.
+
+    Attributes:
+        lens: its stop may be closed, and be given blades, after the fit.
+        pairs, ghosts: those that are kept, brightest first.
+        sine: of the largest angle between the axis and the light.
+        wavelength_nm: range. stop_radius_mm: of the fit.
+        report: what the fit measured, JSON-able.
+    """
+
+    lens: Lens
+    pairs: tuple[Pair, ...]
+    ghosts: tuple[GhostPolynomial, ...]
+    sine: float
+    wavelength_nm: tuple[float, float]
+    stop_radius_mm: float
+    report: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        if not self.lens.stop_radius_mm <= 1.00001 * self.stop_radius_mm:
+            expected = f"at most {self.stop_radius_mm:.6g} mm, that of the fit"
+            raise InputError("flare", "stop_radius_mm", self.lens.stop_radius_mm, expected)
+
+    @cached_property
+    def _of(self) -> dict[Way, GhostPolynomial]:
+        return dict(zip(self.pairs, self.ghosts, strict=True))
+
+    @cached_property
+    def w_middle_half(self) -> tuple[float, float]:
+        """w = (1 / lambda^2 - middle) / half, lambda in um."""
+        short, long = (float(inverse_square_um(v)) for v in self.wavelength_nm)
+        return (short + long) / 2, (short - long) / 2
+
+    def start(self, rays: Floats) -> Floats:
+        """Directions and places of rays [6, N] as `follow` takes them, [4, N]: rows `ENTERING` but the wavelength.
+
+        Raises:
+            InputError: rays further from the axis than the fit goes.
+        """
+        way = rays[2] / rays[5]
+        start = np.stack([rays[3], rays[4], rays[0] - way * rays[3], rays[1] - way * rays[4]])
+        widest = float(np.hypot(start[0], start[1]).max(initial=0.0))
+        if not widest <= _SLACK * self.sine:
+            found, most = (math.degrees(math.asin(min(v, 1.0))) for v in (widest, self.sine))
+            raise InputError("light", "degrees off the axis", found, f"at most {most:.4g}, for which the model is made")
+        return start
+
+    def trace(self, rays: Floats, wavelength_nm: float) -> GhostRays:
+        """As `GhostTracer.trace`."""
+        return self.follow(self.start(rays), wavelength_nm)
+
+    def follow(
+        self, start: Floats, wavelength_nm: float, *, only: Sequence[Way] | None = None, reach: float = 1.0
+    ) -> GhostRays:
+        """As `GhostTracer.follow`; all rays are followed.
+
+        Raises:
+            InputError: a wavelength out of range.
+        """
+        some: Sequence[Way] = self.pairs if only is None else only
+        return GhostRays(np.concatenate([self.follow_each(start, [wavelength_nm], pair) for pair in some]))
+
+    def follow_each(self, start: Floats, wavelengths_nm: Sequence[float], pair: Way, reach: float = 1.0) -> Floats:
+        """As `GhostTracer.follow_each`; errors as of `follow`."""
+        low, high = self.wavelength_nm
+        for nm in wavelengths_nm:
+            if not low <= nm <= high:
+                raise InputError("flare", "wavelength_nm", nm, f"from {low:g} to {high:g}, as the model is made")
+        ghost, count = self._of[pair], start.shape[1]
+        if count and (start[:2] == start[:2, :1]).all():
+            return self._alike(ghost, start[:2, 0], start[2:], wavelengths_nm)
+        radius = np.full((1, 1), self.lens.stop_radius_mm)
+        rays = [np.concatenate([start, np.full((1, count), nm)]) for nm in wavelengths_nm]
+        rows = [evaluate(ghost_graph(self, ghost), {"entering": r, "stop_radius_mm": radius})["arriving"] for r in rays]
+        return np.stack(rows).astype(np.float32)
+
+    def _alike(
+        self, ghost: GhostPolynomial, direction: Floats, places: Floats, wavelengths_nm: Sequence[float]
+    ) -> Floats:
+        """Rays of one direction by compiled code, whose coefficients are numbers of the call."""
+        p, (middle, half) = direction / self.sine, self.w_middle_half
+        w = (inverse_square_um(np.asarray(wavelengths_nm, np.float64)) - middle) / half
+        tables = np.stack([ghost.fixed(float(p @ p), float(v)) for v in w]).astype(np.float32)
+        head = [*p, *(ghost.chief_mm * p), 1 / ghost.scale_mm, self.lens.stop_radius_mm]
+        call = np.array(head, np.float32)
+        given = np.ascontiguousarray(places, np.float32)
+        out = np.empty((len(w), 4, given.shape[1]), np.float32)
+        run, monomials, lights = self._compiled
+        kinds = monomials[_key(ghost.places[0])], lights[self._stops(ghost)]
+        run(given.shape[1], len(w), *tables.shape[1:], *kinds, *(a.ctypes.data for a in (given, call, tables, out)))
+        return out
+
+    def _stops(self, ghost: GhostPolynomial) -> tuple[bool, ...]:
+        """Which crossings are with the stop."""
+        return tuple(k == self.lens.stop_index for k in ghost.surfaces)
+
+    @cached_property
+    def _compiled(self) -> tuple[Any, dict[Any, int], dict[Any, int]]:
+        """The driver, and the number of each set of monomials and of each sort of crossings."""
+        monomials = {key: n for n, key in enumerate(dict.fromkeys(_key(ghost.places[0]) for ghost in self.ghosts))}
+        lights = {key: n for n, key in enumerate(dict.fromkeys(map(self._stops, self.ghosts)))}
+        text = ""
+        for key, n in monomials.items():
+            text += function_text(_monomial_graph(key), f"terms_{n}", f"run_terms_{n}", "place", "term", "call")
+        for stops, n in lights.items():
+            text += function_text(self._light_graph(stops), f"lit_{n}", f"run_lit_{n}", "row", "light", "call")
+        names = (
+            ", ".join(f"run_{name}_{n}" for n in range(len(of))) for name, of in (("terms", monomials), ("lit", lights))
+        )
+        most = max(len(key) for key in monomials), 2 + max(2 * len(stops) + 3 for stops in lights)
+        for word, value in zip(("$TERMS", "$LIGHTS", "$MOST", "$ROWS"), (*names, *map(str, most)), strict=True):
+            text = (text if word != "$TERMS" else "#include <stddef.h>\n" + text + _DRIVER).replace(word, value)
+        run = load_compiled(text).ghosts
+        whole, pointer = ctypes.c_int, ctypes.c_void_p
+        run.argtypes, run.restype = [ctypes.c_size_t, *[whole] * 5, *[pointer] * 4], None
+        return run, monomials, lights
+
+    def _light_graph(self, stops: Sequence[bool]) -> Graph:
+        """Input `row`, the place (mm) and what the rows of a table give, and the numbers of `_CALL`; output `light`."""
+        g, rows = Graph(), 2 * len(stops) + 3
+        row, call = g.input("row", 2 + rows), g.input("call", _CALL, per_call=True)
+        u = (row[0:2] - call[2:4]) * call[4]
+        g.outputs["light"] = self._light(stops, call[0:2], u, row[2:], call[5])
+        return g
+
+    def _light(self, stops: Sequence[bool], p: Value, u: Value, rows: Value, stop_radius: Value) -> Value:
+        """Rows `LIGHT` of the rows of a table; `stops`: which of the crossings are with the stop."""
+        g = rows.graph
+        film, *crossings = (rows[2 * k] * p + rows[2 * k + 1] * u for k in range(1 + len(stops)))
+        worst = g.square(u)
+        for crossing, at_stop in zip(crossings, stops, strict=True):
+            if not at_stop:
+                ratio = g.square(crossing)
+            elif self.lens.aperture is None:
+                per_radius = self.stop_radius_mm / stop_radius
+                ratio = g.square(crossing) * (per_radius * per_radius)
+            else:
+                ratio = self.lens.aperture.rim(g, crossing * self.stop_radius_mm, stop_radius, LOST)
+            worst = worst.maximum(ratio)
+        worst = g.select(g.square(u) <= _FITTED, worst, LOST)
+        power = rows[rows.rows - 1].maximum(0.0)
+        return g.concat(film, g.select(worst <= 1.0, power, 0.0), worst)
+
+
+def ghost_graph(model: GhostModel, ghost: GhostPolynomial, g: Graph | None = None, output: str = "arriving") -> Graph:
+    """One ghost as a graph: inputs `rays` [5] (`RAYS`) and, of the call, `stop_radius_mm`; output rows `ARRIVING`."""
+    g = g or Graph()
+    rays, radius = g.input("entering", 5), g.input("stop_radius_mm", per_call=True)
+    p = rays[0:2] * (1 / model.sine)
+    u = (rays[2:4] - p * ghost.chief_mm) * (1 / ghost.scale_mm)
+    middle, half = model.w_middle_half
+    v = (1000 / math.sqrt(half)) / rays[4]
+    invariants = g.concat(g.quadratic(g.concat(p, u), ROUND), g.quadratic(v, [((0, 0),)], [-middle / half]))
+    stops = [k == model.lens.stop_index for k in ghost.surfaces]
+    rows = g.polynomial(ghost.exponents, ghost.table, invariants)
+    g.outputs[output] = model._light(stops, p, u, rows, radius)
+    return g
+
+
+def _key(exponents: Exponents) -> tuple[tuple[int, ...], ...]:
+    return tuple(map(tuple, exponents.tolist()))
+
+
+def _monomial_graph(exponents: Sequence[tuple[int, ...]]) -> Graph:
+    """Input `place` (mm) and the numbers of `_CALL`; output `term`, monomials of sigma and tau."""
+    g, count = Graph(), len(exponents)
+    place, call = g.input("place", 2), g.input("call", _CALL, per_call=True)
+    u = (place - call[2:4]) * call[4]
+    both = g.concat(g.dot(call[0:2], u), g.square(u))
+    g.outputs["term"] = g.polynomial(np.array(exponents, np.int64), np.eye(count), both)
+    return g
+
+
+# Monomials serve all wavelengths; a table's products with them are what the graphs of light take.
+_DRIVER = """
+enum { BLOCK = 256, MOST = $MOST, ROWS = $ROWS };
+typedef void step(size_t, const float *const *, const float *, float *const *);
+static step *const terms_of[] = { $TERMS }, *const light_of[] = { $LIGHTS };
+
+static void product(int rows, int terms, const float *table, float term[][BLOCK], float row[][BLOCK])
+{
+    for (int r = 0; r < rows; r += 2) {
+        float *const a = row[r], *const b = row[r + 1];
+        const float *const s = table + r * terms, *const t = r + 1 < rows ? s + terms : s;
+        for (int i = 0; i < BLOCK; i++)
+            a[i] = b[i] = 0.0f;
+        for (int k = 0; k < terms; k++)
+            for (int i = 0; i < BLOCK; i++) {
+                a[i] += s[k] * term[k][i];
+                b[i] += t[k] * term[k][i];
+            }
+    }
+}
+
+void ghosts(
+    size_t count, int wavelengths, int rows, int terms, int monomials, int lights, const float *places,
+    const float *call, const float *tables, float *out)
+{
+    static __thread float term[MOST][BLOCK], row[ROWS + 1][BLOCK];
+    for (size_t at = 0; at < count; at += BLOCK) {
+        const size_t n = count - at < BLOCK ? count - at : BLOCK;
+        const float *in[ROWS] = { places + at, places + count + at };
+        float *to[MOST];
+        for (int k = 0; k < terms; k++)
+            to[k] = term[k];
+        terms_of[monomials](n, in, call, to);
+        for (int r = 0; r < rows; r++)
+            in[2 + r] = row[r];
+        for (int w = 0; w < wavelengths; w++) {
+            product(rows, terms, tables + (size_t)w * rows * terms, term, row);
+            for (int k = 0; k < 4; k++)
+                to[k] = out + (4 * (size_t)w + k) * count + at;
+            light_of[lights](n, in, call, to);
+        }
+    }
+}
+"""

@@ -1,0 +1,220 @@
+"""The layers of flare, and the module of each: pictures that are added to a render of the same lens, film and focus.
+
+Each maker gives a picture of its own, and more by name that are parts of it. A layer that is switched off is absent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from neurolens.base.errors import InputError
+from neurolens.base.progress import Progress, Report
+from neurolens.flare.diffraction import starburst_picture
+from neurolens.flare.ghostmodel import GhostModel
+from neurolens.flare.ghosts import GhostTracer, Way, coated, ghost_pairs
+from neurolens.flare.lights import Light
+from neurolens.flare.photons import PhotonTracer
+from neurolens.flare.picture import Ghost, Raster, ghost_picture, ghost_table, photon_picture, with_four
+from neurolens.flare.scatter import Scatter
+from neurolens.flare.sources import SceneLights, keep
+from neurolens.flare.stack import Floats
+from neurolens.optics.prescription import Lens
+from neurolens.render.film import check_memory
+from neurolens.render.scene import Scene
+
+REST = "rest"
+_ONE = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class FlareSettings:
+    """What flare is made of, and how finely.
+
+    Attributes:
+        wavelength_nm: range of light. wavelengths: of equal shares of it.
+        cell_px: size on film of the cells that ghosts are drawn by.
+        photons: if above 0, ghosts by photons with up to `most_reflections`, so many a light and wavelength, smoothed
+            by kernels from radius `kernel_px` on, instead of by all pairs of reflections; 0 leaves them.
+        glare: if above 0, so many photons of the layer "glare": light that was reflected more than twice, or scattered.
+        scatter: what scatters it. The ghosts keep what scatters of theirs, which is little.
+        starburst: whether to make the layer "starburst": what diffraction at the stop and the rims takes out of images.
+        fours: whether ghosts of four reflections are traced, too: the strongest, as of `picture.with_four`; "glare" has
+            that light by chance.
+        single: ghosts that become layers, by name; the other ghosts are the layer "rest".
+        without: layers that are not made.
+        gains: factors of red, green and blue by the name of a layer, of a ghost (g07-03), or of a surface (s07: of all
+            ghosts that it reflects); several for one ghost are multiplied.
+        model: fitted ghosts that take the place of traced ones, of the same lens and stop.
+        seed: of the places and chances of photons, the same for all frames. threads: of the work.
+    """
+
+    wavelength_nm: tuple[float, float] = (400.0, 700.0)
+    wavelengths: int = 15
+    cell_px: float = 8.0
+    photons: int = 0
+    most_reflections: int = 10
+    kernel_px: float = 3.0
+    glare: int = 0
+    scatter: Scatter = Scatter()
+    starburst: bool = False
+    fours: bool = False
+    single: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+    gains: tuple[tuple[str, tuple[float, float, float]], ...] = ()
+    model: GhostModel | None = None
+    seed: int = 0
+    threads: int = 2
+
+    def __post_init__(self) -> None:
+        for name in self.without:
+            if name not in MAKERS:
+                raise InputError("flare", "without", name, f"layers of flare: {', '.join(MAKERS)}")
+        if self.scatter.on and not self.glare:
+            raise InputError("flare", "glare", self.glare, "photons, for light that scatters")
+        if self.fours and (self.photons or self.glare):
+            raise InputError("flare", "fours", self.fours, "false with photons or glare, which have that light")
+        of_ghosts = [name for name, _ in self.gains if name not in MAKERS]
+        if self.photons and (self.single or of_ghosts):
+            raise InputError("flare", "photons", self.photons, "0 with layers or gains of single ghosts")
+        for name, factor in self.gains:
+            if not all(0 <= v < math.inf for v in factor):
+                raise InputError("flare", f"gain {name}", factor, "finite numbers of at least 0")
+
+
+def flare_layers(
+    lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, progress: Progress | None = None
+) -> dict[str, Floats]:
+    """The layers that are switched on, by name, [H, W, 3] linear sRGB each; those of `MAKERS` sum to the flare.
+
+    Args:
+        lens: its film must be placed (`Lens.at`).
+
+    Raises:
+        InputError: as of the makers.
+    """
+    found: dict[str, Floats] = {}
+    progress = progress or Progress(quiet=True)
+    for name, make in MAKERS.items():
+        if name not in settings.without:
+            with progress.stage(name) as report:
+                made = make(lens, lights, raster, settings, report)
+            gain = np.prod([g for of, g in settings.gains if of == name], 0, np.float32)
+            found |= {part: picture * gain for part, picture in made.items()} if name in dict(settings.gains) else made
+    return found
+
+
+def scene_flare(
+    scene: Scene, lens: Lens, raster: Raster, white_balance: str | None, threads: int, progress: Progress
+) -> dict[str, Floats]:
+    """The layers of a scene that has the table [flare], of its own lights, by a lens whose film is placed.
+
+    Raises:
+        InputError: as of `flare_layers` and `coated`.
+    """
+    table, sources = scene.settings.flare, SceneLights(scene)
+    assert table is not None and lens.film_z_mm is not None
+    lights = keep(sources.seen(scene, lens.film_z_mm), table.most).lights
+    lens = lens if table.coating is None else coated(lens, table.coating)
+    tracer = GhostTracer(lens)
+    tables = [ghost_table(tracer, light, 550.0) for light in lights] if table.brightest else [[] for _ in lights]
+    settings = FlareSettings(
+        scene.settings.camera.wavelengths_nm, table.bins, table.cell_px, without=table.without, threads=threads,
+        single=brightest(lights, tables, table.brightest), glare=table.glare, starburst=table.starburst,
+    )  # fmt: skip
+    found = flare_layers(lens, lights, raster, settings, progress)
+    matrix = sources.balance(white_balance).T.astype(np.float32)
+    return {name: picture @ matrix for name, picture in found.items()}
+
+
+def sum_of(layers: Mapping[str, Floats], raster: Raster) -> Floats:
+    """The whole flare, [H, W, 3]: layers of `MAKERS`, without their parts."""
+    total = np.zeros((raster.height, raster.width, 3), np.float32)
+    for name in MAKERS:
+        total += layers.get(name, np.float32(0))
+    return total
+
+
+def brightest(lights: Sequence[Light], tables: Sequence[Sequence[Ghost]], count: int) -> tuple[str, ...]:
+    """Names of so many ghosts that have the most energy of all lights, each with its `ghost_table`."""
+    energy: dict[Way, float] = {}
+    for light, ghosts in zip(lights, tables, strict=True):
+        for ghost in ghosts:
+            energy[ghost.pair] = energy.get(ghost.pair, 0.0) + ghost.energy * sum(light.rgb)
+    return tuple(pair.name for pair in sorted(energy, key=lambda pair: -energy[pair])[:count])
+
+
+def _ghosts(
+    lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report
+) -> dict[str, Floats]:
+    names = "wavelength_nm", "wavelengths", "threads"
+    common: dict[str, Any] = {name: getattr(settings, name) for name in names}
+    if settings.photons:
+        part = "ghosts" if settings.glare else "flare"
+        return {"ghosts": _photons(lens, lights, raster, settings, done, part, settings.photons)}
+    traced = with_four(lens, lights).ways if settings.fours else ghost_pairs(lens)
+    ghosts = settings.model or GhostTracer(lens, traced)
+    factors = _factors(ghosts.pairs, settings)
+    # Ghosts of one layer and of equal factors share a picture.
+    keys = [(p.name if p.name in settings.single else REST, factors[p]) for p in ghosts.pairs]
+    kinds = list(dict.fromkeys([*keys, *((name, _ONE) for name in (*settings.single, REST))]))
+    check_memory(raster.width, raster.height, 12 * (len(kinds) + len(settings.single) + 4))
+    at = [kinds.index(key) for key in keys]
+    pictures = ghost_picture(ghosts, lights, raster, **common, cell_px=settings.cell_px, layers=at, done=done)
+    parts: dict[str, Floats] = {name: np.zeros(pictures.shape[1:], np.float32) for name in (*settings.single, REST)}
+    for (name, factor), picture in zip(kinds, pictures, strict=False):
+        parts[name] += picture * np.array(factor, np.float32)
+    return {"ghosts": np.sum(list(parts.values()), 0), **(parts if settings.single else {})}
+
+
+def _glare(
+    lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report
+) -> dict[str, Floats]:
+    if not settings.glare:
+        return {}
+    return {"glare": _photons(lens, lights, raster, settings, done, "glare", settings.glare)}
+
+
+def _starburst(
+    lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report
+) -> dict[str, Floats]:
+    if not settings.starburst:
+        return {}
+    common: dict[str, Any] = {name: getattr(settings, name) for name in ("wavelength_nm", "wavelengths", "threads")}
+    return {"starburst": starburst_picture(lens, lights, raster, done=done, **common)}
+
+
+def _photons(
+    lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report, part: str, count: int
+) -> Floats:
+    names = "wavelength_nm", "wavelengths", "most_reflections", "kernel_px", "seed", "threads"
+    common: dict[str, Any] = {name: getattr(settings, name) for name in names}
+    tracer = PhotonTracer(lens, settings.scatter)
+    return photon_picture(tracer, lights, raster, part=part, photons=count, done=done, **common)
+
+
+def _factors(pairs: Sequence[Way], settings: FlareSettings) -> dict[Way, tuple[float, float, float]]:
+    """Of every ghost."""
+    surfaces = {k for pair in pairs for k in pair.reflections}
+    known = {*MAKERS, *(pair.name for pair in pairs), *(f"s{k:02d}" for k in surfaces)}
+    for name, _ in settings.gains:
+        if name not in known:
+            named = pairs[0].name if pairs else "g01-00"
+            expected = (
+                f"a layer ({', '.join(MAKERS)}), a ghost ({named}) or a surface (s{min(surfaces, default=0):02d})"
+            )
+            raise InputError("flare", "gain", name, f"{expected} of this lens")
+    found = {}
+    for pair in pairs:
+        names = pair.name, *(f"s{k:02d}" for k in pair.reflections)
+        r, g, b = np.prod([_ONE, *(factor for name, factor in settings.gains if name in names)], 0)
+        found[pair] = float(r), float(g), float(b)
+    return found
+
+
+Maker = Callable[[Lens, Sequence[Light], Raster, FlareSettings, Report], dict[str, Floats]]
+MAKERS: dict[str, Maker] = {"ghosts": _ghosts, "glare": _glare, "starburst": _starburst}

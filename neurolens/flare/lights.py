@@ -1,0 +1,201 @@
+"""Lights of flare, over frames or not, lists of them, and the light that they send into the lens.
+
+Rays go through a disc across the light's way that holds the whole front surface, at the places of a low-discrepancy
+sequence that is the same every time: an animated light has no noise of its own.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError
+from neurolens.base.files import read_bytes
+from neurolens.base.tomlfile import reject_unknown
+from neurolens.flare.stack import Floats
+from neurolens.optics.prescription import Lens
+from neurolens.optics.sag import sag_mm
+
+_PLASTIC = 1.32471795724474602596  # of the R2 sequence (Roberts 2018): x^3 = x + 1
+
+_LARGEST_FILE = 1 << 24
+# Columns of a list of lights: what is left out, and least and most.
+_COLUMNS: dict[str, tuple[float, float, float]] = {
+    "frame": (0.0, -1e7, 1e7),
+    "azimuth_deg": (math.nan, -360.0, 360.0),
+    "elevation_deg": (math.nan, -90.0, 90.0),
+    "r": (1.0, 0.0, 1e30),
+    "g": (1.0, 0.0, 1e30),
+    "b": (1.0, 0.0, 1e30),
+    "distance_m": (math.inf, 1e-6, math.inf),
+}
+
+
+@dataclass(frozen=True)
+class Light:
+    """A light far away, or at a place.
+
+    Attributes:
+        azimuth_deg: to the right of the axis, seen by the camera; elevation_deg: above it.
+        rgb: linear sRGB irradiance that it makes at the lens across its way: radiance times solid angle in sr.
+        distance_m: from the front vertex; inf allowed.
+
+    Raises:
+        InputError: angles that do not come from the front (the light lies behind the lens), a distance that is not
+            positive, an irradiance that is negative.
+    """
+
+    azimuth_deg: float
+    elevation_deg: float
+    rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    distance_m: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not (abs(self.elevation_deg) < 90 and math.isfinite(self.azimuth_deg) and self.towards[2] < 0):
+            found = (self.azimuth_deg, self.elevation_deg)
+            raise InputError("light", "azimuth, elevation", found, "angles within 90 degrees of the axis")
+        if not self.distance_m > 0:
+            raise InputError("light", "distance_m", self.distance_m, "a positive distance in metres, or inf")
+        if not all(0 <= v < math.inf for v in self.rgb):
+            raise InputError("light", "rgb", self.rgb, "three finite numbers of at least 0")
+
+    @property
+    def towards(self) -> NDArray[np.float64]:
+        """Unit vector from the lens to the light, lens frame."""
+        a, e = math.radians(self.azimuth_deg), math.radians(self.elevation_deg)
+        return np.array([math.sin(a) * math.cos(e), math.sin(e), -math.cos(a) * math.cos(e)])
+
+
+@dataclass(frozen=True)
+class Track:
+    """A light over frames.
+
+    Attributes:
+        name: of the light. keys: [K, 7] frame, azimuth and elevation in degrees, r, g, b, 1 / distance in 1/m; linear
+            in between, before the first and after the last as there.
+    """
+
+    name: str
+    keys: NDArray[np.float64]
+
+    def at(self, frame: float) -> Light | None:
+        """The light at a frame; None while it stands behind the lens."""
+        azimuth, elevation, r, g, b, near = (float(np.interp(frame, self.keys[:, 0], c)) for c in self.keys.T[1:])
+        if math.cos(math.radians(azimuth)) <= 1e-6 or abs(elevation) >= 90:
+            return None
+        return Light(azimuth, elevation, (r, g, b), 1 / near if near else math.inf)
+
+
+def read_lights(path: Path) -> list[Track]:
+    """The lights of a list: CSV with a header, or JSON, a list of objects.
+
+    Columns or keys: azimuth_deg, elevation_deg; and, where they are not left out, light (a name; without it each row is
+    a light), frame (rows of one light are its keys, frames increasing), r, g, b (irradiance, 1), distance_m (inf).
+
+    Raises:
+        InputError: names file, row and column, for an unknown or missing one, or a value that is none.
+    """
+    rows, found = _rows(path), dict[str, list[list[float]]]()
+    for number, row in enumerate(rows):
+        place = f"row {number + 1}, "
+        reject_unknown(path, place, row, ["light", *_COLUMNS])
+        frame, *values, distance = (_value(path, place, name, row.get(name)) for name in _COLUMNS)
+        keys = found.setdefault(str(row.get("light") or f"light {number + 1}"), [])
+        if keys and not frame > keys[-1][0]:
+            raise InputError(path, f"{place}frame", frame, f"a frame after {keys[-1][0]:g}, the light's key before")
+        keys.append([frame, *values, 1 / distance])
+    return [Track(name, np.array(keys)) for name, keys in found.items()]
+
+
+def _rows(path: Path) -> list[Mapping[str, Any]]:
+    data = read_bytes(path, _LARGEST_FILE, "a list of lights")
+    try:
+        text = data.decode("utf-8-sig")
+        rows = (
+            json.loads(text)
+            if path.suffix.lower() == ".json"
+            else list(csv.DictReader(text.splitlines(), restkey="(one more)"))
+        )
+    except (ValueError, RecursionError, csv.Error) as error:
+        raise InputError(path, "file", f"({error})", "a list of lights as CSV or JSON") from None
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise InputError(path, "file", "(no list of objects)", "a list of lights, each an object")
+    return rows
+
+
+def _value(path: Path, place: str, name: str, given: Any) -> float:
+    default, least, most = _COLUMNS[name]
+    if given in (None, "") and not math.isnan(default):
+        return default
+    try:
+        value = math.nan if isinstance(given, bool) else float(given)
+    except (TypeError, ValueError, OverflowError):
+        value = math.nan
+    if not least <= value <= most:
+        raise InputError(path, f"{place}{name}", given, f"a number from {least:g} to {most:g}")
+    return value
+
+
+def light_rays(
+    lens: Lens, light: Light, first: int, count: int, shift: float = 0.0, jitter: float = 0.0
+) -> tuple[Floats, float]:
+    """Rays number `first` and following of a light, [6, count] lens frame, and the area in mm^2 that all N share: the
+    irradiance at the lens times area / N is the light of one of N rays. All carry the same: they are uniform across the
+    way of a light far away, and in solid angle from a near one.
+
+    Args:
+        shift: of the sequence, for each wavelength another. jitter: see `disc`.
+    """
+    return rays_across(lens, light, disc(first, count, shift, jitter))
+
+
+def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> tuple[Floats, float]:
+    """Rays [6, N] of a light through places [2, N] of the disc across its way, the unit disc, and the area in mm^2 that
+    the whole disc stands for: equal shares of the unit disc carry equal light; see `light_rays`.
+
+    Places may also lie in the corners of the square about the disc.
+    """
+    front = lens.surfaces[0]
+    depth = float(sag_mm(front, front.semi_diameter_mm, 0.0))
+    centre, radius = np.array([0.0, 0.0, depth / 2]), math.hypot(front.semi_diameter_mm, depth / 2)
+    ahead = light.towards
+    # Two sides that turn without a jump while the light moves (Duff et al. 2017, of one hemisphere).
+    x, y, z = ahead
+    sides = np.array([[1 - x * x / (1 - z), -x * y / (1 - z), x], [x * y / (1 - z), y * y / (1 - z) - 1, -y]])
+    across = sides.T @ place
+    if math.isinf(light.distance_m):
+        target = centre[:, None] + radius * across
+        return np.concatenate([target, np.broadcast_to(-ahead[:, None], target.shape)]), math.pi * radius**2
+    source = 1000 * light.distance_m * ahead
+    far = float(np.linalg.norm(source - centre))
+    if far <= 1.01 * radius:
+        expected = f"a light outside the lens, beyond {radius / 1000:.3g} m"
+        raise InputError("light", "distance_m", light.distance_m, expected)
+    # Uniform in solid angle over the cone that holds the sphere about the front surface.
+    solid = 1 - math.sqrt(1 - (radius / far) ** 2)
+    off = across * np.sqrt(solid * (2 - solid * (across**2).sum(0)))
+    towards = (centre - source) / far
+    off -= towards[:, None] * (towards @ off)
+    cos = 1 - solid * (across**2).sum(0)
+    sine = np.sqrt(np.maximum(1 - cos**2, 0)) / np.maximum(np.linalg.norm(off, axis=0), 1e-300)
+    direction = towards[:, None] * cos + off * sine
+    return np.concatenate([source[:, None] + direction * (far - radius), direction]), 2 * math.pi * solid * far**2
+
+
+def disc(first: int, count: int, shift: float = 0.0, jitter: float = 0.0) -> NDArray[np.float64]:
+    """Points [2, count] of the unit disc, of equal shares: the R2 sequence from a number on, shifted.
+
+    `jitter` moves each by up to so much of the square's side: regular places make patterns in a picture.
+    """
+    n = np.arange(first, first + count) + 1.0
+    moved = jitter * np.random.default_rng([first, int(shift * 2**32)]).random((2, count))
+    u, v = (n / _PLASTIC + shift + moved[0]) % 1, (n / _PLASTIC**2 + 0.5 * shift + moved[1]) % 1
+    return np.sqrt(u) * np.stack([np.cos(2 * math.pi * v), np.sin(2 * math.pi * v)])

@@ -1,0 +1,182 @@
+"""Lights of flare from where they are: in a scene, or in a picture of one.
+
+Of a scene: rectangles, discs, spheres, points, spots and the sun, as far as they are seen from the lens's front vertex.
+Of a picture: regions brighter than a threshold. The sky and other surroundings are no lights.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage  # type: ignore[import-untyped]
+
+from neurolens.base.errors import InputError
+from neurolens.cameras.contract import FloatArray
+from neurolens.cameras.field import Array, Field
+from neurolens.flare.lights import Light
+from neurolens.render.colour import balance
+from neurolens.render.job import camera_axes
+from neurolens.render.scene import Scene
+from neurolens.render.spectrum import SpectralRange
+from neurolens.render.world import World
+
+_SIDE = 8  # samples along each side of a light
+_PATCHES = 4  # patches along each side of a large one
+_SMALL = math.radians(1.0)  # about its middle, seen from the lens: one light
+_CELL = 1 / 48  # of the picture's width: larger highlights are several lights
+_MOST_PIXELS = 1 << 22  # above the threshold
+_DIMMEST = 0.02  # relative illumination that a highlight's radiance is told from
+
+
+class SceneLights:
+    """The lights of a scene, to be seen from anywhere."""
+
+    def __init__(self, scene: Scene) -> None:
+        low, high = scene.settings.camera.wavelengths_nm
+        spectral = SpectralRange(low, high)
+        self._world, self._spectral, every = World(scene, spectral), spectral, np.arange(spectral.bins)
+        rows, palette = self._world.light_emission_row, self._world.palette
+        self._rgb = [spectral.film_rgb(palette.look_up(np.full_like(every, row), every)[0]) for row in rows]
+
+    def balance(self, illuminant: str | None) -> Array:
+        """Matrix [3, 3] on linear sRGB that makes an illuminant neutral, as renders of the scene have it."""
+        if illuminant is None or not self._spectral.colours:
+            return np.eye(3)
+        return balance(self._spectral.film_rgb(self._world.palette.illuminant(illuminant)))
+
+    def seen(self, scene: Scene, film_z_mm: float) -> list[Light]:
+        """The lights before the lens of a camera of `scene`, whose place may be another.
+
+        Args:
+            film_z_mm: of the lens: the front vertex lies so far before the film.
+        """
+        pose = scene.settings.camera
+        axes = camera_axes(pose).astype(np.float64)
+        front = np.array(pose.position_m) - axes[:, 2] * film_z_mm / 1000
+        side = (np.arange(_SIDE) + 0.5) / _SIDE
+        square = np.stack([a.ravel() for a in np.meshgrid(side, side)]).astype(np.float32)
+        point = np.repeat(front[:, None], square.shape[1], 1).astype(np.float32)
+        found: list[Light] = []
+        for (direction, distance, scale), rgb in zip(self._world.lights.each(point, square), self._rgb, strict=False):
+            seen = np.where(self._world.visible(point, direction, distance), scale, 0).astype(np.float64)
+            found += _lights(axes.T @ direction, distance, seen, rgb)
+        return found
+
+
+def _lights(towards: Array, distance: FloatArray, scale: Array, rgb: Array) -> list[Light]:
+    """A light sampled over its square, as one, or where it is large as several.
+
+    Args:
+        towards: [3, N] camera frame. scale: [N] irradiance of emission 1.
+    """
+    if not (scale.any() and rgb.any()):
+        return []
+    middle = towards @ scale
+    middle /= np.linalg.norm(middle)
+    apart = np.linalg.norm(towards[:, scale > 0] - middle[:, None], axis=0).max()
+    cells = 1 if apart <= _SMALL else _PATCHES
+    number = np.arange(_SIDE) * cells // _SIDE
+    cell = (number[:, None] * cells + number).ravel()
+    lights = []
+    for k in range(cells * cells):
+        share = np.where(cell == k, scale, 0)
+        if share.any():
+            mean = float(share @ distance / share.sum()) if np.isfinite(distance).all() else math.inf
+            lights.append(_light(towards @ share, rgb * share.sum() / scale.size, mean))
+    return [light for light in lights if light is not None]
+
+
+def _light(towards: Array, rgb: Array, distance_m: float = math.inf) -> Light | None:
+    """None behind the lens."""
+    x, y, z = towards / np.linalg.norm(towards)
+    azimuth, elevation = math.degrees(math.atan2(x, -z)), math.degrees(math.asin(max(-1.0, min(1.0, y))))
+    if not z < -1e-6:
+        return None
+    r, g, b = (max(float(v), 0.0) for v in rgb)
+    return Light(azimuth, elevation, (r, g, b), distance_m)
+
+
+class Kept(NamedTuple):
+    """Lights, brightest first, of how many, and the share of their energy that is left out."""
+
+    lights: list[Light]
+    of: int
+    dropped: float
+
+
+def keep(lights: Sequence[Light], most: int) -> Kept:
+    """The lights of the most energy at the lens."""
+    ordered = sorted(lights, key=lambda light: -sum(light.rgb))
+    left = sum(sum(light.rgb) for light in ordered[most:])
+    return Kept(ordered[:most], len(ordered), left / max(sum(sum(light.rgb) for light in ordered), 1e-300))
+
+
+def highlights(picture: FloatArray, field: Field, film_mm: tuple[float, float], threshold: float, most: int) -> Kept:
+    """The regions of a picture [H, W, 3] (linear; 1 is a white card of radiance 1) that reach a threshold in a colour.
+
+    A region of connected pixels is a light far away with the region's radiance times solid angle; a large one is
+    several. Radiance is the picture's value over the relative illumination. Pixels count in full from twice the
+    threshold on, less the nearer they are to it: a light that a film brings over it does not switch on at once.
+
+    Args:
+        field: of the camera that took the picture, laid out as equidistant. most: lights, those of the most energy.
+
+    Raises:
+        InputError: values that are not finite; more than `_MOST_PIXELS` pixels that reach the threshold.
+    """
+    if bad := int((~np.isfinite(picture)).any(-1).sum()):
+        raise InputError("picture", "pixels", f"({bad} with NaN or infinity)", "finite values")
+    height, width = picture.shape[:2]
+    value = picture.max(-1)
+    bright = value >= threshold
+    if np.count_nonzero(bright) > _MOST_PIXELS:
+        found = f"{threshold:g} ({np.count_nonzero(bright)} pixels)"
+        raise InputError("picture", "threshold", found, f"one that at most {_MOST_PIXELS} pixels reach")
+    row, column = np.nonzero(bright)
+    if not row.size:
+        return Kept([], 0, 0.0)
+    region = _regions(bright, max(1, round(_CELL * width)))[row, column]
+    energy, towards = _pixels(picture[row, column], row, column, field, film_mm, (height, width))
+    energy *= np.minimum(value[row, column] / threshold - 1, 1)[:, None]
+    count = int(region.max()) + 1
+    colour = np.stack([np.bincount(region, c, count) for c in energy.T], 1)
+    total = energy.sum(1)
+    middle = np.stack([np.bincount(region, total * c, count) for c in towards]).astype(np.float64)
+    lights = [_light(middle[:, k], colour[k]) for k in range(count) if colour[k].any()]
+    return keep([light for light in lights if light], most)
+
+
+def _regions(bright: NDArray[np.bool_], cell: int) -> NDArray[np.intp]:
+    """Numbers from 0 of connected regions, [H, W]; one larger than two cells has a number for each cell of it."""
+    label, _ = ndimage.label(bright, np.ones((3, 3)))
+    part = np.zeros(label.shape, np.int64)
+    for number, box in enumerate(ndimage.find_objects(label), 1):
+        size = [s.stop - s.start for s in box]
+        if max(size) > 2 * cell:
+            row, column = (np.arange(n) // cell for n in size)
+            inside = label[box] == number
+            part[box][inside] = (row[:, None] * (column[-1] + 1) + column)[inside]
+    _, numbers = np.unique(np.stack([label[bright], part[bright]]), axis=1, return_inverse=True)
+    found = np.full(label.shape, -1, np.intp)
+    found[bright] = numbers.reshape(-1)
+    return found
+
+
+def _pixels(
+    colour: FloatArray, row: NDArray[np.intp], column: NDArray[np.intp], field: Field, film_mm: tuple[float, float],
+    size: tuple[int, int],
+) -> tuple[Array, Array]:  # fmt: skip
+    """Irradiance at the lens [N, 3] and direction [3, N] (lens frame) of pixels, as their corners are seen."""
+    x = (np.array([[0], [1], [1], [0]]) + column) * (film_mm[0] / size[1]) - film_mm[0] / 2
+    y = film_mm[1] / 2 - (np.array([[0], [0], [1], [1]]) + row) * (film_mm[1] / size[0])
+    corner = field.directions((x + 1j * y).reshape(-1)).reshape(3, 4, -1)
+    corner[2] *= -1
+    across, down = corner[:, 2] - corner[:, 0], corner[:, 3] - corner[:, 1]
+    solid = np.linalg.norm(np.cross(across, down, axis=0), axis=0) / 2
+    light = field.relative_light(x.mean(0) + 1j * y.mean(0))
+    radiance = np.where(light[:, None] > _DIMMEST, np.maximum(colour, 0) / np.maximum(light, _DIMMEST)[:, None], 0)
+    return radiance * solid[:, None], corner.sum(1)

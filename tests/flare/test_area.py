@@ -1,0 +1,176 @@
+"""Grids of rays as areas on film: exact cover, closed forms of folds and rims, and that nothing is lost."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from neurolens.flare.area import Canvas
+from neurolens.flare.ghosts import GhostTracer
+from neurolens.flare.grids import REACH, grids_of
+from neurolens.flare.lights import Light, light_rays, rays_across
+from neurolens.flare.picture import Raster, ghost_picture
+from neurolens.flare.steps import LOST
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph
+from neurolens.optics.apertures import Aperture
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens
+
+LENSES = Path(__file__).parents[2] / "lenses"
+White = np.ones(3)
+
+
+def drawn(found: np.ndarray, columns: int, share: float, size: tuple[int, int] = (12, 10)) -> np.ndarray:
+    """One channel [H, W]; places in pixels from the middle, x to the left."""
+    canvas, picture = Canvas(*size), np.zeros((size[1], size[0], 3), np.float32)
+    canvas.add(np.ascontiguousarray(found, np.float32), columns, share, 1.0)
+    canvas.onto(picture, White)
+    before = picture.copy()
+    canvas.onto(picture, White)
+    assert np.array_equal(picture, before)  # it is empty then
+    return picture[..., 1].astype(np.float64)
+
+
+def lattice(columns: int, rows: int, low: float = 0.0, high: float = 1.0) -> np.ndarray:
+    u, v = np.meshgrid(np.linspace(low, high, columns + 1), np.linspace(low, high, rows + 1))
+    return np.stack([u.ravel(), v.ravel()])
+
+
+def rays(xy: np.ndarray, power: float = 1.0, worst: np.ndarray | None = None) -> np.ndarray:
+    one = np.ones(xy.shape[1])
+    return np.stack([*xy, power * one, 0 * one if worst is None else worst])
+
+
+def double_gauss(**state: float) -> Lens:
+    return read_lens(LENSES / "laikin_double_gauss_50.toml").at(focus_m=math.inf, **state)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, 2.0, 4.4])
+def test_pixels_are_covered_by_their_area(turn: float) -> None:
+    """A turned square, cell by cell or as one, against many points in it."""
+    cos, sin = math.cos(turn), math.sin(turn)
+    place = np.array([[cos, -sin], [sin, cos]]) @ (5 * lattice(1, 1) - 2.2) + 0.37
+    whole = drawn(rays(place), 1, 25.0)
+    fine = 0.01 * (np.arange(500) + 0.5) - 2.2
+    x, y = np.array([[cos, -sin], [sin, cos]]) @ np.stack(np.meshgrid(fine, fine)).reshape(2, -1) + 0.37
+    counted = np.histogram2d(y, -x, bins=(np.arange(11) - 5.0, np.arange(13) - 6.0))[0] * 1e-4
+    np.testing.assert_allclose(whole, counted, atol=4e-3)
+    np.testing.assert_allclose(whole.sum(), 25.0, rtol=1e-6)
+    place = np.array([[cos, -sin], [sin, cos]]) @ (5 * lattice(7, 4) - 2.2) + 0.37
+    np.testing.assert_allclose(drawn(rays(place), 7, 25 / 28), whole, atol=1e-5)
+
+
+def test_what_lies_off_the_film_changes_nothing_on_it() -> None:
+    """A small film shows the middle of a large one: folded, stretched and cut cells at all borders."""
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        place, worst = 9 * rng.standard_normal((2, 30)), rng.uniform(0, 2, 30)
+        worst[rng.integers(30)] = LOST
+        found = rays(place, 0.7, worst)
+        large, small = (drawn(found, 5, 3.0, size) for size in ((200, 160), (12, 10)))
+        np.testing.assert_allclose(small, large[75:85, 94:106], atol=1e-5 * large.max())
+        assert large.min() >= 0
+
+
+def test_a_fold_is_its_closed_form() -> None:
+    """x = u^2 for u from -1 to 1: the light between two places is 2 (sqrt(b) - sqrt(a)), and all is there."""
+    u, v = lattice(401, 3)
+    place = np.stack([5.5 - 10 * (2 * u - 1) ** 2, 6 * v - 3])
+    picture = drawn(rays(place, 2.0), 401, 1 / (401 * 3))
+    along = np.sqrt(np.clip((np.arange(13) - 0.5) / 10, 0, 1))  # the fold is half a pixel from the border
+    np.testing.assert_allclose(picture.sum(0), 2 * np.diff(along), atol=1e-4)
+    assert picture.sum() == pytest.approx(2.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("cells", [8, 16, 64])
+def test_a_rim_cuts_its_circle(cells: int) -> None:
+    """The light of a disc: its area, with the square of the cells; and none outside it."""
+    place = lattice(cells, cells, -4, 4)
+    picture = drawn(rays(place, 1.0, (place**2).sum(0) / 9), cells, (8 / cells) ** 2)
+    assert picture.sum() == pytest.approx(9 * math.pi, rel=2 / cells**2)
+    y, x = np.mgrid[-4.5:5, -5.5:6]
+    np.testing.assert_allclose(picture[np.hypot(x, y) < 2.2], 1.0, atol=1e-4)
+    assert picture[np.hypot(x, y) > 3.8].max() < 1e-12
+
+
+def test_points_and_what_is_no_place_at_all() -> None:
+    """Cells that shrink to a point keep their light; light that arrives nowhere, or far away, is not drawn."""
+    point = np.full((2, 9), 0.25)
+    picture = drawn(rays(point), 2, 0.25)
+    assert picture.sum() == pytest.approx(1.0) and np.count_nonzero(picture > 1e-12) <= 4
+    for bad in (np.nan, np.inf, 1e20):
+        place = lattice(2, 2)
+        place[0, 4] = bad
+        for worst in (None, np.repeat([0.0, LOST], [8, 1])):
+            assert np.isfinite(drawn(rays(place, 1.0, worst), 2, 0.25)).all()
+    assert not drawn(rays(lattice(2, 2), 1.0, np.full(9, LOST)), 2, 1.0).any()
+
+
+CASES = {
+    "open": lambda: double_gauss(),
+    "blades": lambda: replace(double_gauss().at(f_number=5.6), aperture=Aperture(blades=6, curvature=0.3)),
+    "phone": lambda: read_lens(LENSES / "phone_lens_6.toml").at(focus_m=math.inf),
+}
+
+
+@pytest.mark.parametrize("distance_m", [math.inf, 0.6])
+@pytest.mark.parametrize("case", CASES)
+def test_ghosts_have_the_light_of_their_rays(case: str, distance_m: float) -> None:
+    """Every ghost that counts: grid and low-discrepancy rays agree in the light that falls on the film."""
+    lens, light = CASES[case](), Light(11.0, -6.0, distance_m=distance_m)
+    tracer = GhostTracer(lens)
+    size = 6.0 if case == "phone" else 36.0
+    half = size / 2, size / 3
+    given, disc = light_rays(lens, light, 0, 1 << 15)
+    found = tracer.trace(given, 550.0)
+    on_film = (np.abs(found.film_xy_mm) < np.array(half)[:, None]).all(1)
+    expected = disc * np.where(on_film, found.power, 0).mean(1, dtype=np.float64)
+    noise = 2 * np.maximum((on_film & (found.power > 0)).sum(1), 1.0) ** -0.75  # of such a sequence
+    grids = grids_of(tracer, light, 550.0, half, size / 60)
+    for pair, wanted, off in zip(tracer.pairs, expected, noise, strict=True):
+        if wanted < 2e-3 * expected.sum():
+            continue
+        grid, canvas = grids[pair], Canvas(96, 64)
+        rows, area = rays_across(lens, light, grid.places)
+        found = tracer.follow(tracer.start(rows), 550.0, only=[pair], reach=REACH)
+        canvas.add(found.rows[0], grid.columns, area * grid.cell, 96 / size)
+        picture = np.zeros((64, 96, 3), np.float32)
+        canvas.onto(picture, White)
+        assert picture[..., 0].sum(dtype=np.float64) == pytest.approx(wanted, rel=0.01 + off)
+    total = sum(w for p, w in zip(tracer.pairs, expected, strict=True) if p not in grids)
+    assert total < 1e-3 * expected.sum()
+
+
+def test_any_number_of_threads_and_layers_is_one_picture() -> None:
+    lens, light = double_gauss(), [Light(15.0, 8.0), Light(-4.0, 2.0, (0.1, 0.5, 0.2))]
+    tracer, raster = GhostTracer(lens), Raster((36.0, 24.0), 48, 32)
+    one = ghost_picture(tracer, light, raster, wavelengths=4, threads=1)
+    assert np.array_equal(ghost_picture(tracer, light, raster, wavelengths=4, threads=3), one)
+    several = ghost_picture(tracer, light, raster, wavelengths=4, layers=[k % 3 for k in range(66)])
+    np.testing.assert_allclose(several.sum(0), one[0], rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("aperture", [Aperture(5, 20.0), Aperture(9, 3.0, 0.6), Aperture(3, curvature=1.0)])
+def test_blades_have_a_rim(aperture: Aperture) -> None:
+    """It is 1 where the opening ends, and has no jump there."""
+    g, xy = Graph(), np.random.default_rng(1).uniform(-3, 3, (2, 4000))
+    point, radius = g.input("xy", 2), g.input("radius", per_call=True)
+    g.outputs["rim"], opened = aperture.rim(g, point, radius, LOST), aperture.opening(g, point, radius)
+    g.outputs["open"] = g.select(opened, 1.0, 0.0)
+    found = evaluate(g, {"xy": xy, "radius": np.array([[2.5]])})
+    assert np.array_equal(found["rim"][0] <= 1, found["open"][0] > 0)
+    near = evaluate(g, {"xy": xy + 1e-6, "radius": np.array([[2.5]])})
+    assert np.abs(near["rim"] - found["rim"]).max() < 1e-5
+
+
+@pytest.mark.parametrize(("u", "v"), [(1, 0), (0, 1), (1, 1), (-1, 1)])
+def test_where_rays_are_lost_light_is_as_dense_as_beside(u: int, v: int) -> None:
+    """Of an even light half of whose rays are lost: nowhere brighter, and lit to half a cell from the others."""
+    place, (y, x) = lattice(9, 9, -4, 4), np.mgrid[:10, :10]
+    lost = (u * x + v * y).ravel() > np.median(u * x + v * y)
+    picture = drawn(rays(np.where(lost, np.nan, place), 1.0, np.where(lost, LOST, 0.0)), 9, (8 / 9) ** 2)
+    assert picture.max() < 1 + 1e-5
+    assert picture.sum() == pytest.approx(64 * np.mean(~lost), rel=0.02)

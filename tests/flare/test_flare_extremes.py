@@ -1,0 +1,133 @@
+"""Flare of lights and lenses at the edges: finite pictures or clear errors, bounded memory, an end when asked."""
+
+import math
+import os
+import signal
+import threading
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from neurolens.cli import main
+from neurolens.flare.ghosts import GhostTracer
+from neurolens.flare.lights import Light
+from neurolens.flare.photons import PhotonTracer
+from neurolens.flare.picture import Raster, ghost_picture
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.render.pictures import read_exr, write_exr
+
+COOKE = ["flare", "cooke_triplet_50", "--wavelengths", "2", "--cell", "4", "--width", "36", "--quiet"]
+
+
+@pytest.mark.parametrize(
+    "light", ["0,0", "89,0", "0,-89.9", "60,60", "0,0,1,0.1", "5,3,1,0.05", "3,2,0", "3,2,1e20", "3,2,1e-20"]
+)
+def test_any_light_before_the_lens(tmp_path: Path, light: str) -> None:
+    """On the axis, far beside it, inside the near focus, dark and dazzling: finite, of no negative luminance."""
+    out = tmp_path / "a.exr"
+    assert main([*COOKE, "--light", light, "-o", str(out)]) == 0
+    picture = read_exr(out)[0]
+    assert picture.shape == (24, 36, 3) and np.isfinite(picture).all()
+    assert (picture @ [0.2126, 0.7152, 0.0722] >= -1e-6 * picture.max()).all()
+    assert picture.any() == (light not in ("89,0", "0,-89.9", "60,60", "3,2,0"))
+
+
+def test_no_light_is_a_black_picture_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """An empty list, a list behind the lens, a plate without highlights."""
+    empty, behind = tmp_path / "empty.json", tmp_path / "behind.csv"
+    empty.write_text("[]")
+    behind.write_text("azimuth_deg,elevation_deg\n180,0\n")
+    plate, out = tmp_path / "plate.exr", tmp_path / "a.exr"
+    write_exr(plate, np.full((24, 36, 3), 1.9))
+    for words, said in (
+        (["--lights", str(empty)], "no light"),
+        (["--lights", str(behind)], "1 lights of lists stand behind the lens"),
+        (["--image", str(plate)], "no light"),
+    ):
+        assert main([*COOKE[:-1], *words, "--layers", "2", "-o", str(out)]) == 0
+        assert said in capsys.readouterr().err
+        assert not read_exr(out)[0].any()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--light", "0,0,1,0.001"], "outside the lens"),
+        (["--light", "95,0"], "within 90 degrees"),
+        (["--light", "3,2,inf"], "finite"),
+        (["--light", "3,2,nan"], "finite"),
+        (["--light", "3,2,1,nan"], "positive distance"),
+        (["--light", "0,0", "--coating", "s00"], "s00"),
+    ],
+)
+def test_lights_that_are_none(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*COOKE, *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("count", ["0", "-1", "1e9", "2000000000"])
+def test_counts_of_photons_that_are_none(count: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main([*COOKE, "--light", "0,0", "--photons", count])
+    assert "from 1 to 1073741824" in capsys.readouterr().err
+
+
+def interrupted_after(seconds: float, words: list[str]) -> int:
+    timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background of a shell ignore it
+    timer.start()
+    try:
+        return main(words)
+    finally:
+        timer.cancel()
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_thousand_million_photons_end_when_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "a.exr"
+    words = [*COOKE, "--light", "5,3", "--photons", "1000000000", "-o", str(out)]
+    assert interrupted_after(1.5, words) == 130
+    assert "nothing is written" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_end_when_asked_and_are_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "a.exr"
+    assert main([*COOKE, "--light", "5,3", "--frames", "1:1", "-o", str(out)]) == 0
+    assert interrupted_after(1.5, [*COOKE, "--light", "5,3", "--frames", "1:2000", "-o", str(out)]) == 130
+    assert "goes on" in capsys.readouterr().err
+    files = sorted(tmp_path.iterdir())
+    assert [file.name for file in files] == [f"a.{k + 1:04d}.exr" for k in range(len(files))]
+    assert all(read_exr(file)[0].any() for file in files)
+
+
+def test_memory_does_not_grow_with_lights() -> None:
+    """Twelve lights take what two take: films under way are bounded."""
+    lens = read_lens("lenses/cooke_triplet_50.toml").at(focus_m=math.inf)
+    tracer, raster = GhostTracer(lens), Raster((36.0, 24.0), 360, 240)
+    peaks = []
+    for count in (2, 2, 12):  # the first compiles
+        lights = [Light(float(k), 3.0) for k in range(count)]
+        tracemalloc.start()
+        ghost_picture(tracer, lights, raster, wavelengths=4, cell_px=60.0, threads=2)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[2] < 1.2 * peaks[1]
+
+
+def test_total_reflection_inside() -> None:
+    """A plano-convex glass, its dome behind: beyond R / n light is totally reflected, and no book loses it."""
+    n, radius, gap = 1.8, 10.5, 30.0
+    rows = Surface(math.inf, 12.0, 20.0, n), Surface(-radius, gap, 20.0, stop=True)
+    lens = Lens("dome", "", rows, 2.0, film_z_mm=12.0 + gap)
+    height = np.linspace(0, 9.9, 1000)
+    rays = np.stack([height, 0 * height, 0 * height - 1, 0 * height, 0 * height, 1 + 0 * height])
+    found = GhostTracer(lens).trace(rays, 550.0, direct=True)
+    through = found.power[-1] > 0
+    assert through[height < radius / n - 0.02].all() and not through[height > radius / n + 0.02].any()
+    assert np.isfinite(found.power).all() and np.all((found.power >= 0) & (found.power <= 1))
+    books = PhotonTracer(lens).trace(np.repeat(rays, 20, 1), 550.0, most_reflections=1000)
+    assert books.reflections.size + books.left + books.stopped + books.absorbed + books.cut == books.cast == 20_000

@@ -1,0 +1,213 @@
+"""Fitted ghosts: against the exact ones, in every form they are written in, and what their files may not hold."""
+
+import ctypes
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+
+from neurolens.base.errors import InputError, ModelError
+from neurolens.cli import main
+from neurolens.flare.ghostfile import output_of, read_ghosts, write_ghost_source, write_ghosts
+from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
+from neurolens.flare.ghostmodel import GhostModel
+from neurolens.flare.ghosts import GhostTracer
+from neurolens.flare.lights import Light, light_rays
+from neurolens.flare.picture import Raster, ghost_picture
+from neurolens.graph.compiler import compile_c
+from neurolens.modelfile import CARD_KEY, MODEL_KEY
+from neurolens.optics.apertures import Aperture
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens
+
+LENS = Path(__file__).parents[2] / "lenses" / "brendel_tessar_100.toml"
+SETTINGS = GhostSettings(angle_deg=25.0, keep=0.8, rays=2000, target_um=60.0)
+
+
+def tessar(**state: float) -> Lens:
+    return read_lens(LENS).at(focus_m=math.inf, **state)
+
+
+@pytest.fixture(scope="module")
+def model() -> GhostModel:
+    return fit_ghosts(tessar(), SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def file(model: GhostModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_ghosts(model, tmp_path_factory.mktemp("ghosts") / "tessar.onnx")
+
+
+def lit_rays(model: GhostModel, number: int, count: int = 500) -> np.ndarray:
+    """Directions and places [4, N] where a ghost has its light; light from everywhere."""
+    rng, ghost = np.random.default_rng(number), model.ghosts[number]
+    p = rng.uniform(-0.6, 0.6, (2, count))
+    place = ghost.chief_mm * p + 0.9 * ghost.scale_mm * rng.uniform(-1, 1, (2, count))
+    return np.concatenate([model.sine * p, place])
+
+
+def test_the_fit_is_what_it_says(model: GhostModel) -> None:
+    """On rays of a light that the fit never saw: places, energy and who passes, of every ghost; and at a smaller stop
+    with blades, for which nothing was fitted."""
+    assert 2 < model.report["kept"] < model.report["pairs"] == 21 and 0.8 <= model.report["kept_energy"] < 1
+    light = Light(9.0, -7.0)
+    for lens in (tessar(), replace(tessar(f_number=8.0), aperture=Aperture(blades=5, rotation_deg=10.0))):
+        tracer, fitted = GhostTracer(lens, model.pairs), replace(model, lens=lens)
+        rays, _ = light_rays(lens, light, 0, 40_000)
+        exact, found = tracer.trace(rays, 520.0), fitted.trace(rays, 520.0)
+        on_film = np.hypot(*np.moveaxis(exact.film_xy_mm, 1, 0)) < SETTINGS.film_radius_mm
+        both = on_film & (exact.power > 0) & (found.power > 0)
+        off = np.where(both, np.hypot(*np.moveaxis(found.film_xy_mm - exact.film_xy_mm, 1, 0)), 0)
+        weight = np.where(both, exact.power, 0).astype(np.float64)
+        assert 1e3 * math.sqrt((weight * off**2).sum() / weight.sum()) < 3 * model.report["film_rms_um"]
+        light_there = [np.where(on_film, r.power, 0).sum(dtype=np.float64) for r in (exact, found)]
+        assert light_there[1] == pytest.approx(light_there[0], rel=0.03)
+        wrong = ((exact.power > 0) != (found.power > 0)) & on_film
+        assert wrong.sum() < 0.03 * both.sum()
+
+
+def test_all_forms_agree(model: GhostModel, file: Path, tmp_path: Path) -> None:
+    """Compiled for one direction, for any direction, from the file, in onnxruntime, as C99 source; GLSL is written."""
+    stored = read_ghosts(file)
+    assert stored.pairs == model.pairs and stored.lens.sha256 == model.lens.sha256
+    session = onnxruntime.InferenceSession(str(file))
+    header = write_ghost_source(model, tmp_path / "ghosts.h")
+    library, first = tmp_path / "ghosts.so", f"brendel_tessar_100_{output_of(model.pairs[0])}"
+    call = f"{first}_ray v = {first}(r[0], r[1], r[2], r[3], r[4], stop);"
+    gives = "o[0] = v.film_x_mm; o[1] = v.film_y_mm; o[2] = v.power; o[3] = v.worst;"
+    assert not compile_c(
+        f"{header.read_text()}\nvoid one(const float *r, float stop, float *o) {{ {call} {gives} }}", library
+    )
+    text = write_ghost_source(model, tmp_path / "ghosts.glsl").read_text()
+    radius = np.array([0.8 * model.stop_radius_mm], np.float32)
+    lens = replace(model.lens, surfaces=tuple(
+        replace(s, diameter_mm=0.8 * s.diameter_mm) if s.stop else s for s in model.lens.surfaces
+    ))  # fmt: skip
+    for number, pair in enumerate(model.pairs[:3]):
+        start = lit_rays(model, number)
+        closed, again = replace(model, lens=lens), replace(stored, lens=lens)
+        general = closed.follow_each(start, [480.0, 610.0], pair)
+        lit = general[:, 3] < 1
+        assert 0.05 < lit.mean() < 1
+        assert output_of(pair) in text
+        alike = np.stack(
+            [closed.follow_each(one[:, None], [480.0, 610.0], pair)[..., 0] for one in start[:, :60].T], -1
+        )
+        given = {
+            "entering": np.concatenate([start, np.full((1, 500), 480.0)]).astype(np.float32),
+            "stop_radius_mm": radius,
+        }
+        onnx_found = session.run([output_of(pair)], given)[0]
+        for found, wanted in (
+            (alike, general[..., :60]),
+            (again.follow_each(start, [480.0, 610.0], pair), general),
+            (onnx_found[None], general[:1]),
+        ):
+            here = lit[: len(found), : found.shape[-1]]
+            for row, least in enumerate((2e-3, 2e-3, 1e-7, 1e-5)):  # mm, share, r^2 / R^2
+                np.testing.assert_allclose(found[:, row][here], wanted[:, row][here], rtol=1e-4, atol=least)
+        if number == 0:
+            one = ctypes.CDLL(str(library)).one
+            one.argtypes = [ctypes.c_void_p, ctypes.c_float, ctypes.c_void_p]
+            row = np.empty(4, np.float32)
+            for ray, wanted in zip(given["entering"].T.copy()[:40], general[0].T, strict=False):
+                one(ray.ctypes.data, radius[0], row.ctypes.data)
+                if wanted[3] < 1:
+                    np.testing.assert_allclose(row, wanted, rtol=1e-4, atol=2e-3)
+
+
+def test_symmetry_is_exact(model: GhostModel) -> None:
+    """A turned light is a turned ghost."""
+    start, turn = lit_rays(model, 0, 50), 2.1
+    matrix = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    turned = np.concatenate([matrix @ start[:2], matrix @ start[2:]])
+    a, b = (model.follow_each(rays, [550.0], model.pairs[0])[0] for rays in (start, turned))
+    np.testing.assert_allclose(b[:2], matrix @ a[:2], atol=1e-4)
+    np.testing.assert_allclose(b[2:], a[2:], rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("distance_m", [math.inf, 4.0])
+def test_pictures_are_those_of_traced_ghosts(model: GhostModel, distance_m: float) -> None:
+    light, raster = [Light(9.0, 4.0, distance_m=distance_m)], Raster((36.0, 24.0), 72, 48)
+    pictures = [
+        ghost_picture(t, light, raster, wavelengths=2, threads=1)[0]
+        for t in (GhostTracer(tessar(), model.pairs), model)
+    ]
+    assert pictures[1].sum() == pytest.approx(pictures[0].sum(), rel=0.02)
+    blocks = [p.reshape(8, 6, 9, 8, 3).sum((1, 3)) for p in pictures]
+    assert np.abs(blocks[1] - blocks[0]).sum() < 0.04 * blocks[0].sum()
+
+
+def test_command(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "flare.exr"
+    small = ["--light", "9,4", "--width", "36", "--wavelengths", "2", "--blades", "6", "--f-number", "8", "--json"]
+    assert main(["flare", str(file), *small, "-o", str(out)]) == 0
+    assert json.loads(capsys.readouterr().out)["lens"] == tessar().name and out.is_file()
+    assert main(["flare", str(file), "--fit", str(tmp_path / "g.h")]) == 0
+    assert "um RMS on the film" in capsys.readouterr().out
+    for words, said in (
+        (["--light", "40,0"], "at most 25"),
+        (["--light", "1,0", "--coating", "v-coat"], "--coating"),
+        (["--light", "1,0", "--focus", "1"], "--focus"),
+        (["--light", "1,0", "--f-number", "1"], "stop_radius_mm"),
+        (["--fit", "x.onnx"], "--fit"),
+    ):
+        assert main(["flare", str(file), *words, "-o", str(out), "--width", "24"]) == 2
+        assert said in capsys.readouterr().err
+
+
+def test_what_files_may_not_hold(file: Path, tmp_path: Path) -> None:
+    """Changed coefficients, another kind of model, a card without domain, no ONNX at all."""
+    bad = tmp_path / "bad.onnx"
+
+    def changed(key: str, change: object) -> None:
+        proto = onnx.load(file)
+        for entry in proto.metadata_props:
+            if entry.key == key:
+                entry.value = change(entry.value)  # type: ignore[operator]
+        onnx.save(proto, bad)
+        with pytest.raises(ModelError, match="bad.onnx"):
+            read_ghosts(bad)
+
+    def card(place: str, value: object) -> object:
+        return lambda text: json.dumps({**json.loads(text), place: value})
+
+    changed(CARD_KEY, card("kind", "neurolens.lens_model"))
+    changed(CARD_KEY, card("domain", {"sine": 0.4}))
+    changed(CARD_KEY, card("domain", {"sine": 0.3, "wavelength_nm": [400, 700]}))
+    changed(MODEL_KEY, lambda text: text[:-40])
+    changed(MODEL_KEY, lambda text: "")
+    bad.write_bytes(b"no model")
+    with pytest.raises(ModelError, match="bad.onnx"):
+        read_ghosts(bad)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (replace(SETTINGS, angle_deg=90.0), "angle_deg"),
+        (replace(SETTINGS, keep=1.5), "keep"),
+        (replace(SETTINGS, rays=10), "rays"),
+        (replace(SETTINGS, film_radius_mm=1e-9), "reaches the film"),
+    ],
+)
+def test_refused_settings(settings: GhostSettings, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        fit_ghosts(tessar(), settings)
+
+
+def test_refused_lenses_and_light(model: GhostModel) -> None:
+    anamorphic = read_lens(LENS.with_name("schneider_anamorphic_31.toml")).at(focus_m=math.inf)
+    with pytest.raises(InputError, match="cylinder"):
+        fit_ghosts(anamorphic, SETTINGS)
+    rays, _ = light_rays(model.lens, Light(3.0, 0.0), 0, 10)
+    with pytest.raises(InputError, match="wavelength_nm"):
+        model.trace(rays, 380.0)
+    rays, _ = light_rays(model.lens, Light(30.0, 0.0), 0, 10)
+    with pytest.raises(InputError, match="off the axis"):
+        model.trace(rays, 550.0)
