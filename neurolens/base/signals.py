@@ -37,6 +37,28 @@ def handled(by: Callable[[int], None]) -> Iterator[dict[int, Any]]:
             signal.signal(number, old)
 
 
+@contextmanager
+def held() -> Iterator[None]:
+    """Keep the signals of `ASKING` waiting inside the block, and for ever from processes and threads started there."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ASKING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def end_at_once() -> None:
+    """In a process started inside `held`: signals that were not ignored end it, those that wait now too."""
+    for number in ASKING:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ASKING)
+
+
 def _leave_closed_terminal() -> None:
     """Let what is still printed go nowhere: writing to a closed terminal is an error, in the midst of saving."""
     for descriptor in (1, 2):

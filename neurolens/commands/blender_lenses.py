@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 import multiprocessing
-import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neurolens.base.errors import InputError, NeurolensError
-from neurolens.base.signals import ASKING
+from neurolens.base.signals import end_at_once, held
 from neurolens.blender.pack import Form, PackedLens
 from neurolens.commands.arguments import RANGE
 from neurolens.commands.blender_kept import kept_form
@@ -97,7 +96,8 @@ def forms_of(files: Sequence[Path], jobs: int, report: Callable[[float], object]
             keep(file, _form_or_why(file))
         return found, left
     with ProcessPoolExecutor(jobs, CONTEXT, _begin_job) as pool:
-        waiting = {pool.submit(_form_or_why, file): file for file in files}
+        with held():  # a process just forked would raise what this one raises, and run on as a second command
+            waiting = {pool.submit(_form_or_why, file): file for file in files}
         try:
             for done in as_completed(waiting):
                 keep(waiting[done], done.result())
@@ -115,9 +115,7 @@ def forms_of(files: Sequence[Path], jobs: int, report: Callable[[float], object]
 
 def _begin_job() -> None:
     """In a process: signals end it at once, as the main process ends it; one core is its own."""
-    for number in ASKING:
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, signal.SIG_DFL)
+    end_at_once()
     if find_spec("torch") is not None:
         import torch
 

@@ -12,14 +12,14 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 from neurolens.base.errors import NeurolensError
-from neurolens.base.signals import ASKING
+from neurolens.base.signals import held
 from neurolens.render.film import CONTEXT, FORKS
 from neurolens.render.job import Job
 
@@ -40,7 +40,7 @@ def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None
     team = [kind(target=_quiet, args=(job, claimed, k, workers, os.getpid()), daemon=True) for k in range(workers)]
     killed: list[int] = []
     try:
-        with _signals_held():  # inherited by forked workers: only this process handles Ctrl-C
+        with held():  # inherited by forked workers: only this process handles Ctrl-C
             for worker in team:
                 worker.start()
         while alive := [worker for worker in team if worker.is_alive()]:
@@ -138,16 +138,3 @@ def _pin(number: int, workers: int) -> None:
         cores = sorted(os.sched_getaffinity(0))
         if workers >= len(cores):
             os.sched_setaffinity(0, {cores[number % len(cores)]})
-
-
-@contextmanager
-def _signals_held() -> Iterator[None]:
-    """Block what asks a render to stop inside the block; processes and threads started there never receive them."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, ASKING)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
