@@ -84,12 +84,15 @@ def fit_ghosts(lens: Lens, settings: GhostSettings, done: Callable[[float], None
         done: told the share of the work that is done.
 
     Raises:
-        InputError: a lens with cylinders or without film; settings out of range; no ghost that reaches the film.
+        InputError: a lens with cylinders, with a mask in its stop or without film; settings out of range; no ghost that
+            reaches the film.
     """
     if any(s.cylinder for s in lens.surfaces):
         raise InputError(
             lens.path, "cylinder", "(some)", "a lens with an axis of symmetry: of others ghosts are traced"
         )
+    if lens.aperture is not None and lens.aperture.mask is not None:
+        raise InputError(lens.path, "aperture", "(a mask)", "a round stop or blades: fitted ghosts take no mask")
     for name, least, most in (("angle_deg", 0.1, 89.0), ("keep", 0.0, 1.0), ("target_um", 1e-3, 1e6)):
         if not least <= getattr(settings, name) <= most:
             raise InputError("ghost fit", name, getattr(settings, name), f"from {least:g} to {most:g}")

@@ -20,6 +20,7 @@ from neurolens.flare.ghosts import GhostTracer, Way, coated, ghost_pairs
 from neurolens.flare.lights import Light
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import Ghost, Raster, ghost_picture, ghost_table, photon_picture, with_four
+from neurolens.flare.polarised import PolarisedTracer
 from neurolens.flare.scatter import Scatter
 from neurolens.flare.sources import SceneLights, keep
 from neurolens.flare.stack import Floats
@@ -43,6 +44,7 @@ class FlareSettings:
         glare: if above 0, so many photons of the layer "glare": light that was reflected more than twice, or scattered.
         scatter: what scatters it. The ghosts keep what scatters of theirs, which is little.
         starburst: whether to make the layer "starburst": what diffraction at the stop and the rims takes out of images.
+        polarised: whether light of the ghosts keeps its polarisation from surface to surface (`flare.polarised`).
         fours: whether ghosts of four reflections are traced, too: the strongest, as of `picture.with_four`; "glare" has
             that light by chance.
         single: ghosts that become layers, by name; the other ghosts are the layer "rest".
@@ -62,6 +64,7 @@ class FlareSettings:
     glare: int = 0
     scatter: Scatter = Scatter()
     starburst: bool = False
+    polarised: bool = False
     fours: bool = False
     single: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
@@ -76,6 +79,8 @@ class FlareSettings:
                 raise InputError("flare", "without", name, f"layers of flare: {', '.join(MAKERS)}")
         if self.scatter.on and not self.glare:
             raise InputError("flare", "glare", self.glare, "photons, for light that scatters")
+        if self.polarised and (self.photons or self.model is not None):
+            raise InputError("flare", "polarised", self.polarised, "false with photons or fitted ghosts, which average")
         if self.fours and (self.photons or self.glare):
             raise InputError("flare", "fours", self.fours, "false with photons or glare, which have that light")
         of_ghosts = [name for name, _ in self.gains if name not in MAKERS]
@@ -157,7 +162,7 @@ def _ghosts(
         part = "ghosts" if settings.glare else "flare"
         return {"ghosts": _photons(lens, lights, raster, settings, done, part, settings.photons)}
     traced = with_four(lens, lights).ways if settings.fours else ghost_pairs(lens)
-    ghosts = settings.model or GhostTracer(lens, traced)
+    ghosts = settings.model or (PolarisedTracer if settings.polarised else GhostTracer)(lens, traced)
     factors = _factors(ghosts.pairs, settings)
     # Ghosts of one layer and of equal factors share a picture.
     keys = [(p.name if p.name in settings.single else REST, factors[p]) for p in ghosts.pairs]
