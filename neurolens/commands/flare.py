@@ -107,63 +107,9 @@ def add_parser(subparsers: Any) -> None:
         nargs=2,
         help="draw the rays of one ghost of the first light (PNG, PDF, SVG)",
     )
-    parser.add_argument("--film", metavar="WxH", type=film_size, default=(36.0, 24.0), help="in mm (default: 36x24)")
-    parser.add_argument(
-        "--width", metavar="PX", type=whole(1, 16384), default=960, help="of the picture (default: 960)"
-    )
-    parser.add_argument(
-        "--cell", metavar="PX", type=between(1, 256, "pixels"), default=8.0, dest="cell_px",
-        help="size on film of the cells that a ghost is drawn by (default: 8; a quick look: 48)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--wavelengths", metavar="N", type=whole(1, 256), default=15, help="from 400 to 700 nm (default: 15)"
-    )
-    parser.add_argument(
-        "--layers", metavar="N", type=whole(0, 64), default=0, help="brightest ghosts as layers (default: 0)"
-    )
-    parser.add_argument(
-        "--without",
-        metavar="LAYER",
-        action="append",
-        default=[],
-        help="layer that is not made: ghosts, glare, starburst; repeatable",
-    )
-    parser.add_argument(
-        "--photons", metavar="N", type=whole(1, 1 << 30), default=0,
-        help="instead of all pairs, photons with up to --reflections by chance, N a light and wavelength",
-    )  # fmt: skip
-    parser.add_argument(
-        "--reflections", metavar="N", type=whole(1, 1000), dest="most_reflections",
-        help="of photons and glare at most (default: 10); of ghosts without them, 2 (the default) or 4",
-    )  # fmt: skip
-    parser.add_argument(
-        "--kernel", metavar="PX", type=between(0, 100, "pixels"), default=3.0, dest="kernel_px",
-        help="radius of the kernel that smooths photons, where they are dense (default: 3); 0 leaves them",
-    )  # fmt: skip
-    parser.add_argument(
-        "--glare", metavar="N", type=whole(0, 1 << 30), default=0,
-        help=f"photons a light and wavelength of the layer glare (default: {_GLARE} if anything scatters, else none)",
-    )  # fmt: skip
-    parser.add_argument("--starburst", action="store_true", help="the layer starburst; some seconds a light")
-    for option, name, most, unit, text in _SCATTER:
-        parser.add_argument(
-            option, metavar=unit, type=between(0, most, "a number"), default=0.0, dest=name, help=f"{text} (default: 0)"
-        )
-    parser.add_argument(
-        "--gain", metavar="NAME=X", action="append", default=[], type=_factor(1),
-        help="of a layer (ghosts), a ghost (g07-03) or all that a surface reflects (s07); repeatable, gains multiply",
-    )  # fmt: skip
-    parser.add_argument(
-        "--tint", metavar="NAME=R/G/B", action="append", default=[], type=_factor(3), help="the same, of each colour"
-    )
-    parser.add_argument(
-        "--preview", action="store_true",
-        help="at most 480 pixels wide, 5 wavelengths and 65536 photons a light and wavelength, --cell at least 24",
-    )  # fmt: skip
-    parser.add_argument(
-        "--seed", metavar="N", type=whole(0, 1 << 20), default=0,
-        help="of the chances of photons, the same in all frames; ghosts have none (default: 0)",
-    )  # fmt: skip
+    _add_picture(parser)
+    _add_layers(parser)
+    _add_chances(parser)
     parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=2, help="default: 2")
     add_fit(parser)
     add_frames(parser, _FRAMES)
@@ -171,6 +117,76 @@ def add_parser(subparsers: Any) -> None:
     add_lens_state(parser, efl="as tabled", f_number="the widest")
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="nothing is written", position_m=None, look_at_m=None, frame=None)
+
+
+def _add_picture(parser: argparse.ArgumentParser) -> None:
+    """Add how large and how fine the picture is."""
+    group = parser.add_argument_group("picture")
+    group.add_argument("--film", metavar="WxH", type=film_size, default=(36.0, 24.0), help="in mm (default: 36x24)")
+    group.add_argument("--width", metavar="PX", type=whole(1, 16384), default=960, help="of the picture (default: 960)")
+    group.add_argument(
+        "--cell", metavar="PX", type=between(1, 256, "pixels"), default=8.0, dest="cell_px",
+        help="size on film of the cells that a ghost is drawn by (default: 8; a quick look: 48)",
+    )  # fmt: skip
+    group.add_argument(
+        "--wavelengths", metavar="N", type=whole(1, 256), default=15, help="from 400 to 700 nm (default: 15)"
+    )
+    group.add_argument(
+        "--preview", action="store_true",
+        help="at most 480 pixels wide, 5 wavelengths and 65536 photons a light and wavelength, --cell at least 24",
+    )  # fmt: skip
+
+
+def _add_layers(parser: argparse.ArgumentParser) -> None:
+    """Add what layers there are, and how bright they are."""
+    group = parser.add_argument_group("layers")
+    group.add_argument(
+        "--layers", metavar="N", type=whole(0, 64), default=0, help="brightest ghosts as layers (default: 0)"
+    )
+    group.add_argument(
+        "--without",
+        metavar="LAYER",
+        action="append",
+        default=[],
+        help="layer that is not made: ghosts, glare, starburst; repeatable",
+    )
+    group.add_argument("--starburst", action="store_true", help="the layer starburst; some seconds a light")
+    group.add_argument(
+        "--gain", metavar="NAME=X", action="append", default=[], type=_factor(1),
+        help="of a layer (ghosts), a ghost (g07-03) or all that a surface reflects (s07); repeatable, gains multiply",
+    )  # fmt: skip
+    group.add_argument(
+        "--tint", metavar="NAME=R/G/B", action="append", default=[], type=_factor(3), help="the same, of each colour"
+    )
+
+
+def _add_chances(parser: argparse.ArgumentParser) -> None:
+    """Add what photons do."""
+    group = parser.add_argument_group("photons, and what scatters them")
+    group.add_argument(
+        "--photons", metavar="N", type=whole(1, 1 << 30), default=0,
+        help="instead of all pairs, photons with up to --reflections by chance, N a light and wavelength",
+    )  # fmt: skip
+    group.add_argument(
+        "--reflections", metavar="N", type=whole(1, 1000), dest="most_reflections",
+        help="of photons and glare at most (default: 10); of ghosts without them, 2 (the default) or 4",
+    )  # fmt: skip
+    group.add_argument(
+        "--kernel", metavar="PX", type=between(0, 100, "pixels"), default=3.0, dest="kernel_px",
+        help="radius of the kernel that smooths photons, where they are dense (default: 3); 0 leaves them",
+    )  # fmt: skip
+    group.add_argument(
+        "--glare", metavar="N", type=whole(0, 1 << 30), default=0,
+        help=f"photons a light and wavelength of the layer glare (default: {_GLARE} if anything scatters, else none)",
+    )  # fmt: skip
+    for option, name, most, unit, text in _SCATTER:
+        group.add_argument(
+            option, metavar=unit, type=between(0, most, "a number"), default=0.0, dest=name, help=f"{text} (default: 0)"
+        )
+    group.add_argument(
+        "--seed", metavar="N", type=whole(0, 1 << 20), default=0,
+        help="of the chances of photons, the same in all frames; ghosts have none (default: 0)",
+    )  # fmt: skip
 
 
 def _factor(size: int) -> Callable[[str], tuple[str, tuple[float, ...]]]:
@@ -266,7 +282,7 @@ class _Shots:
 
     def __init__(self, tabled: Lens, sources: Sources, progress: Progress, model: GhostModel | None) -> None:
         self._tabled, self._sources, self._progress, self._model = tabled, sources, progress, model
-        self._lenses: dict[tuple[Any, ...], Lens] = {}
+        self._lenses: dict[tuple[Any, ...], tuple[Lens, GhostModel | None]] = {}
         self._last: tuple[argparse.Namespace, _Shot] | None = None
 
     def at(self, args: argparse.Namespace) -> _Shot:
@@ -281,12 +297,12 @@ class _Shots:
 
         state = args.focus, args.f_number, args.zoom
         if state not in self._lenses:
-            self._lenses[state] = _lens(args, self._tabled) if self._model is None else stopped(args, self._model).lens
-        lens = self._lenses[state]
+            model = None if self._model is None else stopped(args, self._model)
+            self._lenses[state] = _lens(args, self._tabled) if model is None else model.lens, model
+        lens, model = self._lenses[state]
         lights = self._sources.at(args, lens, self._progress)
         found = with_four(lens, lights) if args.fours else Ways(ghost_pairs(lens), 0, 0.0)
         tracer, rays = GhostTracer(lens, found.ways), max(_FEWEST, RANKED // max(len(lights), 1))
-        model = None if self._model is None else stopped(args, self._model)
         return _Shot(lens, lights, [ghost_table(tracer, light, 550.0, rays) for light in lights], found, model)
 
 
