@@ -33,6 +33,7 @@ from neurolens.evaluate.records import plain
 if TYPE_CHECKING:
     from neurolens.commands.flare_lights import Sources
     from neurolens.flare.ghostmodel import GhostModel
+    from neurolens.flare.ghosts import GhostTracer
     from neurolens.flare.lights import Light
     from neurolens.flare.picture import Ghost, Ways
     from neurolens.optics.prescription import Lens
@@ -73,9 +74,8 @@ _PREVIEW = {"width": 480, "wavelengths": 5, "photons": 1 << 16, "glare": 1 << 16
 _PREVIEW_CELL = 24.0
 # Arguments that are numbers of `FlareSettings`, by its names.
 _NUMBERS = (
-    *("wavelengths", "cell_px", "photons", "most_reflections", "kernel_px", "glare", "fours", "starburst"),
-    *("seed", "threads"),
-)
+    "wavelengths", "cell_px", "photons", "most_reflections", "kernel_px", "glare", "starburst", "seed", "threads"
+)  # fmt: skip
 _GLARE = 1 << 18  # photons where anything scatters
 # Of `Scatter`: option, attribute, highest value, unit, help.
 _SCATTER = (
@@ -268,13 +268,13 @@ def _states(args: argparse.Namespace) -> Iterator[argparse.Namespace]:
 
 
 class _Shot(NamedTuple):
-    """Lens, lights, the ghosts of each light, brightest first, which were looked for, and what stands for them."""
+    """Lens, lights, the ghosts of each light, brightest first, which were looked for, and what draws them."""
 
     lens: Lens
     lights: list[Light]
     ghosts: list[list[Ghost]]
     found: Ways
-    model: GhostModel | None
+    tracer: GhostTracer | GhostModel
 
 
 class _Shots:
@@ -303,7 +303,9 @@ class _Shots:
         lights = self._sources.at(args, lens, self._progress)
         found = with_four(lens, lights) if args.fours else Ways(ghost_pairs(lens), 0, 0.0)
         tracer, rays = GhostTracer(lens, found.ways), max(_FEWEST, RANKED // max(len(lights), 1))
-        return _Shot(lens, lights, [ghost_table(tracer, light, 550.0, rays) for light in lights], found, model)
+        return _Shot(
+            lens, lights, [ghost_table(tracer, light, 550.0, rays) for light in lights], found, model or tracer
+        )
 
 
 def _lens(args: argparse.Namespace, tabled: Lens) -> Lens:
@@ -347,13 +349,9 @@ def _write(args: argparse.Namespace, shot: _Shot, single: tuple[str, ...], progr
     numbers = {name: getattr(args, name) for name in _NUMBERS}
     scatter = Scatter(**{name: getattr(args, name) for _, name, *_ in _SCATTER})
     settings = FlareSettings(
-        **numbers,
-        scatter=scatter,
-        single=single,
-        without=tuple(args.without),
-        gains=(*args.gain, *args.tint),
-        model=shot.model,
-    )
+        **numbers, scatter=scatter, single=single, without=tuple(args.without), gains=(*args.gain, *args.tint),
+        ghosts=shot.tracer,
+    )  # fmt: skip
     found = flare_layers(shot.lens, shot.lights, raster, settings, progress)
     layers = {f"{name}.{c}": picture[..., k] for name, picture in found.items() for k, c in enumerate("RGB")}
     told = {k: v for k, v in vars(args).items() if isinstance(v, str | int | float | list | tuple | None)}

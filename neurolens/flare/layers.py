@@ -15,10 +15,10 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress, Report
 from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghostmodel import GhostModel
-from neurolens.flare.ghosts import GhostTracer, Way, coated, ghost_pairs
+from neurolens.flare.ghosts import GhostTracer, Way, coated
 from neurolens.flare.lights import Light
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import Ghost, Raster, ghost_picture, ghost_table, photon_picture, with_four
+from neurolens.flare.picture import Ghost, Raster, ghost_picture, ghost_table, photon_picture
 from neurolens.flare.scatter import Scatter
 from neurolens.flare.sources import SceneLights, keep
 from neurolens.flare.stack import Floats
@@ -43,13 +43,12 @@ class FlareSettings:
         glare: if above 0, so many photons of the layer "glare": light that was reflected more than twice, or scattered.
         scatter: what scatters it. The ghosts keep what scatters of theirs, which is little.
         starburst: whether to make the layer "starburst": what diffraction at the stop and the rims takes out of images.
-        fours: whether ghosts of four reflections are traced, too: the strongest, as of `picture.with_four`; "glare" has
-            that light by chance.
+        ghosts: what traces ghosts, or stands for that, of the same lens and stop; None traces all of two reflections.
+            Those of four (see `picture.with_four`) go without photons and glare, which have that light by chance.
         single: ghosts that become layers, by name; the other ghosts are the layer "rest".
         without: layers that are not made.
         gains: factors of red, green and blue by the name of a layer, of a ghost (g07-03), or of a surface (s07: of all
             ghosts that it reflects); several for one ghost are multiplied.
-        model: fitted ghosts that take the place of traced ones, of the same lens and stop.
         seed: of the places and chances of photons, the same for all frames. threads: of the work.
     """
 
@@ -62,11 +61,10 @@ class FlareSettings:
     glare: int = 0
     scatter: Scatter = Scatter()
     starburst: bool = False
-    fours: bool = False
+    ghosts: GhostTracer | GhostModel | None = None
     single: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     gains: tuple[tuple[str, tuple[float, float, float]], ...] = ()
-    model: GhostModel | None = None
     seed: int = 0
     threads: int = 2
 
@@ -76,8 +74,11 @@ class FlareSettings:
                 raise InputError("flare", "without", name, f"layers of flare: {', '.join(MAKERS)}")
         if self.scatter.on and not self.glare:
             raise InputError("flare", "glare", self.glare, "photons, for light that scatters")
-        if self.fours and (self.photons or self.glare):
-            raise InputError("flare", "fours", self.fours, "false with photons or glare, which have that light")
+        often = [way.name for way in (self.ghosts.pairs if self.ghosts else ()) if len(way.reflections) > 2]
+        if often and (self.photons or self.glare):
+            raise InputError(
+                "flare", "ghosts", often[0], "none of four reflections with photons or glare: they have it"
+            )
         of_ghosts = [name for name, _ in self.gains if name not in MAKERS]
         if self.photons and (self.single or of_ghosts):
             raise InputError("flare", "photons", self.photons, "0 with layers or gains of single ghosts")
@@ -158,8 +159,7 @@ def _ghosts(lens: Lens, lights: Sequence[Light], raster: Raster, settings: Flare
     if settings.photons:
         part = "ghosts" if settings.glare else "flare"
         return {"ghosts": _photons(lens, lights, raster, settings, done, part, settings.photons)}
-    traced = with_four(lens, lights).ways if settings.fours else ghost_pairs(lens)
-    ghosts = settings.model or GhostTracer(lens, traced)
+    ghosts = settings.ghosts or GhostTracer(lens)
     factors = _factors(ghosts.pairs, settings)
     # Ghosts of one layer and of equal factors share a picture.
     keys = [(p.name if p.name in settings.single else REST, factors[p]) for p in ghosts.pairs]
