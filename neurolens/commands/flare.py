@@ -33,6 +33,7 @@ from neurolens.evaluate.records import plain
 if TYPE_CHECKING:
     from neurolens.commands.flare_lights import Sources
     from neurolens.flare.ghostmodel import GhostModel
+    from neurolens.flare.ghosts import GhostTracer
     from neurolens.flare.lights import Light
     from neurolens.flare.picture import Ghost, Ways
     from neurolens.optics.prescription import Lens
@@ -64,6 +65,7 @@ examples:
   neurolens flare lenses/ogawa_zoom_70_200.toml --zoom 100 --light -12,3,1/0.8/0.5 --layers 8 -o flare.exr
   neurolens flare laikin_double_gauss_50 --light 15,8 --coating multi-layer --barrel 0.05 --dust 0.01 -o flare.exr
   neurolens flare laikin_double_gauss_50 --light 15,8 --blades 7 --f-number 11 --starburst -o flare.exr
+  neurolens flare laikin_double_gauss_50 --lights sun.csv --frames 1:48 --key camera.csv -o flare.exr
   neurolens flare laikin_double_gauss_50 --fit ghosts.onnx; neurolens flare ghosts.onnx --light 15,8 -o flare.exr"""
 _COMMAND = "neurolens flare"
 _SHOWN, _SHOWN_LIGHTS, _KEPT = 12, 4, 64  # ghosts of a table and tables; ghosts of a light that files tell
@@ -77,9 +79,8 @@ _PREVIEW = {"width": 480, "wavelengths": 5, "photons": 1 << 16, "glare": 1 << 16
 _PREVIEW_CELL = 24.0
 # Arguments that are numbers of `FlareSettings`, by its names.
 _NUMBERS = (
-    *("wavelengths", "cell_px", "photons", "most_reflections", "kernel_px", "glare", "polarised", "fours"),
-    *("starburst", "seed", "threads"),
-)
+    "wavelengths", "cell_px", "photons", "most_reflections", "kernel_px", "glare", "starburst", "seed", "threads"
+)  # fmt: skip
 _GLARE = 1 << 18  # photons where anything scatters
 # Of `Scatter`: option, attribute, highest value, unit, help.
 _SCATTER = (
@@ -111,66 +112,9 @@ def add_parser(subparsers: Any) -> None:
         nargs=2,
         help="draw the rays of one ghost of the first light (PNG, PDF, SVG)",
     )
-    parser.add_argument("--film", metavar="WxH", type=film_size, default=(36.0, 24.0), help="in mm (default: 36x24)")
-    parser.add_argument(
-        "--width", metavar="PX", type=whole(1, 16384), default=960, help="of the picture (default: 960)"
-    )
-    parser.add_argument(
-        "--cell", metavar="PX", type=between(1, 256, "pixels"), default=8.0, dest="cell_px",
-        help="size on film of the cells that a ghost is drawn by (default: 8; a quick look: 48)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--wavelengths", metavar="N", type=whole(1, 256), default=15, help="from 400 to 700 nm (default: 15)"
-    )
-    parser.add_argument(
-        "--layers", metavar="N", type=whole(0, 64), default=0, help="brightest ghosts as layers (default: 0)"
-    )
-    parser.add_argument(
-        "--without",
-        metavar="LAYER",
-        action="append",
-        default=[],
-        help="layer that is not made: ghosts, glare, starburst; repeatable",
-    )
-    parser.add_argument(
-        "--photons", metavar="N", type=whole(1, 1 << 30), default=0,
-        help="instead of all pairs, photons with up to --reflections by chance, N a light and wavelength",
-    )  # fmt: skip
-    parser.add_argument(
-        "--reflections", metavar="N", type=whole(1, 1000), dest="most_reflections",
-        help="of photons and glare at most (default: 10); of ghosts without them, 2 (the default) or 4",
-    )  # fmt: skip
-    parser.add_argument(
-        "--kernel", metavar="PX", type=between(0, 100, "pixels"), default=3.0, dest="kernel_px",
-        help="radius of the kernel that smooths photons, where they are dense (default: 3); 0 leaves them",
-    )  # fmt: skip
-    parser.add_argument(
-        "--glare", metavar="N", type=whole(0, 1 << 30), default=0,
-        help=f"photons a light and wavelength of the layer glare (default: {_GLARE} if anything scatters, else none)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--polarised", action="store_true", help="ghosts whose light keeps its polarisation from surface to surface"
-    )
-    parser.add_argument("--starburst", action="store_true", help="the layer starburst; some seconds a light")
-    for option, name, most, unit, text in _SCATTER:
-        parser.add_argument(
-            option, metavar=unit, type=between(0, most, "a number"), default=0.0, dest=name, help=f"{text} (default: 0)"
-        )
-    parser.add_argument(
-        "--gain", metavar="NAME=X", action="append", default=[], type=_factor(1),
-        help="of a layer (ghosts), a ghost (g07-03) or all that a surface reflects (s07); repeatable, gains multiply",
-    )  # fmt: skip
-    parser.add_argument(
-        "--tint", metavar="NAME=R/G/B", action="append", default=[], type=_factor(3), help="the same, of each colour"
-    )
-    parser.add_argument(
-        "--preview", action="store_true",
-        help="at most 480 pixels wide, 5 wavelengths and 65536 photons a light and wavelength, --cell at least 24",
-    )  # fmt: skip
-    parser.add_argument(
-        "--seed", metavar="N", type=whole(0, 1 << 20), default=0,
-        help="of the chances of photons, the same in all frames; ghosts have none (default: 0)",
-    )  # fmt: skip
+    _add_picture(parser)
+    _add_layers(parser)
+    _add_chances(parser)
     parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=2, help="default: 2")
     add_fit(parser)
     add_frames(parser, _FRAMES)
@@ -178,6 +122,79 @@ def add_parser(subparsers: Any) -> None:
     add_lens_state(parser, efl="as tabled", f_number="the widest")
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="nothing is written", position_m=None, look_at_m=None, frame=None)
+
+
+def _add_picture(parser: argparse.ArgumentParser) -> None:
+    """Add how large and how fine the picture is."""
+    group = parser.add_argument_group("picture")
+    group.add_argument("--film", metavar="WxH", type=film_size, default=(36.0, 24.0), help="in mm (default: 36x24)")
+    group.add_argument("--width", metavar="PX", type=whole(1, 16384), default=960, help="of the picture (default: 960)")
+    group.add_argument(
+        "--cell", metavar="PX", type=between(1, 256, "pixels"), default=8.0, dest="cell_px",
+        help="size on film of the cells that a ghost is drawn by (default: 8; a quick look: 48)",
+    )  # fmt: skip
+    group.add_argument(
+        "--wavelengths", metavar="N", type=whole(1, 256), default=15, help="from 400 to 700 nm (default: 15)"
+    )
+    group.add_argument(
+        "--preview", action="store_true",
+        help="at most 480 pixels wide, 5 wavelengths and 65536 photons a light and wavelength, --cell at least 24",
+    )  # fmt: skip
+
+
+def _add_layers(parser: argparse.ArgumentParser) -> None:
+    """Add what layers there are, and how bright they are."""
+    group = parser.add_argument_group("layers")
+    group.add_argument(
+        "--layers", metavar="N", type=whole(0, 64), default=0, help="brightest ghosts as layers (default: 0)"
+    )
+    group.add_argument(
+        "--without",
+        metavar="LAYER",
+        action="append",
+        default=[],
+        help="layer that is not made: ghosts, glare, starburst; repeatable",
+    )
+    group.add_argument(
+        "--polarised", action="store_true", help="ghosts whose light keeps its polarisation from surface to surface"
+    )
+    group.add_argument("--starburst", action="store_true", help="the layer starburst; some seconds a light")
+    group.add_argument(
+        "--gain", metavar="NAME=X", action="append", default=[], type=_factor(1),
+        help="of a layer (ghosts), a ghost (g07-03) or all that a surface reflects (s07); repeatable, gains multiply",
+    )  # fmt: skip
+    group.add_argument(
+        "--tint", metavar="NAME=R/G/B", action="append", default=[], type=_factor(3), help="the same, of each colour"
+    )
+
+
+def _add_chances(parser: argparse.ArgumentParser) -> None:
+    """Add what photons do."""
+    group = parser.add_argument_group("photons, and what scatters them")
+    group.add_argument(
+        "--photons", metavar="N", type=whole(1, 1 << 30), default=0,
+        help="instead of all pairs, photons with up to --reflections by chance, N a light and wavelength",
+    )  # fmt: skip
+    group.add_argument(
+        "--reflections", metavar="N", type=whole(1, 1000), dest="most_reflections",
+        help="of photons and glare at most (default: 10); of ghosts without them, 2 (the default) or 4",
+    )  # fmt: skip
+    group.add_argument(
+        "--kernel", metavar="PX", type=between(0, 100, "pixels"), default=3.0, dest="kernel_px",
+        help="radius of the kernel that smooths photons, where they are dense (default: 3); 0 leaves them",
+    )  # fmt: skip
+    group.add_argument(
+        "--glare", metavar="N", type=whole(0, 1 << 30), default=0,
+        help=f"photons a light and wavelength of the layer glare (default: {_GLARE} if anything scatters, else none)",
+    )  # fmt: skip
+    for option, name, most, unit, text in _SCATTER:
+        group.add_argument(
+            option, metavar=unit, type=between(0, most, "a number"), default=0.0, dest=name, help=f"{text} (default: 0)"
+        )
+    group.add_argument(
+        "--seed", metavar="N", type=whole(0, 1 << 20), default=0,
+        help="of the chances of photons, the same in all frames; ghosts have none (default: 0)",
+    )  # fmt: skip
 
 
 def _factor(size: int) -> Callable[[str], tuple[str, tuple[float, ...]]]:
@@ -218,6 +235,7 @@ def run(args: argparse.Namespace) -> int:
     shots = _Shots(tabled, Sources(args), progress, model)
     first = shots.at(states[0])
     found = {"lens": first.lens.name, "pairs": len(ghost_pairs(first.lens)), **_told(first)}
+    found["fitted"] = 0 if model is None else len(model.pairs)
     if args.path is not None:
         _draw(first, args.path[0], Path(args.path[1]))
         found["path"] = args.path[1]
@@ -261,13 +279,13 @@ def _states(args: argparse.Namespace) -> Iterator[argparse.Namespace]:
 
 
 class _Shot(NamedTuple):
-    """Lens, lights, the ghosts of each light, brightest first, which were looked for, and what stands for them."""
+    """Lens, lights, the ghosts of each light, brightest first, which were looked for, and what draws them."""
 
     lens: Lens
     lights: list[Light]
     ghosts: list[list[Ghost]]
     found: Ways
-    model: GhostModel | None
+    tracer: GhostTracer | GhostModel
 
 
 class _Shots:
@@ -275,7 +293,7 @@ class _Shots:
 
     def __init__(self, tabled: Lens, sources: Sources, progress: Progress, model: GhostModel | None) -> None:
         self._tabled, self._sources, self._progress, self._model = tabled, sources, progress, model
-        self._lenses: dict[tuple[Any, ...], Lens] = {}
+        self._lenses: dict[tuple[Any, ...], tuple[Lens, GhostModel | None]] = {}
         self._last: tuple[argparse.Namespace, _Shot] | None = None
 
     def at(self, args: argparse.Namespace) -> _Shot:
@@ -291,14 +309,14 @@ class _Shots:
 
         state = args.focus, args.f_number, args.zoom
         if state not in self._lenses:
-            self._lenses[state] = _lens(args, self._tabled) if self._model is None else stopped(args, self._model).lens
-        lens = self._lenses[state]
+            model = None if self._model is None else stopped(args, self._model)
+            self._lenses[state] = _lens(args, self._tabled) if model is None else model.lens, model
+        lens, model = self._lenses[state]
         lights = self._sources.at(args, lens, self._progress)
         found = with_four(lens, lights) if args.fours else Ways(ghost_pairs(lens), 0, 0.0)
-        model = None if self._model is None else stopped(args, self._model)
         tracer = model or (PolarisedTracer if args.polarised else GhostTracer)(lens, found.ways)
         rays = max(_FEWEST, RANKED // max(len(lights), 1))
-        return _Shot(lens, lights, [ghost_table(tracer, light, 550.0, rays) for light in lights], found, model)
+        return _Shot(lens, lights, [ghost_table(tracer, light, 550.0, rays) for light in lights], found, tracer)
 
 
 def _lens(args: argparse.Namespace, tabled: Lens) -> Lens:
@@ -342,13 +360,9 @@ def _write(args: argparse.Namespace, shot: _Shot, single: tuple[str, ...], progr
     numbers = {name: getattr(args, name) for name in _NUMBERS}
     scatter = Scatter(**{name: getattr(args, name) for _, name, *_ in _SCATTER})
     settings = FlareSettings(
-        **numbers,
-        scatter=scatter,
-        single=single,
-        without=tuple(args.without),
-        gains=(*args.gain, *args.tint),
-        model=shot.model,
-    )
+        **numbers, scatter=scatter, single=single, without=tuple(args.without), gains=(*args.gain, *args.tint),
+        ghosts=shot.tracer,
+    )  # fmt: skip
     found = flare_layers(shot.lens, shot.lights, raster, settings, progress)
     layers = {f"{name}.{c}": picture[..., k] for name, picture in found.items() for k, c in enumerate("RGB")}
     told = {k: v for k, v in vars(args).items() if isinstance(v, str | int | float | list | tuple | None)}
@@ -394,8 +408,8 @@ def _text(shot: _Shot, about: dict[str, Any]) -> str:
             f", and {fours} of its {shot.found.fours} ghosts of four reflections: the others have "
             f"{number(100 * shot.found.left)}% of all ghosts' light"
         )
-    if shot.model is not None:
-        parts[0] += f", {len(shot.model.pairs)} ghosts of them fitted: the table is of the fit"
+    if about["fitted"]:
+        parts[0] += f", {about['fitted']} ghosts of them fitted: the table is of the fit"
     head = ("ghost", "energy of the image's", "x mm", "y mm", "RMS radius mm", "rays that arrive %")
     for light, of_light in zip(shot.lights[:_SHOWN_LIGHTS], shot.ghosts, strict=False):
         all_of = sum(ghost.energy for ghost in of_light)

@@ -62,8 +62,8 @@ def add_frames(parser: argparse.ArgumentParser, does: str = _RENDERED, names: Se
     group.add_argument(
         "--key", metavar="NAME=FRAME:VALUE,...", action="append", default=[],
         help=f"values at frames, repeatable: {measures}{points}; before the first key and after the last one they "
-        "stay. Or a file of keys, .csv with a header or .json (a list of objects): a column frame, and one for each NAME; an "
-        "empty cell is no key",
+        "stay. Or a file of keys, .csv with a header or .json (a list of objects): a column frame, and one for each "
+        "NAME; an empty cell is no key",
     )  # fmt: skip
 
 

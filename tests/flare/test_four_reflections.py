@@ -122,8 +122,8 @@ def test_a_picture_holds_their_light() -> None:
     lens, raster, light = plate(), Raster((90.0, 60.0), 90, 60), Light(5.0, 0.0, (1e6, 1e6, 1e6))
     settings = FlareSettings(wavelengths=1, threads=1)
     one, two = (
-        flare_layers(lens, [light], raster, replace(settings, fours=fours, single=("g01-00",)))
-        for fours in (False, True)
+        flare_layers(lens, [light], raster, replace(settings, ghosts=ghosts, single=("g01-00",)))
+        for ghosts in (None, GhostTracer(lens, with_four(lens, [light]).ways))
     )
     rays, area = light_rays(lens, light, 0, 1 << 14)
     power = GhostTracer(lens, [Four(1, 0, 1, 0)]).trace(rays, 550.0).power[0].mean(dtype=np.float64)
@@ -149,7 +149,7 @@ def test_refusals(monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(InputError, match="back and forward"):
             GhostTracer(plate(), [wrong])
     with pytest.raises(InputError, match="glare"):
-        FlareSettings(fours=True, glare=100)
+        FlareSettings(ghosts=GhostTracer(plate(), [Four(1, 0, 1, 0)]), glare=100)
     monkeypatch.setattr(ghosts, "MOST_WAYS", 100)
     with pytest.raises(InputError, match="at most 100"):
         four_reflections(lens_of("brendel_tessar_100"))
