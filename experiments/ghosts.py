@@ -23,7 +23,6 @@ import numpy as np
 import torch
 
 from experiments import lab
-from neurolens.base.files import atomic_path
 from neurolens.base.progress import Progress
 from neurolens.evaluate.image import flip, flip_map
 from neurolens.flare import grids, picture
@@ -70,9 +69,6 @@ def run(args: argparse.Namespace) -> int:
         linear = first_order_ghosts(fitted)
     with progress.stage("converged"):
         reference = _drawn(tracer, 3.0, wavelengths=45)
-    exposure = picture.axis_irradiance(lens, _NM)
-    known = picture.axis_irradiance
-    picture.axis_irradiance = lambda lens, wavelength_nm: exposure  # of the lens alone
     rows, shown = [], {"exact, converged": reference}
     ways: list[tuple[str, Any, float, int]] = [
         *(("exact, compiled", tracer, cell, WAVELENGTHS) for cell in (8.0, 32.0)),
@@ -81,17 +77,14 @@ def run(args: argparse.Namespace) -> int:
         ("polynomials", fitted, 32.0, 8),
         ("first order", linear, 32.0, WAVELENGTHS),
     ]
-    try:
-        for name, model, cell, count in ways:
-            with progress.stage(f"{name}, {cell:g} px, {count} wavelengths"), _grid(cell):
-                found = _drawn(model, cell or 8.0, 1, count)
-                times = [_timed(model, cell or 8.0, threads, count, args.rounds) for threads in (1, 2)]
-            rms = None if model is tracer else _rms(tracer, model)
-            energy = float(found.sum(dtype=np.float64) / reference.sum(dtype=np.float64) - 1)
-            rows.append(Row(name, cell, count, rms, energy, flip(*_shown(found, reference)), times[0][0], times[1][1]))
-            shown[f"{name}, {f'cells of {cell:g} px, ' if cell else ''}{count} wavelengths"] = found
-    finally:
-        picture.axis_irradiance = known
+    for name, model, cell, count in ways:
+        with progress.stage(f"{name}, {cell:g} px, {count} wavelengths"), _grid(cell):
+            found = _drawn(model, cell or 8.0, 1, count)
+            times = [_timed(model, cell or 8.0, threads, count, args.rounds) for threads in (1, 2)]
+        rms = None if model is tracer else _rms(tracer, model)
+        energy = float(found.sum(dtype=np.float64) / reference.sum(dtype=np.float64) - 1)
+        rows.append(Row(name, cell, count, rms, energy, flip(*_shown(found, reference)), times[0][0], times[1][1]))
+        shown[f"{name}, {f'cells of {cell:g} px, ' if cell else ''}{count} wavelengths"] = found
     exact = next(r for r in rows if r.cell_px == 32.0)
     rows.append(replace(exact, way="exact, torch", cpu_ms=exact.cpu_ms + _torch_ms(lens, tracer, 32.0), wall_ms=None))
     goals = _goals(rows)
@@ -200,10 +193,7 @@ def _draw(out: Any, shown: dict[str, Any], reference: Any) -> None:
         below.set_title(f"FLIP {flip(*pair):.3f}", fontsize=7)
         for axis in (top, below):
             axis.set_axis_off()
-    out.mkdir(parents=True, exist_ok=True)
-    with atomic_path(out / "ghosts.png") as temporary:
-        figure.savefig(temporary, dpi=90, format="png")
-    plt.close(figure)
+    lab.write_figure(out / "ghosts.png", figure, 90)
 
 
 _COLUMNS = lab.columns(

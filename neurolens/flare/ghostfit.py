@@ -54,6 +54,11 @@ class GhostSettings:
     rays: int = 8000
     seed: int = 0
 
+    @property
+    def sine(self) -> float:
+        """Of the largest angle."""
+        return math.sin(math.radians(self.angle_deg))
+
 
 @dataclass(frozen=True)
 class _Sample:
@@ -87,6 +92,7 @@ def fit_ghosts(lens: Lens, settings: GhostSettings, done: Callable[[float], None
         InputError: a lens with cylinders, with a mask in its stop or without film; settings out of range; no ghost that
             reaches the film.
     """
+<<<<<<< HEAD
     if any(s.cylinder for s in lens.surfaces):
         raise InputError(
             lens.path, "cylinder", "(some)", "a lens with an axis of symmetry: of others ghosts are traced"
@@ -98,6 +104,9 @@ def fit_ghosts(lens: Lens, settings: GhostSettings, done: Callable[[float], None
             raise InputError("ghost fit", name, getattr(settings, name), f"from {least:g} to {most:g}")
     if settings.rays < 1000:
         raise InputError("ghost fit", "rays", settings.rays, "at least 1000")
+=======
+    _check(lens, settings)
+>>>>>>> main
     began, plain, rng = time.perf_counter(), replace(lens, aperture=None), np.random.default_rng(settings.seed)
     every = ghost_pairs(plain)
     found = _search(GhostTracer(plain, every), every, settings, rng)
@@ -124,9 +133,18 @@ def fit_ghosts(lens: Lens, settings: GhostSettings, done: Callable[[float], None
         "seconds": time.perf_counter() - began,
         "ghosts": rows,
     }
-    sine = math.sin(math.radians(settings.angle_deg))
     radius = float(lens.stop_radius_mm)
-    return GhostModel(lens, pairs, tuple(fits), sine, settings.wavelength_nm, radius, report)
+    return GhostModel(lens, pairs, tuple(fits), settings.sine, settings.wavelength_nm, radius, report)
+
+
+def _check(lens: Lens, settings: GhostSettings) -> None:
+    if any(s.cylinder for s in lens.surfaces):
+        expected = "a lens with an axis of symmetry: of others ghosts are traced"
+        raise InputError(lens.path, "cylinder", "(some)", expected)
+    bounds = {"angle_deg": (0.1, 89.0), "keep": (0.0, 1.0), "target_um": (1e-3, 1e6), "rays": (1000, 1e9)}
+    for name, (least, most) in bounds.items():
+        if not least <= getattr(settings, name) <= most:
+            raise InputError("ghost fit", name, getattr(settings, name), f"from {least:g} to {most:g}")
 
 
 def _rays(direction: Array, place: Array) -> Array:
@@ -146,7 +164,7 @@ def _search(
     tracer: GhostTracer, every: Sequence[Pair], settings: GhostSettings, rng: np.random.Generator
 ) -> dict[Pair, tuple[float, float, float]]:
     """Of every ghost its light on the film, all directions alike, and chief and scale of u where it enters (mm)."""
-    sine, front = math.sin(math.radians(settings.angle_deg)), tracer.lens.surfaces[0].semi_diameter_mm
+    sine, front = settings.sine, tracer.lens.surfaces[0].semi_diameter_mm
     p, u = _drawn(_SEARCH, rng)
     place = 1.3 * front * u
     cos = np.sqrt(1 - (sine * p[0]) ** 2)
@@ -172,7 +190,7 @@ def _sample(
     short, long = (float(inverse_square_um(v)) for v in settings.wavelength_nm)
     w = 2 * rng.random(count) - 1
     nm = 1000 / np.sqrt(0.5 * (short + long) + 0.5 * (short - long) * w)
-    rays = Rays(*torch.from_numpy(_rays(math.sin(math.radians(settings.angle_deg)) * p, chief * p + scale * u)))
+    rays = Rays(*torch.from_numpy(_rays(settings.sine * p, chief * p + scale * u)))
     open_lens = replace(
         lens, surfaces=tuple(replace(s, diameter_mm=_OPEN * s.diameter_mm) for s in lens.surfaces), aperture=None
     )
@@ -276,7 +294,7 @@ def first_order_ghosts(model: GhostModel) -> GhostModel:
         use = np.arange(1000)
         near = _solved(np.zeros((1, 4), np.int64), data, use, np.ones(1000), rims, steps, 0.0, 1e-3)
         # From the scales of this small sample to those of the model: p = d / sine, u = place / scale.
-        grown = np.array([model.sine / math.sin(math.radians(settings.angle_deg)), ghost_fit.scale_mm / 1e-3])
+        grown = np.array([model.sine / settings.sine, ghost_fit.scale_mm / 1e-3])
         ab = near.ab * grown[:, None]
         # u is counted from the chief's part, which first order has in A.
         ab[:, 0] += ab[:, 1] * (ghost_fit.chief_mm / ghost_fit.scale_mm)

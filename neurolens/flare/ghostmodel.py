@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -182,13 +183,13 @@ class GhostModel:
             text += function_text(_monomial_graph(key), f"terms_{n}", f"run_terms_{n}", "place", "term", "call")
         for stops, n in lights.items():
             text += function_text(self._light_graph(stops), f"lit_{n}", f"run_lit_{n}", "row", "light", "call")
-        names = (
-            ", ".join(f"run_{name}_{n}" for n in range(len(of))) for name, of in (("terms", monomials), ("lit", lights))
+        driver = Template(_DRIVER).substitute(
+            TERMS=", ".join(f"run_terms_{n}" for n in monomials.values()),
+            LIGHTS=", ".join(f"run_lit_{n}" for n in lights.values()),
+            MOST=max(len(key) for key in monomials),
+            ROWS=2 + max(2 * len(stops) + 3 for stops in lights),
         )
-        most = max(len(key) for key in monomials), 2 + max(2 * len(stops) + 3 for stops in lights)
-        for word, value in zip(("$TERMS", "$LIGHTS", "$MOST", "$ROWS"), (*names, *map(str, most)), strict=True):
-            text = (text if word != "$TERMS" else "#include <stddef.h>\n" + text + _DRIVER).replace(word, value)
-        run = load_compiled(text).ghosts
+        run = load_compiled(f"#include <stddef.h>\n{text}{driver}").ghosts
         whole, pointer = ctypes.c_int, ctypes.c_void_p
         run.argtypes, run.restype = [ctypes.c_size_t, *[whole] * 5, *[pointer] * 4], None
         return run, monomials, lights
