@@ -186,7 +186,8 @@ def test_a_scene_has_the_same_lights_in_all_frames(tmp_path: Path) -> None:
     """A camera that passes two lamps keeps the one that is brighter in all frames together, also beside the other."""
     scene, keys = tmp_path / "scene.toml", tmp_path / "camera.csv"
     lamp = "{ position_m = [-0.5, 1.0, 0.0], intensity = [2.0, 2.0, 2.0] }"
-    scene.write_text(SCENE.replace("points = [", f"points = [{lamp}, ").replace("[2.0, 1.0, 0.5]", "[5.0, 0.0, 0.0]"))
+    text = SCENE.replace("points = [", f"points = [{lamp}, ").replace(', illuminant = "2900 K"', "")
+    scene.write_text(text.replace("[2.0, 1.0, 0.5]", "[5.0, 0.0, 0.0]"))
     keys.write_text("frame,position,look-at\n1,-0.5/1/2,-0.5/1/0\n3,0.5/1/2,0.5/1/0\n")
     words = [*SMALL, "--lights", str(scene), "--frames", "1:3", "--key", str(keys), "--most", "1"]
     assert main(["flare", *words, "-o", str(tmp_path / "a.exr")]) == 0
