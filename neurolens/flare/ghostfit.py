@@ -89,7 +89,8 @@ def fit_ghosts(lens: Lens, settings: GhostSettings, done: Callable[[float], None
         done: told the share of the work that is done.
 
     Raises:
-        InputError: a lens with cylinders or without film; settings out of range; no ghost that reaches the film.
+        InputError: a lens with cylinders, with a mask in its stop or without film; settings out of range; no ghost that
+            reaches the film.
     """
     _check(lens, settings)
     began, plain, rng = time.perf_counter(), replace(lens, aperture=None), np.random.default_rng(settings.seed)
@@ -126,6 +127,8 @@ def _check(lens: Lens, settings: GhostSettings) -> None:
     if any(s.cylinder for s in lens.surfaces):
         expected = "a lens with an axis of symmetry: of others ghosts are traced"
         raise InputError(lens.path, "cylinder", "(some)", expected)
+    if lens.aperture is not None and lens.aperture.mask is not None:
+        raise InputError(lens.path, "aperture", "(a mask)", "a round stop or blades: fitted ghosts take no mask")
     bounds = {"angle_deg": (0.1, 89.0), "keep": (0.0, 1.0), "target_um": (1e-3, 1e6), "rays": (1000, 1e9)}
     for name, (least, most) in bounds.items():
         if not least <= getattr(settings, name) <= most:

@@ -78,7 +78,7 @@ class GhostModel:
     """Surrogates of a lens's ghosts, in the state that it has; takes the place of a `GhostTracer`.
 
     Attributes:
-        lens: its stop may be closed, and be given blades, after the fit.
+        lens: its stop may be closed, and be given blades, but no mask, after the fit.
         pairs, ghosts: those that are kept, brightest first.
         sine: of the largest angle between the axis and the light.
         wavelength_nm: range. stop_radius_mm: of the fit.
@@ -94,6 +94,8 @@ class GhostModel:
     report: dict[str, Any]
 
     def __post_init__(self) -> None:
+        if self.lens.aperture is not None and self.lens.aperture.mask is not None:
+            raise InputError("flare", "aperture", "(a mask)", "a round stop or blades: fitted ghosts take no mask")
         if not self.lens.stop_radius_mm <= 1.00001 * self.stop_radius_mm:
             expected = f"at most {self.stop_radius_mm:.6g} mm, that of the fit"
             raise InputError("flare", "stop_radius_mm", self.lens.stop_radius_mm, expected)

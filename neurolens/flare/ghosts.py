@@ -123,6 +123,13 @@ class GhostRays(NamedTuple):
         """[P, N], the largest r^2 / R^2 at any rim on the way: at most 1 where the ray arrives."""
         return self.rows[:, 3]
 
+    @property
+    def sums(self) -> NDArray[np.float64]:
+        """[P, 5], as of `GhostSums`."""
+        x, y, power = np.moveaxis(self.rows[:, :3].astype(np.float64), 1, 0)
+        x, y = (np.where(power > 0, v, 0.0) for v in (x, y))  # lost rays are nowhere
+        return np.stack([power, power * x, power * y, power * (x * x + y * y), power > 0], 1).sum(2)
+
 
 class GhostSums(NamedTuple):
     """Light of ghosts at the film's plane, summed over rays.

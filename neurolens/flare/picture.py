@@ -85,16 +85,26 @@ class Ghost:
     passed: float
 
 
-def ghost_table(tracer: GhostTracer, light: Light, wavelength_nm: float, count: int = RANKED) -> list[Ghost]:
-    """The ghosts of a light at one wavelength that reach the film's plane at all, brightest first."""
+def ghost_table(
+    tracer: GhostTracer | GhostModel, light: Light, wavelength_nm: float, count: int = RANKED
+) -> list[Ghost]:
+    """The ghosts of a light at one wavelength that reach the film's plane at all, brightest first.
+
+    Raises:
+        InputError: of a model, a light or a wavelength that it is not made for.
+    """
     rays, _ = light_rays(tracer.lens, light, 0, count)
-    sums = tracer.sums(tracer.start(rays), wavelength_nm, direct=True).sums
-    image, rows = sums[-1, 0], []
+    if isinstance(tracer, GhostModel):
+        image = GhostTracer(tracer.lens, []).trace(rays, wavelength_nm, direct=True)
+        sums = np.concatenate([tracer.trace(rays, wavelength_nm).sums, image.sums])
+    else:
+        sums = tracer.sums(tracer.start(rays), wavelength_nm, direct=True).sums
+    of_image, rows = sums[-1, 0], []
     for way, (power, *moments, lit) in zip(tracer.pairs, sums.tolist(), strict=False):
         if power > 0:
             x, y, r2 = (moment / power for moment in moments)
             size = math.sqrt(max(r2 - x * x - y * y, 0.0))
-            rows.append(Ghost(way, power / image if image > 0 else math.inf, (x, y), size, lit / count))
+            rows.append(Ghost(way, power / of_image if of_image > 0 else math.inf, (x, y), size, lit / count))
     return sorted(rows, key=lambda ghost: -ghost.energy)
 
 
