@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -26,7 +26,7 @@ from experiments import lab
 from neurolens.base.progress import Progress
 from neurolens.evaluate.image import flip, flip_map
 from neurolens.flare import grids, picture
-from neurolens.flare.ghostfit import GhostSettings, first_order_ghosts, fit_ghosts
+from neurolens.flare.ghostfit import GhostSettings, fit_ghosts, sample, solved
 from neurolens.flare.ghostmodel import GhostModel
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light, light_rays, rays_across
@@ -97,6 +97,36 @@ def run(args: argparse.Namespace) -> int:
     _draw(args.out, shown, reference)
     print(lab.write_results(args.out, "ghosts", text, told))
     return 0
+
+
+def first_order_ghosts(model: GhostModel) -> GhostModel:
+    """The same ghosts and rims to first order (Lee and Eisemann 2013): constant A and B, and power, as on the axis."""
+    settings = GhostSettings(0.01, model.wavelength_nm)
+    lens, found = replace(model.lens, aperture=None), []
+    for pair, fit in zip(model.pairs, model.ghosts, strict=True):
+        steps = [k for k, _ in ghost(len(lens.surfaces), *pair)]
+        rims = _places_of(fit.surfaces, steps)
+        data = sample(lens, pair, 0.0, 1e-3, settings, 1000, np.random.default_rng(0))
+        use = np.arange(1000)
+        near = solved(np.zeros((1, 4), np.int64), data, use, np.ones(1000), rims, steps, 0.0, 1e-3)
+        # From the scales of this small sample to those of the model: p = d / sine, u = place / scale.
+        grown = np.array([model.sine / settings.sine, fit.scale_mm / 1e-3])
+        ab = near.ab * grown[:, None]
+        # u is counted from the chief's part, which first order has in A.
+        ab[:, 0] += ab[:, 1] * (fit.chief_mm / fit.scale_mm)
+        found.append(replace(near, chief_mm=fit.chief_mm, scale_mm=fit.scale_mm, ab=ab))
+    return replace(model, ghosts=tuple(found))
+
+
+def _places_of(surfaces: Sequence[int], steps: Sequence[int]) -> list[int]:
+    """Steps at surfaces, each once, in order."""
+    left = list(enumerate(steps))
+    found = []
+    for surface in surfaces:
+        place = next(pair for pair in left if pair[1] == surface)
+        left.remove(place)
+        found.append(place[0])
+    return found
 
 
 def _goals(rows: list[Row]) -> list[lab.Goal]:

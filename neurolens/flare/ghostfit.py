@@ -61,7 +61,7 @@ class GhostSettings:
 
 
 @dataclass(frozen=True)
-class _Sample:
+class Sample:
     """Rays of one ghost; numpy [.., N] float64.
 
     Attributes:
@@ -171,9 +171,10 @@ def _search(
     return known
 
 
-def _sample(
+def sample(
     lens: Lens, pair: Pair, chief: float, scale: float, settings: GhostSettings, count: int, rng: np.random.Generator
-) -> _Sample:
+) -> Sample:
+    """Random rays of a ghost, by the scales of `GhostPolynomial`; rims stop none."""
     p, u = _drawn(count, rng)
     short, long = (float(inverse_square_um(v)) for v in settings.wavelength_nm)
     w = 2 * rng.random(count) - 1
@@ -190,7 +191,7 @@ def _sample(
     met = np.stack([torch.stack(point[:2]).numpy() for point in out.points])
     crossings = met / np.array([lens.surfaces[k].semi_diameter_mm for k, _ in steps])[:, None, None]
     whole = (out.status == st.PASSED).numpy() & np.isfinite(film).all(0)
-    return _Sample(p, u, w, np.where(whole, film, _LOST), np.where(whole, crossings, _LOST), whole, out.power.numpy())
+    return Sample(p, u, w, np.where(whole, film, _LOST), np.where(whole, crossings, _LOST), whole, out.power.numpy())
 
 
 def _fit(
@@ -198,20 +199,20 @@ def _fit(
 ) -> tuple[GhostPolynomial, dict[str, Any]]:
     """A ghost of the lowest degree that is good enough, and what was measured on rays held out."""
     steps = [k for k, _ in ghost(len(lens.surfaces), *pair)]
-    data = _sample(lens, pair, chief, scale, settings, 4 * settings.rays, rng)
+    data = sample(lens, pair, chief, scale, settings, 4 * settings.rays, rng)
     ratio = np.sqrt(data.ratio)
     near = data.whole & (ratio.max(0) < _REACH) & (np.hypot(*data.film) < _FAR * settings.film_radius_mm)
     rims = _rims(data, steps, lens.stop_index)
     use = np.flatnonzero(near)[: settings.rays]
     weight = np.where(ratio[:, use].max(0) <= 1, 1.0, _BEYOND)
     weight /= 1 + (np.hypot(*data.film[:, use]) / settings.film_radius_mm) ** 4
-    test = _sample(lens, pair, chief, scale, settings, 2 * settings.rays, rng)
+    test = sample(lens, pair, chief, scale, settings, 2 * settings.rays, rng)
     fit, row = None, {}
     for degree in DEGREES:
         exponents = invariant_exponents(degree)
         if 4 * len(exponents) > len(use):
             break
-        fit = _solved(exponents, data, use, weight, rims, steps, chief, scale)
+        fit = solved(exponents, data, use, weight, rims, steps, chief, scale)
         row = _measured(fit, test, settings.film_radius_mm) | {"degree": degree, "rims": len(rims)}
         if row["film_rms_um"] <= settings.target_um:
             break
@@ -220,7 +221,7 @@ def _fit(
     return fit, row
 
 
-def _rims(data: _Sample, steps: list[int], stop: int) -> list[int]:
+def _rims(data: Sample, steps: list[int], stop: int) -> list[int]:
     """Steps whose rims are tested: the stop's, and up to `_RIMS` that explain most of what is blocked, as far as it
     counts."""
     blocked = data.ratio[:, data.whole] > 1
@@ -234,9 +235,9 @@ def _rims(data: _Sample, steps: list[int], stop: int) -> list[int]:
     return chosen
 
 
-def _solved(
+def solved(
     exponents: Any,
-    data: _Sample,
+    data: Sample,
     use: Any,
     weight: Array,
     rims: list[int],
@@ -244,6 +245,7 @@ def _solved(
     chief: float,
     scale: float,
 ) -> GhostPolynomial:
+    """The ghost by least squares from rays number `use` with weights; `rims`: which of the `steps` have crossings."""
     field = LightField(*(torch.from_numpy(v[..., use]) for v in (data.p, data.u, data.w)))
     features, count = monomials(field.invariants(), exponents), len(exponents)
     vectors = torch.from_numpy(np.concatenate([data.film[None], data.crossings[rims]])[..., use])
@@ -253,7 +255,7 @@ def _solved(
     return GhostPolynomial(chief, scale, surfaces, exponents, found.reshape(len(found), 2, count), power[0])
 
 
-def _measured(fit: GhostPolynomial, test: _Sample, film_radius: float) -> dict[str, float]:
+def _measured(fit: GhostPolynomial, test: Sample, film_radius: float) -> dict[str, float]:
     """Of light on the film: RMS distance in um, shares that are wrongly there or missing, and the error of all."""
     field = LightField(*(torch.from_numpy(v) for v in (test.p, test.u, test.w)))
     features = monomials(field.invariants(), fit.exponents).numpy()
@@ -271,33 +273,3 @@ def _measured(fit: GhostPolynomial, test: _Sample, film_radius: float) -> dict[s
         "lost_light": float(true[~passes].sum() / total),
         "energy_error": float(mine.sum() / total - 1),
     }
-
-
-def first_order_ghosts(model: GhostModel) -> GhostModel:
-    """The same ghosts and rims to first order (Lee and Eisemann 2013): constant A and B, and power, as on the axis."""
-    settings = GhostSettings(0.01, model.wavelength_nm)
-    lens, found = replace(model.lens, aperture=None), []
-    for pair, ghost_fit in zip(model.pairs, model.ghosts, strict=True):
-        steps = [k for k, _ in ghost(len(lens.surfaces), *pair)]
-        rims = _places_of(ghost_fit.surfaces, steps)
-        data = _sample(lens, pair, 0.0, 1e-3, settings, 1000, np.random.default_rng(0))
-        use = np.arange(1000)
-        near = _solved(np.zeros((1, 4), np.int64), data, use, np.ones(1000), rims, steps, 0.0, 1e-3)
-        # From the scales of this small sample to those of the model: p = d / sine, u = place / scale.
-        grown = np.array([model.sine / settings.sine, ghost_fit.scale_mm / 1e-3])
-        ab = near.ab * grown[:, None]
-        # u is counted from the chief's part, which first order has in A.
-        ab[:, 0] += ab[:, 1] * (ghost_fit.chief_mm / ghost_fit.scale_mm)
-        found.append(replace(near, chief_mm=ghost_fit.chief_mm, scale_mm=ghost_fit.scale_mm, ab=ab))
-    return replace(model, ghosts=tuple(found))
-
-
-def _places_of(surfaces: Sequence[int], steps: Sequence[int]) -> list[int]:
-    """Steps at surfaces, each once, in order."""
-    left = list(enumerate(steps))
-    found = []
-    for surface in surfaces:
-        place = next(pair for pair in left if pair[1] == surface)
-        left.remove(place)
-        found.append(place[0])
-    return found

@@ -69,16 +69,10 @@ class Four(NamedTuple):
 Way = Pair | Four
 
 
-def ghost_pairs(lens: Lens, *, one_side: bool = False) -> tuple[Pair, ...]:
-    """All ghosts of two reflections: pairs of surfaces that reflect.
-
-    Args:
-        one_side: only those whose both reflections lie on the same side of the stop (Hullin et al. 2011, section 4.1:
-            the others cross the stop three times, and little of them gets through).
-    """
-    at = [k for k, s in enumerate(lens.surfaces) if reflects(lens, k)]
-    pairs = [Pair(i, j) for j in at for i in at if i < j]
-    return tuple(p for p in pairs if not one_side or (p.first > lens.stop_index) == (p.second > lens.stop_index))
+def ghost_pairs(lens: Lens) -> tuple[Pair, ...]:
+    """All ghosts of two reflections: pairs of surfaces that reflect."""
+    at = [k for k in range(len(lens.surfaces)) if reflects(lens, k)]
+    return tuple(Pair(i, j) for j in at for i in at if i < j)
 
 
 def coated(lens: Lens, names: str) -> Lens:

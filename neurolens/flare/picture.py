@@ -151,7 +151,7 @@ def ghost_layout(lens: Lens, pair: Way, light: Light, lines: int = 9) -> Layout:
     At most so many rays, evenly chosen of those that arrive.
 
     Raises:
-        InputError: none does.
+        InputError: no ray arrives.
     """
     front = lens.surfaces[0].semi_diameter_mm
     off = math.acos(min(-float(light.towards[2]), 1.0))

@@ -246,6 +246,11 @@ def test_ghosts_and_glare_are_all(tmp_path: Path) -> None:
         (["--light", "1"], "AZ,EL"),
         (["--light", "1,2,3/4"], "AZ,EL"),
         (["--light", "1,2,1,0"], "positive distance"),
+        (["--light", "1,2,1,nan"], "positive distance"),
+        (["--light", "0,0,1,0.001"], "outside the lens"),
+        (["--light", "3,2,inf"], "finite"),
+        (["--light", "3,2,nan"], "finite"),
+        (["--light", "0,0", "--coating", "s00"], "s00"),
         (["--light", "1,2", "--photons", "9", "--layers", "2", "-o", "x.exr"], "single ghosts"),
         (["--light", "1,2", "--without", "haze", "-o", "x.exr"], "layers of flare"),
         (["--light", "0,0", "-o", "x.png"], ".exr"),
@@ -269,8 +274,12 @@ def test_bad_words(words: list[str], said: str, capsys: pytest.CaptureFixture[st
     assert said in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [["--barrel", "1.1"], ["--haze", "nan"], ["--sensor", "0.95"], ["--glare", "-1"]])
-def test_scatter_has_bounds(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["flare", "laikin_double_gauss_50", "--light", "0,0", *words])
-    assert words[0] in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--barrel", "1.1"), ("--haze", "nan"), ("--sensor", "0.95"), ("--glare", "-1"), ("--photons", "0"),
+     ("--photons", "1e9"), ("--photons", "2000000000")],
+)  # fmt: skip
+def test_numbers_have_bounds(option: str, value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["flare", "laikin_double_gauss_50", "--light", "0,0", option, value])
+    assert option in capsys.readouterr().err
