@@ -48,7 +48,11 @@ ghosts.R, .G, .B, and so on. Of the ghosts each of the brightest --layers is one
 (g07-03: reflected at surface 7, then at 3, counted from 0 at the front), the others are
 "rest". Values are those of `neurolens render`: a white card of radiance 1 is 1 on the axis.
 With --reflections 4, ghosts of four reflections are traced, too: the strongest, until 0.1% of
-all ghosts' light is left. With --photons light goes on by chance instead, with any number of
+all ghosts' light is left. Each surface shares light out by the mean of both polarisations; with
+--polarised light keeps the one that surfaces before gave it: all ghosts' light changes by -2 to
++12% in three lenses tried, single bright ghosts' by -22 to +48%, most in coated lenses, in twenty
+times the time (ghosts alone, not glare). Edges of ghosts are as rays draw them, without the rings
+of diffraction, which no option adds. With --photons light goes on by chance instead, with any number of
 reflections, smoothed by a kernel. With --glare, or anything that scatters, the layer glare has
 by such photons the light that is reflected more than twice or scatters, so that ghosts and
 glare are all. With --starburst the layer starburst has what diffraction sends aside, by the
@@ -61,6 +65,7 @@ examples:
   neurolens flare lenses/ogawa_zoom_70_200.toml --zoom 100 --light -12,3,1/0.8/0.5 --layers 8 -o flare.exr
   neurolens flare laikin_double_gauss_50 --light 15,8 --coating multi-layer --barrel 0.05 --dust 0.01 -o flare.exr
   neurolens flare laikin_double_gauss_50 --light 15,8 --blades 7 --f-number 11 --starburst -o flare.exr
+  neurolens flare laikin_double_gauss_50 --lights sun.csv --frames 1:48 --key camera.csv -o flare.exr
   neurolens flare laikin_double_gauss_50 --fit ghosts.onnx; neurolens flare ghosts.onnx --light 15,8 -o flare.exr"""
 _COMMAND = "neurolens flare"
 _SHOWN, _SHOWN_LIGHTS, _KEPT = 12, 4, 64  # ghosts of a table and tables; ghosts of a light that files tell
@@ -150,6 +155,9 @@ def _add_layers(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="layer that is not made: ghosts, glare, starburst; repeatable",
     )
+    group.add_argument(
+        "--polarised", action="store_true", help="ghosts whose light keeps its polarisation from surface to surface"
+    )
     group.add_argument("--starburst", action="store_true", help="the layer starburst; some seconds a light")
     group.add_argument(
         "--gain", metavar="NAME=X", action="append", default=[], type=_factor(1),
@@ -227,6 +235,7 @@ def run(args: argparse.Namespace) -> int:
     shots = _Shots(tabled, Sources(args), progress, model)
     first = shots.at(states[0])
     found = {"lens": first.lens.name, "pairs": len(ghost_pairs(first.lens)), **_told(first)}
+    found["fitted"] = 0 if model is None else len(model.pairs)
     if args.path is not None:
         _draw(first, args.path[0], Path(args.path[1]))
         found["path"] = args.path[1]
@@ -248,6 +257,8 @@ def _check(args: argparse.Namespace) -> None:
     args.fours = not by_chance and args.most_reflections == 4
     if not by_chance and args.most_reflections not in (None, 2, 4):
         raise InputError(_COMMAND, "--reflections", args.most_reflections, "2 or 4, or --photons or --glare beside it")
+    if args.polarised and (args.photons or args.fit):
+        raise InputError(_COMMAND, "--polarised", "(given)", "neither --photons nor --fit beside it: they average")
     args.most_reflections = args.most_reflections or 10
     if args.out is not None:
         check_suffix(args.out, "--out", (".exr",))
@@ -294,6 +305,7 @@ class _Shots:
     def _made(self, args: argparse.Namespace) -> _Shot:
         from neurolens.flare.ghosts import GhostTracer, ghost_pairs
         from neurolens.flare.picture import RANKED, Ways, ghost_table, with_four
+        from neurolens.flare.polarised import PolarisedTracer
 
         state = args.focus, args.f_number, args.zoom
         if state not in self._lenses:
@@ -302,10 +314,9 @@ class _Shots:
         lens, model = self._lenses[state]
         lights = self._sources.at(args, lens, self._progress)
         found = with_four(lens, lights) if args.fours else Ways(ghost_pairs(lens), 0, 0.0)
-        tracer, rays = GhostTracer(lens, found.ways), max(_FEWEST, RANKED // max(len(lights), 1))
-        return _Shot(
-            lens, lights, [ghost_table(tracer, light, 550.0, rays) for light in lights], found, model or tracer
-        )
+        tracer = model or (PolarisedTracer if args.polarised else GhostTracer)(lens, found.ways)
+        rays = max(_FEWEST, RANKED // max(len(lights), 1))
+        return _Shot(lens, lights, [ghost_table(tracer, light, 550.0, rays) for light in lights], found, tracer)
 
 
 def _lens(args: argparse.Namespace, tabled: Lens) -> Lens:
@@ -397,6 +408,8 @@ def _text(shot: _Shot, about: dict[str, Any]) -> str:
             f", and {fours} of its {shot.found.fours} ghosts of four reflections: the others have "
             f"{number(100 * shot.found.left)}% of all ghosts' light"
         )
+    if about["fitted"]:
+        parts[0] += f", {about['fitted']} ghosts of them fitted: the table is of the fit"
     head = ("ghost", "energy of the image's", "x mm", "y mm", "RMS radius mm", "rays that arrive %")
     for light, of_light in zip(shot.lights[:_SHOWN_LIGHTS], shot.ghosts, strict=False):
         all_of = sum(ghost.energy for ghost in of_light)
