@@ -30,7 +30,6 @@ import torch
 from numpy.typing import NDArray
 
 from experiments import lab
-from neurolens.base.files import atomic_path
 from neurolens.flare.ghosts import GhostTracer, coated
 from neurolens.flare.lights import Light, light_rays
 from neurolens.optics.coatings import reflectance
@@ -282,9 +281,7 @@ def _draw(args: argparse.Namespace, eras: list[Era]) -> None:
     for axes in (by_nm, by_angle, by_lens):
         axes.grid(alpha=0.3)
     figure.tight_layout()
-    with atomic_path(args.out / "coatings.png") as temporary:
-        figure.savefig(temporary, dpi=100, format="png")
-    plt.close(figure)
+    lab.write_figure(args.out / "coatings.png", figure, 100)
 
 
 def _era(name: str) -> tuple[Any, ...]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -23,11 +23,10 @@ import numpy as np
 import torch
 
 from experiments import lab
-from neurolens.base.files import atomic_path
 from neurolens.base.progress import Progress
 from neurolens.evaluate.image import flip, flip_map
 from neurolens.flare import grids, picture
-from neurolens.flare.ghostfit import GhostSettings, first_order_ghosts, fit_ghosts
+from neurolens.flare.ghostfit import GhostSettings, fit_ghosts, sample, solved
 from neurolens.flare.ghostmodel import GhostModel
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light, light_rays, rays_across
@@ -70,9 +69,6 @@ def run(args: argparse.Namespace) -> int:
         linear = first_order_ghosts(fitted)
     with progress.stage("converged"):
         reference = _drawn(tracer, 3.0, wavelengths=45)
-    exposure = picture.axis_irradiance(lens, _NM)
-    known = picture.axis_irradiance
-    picture.axis_irradiance = lambda lens, wavelength_nm: exposure  # of the lens alone
     rows, shown = [], {"exact, converged": reference}
     ways: list[tuple[str, Any, float, int]] = [
         *(("exact, compiled", tracer, cell, WAVELENGTHS) for cell in (8.0, 32.0)),
@@ -81,17 +77,14 @@ def run(args: argparse.Namespace) -> int:
         ("polynomials", fitted, 32.0, 8),
         ("first order", linear, 32.0, WAVELENGTHS),
     ]
-    try:
-        for name, model, cell, count in ways:
-            with progress.stage(f"{name}, {cell:g} px, {count} wavelengths"), _grid(cell):
-                found = _drawn(model, cell or 8.0, 1, count)
-                times = [_timed(model, cell or 8.0, threads, count, args.rounds) for threads in (1, 2)]
-            rms = None if model is tracer else _rms(tracer, model)
-            energy = float(found.sum(dtype=np.float64) / reference.sum(dtype=np.float64) - 1)
-            rows.append(Row(name, cell, count, rms, energy, flip(*_shown(found, reference)), times[0][0], times[1][1]))
-            shown[f"{name}, {f'cells of {cell:g} px, ' if cell else ''}{count} wavelengths"] = found
-    finally:
-        picture.axis_irradiance = known
+    for name, model, cell, count in ways:
+        with progress.stage(f"{name}, {cell:g} px, {count} wavelengths"), _grid(cell):
+            found = _drawn(model, cell or 8.0, 1, count)
+            times = [_timed(model, cell or 8.0, threads, count, args.rounds) for threads in (1, 2)]
+        rms = None if model is tracer else _rms(tracer, model)
+        energy = float(found.sum(dtype=np.float64) / reference.sum(dtype=np.float64) - 1)
+        rows.append(Row(name, cell, count, rms, energy, flip(*_shown(found, reference)), times[0][0], times[1][1]))
+        shown[f"{name}, {f'cells of {cell:g} px, ' if cell else ''}{count} wavelengths"] = found
     exact = next(r for r in rows if r.cell_px == 32.0)
     rows.append(replace(exact, way="exact, torch", cpu_ms=exact.cpu_ms + _torch_ms(lens, tracer, 32.0), wall_ms=None))
     goals = _goals(rows)
@@ -104,6 +97,36 @@ def run(args: argparse.Namespace) -> int:
     _draw(args.out, shown, reference)
     print(lab.write_results(args.out, "ghosts", text, told))
     return 0
+
+
+def first_order_ghosts(model: GhostModel) -> GhostModel:
+    """The same ghosts and rims to first order (Lee and Eisemann 2013): constant A and B, and power, as on the axis."""
+    settings = GhostSettings(0.01, model.wavelength_nm)
+    lens, found = replace(model.lens, aperture=None), []
+    for pair, fit in zip(model.pairs, model.ghosts, strict=True):
+        steps = [k for k, _ in ghost(len(lens.surfaces), *pair)]
+        rims = _places_of(fit.surfaces, steps)
+        data = sample(lens, pair, 0.0, 1e-3, settings, 1000, np.random.default_rng(0))
+        use = np.arange(1000)
+        near = solved(np.zeros((1, 4), np.int64), data, use, np.ones(1000), rims, steps, 0.0, 1e-3)
+        # From the scales of this small sample to those of the model: p = d / sine, u = place / scale.
+        grown = np.array([model.sine / settings.sine, fit.scale_mm / 1e-3])
+        ab = near.ab * grown[:, None]
+        # u is counted from the chief's part, which first order has in A.
+        ab[:, 0] += ab[:, 1] * (fit.chief_mm / fit.scale_mm)
+        found.append(replace(near, chief_mm=fit.chief_mm, scale_mm=fit.scale_mm, ab=ab))
+    return replace(model, ghosts=tuple(found))
+
+
+def _places_of(surfaces: Sequence[int], steps: Sequence[int]) -> list[int]:
+    """Steps at surfaces, each once, in order."""
+    left = list(enumerate(steps))
+    found = []
+    for surface in surfaces:
+        place = next(pair for pair in left if pair[1] == surface)
+        left.remove(place)
+        found.append(place[0])
+    return found
 
 
 def _goals(rows: list[Row]) -> list[lab.Goal]:
@@ -200,10 +223,7 @@ def _draw(out: Any, shown: dict[str, Any], reference: Any) -> None:
         below.set_title(f"FLIP {flip(*pair):.3f}", fontsize=7)
         for axis in (top, below):
             axis.set_axis_off()
-    out.mkdir(parents=True, exist_ok=True)
-    with atomic_path(out / "ghosts.png") as temporary:
-        figure.savefig(temporary, dpi=90, format="png")
-    plt.close(figure)
+    lab.write_figure(out / "ghosts.png", figure, 90)
 
 
 _COLUMNS = lab.columns(

@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments import lab
-from neurolens.base.files import atomic_path
 from neurolens.base.progress import Progress
 from neurolens.flare.ghosts import Four, GhostTracer, coated, four_reflections, ghost_pairs
 from neurolens.flare.layers import FlareSettings, flare_layers, sum_of
@@ -242,10 +241,7 @@ def _draw(gauss: Lens, retrofocus: Lens, args: argparse.Namespace) -> None:
             axis.set_title(title, fontsize=8)
             axis.tick_params(labelsize=7)
     figure.supxlabel("mm on the film", fontsize=8)
-    args.out.mkdir(parents=True, exist_ok=True)
-    with atomic_path(args.out / "glare.png") as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
-    plt.close(figure)
+    lab.write_figure(args.out / "glare.png", figure, 110)
 
 
 # ---- Ways. -----------------------------------------------------------------------------------------------------------

@@ -205,6 +205,16 @@ def write_results(folder: Path, name: str, text: str, data: Any) -> str:
     return text
 
 
+def write_figure(file: Path, figure: Any, dpi: int) -> None:
+    """Write a figure (of matplotlib) as PNG, atomically, and close it."""
+    from matplotlib import pyplot as plt
+
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(file) as temporary:
+        figure.savefig(temporary, dpi=dpi, format="png")
+    plt.close(figure)
+
+
 def write_small_png(file: Path, pictures: Iterable[Any], most_bytes: int) -> None:
     """Write the first of some pictures (of Pillow) that is small enough for the repository, as PNG.
 

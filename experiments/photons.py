@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments import lab
-from neurolens.base.files import atomic_path
 from neurolens.base.progress import Progress
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light, light_rays
@@ -137,10 +136,7 @@ def _draw(tracer: PhotonTracer, args: argparse.Namespace) -> None:
         axis.set_title(title, fontsize=8)
         axis.set_xlabel("mm", fontsize=7)
         axis.tick_params(labelsize=7)
-    args.out.mkdir(parents=True, exist_ok=True)
-    with atomic_path(args.out / "photons.png") as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
-    plt.close(figure)
+    lab.write_figure(args.out / "photons.png", figure, 110)
 
 
 _COLUMNS = lab.columns(

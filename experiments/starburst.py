@@ -108,25 +108,26 @@ def _star(pupil: ExitPupil, lines: list[Array], pixel: float, reach: int) -> Arr
     return star(pupil, lines, outline_spectrum(pupil, lines, NM, pixel, 1.5 * x[-1]), x, x, pixel)
 
 
-def _around(film: Array, low: int, high: int) -> Array:
-    """Means at 720 angles of pixels so far out."""
+def streaks(film: Array, low: int, high: int) -> int:
+    """How many streaks a star [N, N] has from `low` to `high` pixels out."""
     angle, middle = np.arange(720) * math.pi / 360, len(film) // 2
     rows, columns = (np.rint(middle + np.arange(low, high)[:, None] * f(angle)).astype(int) for f in (np.sin, np.cos))
-    return np.asarray(film[rows, columns].mean(0))
+    smooth = np.fft.irfft(np.fft.rfft(film[rows, columns].mean(0))[:60], 720)
+    peaks = (smooth > np.roll(smooth, 1)) & (smooth > np.roll(smooth, -1)) & (smooth > 0.3 * smooth.max())
+    return int(peaks.sum())
 
 
 def _streaks() -> list[Check]:
     """2 n of an odd number of blades, n of an even one."""
     found = []
     for blades in (5, 6, 7, 8, 9):
-        ring = _around(_star(*_pupil(16.0, Aperture(blades=blades, rotation_deg=7.0)), 0.0375, 100), 70, 95)
-        smooth = np.fft.irfft(np.fft.rfft(ring)[:60], 720)
-        peaks = (smooth > np.roll(smooth, 1)) & (smooth > np.roll(smooth, -1)) & (smooth > 0.3 * smooth.max())
-        found.append(Check(f"streaks of {blades} blades", float(peaks.sum()), float(blades * (1 + blades % 2))))
+        count = streaks(_star(*_pupil(16.0, Aperture(blades=blades, rotation_deg=7.0)), 0.0375, 100), 70, 95)
+        found.append(Check(f"streaks of {blades} blades", float(count), float(blades * (1 + blades % 2))))
     return found
 
 
-def _whole(pupil: ExitPupil, lines: list[Array]) -> float:
+def light_of(pupil: ExitPupil, lines: list[Array]) -> float:
+    """Light that passes, for an irradiance of 1 at the lens, mm^2."""
     share = (np.arange(256) + 0.5) / 128 - 1
     e = np.abs(pupil.field((share, share))) ** 2 * coverage(lines, 256)
     return float(e.sum() * np.prod(pupil.half / 128))
@@ -144,7 +145,7 @@ def _light() -> list[Check]:
         core = core * (film[reach - 2 : reach + 3, reach - 2 : reach + 3] == 0)
         angle, na = np.linspace(0, math.pi / 4, 200), np.ptp(lines[0][0]) / 2 * pupil.half[0]
         tail = np.mean(NM * 1e-6 / na / (math.pi**2 * (reach + 0.5) * pixel / np.cos(angle)))
-        share = (core.sum() + film.sum()) * pixel**2 / _whole(pupil, lines) + tail
+        share = (core.sum() + film.sum()) * pixel**2 / light_of(pupil, lines) + tail
         found.append(Check(f"all light at f/{f_number:g}", float(share), 1.0))
     return found
 
@@ -158,7 +159,7 @@ def _seconds(f_number: float, args: argparse.Namespace) -> dict[str, Any]:
     assert pupil is not None
     lines, pixel = outline(pupil), FILM_MM[0] / LARGE[0]
     film = _star(pupil, lines, pixel, 400)
-    aside = float(film.sum()) * pixel**2 / _whole(pupil, lines)
+    aside = float(film.sum()) * pixel**2 / light_of(pupil, lines)
     return {"stop": f"f/{f_number:g}", "seconds": spent[0], "core": spent[1], "aside": aside}
 
 
@@ -211,7 +212,7 @@ def _keller_rows() -> list[dict[str, Any]]:
                 "dim": float(cones[dim].sum() / exact[dim].sum()) if dim.any() else None,
                 "noise": float(np.std(cones[ring] / even[ring] - 1)) if aperture is None else None,
                 "contrast": float((second - first) / (second + first)) if aperture is None else None,
-                "too_much": _edge_light(pupil, lines) / _whole(pupil, lines) / (NM * 1e-6 * 16),
+                "too_much": _edge_light(pupil, lines) / light_of(pupil, lines) / (NM * 1e-6 * 16),
             }
         )
     return rows

@@ -1,5 +1,6 @@
 """`neurolens render` when things go wrong: signals, places that cannot be written, checkpoints."""
 
+import argparse
 import errno
 import os
 import re
@@ -19,6 +20,7 @@ from PIL import Image
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cli import main
+from neurolens.commands.render_frames import frames_of
 from neurolens.render.pictures import read_exr, read_layers, write_exr
 
 
@@ -230,6 +232,40 @@ def test_a_texture_with_the_name_of_the_preview_is_not_written_over(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.png", "ball.toml"]
 
 
+KEYS = "frame,focus,f-number,position\n1,,2,0/0.5/5\n2,1,,\n3,,8,1/0.5/5\n4,inf,,\n"
+
+
+def test_keys_of_files(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """CSV and JSON say what the same keys do on the command line; an error names the file, the row and the column."""
+    args = argparse.Namespace(frames=range(1, 6), focus=None, f_number=None, position_m=None)
+    words = ["focus=2:1,4:inf", "f-number=1:2,3:8", "position=1:0/0.5/5,3:1/0.5/5"]
+    csv, js = tmp_path / "keys.csv", tmp_path / "keys.JSON"
+    csv.write_text(KEYS)
+    js.write_text(
+        '[{"frame": 1, "f-number": 2, "position": [0, 0.5, 5]}, {"frame": 2, "focus": 1.0},'
+        '{"frame": 3, "f-number": 8, "position": [1, 0.5, 5]}, {"frame": 4, "focus": "inf"}]'
+    )
+    expected = list(frames_of(argparse.Namespace(**vars(args), key=words)))
+    for file in (csv, js):
+        assert list(frames_of(argparse.Namespace(**vars(args), key=[str(file)]))) == expected
+    start = ("render", scene, "--camera", "thin", "-o", tmp_path / "b.exr", "--frames", "1:2", "--key", csv)
+    for text, said in (
+        ("frame,iso\n1,100\n", "row 1, iso"),
+        ("frame,focus\n1,2\n1,3\n", "row 2, focus: got '1:3'"),
+        ("frame,focus\n,2\n", "row 1, focus"),
+        ("frame,focus\n1,2,3\n", "row 1"),
+        ("frame,position\n1,1/2\n", "X/Y/Z"),
+        ("frame,f-number\n1,nan\n", "row 1, f-number: got '1:nan'"),
+    ):
+        csv.write_text(text)
+        told = failure(capsys, *start)
+        assert said in told and "keys.csv" in told
+    csv.write_text("frame,focus\n1,2\n")
+    assert "each quantity once" in failure(capsys, *start, "--key", "focus=1:1")
+    csv.unlink()
+    assert "keys.csv" in failure(capsys, *start)
+
+
 def test_frames_follow_their_keys_and_what_exists_is_kept(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -267,6 +303,7 @@ def test_frames_follow_their_keys_and_what_exists_is_kept(
         (("--key", "focus=3:1,2:1"), "frames increasing"),
         (("--key", "iso=1:100"), "NAME of focus"),
         (("--key", "focus=1:1", "--focus", "2"), "left out"),
+        (("--key", "focus=1:1", "--key", "focus=2:1"), "each quantity once"),
     ):
         start = ("render", scene, "--camera", "thin", "-o", tmp_path / "b.exr", "--frames", "1:2")
         assert words in failure(capsys, *start, *wrong)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import hashlib
 import json
@@ -10,7 +11,7 @@ import re
 import secrets
 import stat
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from io import BufferedReader
@@ -19,6 +20,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 
+_LARGEST_LIST = 1 << 24
 _LEFT_OVER = re.compile(r"\.neurolens-[0-9a-f]{16}\.tmp(\.\w{1,16})?")  # a temporary file of ours
 _ABANDONED_S = 24 * 3600.0  # nothing is written for a day
 _DIGEST = 32  # bytes of SHA-256
@@ -215,3 +217,24 @@ def write_json(path: str | Path, data: Any) -> None:
     """Write JSON atomically, its folder made; ValueError where a number is not finite."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     atomic_write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
+
+
+def read_rows(path: Path, what: str) -> list[Mapping[str, Any]]:
+    """The rows of a small table: CSV with a header, or JSON (.json), a list of objects; `what` says what it is.
+
+    Raises:
+        InputError: no such file, one too large, or one that is no such table. Cells without a column are "(one more)".
+    """
+    data = read_bytes(path, _LARGEST_LIST, what)
+    try:
+        text = data.decode("utf-8-sig")
+        rows = (
+            json.loads(text)
+            if path.suffix.lower() == ".json"
+            else list(csv.DictReader(text.splitlines(), restkey="(one more)"))
+        )
+    except (ValueError, RecursionError, csv.Error) as error:
+        raise InputError(path, "file", f"({error})", f"{what} as CSV or JSON") from None
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise InputError(path, "file", "(no list of objects)", f"{what}, each an object")
+    return rows

@@ -51,7 +51,8 @@ def fitted(args: argparse.Namespace) -> GhostModel | None:
     from neurolens.flare.ghostfile import read_ghosts
 
     other = [name for name in given_options(args) if name not in _FREE]
-    other += [f"--{name}" for name in ("coating", "photons", "glare", "frames", "starburst") if getattr(args, name)]
+    never = "coating", "photons", "glare", "frames", "polarised", "starburst"
+    other += [f"--{name}" for name in never if getattr(args, name)]
     other += ["--reflections"] * args.fours
     if other:
         raise InputError(_COMMAND, other[0], args.file, "a lens: fitted ghosts have one state and two reflections")

@@ -7,9 +7,12 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.files import read_rows
+from neurolens.base.tomlfile import reject_unknown
 from neurolens.commands.render_files import Files
 
 _COMMAND = "neurolens render"
@@ -59,7 +62,9 @@ def add_frames(parser: argparse.ArgumentParser, does: str = _RENDERED, names: Se
     points = "; position and look-at are X/Y/Z in m" if "position" in names else ""
     group.add_argument(
         "--key", metavar="NAME=FRAME:VALUE,...", action="append", default=[],
-        help=f"values at frames, repeatable: {measures}{points}; before the first key and after the last one they stay",
+        help=f"values at frames, repeatable: {measures}{points}; before the first key and after the last one they "
+        "stay. Or a file of keys, .csv with a header or .json (a list of objects): a column frame, and one for each "
+        "NAME; an empty cell is no key",
     )  # fmt: skip
 
 
@@ -96,8 +101,9 @@ def frames_of(
     Raises:
         InputError: a key that is none, or of a quantity that the command line sets too.
     """
-    tracks = dict(_track(text, command, names) for text in args.key)
-    if len(tracks) < len(args.key):
+    given = [track for text in args.key for track in _tracks(text, command, names)]
+    tracks = dict(given)
+    if len(tracks) < len(given):
         raise InputError(command, "--key", args.key, "each quantity once")
     for name in tracks:
         option = _QUANTITIES[name].option
@@ -119,26 +125,53 @@ def _frames(text: str) -> range:
     raise argparse.ArgumentTypeError(f"got {text!r}, expected FIRST:LAST or FIRST:LAST:STEP, at most {_MOST} frames")
 
 
+def _tracks(text: str, command: str, names: Sequence[str]) -> Iterator[tuple[str, list[tuple[int, list[float]]]]]:
+    """The quantities of one --key, or of the file of keys that it names."""
+    path = Path(text)
+    if path.suffix.lower() not in (".csv", ".json") or "=" in path.name:
+        yield _track(text, command, names)
+        return
+    rows = read_rows(path, "a list of keys")
+    for number, row in enumerate(rows):
+        reject_unknown(path, f"row {number + 1}, ", row, ["frame", *names])
+    for name in names:
+        keys: list[tuple[int, list[float]]] = []
+        for number, row in enumerate(rows):
+            frame, value = row.get("frame"), row.get(name)
+            if value not in (None, ""):
+                value = "/".join(map(str, value)) if isinstance(value, list) else str(value)
+                _append(keys, name, str(frame).strip(), value.strip(), (path, f"row {number + 1}, {name}"))
+        if keys:
+            yield name, keys
+
+
 def _track(text: str, command: str, names: Sequence[str]) -> tuple[str, list[tuple[int, list[float]]]]:
     """Name and keys, (frame, measures), of one --key."""
     name, _, rest = text.partition("=")
     if name not in names:
         raise InputError(command, "--key", text, f"NAME=FRAME:VALUE,... with NAME of {', '.join(names)}")
-    quantity = _QUANTITIES[name]
     keys: list[tuple[int, list[float]]] = []
     for word in rest.split(","):
         frame, _, value = word.partition(":")
-        try:
-            numbers = [float(v) for v in value.split("/")] if len(value) < 100 else []
-        except ValueError:
-            numbers = []
-        good = [math.isfinite(v) if quantity.size > 1 else 0 < v and (v < math.inf or name == "focus") for v in numbers]
-        later = frame.isascii() and frame.isdecimal() and len(frame) <= 7 and (not keys or int(frame) > keys[-1][0])
-        if not later or len(numbers) != quantity.size or not all(good):
-            form = "X/Y/Z in m" if quantity.size > 1 else "a number above 0"
-            raise InputError(command, f"--key {name}", word, f"FRAME:VALUE, frames increasing, VALUE {form}")
-        keys.append((int(frame), [quantity.to(v) for v in numbers]))
+        _append(keys, name, frame, value, (command, f"--key {name}"))
     return name, keys
+
+
+def _append(
+    keys: list[tuple[int, list[float]]], name: str, frame: str, value: str, place: tuple[str | Path, str]
+) -> None:
+    """One more key of a quantity, as words; `place`: where they stand, for errors."""
+    quantity = _QUANTITIES[name]
+    try:
+        numbers = [float(v) for v in value.split("/")] if len(value) < 100 else []
+    except ValueError:
+        numbers = []
+    good = [math.isfinite(v) if quantity.size > 1 else 0 < v and (v < math.inf or name == "focus") for v in numbers]
+    later = frame.isascii() and frame.isdecimal() and len(frame) <= 7 and (not keys or int(frame) > keys[-1][0])
+    if not later or len(numbers) != quantity.size or not all(good):
+        form = "X/Y/Z in m" if quantity.size > 1 else "a number above 0"
+        raise InputError(*place, f"{frame}:{value}", f"FRAME:VALUE, frames increasing, VALUE {form}")
+    keys.append((int(frame), [quantity.to(v) for v in numbers]))
 
 
 def _at(name: str, keys: Sequence[tuple[int, list[float]]], frame: int) -> float | tuple[float, ...]:

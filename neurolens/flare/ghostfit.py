@@ -54,9 +54,14 @@ class GhostSettings:
     rays: int = 8000
     seed: int = 0
 
+    @property
+    def sine(self) -> float:
+        """Of the largest angle."""
+        return math.sin(math.radians(self.angle_deg))
+
 
 @dataclass(frozen=True)
-class _Sample:
+class Sample:
     """Rays of one ghost; numpy [.., N] float64.
 
     Attributes:
@@ -84,17 +89,10 @@ def fit_ghosts(lens: Lens, settings: GhostSettings, done: Callable[[float], None
         done: told the share of the work that is done.
 
     Raises:
-        InputError: a lens with cylinders or without film; settings out of range; no ghost that reaches the film.
+        InputError: a lens with cylinders, with a mask in its stop or without film; settings out of range; no ghost that
+            reaches the film.
     """
-    if any(s.cylinder for s in lens.surfaces):
-        raise InputError(
-            lens.path, "cylinder", "(some)", "a lens with an axis of symmetry: of others ghosts are traced"
-        )
-    for name, least, most in (("angle_deg", 0.1, 89.0), ("keep", 0.0, 1.0), ("target_um", 1e-3, 1e6)):
-        if not least <= getattr(settings, name) <= most:
-            raise InputError("ghost fit", name, getattr(settings, name), f"from {least:g} to {most:g}")
-    if settings.rays < 1000:
-        raise InputError("ghost fit", "rays", settings.rays, "at least 1000")
+    _check(lens, settings)
     began, plain, rng = time.perf_counter(), replace(lens, aperture=None), np.random.default_rng(settings.seed)
     every = ghost_pairs(plain)
     found = _search(GhostTracer(plain, every), every, settings, rng)
@@ -121,9 +119,20 @@ def fit_ghosts(lens: Lens, settings: GhostSettings, done: Callable[[float], None
         "seconds": time.perf_counter() - began,
         "ghosts": rows,
     }
-    sine = math.sin(math.radians(settings.angle_deg))
     radius = float(lens.stop_radius_mm)
-    return GhostModel(lens, pairs, tuple(fits), sine, settings.wavelength_nm, radius, report)
+    return GhostModel(lens, pairs, tuple(fits), settings.sine, settings.wavelength_nm, radius, report)
+
+
+def _check(lens: Lens, settings: GhostSettings) -> None:
+    if any(s.cylinder for s in lens.surfaces):
+        expected = "a lens with an axis of symmetry: of others ghosts are traced"
+        raise InputError(lens.path, "cylinder", "(some)", expected)
+    if lens.aperture is not None and lens.aperture.mask is not None:
+        raise InputError(lens.path, "aperture", "(a mask)", "a round stop or blades: fitted ghosts take no mask")
+    bounds = {"angle_deg": (0.1, 89.0), "keep": (0.0, 1.0), "target_um": (1e-3, 1e6), "rays": (1000, 1e9)}
+    for name, (least, most) in bounds.items():
+        if not least <= getattr(settings, name) <= most:
+            raise InputError("ghost fit", name, getattr(settings, name), f"from {least:g} to {most:g}")
 
 
 def _rays(direction: Array, place: Array) -> Array:
@@ -143,7 +152,7 @@ def _search(
     tracer: GhostTracer, every: Sequence[Pair], settings: GhostSettings, rng: np.random.Generator
 ) -> dict[Pair, tuple[float, float, float]]:
     """Of every ghost its light on the film, all directions alike, and chief and scale of u where it enters (mm)."""
-    sine, front = math.sin(math.radians(settings.angle_deg)), tracer.lens.surfaces[0].semi_diameter_mm
+    sine, front = settings.sine, tracer.lens.surfaces[0].semi_diameter_mm
     p, u = _drawn(_SEARCH, rng)
     place = 1.3 * front * u
     cos = np.sqrt(1 - (sine * p[0]) ** 2)
@@ -162,14 +171,15 @@ def _search(
     return known
 
 
-def _sample(
+def sample(
     lens: Lens, pair: Pair, chief: float, scale: float, settings: GhostSettings, count: int, rng: np.random.Generator
-) -> _Sample:
+) -> Sample:
+    """Random rays of a ghost, by the scales of `GhostPolynomial`; rims stop none."""
     p, u = _drawn(count, rng)
     short, long = (float(inverse_square_um(v)) for v in settings.wavelength_nm)
     w = 2 * rng.random(count) - 1
     nm = 1000 / np.sqrt(0.5 * (short + long) + 0.5 * (short - long) * w)
-    rays = Rays(*torch.from_numpy(_rays(math.sin(math.radians(settings.angle_deg)) * p, chief * p + scale * u)))
+    rays = Rays(*torch.from_numpy(_rays(settings.sine * p, chief * p + scale * u)))
     open_lens = replace(
         lens, surfaces=tuple(replace(s, diameter_mm=_OPEN * s.diameter_mm) for s in lens.surfaces), aperture=None
     )
@@ -181,7 +191,7 @@ def _sample(
     met = np.stack([torch.stack(point[:2]).numpy() for point in out.points])
     crossings = met / np.array([lens.surfaces[k].semi_diameter_mm for k, _ in steps])[:, None, None]
     whole = (out.status == st.PASSED).numpy() & np.isfinite(film).all(0)
-    return _Sample(p, u, w, np.where(whole, film, _LOST), np.where(whole, crossings, _LOST), whole, out.power.numpy())
+    return Sample(p, u, w, np.where(whole, film, _LOST), np.where(whole, crossings, _LOST), whole, out.power.numpy())
 
 
 def _fit(
@@ -189,20 +199,20 @@ def _fit(
 ) -> tuple[GhostPolynomial, dict[str, Any]]:
     """A ghost of the lowest degree that is good enough, and what was measured on rays held out."""
     steps = [k for k, _ in ghost(len(lens.surfaces), *pair)]
-    data = _sample(lens, pair, chief, scale, settings, 4 * settings.rays, rng)
+    data = sample(lens, pair, chief, scale, settings, 4 * settings.rays, rng)
     ratio = np.sqrt(data.ratio)
     near = data.whole & (ratio.max(0) < _REACH) & (np.hypot(*data.film) < _FAR * settings.film_radius_mm)
     rims = _rims(data, steps, lens.stop_index)
     use = np.flatnonzero(near)[: settings.rays]
     weight = np.where(ratio[:, use].max(0) <= 1, 1.0, _BEYOND)
     weight /= 1 + (np.hypot(*data.film[:, use]) / settings.film_radius_mm) ** 4
-    test = _sample(lens, pair, chief, scale, settings, 2 * settings.rays, rng)
+    test = sample(lens, pair, chief, scale, settings, 2 * settings.rays, rng)
     fit, row = None, {}
     for degree in DEGREES:
         exponents = invariant_exponents(degree)
         if 4 * len(exponents) > len(use):
             break
-        fit = _solved(exponents, data, use, weight, rims, steps, chief, scale)
+        fit = solved(exponents, data, use, weight, rims, steps, chief, scale)
         row = _measured(fit, test, settings.film_radius_mm) | {"degree": degree, "rims": len(rims)}
         if row["film_rms_um"] <= settings.target_um:
             break
@@ -211,7 +221,7 @@ def _fit(
     return fit, row
 
 
-def _rims(data: _Sample, steps: list[int], stop: int) -> list[int]:
+def _rims(data: Sample, steps: list[int], stop: int) -> list[int]:
     """Steps whose rims are tested: the stop's, and those that explain most of what is blocked, as long as it counts."""
     blocked = data.ratio[:, data.whole] > 1
     chosen = [n for n, k in enumerate(steps) if k == stop]
@@ -223,9 +233,9 @@ def _rims(data: _Sample, steps: list[int], stop: int) -> list[int]:
     return chosen
 
 
-def _solved(
+def solved(
     exponents: Any,
-    data: _Sample,
+    data: Sample,
     use: Any,
     weight: Array,
     rims: list[int],
@@ -233,6 +243,7 @@ def _solved(
     chief: float,
     scale: float,
 ) -> GhostPolynomial:
+    """The ghost by least squares from rays number `use` with weights; `rims`: which of the `steps` have crossings."""
     field = LightField(*(torch.from_numpy(v[..., use]) for v in (data.p, data.u, data.w)))
     features, count = monomials(field.invariants(), exponents), len(exponents)
     vectors = torch.from_numpy(np.concatenate([data.film[None], data.crossings[rims]])[..., use])
@@ -242,7 +253,7 @@ def _solved(
     return GhostPolynomial(chief, scale, surfaces, exponents, found.reshape(len(found), 2, count), power[0])
 
 
-def _measured(fit: GhostPolynomial, test: _Sample, film_radius: float) -> dict[str, float]:
+def _measured(fit: GhostPolynomial, test: Sample, film_radius: float) -> dict[str, float]:
     """Of light on the film: RMS distance in um, shares that are wrongly there or missing, and the error of all."""
     field = LightField(*(torch.from_numpy(v) for v in (test.p, test.u, test.w)))
     features = monomials(field.invariants(), fit.exponents).numpy()
@@ -260,33 +271,3 @@ def _measured(fit: GhostPolynomial, test: _Sample, film_radius: float) -> dict[s
         "lost_light": float(true[~passes].sum() / total),
         "energy_error": float(mine.sum() / total - 1),
     }
-
-
-def first_order_ghosts(model: GhostModel) -> GhostModel:
-    """The same ghosts and rims to first order (Lee and Eisemann 2013): constant A and B, and power, as on the axis."""
-    settings = GhostSettings(0.01, model.wavelength_nm)
-    lens, found = replace(model.lens, aperture=None), []
-    for pair, ghost_fit in zip(model.pairs, model.ghosts, strict=True):
-        steps = [k for k, _ in ghost(len(lens.surfaces), *pair)]
-        rims = _places_of(ghost_fit.surfaces, steps)
-        data = _sample(lens, pair, 0.0, 1e-3, settings, 1000, np.random.default_rng(0))
-        use = np.arange(1000)
-        near = _solved(np.zeros((1, 4), np.int64), data, use, np.ones(1000), rims, steps, 0.0, 1e-3)
-        # From the scales of this small sample to those of the model: p = d / sine, u = place / scale.
-        grown = np.array([model.sine / math.sin(math.radians(settings.angle_deg)), ghost_fit.scale_mm / 1e-3])
-        ab = near.ab * grown[:, None]
-        # u is counted from the chief's part, which first order has in A.
-        ab[:, 0] += ab[:, 1] * (ghost_fit.chief_mm / ghost_fit.scale_mm)
-        found.append(replace(near, chief_mm=ghost_fit.chief_mm, scale_mm=ghost_fit.scale_mm, ab=ab))
-    return replace(model, ghosts=tuple(found))
-
-
-def _places_of(surfaces: Sequence[int], steps: Sequence[int]) -> list[int]:
-    """Steps at surfaces, each once, in order."""
-    left = list(enumerate(steps))
-    found = []
-    for surface in surfaces:
-        place = next(pair for pair in left if pair[1] == surface)
-        left.remove(place)
-        found.append(place[0])
-    return found

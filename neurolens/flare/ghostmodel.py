@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -77,7 +78,7 @@ class GhostModel:
     """Surrogates of a lens's ghosts, in the state that it has; takes the place of a `GhostTracer`.
 
     Attributes:
-        lens: its stop may be closed, and be given blades, after the fit.
+        lens: its stop may be closed, and be given blades, but no mask, after the fit.
         pairs, ghosts: those that are kept, brightest first.
         sine: of the largest angle between the axis and the light.
         wavelength_nm: range. stop_radius_mm: of the fit.
@@ -93,6 +94,8 @@ class GhostModel:
     report: dict[str, Any]
 
     def __post_init__(self) -> None:
+        if self.lens.aperture is not None and self.lens.aperture.mask is not None:
+            raise InputError("flare", "aperture", "(a mask)", "a round stop or blades: fitted ghosts take no mask")
         if not self.lens.stop_radius_mm <= 1.00001 * self.stop_radius_mm:
             expected = f"at most {self.stop_radius_mm:.6g} mm, that of the fit"
             raise InputError("flare", "stop_radius_mm", self.lens.stop_radius_mm, expected)
@@ -180,13 +183,13 @@ class GhostModel:
             text += function_text(_monomial_graph(key), f"terms_{n}", f"run_terms_{n}", "place", "term", "call")
         for stops, n in lights.items():
             text += function_text(self._light_graph(stops), f"lit_{n}", f"run_lit_{n}", "row", "light", "call")
-        names = (
-            ", ".join(f"run_{name}_{n}" for n in range(len(of))) for name, of in (("terms", monomials), ("lit", lights))
+        driver = Template(_DRIVER).substitute(
+            TERMS=", ".join(f"run_terms_{n}" for n in monomials.values()),
+            LIGHTS=", ".join(f"run_lit_{n}" for n in lights.values()),
+            MOST=max(len(key) for key in monomials),
+            ROWS=2 + max(2 * len(stops) + 3 for stops in lights),
         )
-        most = max(len(key) for key in monomials), 2 + max(2 * len(stops) + 3 for stops in lights)
-        for word, value in zip(("$TERMS", "$LIGHTS", "$MOST", "$ROWS"), (*names, *map(str, most)), strict=True):
-            text = (text if word != "$TERMS" else "#include <stddef.h>\n" + text + _DRIVER).replace(word, value)
-        run = load_compiled(text).ghosts
+        run = load_compiled(f"#include <stddef.h>\n{text}{driver}").ghosts
         whole, pointer = ctypes.c_int, ctypes.c_void_p
         run.argtypes, run.restype = [ctypes.c_size_t, *[whole] * 5, *[pointer] * 4], None
         return run, monomials, lights

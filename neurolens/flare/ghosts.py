@@ -14,6 +14,7 @@ import ctypes
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from string import Template
 from typing import NamedTuple
 
 import numpy as np
@@ -68,16 +69,10 @@ class Four(NamedTuple):
 Way = Pair | Four
 
 
-def ghost_pairs(lens: Lens, *, one_side: bool = False) -> tuple[Pair, ...]:
-    """All ghosts of two reflections: pairs of surfaces that reflect.
-
-    Args:
-        one_side: only those whose both reflections lie on the same side of the stop (Hullin et al. 2011, section 4.1:
-            the others cross the stop three times, and little of them gets through).
-    """
-    at = [k for k, s in enumerate(lens.surfaces) if reflects(lens, k)]
-    pairs = [Pair(i, j) for j in at for i in at if i < j]
-    return tuple(p for p in pairs if not one_side or (p.first > lens.stop_index) == (p.second > lens.stop_index))
+def ghost_pairs(lens: Lens) -> tuple[Pair, ...]:
+    """All ghosts of two reflections: pairs of surfaces that reflect."""
+    at = [k for k in range(len(lens.surfaces)) if reflects(lens, k)]
+    return tuple(Pair(i, j) for j in at for i in at if i < j)
 
 
 def coated(lens: Lens, names: str) -> Lens:
@@ -127,6 +122,13 @@ class GhostRays(NamedTuple):
     def worst(self) -> Floats:
         """[P, N], the largest r^2 / R^2 at any rim on the way: at most 1 where the ray arrives."""
         return self.rows[:, 3]
+
+    @property
+    def sums(self) -> NDArray[np.float64]:
+        """[P, 5], as of `GhostSums`."""
+        x, y, power = np.moveaxis(self.rows[:, :3].astype(np.float64), 1, 0)
+        x, y = (np.where(power > 0, v, 0.0) for v in (x, y))  # lost rays are nowhere
+        return np.stack([power, power * x, power * y, power * (x * x + y * y), power > 0], 1).sum(2)
 
 
 class GhostSums(NamedTuple):
@@ -178,8 +180,8 @@ class GhostTracer:
             if not sound or not all(0 <= k < len(lens.surfaces) and reflects(lens, k) for k in turns):
                 raise InputError(lens.path, "ghost", way.name, "surfaces that reflect, back and forward in turn")
         self.stack = Stack(lens, self._places())
-        self._call, pointer = self.stack.compiled(_DRIVER.format(block=_BLOCK, lost=LOST), "ghosts"), ctypes.c_void_p
-        whole, real = ctypes.c_int, ctypes.c_float
+        self._call = self.stack.compiled(Template(_DRIVER).substitute(BLOCK=_BLOCK, LOST=LOST), "ghosts")
+        whole, real, pointer = ctypes.c_int, ctypes.c_float, ctypes.c_void_p
         self._call.argtypes = [ctypes.c_size_t, whole, whole, real, real, ctypes.c_double, *[pointer] * 7]
         self._call.restype = ctypes.c_double
 
@@ -278,24 +280,24 @@ class GhostTracer:
 # are in the order in which `sweep` meets them: later surfaces first on the way back. A way ends where no ray is left on
 # it or, where its light is summed, where less than `least` is: nothing that comes of it can carry more.
 _DRIVER = """
-enum {{ BLOCK = {block}, ROOM = BLOCK * STATE, ROW = 6, SUMS = 5 }};
+enum { BLOCK = $BLOCK, ROOM = BLOCK * STATE, ROW = 6, SUMS = 5 };
 
-struct job {{
+struct job {
     struct lens lens;
     size_t n, at, count;
     float shift, reach, *out;
     double least, dropped, *sums;
-}};
+};
 
 static int left_after(struct job *job, int k, int action, const float *from, float *to)
-{{
+{
     const float *const power = to + (STATE - 2) * BLOCK, *const worst = power + BLOCK;
     int left = 0;
     go(job->lens, k, action, job->n, from, to, BLOCK);
     for (size_t i = 0; i < job->n; i++)
         left |= worst[i] <= job->reach;
     if (!left || !(job->least > 0.0)) return left;
-    float part[16] = {{ 0.0f }}, energy = 0.0f;
+    float part[16] = { 0.0f }, energy = 0.0f;
     for (size_t i = 0; i < BLOCK; i += 16)
         for (size_t k = 0; k < 16; k++)
             part[k] += i + k < job->n && worst[i + k] <= 1.0f ? power[i + k] : 0.0f;
@@ -304,19 +306,19 @@ static int left_after(struct job *job, int k, int action, const float *from, flo
     if (energy >= job->least * job->n) return 1;
     job->dropped += energy;
     return 0;
-}}
+}
 
 /* Light of a way at the film: kept ray by ray, or its power, x, y, r^2 and number summed. */
 static void arrive(struct job *job, const float *from, int way)
-{{
-    if (!job->sums) {{
+{
+    if (!job->sums) {
         meet_film(job->n, from, BLOCK, job->shift, job->out + 4 * way * job->count + job->at, job->count);
         return;
-    }}
+    }
     float film[4 * BLOCK];
     double *const sums = job->sums + SUMS * (size_t)way;
     meet_film(job->n, from, BLOCK, job->shift, film, BLOCK);
-    for (size_t i = 0; i < job->n; i++) {{
+    for (size_t i = 0; i < job->n; i++) {
         const double x = film[i], y = film[BLOCK + i], power = film[2 * BLOCK + i];
         if (!(power > 0.0)) continue;
         sums[0] += power;
@@ -324,31 +326,31 @@ static void arrive(struct job *job, const float *from, int way)
         sums[2] += power * y;
         sums[3] += power * (x * x + y * y);
         sums[4] += 1.0;
-    }}
-}}
+    }
+}
 
 /* All ways of some rows, whose first 2 `level` reflections are the same, from `here`, before surface `first`. */
 static void sweep(struct job *job, int first, float *here, const int *rows, int count, int level, float *room)
-{{
+{
     const int surfaces = job->lens.surfaces, own = rows[2 * level] < 0 ? rows[ROW - 1] : -1;
     float *const ahead = room, *back = room + (surfaces + 1) * ROOM, *spare = back + ROOM, *const deeper = spare + ROOM;
     const int *const end = rows + count * ROW;
     if (own >= 0) rows += ROW;
     const int far = own >= 0 ? surfaces : end[2 * level - ROW];
     int reached = first;
-    for (; reached < far; reached++) {{
+    for (; reached < far; reached++) {
         float *const next = rows < end ? here + ROOM : here == back ? spare : back;
         if (!left_after(job, reached, 0, here, next)) break;
         here = next;
-    }}
+    }
     if (own >= 0 && reached == surfaces) arrive(job, here, own);
-    while (rows < end && rows[2 * level] <= reached) {{
+    while (rows < end && rows[2 * level] <= reached) {
         const int j = rows[2 * level];
         const int *of_j = rows;
         while (rows < end && rows[2 * level] == j)
             rows += ROW;
         int left = left_after(job, j, 2, ahead + j * ROOM, back);
-        for (int i = j - 1; left && of_j < rows; i--) {{
+        for (int i = j - 1; left && of_j < rows; i--) {
             const int *const of_i = of_j;
             while (of_j < rows && of_j[2 * level + 1] == i)
                 of_j += ROW;
@@ -360,27 +362,27 @@ static void sweep(struct job *job, int first, float *here, const int *rows, int 
             float *const other = back;
             back = spare;
             spare = other;
-        }}
-    }}
-}}
+        }
+    }
+}
 
 double ghosts(
     size_t count, int surfaces, int ways, float shift, float reach, double least, const float *start,
     const int *functions, const float *numbers, const int *rows, float *room, float *out, double *sums)
-{{
-    struct job job = {{ {{ surfaces, functions, numbers }}, 0, 0, count, shift, reach, out, least, 0.0, sums }};
-    for (; ways && job.at < count; job.at += BLOCK) {{
+{
+    struct job job = { { surfaces, functions, numbers }, 0, 0, count, shift, reach, out, least, 0.0, sums };
+    for (; ways && job.at < count; job.at += BLOCK) {
         job.n = count - job.at < BLOCK ? count - job.at : BLOCK;
         for (int r = 0; r < STATE; r++)
             for (size_t i = 0; i < job.n; i++)
                 room[r * BLOCK + i] = start[r * count + job.at + i];
         for (int p = 0; !sums && p < ways; p++)
-            for (size_t i = 0; i < job.n; i++) {{
+            for (size_t i = 0; i < job.n; i++) {
                 out[(4 * p + 2) * count + job.at + i] = 0.0f;
-                out[(4 * p + 3) * count + job.at + i] = {lost}f;
-            }}
+                out[(4 * p + 3) * count + job.at + i] = ${LOST}f;
+            }
         sweep(&job, 0, room, rows, ways, 0, room);
-    }}
+    }
     return job.dropped;
-}}
+}
 """

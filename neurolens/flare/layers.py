@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -16,10 +15,10 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress, Report
 from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghostmodel import GhostModel
-from neurolens.flare.ghosts import GhostTracer, Way, coated, ghost_pairs
+from neurolens.flare.ghosts import GhostTracer, Way, coated
 from neurolens.flare.lights import Light
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import Ghost, Raster, ghost_picture, ghost_table, photon_picture, with_four
+from neurolens.flare.picture import Ghost, Raster, ghost_picture, ghost_table, photon_picture
 from neurolens.flare.scatter import Scatter
 from neurolens.flare.sources import SceneLights, keep
 from neurolens.flare.stack import Floats
@@ -27,6 +26,7 @@ from neurolens.optics.prescription import Lens
 from neurolens.render.film import check_memory
 from neurolens.render.scene import Scene
 
+Layers = dict[str, Floats]
 REST = "rest"
 _ONE = (1.0, 1.0, 1.0)
 
@@ -43,13 +43,12 @@ class FlareSettings:
         glare: if above 0, so many photons of the layer "glare": light that was reflected more than twice, or scattered.
         scatter: what scatters it. The ghosts keep what scatters of theirs, which is little.
         starburst: whether to make the layer "starburst": what diffraction at the stop and the rims takes out of images.
-        fours: whether ghosts of four reflections are traced, too: the strongest, as of `picture.with_four`; "glare" has
-            that light by chance.
+        ghosts: what traces ghosts, or stands for that, of the same lens and stop; None traces all of two reflections.
+            Those of four (see `picture.with_four`) go without photons and glare, which have that light by chance.
         single: ghosts that become layers, by name; the other ghosts are the layer "rest".
         without: layers that are not made.
         gains: factors of red, green and blue by the name of a layer, of a ghost (g07-03), or of a surface (s07: of all
             ghosts that it reflects); several for one ghost are multiplied.
-        model: fitted ghosts that take the place of traced ones, of the same lens and stop.
         seed: of the places and chances of photons, the same for all frames. threads: of the work.
     """
 
@@ -62,11 +61,10 @@ class FlareSettings:
     glare: int = 0
     scatter: Scatter = Scatter()
     starburst: bool = False
-    fours: bool = False
+    ghosts: GhostTracer | GhostModel | None = None
     single: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     gains: tuple[tuple[str, tuple[float, float, float]], ...] = ()
-    model: GhostModel | None = None
     seed: int = 0
     threads: int = 2
 
@@ -76,8 +74,11 @@ class FlareSettings:
                 raise InputError("flare", "without", name, f"layers of flare: {', '.join(MAKERS)}")
         if self.scatter.on and not self.glare:
             raise InputError("flare", "glare", self.glare, "photons, for light that scatters")
-        if self.fours and (self.photons or self.glare):
-            raise InputError("flare", "fours", self.fours, "false with photons or glare, which have that light")
+        often = [way.name for way in (self.ghosts.pairs if self.ghosts else ()) if len(way.reflections) > 2]
+        if often and (self.photons or self.glare):
+            raise InputError(
+                "flare", "ghosts", often[0], "none of four reflections with photons or glare: they have it"
+            )
         of_ghosts = [name for name, _ in self.gains if name not in MAKERS]
         if self.photons and (self.single or of_ghosts):
             raise InputError("flare", "photons", self.photons, "0 with layers or gains of single ghosts")
@@ -85,10 +86,15 @@ class FlareSettings:
             if not all(0 <= v < math.inf for v in factor):
                 raise InputError("flare", f"gain {name}", factor, "finite numbers of at least 0")
 
+    def gain(self, *names: str) -> tuple[float, float, float]:
+        """Factors of red, green and blue of what has these names."""
+        r, g, b = np.prod([_ONE, *(factor for name, factor in self.gains if name in names)], 0)
+        return float(r), float(g), float(b)
+
 
 def flare_layers(
     lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, progress: Progress | None = None
-) -> dict[str, Floats]:
+) -> Layers:
     """The layers that are switched on, by name, [H, W, 3] linear sRGB each; those of `MAKERS` sum to the flare.
 
     Args:
@@ -97,20 +103,21 @@ def flare_layers(
     Raises:
         InputError: as of the makers.
     """
-    found: dict[str, Floats] = {}
+    found: Layers = {}
     progress = progress or Progress(quiet=True)
     for name, make in MAKERS.items():
         if name not in settings.without:
             with progress.stage(name) as report:
                 made = make(lens, lights, raster, settings, report)
-            gain = np.prod([g for of, g in settings.gains if of == name], 0, np.float32)
-            found |= {part: picture * gain for part, picture in made.items()} if name in dict(settings.gains) else made
+            for picture in made.values():
+                picture *= np.array(settings.gain(name), np.float32)
+            found |= made
     return found
 
 
 def scene_flare(
     scene: Scene, lens: Lens, raster: Raster, white_balance: str | None, threads: int, progress: Progress
-) -> dict[str, Floats]:
+) -> Layers:
     """The layers of a scene that has the table [flare], of its own lights, by a lens whose film is placed.
 
     Raises:
@@ -148,53 +155,51 @@ def brightest(lights: Sequence[Light], tables: Sequence[Sequence[Ghost]], count:
     return tuple(pair.name for pair in sorted(energy, key=lambda pair: -energy[pair])[:count])
 
 
-def _ghosts(
-    lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report
-) -> dict[str, Floats]:
-    names = "wavelength_nm", "wavelengths", "threads"
-    common: dict[str, Any] = {name: getattr(settings, name) for name in names}
+def _ghosts(lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report) -> Layers:
     if settings.photons:
         part = "ghosts" if settings.glare else "flare"
         return {"ghosts": _photons(lens, lights, raster, settings, done, part, settings.photons)}
-    traced = with_four(lens, lights).ways if settings.fours else ghost_pairs(lens)
-    ghosts = settings.model or GhostTracer(lens, traced)
+    ghosts = settings.ghosts or GhostTracer(lens)
     factors = _factors(ghosts.pairs, settings)
     # Ghosts of one layer and of equal factors share a picture.
     keys = [(p.name if p.name in settings.single else REST, factors[p]) for p in ghosts.pairs]
     kinds = list(dict.fromkeys([*keys, *((name, _ONE) for name in (*settings.single, REST))]))
     check_memory(raster.width, raster.height, 12 * (len(kinds) + len(settings.single) + 4))
-    at = [kinds.index(key) for key in keys]
-    pictures = ghost_picture(ghosts, lights, raster, **common, cell_px=settings.cell_px, layers=at, done=done)
-    parts: dict[str, Floats] = {name: np.zeros(pictures.shape[1:], np.float32) for name in (*settings.single, REST)}
+    pictures = ghost_picture(
+        ghosts, lights, raster, wavelength_nm=settings.wavelength_nm, wavelengths=settings.wavelengths,
+        cell_px=settings.cell_px, layers=[kinds.index(key) for key in keys], threads=settings.threads, done=done,
+    )  # fmt: skip
+    parts: Layers = {name: np.zeros(pictures.shape[1:], np.float32) for name in (*settings.single, REST)}
     for (name, factor), picture in zip(kinds, pictures, strict=False):
         parts[name] += picture * np.array(factor, np.float32)
     return {"ghosts": np.sum(list(parts.values()), 0), **(parts if settings.single else {})}
 
 
-def _glare(
-    lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report
-) -> dict[str, Floats]:
+def _glare(lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report) -> Layers:
     if not settings.glare:
         return {}
     return {"glare": _photons(lens, lights, raster, settings, done, "glare", settings.glare)}
 
 
-def _starburst(
-    lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report
-) -> dict[str, Floats]:
+def _starburst(lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report) -> Layers:
     if not settings.starburst:
         return {}
-    common: dict[str, Any] = {name: getattr(settings, name) for name in ("wavelength_nm", "wavelengths", "threads")}
-    return {"starburst": starburst_picture(lens, lights, raster, done=done, **common)}
+    return {
+        "starburst": starburst_picture(
+            lens, lights, raster, wavelength_nm=settings.wavelength_nm, wavelengths=settings.wavelengths,
+            threads=settings.threads, done=done,
+        )
+    }  # fmt: skip
 
 
 def _photons(
     lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report, part: str, count: int
 ) -> Floats:
-    names = "wavelength_nm", "wavelengths", "most_reflections", "kernel_px", "seed", "threads"
-    common: dict[str, Any] = {name: getattr(settings, name) for name in names}
-    tracer = PhotonTracer(lens, settings.scatter)
-    return photon_picture(tracer, lights, raster, part=part, photons=count, done=done, **common)
+    return photon_picture(
+        PhotonTracer(lens, settings.scatter), lights, raster, part=part, wavelength_nm=settings.wavelength_nm,
+        wavelengths=settings.wavelengths, photons=count, most_reflections=settings.most_reflections,
+        kernel_px=settings.kernel_px, seed=settings.seed, threads=settings.threads, done=done,
+    )  # fmt: skip
 
 
 def _factors(pairs: Sequence[Way], settings: FlareSettings) -> dict[Way, tuple[float, float, float]]:
@@ -208,13 +213,11 @@ def _factors(pairs: Sequence[Way], settings: FlareSettings) -> dict[Way, tuple[f
                 f"a layer ({', '.join(MAKERS)}), a ghost ({named}) or a surface (s{min(surfaces, default=0):02d})"
             )
             raise InputError("flare", "gain", name, f"{expected} of this lens")
-    found = {}
-    for pair in pairs:
-        names = pair.name, *(f"s{k:02d}" for k in pair.reflections)
-        r, g, b = np.prod([_ONE, *(factor for name, factor in settings.gains if name in names)], 0)
-        found[pair] = float(r), float(g), float(b)
-    return found
+    return {pair: settings.gain(pair.name, *(f"s{k:02d}" for k in pair.reflections)) for pair in pairs}
 
 
-Maker = Callable[[Lens, Sequence[Light], Raster, FlareSettings, Report], dict[str, Floats]]
-MAKERS: dict[str, Maker] = {"ghosts": _ghosts, "glare": _glare, "starburst": _starburst}
+MAKERS: dict[str, Callable[[Lens, Sequence[Light], Raster, FlareSettings, Report], Layers]] = {
+    "ghosts": _ghosts,
+    "glare": _glare,
+    "starburst": _starburst,
+}

@@ -6,10 +6,7 @@ sequence that is the same every time: an animated light has no noise of its own.
 
 from __future__ import annotations
 
-import csv
-import json
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import read_bytes
+from neurolens.base.files import read_rows
 from neurolens.base.tomlfile import reject_unknown
 from neurolens.flare.stack import Floats
 from neurolens.optics.prescription import Lens
@@ -26,7 +23,6 @@ from neurolens.optics.sag import sag_mm
 
 _PLASTIC = 1.32471795724474602596  # of the R2 sequence (Roberts 2018): x^3 = x + 1
 
-_LARGEST_FILE = 1 << 24
 # Columns of a list of lights: what is left out, and least and most.
 _COLUMNS: dict[str, tuple[float, float, float]] = {
     "frame": (0.0, -1e7, 1e7),
@@ -103,7 +99,7 @@ def read_lights(path: Path) -> list[Track]:
     Raises:
         InputError: names file, row and column, for an unknown or missing one, or a value that is none.
     """
-    rows, found = _rows(path), dict[str, list[list[float]]]()
+    rows, found = read_rows(path, "a list of lights"), dict[str, list[list[float]]]()
     for number, row in enumerate(rows):
         place = f"row {number + 1}, "
         reject_unknown(path, place, row, ["light", *_COLUMNS])
@@ -113,22 +109,6 @@ def read_lights(path: Path) -> list[Track]:
             raise InputError(path, f"{place}frame", frame, f"a frame after {keys[-1][0]:g}, the light's key before")
         keys.append([frame, *values, 1 / distance])
     return [Track(name, np.array(keys)) for name, keys in found.items()]
-
-
-def _rows(path: Path) -> list[Mapping[str, Any]]:
-    data = read_bytes(path, _LARGEST_FILE, "a list of lights")
-    try:
-        text = data.decode("utf-8-sig")
-        rows = (
-            json.loads(text)
-            if path.suffix.lower() == ".json"
-            else list(csv.DictReader(text.splitlines(), restkey="(one more)"))
-        )
-    except (ValueError, RecursionError, csv.Error) as error:
-        raise InputError(path, "file", f"({error})", "a list of lights as CSV or JSON") from None
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise InputError(path, "file", "(no list of objects)", "a list of lights, each an object")
-    return rows
 
 
 def _value(path: Path, place: str, name: str, given: Any) -> float:

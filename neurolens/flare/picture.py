@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -45,6 +46,7 @@ _T = TypeVar("_T")
 _R = TypeVar("_R")
 
 
+@lru_cache(maxsize=32)
 def axis_irradiance(lens: Lens, wavelength_nm: float) -> float:
     """Irradiance at the film's centre from uniform surroundings of radiance 1, in sr: the integral of T cos."""
     film_z = lens.film_z_mm
@@ -83,16 +85,26 @@ class Ghost:
     passed: float
 
 
-def ghost_table(tracer: GhostTracer, light: Light, wavelength_nm: float, count: int = RANKED) -> list[Ghost]:
-    """The ghosts of a light at one wavelength that reach the film's plane at all, brightest first."""
+def ghost_table(
+    tracer: GhostTracer | GhostModel, light: Light, wavelength_nm: float, count: int = RANKED
+) -> list[Ghost]:
+    """The ghosts of a light at one wavelength that reach the film's plane at all, brightest first.
+
+    Raises:
+        InputError: of a model, a light or a wavelength that it is not made for.
+    """
     rays, _ = light_rays(tracer.lens, light, 0, count)
-    sums = tracer.sums(tracer.start(rays), wavelength_nm, direct=True).sums
-    image, rows = sums[-1, 0], []
+    if isinstance(tracer, GhostModel):
+        image = GhostTracer(tracer.lens, []).trace(rays, wavelength_nm, direct=True)
+        sums = np.concatenate([tracer.trace(rays, wavelength_nm).sums, image.sums])
+    else:
+        sums = tracer.sums(tracer.start(rays), wavelength_nm, direct=True).sums
+    of_image, rows = sums[-1, 0], []
     for way, (power, *moments, lit) in zip(tracer.pairs, sums.tolist(), strict=False):
         if power > 0:
             x, y, r2 = (moment / power for moment in moments)
             size = math.sqrt(max(r2 - x * x - y * y, 0.0))
-            rows.append(Ghost(way, power / image if image > 0 else math.inf, (x, y), size, lit / count))
+            rows.append(Ghost(way, power / of_image if of_image > 0 else math.inf, (x, y), size, lit / count))
     return sorted(rows, key=lambda ghost: -ghost.energy)
 
 
@@ -139,7 +151,7 @@ def ghost_layout(lens: Lens, pair: Way, light: Light, lines: int = 9) -> Layout:
     At most so many rays, evenly chosen of those that arrive.
 
     Raises:
-        InputError: none does.
+        InputError: no ray arrives.
     """
     front = lens.surfaces[0].semi_diameter_mm
     off = math.acos(min(-float(light.towards[2]), 1.0))
@@ -266,67 +278,52 @@ def photon_picture(
             more often or scattered ("glare"), or neither ("image").
         photons: of each light and wavelength. kernel_px: radius of the narrowest kernel: see `_smoothed`.
     """
-    # Of glare, light that surfaces alone reflect turns round by choice, and what scatters goes as it does.
-    choices = (False, True)[: 1 + tracer.scatter.on] if part == "glare" else (None,)
-
-    def splat(rays: Floats, nm: float, film: Floats, chances: int) -> None:
-        edges = (np.arange(raster.height + 1) - raster.height / 2, np.arange(raster.width + 1) - raster.width / 2)
-        for scatters in choices:
-            boost = tracer.turning(nm, LEVELS - 1) if scatters is False else 1.0
-            found = tracer.trace(rays, nm, most_reflections=most_reflections, seed=chances, boost=boost)
-            which = PARTS[part](found)
-            if scatters is not None:
-                which &= (found.scattered > 0) == scatters
-            x, y = found.film_xy_mm[:, which] * raster.per_mm
-            # A film that sends light back is exposed by what it keeps.
-            weight = found.weight[which] / (1 - tracer.scatter.sensor)
-            for power in (1, 2):
-                film[power - 1] += np.histogram2d(y, -x, bins=edges, weights=weight**power)[0]
-
-    spectral = SpectralRange(*wavelength_nm, bins=wavelengths)
-    picture, sums = _picture(tracer.lens, lights, raster, spectral, photons, (threads, seed), splat, done)
-    return _smoothed(picture, sums, kernel_px) if kernel_px > 0 else picture
-
-
-def _picture(
-    lens: Lens,
-    lights: Sequence[Light],
-    raster: Raster,
-    spectral: SpectralRange,
-    samples: int,
-    threads_seed: tuple[int, int],
-    splat: Callable[[Floats, float, Floats, int], None],
-    done: Callable[[float], None],
-) -> tuple[Floats, Floats]:
-    """Film [H, W, 3] of rays of every light and bin of the spectrum, of which `splat` adds the sums of weights and of
-    their squares to [2, H, W]; and these sums of all, each light and bin as bright as it is."""
-    (threads, seed), bins = threads_seed, spectral.bins
+    lens, spectral = tracer.lens, SpectralRange(*wavelength_nm, bins=wavelengths)
     exposure = axis_irradiance(lens, 0.5 * (spectral.low_nm + spectral.high_nm))
-    firsts = range(0, samples, _AT_ONCE)
-    tasks = [(number, light, k) for number, light in enumerate(lights) for k in range(bins)]
+    edges = (np.arange(raster.height + 1) - raster.height / 2, np.arange(raster.width + 1) - raster.width / 2)
+    firsts = range(0, photons, _AT_ONCE)
+    tasks = [(number, light, k) for number, light in enumerate(lights) for k in range(wavelengths)]
     work = _Work(len(tasks) * len(firsts), done)
 
     def one(task: tuple[int, Light, int]) -> tuple[Floats, NDArray[np.float64]]:
+        """Sums of weights and of their squares, [2, H, W], and the colour [3] of a weight of 1."""
         number, light, k = task
-        film = np.zeros((2, raster.height, raster.width), np.float32)
-        area = 0.0
-        shift = k / bins + seed * _GOLDEN % 1
+        film, area = np.zeros((2, raster.height, raster.width), np.float32), 0.0
+        shift = (k / wavelengths + seed * _GOLDEN % 1) % 1
         for first in firsts:
             if not work.step():
                 break
-            rays, area = light_rays(lens, light, first, min(_AT_ONCE, samples - first), shift % 1, samples**-0.5)
+            rays, area = light_rays(lens, light, first, min(_AT_ONCE, photons - first), shift, photons**-0.5)
             # A seed of its own, the same for any number of threads.
-            chances = (seed << 44) + (number * bins + k) * samples + first
-            splat(rays, float(spectral.centres_nm[k]), film, chances % (1 << 64))
-        colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / bins
-        return film, colour * (area * raster.per_mm**2 / samples / exposure)
+            chances = ((seed << 44) + (number * wavelengths + k) * photons + first) % (1 << 64)
+            for xy, weight in _arrivals(tracer, part, rays, float(spectral.centres_nm[k]), most_reflections, chances):
+                x, y = xy * raster.per_mm
+                for power in (1, 2):
+                    film[power - 1] += np.histogram2d(y, -x, bins=edges, weights=weight**power)[0]
+        colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / wavelengths
+        return film, colour * (area * raster.per_mm**2 / photons / exposure)
 
     picture = np.zeros((raster.height, raster.width, 3), np.float32)
     sums = np.zeros((2, raster.height, raster.width), np.float32)
     for _, (film, colour) in work.results(one, tasks, threads):
         picture += film[0, ..., None] * colour.astype(np.float32)
         sums += film * (np.abs(colour).max() ** np.array([1, 2], np.float32))[:, None, None]
-    return picture, sums
+    return _smoothed(picture, sums, kernel_px) if kernel_px > 0 else picture
+
+
+def _arrivals(
+    tracer: PhotonTracer, part: str, rays: Floats, wavelength_nm: float, most_reflections: int, seed: int
+) -> Iterator[tuple[Floats, Floats]]:
+    """Places on the film [2, M] (mm) and weights [M] of photons of a part."""
+    # Of glare, light that surfaces alone reflect turns round by choice, and what scatters goes as it does.
+    for scatters in (False, True)[: 1 + tracer.scatter.on] if part == "glare" else (None,):
+        boost = tracer.turning(wavelength_nm, LEVELS - 1) if scatters is False else 1.0
+        found = tracer.trace(rays, wavelength_nm, most_reflections=most_reflections, seed=seed, boost=boost)
+        which = PARTS[part](found)
+        if scatters is not None:
+            which &= (found.scattered > 0) == scatters
+        # A film that sends light back is exposed by what it keeps.
+        yield found.film_xy_mm[:, which], found.weight[which] / (1 - tracer.scatter.sensor)
 
 
 class _Work:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 
@@ -38,6 +39,7 @@ Floats = NDArray[np.float32]
 ACTIONS: tuple[tuple[Action, int], ...] = (("T", 1), ("T", -1), ("R", 1), ("R", -1))
 Place = tuple[int, int]  # surface and action
 NONE: Mapping[str, Graph] = {}
+_MASKS: dict[str, Floats] = {}  # of stops, which compiled code points at as long as it is loaded
 
 
 class Stack:
@@ -80,7 +82,9 @@ class Stack:
         Raises:
             InputError: no C compiler, or one that fails.
         """
-        text = ""
+        mask = self.lens.aperture.table if self.lens.aperture and self.lens.aperture.mask is not None else None
+        key = "" if mask is None else hashlib.sha256(mask.tobytes()).hexdigest()
+        text = "" if mask is None else _MASK.format(key=key)
         for number, kind in enumerate(self._kinds):
             text += function_text(step_graph(kind), f"step_{number}", f"run_{number}", "state", "after", "call")
         text += function_text(film_graph(), "film", "run_film", "state", "film", "shift_mm")
@@ -88,7 +92,11 @@ class Stack:
             text += function_text(graph, called, f"run_{called}", "row", "event", "call")
         runs = ", ".join(f"run_{number}" for number in range(len(self._kinds)))
         head = _HEAD.format(runs=runs, state=STATE, width=self.width, actions=len(ACTIONS))
-        call: ctypes._NamedFuncPointer = getattr(load_compiled(text + head + driver), name)
+        library = load_compiled(text + head + driver)
+        if mask is not None:
+            kept = _MASKS.setdefault(key, mask)
+            library.take_mask(ctypes.c_void_p(kept.ctypes.data), len(kept))
+        call: ctypes._NamedFuncPointer = getattr(library, name)
         call.restype = None
         return call
 
@@ -168,12 +176,25 @@ def function_text(graph: Graph, name: str, run: str, taken: str, given: str, num
     arguments = [
         *(place(row, "in", taken) for row in s.per_ray),
         *(place(row, "call", numbers) for row in s.per_call),
+        *(f"{table}, {table}_cells" for table in s.tables),
         *(place(row, "out", given) for row in s.outputs),
     ]
     head = f"static void {run}(size_t n, const float *const *in, const float *call, float *const *out)"
     text = write_c(program, name, ["A step of flare."])
     return f"{text}\n{head}\n{{\n    (void)call;\n    {name}_rays(n, {', '.join(arguments)});\n}}\n"
 
+
+# Each mask has a library of its own, so that what it points at never changes.
+_MASK = """
+/* {key} */
+static const float *mask;
+static int mask_cells;
+void take_mask(const float *cell, int cells)
+{{
+    mask = cell;
+    mask_cells = cells;
+}}
+"""
 
 # A driver calls `go`: the step of surface k on rows `stride` apart.
 _HEAD = """

@@ -64,7 +64,7 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.tomlfile import read_toml, reject_unknown
 from neurolens.optics import catalogue, designs
 from neurolens.optics.apertures import Aperture
-from neurolens.optics.glass import by_figures, check_against_table
+from neurolens.optics.glass import by_figures, check_against_table, index_at
 from neurolens.optics.prescription import Coating, Configuration, Lens, Surface
 from neurolens.optics.sag import check_clearance
 
@@ -72,6 +72,7 @@ SCHEMA = 1
 MAX_SURFACES = 500
 MAX_TERMS = 1000  # aspheric coefficients of all surfaces: each costs every ray a step, and lenses have at most 400
 MAX_LAYERS = 200
+_LONGEST_NM = 780.0  # of visible light
 FILM_KEYS = ("index", "thickness_nm", "V_d")
 MAX_POWER = 40
 LARGEST = 1e15  # of any figure but a radius
@@ -346,7 +347,12 @@ def _coatings(table: Table) -> dict[str, Coating]:
             if not isinstance(row, list) or len(row) not in (2, 3):
                 raise one.error("layers", row, "[refractive index, thickness in nm], or with V_d behind them")
             film = Table(dict(zip(FILM_KEYS, row, strict=False)), table.file, f"{one.where}layer {n}, ")
-            layers.append(tuple(film.number(key, above=0) for key in film.data))
+            layer = tuple(film.number(key, above=0) for key in film.data)
+            if len(layer) > 2 and index_at(layer[0], layer[2], _LONGEST_NM) < 1:
+                raise film.error(
+                    "V_d", layer[2], f"a dispersion with which its index is at least 1 at {_LONGEST_NM:g} nm"
+                )
+            layers.append(layer)
         found[name] = Coating(name, tuple(layers))
     return found
 

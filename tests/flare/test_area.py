@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,10 +15,8 @@ from neurolens.flare.steps import LOST
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.optics.apertures import Aperture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens
+from tests.flare.test_ghosts import lens_of
 
-LENSES = Path(__file__).parents[2] / "lenses"
 White = np.ones(3)
 
 
@@ -42,10 +39,6 @@ def lattice(columns: int, rows: int, low: float = 0.0, high: float = 1.0) -> np.
 def rays(xy: np.ndarray, power: float = 1.0, worst: np.ndarray | None = None) -> np.ndarray:
     one = np.ones(xy.shape[1])
     return np.stack([*xy, power * one, 0 * one if worst is None else worst])
-
-
-def double_gauss(**state: float) -> Lens:
-    return read_lens(LENSES / "laikin_double_gauss_50.toml").at(focus_m=math.inf, **state)
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3, 2.0, 4.4])
@@ -110,9 +103,11 @@ def test_points_and_what_is_no_place_at_all() -> None:
 
 
 CASES = {
-    "open": lambda: double_gauss(),
-    "blades": lambda: replace(double_gauss().at(f_number=5.6), aperture=Aperture(blades=6, curvature=0.3)),
-    "phone": lambda: read_lens(LENSES / "phone_lens_6.toml").at(focus_m=math.inf),
+    "open": lambda: lens_of("laikin_double_gauss_50"),
+    "blades": lambda: replace(
+        lens_of("laikin_double_gauss_50").at(f_number=5.6), aperture=Aperture(blades=6, curvature=0.3)
+    ),
+    "phone": lambda: lens_of("phone_lens_6"),
 }
 
 
@@ -145,7 +140,7 @@ def test_ghosts_have_the_light_of_their_rays(case: str, distance_m: float) -> No
 
 
 def test_any_number_of_threads_and_layers_is_one_picture() -> None:
-    lens, light = double_gauss(), [Light(15.0, 8.0), Light(-4.0, 2.0, (0.1, 0.5, 0.2))]
+    lens, light = lens_of("laikin_double_gauss_50"), [Light(15.0, 8.0), Light(-4.0, 2.0, (0.1, 0.5, 0.2))]
     tracer, raster = GhostTracer(lens), Raster((36.0, 24.0), 48, 32)
     one = ghost_picture(tracer, light, raster, wavelengths=4, threads=1)
     assert np.array_equal(ghost_picture(tracer, light, raster, wavelengths=4, threads=3), one)

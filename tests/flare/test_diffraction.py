@@ -4,12 +4,12 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from experiments.starburst import light_of, streaks
 from neurolens.analysis.bundles import bundle
 from neurolens.analysis.bundles import points as stop_points
 from neurolens.analysis.fields import Scene
@@ -20,16 +20,15 @@ from neurolens.flare import exit_pupil as p
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.picture import Raster, axis_irradiance
 from neurolens.optics.apertures import Aperture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.prescription import Lens
 from neurolens.optics.trace import Rays, trace
+from tests.flare.test_ghosts import lens_of, plate
 
-LENSES = Path(__file__).parents[2] / "lenses"
 AXIS, NM = Light(0.0, 0.0), 550.0
 
 
 def double_gauss(f_number: float, aperture: Aperture | None = None, shift_mm: float = 0.0) -> Lens:
-    lens = read_lens(LENSES / "laikin_double_gauss_50.toml").at(focus_m=math.inf, f_number=f_number)
+    lens = lens_of("laikin_double_gauss_50", f_number=f_number)
     return replace(lens, aperture=aperture, film_z_mm=lens.film_z_mm + shift_mm)
 
 
@@ -38,13 +37,6 @@ def made(f_number: float, aperture: Aperture | None = None, light: Light = AXIS,
     pupil = p.exit_pupil(double_gauss(f_number, aperture, shift_mm), light, NM)
     assert pupil is not None
     return pupil, p.outline(pupil)
-
-
-def energy(pupil: p.ExitPupil, lines: list[np.ndarray], cells: int = 256) -> float:
-    """Light that passes, for an irradiance of 1 at the lens, mm^2."""
-    share = (np.arange(cells) + 0.5) * 2 / cells - 1
-    e = np.abs(pupil.field((share, share))) ** 2 * p.coverage(lines, cells)
-    return float(e.sum() * np.prod(2 * pupil.half / cells))
 
 
 def polygon(corners: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -69,7 +61,7 @@ def test_airy_disc() -> None:
         along = [d.far_field(pupil, lines, np.array([a]), np.array([b]))[0, 0] for a, b in zip(*way, strict=True)]
         assert r[int(np.argmin(along))] == pytest.approx(airy, rel=5e-3)
     x = (np.arange(301) - 150) * airy / 60
-    image = d.far_field(pupil, lines, x, x) * (x[1] - x[0]) ** 2 / energy(pupil, lines)
+    image = d.far_field(pupil, lines, x, x) * (x[1] - x[0]) ** 2 / light_of(pupil, lines)
     far = np.hypot(x, x[:, None])
     assert image[far < airy].sum() == pytest.approx(0.838, abs=6e-3)
     assert image[far < 1.8311 * airy].sum() == pytest.approx(0.910, abs=6e-3)
@@ -99,7 +91,7 @@ def test_light_of_the_pupil_is_that_of_rays(light: Light) -> None:
     expected = area * float(torch.where(found.status == 0, found.transmittance, 0.0).mean())
     pupil = p.exit_pupil(lens, light, NM)
     assert pupil is not None
-    assert energy(pupil, p.outline(pupil)) == pytest.approx(expected, rel=3e-3)
+    assert light_of(pupil, p.outline(pupil)) == pytest.approx(expected, rel=3e-3)
 
 
 def test_polygons_near_and_far() -> None:
@@ -108,7 +100,7 @@ def test_polygons_near_and_far() -> None:
     angles = np.arange(6) * math.pi / 3
     corners = np.stack([np.cos(angles), np.sin(angles)]) / 32
     wave = NM * 1e-6
-    scale = energy(pupil, lines) / (1.5 * math.sqrt(3) / 32**2) / wave**2
+    scale = light_of(pupil, lines) / (1.5 * math.sqrt(3) / 32**2) / wave**2
     x = np.linspace(-0.08, 0.08, 64)
     expected = scale * np.abs(polygon(corners, x / wave, x[:, None] / wave)) ** 2
     found = d.far_field(pupil, lines, x, x)
@@ -131,19 +123,13 @@ def test_polygons_near_and_far() -> None:
         assert mean == pytest.approx(expected_mean, rel=0.03, abs=6e-5 * streak)
 
 
-@pytest.mark.parametrize(("blades", "streaks"), [(5, 10), (6, 6), (7, 14), (8, 8)])
-def test_streaks(blades: int, streaks: int) -> None:
+@pytest.mark.parametrize(("blades", "expected"), [(5, 10), (6, 6), (7, 14), (8, 8)])
+def test_streaks(blades: int, expected: int) -> None:
     """2 n of an odd number of blades, n of an even one."""
     pupil, lines = made(16.0, Aperture(blades=blades, rotation_deg=7.0))
     x = (np.arange(161) - 80) * 0.0375
     film = d.star(pupil, lines, d.outline_spectrum(pupil, lines, NM, 0.0375, 3.1), x, x, 0.0375)
-    angle = np.arange(720) * math.pi / 360
-    radius = np.arange(50, 70)[:, None]
-    rows, columns = (np.rint(80 + radius * f(angle)).astype(int) for f in (np.sin, np.cos))
-    ring = film[rows, columns].mean(0)
-    smooth = np.fft.irfft(np.fft.rfft(ring)[:60], 720)
-    peaks = (smooth > np.roll(smooth, 1)) & (smooth > np.roll(smooth, -1)) & (smooth > 0.3 * smooth.max())
-    assert peaks.sum() == streaks
+    assert streaks(film, 50, 70) == expected
 
 
 def test_slit() -> None:
@@ -157,7 +143,7 @@ def test_slit() -> None:
     expected = np.outer(np.sinc(q), np.sinc(q)) ** 2
     np.testing.assert_allclose(found / found.max(), expected, atol=4e-3)
     assert found[33, [3, 13, 23, 43, 53, 63]].max() < 1e-4 * found.max()
-    assert found.max() == pytest.approx(energy(pupil, lines) / np.prod(fringe), rel=5e-3)
+    assert found.max() == pytest.approx(light_of(pupil, lines) / np.prod(fringe), rel=5e-3)
 
 
 @pytest.mark.parametrize("waves", [0.25, 0.5, 1.0, 1.5])
@@ -226,7 +212,7 @@ def test_no_seam_and_no_light_lost() -> None:
     inner = ((np.arange(-2, 3)[:, None] + fine) * pixel).reshape(-1)
     core = d.far_field(pupil, lines, inner, inner).reshape(5, 16, 5, 16).mean((1, 3))
     core = core[image[58:63, 58:63]].sum()
-    whole = energy(pupil, lines)
+    whole = light_of(pupil, lines)
     angle = np.linspace(0, math.pi / 4, 100)
     tail = np.mean(2 * NM * 1e-6 * 16 / (math.pi**2 * 60.5 * pixel / np.cos(angle)))
     assert (film.sum() + core) * pixel**2 / whole + tail == pytest.approx(1, abs=2e-3)
@@ -254,7 +240,7 @@ def test_star_out_of_focus(aperture: Aperture | None, light: Light) -> None:
         ring = (film > 0) & (radii > low) & (radii < high)
         assert film[ring].sum() == pytest.approx(expected[ring].sum(), rel=0.03)
     tail = 2 * NM * 1e-6 * 8 / (math.pi**2 * fine[-1])
-    whole = (film.sum() + expected[film == 0].sum()) * pixel**2 / energy(pupil, lines)
+    whole = (film.sum() + expected[film == 0].sum()) * pixel**2 / light_of(pupil, lines)
     assert whole + tail == pytest.approx(1, abs=1.5e-3)
     if aperture is None:
         outside = film > 0
@@ -283,11 +269,6 @@ def test_picture_is_in_units_of_a_white_card() -> None:
     np.testing.assert_allclose(twice, 2 * picture, rtol=1e-5)
 
 
-def plate() -> Lens:
-    rows = Surface(math.inf, 4.0, 20.0, 1.5), Surface(math.inf, 6.0, 20.0), Surface(math.inf, 10.0, 20.0, stop=True)
-    return Lens("plate", "", rows, 2.0, film_z_mm=20.0)
-
-
 def corner_mask() -> Aperture:
     """Open only at one side, which the rims hide from light that comes from above."""
     mask = np.zeros((64, 64), bool)
@@ -299,10 +280,10 @@ def corner_mask() -> Aperture:
     ("lens", "light", "lit"),
     [
         (lambda: double_gauss(45.0, Aperture(blades=9, curvature=1.0)), Light(5.0, 0.0), True),
-        (lambda: read_lens(LENSES / "edmund_asphere_30.toml").at(focus_m=math.inf), Light(1.0, 1.0), True),
+        (lambda: lens_of("edmund_asphere_30"), Light(1.0, 1.0), True),
         (lambda: double_gauss(8.0, Aperture(blades=5)), Light(21.5, 0.0), True),  # off the frame
-        (lambda: read_lens(LENSES / "schneider_anamorphic_31.toml").at(focus_m=math.inf), Light(5.0, 3.0), True),
-        (lambda: read_lens(LENSES / "shimizu_fisheye_220.toml").at(focus_m=math.inf), Light(70.0, 20.0), True),
+        (lambda: lens_of("schneider_anamorphic_31"), Light(5.0, 3.0), True),
+        (lambda: lens_of("shimizu_fisheye_220"), Light(70.0, 20.0), True),
         (lambda: double_gauss(2.0), Light(80.0, 0.0), False),
         (lambda: double_gauss(1.8, corner_mask()), Light(0.0, 20.0), False),
         (plate, Light(5.0, 0.0), False),

@@ -44,6 +44,18 @@ def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     np.testing.assert_allclose(sum(layers[f"{name}.R"] for name in (*top, "rest")), rgb[..., 0], rtol=1e-5, atol=1e-9)
 
 
+def test_polarised_light_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Table and picture alike: a little brighter or fainter, the same ghosts."""
+    out, found = tmp_path / "a.exr", []
+    for words in ([], ["--polarised"]):
+        few = ["--light", "15,8", "--width", "24", "--wavelengths", "2", "--json", *words]
+        assert main(["flare", "cooke_triplet_50", *few, "-o", str(out)]) == 0
+        (ghosts,) = json.loads(capsys.readouterr().out)["ghosts"]
+        found.append((sum(g["energy"] for g in ghosts), read_exr(out)[0].sum(), {g["name"] for g in ghosts}))
+    (energy, light, names), (energy_2, light_2, names_2) = found
+    assert names == names_2 and 0.001 < abs(energy_2 / energy - 1) < 0.1 and 0.001 < abs(light_2 / light - 1) < 0.1
+
+
 def test_photons_paint_the_ghosts(tmp_path: Path) -> None:
     """The light of photons with two reflections at most is that of the ghosts, block by block, within its noise."""
     common = ["laikin_double_gauss_50", "--light", "12,5", "--width", "24", "--wavelengths", "2", "--quiet"]
@@ -218,10 +230,16 @@ def test_ghosts_and_glare_are_all(tmp_path: Path) -> None:
         (["--light", "1"], "AZ,EL"),
         (["--light", "1,2,3/4"], "AZ,EL"),
         (["--light", "1,2,1,0"], "positive distance"),
+        (["--light", "1,2,1,nan"], "positive distance"),
+        (["--light", "0,0,1,0.001"], "outside the lens"),
+        (["--light", "3,2,inf"], "finite"),
+        (["--light", "3,2,nan"], "finite"),
+        (["--light", "0,0", "--coating", "s00"], "s00"),
         (["--light", "1,2", "--photons", "9", "--layers", "2", "-o", "x.exr"], "single ghosts"),
         (["--light", "1,2", "--without", "haze", "-o", "x.exr"], "layers of flare"),
         (["--light", "0,0", "-o", "x.png"], ".exr"),
         (["--light", "0,0", "--coating", "velvet"], "velvet"),
+        (["--light", "1,2", "--polarised", "--photons", "9"], "--polarised"),
         ([], "--light, --lights or --image"),
         (["--light", "0,0", "--key", "focus=1:2"], "--frames"),
         (["--light", "0,0", "--frames", "1:2"], "-o beside it"),
@@ -240,8 +258,12 @@ def test_bad_words(words: list[str], said: str, capsys: pytest.CaptureFixture[st
     assert said in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [["--barrel", "1.1"], ["--haze", "nan"], ["--sensor", "0.95"], ["--glare", "-1"]])
-def test_scatter_has_bounds(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["flare", "laikin_double_gauss_50", "--light", "0,0", *words])
-    assert words[0] in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--barrel", "1.1"), ("--haze", "nan"), ("--sensor", "0.95"), ("--glare", "-1"), ("--photons", "0"),
+     ("--photons", "1e9"), ("--photons", "2000000000")],
+)  # fmt: skip
+def test_numbers_have_bounds(option: str, value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["flare", "laikin_double_gauss_50", "--light", "0,0", option, value])
+    assert option in capsys.readouterr().err

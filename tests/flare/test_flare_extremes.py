@@ -52,29 +52,6 @@ def test_no_light_is_a_black_picture_and_said(tmp_path: Path, capsys: pytest.Cap
         assert not read_exr(out)[0].any()
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--light", "0,0,1,0.001"], "outside the lens"),
-        (["--light", "95,0"], "within 90 degrees"),
-        (["--light", "3,2,inf"], "finite"),
-        (["--light", "3,2,nan"], "finite"),
-        (["--light", "3,2,1,nan"], "positive distance"),
-        (["--light", "0,0", "--coating", "s00"], "s00"),
-    ],
-)
-def test_lights_that_are_none(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*COOKE, *words]) == 2
-    assert said in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("count", ["0", "-1", "1e9", "2000000000"])
-def test_counts_of_photons_that_are_none(count: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        main([*COOKE, "--light", "0,0", "--photons", count])
-    assert "from 1 to 1073741824" in capsys.readouterr().err
-
-
 def interrupted_after(seconds: float, words: list[str]) -> int:
     timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background of a shell ignore it

@@ -2,40 +2,21 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.flare import ghosts
 from neurolens.flare.ghosts import Four, GhostTracer, Pair, coated, four_reflections, ghost_pairs
 from neurolens.flare.layers import FlareSettings, flare_layers
 from neurolens.flare.lights import Light, light_rays
-from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import LEFT, SOME, Raster, axis_irradiance, ghost_layout, ghost_table, with_four
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.sequence import follow, turning
-from neurolens.optics.trace import Rays
-
-LENSES = Path(__file__).parents[2] / "lenses"
-
-
-def lens_of(name: str) -> Lens:
-    return read_lens(LENSES / f"{name}.toml").at(focus_m=math.inf)
-
-
-def plate() -> Lens:
-    """Glass 4 mm thick, a stop, the film."""
-    rows = Surface(math.inf, 4.0, 40.0, 1.5), Surface(math.inf, 6.0, 40.0), Surface(math.inf, 10.0, 40.0, stop=True)
-    return Lens("plate", "", rows, 2.0, film_z_mm=20.0)
+from tests.flare.test_ghosts import exact, lens_of, plate
 
 
 def test_a_plate_by_hand() -> None:
-    lens, angle = plate(), math.radians(10)
+    lens, angle = plate(40.0), math.radians(10)
     (only,) = four_reflections(lens).tolist()
     tracer = GhostTracer(lens, [Four(*only)])
     assert tracer.pairs[0] == (1, 0, 1, 0) and tracer.pairs[0].name == "g01-00-01-00"
@@ -59,16 +40,13 @@ def test_compiled_is_exact() -> None:
     tracer = GhostTracer(lens, [Pair(0, 1), *(Four(*fours[k].tolist()) for k in dict.fromkeys(chosen))])
     found, arrived = tracer.trace(rays, 480.0), 0
     for way, (x, y, power, worst) in zip(tracer.pairs, found.rows, strict=True):
-        steps = turning(len(lens.surfaces), way.reflections)
-        exact = follow(lens, Rays(*torch.from_numpy(rays.copy())), steps, 480.0)
-        far = (lens.film_z_mm - exact.rays.z) / exact.rays.dz
-        both = (worst <= 1) & (exact.status == st.PASSED).numpy()
-        assert np.all(((worst <= 1) == (exact.status == st.PASSED).numpy()) | (np.abs(worst - 1) < 1e-3))
-        place = np.stack([(exact.rays.x + far * exact.rays.dx).numpy(), (exact.rays.y + far * exact.rays.dy).numpy()])
+        place, expected, passed = exact(lens, rays, way, 480.0)
+        both = (worst <= 1) & passed
+        assert np.all(((worst <= 1) == passed) | (np.abs(worst - 1) < 1e-3))
         near = both & (np.hypot(*place) < 50)
         off = np.hypot(x[near] - place[0][near], y[near] - place[1][near])
         assert off.max(initial=0.0) < 2e-2 and (not near.any() or np.median(off) < 2e-3)
-        np.testing.assert_allclose(power[both], exact.power.numpy()[both], rtol=2e-3, atol=1e-12)
+        np.testing.assert_allclose(power[both], expected[both], rtol=2e-3, atol=1e-12)
         arrived += int(both.sum())
     assert arrived > 300
     # The same way by way and summed.
@@ -76,17 +54,6 @@ def test_compiled_is_exact() -> None:
     rows = np.array([way.reflections for way in tracer.pairs[1:]], np.int32)
     np.testing.assert_allclose(tracer.sums(tracer.start(rays), 480.0, rows).sums[:, 0], of_rays[1:], rtol=1e-6)
     np.testing.assert_allclose(tracer.sums(tracer.start(rays), 480.0).sums[:, 0], of_rays, rtol=1e-6)
-
-
-def test_photons_have_as_much_light_of_four_reflections() -> None:
-    lens, count = lens_of("laikin_double_gauss_50"), 1 << 18
-    rays, _ = light_rays(lens, Light(3.0, 2.0), 0, count)
-    tracer = GhostTracer(lens)
-    expected = tracer.sums(tracer.start(rays[:, : 1 << 13]), 550.0, four_reflections(lens)).sums[:, 0].sum() / (1 << 13)
-    found = PhotonTracer(lens).trace(rays, 550.0, most_reflections=4, seed=5)
-    times = np.bincount(found.reflections, minlength=5)
-    assert times[4] > 250
-    assert times[4] / count == pytest.approx(expected, abs=4 * math.sqrt(expected / count) + 5e-3 * expected)
 
 
 def test_what_is_dropped_is_bounded() -> None:
@@ -119,11 +86,11 @@ def test_the_strongest_are_chosen() -> None:
 
 def test_a_picture_holds_their_light() -> None:
     """A film that holds every ghost of a plate: what four reflections add is their rays' power."""
-    lens, raster, light = plate(), Raster((90.0, 60.0), 90, 60), Light(5.0, 0.0, (1e6, 1e6, 1e6))
+    lens, raster, light = plate(40.0), Raster((90.0, 60.0), 90, 60), Light(5.0, 0.0, (1e6, 1e6, 1e6))
     settings = FlareSettings(wavelengths=1, threads=1)
     one, two = (
-        flare_layers(lens, [light], raster, replace(settings, fours=fours, single=("g01-00",)))
-        for fours in (False, True)
+        flare_layers(lens, [light], raster, replace(settings, ghosts=ghosts, single=("g01-00",)))
+        for ghosts in (None, GhostTracer(lens, with_four(lens, [light]).ways))
     )
     rays, area = light_rays(lens, light, 0, 1 << 14)
     power = GhostTracer(lens, [Four(1, 0, 1, 0)]).trace(rays, 550.0).power[0].mean(dtype=np.float64)
@@ -149,7 +116,7 @@ def test_refusals(monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(InputError, match="back and forward"):
             GhostTracer(plate(), [wrong])
     with pytest.raises(InputError, match="glare"):
-        FlareSettings(fours=True, glare=100)
+        FlareSettings(ghosts=GhostTracer(plate(), [Four(1, 0, 1, 0)]), glare=100)
     monkeypatch.setattr(ghosts, "MOST_WAYS", 100)
     with pytest.raises(InputError, match="at most 100"):
         four_reflections(lens_of("brendel_tessar_100"))

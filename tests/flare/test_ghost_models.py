@@ -148,11 +148,23 @@ def test_command(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     small = ["--light", "9,4", "--width", "36", "--wavelengths", "2", "--blades", "6", "--f-number", "8", "--json"]
     assert main(["flare", str(file), *small, "-o", str(out)]) == 0
     assert json.loads(capsys.readouterr().out)["lens"] == tessar().name and out.is_file()
+    # The table is the model's own: its ghosts, and their light as it has it.
+    assert main(["flare", str(file), "--light", "9,4", "--json"]) == 0
+    (rows,) = json.loads(capsys.readouterr().out)["ghosts"]
+    fitted = read_ghosts(file)
+    rays, _ = light_rays(fitted.lens, Light(9.0, 4.0), 0, 4096)
+    image = GhostTracer(fitted.lens, []).trace(rays, 550.0, direct=True).power.astype(float).sum()
+    light = fitted.trace(rays, 550.0).power.astype(float).sum(1) / image
+    energies = {p.name: float(v) for p, v in zip(fitted.pairs, light, strict=True) if v > 0}
+    assert {r["name"]: r["energy"] for r in rows} == pytest.approx(energies)
+    assert main(["flare", str(file), "--light", "9,4"]) == 0
+    assert "21 pairs of surfaces" in (said := capsys.readouterr().out) and "the table is of the fit" in said
     assert main(["flare", str(file), "--fit", str(tmp_path / "g.h")]) == 0
     assert "um RMS on the film" in capsys.readouterr().out
     for words, said in (
         (["--light", "40,0"], "at most 25"),
         (["--light", "1,0", "--coating", "v-coat"], "--coating"),
+        (["--light", "1,0", "--polarised"], "--polarised"),
         (["--light", "1,0", "--focus", "1"], "--focus"),
         (["--light", "1,0", "--f-number", "1"], "stop_radius_mm"),
         (["--fit", "x.onnx"], "--fit"),
@@ -202,6 +214,10 @@ def test_refused_settings(settings: GhostSettings, said: str) -> None:
 
 
 def test_refused_lenses_and_light(model: GhostModel) -> None:
+    masked = replace(tessar(), aperture=Aperture(mask=np.eye(8)))
+    for call in (lambda: fit_ghosts(masked, SETTINGS), lambda: replace(model, lens=masked)):
+        with pytest.raises(InputError, match="mask"):
+            call()
     anamorphic = read_lens(LENS.with_name("schneider_anamorphic_31.toml")).at(focus_m=math.inf)
     with pytest.raises(InputError, match="cylinder"):
         fit_ghosts(anamorphic, SETTINGS)

@@ -138,6 +138,21 @@ BAD_HEADS = [
         "schema = 1\ncoating = [{ name = 'a', layers = [[1.38, 0]] }]",
         ["coating 0, layer 0, thickness_nm"],
     ),
+    *(
+        ("schema = 1", f"schema = 1\ncoating = [{{ {given} }}]", said)
+        for given, said in (
+            ("name = 'a', layers = [[1.38, nan]]", ["coating 0, layer 0, thickness_nm", "got nan", "finite"]),
+            ("name = 'a', layers = [[2.1, 9], [1.38, '99']]", ["coating 0, layer 1, thickness_nm", "got '99'"]),
+            ("name = 'a', layers = [[1.38, 90, 0.3]]", ["coating 0, layer 0, V_d", "got 0.3", "780 nm"]),
+            ("name = 'a', layers = [[1.38, 90], []]", ["coating 0, layers", "got []", "thickness in nm"]),
+            ("name = 'a'", ["coating 0, layers", "(missing)"]),
+            ("layers = [[1.38, 90]]", ["coating 0, name", "(missing)"]),
+            (
+                "name = 'a', layers = [[1.38, 90]], wavelengths_nm = [400, 500]",
+                ["coating 0, wavelengths_nm", "unknown"],
+            ),
+        )
+    ),
     ("schema = 1", "", ["schema", "(missing)", "1"]),
     ("schema = 1", "schema = 2", ["schema", "got 2", "expected 1"]),
     ("schema = 1", "schema = true", ["schema", "got True"]),
