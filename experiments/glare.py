@@ -30,7 +30,7 @@ from experiments import lab
 from neurolens.base.progress import Progress
 from neurolens.flare.ghosts import Four, GhostTracer, coated, four_reflections, ghost_pairs
 from neurolens.flare.layers import FlareSettings, flare_layers, sum_of
-from neurolens.flare.lights import Light, light_rays
+from neurolens.flare.lights import Light, front_sphere, light_rays
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
 from neurolens.flare.picture import Raster, axis_irradiance, ghost_table
 from neurolens.flare.scatter import Scatter
@@ -39,7 +39,6 @@ from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.optics.sag import sag_mm
 
 LENS, NM, HALF_MM = "laikin_double_gauss_50", 550.0, (18.0, 12.0)
 COATINGS = ("bare", "single-layer", "multi-layer")
@@ -164,15 +163,13 @@ def surround_rays(lens: Lens, widest: float, count: int, seed: int) -> tuple[Flo
     """Rays [6, count] of radiance 1 from all directions within an angle (rad) of the axis through the sphere about the
     front surface, and the light of all together, mm^2 sr."""
     chances = np.random.default_rng([seed, 17]).random((4, count))
-    front = lens.surfaces[0]
-    depth = float(sag_mm(front, front.semi_diameter_mm, 0.0))
-    radius = math.hypot(front.semi_diameter_mm, depth / 2)
+    centre, radius = front_sphere(lens)
     cos = 1 - chances[0] * (1 - math.cos(widest))
     sin, turn = np.sqrt(1 - cos * cos), 2 * math.pi * chances[1]
     d = np.stack([sin * np.cos(turn), sin * np.sin(turn), cos])
     across = np.stack([cos * np.cos(turn), cos * np.sin(turn), -sin]), np.stack([-np.sin(turn), np.cos(turn), 0 * turn])
     place, way = radius * np.sqrt(chances[2]), 2 * math.pi * chances[3]
-    target = place * (np.cos(way) * across[0] + np.sin(way) * across[1]) + np.array([[0.0], [0.0], [depth / 2]])
+    target = place * (np.cos(way) * across[0] + np.sin(way) * across[1]) + centre[:, None]
     rays = np.concatenate([target, d]).astype(np.float32)
     return rays, 2 * math.pi * (1 - math.cos(widest)) * math.pi * radius**2
 

@@ -56,6 +56,7 @@ def build_parser() -> Parser:
         lens,
         mitsuba,
         models,
+        plan,
         projection,
         render,
         stmap,
@@ -66,7 +67,7 @@ def build_parser() -> Parser:
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     read = lens, analyse, glass, convert, stmap, projection
-    for command in (*read, train, models, evaluate, export, render, flare, mitsuba, blender, bench):
+    for command in (*read, plan, train, models, evaluate, export, render, flare, mitsuba, blender, bench):
         command.add_parser(subparsers)
     return parser
 

@@ -120,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
     tabled = read_lens(lens_path(args.file, "flare")) if model is None else model.lens
     if args.fit is not None:
         return run_fit(args, None if model else _lens(states[0], tabled), model)
-    shots = _Shots(tabled, Sources(args), progress, model)
+    shots = _Shots(tabled, Sources(args, () if args.frames is None else states), progress, model)
     first = shots.at(states[0])
     found = {"lens": first.lens.name, "pairs": len(ghost_pairs(first.lens)), **_told(first)}
     found["fitted"] = 0 if model is None else len(model.pairs)

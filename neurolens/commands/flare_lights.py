@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,11 +17,12 @@ from neurolens.commands.render_files import warn
 if TYPE_CHECKING:
     from neurolens.cameras.field import Field
     from neurolens.flare.lights import Light
-    from neurolens.flare.sources import Kept, SceneLights
+    from neurolens.flare.sources import Kept, Name, SceneLights
     from neurolens.optics.prescription import Lens
     from neurolens.render.scene import Scene
 
 _COMMAND = "neurolens flare"
+_RANKED_FRAMES = 64  # that tell which lights of a scene have the most energy
 
 
 def add_lights(parser: argparse.ArgumentParser) -> None:
@@ -49,14 +51,15 @@ def add_lights(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--most", metavar="N", type=whole(1, 10_000), default=32,
-        help="of --image and of a scene: the lights of the most energy; what is left out is said (default: 32)",
+        help="of --image and of a scene: the lights of the most energy; what is left out is said. With --frames a "
+        "scene has the same ones in all frames, and those of pictures fade before they are left out (default: 32)",
     )  # fmt: skip
 
 
 class Sources:
-    """The lights of the command line; files are read once."""
+    """The lights of the command line; files are read once. `states`: the arguments of all frames, where there are."""
 
-    def __init__(self, args: argparse.Namespace) -> None:
+    def __init__(self, args: argparse.Namespace, states: Sequence[argparse.Namespace] = ()) -> None:
         from neurolens.flare.lights import read_lights
         from neurolens.flare.sources import SceneLights
         from neurolens.render.scene import load_scene
@@ -68,11 +71,12 @@ class Sources:
         scenes = [(path, load_scene(path)) for path in args.lights if path.suffix.lower() == ".toml"]
         self._scenes: list[tuple[Path, Scene, SceneLights]] = [(p, scene, SceneLights(scene)) for p, scene in scenes]
         self._fields: dict[tuple[Any, ...], Field] = {}
+        self._states = states[:: -(-len(states) // _RANKED_FRAMES)] if states else ()
+        self._chosen: dict[Path, frozenset[Name]] = {}
 
     def at(self, args: argparse.Namespace, lens: Lens, progress: Progress) -> list[Light]:
         """The lights at a frame, the lens and the scene's camera as `args` has them there."""
-        from neurolens.flare.sources import keep
-        from neurolens.render.scene import seen_from
+        from neurolens.flare.sources import chosen, keep_named
 
         there = [track.at(args.frame or 0) for track in self._tracks]
         found = [*self._fixed, *(light for light in there if light is not None)]
@@ -80,8 +84,11 @@ class Sources:
             warn(f"{behind} lights of lists stand behind the lens{_at(args)}")
         assert lens.film_z_mm is not None
         for path, scene, lights in self._scenes:
-            seen = lights.seen(seen_from(scene, path, args.position_m, args.look_at_m), lens.film_z_mm)
-            found += _kept(keep(seen, args.most), path)
+            seen = _seen(scene, path, lights, args, lens.film_z_mm)
+            if path not in self._chosen:
+                of_all = [_seen(scene, path, lights, state, lens.film_z_mm) for state in self._states]
+                self._chosen[path] = chosen(of_all or [seen], args.most)
+            found += _kept(keep_named(seen, self._chosen[path]), path)
         if args.image is not None:
             found += self._of_picture(args, progress)
         if not found:
@@ -99,7 +106,8 @@ class Sources:
             size = f"{picture.shape[1]} x {picture.shape[0]} pixels"
             raise InputError(path, "shape", f"({size})", "the film's, {:g}x{:g}".format(*args.film))
         try:
-            found = highlights(picture, self._field(args, progress), args.film, args.threshold, args.most)
+            fade = args.frame is not None and path != args.image
+            found = highlights(picture, self._field(args, progress), args.film, args.threshold, args.most, fade)
         except InputError as error:
             raise InputError(path, error.field, error.value, error.expected) from None
         return _kept(found, path)
@@ -117,6 +125,15 @@ class Sources:
             camera = make_camera(str(lens_path(args.file, "flare")), shot, progress)
             self._fields[state] = field_of(camera, args.focus, "equidistant")
         return self._fields[state]
+
+
+def _seen(
+    scene: Scene, path: Path, lights: SceneLights, args: argparse.Namespace, film_z_mm: float
+) -> dict[Name, Light]:
+    """The lights of a scene whose camera stands where `args` have it."""
+    from neurolens.render.scene import seen_from
+
+    return lights.named(seen_from(scene, path, args.position_m, args.look_at_m), film_z_mm)
 
 
 def _kept(found: Kept, path: Path) -> list[Light]:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neurolens.analysis.plot_style import INK, drawing, plain_log_ticks
 from neurolens.evaluate.pages import Record, number
 from neurolens.evaluate.records import pareto_front
+
+if TYPE_CHECKING:
+    from neurolens.evaluate.plan import Plan
 
 # Names, Okabe and Ito's colours, and markers, which tell kinds apart without colours; black is the exact tracer's.
 Kinds = Mapping[str, tuple[str, str, str]]
@@ -143,3 +146,39 @@ def _cost(box: tuple[float, float, float, float], points: Sequence[Any], taken: 
     if x < frame.x0 or y < frame.y0 or x + w > frame.x1 or y + h > frame.y1:
         cost += 100.0
     return cost
+
+
+def plot_effects(plan: Plan, path: Path, title: str) -> None:
+    """What a plan found: effects as bars with the budget, and error against time of every camera that was timed."""
+    asked, wide = plan.asked, [e for e in plan.effects if e.unit == "px"][::-1]
+    subtitle = f"f/{asked.f_number:.3g}, focus {asked.focus_m:g} m; 95% of the picture keeps these figures"
+    with drawing(path, 9.5, 4.2, title, subtitle) as figure:
+        bars, trade = figure.subplots(1, 2, width_ratios=(1.0, 1.1))
+        least = max(min((e.worth for e in wide if e.worth > 0), default=1e-3) / 3, 1e-4)
+        colours = [family_colour("ols") if e.needed else "#b8b8b8" for e in wide]
+        bars.barh([e.name for e in wide], [max(e.worth, least) for e in wide], color=colours, left=0)
+        bars.set_xscale("log")
+        bars.set_xlim(left=least)
+        bars.set_xlabel("worth (pixels), grey: left out")
+        timed = [c for c in plan.choices if 0 < c.ns < float("inf") and c.error_px < float("inf")]
+        errors = [max(c.error_px, 1e-4) for c in timed]
+        trade.scatter([c.ns for c in timed], errors, c=["#0072b2" if c.within else "#b8b8b8" for c in timed], s=26)
+        chosen = [k for k, c in enumerate(timed) if c == plan.best]
+        trade.scatter(
+            [timed[k].ns for k in chosen], [errors[k] for k in chosen], s=150, fc="none", ec="#d55e00", lw=1.8
+        )
+        trade.set_xscale("log")
+        trade.set_yscale("log")
+        trade.set_xlabel("time (ns a ray that passes), one thread")
+        trade.set_ylabel("error (pixels; none is drawn at 0.0001)")
+        place_labels(trade, [(c.ns, e) for c, e in zip(timed, errors, strict=True)], [_short(c.name) for c in timed])
+        if plan.budget_px > 0:
+            bars.axvline(plan.budget_px, color="#d55e00", lw=1.2)
+            trade.axhline(plan.budget_px, color="#d55e00", lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
+            figure.legend(loc="upper right", frameon=False)
+        plain_log_ticks(bars.xaxis, trade.xaxis, trade.yaxis)
+
+
+def _short(name: str) -> str:
+    """A model's name without its lens."""
+    return name.rpartition(".")[2] or name

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurolens.base.progress import Progress, Report
 from neurolens.cameras.build import Shot, ideal_as
@@ -203,18 +204,27 @@ def nearest_depth_m(scene: Scene, efl_mm: float, across: int = 96) -> float | No
     Rays of a pinhole of the lens's focal length through a grid of `across` x `across` points of the film; surfaces
     smaller than a step of the grid may be missed.
     """
-    shot = scene.settings.camera
-    film = (shot.film_width_mm, shot.film_height_mm)
-    steps = np.linspace(-0.5, 0.5, across, dtype=np.float32)
-    points = np.stack(np.meshgrid(steps * film[0], steps * film[1])).reshape(2, -1).astype(np.float32)
-    nanometres = np.full(points.shape[1], np.mean(shot.wavelengths_nm), np.float32)
-    rays = Pinhole(efl_mm, film).sample(points, np.full_like(points, 0.5), nanometres)
+    film = (scene.settings.camera.film_width_mm, scene.settings.camera.film_height_mm)
+    steps = np.linspace(-0.5, 0.5, across)
+    points = np.stack(np.meshgrid(steps * film[0], steps * film[1])).reshape(2, -1)
+    nearest = float(seen_depths_m(scene, Pinhole(efl_mm, film), points).min())
+    return nearest if np.isfinite(nearest) else None
+
+
+def seen_depths_m(scene: Scene, camera: Camera, film_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Depths [N] of what a camera's chief rays of film points [2, N] meet, in m from the film plane along the axis.
+
+    inf where they meet nothing, NaN where no light passes.
+    """
+    shot, count = scene.settings.camera, film_mm.shape[1]
+    nanometres = np.full(count, np.mean(shot.wavelengths_nm), np.float32)
+    rays = camera.sample(film_mm.astype(np.float32), np.full((2, count), 0.5, np.float32), nanometres)
     axes, position = camera_axes(shot), np.array(shot.position_m, np.float32)[:, None]
     world = World(scene, SpectralRange(*shot.wavelengths_nm))
     distance, _ = world.nearest(Rays.of(axes @ rays.origin_m + position, axes @ rays.direction))
-    depth = -(rays.origin_m[2] + distance * rays.direction[2])  # the camera looks along -z
-    nearest = float(depth.min())
-    return nearest if np.isfinite(nearest) else None
+    with np.errstate(invalid="ignore"):
+        depth = -(rays.origin_m[2] + distance * rays.direction[2])  # the camera looks along -z
+    return np.where(rays.weight > 0, np.where(np.isfinite(distance), depth, np.inf), np.nan)
 
 
 def domain_facts(lens: Lens, domain: Domain) -> dict[str, Any]:

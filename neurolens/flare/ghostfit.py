@@ -222,11 +222,13 @@ def _fit(
 
 
 def _rims(data: Sample, steps: list[int], stop: int) -> list[int]:
-    """Steps whose rims are tested: the stop's, and those that explain most of what is blocked, as long as it counts."""
+    """Steps whose rims are tested: the stop's, and up to `_RIMS` that explain most of what is blocked, as far as it
+    counts."""
     blocked = data.ratio[:, data.whole] > 1
     chosen = [n for n, k in enumerate(steps) if k == stop]
     left = blocked.any(0) & ~blocked[chosen].any(0)
-    while left.sum() > _UNEXPLAINED * max(int((~blocked.any(0)).sum()), 1) and len(chosen) < _RIMS + 1:
+    most = len(chosen) + _RIMS
+    while left.sum() > _UNEXPLAINED * max(int((~blocked.any(0)).sum()), 1) and len(chosen) < most:
         best = int(blocked[:, left].sum(1).argmax())
         chosen.append(best)
         left &= ~blocked[best]

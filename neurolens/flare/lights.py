@@ -137,15 +137,20 @@ def light_rays(
     return rays_across(lens, light, disc(first, count, shift, jitter))
 
 
+def front_sphere(lens: Lens) -> tuple[NDArray[np.float64], float]:
+    """Centre [3] (lens frame) and radius in mm of a sphere that holds the front surface."""
+    front = lens.surfaces[0]
+    depth = float(sag_mm(front, front.semi_diameter_mm, 0.0))
+    return np.array([0.0, 0.0, depth / 2]), math.hypot(front.semi_diameter_mm, depth / 2)
+
+
 def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> tuple[Floats, float]:
     """Rays [6, N] of a light through places [2, N] of the disc across its way, the unit disc, and the area in mm^2 that
     the whole disc stands for: equal shares of the unit disc carry equal light; see `light_rays`.
 
     Places may also lie in the corners of the square about the disc.
     """
-    front = lens.surfaces[0]
-    depth = float(sag_mm(front, front.semi_diameter_mm, 0.0))
-    centre, radius = np.array([0.0, 0.0, depth / 2]), math.hypot(front.semi_diameter_mm, depth / 2)
+    centre, radius = front_sphere(lens)
     ahead = light.towards
     # Two sides that turn without a jump while the light moves (Duff et al. 2017, of one hemisphere).
     x, y, z = ahead

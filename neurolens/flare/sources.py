@@ -7,7 +7,8 @@ Of a picture: regions brighter than a threshold. The sky and other surroundings 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -28,8 +29,13 @@ _SIDE = 8  # samples along each side of a light
 _PATCHES = 4  # patches along each side of a large one
 _SMALL = math.radians(1.0)  # about its middle, seen from the lens: one light
 _CELL = 1 / 48  # of the picture's width: larger highlights are several lights
+WHOLE = -1
+_FADES = 1.25
 _MOST_PIXELS = 1 << 22  # above the threshold
 _DIMMEST = 0.02  # relative illumination that a highlight's radiance is told from
+
+
+Name = tuple[int, int]  # of a light of a scene: its number, and which part of it, or `WHOLE`
 
 
 class SceneLights:
@@ -49,6 +55,10 @@ class SceneLights:
         return balance(self._spectral.film_rgb(self._world.palette.illuminant(illuminant)))
 
     def seen(self, scene: Scene, film_z_mm: float) -> list[Light]:
+        """The lights of `named`."""
+        return list(self.named(scene, film_z_mm).values())
+
+    def named(self, scene: Scene, film_z_mm: float) -> dict[Name, Light]:
         """The lights before the lens of a camera of `scene`, whose place may be another.
 
         Args:
@@ -60,34 +70,36 @@ class SceneLights:
         side = (np.arange(_SIDE) + 0.5) / _SIDE
         square = np.stack([a.ravel() for a in np.meshgrid(side, side)]).astype(np.float32)
         point = np.repeat(front[:, None], square.shape[1], 1).astype(np.float32)
-        found: list[Light] = []
-        for (direction, distance, scale), rgb in zip(self._world.lights.each(point, square), self._rgb, strict=False):
+        found: dict[Name, Light] = {}
+        each = zip(self._world.lights.each(point, square), self._rgb, strict=False)
+        for number, ((direction, distance, scale), rgb) in enumerate(each):
             seen = np.where(self._world.visible(point, direction, distance), scale, 0).astype(np.float64)
-            found += _lights(axes.T @ direction, distance, seen, rgb)
+            parts = _lights(axes.T @ direction, distance, seen, rgb)
+            found |= {(number, part): light for part, light in parts.items()}
         return found
 
 
-def _lights(towards: Array, distance: FloatArray, scale: Array, rgb: Array) -> list[Light]:
-    """A light sampled over its square, as one, or where it is large as several.
+def _lights(towards: Array, distance: FloatArray, scale: Array, rgb: Array) -> dict[int, Light]:
+    """A light sampled over its square, as one (`WHOLE`), or where it is large as several, by number.
 
     Args:
         towards: [3, N] camera frame. scale: [N] irradiance of emission 1.
     """
     if not (scale.any() and rgb.any()):
-        return []
+        return {}
     middle = towards @ scale
     middle /= np.linalg.norm(middle)
     apart = np.linalg.norm(towards[:, scale > 0] - middle[:, None], axis=0).max()
     cells = 1 if apart <= _SMALL else _PATCHES
     number = np.arange(_SIDE) * cells // _SIDE
     cell = (number[:, None] * cells + number).ravel()
-    lights = []
+    lights = {}
     for k in range(cells * cells):
         share = np.where(cell == k, scale, 0)
         if share.any():
             mean = float(share @ distance / share.sum()) if np.isfinite(distance).all() else math.inf
-            lights.append(_light(towards @ share, rgb * share.sum() / scale.size, mean))
-    return [light for light in lights if light is not None]
+            lights[k if cells > 1 else WHOLE] = _light(towards @ share, rgb * share.sum() / scale.size, mean)
+    return {part: light for part, light in lights.items() if light is not None}
 
 
 def _light(towards: Array, rgb: Array, distance_m: float = math.inf) -> Light | None:
@@ -108,14 +120,64 @@ class Kept(NamedTuple):
     dropped: float
 
 
-def keep(lights: Sequence[Light], most: int) -> Kept:
-    """The lights of the most energy at the lens."""
-    ordered = sorted(lights, key=lambda light: -sum(light.rgb))
-    left = sum(sum(light.rgb) for light in ordered[most:])
-    return Kept(ordered[:most], len(ordered), left / max(sum(sum(light.rgb) for light in ordered), 1e-300))
+def keep(lights: Sequence[Light], most: int, fade: bool = False) -> Kept:
+    """The lights of the most energy at the lens.
+
+    Args:
+        fade: whether lights fade as their energy comes down to that of the brightest one left out, from `_FADES` times
+            it on: over frames none then comes or goes at once. Where all would be dark, none fades.
+    """
+    ordered = sorted(lights, key=_energy, reverse=True)
+    kept, whole = ordered[:most], sum(map(_energy, ordered))
+    cut = _energy(ordered[most]) if fade and len(ordered) > most else 0.0
+    if 0 < cut < _energy(ordered[0]):
+        kept = [_dimmed(k, min((_energy(k) / cut - 1) / (_FADES - 1), 1.0)) for k in kept if _energy(k) > cut]
+    left = 1 - sum(map(_energy, kept)) / max(whole, 1e-300) if len(ordered) > most else 0.0
+    return Kept(kept, len(ordered), left)
 
 
-def highlights(picture: FloatArray, field: Field, film_mm: tuple[float, float], threshold: float, most: int) -> Kept:
+def keep_named(lights: Mapping[Name, Light], names: frozenset[Name]) -> Kept:
+    """The lights of these names; see `chosen`."""
+    kept = sorted((light for name, light in lights.items() if name in names), key=_energy, reverse=True)
+    whole = sum(map(_energy, lights.values()))
+    left = 1 - sum(map(_energy, kept)) / max(whole, 1e-300) if len(kept) < len(lights) else 0.0
+    return Kept(kept, len(lights), left)
+
+
+def chosen(frames: Sequence[Mapping[Name, Light]], most: int) -> frozenset[Name]:
+    """Names of the lights that are kept in all frames: so many at most, of the most energy in all frames together.
+
+    So none comes or goes because others do. Parts of a light go with it, as far as there is room.
+    """
+    energy: dict[int, float] = {}
+    parts: dict[int, dict[int, float]] = {}
+    for frame in frames:
+        for (number, part), light in frame.items():
+            energy[number] = energy.get(number, 0.0) + _energy(light)
+            of_parts = parts.setdefault(number, {})
+            of_parts[part] = of_parts.get(part, 0.0) + _energy(light)
+    found, room = set[Name](), most
+    for number in sorted(energy, key=lambda number: -energy[number]):
+        if room <= 0:
+            break
+        of_it = sorted(set(parts[number]) - {WHOLE}, key=lambda part: -parts[number][part])[:room]
+        found |= {(number, WHOLE), *((number, part) for part in of_it)}
+        room -= max(len(of_it), 1)
+    return frozenset(found)
+
+
+def _energy(light: Light) -> float:
+    return sum(light.rgb)
+
+
+def _dimmed(light: Light, share: float) -> Light:
+    r, g, b = light.rgb
+    return replace(light, rgb=(share * r, share * g, share * b))
+
+
+def highlights(
+    picture: FloatArray, field: Field, film_mm: tuple[float, float], threshold: float, most: int, fade: bool = False
+) -> Kept:
     """The regions of a picture [H, W, 3] (linear; 1 is a white card of radiance 1) that reach a threshold in a colour.
 
     A region of connected pixels is a light far away with the region's radiance times solid angle; a large one is
@@ -123,7 +185,7 @@ def highlights(picture: FloatArray, field: Field, film_mm: tuple[float, float], 
     threshold on, less the nearer they are to it: a light that a film brings over it does not switch on at once.
 
     Args:
-        field: of the camera that took the picture, laid out as equidistant. most: lights, those of the most energy.
+        field: of the camera that took the picture, laid out as equidistant. most, fade: lights, as of `keep`.
 
     Raises:
         InputError: values that are not finite; more than `_MOST_PIXELS` pixels that reach the threshold.
@@ -147,7 +209,7 @@ def highlights(picture: FloatArray, field: Field, film_mm: tuple[float, float], 
     total = energy.sum(1)
     middle = np.stack([np.bincount(region, total * c, count) for c in towards]).astype(np.float64)
     lights = [_light(middle[:, k], colour[k]) for k in range(count) if colour[k].any()]
-    return keep([light for light in lights if light], most)
+    return keep([light for light in lights if light], most, fade)
 
 
 def _regions(bright: NDArray[np.bool_], cell: int) -> NDArray[np.intp]:

@@ -182,6 +182,22 @@ brightest = 2
 """
 
 
+def test_a_scene_has_the_same_lights_in_all_frames(tmp_path: Path) -> None:
+    """A camera that passes two lamps keeps the one that is brighter in all frames together, also beside the other."""
+    scene, keys = tmp_path / "scene.toml", tmp_path / "camera.csv"
+    lamp = "{ position_m = [-0.5, 1.0, 0.0], intensity = [2.0, 2.0, 2.0] }"
+    text = SCENE.replace("points = [", f"points = [{lamp}, ").replace(', illuminant = "2900 K"', "")
+    scene.write_text(text.replace("[2.0, 1.0, 0.5]", "[5.0, 0.0, 0.0]"))
+    keys.write_text("frame,position,look-at\n1,-0.5/1/2,-0.5/1/0\n3,0.5/1/2,0.5/1/0\n")
+    words = [*SMALL, "--lights", str(scene), "--frames", "1:3", "--key", str(keys), "--most", "1"]
+    assert main(["flare", *words, "-o", str(tmp_path / "a.exr")]) == 0
+    found = [read_exr(tmp_path / f"a.{k:04d}.exr")[1]["flare"]["lights"] for k in (1, 2, 3)]
+    assert [len(lights) for lights in found] == [1, 1, 1]
+    assert [lights[0]["rgb"][0] for lights in found] == pytest.approx([2 / 4] + [2 / 4.25, 2 / 5], rel=0.12)
+    azimuths = [lights[0]["azimuth_deg"] for lights in found]
+    assert azimuths[0] == pytest.approx(0.0, abs=0.01) and 0 > azimuths[1] > azimuths[2]
+
+
 def test_renders_of_a_scene_have_its_flare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The layers of a render are those of the command by the scene's lights, in the render's colours."""
     scene, out = tmp_path / "scene.toml", tmp_path / "a.exr"

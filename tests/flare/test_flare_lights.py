@@ -11,7 +11,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.field import field_of
 from neurolens.flare.lights import Light, light_rays, read_lights
-from neurolens.flare.sources import SceneLights, highlights
+from neurolens.flare.sources import WHOLE, SceneLights, chosen, highlights, keep, keep_named
 from neurolens.optics.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables, seen_from
 
@@ -155,6 +155,51 @@ def test_the_sun_and_large_lights() -> None:
     # The solid angle of a square of side 1 from 1 m before its middle: 4 asin(0.25 / 1.25).
     assert len(found) == 16
     assert sum(light.rgb[1] for light in found) == pytest.approx(4 * math.asin(0.2), rel=3e-3)
+
+
+def test_lights_of_frames_neither_come_nor_go() -> None:
+    """Twelve lamps that a camera passes: each frame by itself has others; of all together the same, most energy first,
+    and a near panel keeps its parts."""
+    lamps = [{"position_m": [-3.0 + 0.5 * k, 2.0, -1.0], "intensity": [1.0 + 0.1 * k] * 3} for k in range(12)]
+    quad = {"corner_m": [0.5, 1.5, -4.0], "edge_u_m": [1.0, 0.0, 0.0], "edge_v_m": [0.0, 1.0, 0.0]}
+    lights, made = scene(points=lamps, quads=[{**quad, "emission": [9.0, 9.0, 9.0]}])
+    places = [seen_from(made, "scene", (x, 2.0, 3.0), (x, 2.0, -3.0)) for x in np.linspace(-3.0, 3.0, 25)]
+    frames = [lights.named(place, 100.0) for place in places]
+    assert all(len(frame) == 28 for frame in frames)
+    alone = [set(keep(list(f.values()), 20).lights) for f in frames]
+    assert len({frozenset(n for n, light in f.items() if light in of) for f, of in zip(frames, alone, strict=True)}) > 3
+    names = chosen(frames, 20)
+    whole = {name: sum(sum(f[name].rgb) for f in frames) for name in frames[0]}
+    panel = {name for name in whole if name[1] != WHOLE}
+    others = sorted(set(whole) - panel, key=lambda name: -whole[name])
+    assert len(panel) == 16 and panel < names and set(others[:4]) == names & set(others)
+    for frame in frames:
+        found = keep_named(frame, names)
+        assert found.of == 28 and set(found.lights) == {frame[name] for name in names & set(frame)}
+        left = sum(sum(frame[name].rgb) for name in others[4:]) / sum(sum(light.rgb) for light in frame.values())
+        assert found.dropped == pytest.approx(left)
+    few = chosen(frames, 3)  # less than one light's parts
+    assert len({name for name in few if name in panel}) == 3 and keep_named(frames[0], few).dropped > 0.5
+    assert chosen([], 3) == frozenset() and keep_named({}, few).lights == []
+
+
+def test_lights_fade_before_they_are_left_out() -> None:
+    """Of three lights that change places in energy two are kept: each one's energy goes by no step."""
+    last: dict[float, float] = {}
+    steps = 2000
+    for t in np.linspace(0, 2 * math.pi, steps):
+        lights = [Light(10.0 * k, 0.0, (1 + 0.5 * math.sin(t + 2.1 * k),) * 3) for k in range(3)]
+        found = keep(lights, 2, fade=True)
+        now = {light.azimuth_deg: light.rgb[0] for light in found.lights}
+        assert len(now) <= 2 and found.dropped == pytest.approx(1 - sum(now.values()) / sum(x.rgb[0] for x in lights))
+        for k in (0.0, 10.0, 20.0):
+            # A tenth of what a light that comes at once adds; the step of time is 0.003.
+            assert not last or abs(now.get(k, 0.0) - last.get(k, 0.0)) < 30 * 2 * math.pi / steps
+        last = now
+    assert keep(lights, 3, fade=True).lights == keep(lights, 3).lights
+    equal = [Light(10.0 * k, 0.0) for k in range(3)]
+    assert len(keep(equal, 2, fade=True).lights) == 2
+    assert keep([], 2, fade=True).dropped == 0
 
 
 def test_highlights_by_closed_forms() -> None:

@@ -1,0 +1,143 @@
+"""`neurolens plan SCENE --lens LENS`: what a scene asks of a lens, and the cheapest camera that meets it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path
+from neurolens.base.progress import Progress
+from neurolens.commands.arguments import add_glass, add_json, lens_path, project_root
+from neurolens.commands.output import answer, number, table
+
+if TYPE_CHECKING:
+    from neurolens.evaluate.plan import Plan
+
+_DESCRIPTION = """\
+Look through the exact lens at a scene, say what each of its effects is worth there in pixels, and choose
+the cheapest camera whose error stays within the budget: a pinhole, with or without its picture warped
+afterwards, a thin or thick lens, a model that ships, a polynomial fitted for this shot alone, or the
+exact lens. Needs the extra "train" (torch).
+
+Errors are distances between footprints, the picture of a point by a camera and by the exact lens: the
+least RMS way on which light moves to turn one into the other, in pixels of the scene's picture (place,
+size and shape of the blur, each wavelength by itself), and the relative error of light, of which 1%% is
+allowed. Both are those that 95%% of the picture keep. Times are measured here, on one thread, a ray that
+passes."""
+_EPILOG = """\
+examples:
+  neurolens plan experiments/scenes/garden.toml --lens laikin_double_gauss_50 --budget 0.25px
+  neurolens plan scene.toml --lens my_lens.toml --budget 1px --for onnx --explain -o runs/plan
+
+-o leaves plan.json (all of it), effects.png and models/ with what was fitted."""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser(
+        "plan", help="what a scene asks of a lens, and the cheapest camera for it", description=_DESCRIPTION,
+        epilog=_EPILOG,
+    )  # fmt: skip
+    parser.add_argument("scene", metavar="SCENE", type=Path, help="scene file (.toml)")
+    parser.add_argument("--lens", metavar="LENS", required=True, help="lens file (.toml), or a name in lenses/")
+    parser.add_argument(
+        "--budget", metavar="PIXELS", type=_pixels, default=0.25, help="error allowed, as 0.25px (default: 0.25px)"
+    )
+    parser.add_argument(
+        "--for", dest="target", choices=("render", "c", "onnx"), default="render",
+        help="what runs the camera: our renderer, compiled C, or onnxruntime (default: render)",
+    )  # fmt: skip
+    parser.add_argument("--explain", action="store_true", help="time and list every camera tried")
+    parser.add_argument("--no-fit", dest="fit", action="store_false", help="fit nothing for the shot")
+    parser.add_argument(
+        "-o", "--output", metavar="FOLDER", type=Path, help="for the plan (default: runs/plan-SCENE-LENS)"
+    )
+    add_glass(parser)
+    add_json(parser, quiet=True)
+    parser.set_defaults(run=run, kept="models fitted so far are kept, the plan is not written")
+
+
+def _pixels(text: str) -> float:
+    match = re.fullmatch(r"([0-9.]{1,20}(?:e[+-]?[0-9]{1,3})?)(px)?", text)
+    try:
+        if match and 0 <= (value := float(match[1])) < 1e12:
+            return value
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected pixels, as 0.25px")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Plan, write, print; 1 where no camera for this target is within the budget."""
+    from neurolens.evaluate.plan import plan
+    from neurolens.evaluate.plots import plot_effects
+    from neurolens.optics.lensfile import read_lens
+    from neurolens.render.scene import load_scene
+
+    file = lens_path(args.lens, "plan")
+    lens = read_lens(file).at()
+    scene = load_scene(args.scene)
+    folder = args.output or Path("runs") / f"plan-{scene.name}-{file.stem}"
+    if folder.exists() and not folder.is_dir():
+        raise InputError("neurolens plan", "-o", str(folder), "a folder")
+    shipped = sorted((project_root() / "models").glob(f"{file.stem}.*.onnx"))
+    progress = Progress({"plan": 10}, quiet=args.quiet)
+    with progress.stage("plan") as report:
+        found = plan(
+            scene, lens, args.budget, target=args.target, models=shipped, explain=args.explain, report=report,
+            folder=folder / "models" if args.fit else None,
+        )  # fmt: skip
+    folder.mkdir(parents=True, exist_ok=True)
+    data = {"scene": str(args.scene), "lens": str(file), **found.to_dict()}
+    with atomic_path(folder / "plan.json") as part:
+        part.write_text(json.dumps(_plain(data), indent=1) + "\n", encoding="utf-8")
+    plot_effects(found, folder / "effects.png", f"{scene.name} through {lens.name}")
+    answer(args, _plain(data), lambda: _text(args, found, folder))
+    return 0 if found.best else 1
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no infinity: null."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return None if isinstance(value, float) and value in (float("inf"), float("-inf")) else value
+
+
+def _text(args: argparse.Namespace, found: Plan, folder: Path) -> str:
+    asked = found.asked
+    view = "nothing with a distance" if asked.nearest_m is None else (
+        f"{asked.nearest_m:.4g} to {asked.farthest_m:.4g} m"
+    )  # fmt: skip
+    facts = f"f/{asked.f_number:.3g}, focus {asked.focus_m:g} m, in view {view}"
+    facts += f", {100 * asked.distant:.0f}% of the picture is distant; a pixel is {1e3 * asked.pixel_mm:.3g} um"
+    rows = [
+        (e.name, number(e.worth, 3), number(e.median, 3), "px" if e.unit == "px" else "of light",
+         "" if e.needed else "left out")
+        for e in found.effects
+    ]  # fmt: skip
+    parts = [facts, table(("effect", "worth", "median", "", ""), rows)]
+    if args.explain:
+        header = ("", "camera", "px", "light", "ns", "passes", "")
+        parts.append(table(header, [
+            ("*" if c == found.best else "+" if c.within else "", c.name, number(c.error_px, 3),
+             number(c.light_error, 2), number(c.ns, 3), number(c.passed, 2), c.how)
+            for c in found.choices
+        ], left=2))  # fmt: skip
+        parts.append("* to use, + within the budget; px, light: errors that 95% of the picture keep; ns a ray")
+    best = found.best
+    if best is None:
+        nearest = min(found.choices, key=lambda c: c.error_px, default=None)
+        closest = f"; the closest is {nearest.name} with {number(nearest.error_px, 3)} px" if nearest else ""
+        parts.append(f"No camera for --for {found.target} keeps {found.budget_px:g} px{closest}.")
+    else:
+        told = f"Use {best.name}: {number(best.error_px, 3)} px of {found.budget_px:g}, {number(best.ns, 3)} ns a ray"
+        command = f"neurolens render {shlex.quote(str(args.scene))} --camera {shlex.quote(best.camera)} -o render.exr"
+        parts.append(f"{told}{', ' + best.how if best.how else ''}\n  {command}")
+    return "\n\n".join([*parts, f"Written: {folder}/plan.json, effects.png"])

@@ -1,0 +1,268 @@
+"""What a film point of a camera sees at a distance, measured on the film: footprints, their parts, and how two differ.
+
+The rays of a film point meet the plane across its chief ray at the distance of what it shows. Taken back to the film by
+the first-order map of the exact camera there, the points where they meet it are its footprint, in mm on the film: the
+picture of a point, seen the other way. Any camera of the contract has one, so that all are held against the exact lens
+by the same rule, fisheyes too.
+
+Footprints differ by the sliced Wasserstein distance of order 2 (Bonneel et al. 2015), scaled so that a shift by d is d:
+the least RMS way on which light moves to turn one into the other, over lines through the film. It needs no pairing of
+rays, and holds what a picture shows: place, size and shape of the blur, and of each wavelength by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.cameras.contract import Camera
+
+Array = NDArray[np.float64]
+
+_LINES = 8  # directions of the sliced distance
+_QUANTILES = 64
+_STEP = 1e-3  # of the film's width: step of the first-order map
+EFFECTS = (
+    "distortion", "defocus", "spherical aberration", "coma", "astigmatism", "field curvature", "higher orders",
+    "longitudinal colour", "lateral colour",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Places:
+    """Film points with what they show, and the maps from there to the film.
+
+    Attributes:
+        film_mm: [2, N], lens frame. distance_m: [N] along the chief rays, inf allowed.
+        origin_m, direction: [3, N] of the exact camera's chief rays, camera frame. across: [2, 3, N] unit vectors
+            across them. to_film: [2, 2, N] from slopes against the chief ray to mm on the film.
+        wavelength_nm: [W]. share: [W] of the light, of sum 1.
+    """
+
+    film_mm: Array
+    distance_m: Array
+    origin_m: Array
+    direction: Array
+    across: Array
+    to_film: Array
+    wavelength_nm: Array
+    share: Array
+
+
+@dataclass(frozen=True)
+class Footprints:
+    """Rays of N places, W wavelengths and P pupil samples.
+
+    Attributes:
+        place_mm: [2, N, W, P] on the film, from the place's own film point. pupil_mm: [2, N, W, P] across the chief
+            ray at its origin, on the side of the scene. weight: [N, W, P]; 0 where a ray did not pass.
+    """
+
+    place_mm: Array
+    pupil_mm: Array
+    weight: Array
+
+    @property
+    def light(self) -> Array:
+        """[N] film value of white surroundings, mean over wavelengths."""
+        return self.weight.mean((1, 2))
+
+    @property
+    def passed(self) -> float:
+        """Share of the rays that carry light."""
+        return float((self.weight > 0).mean())
+
+
+def places_of(exact: Camera, film_mm: Array, depth_m: Array, wavelength_nm: Array, share: Array) -> Places:
+    """Places of film points [2, N] that show something at depths [N] along the axis; points without light are left out.
+
+    Depths become distances along the chief ray of the exact camera, in the middle of the wavelengths.
+    """
+    middle = float((wavelength_nm * share).sum())
+    origin, way, lit = _chief(exact, film_mm, middle)
+    lit &= (depth_m > 0) | np.isinf(depth_m)
+    film_mm, depth_m, origin, way = film_mm[:, lit], depth_m[lit], origin[:, lit], way[:, lit]
+    with np.errstate(all="ignore"):  # a ray of a fisheye across the axis meets no depth: what it shows is distant
+        distance = (depth_m + origin[2]) / np.maximum(-way[2], 0.0)
+    distance = np.where(np.isfinite(distance) & (distance > 0), distance, np.inf)
+    helper = np.where(np.abs(way[0]) < 0.9, np.array([[1.0], [0.0], [0.0]]), np.array([[0.0], [1.0], [0.0]]))
+    first = np.cross(way, helper, axis=0)
+    first /= np.linalg.norm(first, axis=0)
+    across = np.stack([first, np.cross(way, first, axis=0)])
+    empty = np.zeros((2, 2, film_mm.shape[1]))
+    raw = Places(film_mm, distance, origin, way, across, empty, wavelength_nm, share)
+    step = _STEP * max(exact.film_mm)
+    slopes = []
+    for axis in (0, 1):
+        moved = np.zeros((2, 1))
+        moved[axis] = step
+        ends = [_meet(raw, *_chief(exact, film_mm + s * moved, middle)[:2]) for s in (1.0, -1.0)]
+        slopes.append((ends[0] - ends[1]) / (2 * step))
+    jacobian = np.stack(slopes, axis=1)  # [slope, film, N]
+    sound = np.isfinite(jacobian).all((0, 1)) & (np.abs(np.linalg.det(jacobian.transpose(2, 0, 1))) > 1e-12)
+    inverse = np.linalg.inv(jacobian.transpose(2, 0, 1)[sound]).transpose(1, 2, 0)
+    keep = (film_mm[:, sound], distance[sound], origin[:, sound], way[:, sound], across[..., sound])
+    return Places(*keep, inverse, wavelength_nm, share)
+
+
+def footprints(camera: Camera, places: Places, samples: int = 16) -> Footprints:
+    """Footprints of a camera at places, by `samples` by `samples` stratified points of its pupil."""
+    steps = (np.arange(samples) + 0.5) / samples
+    pupil = np.stack(np.meshgrid(steps, steps)).reshape(2, -1)
+    points, waves, rays = places.film_mm.shape[1], len(places.wavelength_nm), pupil.shape[1]
+    shape = (points, waves, rays)
+    film = np.broadcast_to(places.film_mm[:, :, None, None], (2, *shape)).reshape(2, -1)
+    square = np.broadcast_to(pupil[:, None, None, :], (2, *shape)).reshape(2, -1)
+    nanometres = np.broadcast_to(places.wavelength_nm[None, :, None], shape).reshape(-1)
+    found = camera.sample(*(np.ascontiguousarray(a, np.float32) for a in (film, square, nanometres)))
+    origin, way = (a.astype(np.float64).reshape(3, points, -1) for a in (found.origin_m, found.direction))
+    slope = _meet(places, origin, way)
+    place = np.einsum("ijn,jnk->ink", places.to_film, slope).reshape(2, *shape)
+    from_chief = origin - places.origin_m[:, :, None]
+    along = (from_chief * places.direction[:, :, None]).sum(0) / (way * places.direction[:, :, None]).sum(0)
+    at_pupil = from_chief - along * way
+    across = 1e3 * np.einsum("icn,cnk->ink", places.across, at_pupil).reshape(2, *shape)
+    weight = np.where(np.isfinite(place).all(0), found.weight.astype(np.float64).reshape(shape), 0.0)
+    return Footprints(np.where(weight > 0, place, 0.0), np.where(weight > 0, across, 0.0), weight)
+
+
+def collapsed(exact: Footprints, share: Array) -> Footprints:
+    """Footprints of a point camera whose picture is warped, and its light corrected, by maps of the exact one."""
+    centre, _ = _centroids(exact, share)
+    place = np.broadcast_to(centre[:, :, None, None], exact.place_mm.shape)
+    return Footprints(np.array(place), exact.pupil_mm, exact.weight)
+
+
+def distance_mm(a: Footprints, b: Footprints, share: Array) -> Array:
+    """Sliced Wasserstein distance [N] between footprints of the same places, RMS over wavelengths by share, mm.
+
+    NaN where one of the two has light and the other none.
+    """
+    turn = np.arange(_LINES) * (np.pi / _LINES)
+    total = np.zeros(a.weight.shape[:2])
+    for c, s in zip(np.cos(turn), np.sin(turn), strict=True):
+        at = [_quantiles(c * f.place_mm[0] + s * f.place_mm[1], f.weight) for f in (a, b)]
+        total += ((at[0] - at[1]) ** 2).mean(-1)
+    return np.asarray(np.sqrt((2 / _LINES * total * share).sum(1)))
+
+
+def effects_mm(exact: Footprints, thin: Footprints, share: Array) -> dict[str, Array]:
+    """Parts of the exact camera's footprints, `EFFECTS` by name, [N] RMS mm on the film.
+
+    A thin lens framed as the lens has the defocus of each depth. What the exact footprint has besides is expanded in
+    the pupil point: by degree, each part orthogonal to those below it over the light that passes (as Zernike's are over
+    a disc: coma with the tilt that balances it, spherical aberration with its best focus).
+    """
+    (centre, by_wave), (ideal, _) = _centroids(exact, share), _centroids(thin, share)
+    linear, parts = _expanded(exact, by_wave)
+    plain, _ = _expanded(thin, _centroids(thin, share)[1])
+    size = _pupil_size(exact)
+    mean = np.einsum("ijnw,w->ijn", linear, share)
+    own = np.einsum("ijnw,w->ijn", plain, share)
+    extra = mean - own
+    focus = (extra[0, 0] + extra[1, 1]) / 2
+    bent = extra - focus * np.eye(2)[:, :, None]
+    colour = (linear - mean[..., None])[[0, 1], [0, 1]].mean(0)
+
+    def over_waves(value: Array) -> Array:
+        return np.sqrt((value * share).sum(-1))
+
+    return {
+        "distortion": np.hypot(*(centre - ideal)),
+        "defocus": _of_matrix(own) * size,
+        "spherical aberration": over_waves(parts[1]),
+        "coma": over_waves(parts[0]),
+        "astigmatism": _of_matrix(bent) * size,
+        "field curvature": np.abs(focus) * size * np.sqrt(2),
+        "higher orders": over_waves(parts[2]),
+        "longitudinal colour": over_waves(colour**2) * size * np.sqrt(2),
+        "lateral colour": over_waves(((by_wave - centre[:, :, None]) ** 2).sum(0)),
+    }
+
+
+def blur_mm(prints: Footprints, share: Array) -> Array:
+    """RMS diameter [N] of footprints: twice the RMS distance from their centroid, all wavelengths together, mm."""
+    centre, _ = _centroids(prints, share)
+    weight = prints.weight * share[:, None]
+    away = ((prints.place_mm - centre[:, :, None, None]) ** 2).sum(0)
+    return np.asarray(2 * np.sqrt((weight * away).sum((1, 2)) / np.maximum(weight.sum((1, 2)), 1e-300)))
+
+
+def _chief(camera: Camera, film_mm: Array, nanometres: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+    count = film_mm.shape[1]
+    half, waves = np.full((2, count), 0.5, np.float32), np.full(count, nanometres, np.float32)
+    rays = camera.sample(np.ascontiguousarray(film_mm, np.float32), half, waves)
+    lit = (rays.status == 0) & (rays.weight > 0)
+    return rays.origin_m.astype(np.float64), rays.direction.astype(np.float64), lit
+
+
+def _meet(places: Places, origin: Array, way: Array) -> Array:
+    """Slopes [2, N(, K)] against the chief rays of where rays [3, N(, K)] meet the planes of what they show."""
+    more = (slice(None), slice(None)) + (None,) * (origin.ndim - 2)
+    base, along, near = places.origin_m[more], places.direction[more], 1 / places.distance_m[more[1:]]
+    rate = (way * along).sum(0)
+    from_base = origin - base
+    with np.errstate(all="ignore"):
+        # Everything over the distance, so that the plane may lie at infinity.
+        step = (1 - near * (from_base * along).sum(0)) / rate
+        meet = near * from_base + step * way
+        meet = np.where(rate > 1e-3, meet, np.nan)
+    axes: Any = places.across[(slice(None), slice(None), slice(None)) + (None,) * (origin.ndim - 2)]
+    return np.asarray((axes * meet).sum(1))
+
+
+def _centroids(prints: Footprints, share: Array) -> tuple[Array, Array]:
+    """Centroid over all light [2, N], and of each wavelength [2, N, W]."""
+    light = np.maximum(prints.weight.sum(2), 1e-300)
+    by_wave = (prints.place_mm * prints.weight).sum(3) / light
+    return (by_wave * share).sum(2), by_wave
+
+
+def _quantiles(value: Array, weight: Array) -> Array:
+    """Values [N, W, Q] at equal steps of the weight of samples [N, W, P]; NaN without weight."""
+    order = np.argsort(value, axis=-1)
+    value, weight = np.take_along_axis(value, order, -1), np.take_along_axis(weight, order, -1)
+    total = weight.sum(-1, keepdims=True)
+    with np.errstate(all="ignore"):
+        middle = (np.cumsum(weight, -1) - weight / 2) / total
+    steps = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
+    found = np.full((*value.shape[:2], _QUANTILES), np.nan)
+    for n, w in np.ndindex(*value.shape[:2]):
+        if total[n, w, 0] > 0:
+            lit = weight[n, w] > 0
+            found[n, w] = np.interp(steps, middle[n, w][lit], value[n, w][lit])
+    return found
+
+
+def _pupil_size(prints: Footprints) -> Array:
+    """RMS pupil coordinate [N] along one axis, mm: what a matrix per mm of pupil is multiplied by."""
+    weight = prints.weight / np.maximum(prints.weight.sum(2, keepdims=True), 1e-300)
+    mean = (prints.pupil_mm * weight).sum(3, keepdims=True)
+    return np.asarray(np.sqrt((((prints.pupil_mm - mean) ** 2) * weight).sum((0, 3)).mean(1) / 2))
+
+
+def _of_matrix(matrix: Array) -> Array:
+    return np.asarray(np.sqrt((matrix**2).sum((0, 1))))
+
+
+def _expanded(prints: Footprints, centre: Array) -> tuple[Array, Array]:
+    """Linear parts [2, 2, N, W] in mm per mm of pupil, and mean squares [3, N, W] of degrees 2, 3 and what is left."""
+    size = np.maximum(_pupil_size(prints), 1e-12)[:, None, None]
+    x, y = prints.pupil_mm / size
+    total = np.maximum(prints.weight.sum(2, keepdims=True), 1e-300)
+    root = np.sqrt(prints.weight / total)
+    monomials = (1 + 0 * x, x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3)
+    basis = np.stack([root * m for m in monomials], axis=-1)  # [N, W, P, 10]
+    q, r = np.linalg.qr(basis)
+    wanted = np.moveaxis((prints.place_mm - centre[..., None]) * root, 0, -1)  # [N, W, P, 2]
+    found = np.swapaxes(q, -1, -2) @ wanted  # [N, W, 10, 2]
+    with np.errstate(all="ignore"):
+        weak = np.abs(np.diagonal(r, axis1=-2, axis2=-1))[..., 1:3].min(-1) < 1e-9
+        steep = np.linalg.solve(np.where(weak[..., None, None], np.eye(2), r[..., 1:3, 1:3]), found[..., 1:3, :])
+    linear = np.where(weak[..., None, None], 0.0, steep) / size[..., None]
+    square = (found**2).sum(-1)
+    rest = np.maximum((wanted**2).sum((-1, -2)) - square.sum(-1), 0.0)
+    return linear.transpose(3, 2, 0, 1), np.stack([square[..., 3:6].sum(-1), square[..., 6:].sum(-1), rest])

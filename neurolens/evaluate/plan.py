@@ -1,0 +1,337 @@
+"""What a scene asks of a lens, what each of the lens's effects is worth there, and the cheapest camera within a budget.
+
+A probe sends the chief rays of a grid of film points into the scene: what they meet, and how far off, are the places at
+which cameras are held against the exact lens (`footprints`). An effect's worth is its part of the exact footprints in
+pixels; a camera's error is the distance of its footprints from the exact ones, in pixels, and of its light. Both count
+where they are largest but for 5% of the picture.
+
+Cost is nanoseconds a ray that passes, measured on this machine with one thread: a camera that wastes samples is charged
+for them.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from neurolens.base.errors import InputError, ModelError
+from neurolens.base.progress import Report
+from neurolens.cameras.build import Shot, ideal_as
+from neurolens.cameras.contract import RAYS_A_CALL, Camera
+from neurolens.cameras.exact import ExactCamera, FusedExactCamera
+from neurolens.cameras.field import WIDEST_DEG, spectrum_of
+from neurolens.cameras.fused import FusedCamera
+from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.evaluate import footprints as prints
+from neurolens.evaluate.footprints import Array, Footprints, Places
+from neurolens.evaluate.scenes import seen_depths_m
+from neurolens.graph.compiler import has_compiler
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.render.scene import Scene
+from neurolens.surrogates.domain import Domain, domain_from_camera
+from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.fit import fit_model, prepare
+from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.settings import ModelSettings
+
+Target = Literal["render", "c", "onnx"]
+TARGETS: tuple[Target, ...] = ("render", "c", "onnx")
+COUNTED = 95.0  # percentile over the picture that a budget is held against
+_ACROSS = 16  # points of the probe along the longer side
+_LIGHT = 0.01  # relative error of light that a plan allows beside its budget of place
+_TERMS = (8, 16, 28, 48)  # of the polynomials that are fitted on the spot
+_PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
+_MOST_OVERSCAN = 4.0  # of a plane picture that is warped afterwards
+_ROUNDS = 7
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a scene asks of its camera.
+
+    Attributes:
+        film_mm: width and height in use. pixel_mm: pitch. focus_m, f_number, wavelength_nm: of the shot; no wider
+            than the lens opens. nearest_m, farthest_m: along the axis from the film; None where nothing is in view.
+        distant: share of the picture that shows what has no distance. dark: share that the lens leaves dark.
+    """
+
+    film_mm: tuple[float, float]
+    pixel_mm: float
+    focus_m: float
+    f_number: float
+    wavelength_nm: tuple[float, float]
+    nearest_m: float | None
+    farthest_m: float | None
+    distant: float
+    dark: float
+
+
+@dataclass(frozen=True)
+class Effect:
+    """An effect's worth: pixels (RMS of what it moves light by; `relative`: share of the light) at the counted
+    percentile, its median over the picture, and whether the budget lets it be left out."""
+
+    name: str
+    worth: float
+    median: float
+    unit: Literal["px", "relative"]
+    needed: bool
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A camera that was tried.
+
+    Attributes:
+        camera: as `--camera` takes it. error_px, light_error: at the counted percentile; inf where it has no light
+            that the lens has. ns: a ray that passes, inf where it was not timed. passed: share of rays.
+        within: whether it meets the budget. how: what else it needs, or how it was made.
+    """
+
+    name: str
+    camera: str
+    error_px: float
+    light_error: float
+    ns: float
+    passed: float
+    within: bool
+    how: str = ""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What was asked, the effects in falling order of worth, every camera tried by rising cost, the one to use."""
+
+    asked: Asked
+    budget_px: float
+    target: Target
+    effects: tuple[Effect, ...]
+    choices: tuple[Choice, ...]
+    best: Choice | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Probed:
+    """A scene's places as the exact lens sees them: its camera, its footprints there, and those of a thin lens."""
+
+    asked: Asked
+    lens: Lens
+    domain: Domain
+    exact: ExactCamera | FusedExactCamera
+    places: Places
+    seen: Footprints
+    thin_seen: Footprints
+
+
+def probe(scene: Scene, lens: Lens, *, across: int = _ACROSS) -> Probed:
+    """Look through the exact lens at a scene.
+
+    Raises:
+        InputError: a scene's camera that the lens cannot be; a picture that the lens leaves dark.
+    """
+    shot = scene.settings.camera
+    film, widest = (shot.film_width_mm, shot.film_height_mm), first_order(lens).f_number
+    f_number = max(shot.f_number or widest, widest)
+    stopped, domain = domain_from_camera(
+        lens, film_mm=film, focus_m=shot.focus_m, f_number=f_number, wavelength_nm=shot.wavelengths_nm
+    )
+    real: dict[str, Any] = {"film_mm": film, "focus_m": shot.focus_m, "f_number": f_number}
+    exact = _exact_camera(lens, {**real, "bounds": domain.bounds, "wavelength_nm": shot.wavelengths_nm})
+    points = _grid(film, across)
+    depth = seen_depths_m(scene, exact, points)
+    nanometres, share = spectrum_of(exact, shot.wavelengths_nm)
+    places = prints.places_of(exact, points, np.where(np.isnan(depth), np.inf, depth), nanometres, share / share.sum())
+    if not places.film_mm.shape[1]:
+        raise InputError(scene.name, "camera", lens.name, "a lens that lights some of this film")
+    thin = ideal_as("thin:", exact.lens, Shot(film, shot.focus_m))
+    met = depth[np.isfinite(depth)]
+    asked = Asked(
+        film, film[0] / shot.width, shot.focus_m, f_number, shot.wavelengths_nm,
+        float(met.min()) if met.size else None, float(met.max()) if met.size else None,
+        float(np.isinf(depth).mean()), 1 - places.film_mm.shape[1] / points.shape[1],
+    )  # fmt: skip
+    seen = [prints.footprints(c, places) for c in (exact, thin)]
+    return Probed(asked, stopped, domain, exact, places, seen[0], seen[1])
+
+
+def effects_of(found: Probed, budget_px: float) -> tuple[Effect, ...]:
+    """What each effect is worth in this picture, the dearest first; see `footprints.effects_mm`.
+
+    An Airy disc has no RMS radius: diffraction is worth the radius that holds half its light, 0.53 wavelengths times
+    the f-number (Born and Wolf, 8.5.2).
+    """
+    pixel, share = found.asked.pixel_mm, found.places.share
+    parts = {k: v / pixel for k, v in prints.effects_mm(found.seen, found.thin_seen, share).items()}
+    middle = float((found.places.wavelength_nm * share).sum())
+    parts["diffraction"] = np.full(1, 0.53 * 1e-6 * middle * found.asked.f_number / pixel)
+    fall = found.seen.light / max(found.seen.light.max(), 1e-30)
+    natural = found.thin_seen.light / max(found.thin_seen.light.max(), 1e-30)
+    light = {"natural fall-off": np.abs(1 - natural), "vignetting": np.abs(1 - fall / np.maximum(natural, 1e-30))}
+    effects = [_effect(k, v, "px", budget_px) for k, v in parts.items()]
+    effects += [_effect(k, v, "relative", _LIGHT) for k, v in light.items()]
+    return tuple(sorted(effects, key=lambda e: (e.unit, -e.worth)))
+
+
+def _effect(name: str, value: Array, unit: Literal["px", "relative"], budget: float) -> Effect:
+    worth = float(np.percentile(value, COUNTED))
+    return Effect(name, worth, float(np.median(value)), unit, worth > budget)
+
+
+def plan(
+    scene: Scene, lens: Lens, budget_px: float, *, target: Target = "render", models: Sequence[Path] = (),
+    folder: Path | None = None, explain: bool = False, report: Report | None = None,
+) -> Plan:  # fmt: skip
+    """The cheapest camera for a scene whose error stays within a budget.
+
+    Args:
+        lens: as its file has it. budget_px: error of place and blur in pixels of the scene's picture.
+        target: what runs the camera: our renderer with all it has, compiled C, or onnxruntime.
+        models: exported models of this lens to try. folder: where models fitted for the shot go; None fits none.
+        explain: whether models beyond the budget are compiled and timed, too; else their time is infinite.
+
+    Raises:
+        InputError: a budget that is negative or no number; as `probe`.
+    """
+    if not budget_px >= 0:
+        raise InputError("plan", "budget_px", budget_px, "0 or more pixels")
+    found = probe(scene, lens)
+    say = report or (lambda done: None)
+    say(0.3)
+    tried = [*_ideal(found, budget_px, target), *_exact(found, budget_px, target)]
+    for file in models:
+        tried += _try_model(found, file, budget_px, target, explain)
+    say(0.6)
+    if folder is not None:
+        for choice in _fitted(found, budget_px, target, folder, explain):
+            tried.append(choice)
+            say(0.8)
+            if choice.within or (math.isfinite(choice.ns) and any(c.within and c.ns < choice.ns for c in tried)):
+                break  # larger ones cost more
+    tried.sort(key=lambda c: c.ns)
+    best = next((c for c in tried if c.within), None)
+    return Plan(found.asked, budget_px, target, effects_of(found, budget_px), tuple(tried), best)
+
+
+def _grid(film_mm: tuple[float, float], across: int) -> Array:
+    """Centres of equal cells of the film, [2, N] mm."""
+    longer = max(film_mm)
+    counts = [max(round(across * side / longer), 1) for side in film_mm]
+    x, y = (((np.arange(n) + 0.5) / n - 0.5) * side for n, side in zip(counts, film_mm, strict=True))
+    return np.stack(np.meshgrid(x, y)).reshape(2, -1)
+
+
+def _ideal(found: Probed, budget_px: float, target: Target) -> Iterator[Choice]:
+    """Pinhole, the same with its picture warped afterwards, thin and thick lens; they are their own source in C."""
+    if target == "onnx":
+        return
+    path, shot = found.lens.path, Shot(found.asked.film_mm, found.asked.focus_m)
+    for kind in ("pinhole:", "thin:", "thick:"):
+        with suppress(InputError):  # no thick lens of cylinders
+            camera = ideal_as(kind, found.exact.lens, shot)
+            spec = f"{kind}{path}"
+            yield _judged(found, kind.rstrip(":"), spec, camera, budget_px)
+            if kind == "pinhole:" and (area := _overscan(found)) < _MOST_OVERSCAN:
+                flat = prints.collapsed(found.seen, found.places.share)
+                how = f"then the ST map of 'neurolens stmap' over the picture, of {area:.3g} times the area"
+                warped = _judged(found, "pinhole + ST map", spec, camera, budget_px, flat, how)
+                yield replace(warped, ns=area * warped.ns * warped.passed, passed=1.0)  # its own rays all pass
+
+
+def _overscan(found: Probed) -> float:
+    """Area of the plane picture that holds all that the lens shows, over that of the film; inf for half a sphere."""
+    way = found.places.direction
+    if (-way[2] < math.cos(math.radians(WIDEST_DEG))).any():
+        return math.inf
+    reach = found.exact.settings["lens_state"]["pinhole_focal_length_mm"]
+    slope = np.abs(way[:2] / way[2]).max(1) * reach / np.maximum(np.abs(found.places.film_mm).max(1), 1e-9)
+    return float(np.maximum(slope, 1.0).prod())
+
+
+def _exact_camera(lens: Lens, real: dict[str, Any]) -> ExactCamera | FusedExactCamera:
+    """As C where a compiler is there and the lens has a form in C: coatings and absorbing glass have none."""
+    with suppress(InputError):
+        if has_compiler():
+            return FusedExactCamera(lens, **real)
+    return ExactCamera(lens, **real)
+
+
+def _exact(found: Probed, budget_px: float, target: Target) -> Iterator[Choice]:
+    """The exact lens, which has no error; as C where that runs."""
+    compiled = isinstance(found.exact, FusedExactCamera)
+    if target == "render" or (target == "c" and compiled):
+        spec = f"{'fused:' if compiled else ''}{found.lens.path}"
+        yield _judged(found, "exact", spec, found.exact, budget_px, found.seen)
+
+
+def _try_model(
+    found: Probed, file: Path, budget_px: float, target: Target, explain: bool, how: str = ""
+) -> Iterator[Choice]:
+    """A model in the form that the target runs; none where its domain is not the shot's, or it has no such form.
+
+    Errors are of onnxruntime: compilers take seconds, and C gives the same rays.
+    """
+    asked = found.asked
+    real: dict[str, Any] = {"film_mm": asked.film_mm, "focus_m": asked.focus_m, "f_number": asked.f_number}
+    real["wavelength_nm"] = asked.wavelength_nm
+    compiled = target != "onnx" and has_compiler()
+    with suppress(InputError, ModelError):
+        model = load_model(file)
+        spec = f"{'fused:' if compiled else ''}{file}"
+        choice = _judged(found, file.stem, spec, OnnxCamera(model, **real), budget_px, how=how, timed=not compiled)
+        if compiled and (choice.within or explain):
+            cost = _ns_a_ray(FusedCamera(model, **real), found.places) / max(choice.passed, 1e-9)
+            choice = replace(choice, ns=cost)
+        if compiled or target != "c":
+            yield choice
+
+
+def _fitted(found: Probed, budget_px: float, target: Target, folder: Path, explain: bool) -> Iterator[Choice]:
+    """Polynomials fitted for the shot alone, of rising size."""
+    prepared = prepare(make_pairs(found.lens, found.domain, _PAIRS))
+    folder.mkdir(parents=True, exist_ok=True)
+    for terms in _TERMS:
+        settings = ModelSettings("ols", terms=terms, planes=False, elimination=False)
+        file = folder / f"{Path(found.lens.path).stem}.shot-{settings.label}.onnx"
+        export_onnx(fit_model(prepared, settings), file, errors={})
+        yield from _try_model(found, file, budget_px, target, explain, "fitted for this shot")
+
+
+def _judged(
+    found: Probed, name: str, spec: str, camera: Camera, budget_px: float, seen: Footprints | None = None,
+    how: str = "", timed: bool = True,
+) -> Choice:  # fmt: skip
+    """A camera's error against the exact footprints, and its cost."""
+    share = found.places.share
+    seen = prints.footprints(camera, found.places) if seen is None else seen
+    apart = prints.distance_mm(found.seen, seen, share) / found.asked.pixel_mm
+    light = np.abs(seen.light / np.maximum(found.seen.light, 1e-30) - 1)
+    error, dim = (float(np.percentile(np.where(np.isfinite(v), v, np.inf), COUNTED)) for v in (apart, light))
+    cost = _ns_a_ray(camera, found.places) / max(seen.passed, 1e-9) if timed else math.inf
+    return Choice(name, spec, error, dim, cost, seen.passed, error <= budget_px and dim <= _LIGHT, how)
+
+
+def _ns_a_ray(camera: Camera, places: Places) -> float:
+    """Least nanoseconds of some calls, over their rays."""
+    rays = int(getattr(camera, "rays_a_call", RAYS_A_CALL))
+    rng = np.random.default_rng(1)
+    rows = rng.integers(0, places.film_mm.shape[1], rays)
+    film, pupil = places.film_mm[:, rows].astype(np.float32), rng.random((2, rays), np.float32)
+    waves = rng.choice(places.wavelength_nm, rays, p=places.share).astype(np.float32)
+    best = math.inf
+    for _ in range(_ROUNDS):
+        began = time.perf_counter()
+        camera.sample(film, pupil, waves)
+        best = min(best, time.perf_counter() - began)
+    return 1e9 * best / rays

@@ -1,0 +1,142 @@
+"""Footprints against closed forms, the parts of what is put together from known ones, and plans of extreme scenes."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from neurolens.base.errors import InputError
+from neurolens.cameras.build import Shot, make_camera
+from neurolens.cli import main
+from neurolens.evaluate.footprints import Footprints, blur_mm, distance_mm, effects_mm, footprints, places_of
+from neurolens.evaluate.plan import effects_of, plan, probe
+from neurolens.evaluate.scenes import seen_depths_m
+from neurolens.optics.lensfile import read_lens
+from neurolens.render.scene import scene_from_tables
+
+LENS = "lenses/cooke_triplet_50.toml"  # of absorbing glass: nothing is compiled
+NM, SHARE = np.array([450.0, 550.0, 650.0]), np.array([0.2, 0.5, 0.3])
+FILM = np.array([[0.0, 5.0, 12.0, -9.0], [0.0, 3.0, -7.0, 8.0]])
+
+
+def wall(distance_m: float, f_number: float | None = None, **camera: object) -> dict:
+    more = {} if f_number is None else {"f_number": f_number}
+    shot = {"position_m": [0.0, 0.0, 0.0], "look_at_m": [0.0, 0.0, -1.0], "focus_m": 3.0, "width": 640, "height": 360}
+    return {
+        "camera": {**shot, **more, **camera},
+        "environment": {"colour": [1.0, 1.0, 1.0]},
+        "materials": {"grey": {"kind": "diffuse", "reflectance": [0.5, 0.5, 0.5]}},
+        "planes": [{"point_m": [0.0, 0.0, -distance_m], "normal": [0.0, 0.0, 1.0], "material": "grey"}],
+    }
+
+
+@pytest.mark.parametrize("depth_m", [0.7, 2.0, 5.0, math.inf])
+def test_blur_of_a_thin_lens_is_its_circle_of_confusion(depth_m: float) -> None:
+    camera = make_camera("thin", Shot((36.0, 24.0), 2.0, f_number=4.0))
+    places = places_of(camera, FILM, np.full(4, depth_m), NM, SHARE)
+    seen = footprints(camera, places, samples=48)
+    image = 50 / (1 - 50 / (2000 - camera.settings["lens_state"]["pinhole_focal_length_mm"]))
+    # Rays at the pupil's edge weigh less, by cos^4: the mean of r^2 under (1 + r^2 / s^2)^-2 over the disc, by sums.
+    r2 = (np.arange(4000) + 0.5) / 4000 * (50 / 8) ** 2
+    rms = math.sqrt(np.average(r2, weights=(1 + r2 / image**2) ** -2))
+    near = 0.0 if math.isinf(depth_m) else 1 / (1000 * depth_m - image)
+    expected = 2 * rms * image * abs(near - 1 / (2000 - image))
+    assert blur_mm(seen, SHARE)[0] == pytest.approx(expected, rel=2e-3, abs=1e-6)
+
+
+def disc(radius: float, shift: tuple[float, float] = (0.0, 0.0), n: int = 4000) -> Footprints:
+    turn, r = np.arange(n) * 2.399963, np.sqrt((np.arange(n) + 0.5) / n)
+    unit = np.stack([r * np.cos(turn), r * np.sin(turn)])
+    place = radius * unit + np.array(shift)[:, None]
+    row = np.broadcast_to(place[:, None, None], (2, 1, 3, n))
+    return Footprints(row, np.broadcast_to(unit[:, None, None], row.shape), np.ones((1, 3, n)))
+
+
+def test_distance_is_that_of_closed_forms() -> None:
+    one = disc(1.0)
+    assert distance_mm(one, one, SHARE)[0] == 0
+    assert distance_mm(one, disc(1.0, (0.3, -0.4)), SHARE)[0] == pytest.approx(0.5, rel=1e-3)
+    # Of discs the least way is along the radius: R - r times r/R, RMS (R - r) / sqrt 2.
+    assert distance_mm(one, disc(0.4), SHARE)[0] == pytest.approx(0.6 / math.sqrt(2), rel=5e-3)
+    dark = replace(one, weight=np.zeros_like(one.weight))
+    assert np.isnan(distance_mm(one, dark, SHARE)[0])
+
+
+def test_parts_are_what_was_put_in() -> None:
+    thin = disc(0.0)
+    x, y = thin.pupil_mm
+    square, by_wave = x * x + y * y, np.array([[-1.6], [-0.1], [1.2333333]])  # of mean 0 by share
+    extra = {
+        "defocus": None,
+        "spherical aberration": 0.02 * np.stack([x, y]) * (square - 2 / 3),  # balanced: its mean slope is 0
+        "coma": 0.03 * np.stack([3 * x * x + y * y - 1, 2 * x * y]),
+        "astigmatism": 0.05 * np.stack([x, -y]),
+        "field curvature": 0.04 * np.stack([x, y]),
+        "lateral colour": 0.01 * by_wave * np.stack([1 + 0 * x, 0 * x]),
+        "longitudinal colour": 0.02 * np.stack([x, y]) * by_wave,
+    }  # fmt: skip
+    both = replace(thin, place_mm=thin.place_mm + sum(v for v in extra.values() if v is not None) + 0.2)
+    found = effects_mm(both, thin, SHARE)
+    assert found["distortion"][0] == pytest.approx(0.2 * math.sqrt(2), rel=1e-3)
+    for name, value in extra.items():
+        expected = 0.0 if value is None else math.sqrt(float(((value**2).sum(0).mean(-1) * SHARE).sum()))
+        assert found[name][0] == pytest.approx(expected, rel=4e-3, abs=1e-4), name
+    assert found["higher orders"][0] < 1e-4
+
+
+def test_exact_footprints_are_the_spots_of_the_lens() -> None:
+    from neurolens.analysis.fields import Scene
+    from neurolens.analysis.spots import spots
+
+    camera = make_camera(LENS, Shot((36.0, 24.0), math.inf, focus="paraxial"))
+    places = places_of(camera, np.array([[0.0], [0.0]]), np.array([math.inf]), np.array([587.56]), np.ones(1))
+    lens = read_lens(LENS).at()
+    found = blur_mm(footprints(camera, places, samples=48), np.ones(1))[0] / 2
+    assert 1000 * found == pytest.approx(spots(Scene(lens), [0.0], [587.56]).rms_um[0], rel=0.03)
+
+
+def test_depths_are_along_the_axis() -> None:
+    camera = make_camera("pinhole", Shot((36.0, 20.25), 3.0))
+    seen = seen_depths_m(scene_from_tables(wall(4.0)), camera, FILM)
+    assert seen == pytest.approx(4.0, abs=1e-4)
+
+
+def test_what_a_shot_needs_falls_with_its_stop() -> None:
+    lens = read_lens(LENS).at()
+    wide, small = (
+        {e.name: e.worth for e in effects_of(probe(scene_from_tables(wall(4.0, n)), lens, across=6), 0.25)}
+        for n in (None, 16.0)
+    )
+    assert (
+        small["defocus"] < 0.5 * wide["defocus"] and small["spherical aberration"] < 0.1 * wide["spherical aberration"]
+    )
+    assert small["diffraction"] > 3 * wide["diffraction"]
+
+
+@pytest.mark.parametrize(
+    ("budget", "distance", "f_number", "best"),
+    [(0.0, 4.0, None, "exact"), (1e9, 4.0, 45.0, "pinhole + ST map"), (1e9, 0.12, 45.0, "pinhole + ST map")],
+)
+def test_budgets_at_the_extremes(budget: float, distance: float, f_number: float | None, best: str) -> None:
+    found = plan(scene_from_tables(wall(distance, f_number)), read_lens(LENS).at(), budget)
+    assert found.best is not None and found.best.light_error <= 0.01
+    assert found.best.name == best or (budget > 0 and found.best.error_px < math.inf and found.best.name != "exact")
+
+
+def test_a_scene_with_nothing_in_view_is_distant() -> None:
+    tables = wall(4.0)
+    tables["planes"][0]["point_m"] = [0.0, 0.0, 4.0]  # behind the camera
+    asked = probe(scene_from_tables(tables), read_lens(LENS).at(), across=4).asked
+    assert asked.nearest_m is None and asked.distant == 1.0
+
+
+def test_bad_budgets_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(InputError, match="budget_px"):
+        plan(scene_from_tables(wall(4.0)), read_lens(LENS).at(), math.nan)
+    for word in ("-1px", "nan", "1um", "1e99"):
+        with pytest.raises(SystemExit) as ended:
+            main(["plan", "experiments/scenes/room.toml", "--lens", LENS, "--budget", word, "-o", str(tmp_path)])
+        assert ended.value.code == 2 and "pixels" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
