@@ -42,7 +42,13 @@ def test_every_command_has_help(command: list[str], capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.parametrize(
-    ("given", "name"), [("cooke_triplet_50", "cooke_triplet_50.toml"), ("thin", "thin"), ("no_lens", "no_lens")]
+    ("given", "name"),
+    [
+        ("cooke_triplet_50", "cooke_triplet_50.toml"),
+        ("fused:cooke_triplet_50", "cooke_triplet_50.toml"),
+        ("thin", "thin"),
+        ("no_lens", "no_lens"),
+    ],
 )
 def test_a_camera_may_be_a_lens_of_the_project_by_name(given: str, name: str) -> None:
     size = ["--size", "36x24", "--film", "36x24"]
@@ -51,8 +57,17 @@ def test_a_camera_may_be_a_lens_of_the_project_by_name(given: str, name: str) ->
         ["projection", given, *size, "--model", "opencv"],
         ["render", "a.toml", "--camera", given, "--film", "36x24", "-o", "a.exr"],
     ):
-        found = Path(build_parser().parse_args(command).camera)
-        assert found.name == name and found.is_file() == (given != name)
+        kind, _, found = build_parser().parse_args(command).camera.rpartition(":")
+        assert Path(found).name == name and Path(found).is_file() == ("cooke" in given)
+        assert kind == given.rpartition(":")[0]
+
+
+def test_export_takes_lenses_of_the_project_by_name_and_refuses_bad_names_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["export", "cooke_triplet_50", "--to", "c", "-o", str(tmp_path / "a.h")]
+    assert build_parser().parse_args(given).model.name == "cooke_triplet_50.toml"
+    assert "no word of C" in failure(capsys, "export", tmp_path / "missing.toml", *given[2:], "--name", "int")
 
 
 # Bad input
@@ -162,6 +177,13 @@ def test_lens_describes_a_lens(name: str) -> None:
     # In air the real marginal ray meets the sine condition to within the spherical aberration of these lenses.
     assert data["working_f_number"] == pytest.approx(data["f_number"], rel=0.12)
     assert data["focus_m"] == "infinity"
+
+
+def test_lens_tells_once_what_its_reader_warns_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, text = tmp_path / "a.toml", SINGLET.read_text(encoding="utf-8")
+    file.write_text(text.replace("n_d = ", 'glass = "XY-9", n_d = '), encoding="utf-8")
+    told = " ".join(run_json(capsys, "lens", file)["warnings"])
+    assert told.count("glass: glass XY-9 is not in the catalogue") == 1 and str(file) not in told
 
 
 def test_lens_list_is_a_table_of_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

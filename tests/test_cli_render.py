@@ -276,6 +276,9 @@ def test_frames_follow_their_keys_and_what_exists_is_kept(
     assert main([*command, "-o", str(tmp_path / "a.exr")]) == 0
     assert sorted(p.name for p in tmp_path.glob("a.*.exr")) == ["a.0001.exr", "a.0003.exr", "a.0005.exr"]
     assert (tmp_path / "a.0003.exr").read_bytes() == b"kept"
+    again = [word for word in command if word != "--quiet"]
+    assert main([*again, "-o", str(tmp_path / "a.exr")]) == 0
+    assert "3 of 3 frames exist and are kept" in capsys.readouterr().err
     first, last = (read_exr(tmp_path / f"a.000{n}.exr") for n in (1, 5))
     cameras = [found[1]["camera"] for found in (first, last)]
     assert [(c["focus_m"], c["f_number"]) for c in cameras] == [(1.0, pytest.approx(2)), (None, pytest.approx(8))]

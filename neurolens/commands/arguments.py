@@ -255,10 +255,12 @@ def lens_path(name: str | Path, command: str) -> Path:
 
 
 def named_camera(text: str) -> str:
-    """Type of a camera's argument: a word that names a lens of lenses/ in the project stands for its file."""
+    """Type of a camera's argument: a name of lenses/ in the project, also after `fused:` and the like, is its file."""
+    kind, colon, word = text.rpartition(":")
     with suppress(InputError):
-        if not set(text) & set(".:/\\") and (file := project_root() / "lenses" / f"{text}.toml").is_file():
-            return os.path.relpath(file) if file.is_relative_to(Path.cwd()) else str(file)
+        if not set(word) & set("./\\") and (file := project_root() / "lenses" / f"{word}.toml").is_file():
+            found = os.path.relpath(file) if file.is_relative_to(Path.cwd()) else str(file)
+            return f"{kind}{colon}{found}"
     return text
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, check_writable
-from neurolens.commands.arguments import add_json, positive
+from neurolens.commands.arguments import add_json, named_camera, positive
 from neurolens.commands.output import answer
 from neurolens.commands.render import film_size
 
@@ -66,8 +66,8 @@ def add_parser(subparsers: Any) -> None:
         epilog=_EPILOG,
     )  # fmt: skip
     parser.add_argument(
-        "model", metavar="MODEL", type=Path,
-        help="exported model (.onnx), or a run folder with one model; of C, GLSL and OSL, a lens file (.toml), too",
+        "model", metavar="MODEL", type=lambda text: Path(named_camera(text)),
+        help="exported model (.onnx), or a run folder with one model; of C, GLSL, OSL also a lens file or name",
     )  # fmt: skip
     parser.add_argument("--to", choices=("c", "glsl", "osl", "onnx"), required=True, help="form to write")
     parser.add_argument("-o", "--out", metavar="FILE", type=Path, required=True, help="file to write")
@@ -109,6 +109,7 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Load, fix, write."""
     from neurolens.cameras.source import model_extras
+    from neurolens.surrogates.source import checked_name
 
     file = model_file(args.model)
     parts = _parts(args.only)
@@ -117,6 +118,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("neurolens export", "--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")
     if args.to != "onnx" and ((args.derivatives and not args.camera) or args.inverse):
         raise InputError("neurolens export", "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
+    if args.name is not None:
+        checked_name(args.to, "", args.name)
     if args.to == "osl":
         return _write_osl(file, args, bool(given) or set(parts) != set(_PARTS))
     exact = file.suffix == ".toml"

@@ -111,8 +111,8 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.surrogates.domain import domain_of
 
     began = time.perf_counter()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NeurolensWarning)  # repeated by `lens_facts`
+    with warnings.catch_warnings(record=True) as caught:  # part of the answer
+        warnings.simplefilter("always", NeurolensWarning)
         tabled = read_lens(args.file)
     lens = state_of(args, tabled)
     focus, film_z = focus_of(args, tabled, lens), float(lens.film_z_mm or 0.0)
@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
         {"name": c.name, "efl_mm": c.efl_mm, "object_distance_mm": c.object_distance_mm} for c in tabled.configurations
     ]
     facts = lens_facts(lens, domain)
-    facts["warnings"] += file_doubts(tabled)
+    facts["warnings"] += [str(w.message).removeprefix(f"{tabled.path}: ") for w in caught] + file_doubts(tabled)
     data = {
         "file": str(args.file),
         **facts,

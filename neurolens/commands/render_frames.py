@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import math
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import read_rows
 from neurolens.base.tomlfile import reject_unknown
 from neurolens.commands.render_files import Files
@@ -70,17 +71,25 @@ def add_frames(parser: argparse.ArgumentParser, does: str = _RENDERED, names: Se
 def run_frames(args: argparse.Namespace, render: Callable[[argparse.Namespace], int]) -> int:
     """Render the frames that are missing, by `render`, as the keys say; the exit code of the first that fails.
 
+    Warns:
+        NeurolensWarning: frames that exist are kept, by whatever keys they were rendered.
+
     Raises:
         InputError: a key that is none, or of a quantity that the command line sets too.
     """
+    kept = 0
     for frame, number, values in frames_of(args):
         out = args.out.with_name(f"{args.out.stem}.{number}{args.out.suffix}")
         if out.is_file() and not Files.of(out).checkpoint.exists() and not args.restart:
+            kept += 1
             continue
         values |= {"out": out, "seed": args.seed + frame, "frame": frame}
         code = render(argparse.Namespace(**vars(args) | values))
         if code:
             return code
+    if kept:
+        told = f"{kept} of {len(args.frames)} frames exist and are kept, whatever their settings"
+        warnings.warn(f"{told}; --restart renders them again", NeurolensWarning, stacklevel=2)
     return 0
 
 

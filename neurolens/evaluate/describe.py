@@ -15,7 +15,7 @@ from neurolens.analysis.fields import Scene
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.optics.focusing import at_infinity
-from neurolens.optics.glass import glass_of, table_notes
+from neurolens.optics.glass import glass_of
 from neurolens.optics.lenscheck import check_lens, doubts, film_edge_mm, verdict
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
@@ -164,7 +164,7 @@ def rim_doubts(lens: Lens) -> list[str]:
 
 
 def warnings_of(lens: Lens, f_number: float, reached_deg: float | None, far: bool) -> list[str]:
-    """Warnings about a lens in its state, as sentences; see `file_doubts` for its file.
+    """Warnings about a lens in its state, as sentences; see `file_doubts` for its file, and the reader's own warnings.
 
     Args:
         f_number: of the lens focused at infinity, as the source states it.
@@ -172,10 +172,6 @@ def warnings_of(lens: Lens, f_number: float, reached_deg: float | None, far: boo
         far: whether the lens is focused at infinity, where its source states the field.
     """
     found = rim_doubts(lens)
-    unknown = [str(k) for k, s in enumerate(lens.surfaces) if s.n_d != 1 and s.V_d is None]
-    if unknown:
-        found.append(f"V_d is unknown after surface {', '.join(unknown)}: the index there is constant")
-    found += [f"surface {k}: {note}" for k, s in enumerate(lens.surfaces) for note in table_notes(s)]
     if abs(f_number / lens.f_number - 1) > 0.05 and f_number < lens.f_number:
         found.append(f"the stop gives f/{f_number:.3g}, wider than the f/{lens.f_number:.3g} of the source")
     if far and lens.half_field_deg is not None and reached_deg is not None and reached_deg < lens.half_field_deg - 2:

@@ -41,7 +41,7 @@ class Light:
 
     Attributes:
         azimuth_deg: to the right of the axis, seen by the camera; elevation_deg: above it.
-        rgb: linear sRGB irradiance that it makes at the lens across its way: radiance times solid angle in sr.
+        rgb: linear sRGB irradiance that it makes at the front vertex across its way: radiance times solid angle in sr.
         distance_m: from the front vertex; inf allowed.
 
     Raises:
@@ -172,7 +172,8 @@ def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> t
     cos = 1 - solid * (across**2).sum(0)
     sine = np.sqrt(np.maximum(1 - cos**2, 0)) / np.maximum(np.linalg.norm(off, axis=0), 1e-300)
     direction = towards[:, None] * cos + off * sine
-    return np.concatenate([source[:, None] + direction * (far - radius), direction]), 2 * math.pi * solid * far**2
+    area = 2 * math.pi * solid * (1000 * light.distance_m) ** 2  # the irradiance is that at the front vertex
+    return np.concatenate([source[:, None] + direction * (far - radius), direction]), area
 
 
 def disc(first: int, count: int, shift: float = 0.0, jitter: float = 0.0) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import OpenEXR
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, open_regular, read_bytes
@@ -266,7 +266,8 @@ def _opened(file: str | Path, field: str, path: Path, most: int) -> Iterator[Ima
         raise
     except Exception as error:  # decoders of damaged files raise errors of many types
         kinds = ", ".join(FORMATS)
-        raise InputError(file, field, str(path), f"a readable picture, one of {kinds} ({error})") from None
+        why = "" if isinstance(error, UnidentifiedImageError) else f" ({error})"  # its words name an object
+        raise InputError(file, field, str(path), f"a readable picture, one of {kinds}{why}") from None
 
 
 def read_pictures(scene: Path, files: Mapping[str, Path]) -> dict[str, FloatArray]:

@@ -277,20 +277,23 @@ def test_coatings_of_the_file_stay() -> None:
     assert after.surfaces[2].coating is None
 
 
-@pytest.mark.parametrize("distance_m", [math.inf, 3.0, 0.08])
-def test_lights_send_what_the_front_receives(distance_m: float) -> None:
-    """Light through the front rim's disc: that of a point source, by quadrature over the disc."""
+@pytest.mark.parametrize(("distance_m", "depth"), [(math.inf, 0.0), (3.0, 0.0), (0.08, 0.0), (0.08, 4.0)])
+def test_lights_send_what_the_front_receives(distance_m: float, depth: float) -> None:
+    """Light through the front rim's disc, so far behind the vertex: that of a point source, by quadrature over the
+    disc, which makes the irradiance given at the vertex."""
     lens = plate()
+    dome = replace(lens.surfaces[0], radius_mm=(100 + depth**2) / (2 * depth) if depth else math.inf)
+    lens = replace(lens, surfaces=(dome, *lens.surfaces[1:]))
     light = Light(20.0, 10.0, distance_m=distance_m)
     rays, area = light_rays(lens, light, 0, 200_000)
-    way = -rays[2] / rays[5]
+    way = (depth - rays[2]) / rays[5]
     at = rays[:2] + way * rays[3:5]
     inside = np.hypot(*at) <= 10.0
     cos = -light.towards[2]
     expected = math.pi * 100 * cos
     if math.isfinite(distance_m):
         r, angle = np.meshgrid(10 * np.sqrt((np.arange(400) + 0.5) / 400), np.arange(64) * math.pi / 32)
-        disc = np.stack([r * np.cos(angle), r * np.sin(angle), 0 * r], -1)
+        disc = np.stack([r * np.cos(angle), r * np.sin(angle), 0 * r + depth], -1)
         to = 1000 * distance_m * light.towards - disc
         far = np.linalg.norm(to, axis=-1)
         expected = math.pi * 100 * np.mean(-to[..., 2] / far**3) * (1000 * distance_m) ** 2
