@@ -29,12 +29,17 @@ _POWERS = [(i, j, 0, 0) for i in range(RADIUS + 1) for j in range(3)]
 _POWERS += [(i, j, 1, 0) for i in range(3) for j in range(2)]  # few: renderers may learn the focus late
 _POWERS += [(i, j, 0, 1) for i in range(4) for j in range(2)]  # the stop's image moves with the wavelength
 _HALVINGS, _WIDER = 14, 1.15  # that place the end of the light; boxes of a stop over the last one's pupil
-_ROUNDS, _PUSH, _LOOSE = 40, 300.0, 1e-4  # of asymmetric least squares: weight of what lies outside, and of slack
+_ROUNDS, _LOOSE = 40, 1e-4  # of asymmetric least squares: weight of slack
 _MARGIN = 0.001  # of half the pupil
 _RIDGE = 1e-10
 _AZIMUTHS = 4  # of a quadrant, of anamorphic lenses
 _ENOUGH = 0.97  # of points, at the widest stop, that pass
 _FEWEST = 12  # vertices that rims of a side block
+# Ways to fit, the next where too little passes: weight of what lies outside, and fits again to random rays that are
+# missed. Arcs that are moved as a whole until they hold those are wide everywhere for the sake of one place.
+_WAYS, _PLENTY = ((300.0, 0), (3000.0, 3)), 0.96
+_REFIT_SEED, _CHECK_SEED, _NO_SIDE = 10, 20, 2  # such rays lie on no arc
+_LOST = 1e-3  # of rays that pass, that a way may miss
 _HELD = 0.9998  # of random rays that pass
 _RISE, _STEP, _STEPS = 1.03, 0.004, 12  # of arcs that do not hold them: in y^2, and of half the pupil along x
 _ASKED = 20_000
@@ -112,7 +117,7 @@ class _Places:
 class _Edge:
     """Vertices [N] of outlines: place in the frame of the film point, radius, stop and film position scaled to 1.
 
-    `side`: 0 where the stop blocks, 1 and -1 rims on the film point's side and on the other.
+    `side`: 0 where the stop blocks, 1 and -1 rims on the film point's side and on the other; of rays within, none.
     `first`, `last`: the ends of every outline.
     """
 
@@ -144,15 +149,38 @@ def fit_arcs(sights: Sequence[Sight], report: Report, between: Sequence[tuple[Ar
         raise InputError("export", "stop", "(blocks nothing)", "a lens whose stop blocks light")
     sides = tuple(side for side, vertices in blocked.items() if vertices >= _FEWEST)
     seen = [*zip(np.eye(len(nodes)), sights, strict=True), *between]
+    ways = _WAYS[:1] if len(nodes) > 1 else _WAYS  # refitted by themselves, nodes hold less of what lies between them
+    kept, best, lost = nodes, -1.0, 1.0
+    for part, (push, refits) in enumerate(ways):
+        own = _fitted(sights, nodes, edges, sides, push, refits)
+        own = _widened(own, seen, partial(_within, report, 0.6 + 0.2 * part, 0.2))
+        least = min(min(passing(sight, a).values()) for sight, a in zip(sights, own, strict=True))
+        beyond = max(_beyond(sight, a, _CHECK_SEED)[-1].mean() for sight, a in zip(sights, own, strict=True))
+        if least > best and beyond <= max(lost, _LOST):
+            kept, best, lost = own, least, beyond
+        if best >= _PLENTY:
+            break
+    return kept
+
+
+def _fitted(
+    sights: Sequence[Sight], nodes: list[PupilArcs], edges: Sequence[_Edge], sides: tuple[int, ...], push: float,
+    refits: int,
+) -> list[PupilArcs]:  # fmt: skip
+    """Arcs with numbers, see `_WAYS`."""
     for coloured in (False, True):
-        nodes = [
-            replace(a, sides=sides, numbers=_arcs(a, edge, sides, coloured))
-            for a, edge in zip(nodes, edges, strict=True)
-        ]
+        held = edges
+        for seed in range(refits + 1):
+            if seed:
+                held = [_with_missed(*of_one, seed) for of_one in zip(sights, nodes, held, strict=True)]
+            nodes = [
+                replace(a, sides=sides, numbers=_arcs(a, edge, sides, coloured, push))
+                for a, edge in zip(nodes, held, strict=True)
+            ]
         # Rims that move with the wavelength, as those of fisheyes do, cost time in a shader: only where it pays.
         if min(passing(sight, a)[1.0] for sight, a in zip(sights, nodes, strict=True)) >= _ENOUGH:
             break
-    return _widened(nodes, seen, partial(_within, report, 0.6, 0.4))
+    return nodes
 
 
 def _empty(sights: Sequence[Sight], radii: Sequence[float]) -> list[PupilArcs]:
@@ -226,14 +254,31 @@ def _edge(sight: Sight, arcs: PupilArcs, p: _Places) -> _Edge:
     return _Edge(x[lit], y[lit], scaled[:, lit], side[lit], first[lit], last[lit])
 
 
-def _arcs(arcs: PupilArcs, edge: _Edge, sides: Sequence[int], coloured: bool) -> Array:
+def _with_missed(sight: Sight, arcs: PupilArcs, edge: _Edge, seed: int) -> _Edge:
+    """With random rays that pass beyond the arcs as vertices that they must hold."""
+    rays, stop, left, right, out = _beyond(sight, arcs, _REFIT_SEED + seed)
+    scaled = arcs.scaled(rays["film_mm"][0], stop, rays["film_z_mm"][0], rays["wavelength_nm"][0])
+    missed = *rays["pupil_mm"], scaled, np.full(out.size, _NO_SIDE), right, left
+    own = edge.x, edge.y, edge.scaled, edge.side, edge.first, edge.last
+    return _Edge(*(np.concatenate([a, b[..., out]], -1) for a, b in zip(own, missed, strict=True)))
+
+
+def _beyond(sight: Sight, arcs: PupilArcs, seed: int) -> tuple[dict[str, Array], Array, Truths, Truths, Truths]:
+    """Rays and stops of `_random`, and which of them lie beyond a low end, a high end, any arc."""
+    rays, stop = _random(sight, arcs, seed)
+    found = evaluate(arcs.checked, rays)
+    left, right = ((found[name] < 0).any(0) for name in ("left", "right"))
+    return rays, stop, left, right, left | right | (found["height"] < rays["pupil_mm"][1] ** 2).any(0)
+
+
+def _arcs(arcs: PupilArcs, edge: _Edge, sides: Sequence[int], coloured: bool, push: float) -> Array:
     """[A, 4, M]: the numbers of arcs of these sides; `coloured`: whether rims move with the wavelength."""
     monomials = np.prod(edge.scaled[:, None] ** arcs.exponents.T[:, :, None], axis=0)  # [M, N]
     still = arcs.exponents[:, [1] if coloured else [1, 3]].sum(1) == 0  # rims do not move with the stop
-    return np.stack([_arc(arcs, edge, monomials * still[:, None] if side else monomials, side) for side in sides])
+    return np.stack([_arc(arcs, edge, monomials * still[:, None] if side else monomials, side, push) for side in sides])
 
 
-def _arc(arcs: PupilArcs, edge: _Edge, monomials: Array, side: int) -> Array:
+def _arc(arcs: PupilArcs, edge: _Edge, monomials: Array, side: int, push: float) -> Array:
     """[4, M]: the numbers of an arc."""
     own = edge.side == side
     size = np.maximum(edge.scaled[1], 0.05)
@@ -242,15 +287,15 @@ def _arc(arcs: PupilArcs, edge: _Edge, monomials: Array, side: int) -> Array:
     margin = _MARGIN * float(np.ptp(edge.x)) / 2 * _unit(arcs, side == 0)
     both = np.ones_like(edge.x)
     if side <= 0:
-        numbers[0] = -_above(monomials[:, low], -edge.x[low], own[low], size[low]) - margin
+        numbers[0] = -_above(monomials[:, low], -edge.x[low], own[low], size[low], push) - margin
         both *= (away := np.maximum(edge.x - numbers[0] @ monomials, 1e-6))
     if side >= 0:
-        numbers[1] = _above(monomials[:, high], edge.x[high], own[high], size[high]) + margin
+        numbers[1] = _above(monomials[:, high], edge.x[high], own[high], size[high], push) + margin
         both *= (right := np.maximum(numbers[1] @ monomials - edge.x, 1e-6))
         away = right if side else away
     white = monomials * (arcs.exponents[:, 3] == 0)[:, None]
     rows = np.concatenate([white * both, white * both * away])
-    factors = _above(rows, edge.y**2, own, size**2)
+    factors = _above(rows, edge.y**2, own, size**2, push)
     numbers[2:] = factors.reshape(2, -1)
     return numbers
 
@@ -264,7 +309,7 @@ def _unit(arcs: PupilArcs, of_stop: bool) -> Array:
     return np.all(arcs.exponents == (0, int(of_stop), 0, 0), axis=1).astype(np.float64)
 
 
-def _above(rows: Array, wanted: Array, own: Truths, size: Array) -> Array:
+def _above(rows: Array, wanted: Array, own: Truths, size: Array, push: float) -> Array:
     """Weights [M] of rows [M, N] whose sum comes near `wanted` where `own`, and lies above it elsewhere."""
     used = rows.any(1)
     a, b = (rows[used] / size).T, wanted / size
@@ -276,7 +321,7 @@ def _above(rows: Array, wanted: Array, own: Truths, size: Array) -> Array:
         heavy = a * weight[:, None]
         found = np.linalg.solve(heavy.T @ a + _RIDGE * len(a) * np.eye(a.shape[1]), heavy.T @ b)
         over = a @ found - b
-        weight = np.where(over < 0, _PUSH, np.where(own, 1.0, _LOOSE))
+        weight = np.where(over < 0, push, np.where(own, 1.0, _LOOSE))
     out = np.zeros(len(rows))
     out[used] = found / scale
     return out

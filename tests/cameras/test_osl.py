@@ -173,6 +173,20 @@ def test_at_least_95_percent_of_rays_pass() -> None:
     assert min(lens().passing().values()) >= 0.95
 
 
+def test_arcs_that_let_little_pass_are_fitted_again_and_lose_no_light() -> None:
+    file = ROOT / "models" / "ogawa_zoom_70_200-135mm.ols-60.onnx"
+    made = osl.model_lens(load_model(file), None, lambda share: None)
+    assert min(made.passing().values()) > 0.97
+    again, rng = osl.osl_graph(made.nodes[0]), np.random.default_rng(11)
+    camera = OnnxCamera(load_model(file), film_mm=FILM, focus_m=math.inf)
+    for point in ((0.0, 0.0), (-16.0, 9.0)):
+        square, film = rng.random((2, 30_000)).astype(np.float32), np.repeat(np.array(point)[:, None], 30_000, 1)
+        nm = rng.uniform(400, 700, 30_000).astype(np.float32)
+        wanted = camera.sample(film.astype(np.float32), square, nm).weight.mean(dtype=np.float64)
+        found = evaluate(again, inputs(film, square, f_number=1.0, asked_m=FAR))["throughput"].mean()
+        assert found == pytest.approx(wanted, rel=0.008)
+
+
 def test_from_the_entrance_pupil_chief_rays_start_at_the_camera() -> None:
     found = shot((4.0, 0.0), f_number=100.0, at_pupil=1, in_colour=0)
     passed = found["throughput"][0] > 0
