@@ -128,7 +128,7 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
         zoom: as `shader_of`.
 
     Raises:
-        InputError: coatings or glass that absorbs; a range of no zoom.
+        InputError: coatings or glass that absorbs; a range of no zoom, or of one whose groups move to focus.
     """
     from neurolens.cameras.exact import check_bare
     from neurolens.cameras.osl import osl_lens, states_between
@@ -141,6 +141,8 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
 
     lens, state = read_lens(file), None if zoom == RANGE else zoom
     ranged, internal = zoom == RANGE, bool(focus_states(lens))
+    if ranged and internal:  # before minutes of work
+        raise InputError(lens.path, "zoom", RANGE, "one focal length of the zoom: its groups move to focus, too")
     check_bare(lens.at(zoom=state), "a model of the lens has them")
     told = [f"{lens.name}: every surface traced (bare), {lens.source} (sha256 {str(lens.sha256)[:16]})."]
     if not (ranged or internal):

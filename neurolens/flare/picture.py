@@ -210,6 +210,7 @@ def ghost_picture(
     """
     lens, spectral = tracer.lens, SpectralRange(*wavelength_nm, bins=wavelengths)
     layer = dict(zip(tracer.pairs, [0] * len(tracer.pairs) if layers is None else layers, strict=True))
+    picture = np.zeros((1 + max(layer.values(), default=0), raster.height, raster.width, 3), np.float32)
     middle = 0.5 * (spectral.low_nm + spectral.high_nm)
     exposure = axis_irradiance(lens, middle)
     half = raster.film_mm[0] / 2, raster.height / raster.per_mm / 2
@@ -219,10 +220,9 @@ def ghost_picture(
     tasks = [
         (light, {pair: grid for pair, grid in of_light.items() if layer[pair] == number}, number, first)
         for light, of_light in zip(lights, grids, strict=True)
-        for number in range(max(layer.values(), default=0) + 1)
+        for number in range(len(picture))
         for first in range(0, wavelengths, at_once)
     ]
-
     work = _Work(sum(len(some) for _, some, _, _ in tasks), done)
 
     def one(task: tuple[Light, dict[Way, Grid], int, int]) -> list[Canvas]:
@@ -239,7 +239,6 @@ def ghost_picture(
                 canvas.add(found, grid.columns, area * grid.cell, raster.per_mm)
         return canvases
 
-    picture = np.zeros((1 + max(layer.values(), default=0), raster.height, raster.width, 3), np.float32)
     for (light, _, number, first), canvases in work.results(one, tasks, threads):
         for k, canvas in enumerate(canvases, first):
             colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / wavelengths

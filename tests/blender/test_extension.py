@@ -34,6 +34,7 @@ shader camera(
   throughput = color(f_number / 10.0, focus / 10.0, blades / 10.0);
 }
 """
+ZOOM = SHADER.replace("  int blades", "  float zoom_mm = 80.0 [[ float min = 80.0, float max = 200.0 ]],\n  int blades")
 BROKEN = "shader camera(output point position = 0.0) { nonsense; }"
 MODULE = "bl_ext.user_default.neurolens"
 
@@ -68,7 +69,7 @@ def png() -> bytes:
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The zip, installed as from disk and enabled."""
     out = tmp_path_factory.mktemp("pack") / "neurolens.zip"
-    write_pack(out, [packed(picture=png()), phone(), packed("broken", BROKEN)])
+    write_pack(out, [packed(picture=png()), phone(), packed("broken", BROKEN), packed("zoom", ZOOM)])
     bpy.ops.extensions.package_install_files(filepath=str(out), repo="user_default", enable_on_install=True)
     yield out
     bpy.ops.preferences.addon_disable(module=MODULE)
@@ -128,6 +129,7 @@ def test_zip_is_one_that_blender_accepts_and_shows(installed: Path) -> None:
         ("phone", "Phone lens (5.9 mm f/2.4)"),
         ("broken", "Lens broken (49.6 mm f/1.8, 1955)"),
         ("gauss", "Lens gauss (49.6 mm f/1.8, 1955)"),
+        ("zoom", "Lens zoom (49.6 mm f/1.8, 1955)"),
     ]
     pictures = module.LIBRARY.pictures  # without a screen they have no numbers to draw by
     assert pictures.keys() == {"gauss"} and tuple(pictures["gauss"].image_size) == (8, 8)
@@ -241,10 +243,55 @@ def said(**given: Any) -> str:
     return str(failed.value).removeprefix("Error: ").strip()
 
 
+def test_focal_length_of_the_viewport_follows_the_zoom(scene: Any, tmp_path: Path) -> None:
+    camera, before = scene.camera.data, everything(scene)
+    bpy.ops.neurolens.apply(lens="zoom", kind="polynomial")
+    for zoom_mm in (85.0, 150.0):
+        camera.cycles_custom["zoom_mm"] = zoom_mm
+        camera.update_tag()
+        bpy.context.view_layer.update()
+        assert camera.lens == pytest.approx(zoom_mm)
+    for frame, zoom_mm in ((1, 80.0), (3, 200.0)):
+        camera.cycles_custom["zoom_mm"] = zoom_mm
+        camera.keyframe_insert('cycles_custom["zoom_mm"]', frame=frame)
+    scene.frame_set(2)
+    assert camera.lens == pytest.approx(140.0, abs=0.1)
+    assert bpy.ops.neurolens.apply(lens="gauss", kind="polynomial") == {"FINISHED"}
+    assert not camera.animation_data.drivers
+    bpy.ops.neurolens.take_back()
+    camera.animation_data_clear()
+    scene.frame_set(1)
+    assert everything(scene) == before
+    bpy.ops.neurolens.apply(lens="zoom", kind="polynomial")
+    bpy.ops.neurolens.take_back()
+    assert not camera.animation_data.drivers and everything(scene) == before
+
+
+def test_a_focal_length_with_a_driver_of_its_own_keeps_it(scene: Any) -> None:
+    camera = scene.camera.data
+    camera.driver_add("lens").driver.expression = "35"
+    bpy.ops.neurolens.apply(lens="zoom", kind="polynomial")
+    bpy.ops.neurolens.take_back()
+    assert [d.driver.expression for d in camera.animation_data.drivers] == ["35"]
+
+
+def test_a_render_that_will_be_black_says_so(scene: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    bpy.ops.neurolens.apply(lens="gauss", kind="polynomial")
+    middle(scene, tmp_path)
+    assert "neurolens" not in capfd.readouterr().err
+    scene.camera.data.dof.focus_distance = 0.3
+    middle(scene, tmp_path)
+    [line] = [text for text in capfd.readouterr().err.splitlines() if "neurolens" in text]
+    assert line.startswith("neurolens: camera 'Camera', frame 1: The focus distance is 0.3 m away, nearer than")
+    bpy.ops.neurolens.take_back()
+    middle(scene, tmp_path)
+    assert "neurolens" not in capfd.readouterr().err
+
+
 def test_what_cannot_be_is_one_sentence_and_changes_nothing(scene: Any) -> None:
     gauss = {"lens": "gauss", "kind": "polynomial"}
     camera, before = scene.camera, everything(scene)
-    assert "There is no lens 'other'; lenses: phone, broken, gauss" in said(lens="other")
+    assert "There is no lens 'other'; lenses: phone, broken, gauss, zoom" in said(lens="other")
     assert "larger than the lens's picture of 7.2 mm" in said(lens="phone")
     assert "does not compile" in said(lens="broken", kind="polynomial")
     assert "has no network form here: polynomial, exact" in said(lens="gauss", kind="network")

@@ -160,6 +160,15 @@ def test_groups_of_a_lens_file_move_where_the_camera_is_focused(coarse: None) ->
     assert not near["throughput_0"].any()
 
 
+def test_range_of_a_zoom_whose_groups_focus_is_refused_in_one_line(tmp_path, capsys) -> None:
+    out = tmp_path / "zoom.osl"
+    file = ROOT / "lenses" / "nikon_zoom_70_200.toml"
+    assert main(["export", str(file), "--to", "osl", "-o", str(out), "--zoom", "range"]) == 2
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "nikon_zoom_70_200.toml" in told and "one focal length of the zoom: its groups move to focus" in told
+    assert not out.exists()
+
+
 def test_at_least_95_percent_of_rays_pass() -> None:
     assert min(lens().passing().values()) >= 0.95
 
@@ -328,7 +337,8 @@ def test_the_text_is_osl() -> None:
 
 
 def test_command_line_writes_a_shader_and_refuses_what_is_its_input(tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(osl, "model_lens", lambda *given, fixed: lens())
+    made = lens()
+    monkeypatch.setattr(osl, "model_lens", lambda *given, fixed: made)
     out = tmp_path / "lens.osl"
     assert main(["export", str(MODEL), "--to", "osl", "-o", str(out), "--name", "gauss", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from .panel import CLASSES, LIBRARY, CameraSettings
+from .panel import CLASSES, LIBRARY, CameraSettings, warn_of_black
 
 
 def register() -> None:
@@ -14,10 +14,12 @@ def register() -> None:
     bpy.types.Camera.neurolens = bpy.props.PointerProperty(type=CameraSettings)
     bpy.types.Scene.neurolens_before = bpy.props.StringProperty(options={"HIDDEN"})
     LIBRARY.load()
+    bpy.app.handlers.render_pre.append(warn_of_black)
 
 
 def unregister() -> None:
     """Take them away; cameras keep their lenses, and render."""
+    bpy.app.handlers.render_pre.remove(warn_of_black)
     LIBRARY.close()
     del bpy.types.Scene.neurolens_before
     del bpy.types.Camera.neurolens

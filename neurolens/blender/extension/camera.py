@@ -19,6 +19,7 @@ _CAMERA = (
     "sensor_fit", "sensor_width", "sensor_height", "lens",
 )  # fmt: skip
 _TEXT = "neurolens "  # the names of our shaders in a file start so
+_ZOOM = 'cycles_custom["zoom_mm"]'
 
 
 def camera_of(context: Any) -> Any:
@@ -160,6 +161,7 @@ def _set(scene: Any, camera: Any, lens: LensFacts, variant: Variant, source: str
     custom = camera.cycles_custom
     if first and opened is not None and "f_number" in custom:
         custom["f_number"] = max(float(opened), variant.f_number)
+    _follow_zoom(camera)
 
 
 def _text(name: str, source: str) -> Any:
@@ -194,6 +196,26 @@ def _is_animated(camera: Any, path: str) -> bool:
     return driven or (data.action is not None)
 
 
+def _zoom_driver(camera: Any) -> Any:
+    """Our driver of the focal length, or None."""
+    for driver in camera.animation_data.drivers if camera.animation_data is not None else ():
+        if driver.data_path == "lens" and any(t.data_path == _ZOOM for v in driver.driver.variables for t in v.targets):
+            return driver
+    return None
+
+
+def _follow_zoom(camera: Any) -> None:
+    """Let the focal length, which frames the viewport, be that of a lens's zoom; one that is animated stays its own."""
+    ours, zooms = _zoom_driver(camera), "zoom_mm" in camera.cycles_custom
+    if ours is not None and not zooms:
+        camera.driver_remove("lens")
+    elif zooms and ours is None and not _is_animated(camera, "lens"):
+        driver = camera.driver_add("lens").driver
+        driver.type = "SUM"  # no script: those may be forbidden
+        target = driver.variables.new().targets[0]
+        target.id_type, target.id, target.data_path = "CAMERA", camera, _ZOOM
+
+
 def _remembered(scene: Any, camera: Any) -> dict[str, Any]:
     """What `apply` changes, as it is, JSON-able."""
     kept = {name: getattr(camera, name) for name in _CAMERA}
@@ -218,6 +240,8 @@ def take_back(scene: Any, found: Any) -> None:
     camera = found.data
     if not camera.neurolens.before:
         raise LensError(f"The camera {found.name!r} carries no lens of neurolens")
+    if _zoom_driver(camera) is not None:
+        camera.driver_remove("lens")
     memory: dict[str, Any] = {"camera": json.loads(camera.neurolens.before)}
     others = (o.data for o in scene.objects if o.type == "CAMERA" and o.data != camera)
     if scene.neurolens_before and not any(applied(other) for other in others):

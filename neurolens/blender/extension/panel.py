@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -252,6 +253,19 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
         column.prop(camera, "sensor_width")
         for name in names:
             column.prop(custom, f'["{name}"]', text=_LABELS.get(name, name.capitalize()))
+
+
+@bpy.app.handlers.persistent
+def warn_of_black(scene: Any, _graph: Any = None) -> None:
+    """Before a frame is rendered: a line to the console where the lens cannot take the picture."""
+    found = scene.camera
+    if found is None or found.type != "CAMERA" or not on_camera.applied(found.data):
+        return
+    lens_id, _, kind = found.data.neurolens.on.partition("/")
+    lens = LIBRARY.lenses.get(lens_id)
+    if lens is not None and kind in lens.variants:
+        for line in refusals(lens.variants[kind], on_camera.setting_of(scene, found)):
+            print(f"neurolens: camera {found.name!r}, frame {scene.frame_current}: {line}", file=sys.stderr)
 
 
 def _wrapped(layout: Any, text: str, icon: str, width: int = 60) -> None:
