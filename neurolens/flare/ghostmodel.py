@@ -186,7 +186,7 @@ class GhostModel:
         driver = Template(_DRIVER).substitute(
             TERMS=", ".join(f"run_terms_{n}" for n in monomials.values()),
             LIGHTS=", ".join(f"run_lit_{n}" for n in lights.values()),
-            MOST=max(len(key) for key in monomials),
+            MOST=max(4, *map(len, monomials)),  # a ray's four results have their places there, too
             ROWS=2 + max(2 * len(stops) + 3 for stops in lights),
         )
         run = load_compiled(f"#include <stddef.h>\n{text}{driver}").ghosts
