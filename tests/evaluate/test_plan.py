@@ -11,7 +11,8 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cli import main
 from neurolens.evaluate.footprints import Footprints, blur_mm, distance_mm, effects_mm, footprints, places_of
-from neurolens.evaluate.plan import effects_of, plan, probe
+from neurolens.evaluate.plan import plan
+from neurolens.evaluate.probe import effects_of, probe
 from neurolens.evaluate.scenes import seen_depths_m
 from neurolens.optics.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables
