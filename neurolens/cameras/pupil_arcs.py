@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens.cameras.blades import Blades
+from neurolens.cameras.stop_image import StopImage
 from neurolens.graph.ir import Graph, Value
 
 Array = NDArray[np.float64]
@@ -40,9 +41,11 @@ class PupilArcs:
         unit_mm, stop_radius_mm, wave: film radius, stop, middle and half range of (1000 / wavelength)^2 that `numbers`
             are scaled to; the same in all states of a lens.
         numbers: [A, 4, M]: of the stop's image, then of rims, the low end, the high end and two factors, as polynomials
-            of the monomials `exponents` [M, 4] in film radius, stop, film position and wavelength, scaled to 1.
+            of the monomials `exponents` [M, 5] in film radius, stop, film position and wavelength, scaled to 1, and the
+            cosine of twice the azimuth of the film point.
         sides: [A] of an arc: 1 of a rim that ends the light on the film point's side, -1 on the other, 0 on both; the
             row of an end that it has not is 0.
+        image: of the stop, which the arcs stand in, in place of the pupil; None: in the pupil.
     """
 
     film_radius_mm: float
@@ -53,13 +56,19 @@ class PupilArcs:
     numbers: Array
     exponents: NDArray[np.int64]
     sides: tuple[int, ...]
+    image: StopImage | None = None
 
-    def scaled(self, radius: Array, stop: ArrayLike, film_z: ArrayLike, nanometres: Array) -> Array:
-        """[4, ...]: film radius, stop, film position and wavelength as the polynomials take them."""
+    def scaled(self, radius: Array, stop: ArrayLike, film_z: ArrayLike, nanometres: Array, azimuth: ArrayLike) -> Array:
+        """[5, ...]: film radius, stop, film position, wavelength and azimuth as the polynomials take them."""
         (middle, half), (mean, reach) = self.film_z_mm, self.wave
         call = np.divide(stop, self.stop_radius_mm), np.subtract(film_z, middle) / half
-        parts = radius / self.unit_mm, *call, ((1000 / nanometres) ** 2 - mean) / reach
+        parts = radius / self.unit_mm, *call, ((1000 / nanometres) ** 2 - mean) / reach, np.cos(np.multiply(azimuth, 2))
         return np.stack(np.broadcast_arrays(*parts))
+
+    @property
+    def turns(self) -> bool:
+        """Whether the arcs depend on the azimuth of the film point."""
+        return bool(self.exponents[:, 4].any())
 
     @cached_property
     def graph(self) -> Graph:
@@ -83,11 +92,11 @@ class PupilArcs:
         g = Graph()
         film, square = g.input("film_mm", 2), g.input("square", 2)
         radius = g.square(film).sqrt()
-        arcs = self._arcs(g, radius * (1 / self.unit_mm))
+        turn = (film + [_HAIR, 0.0]) * (1.0 / (radius + _HAIR))
+        arcs = self._arcs(g, radius * (1 / self.unit_mm), turn[0] * turn[0] - turn[1] * turn[1])
         disc = unit_disc(square)
         low, high = _ends(arcs)
         half, middle = (high - low) * 0.5, (low + high) * 0.5
-        turn = (film + [_HAIR, 0.0]) * (1.0 / (radius + _HAIR))
         across = g.affine([[0.0, -1.0], [1.0, 0.0]], turn)
 
         # Written from the ends, so that rounding leaves no side negative.
@@ -120,47 +129,62 @@ class PupilArcs:
         here = stretch(disc[0] + 1.0, 1.0 - disc[0])
         x, y = middle + half * disc[0], disc[1] * here
         inside = radius <= self.film_radius_mm
-        g.outputs["pupil_mm"] = turn * x + across * y
+        point, unit = turn * x + across * y, g.constant(math.pi)
+        if self.image is not None:
+            point, wide = self.image.placed(film, g.input("film_z_mm", per_call=True), point)
+            unit = wide * math.pi
+        g.outputs["pupil_mm"] = point
         g.outputs["at_stop"] = at_stop(x, y)
-        g.outputs["area_mm2"] = g.select(inside, half * here * (share * share * math.pi), 0.0)
+        g.outputs["area_mm2"] = g.select(inside, half * here * (share * share * unit), 0.0)
         one = g.constant(1.0)
         nodes = [stretch(one * (1 + x), one * (1 - x)) * w for x, w in _NODES]
-        g.outputs["mean_area_mm2"] = half * (nodes[0] + nodes[1] + nodes[2]) * math.pi
+        g.outputs["mean_area_mm2"] = half * (nodes[0] + nodes[1] + nodes[2]) * unit
         return g
 
-    def _arcs(self, g: Graph, radius: Value) -> list[Arc]:
-        """The arcs of a film radius, by Horner's rule with coefficients of the call."""
+    def _arcs(self, g: Graph, radius: Value, twice: Value) -> list[Arc]:
+        """The arcs of a film radius and the cosine of twice its azimuth, by Horner's rule with coefficients of the
+        call."""
         stop, film_z = g.input("stop_radius_mm", per_call=True), g.input("film_z_mm", per_call=True)
         (middle, half), (mean, reach) = self.film_z_mm, self.wave
         call = g.concat(stop * (1 / self.stop_radius_mm), (film_z - middle) * (1 / half))
         inverse = 1000.0 / g.input("wavelength_nm")
+        wave = inverse * inverse * (1 / reach) - mean / reach
+        factors = {(0, 0): None, (1, 0): wave, (0, 1): twice, (0, 2): twice * twice}
         arcs = []
         for side, numbers in zip(self.sides, self.numbers, strict=True):
-            rows = self._horner(g, numbers, 0, radius, call)
-            if numbers[:, self.exponents[:, 3] == 1].any():
-                rows = rows + self._horner(g, numbers, 1, radius, call) * (
-                    inverse * inverse * (1 / reach) - mean / reach
-                )
+            rows: Value | None = None
+            for powers, factor in factors.items():
+                own = (self.exponents[:, 3:] == powers).all(1)
+                if numbers[:, own].any():
+                    part = self._horner(g, numbers, own, radius, call)
+                    part = part if factor is None else part * factor
+                    rows = part if rows is None else rows + part
+            assert rows is not None
             low, high, first, change = g.split(rows, (1, 1, 1, 1))
             arcs.append(Arc(None if side > 0 else low, None if side < 0 else high, first, change))
         return arcs
 
-    def _horner(self, g: Graph, numbers: Array, wave: int, radius: Value, call: Value) -> Value:
-        """Rows of the terms of one power of the wavelength's variable."""
+    def _horner(self, g: Graph, numbers: Array, own: NDArray[np.bool_], radius: Value, call: Value) -> Value:
+        """Rows of the terms `own`."""
         rows: Value | None = None
-        own = self.exponents[:, 3] == wave
         for power in range(self.exponents[own, 0].max(), -1, -1):
             here = own & (self.exponents[:, 0] == power)
-            term = self._of_call(g, self.exponents[here, 1:3], numbers[:, here], call)
-            rows = term if rows is None else rows * radius + term
+            rows = rows if rows is None else rows * radius
+            if here.any():
+                term = self._of_call(g, self.exponents[here, 1:3], numbers[:, here], call)
+                rows = term if rows is None else rows + term
         assert rows is not None
         return rows
 
     def _of_call(self, g: Graph, exponents: NDArray[np.int64], numbers: Array, call: Value) -> Value:
-        """Rows of polynomials in the stop and, to first order, film position: the stop is known before the focus is."""
-        moves = exponents[:, 1] == 1
-        still, moved = (g.polynomial(exponents[part, :1], numbers[:, part], call[0]) for part in (~moves, moves))
-        return still + moved * call[1] if moves.any() else still
+        """Rows of polynomials in the stop and film position: the stop is known before the focus is."""
+        rows: Value | None = None
+        for power in range(exponents[:, 1].max(), -1, -1):
+            part = exponents[:, 1] == power
+            term = g.polynomial(exponents[part, :1], numbers[:, part], call[0])
+            rows = term if rows is None else rows * call[1] + term
+        assert rows is not None
+        return rows
 
     def mixed(self, others: Sequence[PupilArcs], weights: Array) -> PupilArcs:
         """These arcs and others of the same lens, with these weights: those of a state between them."""
@@ -175,10 +199,11 @@ class PupilArcs:
 
     @cached_property
     def checked(self) -> Graph:
-        """Whether rays lie inside: inputs `film_mm`, `pupil_mm` [2] of film points on +x; outputs by arc."""
+        """Whether rays lie inside: inputs `film_mm`, `pupil_mm` [2] of film points on +x, from the azimuth whose double
+        has the cosine `twice`, turned; outputs by arc. Points are those of the image, where there is one."""
         g = Graph()
         pupil = g.input("pupil_mm", 2)
-        arcs = self._arcs(g, g.input("film_mm", 2)[0] * (1 / self.unit_mm))
+        arcs = self._arcs(g, g.input("film_mm", 2)[0] * (1 / self.unit_mm), g.input("twice"))
         rows = [
             (None if arc.low is None else pupil[0] - arc.low, None if arc.high is None else arc.high - pupil[0])
             for arc in arcs

@@ -14,36 +14,67 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
-from neurolens.cameras.pupil_arcs import RADIUS, PupilArcs
+from neurolens.cameras.pupil_arcs import PupilArcs
 from neurolens.cameras.pupil_boxes import PupilTable, asking, end_of_light, frame_of
+from neurolens.cameras.stop_image import StopImage, stop_image
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 
 Array = NDArray[np.float64]
 Truths = NDArray[np.bool_]
 Rows = NDArray[np.floating[Any]]
-# Where light ends is sought: stops as shares of the widest, film radii, ways; powers of film radius, stop and film
-# position.
-_STOPS, _ROWS, _ANGLES = (1.0, 0.75, 0.5, 0.25, 0.1), 17, np.linspace(0, np.pi, 17)
-_POWERS = [(i, j, 0, 0) for i in range(RADIUS + 1) for j in range(3)]
-_POWERS += [(i, j, 1, 0) for i in range(3) for j in range(2)]  # few: renderers may learn the focus late
-_POWERS += [(i, j, 0, 1) for i in range(4) for j in range(2)]  # the stop's image moves with the wavelength
+# Where light ends is sought: film radii, ways, and of anamorphic lenses azimuths of a quadrant.
+_ROWS, _ANGLES, _AZIMUTHS = 17, np.linspace(0, np.pi, 17), 4
 _HALVINGS, _WIDER = 14, 1.15  # that place the end of the light; boxes of a stop over the last one's pupil
 _ROUNDS, _LOOSE = 40, 1e-4  # of asymmetric least squares: weight of slack
 _MARGIN = 0.001  # of half the pupil
 _RIDGE = 1e-10
-_AZIMUTHS = 4  # of a quadrant, of anamorphic lenses
 _ENOUGH = 0.97  # of points, at the widest stop, that pass
 _FEWEST = 12  # vertices that rims of a side block
-# Ways to fit, the next where too little passes: weight of what lies outside, and fits again to random rays that are
-# missed. Arcs that are moved as a whole until they hold those are wide everywhere for the sake of one place.
-_WAYS, _PLENTY = ((300.0, 0), (3000.0, 3)), 0.96
+_PLENTY = 0.96  # of points, that no other way to fit needs to pass
 _REFIT_SEED, _CHECK_SEED, _NO_SIDE = 10, 20, 2  # such rays lie on no arc
 _LOST = 1e-3  # of rays that pass, that a way may miss
 _HELD = 0.9998  # of random rays that pass
 _RISE, _STEP, _STEPS = 1.03, 0.004, 12  # of arcs that do not hold them: in y^2, and of half the pupil along x
 _ASKED = 20_000
 _RAYS = 60_000  # random ones that must lie inside
+_POWERS_TURNED = 8  # of the film radius, of anamorphic lenses at most
+_LIMIT = 1.6  # stop radii: points in the image of the stop lie within
+
+
+@dataclass(frozen=True)
+class Way:
+    """How arcs are fitted.
+
+    Attributes:
+        stops: as shares of the widest, where the end of the light is sought. powers: of the film radius.
+        push: weight of what lies outside. refits: fits again to random rays that are missed: arcs that are moved as a
+            whole until they hold those are wide everywhere for the sake of one place. image: in that of the stop.
+    """
+
+    stops: tuple[float, ...]
+    powers: int
+    push: float
+    refits: int
+    image: bool
+
+    def exponents(self, anamorphic: bool) -> NDArray[np.int64]:
+        """Of film radius, stop, film position, wavelength and azimuth, see `PupilArcs`."""
+        powers = min(self.powers, _POWERS_TURNED) if anamorphic else self.powers
+        found = [(i, j, 0, 0, 0) for i in range(powers + 1) for j in range(3)]
+        found += [(i, j, 1, 0, 0) for i in range(3) for j in range(2)]  # few: renderers may learn the focus late
+        found += [(i, j, 0, 1, 0) for i in range(4) for j in range(2)]  # the stop's image moves with the wavelength
+        if anamorphic and self.image:
+            found += [(i, 0, 0, 0, k) for k in (1, 2) for i in range(k, powers + 1)]
+        return np.array(found)
+
+
+# The next where too little passes.
+_WAYS = (
+    Way((1.0, 0.75, 0.5, 0.25, 0.1), 4, 300.0, 0, False),
+    Way((1.0, 0.85, 0.7, 0.55, 0.4, 0.28, 0.18, 0.08), 4, 3000.0, 3, False),
+    Way((1.0, 0.7, 0.4, 0.2, 0.08), 12, 3000.0, 2, True),
+)
 
 
 @dataclass(frozen=True)
@@ -53,7 +84,8 @@ class Sight:
     Attributes:
         graph: of the lens; see `fused.LensGraph`. table: boxes that hold what passes.
         film_z_mm, wavelength_nm: ranges. stop_radius_mm: the widest. stop_surface: for the status of its rays.
-        anamorphic: whether it matters on which side of the film a point lies: the arcs then hold what passes of any.
+        anamorphic: whether it matters on which side of the film a point lies. image: of the stop, that `graph` takes
+            points of in place of pupil points.
     """
 
     graph: Graph
@@ -63,23 +95,23 @@ class Sight:
     stop_radius_mm: float
     stop_surface: int
     anamorphic: bool = False
+    image: StopImage | None = None
 
-    def turned(self, film: Rows, pupil: Rows) -> list[tuple[Rows, Rows]]:
-        """Points [2, N] at the azimuths asked about, of a lens symmetric about x and y, pupils mirrored too."""
-        if not self.anamorphic:
-            return [(film, pupil)]
-        found: list[tuple[Rows, Rows]] = []
-        for angle in np.linspace(0, np.pi / 2, _AZIMUTHS):
-            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-            found += [(turn @ film, turn @ (pupil * [[1.0], [side]])) for side in (1.0, -1.0)]
-        return found
+    def passes(
+        self, film: Rows, pupil: Rows, nanometres: ArrayLike, film_z: ArrayLike, stop: ArrayLike,
+        azimuth: ArrayLike | None = None,
+    ) -> Truths:  # fmt: skip
+        """[...] whether rays pass, turned by an azimuth about the axis; points [2, ...].
 
-    def passes(self, film: Rows, pupil: Rows, nanometres: ArrayLike, film_z: ArrayLike, stop: ArrayLike) -> Truths:
-        """[...] whether rays pass at any of the azimuths asked about; points [2, ...]."""
+        Of an anamorphic lens also of rays mirrored, which arcs hold too; without an azimuth, at any of a quadrant.
+        """
         shape, passed = film.shape[1:], np.zeros(film[0].size, bool)
         wide = np.broadcast_to(nanometres, shape).ravel()
-        for f, p in self.turned(film.reshape(2, -1), pupil.reshape(2, -1)):
-            passed |= self.status(f, p, wide, film_z, stop) == st.PASSED
+        quadrant = np.linspace(0, np.pi / 2, _AZIMUTHS) if self.anamorphic else [0.0]
+        for angle in quadrant if azimuth is None else [azimuth]:
+            for side in (1.0, -1.0) if self.anamorphic else (1.0,):
+                f, p = turned(film.reshape(2, -1), angle), turned(pupil.reshape(2, -1) * [[1.0], [side]], angle)
+                passed |= self.status(f, p, wide, film_z, stop) == st.PASSED
         return passed.reshape(shape)
 
     def status(
@@ -101,7 +133,7 @@ class Sight:
 @dataclass(frozen=True)
 class _Places:
     """Ways [N] from the middle of a pupil (centre, 0) to (centre + x, y) beyond it, at `angle` from the film point's
-    side; film radius, film position, stop and wavelength."""
+    side; film radius, film position, stop, wavelength and azimuth."""
 
     film_mm: Array
     centre: Array
@@ -111,6 +143,7 @@ class _Places:
     stop: Array
     nm: Array
     angle: Array
+    azimuth: Array
 
 
 @dataclass(frozen=True)
@@ -139,42 +172,64 @@ def fit_arcs(sights: Sequence[Sight], report: Report, between: Sequence[tuple[Ar
     Raises:
         InputError: no ray passes.
     """
-    places = []
-    for k, sight in enumerate(sights):
-        places.append(_places(sight, partial(_within, report, 0.6 * k / len(sights), 0.6 / len(sights))))
-    nodes = _empty(sights, [float(p.film_mm.max()) for p in places])
-    edges = [_edge(*of_one) for of_one in zip(sights, nodes, places, strict=True)]
-    blocked = {side: max(int((edge.side == side).sum()) for edge in edges) for side in (0, 1, -1)}
-    if blocked[0] < _FEWEST:
-        raise InputError("export", "stop", "(blocks nothing)", "a lens whose stop blocks light")
-    sides = tuple(side for side, vertices in blocked.items() if vertices >= _FEWEST)
-    seen = [*zip(np.eye(len(nodes)), sights, strict=True), *between]
-    ways = _WAYS[:1] if len(nodes) > 1 else _WAYS  # refitted by themselves, nodes hold less of what lies between them
-    kept, best, lost = nodes, -1.0, 1.0
-    for part, (push, refits) in enumerate(ways):
-        own = _fitted(sights, nodes, edges, sides, push, refits)
-        own = _widened(own, seen, partial(_within, report, 0.6 + 0.2 * part, 0.2))
-        least = min(min(passing(sight, a).values()) for sight, a in zip(sights, own, strict=True))
-        beyond = max(_beyond(sight, a, _CHECK_SEED)[-1].mean() for sight, a in zip(sights, own, strict=True))
+    single = len(sights) == 1
+    if not single:  # refitted by themselves, nodes hold less of what lies between them
+        return _by(_WAYS[0], sights, report, between)[0]
+    ways = _WAYS[2:] if sights[0].anamorphic else _WAYS
+    kept: list[PupilArcs] = []
+    best, lost = -1.0, 1.0
+    for part, way in enumerate(ways):
+        seen = _imaged(sights[0]) if way.image else sights[0]
+        own, beyond = _by(way, [seen], partial(_within, report, part / len(ways), 1 / len(ways)))
+        least = min(passing(seen, own[0]).values())
         if least > best and beyond <= max(lost, _LOST):
-            kept, best, lost = own, least, beyond
+            kept, best, lost = [replace(own[0], image=seen.image)], least, beyond
         if best >= _PLENTY:
             break
     return kept
 
 
+def _imaged(sight: Sight) -> Sight:
+    """The lens from points in the image of its stop; itself where that is not found."""
+    nm, radius = float(np.mean(sight.wavelength_nm)), sight.table.film_radius_mm
+    image = stop_image(sight.graph, radius, sight.film_z_mm, nm, sight.stop_radius_mm, sight.anamorphic)
+    if image is None:
+        return sight
+    reach = _LIMIT * sight.stop_radius_mm * np.array([[-1], [1], [1]], np.float32)
+    table = replace(sight.table, rows=np.repeat(reach, sight.table.rows.shape[1], axis=1))
+    return replace(sight, graph=image.before(sight.graph), table=table, image=image)
+
+
+def _by(
+    way: Way, sights: Sequence[Sight], report: Report, between: Sequence[tuple[Array, Sight]] = ()
+) -> tuple[list[PupilArcs], float]:
+    """Arcs with numbers, and the share of random rays that pass beyond them."""
+    places = []
+    for k, sight in enumerate(sights):
+        places.append(_places(way, sight, partial(_within, report, 0.6 * k / len(sights), 0.6 / len(sights))))
+    nodes = _empty(way, sights, [float(p.film_mm.max()) for p in places])
+    edges = [_edge(*of_one) for of_one in zip(sights, nodes, places, strict=True)]
+    blocked = {side: max(int((edge.side == side).sum()) for edge in edges) for side in (0, 1, -1)}
+    if blocked[0] < _FEWEST:
+        raise InputError("export", "stop", "(blocks nothing)", "a lens whose stop blocks light")
+    sides = tuple(side for side, vertices in blocked.items() if vertices >= _FEWEST)
+    nodes = _fitted(way, sights, nodes, edges, sides)
+    seen = [*zip(np.eye(len(nodes)), sights, strict=True), *between]
+    nodes = _widened(nodes, seen, partial(_within, report, 0.6, 0.4))
+    return nodes, max(float(_beyond(s, a, _CHECK_SEED)[-1].mean()) for s, a in zip(sights, nodes, strict=True))
+
+
 def _fitted(
-    sights: Sequence[Sight], nodes: list[PupilArcs], edges: Sequence[_Edge], sides: tuple[int, ...], push: float,
-    refits: int,
-) -> list[PupilArcs]:  # fmt: skip
-    """Arcs with numbers, see `_WAYS`."""
+    way: Way, sights: Sequence[Sight], nodes: list[PupilArcs], edges: Sequence[_Edge], sides: tuple[int, ...]
+) -> list[PupilArcs]:
+    """Arcs with numbers."""
     for coloured in (False, True):
         held = edges
-        for seed in range(refits + 1):
+        for seed in range(way.refits + 1):
             if seed:
                 held = [_with_missed(*of_one, seed) for of_one in zip(sights, nodes, held, strict=True)]
             nodes = [
-                replace(a, sides=sides, numbers=_arcs(a, edge, sides, coloured, push))
+                replace(a, sides=sides, numbers=_arcs(a, edge, sides, coloured, way.push))
                 for a, edge in zip(nodes, held, strict=True)
             ]
         # Rims that move with the wavelength, as those of fisheyes do, cost time in a shader: only where it pays.
@@ -183,15 +238,16 @@ def _fitted(
     return nodes
 
 
-def _empty(sights: Sequence[Sight], radii: Sequence[float]) -> list[PupilArcs]:
+def _empty(way: Way, sights: Sequence[Sight], radii: Sequence[float]) -> list[PupilArcs]:
     """What numbers of arcs are scaled by."""
+    exponents = way.exponents(sights[0].anamorphic)
     long, short = ((1000 / w) ** 2 for w in reversed(sights[0].wavelength_nm))
     wave = (long + short) / 2, max((short - long) / 2, 1e-9)
-    unit, stop, nothing = max(radii), max(s.stop_radius_mm for s in sights), np.zeros((0, 4, len(_POWERS)))
+    unit, stop, nothing = max(radii), max(s.stop_radius_mm for s in sights), np.zeros((0, 4, len(exponents)))
     found = []
     for radius, (low, high) in zip(radii, (s.film_z_mm for s in sights), strict=True):
         place = (low + high) / 2, max((high - low) / 2, 1e-6)
-        found.append(PupilArcs(radius, unit, place, stop, wave, nothing, np.array(_POWERS), ()))
+        found.append(PupilArcs(radius, unit, place, stop, wave, nothing, exponents, ()))
     return found
 
 
@@ -199,7 +255,7 @@ def _within(report: Report, begun: float, part: float, share: float) -> None:
     report(begun + part * share)
 
 
-def _places(sight: Sight, report: Report) -> _Places:
+def _places(way: Way, sight: Sight, report: Report) -> _Places:
     """Where light ends, is sought: all over the film, at its ends and in its middle, from the widest stop down.
 
     Raises:
@@ -209,11 +265,12 @@ def _places(sight: Sight, report: Report) -> _Places:
     ends = sight.wavelength_nm
     found: list[list[Array]] = []
     planes = (low, (low + high) / 2, high) if high > low else (low,)
-    for z in planes:
-        report(len(found) / len(planes) / len(_STOPS))
+    azimuths = np.linspace(0, np.pi / 2, _AZIMUTHS) if sight.anamorphic and way.image else [None]
+    for k, (z, azimuth) in enumerate(product(planes, azimuths)):
+        report(k / len(planes) / len(azimuths))
         table, film_radius = sight.table, None
-        for stop in np.array(_STOPS) * sight.stop_radius_mm:
-            ask = asking(partial(sight.passes, film_z=z, stop=stop), ends)
+        for stop in np.array(way.stops) * sight.stop_radius_mm:
+            ask = asking(partial(sight.passes, film_z=z, stop=stop, azimuth=azimuth), ends)
             film_radius = end_of_light(table, ask) if film_radius is None else film_radius
             if film_radius is None:
                 break
@@ -222,7 +279,17 @@ def _places(sight: Sight, report: Report) -> _Places:
             across = (frame.reach[:, None] * v[:, None] for v in frame.stretch)
             x, y = (way * side for way, side in zip(across, (np.cos(_ANGLES), np.sin(_ANGLES)), strict=True))
             shape = (len(ends), *x.shape)
-            rows = (radius[:, None], frame.centre[:, None], x, y, z, stop, np.reshape(ends, (-1, 1, 1)), _ANGLES)
+            rows = (
+                radius[:, None],
+                frame.centre[:, None],
+                x,
+                y,
+                z,
+                stop,
+                np.reshape(ends, (-1, 1, 1)),
+                _ANGLES,
+                azimuth or 0.0,
+            )
             found.append([np.broadcast_to(row, shape).ravel() for row in rows])
             # The next stop's pupil lies within this one's.
             around = frame.centre - _WIDER * frame.stretch[0], frame.centre + _WIDER * frame.stretch[0]
@@ -237,27 +304,42 @@ def _places(sight: Sight, report: Report) -> _Places:
 def _edge(sight: Sight, arcs: PupilArcs, p: _Places) -> _Edge:
     """Where light ends on the way from a centre, and what blocks the rays beyond."""
 
-    def asked(t: Array) -> tuple[Array, Array, Array, Array, Array]:
-        film, pupil = np.stack([p.film_mm, 0 * p.film_mm]), np.stack([p.centre + t * p.x, t * p.y])
-        return film, pupil, p.nm, p.film_z, p.stop
+    azimuth = p.azimuth if arcs.turns else None
+    film, call = np.stack([p.film_mm, 0 * p.film_mm]), (p.nm, p.film_z, p.stop)
+
+    def passes(t: Array) -> Truths:
+        return sight.passes(film, np.stack([p.centre + t * p.x, t * p.y]), *call, azimuth)
 
     low, high = np.zeros(p.x.size), np.ones(p.x.size)
-    lit = sight.passes(*asked(low))
+    lit = passes(low)
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        inside = sight.passes(*asked(middle))
+        inside = passes(middle)
         low, high = np.where(inside, middle, low), np.where(inside, high, middle)
-    code = sight.status(*asked(high))
-    side = np.where(code == st.blocked(sight.stop_surface, st.RIM), 0, np.where(p.x > 0, 1, -1))
-    scaled = arcs.scaled(p.film_mm, p.stop, p.film_z, p.nm)
     x, y, first, last = p.centre + low * p.x, low * p.y, p.angle == 0, p.angle == np.pi
+    side = np.where(
+        _stopped(sight, film, np.stack([p.centre + high * p.x, high * p.y]), call, p.azimuth),
+        0,
+        np.where(p.x > 0, 1, -1),
+    )
+    scaled = arcs.scaled(p.film_mm, p.stop, p.film_z, p.nm, p.azimuth)
     return _Edge(x[lit], y[lit], scaled[:, lit], side[lit], first[lit], last[lit])
+
+
+def _stopped(sight: Sight, film: Array, pupil: Array, call: tuple[Array, Array, Array], azimuth: Array) -> Truths:
+    """Whether the stop blocks rays, of an anamorphic lens also mirrored."""
+    blocked = np.ones(film.shape[1], bool)
+    for side in (1.0, -1.0) if sight.anamorphic else (1.0,):
+        code = sight.status(turned(film, azimuth), turned(pupil * [[1.0], [side]], azimuth), *call)
+        blocked &= code == st.blocked(sight.stop_surface, st.RIM)
+    return blocked
 
 
 def _with_missed(sight: Sight, arcs: PupilArcs, edge: _Edge, seed: int) -> _Edge:
     """With random rays that pass beyond the arcs as vertices that they must hold."""
     rays, stop, left, right, out = _beyond(sight, arcs, _REFIT_SEED + seed)
-    scaled = arcs.scaled(rays["film_mm"][0], stop, rays["film_z_mm"][0], rays["wavelength_nm"][0])
+    azimuth = np.arccos(rays["twice"][0]) / 2
+    scaled = arcs.scaled(rays["film_mm"][0], stop, rays["film_z_mm"][0], rays["wavelength_nm"][0], azimuth)
     missed = *rays["pupil_mm"], scaled, np.full(out.size, _NO_SIDE), right, left
     own = edge.x, edge.y, edge.scaled, edge.side, edge.first, edge.last
     return _Edge(*(np.concatenate([a, b[..., out]], -1) for a, b in zip(own, missed, strict=True)))
@@ -300,13 +382,19 @@ def _arc(arcs: PupilArcs, edge: _Edge, monomials: Array, side: int, push: float)
     return numbers
 
 
+def turned(points: Rows, angle: ArrayLike) -> Rows:
+    """Points [2, N] about the axis, by angles [N] or one."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack([cos * points[0] - sin * points[1], sin * points[0] + cos * points[1]])
+
+
 def _call(value: ArrayLike) -> NDArray[np.float32]:
     return np.asarray(value, np.float32).reshape(1, -1)
 
 
 def _unit(arcs: PupilArcs, of_stop: bool) -> Array:
     """A margin that grows with the stop, for its own arc."""
-    return np.all(arcs.exponents == (0, int(of_stop), 0, 0), axis=1).astype(np.float64)
+    return np.all(arcs.exponents == (0, int(of_stop), 0, 0, 0), axis=1).astype(np.float64)
 
 
 def _above(rows: Array, wanted: Array, own: Truths, size: Array, push: float) -> Array:
@@ -349,10 +437,14 @@ def _random(sight: Sight, arcs: PupilArcs, seed: int) -> tuple[dict[str, Array],
         "film_z_mm": film_z[None],
         "wavelength_nm": nm[None],
     }
-    near = evaluate(arcs.graph, given)["pupil_mm"]
-    middle = evaluate(arcs.graph, given | {"square": np.full((2, count), 0.5)})["pupil_mm"]
+    azimuth = np.pi / 2 * rng.random(count) if arcs.turns else None
+    back = 0.0 if azimuth is None else azimuth
+    there = given | {"film_mm": turned(film, back)}
+    near = turned(evaluate(arcs.graph, there)["pupil_mm"], -back)
+    middle = turned(evaluate(arcs.graph, there | {"square": np.full((2, count), 0.5)})["pupil_mm"], -back)
     pupil = np.where(rng.random(count) < 0.7, middle + 1.25 * (near - middle), pupil)
-    passed = sight.passes(film, pupil, nm, film_z, stop)
+    passed = sight.passes(film, pupil, nm, film_z, stop, azimuth)
+    given["twice"] = np.cos(2 * np.broadcast_to(back, (1, count)))
     return {name: rows[:, passed] for name, rows in (given | {"pupil_mm": pupil}).items()}, stop[passed]
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.graph.ir import Exponents, Graph, Node
-from neurolens.graph.passes import live_rows
 
 # torch tensors or numpy arrays, [R, N]; values of the call are [R, 1].
 Rows = Any
@@ -49,7 +48,12 @@ def _plan(graph: Graph) -> list[tuple[int, list[int]]]:
     wanted = (len(graph.nodes), *(v.number for v in graph.outputs.values()))
     kept = _PLANS.get(graph)
     if kept is None or kept[0] != wanted:
-        live = live_rows(graph, graph.outputs)
+        live = set(wanted[1:])
+        for number in range(
+            len(graph.nodes) - 1, -1, -1
+        ):  # of nodes, not of rows: an operation takes all of its inputs
+            if number in live:
+                live.update(graph.nodes[number].inputs)
         last = {k: number for number in sorted(live) for k in (number, *graph.nodes[number].inputs)}
         done: dict[int, list[int]] = {number: [] for number in sorted(live)}
         for k, number in last.items():

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -44,7 +45,8 @@ def graph() -> Graph:
 @pytest.fixture
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pupils of several states found quickly, and wide."""
-    monkeypatch.setattr(pupil_arcs_fit, "_STOPS", (1.0, 0.6, 0.3))
+    coarse_way = replace(pupil_arcs_fit._WAYS[0], stops=(1.0, 0.6, 0.3))
+    monkeypatch.setattr(pupil_arcs_fit, "_WAYS", (coarse_way,))
     monkeypatch.setattr(pupil_arcs_fit, "_ROWS", 7)
     monkeypatch.setattr(osl, "_ACROSS", 8)
     monkeypatch.setattr(pupil_arcs_fit, "_RAYS", 6000)
@@ -171,6 +173,34 @@ def test_range_of_a_zoom_whose_groups_focus_is_refused_in_one_line(tmp_path, cap
 
 def test_at_least_95_percent_of_rays_pass() -> None:
     assert min(lens().passing().values()) >= 0.95
+
+
+@pytest.mark.parametrize("name, least", [("phone_lens_6", 0.95), ("panavision_anamorphic_zoom_21", 0.8)])
+def test_pupils_of_high_order_pass_and_keep_the_light(name: str, least: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against samples all over a box on the pupil plane: light of film points on all sides, stop open and closed."""
+    way = pupil_arcs_fit._WAYS[2]
+    monkeypatch.setattr(
+        pupil_arcs_fit, "_WAYS", (way, way, way if least > 0.9 else replace(way, stops=(1.0, 0.4, 0.1)))
+    )
+    file = ROOT / "models" / f"{name}.ols-64.onnx"
+    (camera,) = osl.model_lens(load_model(file), None, lambda share: None).nodes
+    sight, arcs, rng, count = camera.sight, camera.arcs, np.random.default_rng(12), 200_000
+    assert min(pupil_arcs_fit.passing(sight, arcs).values()) >= least
+    low, high, half = sight.table.rows
+    reach = float(np.abs([low, high, half])[:, low <= high].max())
+    for share, turn in ((1.0, 0.5), (1.0, 1.2), (0.5, 0.3)):
+        stop = share * sight.stop_radius_mm
+        place = 0.6 * arcs.film_radius_mm * np.array([[math.cos(turn)], [math.sin(turn)]])
+        film, z, nm = np.repeat(place, count, 1), float(np.mean(sight.film_z_mm)), np.full(count, 550.0)
+        given = {"film_mm": film, "square": rng.random((2, count)), "wavelength_nm": nm[None]}
+        given |= {"film_z_mm": np.array([[z]]), "stop_radius_mm": np.array([[stop]])}
+        found = evaluate(arcs.graph, given)
+        passed = sight.status(film, found["pupil_mm"], nm, z, stop) == 0
+        area = float(np.mean(np.where(passed, found["area_mm2"], 0.0)))
+        box = rng.uniform(-reach, reach, (2, count))
+        wanted = float(np.mean(sight.status(film, box, nm, z, stop) == 0)) * 4 * reach**2
+        spread = wanted * math.sqrt(4 * reach**2 / wanted / count)  # of the box's mean
+        assert area == pytest.approx(wanted, abs=4 * spread + 0.002 * wanted)
 
 
 def test_arcs_that_let_little_pass_are_fitted_again_and_lose_no_light() -> None:
