@@ -175,7 +175,7 @@ def fit_arcs(sights: Sequence[Sight], report: Report, between: Sequence[tuple[Ar
     single = len(sights) == 1
     if not single:  # refitted by themselves, nodes hold less of what lies between them
         return _by(_WAYS[0], sights, report, between)[0]
-    ways = _WAYS[2:] if sights[0].anamorphic else _WAYS
+    ways = _WAYS[::2] if sights[0].anamorphic else _WAYS
     kept: list[PupilArcs] = []
     best, lost = -1.0, 1.0
     for part, way in enumerate(ways):
