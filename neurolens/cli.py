@@ -61,13 +61,14 @@ def build_parser() -> Parser:
         render,
         stmap,
         train,
+        view,
     )
 
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     read = lens, analyse, glass, convert, stmap, projection
-    for command in (*read, plan, train, models, evaluate, export, render, flare, mitsuba, blender, bench):
+    for command in (*read, plan, train, models, evaluate, export, render, flare, mitsuba, blender, view, bench):
         command.add_parser(subparsers)
     return parser
 
