@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import RANGE, add_glass, add_json, check_folder, check_suffix, lens_path, project_root
-from neurolens.commands.blender_lenses import form_of, key_of, library
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
@@ -37,6 +35,7 @@ _NETWORK = "mlp"
 _ERRORS = ("rms_um", "p99_um", "rms_infinity_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
 _LIGHT_NM = (400.0, 700.0)
 _NEAR_EFL = 10.0
+_DOWNLOADS = ("glsl", "onnx", "c", "osl")
 _OSL_LENSES = 4  # of more lenses the page leaves OSL out: fitting a pupil takes seconds each, and it is large
 
 
@@ -59,9 +58,24 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "-o", "--out", metavar="FILE.html", type=Path, default=Path("view.html"), help="page (default: view.html)"
     )
+    parser.add_argument(
+        "--downloads", metavar="KINDS", type=_kinds, default=None,
+        help="of glsl, onnx, c, osl what the page brings as files of each form (default: all, of more than "
+        f"{_OSL_LENSES} lenses glsl,onnx,c: OSL takes seconds each); the last are left out where the page grows beyond "
+        "3 MB",
+    )  # fmt: skip
     add_glass(parser)
     add_json(parser)
     parser.set_defaults(run=run, kept="nothing was written")
+
+
+def _kinds(text: str) -> list[str]:
+    words = text.split(",")
+    if words[0] != "glsl" or len(set(words)) < len(words) or not set(words) <= set(_DOWNLOADS):
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected glsl, and of {', '.join(_DOWNLOADS[1:])} what is wanted"
+        )
+    return words
 
 
 def run(args: argparse.Namespace) -> int:
@@ -69,16 +83,17 @@ def run(args: argparse.Namespace) -> int:
     check_suffix(args.out, "--out", (".html", ".htm"))
     check_folder(args.out, "--out")
     entries = list(_asked(args.lenses) if args.lenses else _library())
+    kinds = args.downloads or [k for k in _DOWNLOADS if k != "osl" or len(entries) <= _OSL_LENSES]
     progress = Progress(quiet=args.json)
     made: list[ViewLens] = []
     with progress.stage(f"{len(entries)} lenses") as report, tempfile.TemporaryDirectory() as folder:
         for entry in entries:
-            made.append(_view_lens(entry, Path(folder), osl=len(entries) <= _OSL_LENSES))
+            made.append(_view_lens(entry, Path(folder), kinds))
             report(len(made) / len(entries))
     from neurolens.view.page import write_page
 
-    about = write_page(args.out, made)
-    left = [kind for kind in ("glsl", "c", "onnx", "osl") if kind not in about["downloads"]]
+    about = write_page(args.out, made, kinds)
+    left = [kind for kind in kinds if kind not in about["downloads"]]
     data = {"file": str(args.out), **about, "lenses": [lens.key for lens in made]}
     more = f"; left out for its size: {', '.join(left)}" if left else ""
     return answer(args, data, lambda: f"{args.out}: {len(made)} lenses, {about['bytes'] / 1e6:.2f} MB{more}")
@@ -86,6 +101,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _library() -> Iterator[_Entry]:
     """Every lens of lenses/ with its best models; zooms over their range where a model has it."""
+    from neurolens.commands.blender_lenses import key_of, library
     from neurolens.optics.lensfile import read_lens
 
     root = project_root()
@@ -101,6 +117,7 @@ def _library() -> Iterator[_Entry]:
 
 def _asked(words: Sequence[str]) -> Iterator[_Entry]:
     """Lenses in the order of their first word; models join the lens of their id, in place of those of the library."""
+    from neurolens.commands.blender_lenses import library
     from neurolens.readers.any_format import read_any
 
     root = project_root()
@@ -119,14 +136,14 @@ def _asked(words: Sequence[str]) -> Iterator[_Entry]:
         if path.parent == root / "lenses":  # one of the library brings its models
             known = library(root / "models", root / "lenses", [path.stem]) if _has_models(root, path.stem) else ()
             brought[lens.lens_id] = [m for files, _ in known for m in files]
-    for lens_id, lens in lenses.items():
+    for lens_id, own in lenses.items():
         found = models.get(lens_id) or brought.get(lens_id, [])
         zoom = RANGE if any(_card(m).get("states") for m in found) else None
-        yield _Entry(lens_id, found, lens, zoom)
+        yield _Entry(lens_id, found, own, zoom)
 
 
 def _has_models(root: Path, key: str) -> bool:
-    return any(key_of(p) == key for p in (root / "models").glob(f"{key}.*.onnx"))
+    return any((root / "models").glob(f"{key}.*.onnx"))
 
 
 def _card(file: Path) -> dict[str, Any]:
@@ -135,7 +152,12 @@ def _card(file: Path) -> dict[str, Any]:
     return read_checked(file)[1]
 
 
-def _view_lens(entry: _Entry, folder: Path, osl: bool) -> ViewLens:
+def _kind_of(card: Mapping[str, Any]) -> str:
+    family = str(card["fit"]["settings"].get("method", card["fit"]["method"]))
+    return "network" if family.startswith(_NETWORK) else "polynomial"
+
+
+def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str]) -> ViewLens:
     """A lens of the page.
 
     Raises:
@@ -143,17 +165,17 @@ def _view_lens(entry: _Entry, folder: Path, osl: bool) -> ViewLens:
     """
     from neurolens.view.page import ViewLens
 
-    forms = [_model_form(file, folder, osl) for file in entry.models]
-    kinds = [form.kind for form in forms]
-    if len(set(kinds)) < len(kinds):
-        raise InputError("neurolens view", entry.key, f"({' and '.join(kinds)})", "one model of each kind")
+    found = [_kind_of(_card(file)) for file in entry.models]
+    if len(set(found)) < len(found):
+        raise InputError("neurolens view", entry.key, f"({' and '.join(found)})", "one model of each kind")
+    forms = [_model_form(file, folder, kinds) for file in entry.models]
     drawn: dict[str, Any] = {}
     path = None
     if entry.lens is not None:
         lens = entry.lens.at() if entry.zoom == RANGE else entry.lens.at(zoom=entry.zoom)
         try:
             forms.append(_exact_form(entry, folder))
-            path = _path(lens, forms) if entry.zoom != RANGE else None
+            path = _path(lens) if entry.zoom != RANGE else None
         except NeurolensError:
             if not forms:
                 raise  # a model of the lens stands in for it: coatings and the like have no code
@@ -183,14 +205,14 @@ def _section(lens: Lens) -> dict[str, Any]:
     return section_svg(replace(layout_profile(Scene(lens, axis="y")), rays=()))
 
 
-def _path(lens: Lens, forms: Sequence[Form]) -> tuple[str, Sequence[str]]:
+def _path(lens: Lens) -> tuple[str, Sequence[str]]:
     from neurolens.optics.pupils import pupil_plane_z_mm
     from neurolens.view.shaders import path_glsl
 
     return path_glsl(lens, pupil_plane_z_mm(lens), _LIGHT_NM)
 
 
-def _model_form(file: Path, folder: Path, osl: bool) -> Form:
+def _model_form(file: Path, folder: Path, kinds: Sequence[str]) -> Form:
     from neurolens.cameras.onnxlens import load_model
     from neurolens.cameras.source import model_extras
     from neurolens.surrogates.source import export_file
@@ -199,11 +221,7 @@ def _model_form(file: Path, folder: Path, osl: bool) -> Form:
     loaded = load_model(file)
     card, domain, errors = loaded.card, loaded.card["domain"], loaded.card["errors"]
     extras, notes = model_extras(loaded)
-    written = {
-        to: export_file(file, folder / f"model.{to}", to, None, extras, notes) for to in ("glsl", "c")
-    }
-    family = str(card["fit"]["settings"].get("method", card["fit"]["method"]))
-    kind = "network" if family.startswith(_NETWORK) else "polynomial"
+    written = {to: export_file(file, folder / f"model.{to}", to, None, extras, notes) for to in ("glsl", "c")}
     told = {
         **_facts(card["lens"]),
         "film_radius_mm": domain["film_radius_mm"],
@@ -214,10 +232,12 @@ def _model_form(file: Path, folder: Path, osl: bool) -> Form:
         "poor": list(errors.get("poor") or ()),
     }
     files = {"c": (folder / "model.c").read_bytes(), "onnx": file.read_bytes()}
-    if osl:
+    if "osl" in kinds:
+        from neurolens.commands.blender_lenses import form_of
+
         files["osl"] = form_of(file, quiet=True).osl.encode()
     text = (folder / "model.glsl").read_text(encoding="utf-8")
-    return Form(kind, str(card["fit"]["method"]), text, written["glsl"].signature, told, files)
+    return Form(_kind_of(card), str(card["fit"]["method"]), text, written["glsl"].signature, told, files)
 
 
 def _lens_nodes(card: Mapping[str, Any]) -> list[Mapping[str, Any]]:

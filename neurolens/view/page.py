@@ -28,12 +28,9 @@ SHADERS = ("scene.glsl", "trace.glsl")
 # A form's download that would carry the page beyond this is left out.
 MOST_BYTES = 3_000_000
 _AIR, _ARC = 1.01, 8  # a medium of a smaller index is drawn as air; of 65 points of an arc every eighth is drawn
-_LINE = "</script"
 _CONSTANT = re.compile(r"^const float ([A-Z][A-Z0-9_]*_(?:MM|NM)) = ", re.MULTILINE)
 _FUNCTION = re.compile(r"^float ([a-z]\w*)\(([^)]*)\)$", re.MULTILINE)
 _GIVEN = {"zoom_mm": "zoom", "focus_m": "focus", "stop_radius_mm": "stop_radius"}
-# Files of a form, in the order in which a page too small for all of them keeps them.
-KINDS = ("glsl", "onnx", "c", "osl")
 
 
 @dataclass(frozen=True)
@@ -86,8 +83,10 @@ class ViewLens:
     forms: Sequence[Form]
 
 
-def write_page(out: Path, lenses: Sequence[ViewLens], most_bytes: int = MOST_BYTES) -> dict[str, Any]:
-    """Write the page; downloads that do not fit are left out, the last of `KINDS` first.
+def write_page(
+    out: Path, lenses: Sequence[ViewLens], kinds: Sequence[str], most_bytes: int = MOST_BYTES
+) -> dict[str, Any]:
+    """Write the page; of the `kinds` of files that it brings, "glsl" first, the last go where they do not fit.
 
     Returns its size and what of the downloads is there.
 
@@ -96,11 +95,11 @@ def write_page(out: Path, lenses: Sequence[ViewLens], most_bytes: int = MOST_BYT
     """
     if not lenses:
         raise InputError(out, "lenses", "(none)", "at least one lens")
-    for count in range(len(KINDS), 0, -1):
-        text = _page(lenses, KINDS[:count])
+    for count in range(len(kinds), 0, -1):
+        text = _page(lenses, kinds[:count])
         if len(text.encode()) <= most_bytes:
             atomic_write_text(out, text)
-            return {"bytes": len(text.encode()), "downloads": list(KINDS[:count])}
+            return {"bytes": len(text.encode()), "downloads": list(kinds[:count])}
     raise InputError(out, "bytes", len(text.encode()), f"at most {most_bytes}: fewer lenses")
 
 

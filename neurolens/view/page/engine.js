@@ -13,9 +13,17 @@ async function unpack(id) {
 function functionOf(text) {
   const packed = (_, n) => `state_c[${n >> 2}].${"xyzw"[n & 3]}`;
   const count = Number(text.match(/struct \w+_state \{[^}]*float c\[(\d+)\]/)?.[1] ?? 0);
-  const own = text.slice(text.lastIndexOf("\nvoid ")).replace(/\s*in \w+_state state,/, "");
+  const own = text.slice(Math.max(0, text.lastIndexOf("\nvoid "))).replace(/\s*in \w+_state state,/, "");
   const state = count ? `uniform vec4 state_c[${(count + 3) >> 2}];\nuniform bool state_inside;\n` : "";
   return { count, text: state + own.replace(/state\.c\[(\d+)\]/g, packed).replaceAll("state.inside", "state_inside") };
+}
+
+/** The picture's shader with the function of a lens. */
+function pictureShader({ shaders, functions: { weigh, opened } }, text, call) {
+  const given = "uniform float film_z, stop_radius, distance_mm, per_depth;\n";
+  const trace = shaders.trace.replace("LENS", call).replace("WEIGH", weigh.call).replace("OPENED", opened.call);
+  const scene = shaders.scene.replaceAll("MOST", MOST_BALLS).replaceAll("DOT", DOT);
+  return given + functionOf(text).text + weigh.text + opened.text + scene + trace;
 }
 
 class Engine {
@@ -39,13 +47,8 @@ class Engine {
   async program(lens, kind) {
     const key = kind === "thin" ? "thin" : `${lens.key}/${kind}/program`;
     return this.once(key, async () => {
-      const { shaders, functions: { thin, weigh, opened } } = this.shared;
-      const own = kind === "thin" ? { text: thin.text, count: 0 } : functionOf(await this.text(lens, kind));
-      const call = kind === "thin" ? thin.call : this.form(lens, kind).call;
-      const given = "uniform float film_z, stop_radius, distance_mm, per_depth;\n";
-      const trace = shaders.trace.replace("LENS", call).replace("WEIGH", weigh.call).replace("OPENED", opened.call);
-      const scene = shaders.scene.replaceAll("MOST", MOST_BALLS).replaceAll("DOT", DOT);
-      return { ...this.gpu.program(given + own.text + weigh.text + opened.text + scene + trace), count: own.count };
+      const { thin } = this.shared.functions, text = kind === "thin" ? thin.text : await this.text(lens, kind);
+      return this.gpu.program(pictureShader(this.shared, text, kind === "thin" ? thin.call : this.form(lens, kind).call));
     });
   }
 

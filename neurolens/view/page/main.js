@@ -10,7 +10,7 @@ const share = (low, high, value) => Math.log(value / low) / Math.log(high / low)
 
 function framing() {
   const { lens } = set, h = (lens.film_radius_mm * 0.999) / Math.hypot(16 / 9 / lens.squeeze, 1);
-  const f = Math.abs(lens.efl_mm), far = Math.max((0.45 * f) / h + f / 1000, lens.nearest_m * 1.05);
+  const f = Math.abs(lens.efl_mm), far = Math.max((0.28 * f) / h + f / 1000, lens.nearest_m * 1.05);
   return { far, unit: ((far - f / 1000) * h) / f };
 }
 
@@ -236,4 +236,4 @@ async function begin() {
 }
 
 // For tests and the curious.
-window.neurolens = { set, show, pass, click, measure, framing, chooseLens, shared, ready: begin(), get engine() { return engine; }, get layout() { return layout; } };
+window.neurolens = { set, show, pass, idle: () => busy, click, measure, framing, chooseLens, shared, sceneUniforms, ready: begin(), get engine() { return engine; }, get layout() { return layout; } };
