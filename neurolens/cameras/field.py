@@ -16,15 +16,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.contract import CameraRays, FloatArray
-from neurolens.cameras.pinhole import PROJECTIONS, Pinhole
+from neurolens.cameras.pinhole import PROJECTIONS
 from neurolens.optics import film_plane
 
 Array = NDArray[np.float64]
@@ -38,7 +37,7 @@ LIGHT_NM = (400.0, 700.0)
 _PUPIL = 6, 24  # rings of pupil samples, and samples of a ring
 _RAYS = 1 << 17  # at once
 _ROUND, _OTHER = (513, 1), (97, 64)  # radii and azimuths of the tables
-_BEYOND = 1.02  # radius of the film's corner over that of the light: as lenses are engraved
+BEYOND = 1.02  # radius of the film's corner over that of the light: as lenses are engraved
 _FINER = 64, 4  # rings (and azimuths) of the map back over those of the map there, of round cameras and of others
 _EDGE = 16  # points on each side of the film
 _TRIED, _AZIMUTHS, _UNEVEN = (0.4, 0.7, 0.95), 7, 3e-6  # where roundness is tried; of the radius
@@ -328,61 +327,6 @@ class Field:
         return np.stack([np.sin(angle) * turn.real, np.sin(angle) * turn.imag, np.cos(angle)])
 
 
-class WarpedPinhole(Pinhole):
-    """What compositing makes of a pinhole's picture by the maps of a camera's rectilinear field: its places and light.
-
-    Args:
-        hole: any, of the same film. camera: to be shown. focus_m: from the film to the plane that the maps are of.
-        field: of both, which takes seconds; without it every film point is traced by itself.
-
-    Raises:
-        InputError: a camera that sees some of the film's edge beyond `WIDEST_DEG`, or not at all.
-    """
-
-    name = "pinhole, warped"
-
-    def __init__(self, hole: Pinhole, camera: Any, focus_m: float, field: Field | None = None) -> None:
-        super().__init__(hole.focal_mm, hole.film_mm, hole.f_number)
-        self._shown, self._focus_m, self._field = camera, focus_m, field
-        self._frame, self._spectrum = frame_of(camera), spectrum_of(camera)
-        self._axis = float(self._traced(np.zeros(1, complex))[1][0])
-        near, frame = 1e-3 / focus_m, self._frame
-        # Sizes of things in focus, of the hole over the ideal camera: 1, but for the other meridian of cylinders.
-        self._size = [
-            (1 - near * before) / reach * self.focal_mm / (1 - near * self.focal_mm)
-            for before, reach in zip(frame.pupil_mm, frame.reach_mm, strict=True)
-        ]
-        edge = _film_edge(self.film_mm) / _BEYOND
-        ideal, light = self._traced(edge)
-        if not ((light > 0) & (np.abs(ideal) < math.tan(math.radians(WIDEST_DEG)) * max(frame.reach_mm))).all():
-            raise InputError(
-                camera.name, "film_mm", self.film_mm, "a film within the image circle, and a narrower field"
-            )
-        sides = 2 * _BEYOND * np.abs(self._before(ideal)).max(1) / self.film_mm
-        self.area = float(np.maximum(sides, 1.0).prod())  # of the picture before it is warped, over that of the film
-
-    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays of film points [2, N] in mm, as of the hole."""
-        point = -(film_mm[0] + 1j * film_mm[1]).astype(np.complex128)
-        if self._field is None:
-            each, back = np.unique(point, return_inverse=True)
-            ideal, light = (v[back] for v in self._traced(each))
-            light = light / self._axis
-        else:
-            ideal, light = self._field.ideal(point), self._field.relative_light(point)
-        rays = super().sample(-self._before(ideal).astype(np.float32), pupil, wavelength_nm)
-        return replace(rays, weight=light.astype(np.float32))
-
-    def _traced(self, point: Complex) -> tuple[Complex, Array]:
-        picture = np.stack([point.real, point.imag])
-        found = seen(self._shown, picture, self._spectrum, self._frame, RECTILINEAR, self._focus_m)
-        return laid(found.direction, self._frame, RECTILINEAR), found.light
-
-    def _before(self, ideal: Complex) -> Array:
-        """Places [2, N] in the hole's picture, mm."""
-        return np.stack([self._size[0] * ideal.real, self._size[1] * ideal.imag])
-
-
 def field_of(
     camera: Any,
     focus_m: float,
@@ -419,8 +363,8 @@ def field_of(
     end = corner if azimuths > 1 else _end_of_light(lambda r: at(np.array([r + 0j]), distance)[1].light[0] > 0, corner)
     points = (np.linspace(0, end, rings)[:, None] * turns(azimuths)).reshape(-1)
     place, found = at(points, distance)
-    edge = _film_edge(camera.film_mm)
-    edge_place, _ = at(edge / _BEYOND, distance)
+    edge = film_edge(camera.film_mm)
+    edge_place, _ = at(edge / BEYOND, distance)
     widest = math.degrees(float(np.where(found.light > 0, found.angle, 0.0).max()))
     if target == RECTILINEAR:
         _check_plane(camera, widest, bool(np.isfinite(edge_place).all()), end)
@@ -431,13 +375,13 @@ def field_of(
         raise InputError(camera.name, "film_mm", camera.film_mm, f"no picture beyond {fold:.4g} mm, where it folds")
     ideal, light = Polar.of(end, place), found.light.reshape(rings, azimuths)
     others = [] if math.isinf(distance) else [d for d in (math.inf, 2 * distance, distance / 2) if d > 2 * nearest]
-    moved = {d: np.abs(at(edge / _BEYOND, d)[0] - edge_place) for d in others}
+    moved = {d: np.abs(at(edge / BEYOND, d)[0] - edge_place) for d in others}
     parallax = {d: float(np.nanmax(m, initial=0.0)) for d, m in moved.items()}
     light = light / light[0].mean()
     return Field(ideal, _inverted(ideal), frame, target, end, widest, light, parallax, spectrum)
 
 
-def _film_edge(film_mm: tuple[float, float]) -> Complex:
+def film_edge(film_mm: tuple[float, float]) -> Complex:
     """Points round the edge of a film, mm."""
     line, half = np.linspace(-1, 1, _EDGE), np.array(film_mm) / 2
     sides = [line * half[0] + 1j * half[1], line * half[0] - 1j * half[1],

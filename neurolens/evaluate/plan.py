@@ -24,10 +24,10 @@ from neurolens.base.progress import Report
 from neurolens.cameras.build import Shot, ideal_as
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
 from neurolens.cameras.exact import FusedExactCamera
-from neurolens.cameras.field import WarpedPinhole
 from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.warped import WarpedPinhole
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate.footprints import Footprints, Places
 from neurolens.evaluate.probe import COUNTED, LIGHT, Asked, Effect, Probed, effects_of, probe

@@ -9,8 +9,9 @@ import pytest
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
-from neurolens.cameras.field import WarpedPinhole, spectrum_of
+from neurolens.cameras.field import spectrum_of
 from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.warped import WarpedPinhole
 from neurolens.cli import main
 from neurolens.evaluate.footprints import Footprints, blur_mm, centroids, distance_mm, effects_mm, footprints, places_of
 from neurolens.evaluate.plan import plan
