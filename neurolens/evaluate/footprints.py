@@ -131,11 +131,6 @@ def footprints(camera: Camera, places: Places, samples: int = 16) -> Footprints:
     return Footprints(np.where(weight > 0, place, 0.0), np.where(weight > 0, across, 0.0), weight)
 
 
-def centre_mm(prints: Footprints, share: Array) -> Array:
-    """Centroids [2, N] over all light, from the places' film points."""
-    return _centroids(prints, share)[0]
-
-
 def distance_mm(a: Footprints, b: Footprints, share: Array) -> Array:
     """Sliced Wasserstein distance [N] between footprints of the same places, RMS over wavelengths by share, mm.
 
@@ -154,9 +149,9 @@ def effects_mm(exact: Footprints, thin: Footprints, share: Array) -> dict[str, A
     the pupil point: by degree, each part orthogonal to those below it over the light that passes (as Zernike's are over
     a disc: coma with the tilt that balances it, spherical aberration with its best focus).
     """
-    (centre, by_wave), (ideal, _) = _centroids(exact, share), _centroids(thin, share)
+    (centre, by_wave), (ideal, _) = centroids(exact, share), centroids(thin, share)
     linear, parts = _expanded(exact, by_wave)
-    plain, _ = _expanded(thin, _centroids(thin, share)[1])
+    plain, _ = _expanded(thin, centroids(thin, share)[1])
     size = _pupil_size(exact)
     mean = np.einsum("ijnw,w->ijn", linear, share)
     own = np.einsum("ijnw,w->ijn", plain, share)
@@ -183,7 +178,7 @@ def effects_mm(exact: Footprints, thin: Footprints, share: Array) -> dict[str, A
 
 def blur_mm(prints: Footprints, share: Array) -> Array:
     """RMS diameter [N] of footprints: twice the RMS distance from their centroid, all wavelengths together, mm."""
-    centre, _ = _centroids(prints, share)
+    centre, _ = centroids(prints, share)
     weight = prints.weight * share[:, None]
     away = ((prints.place_mm - centre[:, :, None, None]) ** 2).sum(0)
     return np.asarray(2 * np.sqrt((weight * away).sum((1, 2)) / np.maximum(weight.sum((1, 2)), 1e-300)))
@@ -212,7 +207,7 @@ def _meet(places: Places, origin: Array, way: Array) -> Array:
     return np.asarray((axes * meet).sum(1))
 
 
-def _centroids(prints: Footprints, share: Array) -> tuple[Array, Array]:
+def centroids(prints: Footprints, share: Array) -> tuple[Array, Array]:
     """Centroid over all light [2, N], and of each wavelength [2, N, W]."""
     light = np.maximum(prints.weight.sum(2), 1e-300)
     by_wave = (prints.place_mm * prints.weight).sum(3) / light

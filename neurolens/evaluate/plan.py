@@ -21,12 +21,13 @@ import numpy as np
 
 from neurolens.base.errors import InputError, ModelError
 from neurolens.base.progress import Report
-from neurolens.cameras.build import IDEAL_OF, Shot, ideal_as
+from neurolens.cameras.build import Shot, ideal_as
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 from neurolens.cameras.exact import FusedExactCamera
-from neurolens.cameras.field import WIDEST_DEG
 from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.warped import WarpedPinhole
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate.costs import (
     CYCLES_NS,
@@ -66,7 +67,7 @@ class Choice:
         camera: as `--camera` takes it, or what `export` takes. error_px, light_error: at the counted percentile; inf
             where it has no light that the lens has. cost: of a ray, in the plan's unit, times `noise`; inf where it was
             not asked for. noise: how many times the rays it needs for equal error, see `costs`.
-        within: whether it meets the budget. how: what else it needs, or how it was made.
+        how: what else it needs, or how it was made. within: whether it meets the budget of its plan.
     """
 
     name: str
@@ -75,8 +76,12 @@ class Choice:
     light_error: float
     cost: float
     noise: float
-    within: bool
     how: str = ""
+    within: bool = False
+
+    def meets(self, budget_px: float) -> bool:
+        """Whether it may be used."""
+        return self.error_px <= budget_px and self.light_error <= LIGHT
 
 
 @dataclass(frozen=True)
@@ -119,29 +124,42 @@ def plan(
     if not budget_px >= 0:
         raise InputError("plan", "budget_px", budget_px, "0 or more pixels")
     found = probe(scene, lens)
+    tried = candidates(found, (budget_px,), target, models=models, folder=folder, explain=explain, report=report)
+    return decided(found, tried, budget_px, target)
+
+
+def candidates(
+    found: Probed, budgets_px: Sequence[float], target: Target, *, models: Sequence[Path] = (),
+    folder: Path | None = None, explain: bool = False, report: Report | None = None,
+) -> tuple[Choice, ...]:  # fmt: skip
+    """Cameras with error and cost, enough to decide for each of some budgets; arguments as of `plan`."""
     say = report or (lambda done, left=None: None)
     say(0.3)
-    trial = _Trial(found, budget_px, target, explain)
+    # Infinity: all are timed, whatever their light.
+    trial = _Trial(found, target, math.inf if explain else max(budgets_px))
     tried = [*_ideal(trial), *_exact(trial)]
     for file in models:
         tried += _model(trial, file)
     say(0.6)
     if folder is not None:
-        tried += _fitted(trial, folder, tried, lambda done, left=None: say(0.6 + 0.4 * done))
-    tried.sort(key=lambda c: c.cost)
-    best = next((c for c in tried if c.within), None)
-    return Plan(found.asked, budget_px, target, UNIT[target], effects_of(found, budget_px), tuple(tried), best)
+        tried += _fitted(trial, budgets_px, folder, tried, lambda done, left=None: say(0.6 + 0.4 * done))
+    return tuple(tried)
+
+
+def decided(found: Probed, tried: Sequence[Choice], budget_px: float, target: Target) -> Plan:
+    """The plan for a budget, from candidates that serve it."""
+    ranked = tuple(replace(c, within=c.meets(budget_px)) for c in sorted(tried, key=lambda c: c.cost))
+    best = next((c for c in ranked if c.within), None)
+    return Plan(found.asked, budget_px, target, UNIT[target], effects_of(found, budget_px), ranked, best)
 
 
 @dataclass(frozen=True)
 class _Trial:
-    """What cameras are tried for."""
+    """What cameras are tried for; those with an error up to `costed_px` are compiled and timed, all where it is inf."""
 
     found: Probed
-    budget_px: float
     target: Target
-    explain: bool
-    costed: bool = True
+    costed_px: float
 
     @property
     def share(self) -> prints.Array:
@@ -163,11 +181,12 @@ class _Trial:
         apart = prints.distance_mm(found.seen, seen, self.share) / found.asked.pixel_mm
         light = np.abs(seen.light / np.maximum(found.seen.light, 1e-30) - 1)
         error, dim = (float(np.percentile(np.where(np.isfinite(v), v, np.inf), COUNTED)) for v in (apart, light))
-        within = error <= self.budget_px and dim <= LIGHT
-        asked = self.costed and (within or self.explain)
-        ray, times = cost() if asked else (math.inf, noise(seen.weight, self.share))
+        choice = Choice(name, spec, error, dim, math.inf, noise(seen.weight, self.share), how)
+        if not (choice.meets(self.costed_px) or math.isinf(self.costed_px)):
+            return choice
+        ray, times = cost()
         # A shader that does not focus so near shows nothing.
-        return Choice(name, spec, error, dim, ray * times, times, within and math.isfinite(times), how)
+        return replace(choice, cost=ray * times, noise=times, error_px=error if math.isfinite(times) else math.inf)
 
     def timed(self, camera: Camera, seen: Footprints) -> tuple[float, float]:
         return ns_a_ray(camera, self.found.places), noise(seen.weight, self.share)
@@ -190,20 +209,29 @@ def _ideal(trial: _Trial) -> Iterator[Choice]:
 
     In C and GLSL they are their own source.
     """
-    found = trial.found
-    kinds = {"onnx": (), "osl": ("pinhole:", "thin:")}.get(trial.target, IDEAL_OF)
-    for kind in reversed(kinds):
+    found, shot = trial.found, Shot(trial.found.asked.film_mm, trial.found.asked.focus_m)
+    area = math.inf
+    kinds = {"onnx": (), "osl": ("pinhole:", "thin:")}.get(trial.target, ("pinhole:", "thin:", "thick:"))
+    for kind in kinds:
         name, spec = kind.rstrip(":"), f"{kind}{found.lens.path}"
-        with suppress(InputError):  # no thick lens of cylinders
-            camera = ideal_as(kind, found.exact.lens, Shot(found.asked.film_mm, found.asked.focus_m))
-            seen, area = prints.footprints(camera, found.places), _overscan(found)
+        with suppress(InputError):  # no thick lens of cylinders; no maps of half a sphere, or of a film that is dark
+            camera = ideal_as(kind, found.exact.lens, shot)
+            seen = prints.footprints(camera, found.places)
             yield trial.judged(name, spec, seen, partial(trial.ideal, name, camera, seen))
-            moved = camera if kind == "thick:" else _FromPupil(camera, found)
-            if area < _MOST_OVERSCAN and (warped := _warped(found, moved)) is not None:
-                how = f"from where 'neurolens stmap' says, {area:.3g} times the picture, then its maps"
-                yield trial.judged(
-                    f"{name} + ST map", spec, warped, partial(trial.ideal, name, camera, seen, area), how
-                )
+            where = "" if kind == "thick:" or trial.target in _OURS else "from the entrance pupil, "
+            warped: Footprints | None
+            if isinstance(camera, Pinhole):
+                hole = WarpedPinhole(camera, found.exact, found.asked.focus_m)
+                area, warped = hole.area, prints.footprints(hole, found.places)
+                where = ""
+            elif kind == "thin:" and not where:
+                continue  # in our renderer the thick lens stands in its place
+            else:
+                warped = _warped(found, _FromPupil(camera, found) if where else camera)
+            if area < _MOST_OVERSCAN and warped is not None:
+                how = f"{where}then the ST map of 'neurolens stmap' over the picture, of {area:.3g} times the area"
+                cost = partial(trial.ideal, name, camera, seen, area)
+                yield trial.judged(f"{name} + ST map", spec, warped, cost, how)
 
 
 class _FromPupil:
@@ -231,21 +259,11 @@ def _warped(found: Probed, camera: Any) -> Footprints | None:
     flat = prints.places_of(found.exact, places.film_mm, focus, places.wavelength_nm, places.share)
     if flat.film_mm.shape != places.film_mm.shape:
         return None
-    by = np.subtract(*(prints.centre_mm(prints.footprints(c, flat), places.share) for c in (found.exact, camera)))
+    by = np.subtract(*(prints.centroids(prints.footprints(c, flat), places.share)[0] for c in (found.exact, camera)))
     seen = prints.footprints(camera, places)
     lit = seen.weight > 0
     weight = seen.weight * (found.seen.light / np.maximum(seen.light, 1e-30))[:, None, None]
     return Footprints(np.where(lit, seen.place_mm + by[:, :, None, None], 0.0), seen.pupil_mm, weight)
-
-
-def _overscan(found: Probed) -> float:
-    """Area of the plane picture that holds all that the lens shows, over that of the film; inf for half a sphere."""
-    way = found.places.direction
-    if (-way[2] < math.cos(math.radians(WIDEST_DEG))).any():
-        return math.inf
-    reach = found.exact.settings["lens_state"]["pinhole_focal_length_mm"]
-    slope = np.abs(way[:2] / way[2]).max(1) * reach / np.maximum(np.abs(found.places.film_mm).max(1), 1e-9)
-    return float(np.maximum(slope, 1.0).prod())
 
 
 def _exact(trial: _Trial) -> Iterator[Choice]:
@@ -284,26 +302,33 @@ def _model(trial: _Trial, file: Path, how: str = "") -> Iterator[Choice]:
             yield trial.judged(file.stem, f"{'fused:' if compiled else ''}{file}", seen, cost, how)
 
 
-def _fitted(trial: _Trial, folder: Path, tried: Sequence[Choice], say: Report) -> Iterator[Choice]:
+def _fitted(
+    trial: _Trial, budgets_px: Sequence[float], folder: Path, tried: Sequence[Choice], say: Report
+) -> Iterator[Choice]:
     """Polynomials fitted for the shot alone, by halves of their sizes: the smallest that holds, and those on the way.
 
     None where a camera without a lens does, in targets where it costs less than any.
     """
     found, ideal = trial.found, ("pinhole",) if trial.target in _OURS else ("pinhole", "thin")
-    if any(c.within and c.name.startswith(ideal) for c in tried):
+    asked = [b for b in budgets_px if not any(c.meets(b) and c.name.startswith(ideal) for c in tried)]
+    if not asked:
         return
     prepared = prepare(make_pairs(found.lens, found.domain, _PAIRS))
     folder.mkdir(parents=True, exist_ok=True)
-    low, high = 0, len(_TERMS)  # sizes below `low` do not hold, those from `high` on do
     known: dict[int, tuple[Path, list[Choice]]] = {}
-    while low < high:
-        middle = (low + high) // 2
-        settings = ModelSettings("ols", terms=_TERMS[middle], planes=False, elimination=False)
-        file = folder / f"{Path(found.lens.path).stem}.shot-{settings.label}.onnx"
-        export_onnx(fit_model(prepared, settings), file, errors={})
-        made = list(_model(replace(trial, costed=trial.explain), file, _SHOT))
-        known[middle] = file, made
-        low, high = (low, middle) if any(c.within for c in made) else (middle + 1, high)
-        say(1 - (high - low) / len(_TERMS))
+    explain = math.isinf(trial.costed_px)
+    smallest = set()
+    for k, budget_px in enumerate(asked):
+        low, high = 0, len(_TERMS)  # sizes below `low` do not hold, those from `high` on do
+        while low < high:
+            size = (low + high) // 2
+            if size not in known:
+                settings = ModelSettings("ols", terms=_TERMS[size], planes=False, elimination=False)
+                file = folder / f"{Path(found.lens.path).stem}.shot-{settings.label}.onnx"
+                export_onnx(fit_model(prepared, settings), file, errors={})
+                known[size] = file, list(_model(trial if explain else replace(trial, costed_px=-1.0), file, _SHOT))
+            low, high = (low, size) if any(c.meets(budget_px) for c in known[size][1]) else (size + 1, high)
+            say((k + 1 - (high - low) / len(_TERMS)) / len(asked))
+        smallest.add(low)
     for size, (file, made) in known.items():  # what is larger than the smallest costs more, and is not compiled
-        yield from _model(trial, file, _SHOT) if size == low and not trial.explain else made
+        yield from _model(trial, file, _SHOT) if size in smallest and not explain else made

@@ -10,12 +10,15 @@ import pytest
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.field import spectrum_of
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.warped import WarpedPinhole
 from neurolens.cli import main
 from neurolens.commands.plan import TARGETS
 from neurolens.evaluate import plan as planned
 from neurolens.evaluate.costs import noise, shader_cost
-from neurolens.evaluate.footprints import Footprints, blur_mm, distance_mm, effects_mm, footprints, places_of
-from neurolens.evaluate.plan import Target, plan
+from neurolens.evaluate.footprints import Footprints, blur_mm, centroids, distance_mm, effects_mm, footprints, places_of
+from neurolens.evaluate.plan import Target, candidates, decided, plan
 from neurolens.evaluate.probe import effects_of, probe
 from neurolens.evaluate.scenes import seen_depths_m
 from neurolens.evaluate.shaders import lens_of
@@ -122,10 +125,27 @@ def test_what_a_shot_needs_falls_with_its_stop() -> None:
     assert small["diffraction"] > 3 * wide["diffraction"]
 
 
+@pytest.mark.parametrize("lens", ["canon_gauss_35", "cooke_anamorphic_42"])
+def test_a_warped_pinhole_shows_what_is_in_focus_where_the_lens_does(lens: str) -> None:
+    shot = Shot((18.0, 10.0), 2.0, f_number=16.0)
+    exact, hole = make_camera(f"lenses/{lens}.toml", shot), make_camera(f"pinhole:lenses/{lens}.toml", shot)
+    assert isinstance(hole, Pinhole)
+    flat, film = WarpedPinhole(hole, exact, 2.0), 0.7 * FILM
+    nanometres, light = spectrum_of(exact)
+    share = light / light.sum()
+    for depth_m, most in ((2.0, 5e-4), (0.5, math.inf)):  # what is nearer is seen from elsewhere
+        places = places_of(exact, film, np.full(4, depth_m), nanometres, share)
+        seen = footprints(exact, places)
+        sharp = replace(seen, place_mm=np.broadcast_to(centroids(seen, share)[0][..., None, None], seen.place_mm.shape))
+        apart, without = (distance_mm(sharp, footprints(c, places), share).max() for c in (flat, hole))
+        assert apart < min(most, without)
+
+
 @pytest.mark.parametrize(("budget", "distance_m", "f_number"), [(0.0, 4.0, None), (1e9, 4.0, 45.0), (1e9, 0.12, 45.0)])
 def test_budgets_at_the_extremes(budget: float, distance_m: float, f_number: float | None) -> None:
     """No budget leaves the exact lens; any budget, a point whose picture is warped, for it costs least."""
-    found = plan(scene_from_tables(wall(distance_m, f_number)), read_lens(LENS).at(), budget)
+    film = {"film_width_mm": 28.0, "film_height_mm": 15.75}  # less than its circle of light, for the maps
+    found = plan(scene_from_tables(wall(distance_m, f_number, **film)), read_lens(LENS).at(), budget)
     assert found.best is not None and found.best.light_error <= 0.01
     assert found.best.name == ("exact" if budget == 0 else "pinhole + ST map")
     assert all(c.cost >= found.best.cost for c in found.choices if c.within)
@@ -164,9 +184,10 @@ def test_noise_of_weights_is_how_many_times_the_rays_it_takes() -> None:
 
 def test_what_is_cheapest_differs_by_target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Blender's own thin lens costs less than any shader; in our renderer a small polynomial costs less than it."""
-    scene, lens = load_scene(Path("experiments/scenes/garden.toml")), read_lens(GAUSS).at()
+    found = probe(load_scene(Path("experiments/scenes/garden.toml")), read_lens(GAUSS).at(), across=8)
     monkeypatch.setattr(planned, "_TERMS", (8,))
-    best = {t: plan(scene, lens, 1.0, target=t, folder=tmp_path).best for t in ("render", "osl")}
+    targets: tuple[Target, ...] = ("render", "osl")
+    best = {t: decided(found, candidates(found, (1.0,), t, folder=tmp_path), 1.0, t).best for t in targets}
     assert best["osl"] is not None and best["osl"].name == "thin + ST map" and best["osl"].error_px < 1
     assert best["render"] is not None and best["render"].how == "fitted for this shot"
 
@@ -193,7 +214,7 @@ def test_a_warped_pinhole_lacks_the_blur_alone() -> None:
     choices, found = {c.name: c for c in plan(scene, lens, 1e9, explain=True).choices}, probe(scene, lens)
     blur = np.percentile(blur_mm(found.seen, found.places.share) / 2, 95) / found.asked.pixel_mm
     assert choices["pinhole + ST map"].error_px == pytest.approx(blur, rel=0.02)
-    assert choices["thin + ST map"].error_px == pytest.approx(blur, rel=0.02)  # in focus it is a point
+    assert choices["thick + ST map"].error_px == pytest.approx(blur, rel=0.02)  # in focus it is a point
     assert choices["pinhole"].error_px > 3 * blur
     assert choices["pinhole + ST map"].light_error < 1e-9 < choices["pinhole"].light_error
 
