@@ -307,16 +307,16 @@ def _fitted(
 ) -> Iterator[Choice]:
     """Polynomials fitted for the shot alone, by halves of their sizes: the smallest that holds, and those on the way.
 
-    None where a camera without a lens does, in targets where it costs less than any.
+    None where a camera without a lens does, in targets where it costs less than any, unless all is asked for.
     """
     found, ideal = trial.found, ("pinhole",) if trial.target in _OURS else ("pinhole", "thin")
-    asked = [b for b in budgets_px if not any(c.meets(b) and c.name.startswith(ideal) for c in tried)]
+    explain = math.isinf(trial.costed_px)
+    asked = [b for b in budgets_px if explain or not any(c.meets(b) and c.name.startswith(ideal) for c in tried)]
     if not asked:
         return
     prepared = prepare(make_pairs(found.lens, found.domain, _PAIRS))
     folder.mkdir(parents=True, exist_ok=True)
     known: dict[int, tuple[Path, list[Choice]]] = {}
-    explain = math.isinf(trial.costed_px)
     smallest = set()
     for k, budget_px in enumerate(asked):
         low, high = 0, len(_TERMS)  # sizes below `low` do not hold, those from `high` on do
