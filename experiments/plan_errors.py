@@ -32,7 +32,7 @@ from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
 
 Array = NDArray[np.float64]
-_PUPIL = 20  # squared: pupil samples of a fresh footprint
+_PUPIL = 18  # squared: pupil samples of a fresh footprint
 _SMOOTH_PX = 1.2  # of pictures before derivatives
 _EDGE = 4  # pixels at a piece's rim that the filter spoils
 _COLOURS = np.array([0.2126, 0.7152, 0.0722])  # luminance of linear sRGB: what each colour counts
@@ -43,7 +43,7 @@ _PART = 2.0  # standard errors above which a part of a difference is one
 # ---- By rays. --------------------------------------------------------------------------------------------------------
 
 
-def fresh_places(scene: Scene, exact: Camera, across: int = 28, seed: int = 5) -> Places:
+def fresh_places(scene: Scene, exact: Camera, across: int = 22, seed: int = 5) -> Places:
     """Places at random in the cells of a grid, `across` along the width, at wavelengths in steps of a fifth."""
     shot = scene.settings.camera
     film = np.array([shot.film_width_mm, shot.film_height_mm])
