@@ -54,6 +54,7 @@ def build_parser() -> Parser:
         flare,
         glass,
         lens,
+        merge,
         mitsuba,
         models,
         plan,
@@ -68,7 +69,7 @@ def build_parser() -> Parser:
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     read = lens, analyse, glass, convert, survey, stmap, projection
-    for command in (*read, plan, train, models, evaluate, export, render, flare, mitsuba, blender, bench):
+    for command in (*read, plan, train, models, evaluate, export, render, merge, flare, mitsuba, blender, bench):
         command.add_parser(subparsers)
     return parser
 
