@@ -177,8 +177,8 @@ def _fit(exact: Array, other: Array) -> tuple[Array, Array]:
     columns, wanted = [], []
     for a, b in zip(exact, other, strict=True):
         flat, apart = _smooth(a, _SMOOTH_PX), _smooth(b - a, _SMOOTH_PX)
-        down, right = np.gradient(flat)
-        bend = np.gradient(down, axis=0) + np.gradient(right, axis=1)
+        down, right = (np.gradient(flat, axis=k) for k in (0, 1))
+        bend = np.asarray(np.gradient(down, axis=0) + np.gradient(right, axis=1))
         inner = (slice(_EDGE, -_EDGE),) * 2
         # The variance along each axis is half of the squared distance: 1/2 * 1/2.
         columns.append(np.stack([-right[inner], -down[inner], bend[inner] / 4, flat[inner]]).reshape(4, -1))

@@ -22,9 +22,7 @@ from experiments import lab, plan_errors
 from neurolens.base.progress import Report
 from neurolens.cameras.build import Shot, ideal_as, make_camera
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.field import field_of
-from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.warped import WarpedPinhole
+from neurolens.cameras.warped import Warped
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate import plan as plans
 from neurolens.evaluate.experiment import near_limit_m
@@ -46,8 +44,8 @@ LENSES = (
 )  # fmt: skip
 SCENES = ("distant", "garden", "room", "lights")  # stopped down and grey, to wide open among coloured lights
 BUDGETS = (1.0, 0.25, 0.05)
-TARGETS: tuple[plans.Target, ...] = ("render", "onnx")
-MORE_TERMS = (4, 6, 12, 22, 36)  # besides those of plans
+TARGETS: tuple[plans.Target, ...] = ("render", "osl")
+MORE_TERMS = (5, 10, 19, 64)  # besides those of plans
 _WIDTH = 1920
 _LIT = 0.95  # of the image circle that the film's corners reach
 _LARGEST_MM = 36.0
@@ -102,11 +100,11 @@ def suited(scene: Scene, lens: Lens, width: int = _WIDTH) -> Scene:
     across = min(2 * _LIT * image_radius_mm(lens)[0] * 16 / math.hypot(16, 9), _LARGEST_MM)
     back = max(near_limit_m(lens) - shot.focus_m, 0.0)
     eye, target = np.array(shot.position_m), np.array(shot.look_at_m)
-    place = eye - back * (target - eye) / np.linalg.norm(target - eye)
+    x, y, z = (float(v) for v in eye - back * (target - eye) / np.linalg.norm(target - eye))
     widest = first_order(lens).f_number
     f_number = widest if scene.name == "lights" else max(shot.f_number or widest, widest)
     camera = replace(
-        shot, position_m=tuple(float(v) for v in place), focus_m=shot.focus_m + back, f_number=f_number,
+        shot, position_m=(x, y, z), focus_m=shot.focus_m + back, f_number=f_number,
         film_width_mm=across, film_height_mm=across * 9 / 16, width=width, height=width * 9 // 16,
     )  # fmt: skip
     return replace(scene, settings=replace(scene.settings, camera=camera))
@@ -143,7 +141,7 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
                     "plan_px": choice.error_px, "plan_light": choice.light_error, "px": _counted(apart),
                     "light": _counted(light),
                 }  # fmt: skip
-            rows[choice.name][f"ns_{target}"] = choice.ns
+            rows[choice.name][f"cost_{target}"] = choice.cost if math.isfinite(choice.cost) else None
         for budget in BUDGETS:
             best = plans.decided(found, picks, budget, target).best
             decisions.append(_decision(target, budget, best, every, rows) | {"plan_s": plan_s})
@@ -154,10 +152,9 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
     for decision in decisions:
         decision["render"] = told.get(decision["chosen"])
     dense = replace(found, places=places, seen=fresh.seen, thin_seen=plan_errors.fresh_prints(_thin(found), places))
-    return {
-        "lens": case.lens, "scene": case.scene, "f_number": found.asked.f_number,
-        "pixel_um": 1e3 * found.asked.pixel_mm, "nearest_m": found.asked.nearest_m, "effects": _effects(found, dense), "cameras": rows, "decisions": decisions,
-    }  # fmt: skip
+    facts = {"lens": case.lens, "scene": case.scene, "f_number": found.asked.f_number}
+    facts |= {"pixel_um": 1e3 * found.asked.pixel_mm, "nearest_m": found.asked.nearest_m}
+    return facts | {"effects": _effects(found, dense), "cameras": rows, "decisions": decisions}
 
 
 def _ladder(found: Probed, folder: Path) -> list[Path]:
@@ -176,15 +173,13 @@ def _ladder(found: Probed, folder: Path) -> list[Path]:
 def camera_of(choice: plans.Choice, found: Probed, state: str | None, smooth: bool = False) -> Camera:
     """The camera that a plan names, as a render makes it; with `smooth`, a warped picture by tables of the field."""
     asked = found.asked
-    light = {"wavelength_nm": asked.wavelength_nm}
+    shot = Shot(asked.film_mm, asked.focus_m, asked.f_number, wavelength_nm=asked.wavelength_nm)
     if choice.camera.endswith(".onnx"):
-        return make_camera(choice.camera, Shot(asked.film_mm, asked.focus_m, asked.f_number, **light))
-    camera = make_camera(choice.camera, Shot(asked.film_mm, asked.focus_m, asked.f_number, zoom=state, **light))
-    if "ST map" in choice.name:
-        assert isinstance(camera, Pinhole)
-        field = field_of(found.exact, asked.focus_m) if smooth else None
-        return WarpedPinhole(camera, found.exact, asked.focus_m, field)
-    return camera
+        return make_camera(choice.camera, shot)
+    if "ST map" not in choice.name:
+        return make_camera(choice.camera, replace(shot, zoom=state))
+    flat = ideal_as(f"{choice.name.partition(' ')[0]}:", found.exact.lens, Shot(asked.film_mm, asked.focus_m))
+    return Warped(flat, found.exact, asked.focus_m, tables=smooth)
 
 
 def _thin(found: Probed) -> Camera:
@@ -203,7 +198,7 @@ def _decision(
     def holds(name: str) -> bool:
         return bool(rows[name]["px"] <= budget and rows[name]["light"] <= LIGHT)
 
-    costs = {c.name: c.ns for c in every}
+    costs = {c.name: c.cost for c in every}
     good = sorted((n for n in costs if holds(n)), key=costs.__getitem__)
     cheapest = good[0] if good else None
     made: dict[str, Any] = {"target": target, "budget_px": budget, "chosen": best and best.name, "cheapest": cheapest}
@@ -274,10 +269,10 @@ _HEAD = """\
 # Plans against all cameras tried
 
 {cases} cases: each lens with each scene ("distant": f/11, one line of light; "lights": wide open, near, coloured), 1920
-pixels across the film, for our renderer and for onnxruntime. *px*: error of the camera chosen in pixels that 95% of the
-picture keep, at places, pupil samples and wavelengths that the plan did not see; *render*: the same from renders of
-pieces of the picture, as far as it is above the noise. *times*: its cost over that of the cheapest camera that holds
-among all that were tried ({tried}, polynomials of {sizes} sizes among them).
+pixels across the film, for our renderer and for Blender's Cycles (osl). *px*: error of the camera chosen in pixels that
+95% of the picture keep, at places, pupil samples and wavelengths that the plan did not see; *render*: the same from
+renders of pieces of the picture, as far as it is above the noise. *times*: its cost over that of the cheapest camera
+that holds among all that were tried ({tried}, polynomials of {sizes} sizes among them).
 Made by `python -m experiments plans`."""
 _COLUMNS = lab.columns(
     ("lens", "lens"), ("scene", "scene"), ("f/", "f_number", ".3g"), ("pixel um", "pixel_um", ".3g"), ("for", "target"),
