@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path
+from neurolens.base.files import atomic_path, library
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, lens_path, project_root
+from neurolens.commands.arguments import add_glass, add_json, lens_path
 from neurolens.commands.output import answer, number, table
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     folder = args.output or Path("runs") / f"plan-{scene.name}-{file.stem}"
     if folder.exists() and not folder.is_dir():
         raise InputError("neurolens plan", "-o", str(folder), "a folder")
-    shipped = sorted((project_root() / "models").glob(f"{file.stem}.*.onnx"))
+    shipped = sorted((library() / "models").glob(f"{file.stem}.*.onnx"))
     progress = Progress({"plan": 10}, quiet=args.quiet)
     with progress.stage("plan") as report:
         found = plan(
