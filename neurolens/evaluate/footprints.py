@@ -12,6 +12,7 @@ rays, and holds what a picture shows: place, size and shape of the blur, and of 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +30,7 @@ EFFECTS = (
     "distortion", "defocus", "spherical aberration", "coma", "astigmatism", "field curvature", "higher orders",
     "longitudinal colour", "lateral colour",
 )  # fmt: skip
+AFTERWARDS = ("distortion", "defocus")  # what compositing may do to a picture
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,19 @@ def collapsed(exact: Footprints, share: Array) -> Footprints:
     centre, _ = _centroids(exact, share)
     place = np.broadcast_to(centre[:, :, None, None], exact.place_mm.shape)
     return Footprints(np.array(place), exact.pupil_mm, exact.weight)
+
+
+def left_to(exact: Footprints, thin: Footprints, share: Array, afterwards: Collection[str]) -> Footprints:
+    """The exact camera's footprints without what `AFTERWARDS` makes of the picture later.
+
+    Without distortion they lie where a thin lens's do; without defocus they are points.
+    """
+    found = collapsed(exact, share) if "defocus" in afterwards else exact
+    if "distortion" not in afterwards:
+        return found
+    shift = _centroids(thin, share)[0] - _centroids(exact, share)[0]
+    place = np.where(found.weight > 0, found.place_mm + shift[:, :, None, None], 0.0)
+    return Footprints(place, found.pupil_mm, found.weight)
 
 
 def distance_mm(a: Footprints, b: Footprints, share: Array) -> Array:
