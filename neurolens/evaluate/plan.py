@@ -53,7 +53,7 @@ class Choice:
     Attributes:
         camera: as `--camera` takes it. error_px, light_error: at the counted percentile; inf where it has no light
             that the lens has. ns: a ray that passes, inf where it was not timed. passed: share of rays.
-        within: whether it meets the budget. how: what else it needs, or how it was made.
+        how: what else it needs, or how it was made. within: whether it meets the budget of its plan.
     """
 
     name: str
@@ -62,8 +62,12 @@ class Choice:
     light_error: float
     ns: float
     passed: float
-    within: bool
     how: str = ""
+    within: bool = False
+
+    def meets(self, budget_px: float) -> bool:
+        """Whether it may be used."""
+        return self.error_px <= budget_px and self.light_error <= LIGHT
 
 
 @dataclass(frozen=True)
@@ -100,24 +104,41 @@ def plan(
     if not budget_px >= 0:
         raise InputError("plan", "budget_px", budget_px, "0 or more pixels")
     found = probe(scene, lens)
+    tried = candidates(found, (budget_px,), target, models=models, folder=folder, explain=explain, report=report)
+    return decided(found, tried, budget_px, target)
+
+
+def candidates(
+    found: Probed, budgets_px: Sequence[float], target: Target, *, models: Sequence[Path] = (),
+    folder: Path | None = None, explain: bool = False, report: Report | None = None,
+) -> tuple[Choice, ...]:  # fmt: skip
+    """Cameras with error and cost, enough to decide for each of some budgets; arguments as of `plan`."""
     say = report or (lambda done: None)
     say(0.3)
-    tried = [*_ideal(found, budget_px, target), *_exact(found, budget_px, target)]
+    # Infinity: all are timed, whatever their light.
+    timed_px, least_px = math.inf if explain else max(budgets_px), min(budgets_px)
+    tried = [*_ideal(found, target), *_exact(found, target)]
     for file in models:
-        tried += _try_model(found, file, budget_px, target, explain)
+        tried += _try_model(found, file, target, timed_px)
     say(0.6)
     if folder is not None:
-        for choice in _fitted(found, budget_px, target, folder, explain):
+        for choice in _fitted(found, target, folder, timed_px):
             tried.append(choice)
             say(0.8)
-            if choice.within or (math.isfinite(choice.ns) and any(c.within and c.ns < choice.ns for c in tried)):
+            known = math.isfinite(choice.ns)
+            if choice.meets(least_px) or (known and any(c.meets(least_px) and c.ns < choice.ns for c in tried)):
                 break  # larger ones cost more
-    tried.sort(key=lambda c: c.ns)
-    best = next((c for c in tried if c.within), None)
-    return Plan(found.asked, budget_px, target, effects_of(found, budget_px), tuple(tried), best)
+    return tuple(tried)
 
 
-def _ideal(found: Probed, budget_px: float, target: Target) -> Iterator[Choice]:
+def decided(found: Probed, tried: Sequence[Choice], budget_px: float, target: Target) -> Plan:
+    """The plan for a budget, from candidates that serve it."""
+    ranked = tuple(replace(c, within=c.meets(budget_px)) for c in sorted(tried, key=lambda c: c.ns))
+    best = next((c for c in ranked if c.within), None)
+    return Plan(found.asked, budget_px, target, effects_of(found, budget_px), ranked, best)
+
+
+def _ideal(found: Probed, target: Target) -> Iterator[Choice]:
     """Pinhole, the same with its picture warped afterwards, thin and thick lens; they are their own source in C."""
     if target == "onnx":
         return
@@ -126,11 +147,11 @@ def _ideal(found: Probed, budget_px: float, target: Target) -> Iterator[Choice]:
         with suppress(InputError):  # no thick lens of cylinders
             camera = ideal_as(kind, found.exact.lens, shot)
             spec = f"{kind}{path}"
-            yield _judged(found, kind.rstrip(":"), spec, camera, budget_px)
+            yield _judged(found, kind.rstrip(":"), spec, camera)
             if kind == "pinhole:" and (area := _overscan(found)) < _MOST_OVERSCAN:
                 flat = prints.collapsed(found.seen, found.places.share)
                 how = f"then the ST map of 'neurolens stmap' over the picture, of {area:.3g} times the area"
-                warped = _judged(found, "pinhole + ST map", spec, camera, budget_px, flat, how)
+                warped = _judged(found, "pinhole + ST map", spec, camera, flat, how)
                 yield replace(warped, ns=area * warped.ns * warped.passed, passed=1.0)  # its own rays all pass
 
 
@@ -144,20 +165,19 @@ def _overscan(found: Probed) -> float:
     return float(np.maximum(slope, 1.0).prod())
 
 
-def _exact(found: Probed, budget_px: float, target: Target) -> Iterator[Choice]:
+def _exact(found: Probed, target: Target) -> Iterator[Choice]:
     """The exact lens, which has no error; as C where that runs."""
     compiled = isinstance(found.exact, FusedExactCamera)
     if target == "render" or (target == "c" and compiled):
         spec = f"{'fused:' if compiled else ''}{found.lens.path}"
-        yield _judged(found, "exact", spec, found.exact, budget_px, found.seen)
+        yield _judged(found, "exact", spec, found.exact, found.seen)
 
 
-def _try_model(
-    found: Probed, file: Path, budget_px: float, target: Target, explain: bool, how: str = ""
-) -> Iterator[Choice]:
+def _try_model(found: Probed, file: Path, target: Target, timed_px: float, how: str = "") -> Iterator[Choice]:
     """A model in the form that the target runs; none where its domain is not the shot's, or it has no such form.
 
-    Errors are of onnxruntime: compilers take seconds, and C gives the same rays.
+    Errors are of onnxruntime: compilers take seconds, and C gives the same rays; it is timed up to an error of
+    `timed_px`.
     """
     asked = found.asked
     real: dict[str, Any] = {"film_mm": asked.film_mm, "focus_m": asked.focus_m, "f_number": asked.f_number}
@@ -166,15 +186,15 @@ def _try_model(
     with suppress(InputError, ModelError):
         model = load_model(file)
         spec = f"{'fused:' if compiled else ''}{file}"
-        choice = _judged(found, file.stem, spec, OnnxCamera(model, **real), budget_px, how=how, timed=not compiled)
-        if compiled and (choice.within or explain):
+        choice = _judged(found, file.stem, spec, OnnxCamera(model, **real), how=how, timed=not compiled)
+        if compiled and (choice.meets(timed_px) or math.isinf(timed_px)):
             cost = _ns_a_ray(FusedCamera(model, **real), found.places) / max(choice.passed, 1e-9)
             choice = replace(choice, ns=cost)
         if compiled or target != "c":
             yield choice
 
 
-def _fitted(found: Probed, budget_px: float, target: Target, folder: Path, explain: bool) -> Iterator[Choice]:
+def _fitted(found: Probed, target: Target, folder: Path, timed_px: float) -> Iterator[Choice]:
     """Polynomials fitted for the shot alone, of rising size."""
     prepared = prepare(make_pairs(found.lens, found.domain, _PAIRS))
     folder.mkdir(parents=True, exist_ok=True)
@@ -182,12 +202,12 @@ def _fitted(found: Probed, budget_px: float, target: Target, folder: Path, expla
         settings = ModelSettings("ols", terms=terms, planes=False, elimination=False)
         file = folder / f"{Path(found.lens.path).stem}.shot-{settings.label}.onnx"
         export_onnx(fit_model(prepared, settings), file, errors={})
-        yield from _try_model(found, file, budget_px, target, explain, "fitted for this shot")
+        yield from _try_model(found, file, target, timed_px, "fitted for this shot")
 
 
 def _judged(
-    found: Probed, name: str, spec: str, camera: Camera, budget_px: float, seen: Footprints | None = None,
-    how: str = "", timed: bool = True,
+    found: Probed, name: str, spec: str, camera: Camera, seen: Footprints | None = None, how: str = "",
+    timed: bool = True,
 ) -> Choice:  # fmt: skip
     """A camera's error against the exact footprints, and its cost."""
     share = found.places.share
@@ -196,7 +216,7 @@ def _judged(
     light = np.abs(seen.light / np.maximum(found.seen.light, 1e-30) - 1)
     error, dim = (float(np.percentile(np.where(np.isfinite(v), v, np.inf), COUNTED)) for v in (apart, light))
     cost = _ns_a_ray(camera, found.places) / max(seen.passed, 1e-9) if timed else math.inf
-    return Choice(name, spec, error, dim, cost, seen.passed, error <= budget_px and dim <= LIGHT, how)
+    return Choice(name, spec, error, dim, cost, seen.passed, how)
 
 
 def _ns_a_ray(camera: Camera, places: Places) -> float:
