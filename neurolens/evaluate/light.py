@@ -48,11 +48,13 @@ class Glance:
 
     Attributes:
         rgb: [H, W, 3] linear sRGB. contrast: [H, W] RMS relative difference of neighbours (one to the right and one
-            below), noise taken out. wavelength_nm, share: [W] of its light by the eye, of sum 1.
+            below), noise taken out. range_nm: of all but the last of its light by the eye; wavelength_nm, share: [W] of
+            that, of sum 1.
     """
 
     rgb: Array
     contrast: Array
+    range_nm: tuple[float, float]
     wavelength_nm: Array
     share: Array
 
@@ -84,13 +86,15 @@ def small_raster(film_mm: tuple[float, float]) -> tuple[int, int]:
     return width, height
 
 
-def light_of(scene: Scene, camera: Camera, rgb: Array) -> tuple[Array, Array]:
-    """Wavelengths in nm and their shares of a picture's light, as the eye weighs it: of the scene's lights, tinted so
-    that the picture has its mean colour. Equal parts of the range that holds all but the last of it, each by its
-    centroid: a narrow line is one wavelength."""
+def light_of(scene: Scene, camera: Camera, rgb: Array) -> tuple[tuple[float, float], Array, Array]:
+    """Range and wavelengths in nm and their shares of a picture's light, as the eye weighs it.
+
+    It is that of the scene's lights, tinted so that the picture has its mean colour. Equal parts of the range that
+    holds all but the last of it are each one wavelength, their centroid: a narrow line is one.
+    """
     low, high = scene.settings.camera.wavelengths_nm
     if not camera.dispersive and getattr(camera, "achromatic", False):
-        return np.array([(low + high) / 2]), np.ones(1)
+        return (low, high), np.array([(low + high) / 2]), np.ones(1)
     nm, light = expected_light(scene)
     spectral = SpectralRange(low, high, len(nm))
     if spectral.colours and rgb.max() > 0:
@@ -105,7 +109,7 @@ def light_of(scene: Scene, camera: Camera, rgb: Array) -> tuple[Array, Array]:
     share = np.bincount(part, seen, len(edges) - 1)
     lit = share > 1e-6 * share.sum()
     middle = np.bincount(part, seen * nm, len(edges) - 1)[lit] / share[lit]
-    return middle, share[lit] / share[lit].sum()
+    return (float(nm[first]), float(nm[last])), middle, share[lit] / share[lit].sum()
 
 
 def stray_light(scene: Scene, camera: Any, seen: Glance, white_balance: str | None = None) -> dict[str, Array]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -80,15 +80,18 @@ class Plan:
     effects: tuple[Effect, ...]
     choices: tuple[Choice, ...]
     best: Choice | None
+    probed: Probed
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return asdict(self)
+        """JSON-able: what is above `probed`."""
+        told = asdict(replace(self, probed=None))  # type: ignore[arg-type]
+        del told["probed"]
+        return told
 
 
 def plan(
     scene: Scene, lens: Lens, budget_px: float, *, target: Target = "render", models: Sequence[Path] = (),
-    folder: Path | None = None, explain: bool = False, report: Report | None = None,
+    folder: Path | None = None, explain: bool = False, afterwards: Collection[str] = (), report: Report | None = None,
 ) -> Plan:  # fmt: skip
     """The cheapest camera for a scene whose error stays within a budget.
 
@@ -97,13 +100,14 @@ def plan(
         target: what runs the camera: our renderer with all it has, compiled C, or onnxruntime.
         models: exported models of this lens to try. folder: where models fitted for the shot go; None fits none.
         explain: whether models beyond the budget are compiled and timed, too; else their time is infinite.
+        afterwards: what compositing makes of the picture, see `probe`.
 
     Raises:
         InputError: a budget that is negative or no number; as `probe`.
     """
     if not budget_px >= 0:
         raise InputError("plan", "budget_px", budget_px, "0 or more pixels")
-    found = probe(scene, lens)
+    found = probe(scene, lens, afterwards=afterwards)
     tried = candidates(found, (budget_px,), target, models=models, folder=folder, explain=explain, report=report)
     return decided(found, tried, budget_px, target)
 
@@ -135,7 +139,7 @@ def decided(found: Probed, tried: Sequence[Choice], budget_px: float, target: Ta
     """The plan for a budget, from candidates that serve it."""
     ranked = tuple(replace(c, within=c.meets(budget_px)) for c in sorted(tried, key=lambda c: c.ns))
     best = next((c for c in ranked if c.within), None)
-    return Plan(found.asked, budget_px, target, effects_of(found, budget_px), ranked, best)
+    return Plan(found.asked, budget_px, target, effects_of(found, budget_px), ranked, best, found)
 
 
 def _ideal(found: Probed, target: Target) -> Iterator[Choice]:
@@ -148,7 +152,8 @@ def _ideal(found: Probed, target: Target) -> Iterator[Choice]:
             camera = ideal_as(kind, found.exact.lens, shot)
             spec = f"{kind}{path}"
             yield _judged(found, kind.rstrip(":"), spec, camera)
-            if kind == "pinhole:" and (area := _overscan(found)) < _MOST_OVERSCAN:
+            by_map = kind == "pinhole:" and "distortion" not in found.asked.afterwards
+            if by_map and (area := _overscan(found)) < _MOST_OVERSCAN:
                 flat = prints.collapsed(found.seen, found.places.share)
                 how = f"then the ST map of 'neurolens stmap' over the picture, of {area:.3g} times the area"
                 warped = _judged(found, "pinhole + ST map", spec, camera, flat, how)
@@ -212,8 +217,10 @@ def _judged(
     """A camera's error against the exact footprints, and its cost."""
     share = found.places.share
     seen = prints.footprints(camera, found.places) if seen is None else seen
-    apart = prints.distance_mm(found.seen, seen, share) / found.asked.pixel_mm
-    light = np.abs(seen.light / np.maximum(found.seen.light, 1e-30) - 1)
+    apart = prints.distance_mm(found.wanted, seen, share) / found.asked.pixel_mm
+    light = np.abs(seen.light / np.maximum(found.wanted.light, 1e-30) - 1)
+    if "distortion" in found.asked.afterwards:  # the map corrects light, too
+        light = np.where(seen.light > 0, 0.0, light)
     error, dim = (float(np.percentile(np.where(np.isfinite(v), v, np.inf), COUNTED)) for v in (apart, light))
     cost = _ns_a_ray(camera, found.places) / max(seen.passed, 1e-9) if timed else math.inf
     return Choice(name, spec, error, dim, cost, seen.passed, how)

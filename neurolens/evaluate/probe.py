@@ -12,9 +12,11 @@ import math
 from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import cached_property
+from typing import Any, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, ideal_as
@@ -30,6 +32,8 @@ from neurolens.render.scene import Scene
 from neurolens.surrogates.domain import Domain, domain_from_camera
 
 COUNTED = 95.0  # percentile over the picture that a budget is held against
+_Real = TypeVar("_Real", bound=np.floating[Any])
+Maps = dict[str, tuple[Literal["px", "relative"], Array]]
 LIGHT = 0.01  # relative error of light that a plan allows beside its budget of place
 _ACROSS = 16  # points of the probe along the longer side
 # Of effects, what makes them where the picture is finished: a blur by depth makes all blur.
@@ -107,6 +111,11 @@ class Probed:
     wanted: Footprints
     glance: Glance
 
+    @cached_property
+    def maps(self) -> Maps:
+        """`effect_maps`, made once."""
+        return effect_maps(self)
+
     def on_film(self, value: Array) -> Array:
         """Values [N] of places as a picture [rows, columns], as prints show it: upright; NaN where none is."""
         found = np.full(self.shape, np.nan)
@@ -149,7 +158,7 @@ def probe(scene: Scene, lens: Lens, *, across: int = _ACROSS, afterwards: Collec
         film, film[0] / shot.width, shot.focus_m, f_number, shot.wavelengths_nm,
         float(met.min()) if met.size else None, float(met.max()) if met.size else None,
         float(np.isinf(depth).mean()), 1 - places.film_mm.shape[1] / points.shape[1],
-        (float(small.wavelength_nm.min()), float(small.wavelength_nm.max())), float(np.median(small.contrast)),
+        small.range_nm, float(np.median(small.contrast)),
         *_edges(scene, exact, small, film[0] / shot.width), afterwards=tuple(sorted(afterwards)),
     )  # fmt: skip
     seen, ideal = (prints.footprints(c, places) for c in (exact, thin))
@@ -171,18 +180,19 @@ def _edges(scene: Scene, exact: Any, small: Glance, pixel_mm: float) -> tuple[fl
     return float(there.mean()), float(np.median(small.contrast[there])) if there.any() else None
 
 
-def upright(film: Array) -> Array:
-    """Rows and columns by rising film x and y of the lens frame, as a print shows them: turned by 180 degrees."""
-    return film[::-1, ::-1]
+def upright(film: NDArray[_Real]) -> NDArray[_Real]:
+    """Rows by rising y and columns by rising x of the film (lens frame) as a picture shows them, turned by 180 degrees:
+    its top left is at +x, -y."""
+    return film[:, ::-1]
 
 
-def effect_maps(found: Probed) -> dict[str, tuple[Literal["px", "relative"], Array]]:
+def effect_maps(found: Probed) -> Maps:
     """Unit and map [H, W] of each effect over the picture, upright; NaN where the lens is dark. See `effects_mm`.
 
     Flare, glare and star-bursts are on more pixels; they are left out where they are not known (`effects_of`). An Airy
     disc has no RMS radius: diffraction is worth the radius that holds half its light, 0.53 wavelengths times the
-    f-number (Born and Wolf, 8.5.2). Transmittance is the colour that glass and coatings give: RMS over wavelengths of
-    the light there relative to its mean.
+    f-number (Born and Wolf, 8.5.2). Transmittance is the colour that the lens gives, by its glass and coatings and an
+    aperture that changes with the wavelength: RMS over wavelengths of the light there relative to its mean.
     """
     pixel, share = found.asked.pixel_mm, found.places.share
     parts = {k: v / pixel for k, v in prints.effects_mm(found.seen, found.thin_seen, share).items()}
@@ -196,20 +206,23 @@ def effect_maps(found: Probed) -> dict[str, tuple[Literal["px", "relative"], Arr
         "vignetting": np.abs(1 - fall / np.maximum(natural, 1e-30)),
         "transmittance": np.sqrt((share * (by_wave - 1) ** 2).sum(1)),
     }
-    maps: dict[str, tuple[Literal["px", "relative"], Array]] = {k: ("px", found.on_film(v)) for k, v in parts.items()}
+    maps: Maps = {k: ("px", found.on_film(v)) for k, v in parts.items()}
     maps |= {k: ("relative", found.on_film(v)) for k, v in light.items()}
     with suppress(InputError):
         maps |= {k: ("relative", v) for k, v in stray_light(found.scene, found.exact, found.glance).items()}
     return maps
 
 
-def effects_of(found: Probed, budget_px: float, maps: dict[str, Any] | None = None) -> tuple[Effect, ...]:
-    """What each effect is worth in this picture, the dearest first; `maps`: those of `effect_maps`, if made before."""
+def effects_of(found: Probed, budget_px: float) -> tuple[Effect, ...]:
+    """What each effect is worth in this picture, the dearest first."""
     effects = []
-    for name, (unit, value) in (maps or effect_maps(found)).items():
+    for name, (unit, value) in found.maps.items():
         budget = budget_px if unit == "px" else LIGHT
         known = value[np.isfinite(value)]
-        worth, later = float(np.percentile(known, COUNTED)), name in _MADE_BY and _MADE_BY[name] in found.asked.afterwards
+        worth, later = (
+            float(np.percentile(known, COUNTED)),
+            name in _MADE_BY and _MADE_BY[name] in found.asked.afterwards,
+        )
         why = "made afterwards" if later else "left out" if worth <= budget else ""
         over = float((known > budget).mean())
         effects.append(Effect(name, worth, float(np.median(known)), over, unit, not why, why))
